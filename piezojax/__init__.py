@@ -1,0 +1,43 @@
+"""Simulate, identify and tune piezo nanopositioning stages."""
+
+from . import _runtime
+
+__version__ = "0.1.0"
+
+_runtime.configure()
+
+from . import catalog as catalog
+from . import signals as signals
+from .control import PID as PID
+from .control import AlphaBeta as AlphaBeta
+from .control import DisturbanceObserverControl as DisturbanceObserverControl
+from .control import InversionControl as InversionControl
+from .control import SlidingModePID as SlidingModePID
+from .dynamics import ARMA as ARMA
+from .dynamics import FirstOrderLag as FirstOrderLag
+from .hardware import Quantiser as Quantiser
+from .hardware import Saturation as Saturation
+from .hardware import Sensor as Sensor
+from .hardware import SlewLimit as SlewLimit
+from .hysteresis import ColemanHodgdon as ColemanHodgdon
+from .hysteresis import InverseColemanHodgdon as InverseColemanHodgdon
+from .identify import Record as Record
+from .identify import identify as identify
+from .identify import read_record as read_record
+from .metrics import Tracking as Tracking
+from .rollout import Metric as Metric
+from .rollout import in_blocks as in_blocks
+from .rollout import simulate as simulate
+from .serial import load as load
+from .serial import save as save
+from .study import read as read_study
+from .system import Affine as Affine
+from .system import Delay as Delay
+from .system import Feedback as Feedback
+from .system import Parallel as Parallel
+from .system import Series as Series
+from .system import System as System
+from .system import loop_inputs as loop_inputs
+from .system import series as series
+from .tune import load_result as load_result
+from .tune import tune as tune

@@ -1,0 +1,91 @@
+"""Array types and the conversions and checks every constructor shares."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Shaped
+
+Scalar = Float[Array, ""]
+ScalarLike = Shaped[ArrayLike, ""]
+State = Any  # a pytree of arrays; every System defines its own
+
+
+def as_array(value: Any) -> Array:
+    """Return ``value`` as a float64 array."""
+    return jnp.asarray(value, dtype=jnp.float64)
+
+
+def as_scalars(values: Iterable[Any]) -> tuple[Array, ...]:
+    """Return ``values`` as a tuple of float64 scalars.
+
+    Scalars, not one packed array: XLA keeps them in registers inside the loop.
+    """
+    return tuple(as_array(value) for value in values)
+
+
+def parameter() -> Any:
+    """Declare a scalar array field: a leaf that can be tuned, batched, perturbed."""
+    return eqx.field(converter=as_array)
+
+
+def parameters() -> Any:
+    """Declare a field holding a tuple of scalar array leaves."""
+    return eqx.field(converter=as_scalars)
+
+
+def _known(value: Any) -> np.ndarray | None:
+    """Return the numbers in ``value``, or None while it is being traced."""
+    return None if isinstance(value, jax.core.Tracer) else np.asarray(value)
+
+
+def check(
+    name: str,
+    value: Any,
+    *,
+    above: float = -np.inf,
+    least: float = -np.inf,
+    most: float = np.inf,
+    below: float = np.inf,
+) -> None:
+    """Raise ValueError unless ``value`` is finite and inside the stated bounds.
+
+    Values that are being traced have no number to check and pass.
+    """
+    for element in value if isinstance(value, Sequence) else (value,):
+        number = _known(element)
+        if number is None:
+            continue
+        inside = (
+            (number > above) & (number >= least) & (number <= most) & (number < below)
+        )
+        if not (np.all(np.isfinite(number)) and np.all(inside)):
+            bounds = [
+                f"{word} {bound:g}"
+                for word, bound in (
+                    ("above", above),
+                    ("at least", least),
+                    ("at most", most),
+                    ("below", below),
+                )
+                if np.isfinite(bound)
+            ]
+            allowed = " and ".join(["finite", *bounds])
+            raise ValueError(f"{name} is {_shown(number)}; it must be {allowed}")
+
+
+def check_order(low_name: str, low: Any, high_name: str, high: Any) -> None:
+    """Raise ValueError unless ``low < high`` wherever both are known."""
+    lower, upper = _known(low), _known(high)
+    if lower is not None and upper is not None and not np.all(lower < upper):
+        raise ValueError(
+            f"{low_name} is {_shown(lower)} and {high_name} is {_shown(upper)}; "
+            f"{low_name} must be below {high_name}"
+        )
+
+
+def _shown(number: np.ndarray) -> str:
+    return f"{number:g}" if number.ndim == 0 else np.array2string(number, threshold=6)

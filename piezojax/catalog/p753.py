@@ -1,0 +1,211 @@
+"""The P-753 actuator (Physik Instrumente, 15 um) and its printed controllers.
+
+Every number carries its equation or table in Y. Cao's thesis (2013). All sets hold at
+20 kHz unless their name says otherwise.
+"""
+
+from .._types import ScalarLike
+from ..control import (
+    PID,
+    AlphaBeta,
+    DisturbanceObserverControl,
+    InversionControl,
+    SlidingModePID,
+)
+from ..dynamics import ARMA, scaled_to_dc
+from ..hardware import Saturation, Sensor
+from ..hysteresis import ColemanHodgdon, InverseColemanHodgdon
+from ..system import Feedback, Series, System, series
+
+RATE = 20_000.0
+"""Sampling rate of chapters 3 and 5, Hz."""
+
+DT = 1.0 / RATE
+VOLTAGE_LIMITS = (-20.0, 120.0)
+"""Range of the drive, V: the maker's data, not in the thesis."""
+
+NOISE_RMS = 0.012
+"""Sensor noise, um: section 5.5.6 gives 10 to 15 nm rms."""
+
+HYSTERESIS_CHAPTER_5 = {"a": 0.0077, "b": 0.1167, "c": -0.0487}
+"""Section 5.5.6.1, from a 70 V, 1 Hz sine: um/V^2, um/V, 1/V."""
+
+HYSTERESIS_CHAPTER_3 = {"a": 0.0064, "b": 0.1144, "c": -0.0305}
+"""Section 3.5.5.1, with c after its line search."""
+
+INITIAL_C_CHAPTER_3 = -0.0378
+"""Section 3.5.5.1: c of the first 1 Hz fit, before the line search."""
+
+GAIN = 0.1347
+"""K_e in um/V, section 5.5.6.1: the linear part of the hysteresis."""
+
+DYNAMICS_BEHIND_HYSTERESIS = {
+    "autoregressive": (1.6035, -0.61995),
+    "moving": (0.0050811, -0.0036354, 0.010553),
+}
+"""(5.33): from hysteresis output to displacement; DC gain 0.729 as printed."""
+
+DYNAMICS_FROM_VOLTAGE = {
+    "autoregressive": (1.6076, -0.61956),
+    "moving": (0.00071058, -0.00047055, 0.0012609),
+}
+"""(5.34): from voltage to displacement, um/V, hysteresis ignored."""
+
+ARMA_HYSTERESIS = {
+    # b' multiplies y_1 (a = 1, b = 0), b'' multiplies y_2 (a = 0, b = 1), (3.32).
+    "3-1": {
+        "autoregressive": (0.0725, 0.7577),
+        "c": -0.0305,
+        "error_um": 0.0451,
+        "moving_1": (-0.0703, 0.1448, -0.0732),
+        "moving_2": (-1.4122, 2.9350, -1.5032),
+    },
+    "3-2": {
+        "autoregressive": (1.6531, -0.6758),
+        "c": -0.0305,
+        "error_um": 0.0309,
+        "moving_1": (-0.002759, 0.006409, -0.003526),
+        "moving_2": (-0.07323, 0.1736, -0.09756),
+    },
+    "3-3": {
+        "autoregressive": (0.0592, 0.7413),
+        "c": -0.029,
+        "error_um": 0.1323,
+        "moving_1": (-0.0763, 0.1539, -0.0766),
+        "moving_2": (-2.4981, 5.0563, -2.5343),
+    },
+    "3-4": {
+        "autoregressive": (1.6522, -0.6751),
+        "c": -0.029,
+        "error_um": 0.0309,
+        "moving_1": (-0.0027, 0.0063, -0.0035),
+        "moving_2": (-0.0748, 0.1766, -0.099),
+    },
+}
+"""Tables 3-1 (trapezoid, least squares), 3-2 (trapezoid, online), 3-3 (quadratic, least
+squares), 3-4 (quadratic, online). 3-3 and 3-4 with their column heads put right."""
+
+DYNAMICS_BY_RATE = {
+    1_000: {
+        "autoregressive": (0.3212, 0.01025),
+        "moving": (0.003889, 0.1189, -0.01765),
+    },
+    2_000: {
+        "autoregressive": (0.0712, 0.12058),
+        "moving": (0.002944, 0.10592, 0.01797),
+    },
+    5_000: {
+        "autoregressive": (0.7567, -0.16145),
+        "moving": (0.003463, 0.01386, 0.00447),
+    },
+    10_000: {
+        "autoregressive": (1.0589, -0.15055),
+        "moving": (0.002018, 0.00075, 0.01001),
+    },
+    20_000: {
+        "autoregressive": (1.6092, -0.6248),
+        "moving": (0.000778, -0.00041, 0.00134),
+    },
+}
+"""Table 4-1, from voltage to displacement, by sampling rate in Hz. The row at 5 kHz does
+not fit the others (DC gain 0.054 against 0.11 to 0.16)."""
+
+GAINS = {
+    "5-2": {
+        name: {"proportional": 0.01, "integral": 30.0, "derivative": 1e-6}
+        for name in ("pid", "inversion", "dob")
+    },
+    "5-4": {
+        "pid": {"proportional": 0.01, "integral": 60.0, "derivative": 1e-6},
+        "inversion": {"proportional": 0.001, "integral": 10.0, "derivative": 1e-6},
+        "dob": {"proportional": 0.05, "integral": 12.0, "derivative": 1e-6},
+    },
+}
+"""Tables 5-2 (the same for all three) and 5-4 (adjusted one by one); ``pid`` is the
+nominal PID-based SMC, as in the columns of Tables 5-3 and 5-5."""
+
+SURFACE = 18_000.0
+"""m in S = [m, 1], 1/s, section 5.5.6.2."""
+
+ERROR_WEIGHT, CONTROL_WEIGHT = 1.0, 100.0
+"""Q and R, Tables 5-2 and 5-4."""
+
+ALPHA, BETA = 0.1, 1e-4
+"""Alpha-beta filter at 20 kHz, section 5.5.6.2."""
+
+CUTOFF = 500.0
+"""Q-filter cut-off, rad/s, section 5.5.6.2."""
+
+
+def hysteresis(scheme: str = "trapezoid") -> ColemanHodgdon:
+    """Return the chapter 5 hysteresis, V to um."""
+    return ColemanHodgdon(**HYSTERESIS_CHAPTER_5, scheme=scheme)
+
+
+def plant(scheme: str = "trapezoid") -> Series:
+    """Return the stage, V to um: hysteresis, then (5.33) scaled to unit DC gain.
+
+    The hysteresis was fitted from voltage to displacement at 1 Hz, so what follows it
+    must pass 1 Hz unchanged; with (5.33) as printed the 1 Hz cells of Table 5-3 are off
+    by the missing 27 %.
+    """
+    dynamics = scaled_to_dc(ARMA(**DYNAMICS_BEHIND_HYSTERESIS), 1.0)
+    return series(hysteresis=hysteresis(scheme), dynamics=dynamics)
+
+
+def _sliding_mode(model: ARMA, gains: dict[str, float]) -> SlidingModePID:
+    return SlidingModePID(
+        **gains,
+        surface=SURFACE,
+        error_weight=ERROR_WEIGHT,
+        control_weight=CONTROL_WEIGHT,
+        model=model,
+        filter=AlphaBeta(ALPHA, BETA, DT),
+    )
+
+
+def sliding_mode(table: str = "5-2") -> SlidingModePID:
+    """Return the nominal PID-based SMC with the printed gains, um to V."""
+    return _sliding_mode(ARMA(**DYNAMICS_FROM_VOLTAGE), GAINS[table]["pid"])
+
+
+def inversion(table: str = "5-2") -> InversionControl:
+    """Return the inversion-based PID-SMC with the printed gains, um to V."""
+    model = ARMA(**DYNAMICS_BEHIND_HYSTERESIS)
+    return InversionControl(
+        _sliding_mode(model, GAINS[table]["inversion"]),
+        InverseColemanHodgdon(hysteresis()),
+    )
+
+
+def disturbance_observer(
+    table: str = "5-2", coefficients: str = "corrected"
+) -> DisturbanceObserverControl:
+    """Return the DOB-based PID-SMC with the printed gains, um to V."""
+    model = ARMA(**DYNAMICS_BEHIND_HYSTERESIS)
+    return DisturbanceObserverControl(
+        _sliding_mode(model, GAINS[table]["dob"]),
+        model,
+        gain=GAIN,
+        cutoff=CUTOFF,
+        dt=DT,
+        coefficients=coefficients,
+    )
+
+
+def pid() -> PID:
+    """Return a plain PID baseline, um to V: ours, the thesis prints none.
+
+    An integral action of 60 V/(um s) crosses over near 400 rad/s.
+    """
+    return PID(0.5, 3000.0, 0.0, 1e-4, 100.0, dt=DT)
+
+
+def actuator() -> Saturation:
+    """Return the drive's voltage limits."""
+    return Saturation(*VOLTAGE_LIMITS)
+
+
+def loop(controller: System, noise_rms: ScalarLike = NOISE_RMS) -> Feedback:
+    """Return ``controller`` around the P-753 with its drive and noisy sensor."""
+    return Feedback(controller, plant(), actuator(), Sensor(noise_rms))

@@ -1,0 +1,56 @@
+"""What all commands share: options, the results folder, errors in one line."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+
+from .files import fresh_folder, numbered_folder
+from .report.console import console
+
+RESULTS = Path("results")
+"""Where results go if no folder is named."""
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it."""
+
+
+def common(function: Callable) -> Callable:
+    """Add the options every command takes."""
+    for option in (
+        click.option("--quiet", is_flag=True, help="Print nothing but errors."),
+        click.option(
+            "--seed",
+            type=click.IntRange(min=0),
+            default=None,
+            help="Seed of all noise and sampling (default: the study's).",
+        ),
+        click.option(
+            "--out",
+            type=click.Path(path_type=Path),
+            default=None,
+            help="New folder for the results (default: a fresh one under results/).",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def results_folder(out: Path | None, name: str) -> Path:
+    """Return an empty folder for results: ``out``, or a fresh one named after ``name``.
+
+    Raises ValueError if ``out`` is in use or cannot be written.
+    """
+    return fresh_folder(out if out is not None else numbered_folder(RESULTS / name))
+
+
+def run(quiet: bool, body: Callable[[Console], Any]) -> None:
+    """Run ``body``; turn bad input into one line and a non-zero exit status."""
+    try:
+        body(console(quiet))
+    except ValueError as error:
+        raise click.ClickException(" ".join(str(error).split())) from None
+    except KeyboardInterrupt:
+        raise SystemExit(INTERRUPTED) from None

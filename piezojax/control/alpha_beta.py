@@ -1,0 +1,48 @@
+"""Alpha-beta filter: displacement and velocity from a noisy measurement."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._types import Scalar, ScalarLike, as_array, check, parameter
+from ..system import System
+
+
+class Motion(NamedTuple):
+    """Displacement in um and velocity in um/s."""
+
+    position: Scalar
+    velocity: Scalar
+
+
+class AlphaBeta(System):
+    """Fixed-gain observer of position and velocity (section 4.5.4.1).
+
+    Input z(k) in um, output a Motion. ``alpha`` in (0, 1] corrects the position,
+    ``beta`` in (0, 2) the velocity, both without unit; ``dt`` in s. A ramp is followed
+    without lag only as fast as ``beta`` lets the velocity in; until then the position
+    lags by (1 - alpha) / alpha samples.
+    """
+
+    alpha: Scalar = parameter()
+    beta: Scalar = parameter()
+    dt: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        check("alpha", self.alpha, above=0, most=1)
+        check("beta", self.beta, least=0, below=2)
+        check("sample time in s", self.dt, above=0)
+
+    def init(self, input: ScalarLike = 0.0) -> Motion:
+        position = as_array(input)
+        return Motion(position, jnp.zeros_like(position))
+
+    def step(self, state: Motion, input: ScalarLike) -> tuple[Motion, Motion]:
+        predicted = state.position + self.dt * state.velocity
+        residual = input - predicted
+        motion = Motion(
+            predicted + self.alpha * residual,
+            state.velocity + (self.beta / self.dt) * residual,
+        )
+        return motion, motion

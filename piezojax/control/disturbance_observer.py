@@ -1,0 +1,108 @@
+"""Disturbance observer (DOB) with its Q-filter, around any controller."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._types import Scalar, State, check, parameter
+from ..dynamics.arma import ARMA
+from ..system import Observation, System
+
+COEFFICIENTS = ("corrected", "printed")
+
+
+class DisturbanceObserverState(NamedTuple):
+    """State of the controller; past measurements, voltages and estimates."""
+
+    feedback: State
+    measured: tuple[Scalar, Scalar]
+    applied: tuple[Scalar, Scalar]
+    disturbance: tuple[Scalar, Scalar]
+
+
+class DisturbanceObserverControl(System):
+    """``u = f / gain - w``: the controller's f less the observed input disturbance w.
+
+    Figure 5.2, (5.26)-(5.32): w = Q/(gain G) z - Q u, where G is ``model``
+    (a_1, a_2 | b_0, b_1, b_2, DC gain near 1), ``gain`` K_e in um/V is the linear part of
+    the hysteresis, and Q has G's zeros, unit DC gain and a double pole at ``cutoff``
+    (rad/s). u is the voltage that was applied, after the limits.
+
+    ``coefficients`` is ``"corrected"`` (the bilinear double pole) or ``"printed"``
+    ((5.32) as printed, whose poles lie at -0.54 and -7.46 times the cut-off). Input an
+    Observation, output in V.
+
+    Raises ValueError for a model of another order, gain = 0, a cut-off that is not
+    between 0 and the Nyquist frequency pi/dt, or an unknown name in ``coefficients``.
+    """
+
+    feedback: System
+    model: ARMA
+    gain: Scalar = parameter()
+    cutoff: Scalar = parameter()
+    dt: float = eqx.field(static=True)
+    coefficients: str = eqx.field(static=True, default="corrected")
+
+    def __check_init__(self):
+        orders = len(self.model.autoregressive), len(self.model.moving)
+        if orders != (2, 3):
+            raise ValueError(
+                f"the model has {orders[0]} a and {orders[1]} b coefficients; "
+                "it must have 2 and 3"
+            )
+        check("sample time in s", self.dt, above=0)
+        check("gain K_e in um/V", self.gain, above=0)
+        check("cut-off in rad/s", self.cutoff, above=0, below=jnp.pi / self.dt)
+        if self.coefficients not in COEFFICIENTS:
+            raise ValueError(
+                f"coefficients {self.coefficients!r}; "
+                f"it must be one of {list(COEFFICIENTS)}"
+            )
+
+    def denominator(self) -> tuple[Scalar, Scalar, Scalar]:
+        """Return c_0, c_1, c_2 of the Q-filter (5.32)."""
+        x = 1.0 / (self.cutoff * self.dt)
+        square, double = (
+            (x**2, 2.0 * x**2)
+            if self.coefficients == "corrected"
+            else (x**2 / 4.0, x**2 / 2.0)
+        )
+        total = sum(self.model.moving)
+        return (
+            (0.25 + square + x) * total,
+            (0.5 - double) * total,
+            (0.25 + square - x) * total,
+        )
+
+    def init(self, input: Observation) -> DisturbanceObserverState:
+        # At rest Q = 1: w = z / (gain G(1)) - u.
+        w = input.measured / (self.gain * self.model.dc_gain()) - input.applied
+        force = self.gain * (input.applied + w)
+        return DisturbanceObserverState(
+            feedback=self.feedback.init(input._replace(applied=force)),
+            measured=(input.measured,) * 2,
+            applied=(input.applied,) * 2,
+            disturbance=(w,) * 2,
+        )
+
+    def step(
+        self, state: DisturbanceObserverState, input: Observation
+    ) -> tuple[DisturbanceObserverState, Scalar]:
+        a1, a2 = self.model.autoregressive
+        b0, b1, b2 = self.model.moving
+        c0, c1, c2 = self.denominator()
+        z, (z1, z2) = input.measured, state.measured
+        u1, (u2, u3) = input.applied, state.applied
+        w1, w2 = state.disturbance
+        # Both filters of (5.26) have the denominator c: one recursion serves both.
+        w = (
+            (z - a1 * z1 - a2 * z2) / self.gain
+            - (b0 * u1 + b1 * u2 + b2 * u3)
+            - c1 * w1
+            - c2 * w2
+        ) / c0
+        force = self.gain * (u1 + w1)
+        feedback, f = self.feedback.step(state.feedback, input._replace(applied=force))
+        state = DisturbanceObserverState(feedback, (z, z1), (u1, u2), (w, w1))
+        return state, f / self.gain - w

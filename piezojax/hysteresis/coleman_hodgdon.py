@@ -1,0 +1,185 @@
+"""Coleman-Hodgdon (ferromagnetic) hysteresis, four discretisations, and its inverse."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._types import Scalar, ScalarLike, State, as_array, check, parameter
+from ..system import System
+
+
+class HysteresisState(NamedTuple):
+    """Last input (V) and output (um); ``older`` holds the pair before, if needed."""
+
+    input: Scalar
+    output: Scalar
+    older: tuple[Scalar, Scalar] | None = None
+
+
+class ColemanHodgdon(System):
+    """Rate-independent hysteresis ``y' = |x'| (a x + c y) + b x'``.
+
+    Input x in V, output y in um. ``a`` in um/V^2, ``b`` in um/V, ``c`` in 1/V (negative
+    for a loop that closes). The material starts on its virgin loading curve from
+    ``rest_input`` (V) and ``rest_output`` (um).
+
+    ``scheme`` is one of
+
+    - ``"trapezoid"`` (3.10)-(3.16), second order in the input step, the default;
+    - ``"quadratic"`` (3.17)-(3.29), third order where turning points fall on samples;
+      the trapezoid step is taken right after a turning point or a pause;
+    - ``"voros"`` (2.11), explicit, first order: the earlier model the thesis compares;
+    - ``"exact"``, the closed form on each monotone branch.
+
+    Raises ValueError for non-finite parameters, ``c >= 0`` or an unknown scheme.
+    """
+
+    a: Scalar = parameter()
+    b: Scalar = parameter()
+    c: Scalar = parameter()
+    rest_input: Scalar = parameter()
+    rest_output: Scalar = parameter()
+    scheme: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        a: ScalarLike,
+        b: ScalarLike,
+        c: ScalarLike,
+        rest_input: ScalarLike = 0.0,
+        rest_output: ScalarLike = 0.0,
+        scheme: str = "trapezoid",
+    ):
+        self.a, self.b, self.c = a, b, c
+        self.rest_input, self.rest_output = rest_input, rest_output
+        self.scheme = scheme
+
+    def __check_init__(self):
+        check("a in um/V^2", self.a)
+        check("b in um/V", self.b)
+        check("c in 1/V", self.c, below=0)
+        if self.scheme not in SCHEMES:
+            raise ValueError(
+                f"scheme {self.scheme!r}; it must be one of {list(SCHEMES)}"
+            )
+
+    def init(self, input: ScalarLike = 0.0) -> HysteresisState:
+        input = as_array(input)
+        virgin = HysteresisState(self.rest_input, self.rest_output)
+        output = _exact(self, virgin, input)
+        # Equal pairs mark a pause, so the first quadratic step is a trapezoid (3.25).
+        older = (input, output) if self.scheme == "quadratic" else None
+        return HysteresisState(input, output, older)
+
+    def step(
+        self, state: HysteresisState, input: ScalarLike
+    ) -> tuple[HysteresisState, Scalar]:
+        input = as_array(input)
+        output = SCHEMES[self.scheme](self, state, input)
+        older = None if state.older is None else (state.input, state.output)
+        return HysteresisState(input, output, older), output
+
+
+def _direction(dx: Scalar) -> Scalar:
+    # +1 at rest, as in (3.26): |dx| then has the slope +1 there, never NaN.
+    return jnp.where(dx >= 0.0, 1.0, -1.0)
+
+
+def _trapezoid(model: ColemanHodgdon, state: HysteresisState, x: Scalar) -> Scalar:
+    """(3.26)-(3.29): implicit in the output, solved in closed form."""
+    dx = x - state.input
+    sign = _direction(dx)
+    half = 0.5 * sign * model.c * dx
+    force = 0.5 * sign * model.a * (x + state.input) * dx + model.b * dx
+    return (force + (1.0 + half) * state.output) / (1.0 - half)
+
+
+def _quadratic(model: ColemanHodgdon, state: HysteresisState, x: Scalar) -> Scalar:
+    """(3.21)-(3.24) with the quadrature weights q1, q2, q3 in closed form."""
+    assert state.older is not None
+    older_input, older_output = state.older
+    d0, d1 = state.input - older_input, x - state.input
+    smooth = d0 * d1 > 0.0
+    d0_safe = jnp.where(smooth, d0, 1.0)
+    d1_safe = jnp.where(smooth, d1, 1.0)
+    sign = _direction(d1_safe)
+    c = model.c
+    q1 = -c * d1_safe**3 / (6.0 * d0_safe * (d0_safe + d1_safe))
+    q2 = c * d1_safe * (d1_safe + 3.0 * d0_safe) / (6.0 * d0_safe)
+    q3 = c * d1_safe * (2.0 * d1_safe + 3.0 * d0_safe) / (6.0 * (d0_safe + d1_safe))
+    force = 0.5 * sign * model.a * (x + state.input) * d1 + model.b * d1
+    memory = sign * q1 * older_output + (1.0 + sign * q2) * state.output
+    curved = (force + memory) / (1.0 - sign * q3)
+    return jnp.where(smooth, curved, _trapezoid(model, state, x))
+
+
+def _voros(model: ColemanHodgdon, state: HysteresisState, x: Scalar) -> Scalar:
+    """(2.11) with alpha (f - y) = a x + c y: everything at the old sample."""
+    dx = x - state.input
+    pull = model.a * state.input + model.c * state.output
+    return state.output + pull * _direction(dx) * dx + model.b * dx
+
+
+def _exact(model: ColemanHodgdon, state: HysteresisState, x: Scalar) -> Scalar:
+    """The branch y = p x + q + K exp(s c x), from the last point to the new one."""
+    dx = x - state.input
+    sign = _direction(dx)
+    p = -model.a / model.c
+    q = sign * (p - model.b) / model.c
+    decay = jnp.exp(sign * model.c * dx)
+    return p * x + q + (state.output - p * state.input - q) * decay
+
+
+SCHEMES: dict[str, Callable[[ColemanHodgdon, HysteresisState, Scalar], Scalar]] = {
+    "trapezoid": _trapezoid,
+    "quadratic": _quadratic,
+    "voros": _voros,
+    "exact": _exact,
+}
+
+
+class InverseColemanHodgdon(System):
+    """Voltage that moves a trapezoid Coleman-Hodgdon model to a wanted output.
+
+    Input f(k) in um, output u(k) in V. Source: (5.24)-(5.25) with
+    ``2 [f(k+1) - f(k)]`` in zeta (printed as a sum), in the form that also holds for
+    ``a = 0``. The state is that of the model itself, so a controller whose voltage was
+    clipped can advance it with the voltage that was really applied.
+
+    Raises ValueError unless the model uses the trapezoid scheme.
+    """
+
+    model: ColemanHodgdon
+
+    def __check_init__(self):
+        if self.model.scheme != "trapezoid":
+            raise ValueError(
+                f"the inverse of scheme {self.model.scheme!r} is not available; "
+                "it must be 'trapezoid'"
+            )
+
+    def init(self, input: ScalarLike = 0.0) -> HysteresisState:
+        from ..system import holding_input
+
+        return self.model.init(holding_input(self.model, input))
+
+    def step(self, state: HysteresisState, input: Any) -> tuple[State, Scalar]:
+        voltage = self.solve(state, input)
+        return self.model.step(state, voltage)[0], voltage
+
+    def solve(self, state: HysteresisState, wanted: ScalarLike) -> Scalar:
+        """Return the voltage (V) for which the model's next output is ``wanted``."""
+        model = self.model
+        rise = wanted - state.output
+        sign = _direction(rise)
+        eta = sign * model.c * (wanted + state.output) + 2.0 * model.b
+        # With v = u(k+1) - u(k):  s a v^2 + (eta + 2 s a u) v = 2 rise.
+        slope = eta + 2.0 * sign * model.a * state.input
+        discriminant = slope**2 + 8.0 * sign * model.a * rise
+        root = jnp.sqrt(jnp.maximum(discriminant, _TINY))
+        return state.input + 4.0 * rise / (slope + root)
+
+
+_TINY = 1e-24  # keeps the gradient of the root finite where no voltage exists

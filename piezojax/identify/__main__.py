@@ -1,0 +1,63 @@
+"""``python -m piezojax.identify RECORD --model NAME --out DIR``."""
+
+from pathlib import Path
+
+import click
+
+from ..command import common, results_folder, run
+from ..report.console import fit_table
+from ..report.identification import write_fit
+from .models import MODELS
+from .output_error import identify
+from .record import read_record
+
+
+class _Part(click.ParamType):
+    name = "START:STOP"
+
+    def convert(self, value, param, ctx):
+        try:
+            start, stop = (int(number) for number in value.split(":"))
+        except ValueError:
+            self.fail(f"{value!r} must be two sample numbers, as in 0:1200", param, ctx)
+        return slice(start, stop)
+
+
+@click.command()
+@click.argument("record", type=click.Path(path_type=Path))
+@click.option(
+    "--model",
+    default="coleman_hodgdon",
+    show_default=True,
+    help="Model to fit; 'help' lists them.",
+)
+@click.option("--time", help="Time column, by name or number from zero.")
+@click.option("--input", default="0", show_default=True, help="Input column.")
+@click.option("--output", default="1", show_default=True, help="Output column.")
+@click.option("--rate", type=float, help="Sampling rate, Hz, if no time column.")
+@click.option("--train", type=_Part(), help="Samples to fit (default: first half).")
+@click.option("--validate", type=_Part(), help="Samples to judge on (default: rest).")
+@common
+def main(record, model, time, input, output, rate, train, validate, out, seed, quiet):
+    """Fit a plant model to the measured RECORD (.csv, .txt, .dat or .npz)."""
+    del seed  # this fit draws nothing
+
+    def body(console):
+        if model == "help":
+            console.print("\n".join(MODELS))
+            return
+        loaded = read_record(record, time=time, input=input, output=output, rate=rate)
+        folder = results_folder(out, record.stem)
+        with console.status(f"fitting {model} to {loaded.input.size} samples"):
+            fit = identify(loaded, model, train=train, validate=validate)
+            write_fit(fit, folder)
+        console.print(fit_table(fit.report))
+        for warning in fit.report.warnings:
+            console.print(f"note: {warning}")
+        console.print(f"{fit.report.wall_s:.1f} s; results in {folder}")
+
+    run(quiet, body)
+
+
+if __name__ == "__main__":
+    main(prog_name="python -m piezojax.identify")

@@ -1,0 +1,87 @@
+"""Figures of a loop, accumulated while it runs."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ._types import Scalar, ScalarLike, State
+from .rollout import Metric
+from .system import LoopSample
+
+
+class TrackingFigures(NamedTuple):
+    """What a run of a loop came to, over the window of its Tracking metric.
+
+    ``rms_error`` and ``peak_error`` of the true displacement against the reference in
+    um; ``rms_effort`` of the voltage in V; ``rms_slew`` of its change a sample in V;
+    ``saturated``, the share of samples at which the actuator did not give what was
+    asked for (0 to 1); ``peak_voltage`` in V.
+    """
+
+    rms_error: Scalar
+    peak_error: Scalar
+    rms_effort: Scalar
+    rms_slew: Scalar
+    saturated: Scalar
+    peak_voltage: Scalar
+
+
+class Tracking(Metric):
+    """Tracking error, effort and saturation of a Feedback loop from a sample on.
+
+    ``start`` is the first sample counted: the thesis leaves the start-up transient out.
+    A voltage that differs from the command by more than ``tolerance`` (V) counts as
+    saturated, so that a converter's rounding does not.
+    """
+
+    start: int = eqx.field(static=True, default=0)
+    tolerance: float = eqx.field(static=True, default=0.1)
+
+    def init(self) -> State:
+        zero = jnp.zeros(())
+        return {
+            "count": zero,
+            "error": zero,
+            "peak": zero,
+            "effort": zero,
+            "slew": zero,
+            "saturated": zero,
+            "voltage": zero,
+            "last": zero,
+        }
+
+    def update(self, total: State, index: Array, output: LoopSample) -> State:
+        inside = jnp.where(index >= self.start, 1.0, 0.0)
+        error = output.displacement - output.reference
+        voltage = output.voltage
+        change = jnp.where(index > self.start, voltage - total["last"], 0.0)
+        clipped = jnp.abs(output.command - voltage) > self.tolerance
+        return {
+            "count": total["count"] + inside,
+            "error": total["error"] + inside * error**2,
+            "peak": jnp.maximum(total["peak"], inside * jnp.abs(error)),
+            "effort": total["effort"] + inside * voltage**2,
+            "slew": total["slew"] + inside * change**2,
+            "saturated": total["saturated"] + inside * jnp.where(clipped, 1.0, 0.0),
+            "voltage": jnp.maximum(total["voltage"], inside * jnp.abs(voltage)),
+            "last": voltage,
+        }
+
+    def result(self, total: State) -> TrackingFigures:
+        count = jnp.maximum(total["count"], 1.0)
+        return TrackingFigures(
+            rms_error=_root(total["error"] / count),
+            peak_error=total["peak"],
+            rms_effort=_root(total["effort"] / count),
+            rms_slew=_root(total["slew"] / count),
+            saturated=total["saturated"] / count,
+            peak_voltage=total["voltage"],
+        )
+
+
+def _root(square: ScalarLike) -> Scalar:
+    # The slope of sqrt at 0 is infinite; a perfect run must have the gradient 0.
+    positive = square > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0 * square)

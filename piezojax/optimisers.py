@@ -1,0 +1,154 @@
+"""Optimisers behind one interface: start, step, look; one point at a time.
+
+Each is run for many starts at once by ``jax.vmap`` and stepped from Python, so that
+progress can be shown, the history kept and a run stopped with its best point in hand.
+"""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from .space import squash, unsquash
+
+Unit = Float[Array, " n"]
+Function = Callable[[Unit], Array]
+
+
+class View(NamedTuple):
+    """Where an optimiser stands: the point in [0, 1]^n, its loss, whether it is done."""
+
+    unit: Unit
+    loss: Float[Array, ""]
+    done: Bool[Array, ""]
+
+
+class Optimiser(NamedTuple):
+    """``start(unit) -> carry``, ``step(carry) -> carry``, ``view(carry) -> View``."""
+
+    start: Callable[[Unit], Any]
+    step: Callable[[Any], Any]
+    view: Callable[[Any], View]
+
+
+class _Carry(NamedTuple):
+    point: Array
+    state: Any
+    loss: Array
+    done: Array
+
+
+def _settled(carry: _Carry) -> _Carry:
+    # Weakly typed leaves would make the second step compile anew.
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), carry)
+
+
+def _advanced(old: _Carry, new: _Carry) -> _Carry:
+    """Return ``new``, or ``old`` where that start had already finished."""
+    kept = jax.tree.map(lambda o, n: jnp.where(old.done, o, n), old, new)
+    return _settled(kept)
+
+
+def _optimistix(
+    solver: Any, function: Function, loss_of: Callable[[Array], Array], options: dict
+) -> Optimiser:
+    """Wrap an optimistix solver; it knows no bounds, so it works on the whole line."""
+
+    def objective(free, _):
+        value = function(squash(free))
+        return value, loss_of(value)
+
+    def initial(free):
+        value, loss = eqx.filter_eval_shape(objective, free, None)
+        return solver.init(objective, free, None, options, value, loss, frozenset())
+
+    def fixed(free):
+        # A solver's state also holds functions and shapes, which no carry can take:
+        # they follow from the point's shape, so each step finds them again by tracing.
+        shapes = eqx.filter_eval_shape(initial, free)
+        return eqx.filter(shapes, _is_shape, inverse=True)
+
+    def start(unit):
+        free = unsquash(unit)
+        arrays = eqx.filter(initial(free), eqx.is_array)
+        return _settled(_Carry(free, arrays, jnp.asarray(jnp.inf), jnp.asarray(False)))
+
+    def step(carry):
+        state = eqx.combine(carry.state, fixed(carry.point))
+        point, state, loss = solver.step(
+            objective, carry.point, None, options, state, frozenset()
+        )
+        done, _ = solver.terminate(objective, point, None, options, state, frozenset())
+        arrays = eqx.filter(state, eqx.is_array)
+        return _advanced(carry, _Carry(point, arrays, loss, carry.done | done))
+
+    def view(carry):
+        return View(squash(carry.point), carry.loss, carry.done)
+
+    return Optimiser(start, step, view)
+
+
+def _is_shape(leaf: Any) -> bool:
+    return isinstance(leaf, jax.ShapeDtypeStruct)
+
+
+def bfgs(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
+    """BFGS (optimistix) on the loss."""
+    del residuals
+    solver = optx.BFGS(rtol=tolerance, atol=tolerance)
+    return _optimistix(solver, loss, lambda value: value, {})
+
+
+def levenberg_marquardt(
+    loss: Function, residuals: Function, tolerance: float
+) -> Optimiser:
+    """Levenberg-Marquardt (optimistix) on the residuals, forward Jacobian."""
+    del loss
+    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    return _optimistix(
+        solver, residuals, lambda value: jnp.sum(value**2), {"jac": "fwd"}
+    )
+
+
+def lbfgsb(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
+    """L-BFGS-B (jaxopt) on the loss, which takes the bounds as they are."""
+    del residuals
+    with warnings.catch_warnings():
+        # jaxopt announces on import that it is no longer maintained.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        import jaxopt
+
+    solver = jaxopt.LBFGSB(
+        loss, tol=tolerance, maxls=12, linesearch="backtracking", implicit_diff=False
+    )
+    box = (0.0, 1.0)
+
+    def bounds(unit):
+        return tuple(jnp.full_like(unit, side) for side in box)
+
+    def start(unit):
+        state = solver.init_state(unit, bounds(unit))
+        return _settled(_Carry(unit, state, state.value, jnp.asarray(False)))
+
+    def step(carry):
+        point, state = solver.update(carry.point, carry.state, bounds(carry.point))
+        done = carry.done | (state.error <= tolerance)
+        return _advanced(carry, _Carry(point, state, state.value, done))
+
+    def view(carry):
+        return View(carry.point, carry.loss, carry.done)
+
+    return Optimiser(start, step, view)
+
+
+METHODS: dict[str, Callable[[Function, Function, float], Optimiser]] = {
+    "bfgs": bfgs,
+    "levenberg_marquardt": levenberg_marquardt,
+    "lbfgsb": lbfgsb,
+}
+"""Optimisers by the name a study uses."""

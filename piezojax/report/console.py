@@ -1,0 +1,162 @@
+"""What the commands print: progress while they work, one table at the end."""
+
+import sys
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.table import Table
+
+from ..identify.output_error import FitReport
+from ..reproduce.chapter5 import Cell
+from ..reproduce.summary import TableAgreement
+from ..tune.result import Result, Scores
+
+
+class Bar:
+    """Progress of tuning on a terminal; plain lines where there is none."""
+
+    def __init__(self, console: Console):
+        self._console = console
+        self._live = console.is_terminal
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            console=console,
+            disable=not self._live,
+        )
+        self._task = None
+
+    def __enter__(self) -> "Bar":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self._progress.stop()
+
+    def stage(self, text: str, steps: int = 0) -> None:
+        """Show a new stage; without ``steps`` its length is unknown."""
+        if not self._live:
+            self._console.print(text)
+        if self._task is not None:
+            self._progress.update(self._task, total=1, completed=1)
+        self._task = self._progress.add_task(text, total=steps or None, note="")
+
+    def advance(self, best: float) -> None:
+        """Move the bar by one step."""
+        if self._task is not None:
+            self._progress.update(self._task, advance=1, note=f"objective {best:.3f}")
+
+
+def console(quiet: bool) -> Console:
+    """Return where a command prints: standard output, or nowhere."""
+    return Console(quiet=quiet, file=sys.stdout, highlight=False)
+
+
+def _nanometres(value: float | None) -> str:
+    return "diverges" if value is None else f"{1e3 * value:.2f}"
+
+
+def _ratio(before: float | None, after: float | None) -> str:
+    return f"{before / after:.1f}x" if before and after else "-"
+
+
+def tuning_table(result: Result) -> Table:
+    """Return the before/after table on held-out noise, in nm rms."""
+    table = Table(title=f"{result.title}\nrms tracking error on held-out noise, nm")
+    table.add_column("reference")
+    for heading in ("before", "tuned", "better", "peak, tuned"):
+        table.add_column(heading, justify="right")
+    sections: list[tuple[str, Scores | None, Scores | None]] = [
+        ("geometric mean", result.holdout_before, result.holdout),
+        ("geometric mean, not tuned on", result.unseen_before, result.unseen),
+    ]
+    for heading, before, after in sections:
+        if before is None or after is None:
+            continue
+        for name, error in before.per_reference_rms_um.items():
+            tuned = after.per_reference_rms_um[name]
+            peak = after.peak_error_um[name]
+            table.add_row(
+                name,
+                _nanometres(error),
+                _nanometres(tuned),
+                _ratio(error, tuned),
+                _nanometres(peak),
+            )
+        table.add_section()
+        table.add_row(
+            heading,
+            _nanometres(before.geomean_rms_um),
+            _nanometres(after.geomean_rms_um),
+            _ratio(before.geomean_rms_um, after.geomean_rms_um),
+            "",
+            style="bold",
+        )
+        table.add_section()
+    return table
+
+
+def gains_table(result: Result) -> Table:
+    """Return the tuned parameters beside their start."""
+    table = Table(title="gains")
+    table.add_column("parameter")
+    table.add_column("before", justify="right")
+    table.add_column("tuned", justify="right")
+    for path, value in result.gains.items():
+        table.add_row(path, f"{result.start[path]:.4g}", f"{value:.4g}")
+    return table
+
+
+def fit_table(report: FitReport) -> Table:
+    """Return the parameters of a fit and how well it simulates the record."""
+    errors = ", ".join(
+        f"{name} {part.rmse:.3g} {part.unit} ({part.rmse_percent_of_span:.2f} % of span)"
+        for name, part in (
+            ("training", report.train),
+            ("validation", report.validation),
+        )
+    )
+    table = Table(title=f"{report.model}: free-run rms error\n{errors}")
+    table.add_column("parameter")
+    table.add_column("value", justify="right")
+    table.add_column("standard error", justify="right")
+    for path, parameter in report.parameters.items():
+        deviation = parameter.standard_error
+        shown = "-" if deviation is None else f"{deviation:.2g}"
+        table.add_row(path, f"{parameter.value:.5g}", shown)
+    return table
+
+
+def reproduction_table(
+    name: str, cells: Sequence[Cell], agreement: TableAgreement
+) -> Table:
+    """Return paper beside simulation, a row a reference."""
+    columns = list(agreement.columns)
+    table = Table(
+        title=f"Table {name}: rms error in {cells[0].unit}, paper / simulation\n"
+        f"geometric-mean ratio {agreement.geomean_ratio:.3f}, "
+        f"worst {agreement.worst_ratio:.2f}"
+    )
+    table.add_column("reference")
+    for column in columns:
+        table.add_column(column, justify="right")
+    by_place = {(cell.row, cell.column): cell for cell in cells}
+    for row in dict.fromkeys(cell.row for cell in cells):
+        found = [by_place[row, column] for column in columns]
+        table.add_row(row, *(f"{c.paper:.4f} / {c.sim:.4f}" for c in found))
+    table.add_section()
+    ratios = (f"{agreement.columns[c].geomean_ratio:.3f}" for c in columns)
+    table.add_row("geometric-mean ratio", *ratios, style="bold")
+    return table

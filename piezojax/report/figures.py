@@ -1,0 +1,46 @@
+"""The house style of every picture, and writing one to a file."""
+
+import io
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from ..files import write_bytes
+
+REFERENCE, BEFORE, AFTER, MEASURED = "#222222", "#c9753d", "#1f6f8b", "#8a8a8a"
+"""Colours with one meaning in every picture."""
+
+STYLE = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.2,
+    "legend.frameon": False,
+    "figure.dpi": 150.0,
+}
+
+
+def figure(width: float, height: float) -> Figure:
+    """Return an empty figure of ``width`` x ``height`` inches.
+
+    Made without pyplot: nothing global, no window, no backend to choose.
+    """
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def styled():
+    """Return the context in which pictures are drawn."""
+    return mpl.rc_context(STYLE)
+
+
+def write(picture: Figure, path: Path) -> None:
+    """Write ``picture`` as PNG, whole or not at all."""
+    buffer = io.BytesIO()
+    picture.savefig(buffer, format="png")
+    write_bytes(path, buffer.getvalue())

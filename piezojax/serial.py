@@ -1,0 +1,121 @@
+"""Systems as plain data: TOML or JSON files that load back, and nothing executable."""
+
+import dataclasses
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+import tomli_w
+
+from .files import write_text
+from .system import System
+
+
+def _kinds() -> dict[str, type[System]]:
+    # Every System that the package exports can be saved: exporting it is all it takes.
+    import piezojax
+
+    return {
+        name: kind
+        for name, kind in vars(piezojax).items()
+        if isinstance(kind, type) and issubclass(kind, System) and kind is not System
+    }
+
+
+def to_data(system: System) -> dict[str, Any]:
+    """Return ``system`` as nested tables of numbers and strings."""
+    data: dict[str, Any] = {"type": type(system).__name__}
+    for field in dataclasses.fields(system):
+        data[field.name] = _value_to_data(getattr(system, field.name))
+    return data
+
+
+def _value_to_data(value: Any) -> Any:
+    if isinstance(value, System):
+        return to_data(value)
+    if eqx.is_array(value):
+        return np.asarray(value).tolist()
+    if isinstance(value, tuple):
+        return [_value_to_data(item) for item in value]
+    return value
+
+
+def from_data(data: Mapping[str, Any], where: str = "system") -> System:
+    """Return the System that ``data``, as made by ``to_data``, describes.
+
+    Raises ValueError naming the key, the value and what is allowed.
+    """
+    kinds = _kinds()
+    if not isinstance(data, Mapping) or "type" not in data:
+        raise ValueError(
+            f"{where} needs a key 'type'; one of {', '.join(sorted(kinds))}"
+        )
+    kind = kinds.get(data["type"])
+    if kind is None:
+        raise ValueError(
+            f"{where}.type is {data['type']!r}; "
+            f"it must be one of {', '.join(sorted(kinds))}"
+        )
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    arguments = {key: value for key, value in data.items() if key != "type"}
+    for key in arguments:
+        if key not in fields:
+            raise ValueError(
+                f"{where}.{key} is unknown; {kind.__name__} has {', '.join(fields)}"
+            )
+    built = {
+        key: _value_from_data(value, f"{where}.{key}")
+        for key, value in arguments.items()
+    }
+    try:
+        return kind(**built)
+    except TypeError as error:
+        raise ValueError(f"{where}: {error}".replace("__init__() ", "")) from None
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _value_from_data(value: Any, where: str) -> Any:
+    if isinstance(value, Mapping):
+        return from_data(value, where)
+    if isinstance(value, list):
+        return tuple(_value_from_data(v, f"{where}.{i}") for i, v in enumerate(value))
+    return value
+
+
+def save(system: System, path: str | Path) -> None:
+    """Write ``system`` to ``path`` (``.toml`` or ``.json``), whole or not at all."""
+    path, data = Path(path), to_data(system)
+    if _format(path) == "toml":
+        write_text(path, tomli_w.dumps(data))
+    else:
+        write_text(path, json.dumps(data, indent=2) + "\n")
+
+
+def load(path: str | Path) -> System:
+    """Read back what ``save`` wrote.
+
+    Raises ValueError for a file that is missing, is no TOML or JSON, or describes no
+    System.
+    """
+    path = Path(path)
+    kind = _format(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        data = tomllib.loads(text) if kind == "toml" else json.loads(text)
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no {kind.upper()} file: {error}") from None
+    return from_data(data, path.name)
+
+
+def _format(path: Path) -> str:
+    suffix = path.suffix.lower().lstrip(".")
+    if suffix not in ("toml", "json"):
+        raise ValueError(f"{path}: the name must end in .toml or .json")
+    return suffix

@@ -1,0 +1,6 @@
+"""From a study to gains."""
+
+from .result import Result as Result
+from .result import load_result as load_result
+from .tuner import Outcome as Outcome
+from .tuner import tune as tune

@@ -1,0 +1,140 @@
+"""What tuning minimises: normalised tracking errors over references and noise draws."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..metrics import Tracking, TrackingFigures
+from ..rollout import simulate
+from ..space import Space
+from ..system import Feedback, loop_inputs
+
+Aggregate = Literal["geometric_mean", "mean_square", "worst"]
+
+HOPELESS = 1e6
+"""Objective of a run that diverged: finite, so that a line search can step back."""
+
+_SHARPNESS = 20.0  # of the smooth maximum in "worst"
+_FLOOR = 1e-9  # um: an error below a femtometre is as good as none
+
+
+class Signals(eqx.Module):
+    """References (um) and unit-variance noise draws to run a loop on."""
+
+    references: Float[Array, "references samples"]
+    noise: Float[Array, "references draws samples"]
+
+
+def evaluate(loop: Feedback, signals: Signals, start: int) -> TrackingFigures:
+    """Return the figures of ``loop`` for each reference and noise draw.
+
+    Every run starts at rest at its reference; samples before ``start`` do not count.
+    """
+    metric = Tracking(start=start)
+
+    def one(reference, noise):
+        inputs = loop_inputs(reference, noise)
+        return simulate(loop, inputs, loop.init(reference[0]), metric=metric)[1]
+
+    draws = jax.vmap(one, in_axes=(None, 0))
+    return jax.vmap(draws)(signals.references, signals.noise)
+
+
+class Objective(eqx.Module):
+    """The objective over a Space.
+
+    Each reference's RMS error, over its noise draws, is divided by ``scale`` (um).
+    ``aggregate`` joins them: ``geometric_mean`` (mean of logarithms: a tenfold gain
+    counts the same on every reference), ``mean_square``, or ``worst`` (a smooth
+    maximum of the logarithms). ``effort_weight`` and ``slew_weight`` add the mean RMS
+    voltage and RMS voltage change a sample, both as a share of ``voltage_span`` (V).
+    """
+
+    loop: Feedback
+    space: Space
+    signals: Signals
+    scale: Float[Array, " references"]
+    voltage_span: Float[Array, ""]
+    start: int = eqx.field(static=True)
+    aggregate: Aggregate = eqx.field(static=True, default="geometric_mean")
+    effort_weight: float = eqx.field(static=True, default=0.0)
+    slew_weight: float = eqx.field(static=True, default=0.0)
+
+    def _parts(self, unit: Float[Array, " n"]) -> tuple[Array, Array, Array]:
+        loop = self.space.put(self.loop, unit)
+        figures = evaluate(loop, self.signals, self.start)  # type: ignore[arg-type]
+        square = jnp.mean(figures.rms_error**2, axis=1)
+        normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
+        effort = jnp.mean(figures.rms_effort) / self.voltage_span
+        slew = jnp.mean(figures.rms_slew) / self.voltage_span
+        return normalised, effort, slew
+
+    def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
+        """Return the objective; ``HOPELESS`` where the loop diverges."""
+        normalised, effort, slew = self._parts(unit)
+        if self.aggregate == "mean_square":
+            joined = jnp.mean(normalised**2)
+        elif self.aggregate == "geometric_mean":
+            joined = jnp.mean(jnp.log(normalised))
+        else:
+            logs = _SHARPNESS * jnp.log(normalised)
+            joined = jax.nn.logsumexp(logs) / _SHARPNESS
+        total = joined + self.effort_weight * effort + self.slew_weight * slew
+        return jnp.where(jnp.isfinite(total), total, HOPELESS)
+
+    def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " residuals"]:
+        """Return what least squares minimises: the squares sum to a mean-square loss.
+
+        Raises ValueError for another aggregate.
+        """
+        if self.aggregate != "mean_square":
+            raise ValueError(f"least squares cannot minimise {self.aggregate!r}")
+        normalised, effort, slew = self._parts(unit)
+        parts = [normalised / jnp.sqrt(normalised.size)]
+        for weight, value in ((self.effort_weight, effort), (self.slew_weight, slew)):
+            if weight > 0.0:
+                parts.append(jnp.sqrt(weight * value)[None])
+        every = jnp.concatenate(parts)
+        finite = jnp.all(jnp.isfinite(every))
+        return jnp.where(finite, every, jnp.sqrt(HOPELESS / every.size))
+
+
+@jax.custom_vjp
+def _guarded(value: Array, gradient: Array, unit: Array) -> Array:
+    return value
+
+
+def _guarded_forward(value, gradient, unit):
+    return value, gradient
+
+
+def _guarded_backward(gradient, cotangent):
+    return jnp.zeros_like(cotangent), jnp.zeros_like(gradient), cotangent * gradient
+
+
+_guarded.defvjp(_guarded_forward, _guarded_backward)
+
+
+def with_finite_gradient(loss, *, forward: bool):
+    """Return ``loss`` of a vector with its gradient made finite and computed at once.
+
+    The derivative of a diverged run is NaN and would spoil the optimiser's memory; it
+    becomes zero. ``forward`` picks forward mode, which wins for few parameters and few
+    lanes; reverse mode wins beyond.
+    """
+
+    def guarded(unit):
+        fixed = jax.lax.stop_gradient(unit)
+        if forward:
+            value, push = jax.linearize(loss, fixed)
+            gradient = jax.vmap(push)(jnp.eye(fixed.shape[0]))
+        else:
+            value, gradient = jax.value_and_grad(loss)(fixed)
+        usable = jnp.all(jnp.isfinite(gradient)) & (value < HOPELESS)
+        gradient = jnp.where(usable, jnp.nan_to_num(gradient), 0.0)
+        return _guarded(value, gradient, unit)
+
+    return guarded

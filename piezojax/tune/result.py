@@ -1,0 +1,102 @@
+"""The outcome of tuning: what ``result.json`` holds, and how it is written and read."""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from ..metrics import TrackingFigures
+
+RESULT_FILE = "result.json"
+GAINS_FILE = "gains.toml"
+
+
+class Scores(BaseModel):
+    """Tracking errors of one set of gains, um, by reference, over all noise draws."""
+
+    per_reference_rms_um: dict[str, float | None]
+    geomean_rms_um: float | None
+    worst_rms_um: float | None
+    peak_error_um: dict[str, float | None]
+    saturated_percent: dict[str, float]
+    peak_voltage_V: float | None  # noqa: N815
+
+    @property
+    def stable(self) -> bool:
+        """Whether every run stayed finite."""
+        return self.geomean_rms_um is not None
+
+
+class Result(BaseModel):
+    """Everything a tuning run found; ``result.json`` is this as JSON.
+
+    ``before`` and ``after`` are the study's own gains and the tuned ones on the tuning
+    references and draws; ``holdout_before`` and ``holdout`` are the same two on noise
+    the optimiser has not seen, and ``unseen_before`` and ``unseen`` on references it
+    has not seen, with that noise too.
+    """
+
+    model_config = ConfigDict(extra="ignore")
+
+    study: str
+    title: str
+    status: Literal["converged", "step limit", "interrupted"]
+    method: str
+    gains: dict[str, float]
+    start: dict[str, float]
+    at_bound: list[str]
+    before: Scores
+    after: Scores
+    holdout_before: Scores
+    holdout: Scores
+    unseen_before: Scores | None
+    unseen: Scores | None
+    warnings: list[str]
+    history: list[list[float | None]]
+    evaluations: int
+    compile_s: float
+    wall_s: float
+    versions: dict[str, str]
+    seed: int
+
+
+def scores(figures: TrackingFigures, names: tuple[str, ...]) -> Scores:
+    """Return the Scores of figures of shape [reference, draw]."""
+    rms = np.sqrt(np.mean(np.asarray(figures.rms_error) ** 2, axis=1))
+    peak = np.max(np.asarray(figures.peak_error), axis=1)
+    saturated = 100.0 * np.mean(np.asarray(figures.saturated), axis=1)
+    finite = bool(np.all(np.isfinite(rms)))
+    voltage = float(np.max(np.asarray(figures.peak_voltage)))
+    return Scores(
+        per_reference_rms_um=dict(zip(names, map(_number, rms), strict=True)),
+        geomean_rms_um=_number(np.exp(np.mean(np.log(rms)))) if finite else None,
+        worst_rms_um=_number(np.max(rms)) if finite else None,
+        peak_error_um=dict(zip(names, map(_number, peak), strict=True)),
+        saturated_percent={
+            name: float(share) for name, share in zip(names, saturated, strict=True)
+        },
+        peak_voltage_V=_number(voltage),
+    )
+
+
+def _number(value: float) -> float | None:
+    # JSON has no infinity: a run that diverged has no figure.
+    return float(value) if np.isfinite(value) else None
+
+
+def load_result(path: str | Path) -> Result:
+    """Read a ``result.json``, or the folder that holds one.
+
+    Raises ValueError if there is none or it is damaged.
+    """
+    path = Path(path)
+    path = path / RESULT_FILE if path.is_dir() else path
+    try:
+        return Result.model_validate_json(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from None
+    except ValidationError as error:
+        raise ValueError(
+            f"{path} is no result of tuning: {error.errors()[0]['msg']}"
+        ) from None

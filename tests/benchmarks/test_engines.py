@@ -1,0 +1,73 @@
+"""The engines of the benchmark compute the same thing."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+# The benchmark is a script beside its modules, not a package.
+sys.path.insert(0, str(Path(__file__).parent))
+engines = importlib.import_module("engines")
+piezojax_engine = importlib.import_module("piezojax_engine")
+
+STEPS = 20_000  # one second
+
+
+def rms_of(engine, *problem):
+    try:
+        return engine(*problem)
+    except (engines.UnavailableError, NotImplementedError) as reason:
+        pytest.skip(str(reason))
+
+
+# One lane, a half-filled block, more than one block.
+@pytest.mark.parametrize("lanes", [1, 5, 20])
+def test_c_and_numba_agree(lanes):
+    problem = engines.problem(lanes, STEPS)
+    c = rms_of(engines.c_engine, *problem)
+    np.testing.assert_allclose(
+        rms_of(engines.numba_engine, *problem), c, rtol=0, atol=1e-9
+    )
+
+
+def test_c_and_numpy_agree():
+    problem = engines.problem(20, STEPS)
+    c = rms_of(engines.c_engine, *problem)
+    np.testing.assert_allclose(engines.numpy_engine(*problem), c, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("lanes", [1, 20])
+def test_piezojax_agrees_with_c(lanes):
+    problem = engines.problem(lanes, STEPS)
+    c = rms_of(engines.c_engine, *problem)
+    rms = rms_of(piezojax_engine.PiezojaxEngine("forward"), *problem)
+    np.testing.assert_allclose(rms, c, rtol=0, atol=1e-9)
+
+
+def test_gradient_agrees_with_central_differences():
+    lanes = 4
+    _, reference, noise = engines.problem(lanes, STEPS)
+    nominal = engines.NOMINAL_GAINS
+    loss, gradient = rms_of(
+        piezojax_engine.PiezojaxEngine("gradient"), nominal, reference, noise
+    )
+
+    def mean_square(gains):
+        rows = np.tile(gains, (lanes, 1))
+        return np.mean(rms_of(engines.c_engine, rows, reference, noise) ** 2)
+
+    step = 1e-5 * nominal
+    differences = [
+        (mean_square(nominal + d) - mean_square(nominal - d)) / (2 * d.sum())
+        for d in np.diag(step)
+    ]
+    np.testing.assert_allclose(loss, mean_square(nominal), rtol=1e-9)
+    # Compared as slopes per relative change, so that each gain counts alike.
+    np.testing.assert_allclose(
+        gradient * nominal,
+        np.array(differences) * nominal,
+        rtol=1e-4,
+        atol=1e-7 * loss,
+    )

@@ -1,0 +1,295 @@
+"""Throughput of piezojax beside C, numba and NumPy on one closed loop.
+
+    python tests/benchmarks/throughput.py --json throughput.json
+
+Each engine runs on one core, in turn with the others (A, B, A, B, ...), so that a
+busy machine disturbs all alike. Rows of the JSON file:
+
+    seconds_median    median time of --steps steps of all lanes. Engines too slow for
+                      that are timed over fewer steps, given as `steps`, and scaled.
+    lane_steps_per_s  lanes * --steps / seconds_median
+    ratio_to_c        seconds_median over that of one forward run in C of the same
+                      lanes, for gradients too; null where gcc is missing
+    extra_memory_mb   growth of resident memory during a run (10^6 bytes), inputs and
+                      compiled code not counted; null where the system is not Linux
+
+Compile times stand apart, in `compile_s`, and are in no row. C is always timed.
+Every lane has its own reference and noise: 4096 lanes need about 6 GB of memory.
+"""
+
+import argparse
+import ctypes
+import gc
+import importlib.metadata
+import json
+import math
+import multiprocessing
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+# Before any library starts its threads.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import engines  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.table import Table  # noqa: E402
+
+LOOP = "dob_pid_smc"
+ENGINES = ("piezojax", "c", "numba", "numpy")
+SHORTEST_SAMPLE_S = 0.02  # shorter runs are repeated within one sample
+SLOW_BUDGET_S = 1.0  # about the longest run of an engine marked slow
+TRIAL_STEPS = 200
+
+
+def positive_int(text):
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive whole number")
+    return value
+
+
+def int_list(text):
+    return sorted({positive_int(part) for part in text.split(",") if part})
+
+
+def engine_list(text):
+    names = [part for part in text.split(",") if part]
+    for name in names:
+        if name not in ENGINES:
+            raise argparse.ArgumentTypeError(
+                f"no engine {name!r}; there are {', '.join(ENGINES)}"
+            )
+    return names
+
+
+def parse(arguments=None):
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, required=True, metavar="FILE")
+    parser.add_argument("--lanes", type=int_list, default=[1, 8, 64, 512, 4096])
+    parser.add_argument("--gradient-lanes", type=int_list, default=[8, 64])
+    parser.add_argument("--steps", type=positive_int, default=20000)
+    parser.add_argument("--repeats", type=positive_int, default=5)
+    parser.add_argument("--engines", type=engine_list, default=list(ENGINES))
+    options = parser.parse_args(arguments)
+    if options.steps < TRIAL_STEPS:
+        parser.error(f"--steps: at least {TRIAL_STEPS}")
+    if not options.json.absolute().parent.is_dir():
+        parser.error(f"--json: no folder {options.json.parent}")
+    return options
+
+
+def pin_to_one_core():
+    """One core for this process, its later threads and its children."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+        return 1
+    return os.cpu_count()
+
+
+def make_engine(name, what):
+    if name == "piezojax":
+        from piezojax_engine import PiezojaxEngine
+
+        return PiezojaxEngine(what)
+    return {
+        "c": engines.CEngine,
+        "numba": engines.NumbaEngine,
+        "numpy": engines.NumpyEngine,
+    }[name]()
+
+
+def part(data, what, steps):
+    """What an engine is given: the first steps, and for gradients shared gains."""
+    gains, reference, noise = data
+    gains = engines.NOMINAL_GAINS if what == "gradient" else gains
+    return gains, reference[:, : steps + 1], noise[:, :steps]
+
+
+def seconds_of(run, calls=1):
+    begin = time.perf_counter()
+    for _ in range(calls):
+        run()
+    return (time.perf_counter() - begin) / calls
+
+
+def prepare(engine, data, what, steps):
+    """Prepare for at most `steps` steps; returns how many it will run."""
+    if engine.slow:
+        engine.prepare(*part(data, what, TRIAL_STEPS))
+        each = seconds_of(engine.run) / TRIAL_STEPS
+        steps = min(steps, max(TRIAL_STEPS, int(SLOW_BUDGET_S / each)))
+    engine.prepare(*part(data, what, steps))
+    return steps
+
+
+def measure(lanes, wanted, options, skip):
+    """Time the wanted (what, engine) pairs on one number of lanes, in turn."""
+    entries, data = [], engines.problem(lanes, options.steps)
+    for what, name in wanted:
+        try:
+            engine = make_engine(name, what)
+            steps = prepare(engine, data, what, options.steps)
+        except (engines.UnavailableError, NotImplementedError) as reason:
+            skip(f"{name}, {what}: {reason}")
+            continue
+        warm = seconds_of(engine.run)
+        calls = max(1, math.ceil(SHORTEST_SAMPLE_S / warm))
+        entries.append((what, name, engine, steps, calls, []))
+    for _ in range(options.repeats):
+        for _, _, engine, _, calls, samples in entries:
+            samples.append(seconds_of(engine.run, calls))
+    return [
+        {
+            "what": what,
+            "loop": LOOP,
+            "engine": name,
+            "lanes": lanes,
+            "steps": steps,
+            "seconds_median": statistics.median(samples) * options.steps / steps,
+            "compile_s": engine.compile_s,
+        }
+        for what, name, engine, steps, _, samples in entries
+    ]
+
+
+def memory_bytes(field):
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field + ":"):
+            return int(line.split()[1]) * 1024
+    raise OSError(f"no {field} in /proc/self/status")
+
+
+def extra_memory_mb(what, name, lanes, steps):
+    """Peak growth of resident memory in one run; for a fresh process.
+
+    Not ru_maxrss: a child inherits its parent's high-water mark, and compiling
+    raises it above what the run needs. The kernel's mark is reset instead, after a
+    warm-up run and after freed memory, which a run would reuse unseen, is returned.
+    """
+    engine = make_engine(name, what)
+    engine.prepare(*part(engines.problem(lanes, steps), what, steps))
+    engine.run()
+    gc.collect()
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+        Path("/proc/self/clear_refs").write_text("5")
+        before = memory_bytes("VmRSS")
+        engine.run()
+        return max(0, memory_bytes("VmHWM") - before) / 1e6
+    except (OSError, AttributeError, TypeError):
+        return None
+
+
+def in_fresh_process(function, *arguments):
+    # Spawned: a fork would start with this process's memory.
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(max_workers=1, mp_context=spawn) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def versions():
+    found = {"python": platform.python_version(), "machine": platform.machine()}
+    for name in ("piezojax", "jax", "jaxlib", "numba", "numpy"):
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    try:
+        number = subprocess.check_output(["gcc", "-dumpfullversion"], text=True)
+        found["gcc"] = f"{number.strip()} {engines.c_flags()}"
+    except (OSError, subprocess.CalledProcessError, engines.UnavailableError):
+        found["gcc"] = None
+    return found
+
+
+def table(rows):
+    shown = Table(title=f"{LOOP}, one core")
+    shown.add_column("what")
+    shown.add_column("engine")
+    for column in ("lanes", "ns/lane-step", "x C", "extra MB", "steps"):
+        shown.add_column(column, justify="right")
+
+    def number(value, digits):
+        return "-" if value is None else f"{value:.{digits}f}"
+
+    for row in rows:
+        shown.add_row(
+            row["what"],
+            row["engine"],
+            str(row["lanes"]),
+            number(1e9 / row["lane_steps_per_s"], 2),
+            number(row["ratio_to_c"], 2),
+            number(row["extra_memory_mb"], 1),
+            str(row["steps"]),
+        )
+    return shown
+
+
+def compile_key(row):
+    """C and numba compile once, piezojax once a shape."""
+    if row["engine"] == "piezojax":
+        return f"piezojax {row['what']} {row['lanes']}"
+    return row["engine"]
+
+
+def main(arguments=None):
+    options = parse(arguments)
+    threads = pin_to_one_core()
+    console = Console()
+    skipped = set()
+
+    def skip(line):
+        if line not in skipped:
+            skipped.add(line)
+            console.print(
+                f"skipped: {line}", style="yellow", markup=False, soft_wrap=True
+            )
+
+    forward = ["c", *(name for name in options.engines if name != "c")]
+    rows, compile_s = [], {}
+    for lanes in sorted({*options.lanes, *options.gradient_lanes}):
+        wanted = [("forward", name) for name in forward if lanes in options.lanes]
+        if lanes in options.gradient_lanes and "piezojax" in options.engines:
+            wanted = [*(wanted or [("forward", "c")]), ("gradient", "piezojax")]
+        if not wanted:
+            continue
+        console.print(f"{lanes} lanes", style="dim")
+        measured = measure(lanes, wanted, options, skip)
+        gc.collect()
+        yardstick = next(
+            (row["seconds_median"] for row in measured if row["engine"] == "c"), None
+        )
+        for row in measured:
+            seconds, compiled = row["seconds_median"], row.pop("compile_s")
+            if compiled is not None:
+                compile_s.setdefault(compile_key(row), compiled)
+            row["threads"] = threads if row["engine"] == "piezojax" else 1
+            row["lane_steps_per_s"] = lanes * options.steps / seconds
+            row["ratio_to_c"] = seconds / yardstick if yardstick else None
+            row["extra_memory_mb"] = in_fresh_process(
+                extra_memory_mb, row["what"], row["engine"], lanes, row["steps"]
+            )
+            rows.append(row)
+
+    if not rows:
+        console.print("no engine could be timed", style="red")
+        return 1
+    result = {"rows": rows, "compile_s": compile_s, "versions": versions()}
+    options.json.write_text(json.dumps(result, indent=2) + "\n")
+    console.print(table(rows))
+    for key, seconds in compile_s.items():
+        console.print(f"compile {key}: {seconds:.2f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

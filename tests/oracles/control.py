@@ -1,0 +1,195 @@
+"""Discrete controllers of thesis Chapter 5 and a plain PID baseline.
+
+At time k a controller gets z(k), r(k+1), r(k), r(k-1) and returns the command
+u(k); it is then told the applied (clipped) u(k) through `applied`.
+"""
+
+from dataclasses import dataclass
+
+from .hysteresis import inverse_trapezoid_step
+
+
+def q_filter(b, cutoff, rate, corrected=True):
+    """Denominator (c0, c1, c2) of the Q filter (5.28), cutoff in rad/s.
+
+    Q(z) = (b0 + b1 z^-1 + b2 z^-2) / (c0 + c1 z^-1 + c2 z^-2) with unit DC
+    gain (5.29). corrected=True: the bilinear transform puts both poles at
+    -cutoff. corrected=False: (5.32) as printed, whose 1 / (w T)^2 terms are
+    four times too small.
+    """
+    wt = cutoff / rate
+    b_sum = b[0] + b[1] + b[2]
+    if corrected:
+        square = 1.0 / (wt * wt)
+        middle = 2.0 / (wt * wt)
+    else:
+        square = 1.0 / (4.0 * wt * wt)
+        middle = 1.0 / (2.0 * wt * wt)
+    c0 = (0.25 + square + 1.0 / wt) * b_sum
+    c1 = (0.5 - middle) * b_sum
+    c2 = (0.25 + square - 1.0 / wt) * b_sum
+    return c0, c1, c2
+
+
+@dataclass
+class AlphaBeta:
+    """alpha-beta filter: position yh and velocity vh estimated from z."""
+
+    alpha: float
+    beta: float
+    period: float
+    yh: float = 0.0
+    vh: float = 0.0
+
+    def step(self, z):
+        """Predict, then correct with the residual; returns (yh, vh)."""
+        prediction = self.yh + self.period * self.vh
+        residual = z - prediction
+        self.yh = prediction + self.alpha * residual
+        self.vh = self.vh + self.beta / self.period * residual
+        return self.yh, self.vh
+
+
+class PID:
+    """Our baseline, not of the thesis: filtered D, back-calculation.
+
+    gains: P, I, D, derivative_filter Tf [s], anti_windup K_aw [1/s].
+    """
+
+    def __init__(self, gains, rate):
+        self.gains = gains
+        self.period = 1.0 / rate
+        self.integral = 0.0
+        self.derivative = 0.0
+        self.e_prev = 0.0
+        self.saturation = 0.0  # u_applied(k-1) - u_command(k-1)
+        self.command = 0.0
+
+    def step(self, z, r_next, r, r_prev):
+        """u(k) = P e + q + D d; see the module docstring for the arguments."""
+        period = self.period
+        e = r - z
+        self.integral += period * self.gains["anti_windup"] * self.saturation
+        self.integral += period * self.gains["I"] * e
+        weight = period / (period + self.gains["derivative_filter"])
+        slope = (e - self.e_prev) / period
+        self.derivative += weight * (slope - self.derivative)
+        self.e_prev = e
+        self.command = (
+            self.gains["P"] * e + self.integral + self.gains["D"] * self.derivative
+        )
+        return self.command
+
+    def applied(self, u):
+        """Store the difference that back-calculation uses at k + 1."""
+        self.saturation = u - self.command
+
+
+class PIDSMC:
+    """Discrete PID-based SMC; variant "smc", "inversion" or "dob".
+
+    gains: P, I, D, m, R, Q, alpha, beta, model_a = (a1, a2),
+    model_b = (b0, b1, b2); Ke and cutoff for "dob"; hysteresis = (a, b, c) for
+    "inversion". Optional q_corrected (default True) chooses the form of the
+    Q filter. All stored values start at zero.
+    """
+
+    def __init__(self, variant, gains, rate):
+        self.variant = variant
+        self.gains = gains
+        self.period = 1.0 / rate
+        self.observer = AlphaBeta(gains["alpha"], gains["beta"], self.period)
+        self.s_sum = 0.0
+        self.s_prev = 0.0
+        self.f1 = 0.0  # f(k-1), as produced
+        self.f2 = 0.0  # f(k-2)
+        self.u1 = 0.0  # u(k-1), as applied
+        self.u2 = 0.0  # u(k-2)
+        self.u3 = 0.0  # u(k-3)
+        self.z1 = 0.0  # z(k-1)
+        self.z2 = 0.0  # z(k-2)
+        self.qy1 = self.qy2 = 0.0
+        self.qu1 = self.qu2 = 0.0
+        if variant == "dob":
+            self.c = q_filter(
+                gains["model_b"],
+                gains["cutoff"],
+                rate,
+                gains.get("q_corrected", True),
+            )
+
+    def sliding_mode(self, z, r_next, r, r_prev):
+        """v(k): v1 of (5.13), veq of (5.17), PID of (5.18).
+
+        State [y, (y(k) - y(k-1)) / T]; F of (5.10) is not needed.
+        """
+        period = self.period
+        a1, a2 = self.gains["model_a"]
+        b0 = self.gains["model_b"][0]
+        m = self.gains["m"]
+        a11, a12 = a1 + a2, -a2 * period
+        a21, a22 = (a1 + a2 - 1.0) / period, -a2
+
+        yh, vh = self.observer.step(z)
+        e1 = yh - r
+        e2 = vh - (r - r_prev) / period
+        s = m * e1 + e2
+
+        v1 = (r_next - a1 * r - a2 * r_prev) / b0
+        veq = -(m * (a11 * e1 + a12 * e2) + a21 * e1 + a22 * e2)
+        veq = veq / (m * b0 + b0 / period)
+        self.s_sum += s
+        dv = -(
+            self.gains["P"] * s
+            + self.gains["I"] * period * self.s_sum
+            + self.gains["D"] * (s - self.s_prev) / period
+        )
+        self.s_prev = s
+        return v1 + veq + dv
+
+    def optimal_inverse(self, v):
+        """f(k) of (5.23), b0 belonging to B."""
+        b0, b1, b2 = self.gains["model_b"]
+        weight = self.gains["Q"] / (self.gains["Q"] + self.gains["R"])
+        return weight * (v - b1 / b0 * self.f1 - b2 / b0 * self.f2)
+
+    def observer_term(self, z):
+        """w(k) of (5.1): Q/(Ke G) z(k) - Q u(k-1), u as applied."""
+        a1, a2 = self.gains["model_a"]
+        b0, b1, b2 = self.gains["model_b"]
+        c0, c1, c2 = self.c
+        qy = (z - a1 * self.z1 - a2 * self.z2) / self.gains["Ke"]
+        qy = (qy - c1 * self.qy1 - c2 * self.qy2) / c0
+        qu = b0 * self.u1 + b1 * self.u2 + b2 * self.u3
+        qu = (qu - c1 * self.qu1 - c2 * self.qu2) / c0
+        self.qy1, self.qy2 = qy, self.qy1
+        self.qu1, self.qu2 = qu, self.qu1
+        self.z1, self.z2 = z, self.z1
+        return qy - qu
+
+    def step(self, z, r_next, r, r_prev):
+        """The command u(k), not yet clipped."""
+        v = self.sliding_mode(z, r_next, r, r_prev)
+        f = self.optimal_inverse(v)
+        if self.variant == "smc":
+            u = f
+        elif self.variant == "inversion":
+            a, b, c = self.gains["hysteresis"]
+            u = inverse_trapezoid_step(self.f1, self.u1, f, a, b, c)
+        else:
+            u = f / self.gains["Ke"] - self.observer_term(z)
+        self.f1, self.f2 = f, self.f1
+        return u
+
+    def applied(self, u):
+        """Store the applied voltage u(k)."""
+        self.u1, self.u2, self.u3 = u, self.u1, self.u2
+
+
+def make_controller(kind, gains, rate):
+    """kind: "pid", "smc", "inversion" or "dob"."""
+    if kind == "pid":
+        return PID(gains, rate)
+    if kind in ("smc", "inversion", "dob"):
+        return PIDSMC(kind, gains, rate)
+    raise ValueError(f"unknown kind {kind!r}")
