@@ -3,14 +3,13 @@
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Shaped
+from jax.core import Tracer
+from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
-ScalarLike = Shaped[ArrayLike, ""]
+ScalarLike = Float[Array, ""] | float | int
 State = Any  # a pytree of arrays; every System defines its own
 
 
@@ -27,19 +26,9 @@ def as_scalars(values: Iterable[Any]) -> tuple[Array, ...]:
     return tuple(as_array(value) for value in values)
 
 
-def parameter() -> Any:
-    """Declare a scalar array field: a leaf that can be tuned, batched, perturbed."""
-    return eqx.field(converter=as_array)
-
-
-def parameters() -> Any:
-    """Declare a field holding a tuple of scalar array leaves."""
-    return eqx.field(converter=as_scalars)
-
-
 def _known(value: Any) -> np.ndarray | None:
     """Return the numbers in ``value``, or None while it is being traced."""
-    return None if isinstance(value, jax.core.Tracer) else np.asarray(value)
+    return None if isinstance(value, Tracer) else np.asarray(value)
 
 
 def check(

@@ -6,15 +6,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ._types import Scalar, ScalarLike, State, as_array, check, check_order, parameter
+from ._types import Scalar, ScalarLike, State, as_array, check, check_order
 from .system import System
 
 
 class Saturation(System):
     """Clips its input to ``[lower, upper]``, V."""
 
-    lower: Scalar = parameter()
-    upper: Scalar = parameter()
+    lower: Scalar = eqx.field(converter=as_array)
+    upper: Scalar = eqx.field(converter=as_array)
 
     def __check_init__(self):
         check_order("lower limit", self.lower, "upper limit", self.upper)
@@ -32,7 +32,7 @@ class SlewLimit(System):
     ``rate`` in V/s, ``dt`` in s. Raises ValueError unless both are positive.
     """
 
-    rate: Scalar = parameter()
+    rate: Scalar = eqx.field(converter=as_array)
     dt: float = eqx.field(static=True)
 
     def __check_init__(self):
@@ -55,7 +55,7 @@ class Quantiser(System):
     tuned; the value is the rounded one.
     """
 
-    resolution: Scalar = parameter()
+    resolution: Scalar = eqx.field(converter=as_array)
 
     def __check_init__(self):
         check("resolution", self.resolution, above=0)
@@ -76,7 +76,7 @@ class Sensor(System):
     um: displacement + ``noise_rms`` * draw. Follow it with a Quantiser for a converter.
     """
 
-    noise_rms: Scalar = parameter()
+    noise_rms: Scalar = eqx.field(converter=as_array)
 
     def __check_init__(self):
         check("sensor noise in um rms", self.noise_rms, least=0)

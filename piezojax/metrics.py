@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._types import Scalar, ScalarLike, State
+from ._types import Scalar, State
 from .rollout import Metric
 from .system import LoopSample
 
@@ -81,7 +81,7 @@ class Tracking(Metric):
         )
 
 
-def _root(square: ScalarLike) -> Scalar:
+def _root(square: Scalar) -> Scalar:
     # The slope of sqrt at 0 is infinite; a perfect run must have the gradient 0.
     positive = square > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0 * square)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from ._types import as_array
 from .space import squash, unsquash
 
 Unit = Float[Array, " n"]
@@ -21,7 +22,7 @@ Function = Callable[[Unit], Array]
 
 
 class View(NamedTuple):
-    """Where an optimiser stands: the point in [0, 1]^n, its loss, whether it is done."""
+    """Where an optimiser stands: a point in [0, 1]^n, its loss, whether it is done."""
 
     unit: Unit
     loss: Float[Array, ""]
@@ -76,7 +77,7 @@ def _optimistix(
     def start(unit):
         free = unsquash(unit)
         arrays = eqx.filter(initial(free), eqx.is_array)
-        return _settled(_Carry(free, arrays, jnp.asarray(jnp.inf), jnp.asarray(False)))
+        return _settled(_Carry(free, arrays, as_array(jnp.inf), jnp.asarray(False)))
 
     def step(carry):
         state = eqx.combine(carry.state, fixed(carry.point))
@@ -126,13 +127,12 @@ def lbfgsb(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
     solver = jaxopt.LBFGSB(
         loss, tol=tolerance, maxls=12, linesearch="backtracking", implicit_diff=False
     )
-    box = (0.0, 1.0)
 
     def bounds(unit):
-        return tuple(jnp.full_like(unit, side) for side in box)
+        return tuple(jnp.full_like(unit, side) for side in (0.0, 1.0))
 
     def start(unit):
-        state = solver.init_state(unit, bounds(unit))
+        state: Any = solver.init_state(unit, bounds(unit))
         return _settled(_Carry(unit, state, state.value, jnp.asarray(False)))
 
     def step(carry):

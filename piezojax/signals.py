@@ -25,7 +25,7 @@ def time_grid(duration: float, rate: float) -> Time:
     samples = round(duration * rate)
     if samples < 2:
         raise ValueError(
-            f"{duration:g} s at {rate:g} Hz hold {samples} samples; at least 2 are needed"
+            f"{duration:g} s at {rate:g} Hz hold {samples} samples; it takes 2 or more"
         )
     return jnp.arange(samples) / rate
 
@@ -110,7 +110,7 @@ def superposed_sine(
         (5.0, 2.0, 0.2),
         (5.0, 1.0, 0.0),
     )  # amplitude * 7, frequency divisor, phase / pi
-    total = 5.0
+    total = jnp.full_like(time, 5.0)
     for weight, divisor, phase in parts:
         total = total + weight / 7.0 * jnp.sin(
             2.0 * jnp.pi * frequency / divisor * t + phase * jnp.pi
@@ -136,7 +136,7 @@ def multisine(
     offset: ScalarLike = 0.0,
     tones: int = 20,
 ) -> Time:
-    """Equal tones up to ``frequency`` with Schroeder phases; peak about ``amplitude``."""
+    """Equal tones up to ``frequency``, Schroeder phases; peak about ``amplitude``."""
     number = jnp.arange(1, tones + 1)
     phase = -jnp.pi * number * (number - 1) / tones
     angle = 2.0 * jnp.pi * frequency * jnp.outer(time, number / tones) + phase

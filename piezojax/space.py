@@ -1,7 +1,7 @@
-"""The box that tuning and identification search: parameters by path, their bounds and their scales."""
+"""The box that tuning and identification search: paths, bounds, scales."""
 
 from collections.abc import Callable, Mapping
-from typing import Literal
+from typing import Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 from ._types import as_array
 from .paths import get, replace
 from .system import System
+
+S = TypeVar("S", bound=System)
 
 Transform = Literal["log", "logit", "linear"]
 
@@ -90,7 +92,7 @@ class Space(eqx.Module):
         # exp(log(x)) may miss x by a rounding.
         return jnp.clip(values, self.lower, self.upper)
 
-    def put(self, system: System, unit: Float[Array, " n"]) -> System:
+    def put(self, system: S, unit: Float[Array, " n"]) -> S:
         """Return ``system`` with its tuned parameters at ``unit``."""
         return replace(system, self.named(unit))
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ._types import Scalar, ScalarLike, State, as_array, check, parameter
+from ._types import Scalar, ScalarLike, State, as_array, check
 
 
 class System(eqx.Module):
@@ -100,8 +100,9 @@ def series(**parts: System) -> Series:
 
 
 def _series_parts(system: System) -> tuple[System, ...]:
-    unnamed = isinstance(system, Series) and not system.names
-    return system.parts if unnamed else (system,)
+    if isinstance(system, Series) and not system.names:
+        return system.parts
+    return (system,)
 
 
 def _parallel_parts(system: System) -> tuple[System, ...]:
@@ -111,17 +112,14 @@ def _parallel_parts(system: System) -> tuple[System, ...]:
 class Affine(System):
     """``output = gain * input + offset``: a calibration, a sensor's zero."""
 
-    gain: Scalar = parameter()
-    offset: Scalar = parameter()
-
-    def __init__(self, gain: ScalarLike = 1.0, offset: ScalarLike = 0.0):
-        self.gain, self.offset = gain, offset
+    gain: Scalar = eqx.field(converter=as_array, default=1.0)
+    offset: Scalar = eqx.field(converter=as_array, default=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return ()
 
     def step(self, state: State, input: ScalarLike) -> tuple[State, Scalar]:
-        return state, self.gain * input + self.offset
+        return state, self.gain * as_array(input) + self.offset
 
 
 class Delay(System):

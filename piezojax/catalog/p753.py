@@ -107,8 +107,8 @@ DYNAMICS_BY_RATE = {
         "moving": (0.000778, -0.00041, 0.00134),
     },
 }
-"""Table 4-1, from voltage to displacement, by sampling rate in Hz. The row at 5 kHz does
-not fit the others (DC gain 0.054 against 0.11 to 0.16)."""
+"""Table 4-1, from voltage to displacement, by sampling rate in Hz. The row at 5 kHz
+does not fit the others (DC gain 0.054 against 0.11 to 0.16)."""
 
 GAINS = {
     "5-2": {

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, check, parameter
+from .._types import Scalar, ScalarLike, as_array, check
 from ..system import System
 
 
@@ -25,8 +25,8 @@ class AlphaBeta(System):
     lags by (1 - alpha) / alpha samples.
     """
 
-    alpha: Scalar = parameter()
-    beta: Scalar = parameter()
+    alpha: Scalar = eqx.field(converter=as_array)
+    beta: Scalar = eqx.field(converter=as_array)
     dt: float = eqx.field(static=True)
 
     def __check_init__(self):

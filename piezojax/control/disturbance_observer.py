@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, State, check, parameter
+from .._types import Scalar, State, as_array, check
 from ..dynamics.arma import ARMA
 from ..system import Observation, System
 
@@ -25,9 +25,9 @@ class DisturbanceObserverControl(System):
     """``u = f / gain - w``: the controller's f less the observed input disturbance w.
 
     Figure 5.2, (5.26)-(5.32): w = Q/(gain G) z - Q u, where G is ``model``
-    (a_1, a_2 | b_0, b_1, b_2, DC gain near 1), ``gain`` K_e in um/V is the linear part of
-    the hysteresis, and Q has G's zeros, unit DC gain and a double pole at ``cutoff``
-    (rad/s). u is the voltage that was applied, after the limits.
+    (a_1, a_2 | b_0, b_1, b_2, DC gain near 1), ``gain`` K_e in um/V is the linear part
+    of the hysteresis, and Q has G's zeros, unit DC gain and a double pole at
+    ``cutoff`` (rad/s). u is the voltage that was applied, after the limits.
 
     ``coefficients`` is ``"corrected"`` (the bilinear double pole) or ``"printed"``
     ((5.32) as printed, whose poles lie at -0.54 and -7.46 times the cut-off). Input an
@@ -39,8 +39,8 @@ class DisturbanceObserverControl(System):
 
     feedback: System
     model: ARMA
-    gain: Scalar = parameter()
-    cutoff: Scalar = parameter()
+    gain: Scalar = eqx.field(converter=as_array)
+    cutoff: Scalar = eqx.field(converter=as_array)
     dt: float = eqx.field(static=True)
     coefficients: str = eqx.field(static=True, default="corrected")
 
@@ -81,9 +81,9 @@ class DisturbanceObserverControl(System):
         force = self.gain * (input.applied + w)
         return DisturbanceObserverState(
             feedback=self.feedback.init(input._replace(applied=force)),
-            measured=(input.measured,) * 2,
-            applied=(input.applied,) * 2,
-            disturbance=(w,) * 2,
+            measured=(input.measured, input.measured),
+            applied=(input.applied, input.applied),
+            disturbance=(w, w),
         )
 
     def step(

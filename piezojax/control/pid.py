@@ -5,12 +5,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, check, parameter
+from .._types import Scalar, as_array, check
 from ..system import Observation, System
 
 
 class PIDState(NamedTuple):
-    """Integral part (V), filtered error rate (um/s), last error (um), last command (V)."""
+    """Integral part in V, error rate in um/s, last error in um, last command in V."""
 
     integral: Scalar
     rate: Scalar
@@ -29,27 +29,12 @@ class PID(System):
     filter or anti-windup rate and for ``dt <= 0``.
     """
 
-    proportional: Scalar = parameter()
-    integral: Scalar = parameter()
-    derivative: Scalar = parameter()
-    derivative_filter: Scalar = parameter()
-    anti_windup: Scalar = parameter()
-    dt: float = eqx.field(static=True)
-
-    def __init__(
-        self,
-        proportional: ScalarLike,
-        integral: ScalarLike,
-        derivative: ScalarLike = 0.0,
-        derivative_filter: ScalarLike = 0.0,
-        anti_windup: ScalarLike = 0.0,
-        *,
-        dt: float,
-    ):
-        self.proportional, self.integral = proportional, integral
-        self.derivative, self.derivative_filter = derivative, derivative_filter
-        self.anti_windup = anti_windup
-        self.dt = dt
+    proportional: Scalar = eqx.field(converter=as_array)
+    integral: Scalar = eqx.field(converter=as_array)
+    derivative: Scalar = eqx.field(converter=as_array, default=0.0)
+    derivative_filter: Scalar = eqx.field(converter=as_array, default=0.0)
+    anti_windup: Scalar = eqx.field(converter=as_array, default=0.0)
+    dt: float = eqx.field(static=True, kw_only=True)
 
     def __check_init__(self):
         check("sample time in s", self.dt, above=0)

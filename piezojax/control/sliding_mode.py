@@ -2,9 +2,10 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, check, parameter
+from .._types import Scalar, as_array, check
 from ..dynamics.arma import ARMA
 from ..system import Observation, System
 from .alpha_beta import AlphaBeta, Motion
@@ -26,8 +27,8 @@ class SlidingModePID(System):
     The state is x = [y, dy/dt] from the alpha-beta filter and the sliding variable
     ``s = surface * e1 + e2`` (5.15): ``surface`` m in 1/s. The equivalent control and
     the reference part v1 come from ``model`` (a_1, a_2 | b_0, b_1, b_2, b_0 not zero),
-    a PID of s with ``proportional``, ``integral``, ``derivative`` replaces the switching
-    term (5.18), and the zeros of the model, which may lie outside the unit circle, are
+    a PID of s with ``proportional``, ``integral``, ``derivative`` replaces the
+    switching term (5.18), and the zeros of the model, which may lie outside the unit circle, are
     inverted in the least-squares sense with the weights ``error_weight`` Q and
     ``control_weight`` R (5.23): f = Q/(Q+R) [v - (b1/b0) f' - (b2/b0) f''].
 
@@ -39,12 +40,12 @@ class SlidingModePID(System):
     Raises ValueError for a model of another order, Q <= 0, R < 0 or ``dt <= 0``.
     """
 
-    proportional: Scalar = parameter()
-    integral: Scalar = parameter()
-    derivative: Scalar = parameter()
-    surface: Scalar = parameter()
-    error_weight: Scalar = parameter()
-    control_weight: Scalar = parameter()
+    proportional: Scalar = eqx.field(converter=as_array)
+    integral: Scalar = eqx.field(converter=as_array)
+    derivative: Scalar = eqx.field(converter=as_array)
+    surface: Scalar = eqx.field(converter=as_array)
+    error_weight: Scalar = eqx.field(converter=as_array)
+    control_weight: Scalar = eqx.field(converter=as_array)
     model: ARMA
     filter: AlphaBeta
 

@@ -2,10 +2,11 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Scalar, ScalarLike, as_array, check, parameters
+from .._types import Scalar, ScalarLike, as_array, as_scalars, check
 from ..system import System
 
 
@@ -19,13 +20,13 @@ class ARMAState(NamedTuple):
 class ARMA(System):
     """``y(k) = sum_i autoregressive[i] y(k-1-i) + sum_i moving[i] x(k-i)``, (3.30).
 
-    ``autoregressive`` holds a_1, a_2, ... with the sign of the thesis (on the right-hand
-    side), ``moving`` holds b_0, b_1, ...; x and y in the units of the neighbours in the
+    ``autoregressive`` holds a_1, a_2, ... with the sign of the thesis (on the
+    right-hand side), ``moving`` holds b_0, b_1, ...; x and y in the units of the neighbours in the
     chain. Raises ValueError for empty ``moving`` or non-finite coefficients.
     """
 
-    autoregressive: tuple[Scalar, ...] = parameters()
-    moving: tuple[Scalar, ...] = parameters()
+    autoregressive: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
+    moving: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
 
     def __check_init__(self):
         if not self.moving:
@@ -35,7 +36,7 @@ class ARMA(System):
 
     def dc_gain(self) -> Scalar:
         """Return output over input at rest."""
-        return sum(self.moving) / (1.0 - sum(self.autoregressive))
+        return as_array(sum(self.moving) / (1.0 - sum(self.autoregressive)))
 
     def poles(self) -> np.ndarray:
         """Return the poles in the z plane (concrete parameters only)."""

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, check, parameter
+from .._types import Scalar, ScalarLike, as_array, check
 from ..system import System
 from .arma import ARMA
 
@@ -15,7 +15,7 @@ class FirstOrderLag(System):
     unless both are positive.
     """
 
-    time_constant: Scalar = parameter()
+    time_constant: Scalar = eqx.field(converter=as_array)
     dt: float = eqx.field(static=True)
 
     def __check_init__(self):
@@ -35,5 +35,6 @@ class FirstOrderLag(System):
         return as_array(input)
 
     def step(self, state: Scalar, input: ScalarLike) -> tuple[Scalar, Scalar]:
+        input = as_array(input)
         output = input + self.pole() * (state - input)
         return output, output

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, State, as_array, check, parameter
-from ..system import System
+from .._types import Scalar, ScalarLike, State, as_array, check
+from ..system import System, holding_input
 
 
 class HysteresisState(NamedTuple):
@@ -36,25 +36,12 @@ class ColemanHodgdon(System):
     Raises ValueError for non-finite parameters, ``c >= 0`` or an unknown scheme.
     """
 
-    a: Scalar = parameter()
-    b: Scalar = parameter()
-    c: Scalar = parameter()
-    rest_input: Scalar = parameter()
-    rest_output: Scalar = parameter()
-    scheme: str = eqx.field(static=True)
-
-    def __init__(
-        self,
-        a: ScalarLike,
-        b: ScalarLike,
-        c: ScalarLike,
-        rest_input: ScalarLike = 0.0,
-        rest_output: ScalarLike = 0.0,
-        scheme: str = "trapezoid",
-    ):
-        self.a, self.b, self.c = a, b, c
-        self.rest_input, self.rest_output = rest_input, rest_output
-        self.scheme = scheme
+    a: Scalar = eqx.field(converter=as_array)
+    b: Scalar = eqx.field(converter=as_array)
+    c: Scalar = eqx.field(converter=as_array)
+    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+    rest_output: Scalar = eqx.field(converter=as_array, default=0.0)
+    scheme: str = eqx.field(static=True, default="trapezoid")
 
     def __check_init__(self):
         check("a in um/V^2", self.a)
@@ -161,8 +148,6 @@ class InverseColemanHodgdon(System):
             )
 
     def init(self, input: ScalarLike = 0.0) -> HysteresisState:
-        from ..system import holding_input
-
         return self.model.init(holding_input(self.model, input))
 
     def step(self, state: HysteresisState, input: Any) -> tuple[State, Scalar]:
@@ -171,7 +156,7 @@ class InverseColemanHodgdon(System):
 
     def solve(self, state: HysteresisState, wanted: ScalarLike) -> Scalar:
         """Return the voltage (V) for which the model's next output is ``wanted``."""
-        model = self.model
+        model, wanted = self.model, as_array(wanted)
         rise = wanted - state.output
         sign = _direction(rise)
         eta = sign * model.c * (wanted + state.output) + 2.0 * model.b

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._types import as_array
 from ..dynamics import FirstOrderLag
 from ..hysteresis import ColemanHodgdon
 from ..space import Space, space_of
@@ -69,7 +70,7 @@ def coleman_hodgdon(record: Record) -> Structure:
             values[names.index("hysteresis.c")] = -steepness / width
             values[names.index("hysteresis.a")] = steepness * slope / width
             values[names.index(REST_INPUT)] = before
-            starts.append(np.asarray(space.to_unit(values)))
+            starts.append(np.asarray(space.to_unit(as_array(values))))
     return Structure(system, space, np.stack(starts))
 
 

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, Field
 
 from .._types import ScalarLike
 from ..paths import get, replace
 from ..rollout import simulate
 from ..space import Space, squash, unsquash
-from ..system import Series, System, rest_output
+from ..system import System, rest_output
 from .models import MODELS, REST_INPUT
 from .record import Record
 
@@ -42,12 +42,13 @@ class FitError(BaseModel):
 class FitReport(BaseModel):
     """What a fit found: the content of ``fit.json``."""
 
-    model_config = ConfigDict(populate_by_name=True)
-
     model: str
     parameters: dict[str, FittedParameter]
     train: FitError
-    validation: FitError = Field(alias="validate")
+    validation: FitError = Field(
+        serialization_alias="validate",
+        validation_alias=AliasChoices("validate", "validation"),
+    )
     warnings: list[str]
     wall_s: float
 
@@ -56,7 +57,7 @@ class FitReport(BaseModel):
 class Fit:
     """A fitted plant, its report, the record and the simulated output (its unit)."""
 
-    system: Series
+    system: System
     report: FitReport
     record: Record
     simulated: np.ndarray

@@ -77,8 +77,8 @@ def read_record(
     ``time``, ``input`` and ``output`` are column names or zero-based numbers; without
     ``time``, ``rate`` (Hz) must be given. Units are taken from names such as
     ``displacement_um``. Raises ValueError, naming the column and the sample, for a
-    missing file or column, missing numbers, unsorted or uneven time, or a record that is
-    too short.
+    missing file or column, missing numbers, unsorted or uneven time, or a record that
+    is too short.
     """
     path = Path(path)
     columns = _read_columns(path)

@@ -121,8 +121,8 @@ def gains_table(result: Result) -> Table:
 
 def fit_table(report: FitReport) -> Table:
     """Return the parameters of a fit and how well it simulates the record."""
-    errors = ", ".join(
-        f"{name} {part.rmse:.3g} {part.unit} ({part.rmse_percent_of_span:.2f} % of span)"
+    errors = "; ".join(
+        f"{name} {part.rmse:.3g} {part.unit}, {part.rmse_percent_of_span:.2f} % of span"
         for name, part in (
             ("training", report.train),
             ("validation", report.validation),

@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -11,7 +12,7 @@ from ..files import write_bytes
 REFERENCE, BEFORE, AFTER, MEASURED = "#222222", "#c9753d", "#1f6f8b", "#8a8a8a"
 """Colours with one meaning in every picture."""
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.size": 9.0,
     "axes.titlesize": 9.5,
     "axes.titleweight": "bold",

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -44,7 +45,7 @@ def _logs(outcome: Outcome) -> Logs:
 
     @jax.jit
     def run(loop, reference):
-        inputs = loop_inputs(reference, noise)
+        inputs = loop_inputs(reference, jnp.asarray(noise))
         return simulate(loop, inputs, loop.init(reference[0]))[1]
 
     logs = {}

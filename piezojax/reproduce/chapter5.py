@@ -90,5 +90,5 @@ def cells(table: str) -> list[Cell]:
 
 
 def _printed() -> list[dict[str, str]]:
-    source = files(__package__).joinpath("data/ch5.csv")
+    source = files("piezojax.reproduce").joinpath("data/ch5.csv")
     return list(csv.DictReader(source.read_text(encoding="utf-8").splitlines()))

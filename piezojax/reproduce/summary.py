@@ -24,13 +24,13 @@ class TableAgreement(Agreement):
     columns: dict[str, Agreement]
 
 
-def _figures(cells: Sequence[Cell]) -> dict[str, float | int]:
+def _agreement(cells: Sequence[Cell]) -> Agreement:
     distance = np.abs(np.log([cell.ratio for cell in cells]))
-    return {
-        "geomean_ratio": float(np.exp(distance.mean())),
-        "worst_ratio": float(np.exp(distance.max())),
-        "cells": len(cells),
-    }
+    return Agreement(
+        geomean_ratio=float(np.exp(distance.mean())),
+        worst_ratio=float(np.exp(distance.max())),
+        cells=len(cells),
+    )
 
 
 def summarise(cells: Sequence[Cell]) -> dict[str, TableAgreement]:
@@ -39,10 +39,12 @@ def summarise(cells: Sequence[Cell]) -> dict[str, TableAgreement]:
     for table in dict.fromkeys(cell.table for cell in cells):
         inside = [cell for cell in cells if cell.table == table]
         columns = {
-            column: Agreement(**_figures([c for c in inside if c.column == column]))
+            column: _agreement([c for c in inside if c.column == column])
             for column in dict.fromkeys(cell.column for cell in inside)
         }
-        summary[table] = TableAgreement(**_figures(inside), columns=columns)
+        summary[table] = TableAgreement(
+            **_agreement(inside).model_dump(), columns=columns
+        )
     return summary
 
 

@@ -18,8 +18,8 @@ from .tuner import tune
 def main(study: Path | None, out: Path | None, seed: int | None, quiet: bool) -> None:
     """Tune the controller that STUDY describes, by gradients through the simulation.
 
-    STUDY is a TOML file or the name of a study that comes with piezojax; without it, the
-    DOB-based PID-SMC of the P-753 stage is tuned.
+    STUDY is a TOML file or the name of a study that comes with piezojax; without it,
+    the DOB-based PID-SMC of the P-753 stage is tuned.
     """
 
     def body(console):

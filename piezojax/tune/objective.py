@@ -65,7 +65,7 @@ class Objective(eqx.Module):
 
     def _parts(self, unit: Float[Array, " n"]) -> tuple[Array, Array, Array]:
         loop = self.space.put(self.loop, unit)
-        figures = evaluate(loop, self.signals, self.start)  # type: ignore[arg-type]
+        figures = evaluate(loop, self.signals, self.start)
         square = jnp.mean(figures.rms_error**2, axis=1)
         normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
         effort = jnp.mean(figures.rms_effort) / self.voltage_span

@@ -15,7 +15,7 @@ from scipy.stats import qmc
 from .. import __version__
 from .. import signals as signal_library
 from .._types import as_array
-from ..optimisers import METHODS, View
+from ..optimisers import METHODS
 from ..rollout import in_blocks
 from ..study import Case, read, shipped
 from ..system import Feedback
@@ -213,7 +213,7 @@ def _screen(objective, own, case, clock, progress) -> tuple[np.ndarray, np.ndarr
     candidates = max(table.candidates, table.starts - 1)
     # Sobol points are balanced in powers of two.
     power = int(np.ceil(np.log2(max(candidates, 1))))
-    sampler = qmc.Sobol(own.size, seed=np.random.default_rng(case.study.seed))
+    sampler = qmc.Sobol(own.size, rng=np.random.default_rng(case.study.seed))
     points = sampler.random_base2(power)[:candidates]
     points = np.concatenate([own[None], points])
     lanes = objective.signals.noise.shape[0] * objective.signals.noise.shape[1]
@@ -271,7 +271,7 @@ def _descend(objective, starts, best, search, case, clock, progress) -> None:
     lowest = np.full(len(starts), np.inf)
     for _ in range(table.steps):
         carry, view = program(objective, carry)
-        view = View(*map(np.asarray, view))
+        view = jax.tree.map(np.asarray, view)
         search.evaluations += len(starts)
         losses = np.where(np.isfinite(view.loss), view.loss, np.inf)
         lowest = np.minimum(lowest, losses)

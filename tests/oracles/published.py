@@ -69,10 +69,8 @@ def smc_gains(kind, table):
 
 
 def table_duration(name):
-    """Length (s) of the run behind a cell, so that half of it is whole periods.
+    """Length (s) of the run behind a cell: half of it holds whole periods of SIN, SW.
 
-    Not in the thesis: with the RMS over the second half these lengths give
-    back the "T2 printed" column of the errata in docs (SW10 has a 2 s period,
-    PWSW10 0.4 s, so 1 s runs give other numbers for SW and PWSW).
+    Not in the thesis. SW10 repeats itself after 2 s, SW30 after 0.67 s.
     """
     return 4.0 if name == "SW10" else 2.0
