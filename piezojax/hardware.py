@@ -36,8 +36,8 @@ class SlewLimit(System):
     dt: float = eqx.field(static=True)
 
     def __check_init__(self):
-        check("slew rate in V/s", self.rate, above=0)
-        check("sample time in s", self.dt, above=0)
+        check("slew rate in V/s", self.rate, above=0.0)
+        check("sample time in s", self.dt, above=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return as_array(input)
@@ -58,7 +58,7 @@ class Quantiser(System):
     resolution: Scalar = eqx.field(converter=as_array)
 
     def __check_init__(self):
-        check("resolution", self.resolution, above=0)
+        check("resolution", self.resolution, above=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return ()
@@ -79,7 +79,7 @@ class Sensor(System):
     noise_rms: Scalar = eqx.field(converter=as_array)
 
     def __check_init__(self):
-        check("sensor noise in um rms", self.noise_rms, least=0)
+        check("sensor noise in um rms", self.noise_rms, least=0.0)
 
     def init(self, input: Any = (0.0, 0.0)) -> State:
         return ()

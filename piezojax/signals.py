@@ -20,8 +20,8 @@ def time_grid(duration: float, rate: float) -> Time:
 
     Raises ValueError unless both are positive and at least two samples result.
     """
-    check("duration in s", duration, above=0)
-    check("rate in Hz", rate, above=0)
+    check("duration in s", duration, above=0.0)
+    check("rate in Hz", rate, above=0.0)
     samples = round(duration * rate)
     if samples < 2:
         raise ValueError(

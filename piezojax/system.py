@@ -128,7 +128,7 @@ class Delay(System):
     samples: int = eqx.field(static=True)
 
     def __check_init__(self):
-        check("delay in samples", self.samples, least=0)
+        check("delay in samples", self.samples, least=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return (as_array(input),) * self.samples

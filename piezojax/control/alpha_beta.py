@@ -30,9 +30,9 @@ class AlphaBeta(System):
     dt: float = eqx.field(static=True)
 
     def __check_init__(self):
-        check("alpha", self.alpha, above=0, most=1)
-        check("beta", self.beta, least=0, below=2)
-        check("sample time in s", self.dt, above=0)
+        check("alpha", self.alpha, above=0.0, most=1.0)
+        check("beta", self.beta, least=0.0, below=2.0)
+        check("sample time in s", self.dt, above=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> Motion:
         position = as_array(input)

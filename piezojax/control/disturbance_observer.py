@@ -1,9 +1,9 @@
 """Disturbance observer (DOB) with its Q-filter, around any controller."""
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 
 from .._types import Scalar, State, as_array, check
 from ..dynamics.arma import ARMA
@@ -51,9 +51,9 @@ class DisturbanceObserverControl(System):
                 f"the model has {orders[0]} a and {orders[1]} b coefficients; "
                 "it must have 2 and 3"
             )
-        check("sample time in s", self.dt, above=0)
-        check("gain K_e in um/V", self.gain, above=0)
-        check("cut-off in rad/s", self.cutoff, above=0, below=jnp.pi / self.dt)
+        check("sample time in s", self.dt, above=0.0)
+        check("gain K_e in um/V", self.gain, above=0.0)
+        check("cut-off in rad/s", self.cutoff, above=0.0, below=math.pi / self.dt)
         if self.coefficients not in COEFFICIENTS:
             raise ValueError(
                 f"coefficients {self.coefficients!r}; "

@@ -37,9 +37,9 @@ class PID(System):
     dt: float = eqx.field(static=True, kw_only=True)
 
     def __check_init__(self):
-        check("sample time in s", self.dt, above=0)
-        check("derivative filter in s", self.derivative_filter, least=0)
-        check("anti-windup rate in 1/s", self.anti_windup, least=0)
+        check("sample time in s", self.dt, above=0.0)
+        check("derivative filter in s", self.derivative_filter, least=0.0)
+        check("anti-windup rate in 1/s", self.anti_windup, least=0.0)
 
     def init(self, input: Observation) -> PIDState:
         error = input.reference - input.measured

@@ -28,9 +28,9 @@ class SlidingModePID(System):
     ``s = surface * e1 + e2`` (5.15): ``surface`` m in 1/s. The equivalent control and
     the reference part v1 come from ``model`` (a_1, a_2 | b_0, b_1, b_2, b_0 not zero),
     a PID of s with ``proportional``, ``integral``, ``derivative`` replaces the
-    switching term (5.18), and the zeros of the model, which may lie outside the unit circle, are
-    inverted in the least-squares sense with the weights ``error_weight`` Q and
-    ``control_weight`` R (5.23): f = Q/(Q+R) [v - (b1/b0) f' - (b2/b0) f''].
+    switching term (5.18), and the zeros of the model, which may lie outside the unit
+    circle, are inverted in the least-squares sense with the weights ``error_weight`` Q
+    and ``control_weight`` R (5.23): f = Q/(Q+R) [v - (b1/b0) f' - (b2/b0) f''].
 
     Input an Observation; output f in the unit of the model's input: volts if the model
     was identified from voltage (the nominal controller), um behind an inverse
@@ -56,8 +56,8 @@ class SlidingModePID(System):
                 f"the model has {orders[0]} a and {orders[1]} b coefficients; "
                 "it must have 2 and 3"
             )
-        check("error_weight Q", self.error_weight, above=0)
-        check("control_weight R", self.control_weight, least=0)
+        check("error_weight Q", self.error_weight, above=0.0)
+        check("control_weight R", self.control_weight, least=0.0)
 
     @property
     def dt(self) -> float:

@@ -21,8 +21,8 @@ class ARMA(System):
     """``y(k) = sum_i autoregressive[i] y(k-1-i) + sum_i moving[i] x(k-i)``, (3.30).
 
     ``autoregressive`` holds a_1, a_2, ... with the sign of the thesis (on the
-    right-hand side), ``moving`` holds b_0, b_1, ...; x and y in the units of the neighbours in the
-    chain. Raises ValueError for empty ``moving`` or non-finite coefficients.
+    right-hand side), ``moving`` holds b_0, b_1, ...; x and y in the units of the
+    neighbours in the chain. Raises ValueError for empty ``moving`` or non-finite coefficients.
     """
 
     autoregressive: tuple[Scalar, ...] = eqx.field(converter=as_scalars)

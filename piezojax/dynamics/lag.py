@@ -19,8 +19,8 @@ class FirstOrderLag(System):
     dt: float = eqx.field(static=True)
 
     def __check_init__(self):
-        check("time constant in s", self.time_constant, above=0)
-        check("sample time in s", self.dt, above=0)
+        check("time constant in s", self.time_constant, above=0.0)
+        check("sample time in s", self.dt, above=0.0)
 
     def pole(self) -> Scalar:
         """Return the pole in the z plane."""

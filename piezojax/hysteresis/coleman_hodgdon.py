@@ -46,7 +46,7 @@ class ColemanHodgdon(System):
     def __check_init__(self):
         check("a in um/V^2", self.a)
         check("b in um/V", self.b)
-        check("c in 1/V", self.c, below=0)
+        check("c in 1/V", self.c, below=0.0)
         if self.scheme not in SCHEMES:
             raise ValueError(
                 f"scheme {self.scheme!r}; it must be one of {list(SCHEMES)}"

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from .. import __version__
 from .. import signals as signal_library
 from .._types import as_array
 from ..optimisers import METHODS
+from ..progress import Progress, Silent
 from ..rollout import in_blocks
 from ..study import Case, read, shipped
 from ..system import Feedback
@@ -29,26 +30,6 @@ FORWARD_BELOW = 5
 """Fewer parameters than this are differentiated in forward mode."""
 
 _SCREEN_LANES = 64  # lanes simulated at once while screening
-
-
-class Progress(Protocol):
-    """What tuning tells while it runs."""
-
-    def stage(self, text: str, steps: int = 0) -> None:
-        """Announce a stage that takes ``steps`` advances, or an unknown time."""
-
-    def advance(self, best: float) -> None:
-        """Tell that a step is done and how good the best start is."""
-
-
-class Silent:
-    """No progress."""
-
-    def stage(self, text: str, steps: int = 0) -> None:
-        """Say nothing."""
-
-    def advance(self, best: float) -> None:
-        """Say nothing."""
 
 
 @dataclass
