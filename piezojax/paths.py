@@ -39,6 +39,14 @@ def parameters(system: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
+def static_fields(system: Any, name: str) -> list[Any]:
+    """Return the values of every field called ``name`` in the tree of ``system``."""
+    found = []
+    for key, child in _children(system).items():
+        found += [child] if key == name else static_fields(child, name)
+    return found
+
+
 def _walk(node: Any, path: str) -> Any:
     for part in path.split("."):
         node = _children(node)[part]

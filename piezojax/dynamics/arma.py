@@ -22,7 +22,8 @@ class ARMA(System):
 
     ``autoregressive`` holds a_1, a_2, ... with the sign of the thesis (on the
     right-hand side), ``moving`` holds b_0, b_1, ...; x and y in the units of the
-    neighbours in the chain. Raises ValueError for empty ``moving`` or non-finite coefficients.
+    neighbours in the chain. Raises ValueError for empty ``moving`` or non-finite
+    coefficients.
     """
 
     autoregressive: tuple[Scalar, ...] = eqx.field(converter=as_scalars)

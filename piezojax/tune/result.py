@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ..metrics import TrackingFigures
 
+Status = Literal["converged", "step limit", "interrupted"]
+
 RESULT_FILE = "result.json"
 GAINS_FILE = "gains.toml"
 
@@ -41,7 +43,7 @@ class Result(BaseModel):
 
     study: str
     title: str
-    status: Literal["converged", "step limit", "interrupted"]
+    status: Status
     method: str
     gains: dict[str, float]
     start: dict[str, float]

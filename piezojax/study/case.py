@@ -1,0 +1,156 @@
+"""A study made ready to run: files read, plant fitted, loop and search space built."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..catalog import CONTROLLERS, PLANTS
+from ..control.design import DESIGNS
+from ..hardware import Quantiser, Saturation, Sensor, SlewLimit
+from ..identify import Fit, identify, read_record
+from ..paths import replace, static_fields
+from ..serial import from_data
+from ..serial import load as load_system
+from ..space import Space, space_of
+from ..system import Feedback, System, series
+from .schema import RecordPlant, Study, load, one_of, validated
+
+
+@dataclass(frozen=True)
+class Case:
+    """A study with its files read, its plant fitted, its loop and search space built.
+
+    ``fit`` is there if the plant was fitted to a record.
+    """
+
+    study: Study
+    name: str
+    loop: Feedback
+    space: Space
+    fit: Fit | None = None
+
+
+def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
+    """Return ``study`` made ready to run.
+
+    Files named in it lie beside ``path``. Raises ValueError, one line naming the key,
+    the value and what is allowed.
+    """
+    path = Path(path)
+    if seed is not None:
+        study = study.model_copy(update={"seed": seed})
+    plant, fit = _plant(study, path.parent)
+    controller = _choice(
+        study.controller,
+        "controller",
+        path.parent,
+        CONTROLLERS,
+        design=lambda name: DESIGNS[one_of(name, DESIGNS)](plant, study.dt),
+    )
+    loop = Feedback(controller, plant, _actuator(study), _sensor(study))
+    loop, space = _search_space(study, loop)
+    _check_rates(study, loop)
+    return Case(study, path.stem, loop, space, fit)
+
+
+def read(path: str | Path, seed: int | None = None) -> Case:
+    """Load and build the study in the file ``path``. Raises ValueError as ``build``."""
+    return build(load(path), path, seed)
+
+
+def _plant(study: Study, folder: Path) -> tuple[System, Fit | None]:
+    table = study.plant
+    if "record" not in table:
+        return _choice(table, "plant", folder, PLANTS), None
+    wanted = validated(RecordPlant, table, "plant")
+    record = read_record(
+        folder / wanted.record,
+        time=wanted.time,
+        input=wanted.input,
+        output=wanted.output,
+        rate=wanted.record_rate,
+    )
+    train = slice(*wanted.train) if wanted.train else None
+    fit = identify(record, wanted.model, train=train)
+    return fit.system, fit
+
+
+def _actuator(study: Study) -> System:
+    table = study.actuator
+    parts: dict[str, System] = {"limits": Saturation(table.lower, table.upper)}
+    if table.slew_rate is not None:
+        parts["slew"] = SlewLimit(table.slew_rate, study.dt)
+    if table.resolution is not None:
+        parts["converter"] = Quantiser(table.resolution)
+    return series(**parts)
+
+
+def _sensor(study: Study) -> System:
+    parts: dict[str, System] = {"noise": Sensor(study.sensor.noise_rms)}
+    if study.sensor.resolution is not None:
+        parts["converter"] = Quantiser(study.sensor.resolution)
+    return series(**parts)
+
+
+def _search_space(study: Study, loop: Feedback) -> tuple[Feedback, Space]:
+    bounds = study.parameters
+    for path in bounds:
+        if not path.startswith("controller."):
+            raise ValueError(
+                f"parameters.{path}: the path must start with 'controller.'; "
+                "the stage is not for tuning"
+            )
+        if path.endswith(".cutoff") and bounds[path].upper >= np.pi * study.rate:
+            raise ValueError(
+                f"parameters.{path}.upper is {bounds[path].upper:g} rad/s; it must be "
+                f"below the Nyquist frequency, {np.pi * study.rate:g} rad/s"
+            )
+    starts = {path: b.start for path, b in bounds.items() if b.start is not None}
+    loop = replace(loop, starts)
+    space = space_of(
+        {path: (b.lower, b.upper, b.transform) for path, b in bounds.items()}
+    )
+    space.start(loop)
+    return loop, space
+
+
+def _check_rates(study: Study, loop: Feedback) -> None:
+    for dt in static_fields(loop, "dt"):
+        if not np.isclose(dt, study.dt, rtol=1e-9):
+            raise ValueError(
+                f"rate is {study.rate:g} Hz, but the controller or plant was made for "
+                f"{1.0 / dt:g} Hz"
+            )
+
+
+def _choice(
+    table: dict[str, Any],
+    where: str,
+    folder: Path,
+    catalog: Mapping[str, Callable[[], System]],
+    design: Callable[[str], System] | None = None,
+) -> System:
+    """Build the System that exactly one of catalog, file, type (and design) names."""
+    ways = {
+        "catalog": lambda: catalog[one_of(table["catalog"], catalog)](),
+        "file": lambda: load_system(folder / str(table["file"])),
+        "type": lambda: from_data(table, where),
+    }
+    if design is not None:
+        ways["design"] = lambda: design(table["design"])
+    given = [way for way in ways if way in table]
+    extra = [key for key in table if key not in ways] if "type" not in table else []
+    if len(given) != 1 or extra:
+        allowed = ", ".join([*ways, *(["record"] if where == "plant" else [])])
+        raise ValueError(
+            f"{where} has the keys {', '.join(table) or 'none'}; "
+            f"it must have exactly one of {allowed}"
+        )
+    try:
+        return ways[given[0]]()
+    except ValueError as error:
+        prefix = "" if str(error).startswith(where) else f"{where}.{given[0]}: "
+        raise ValueError(f"{prefix}{error}") from None

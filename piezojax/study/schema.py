@@ -1,0 +1,213 @@
+"""The tables of a study file, validated before anything is built."""
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from .. import signals
+from ..identify import MODELS
+from ..optimisers import METHODS
+from ..space import Transform
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Table(BaseModel):
+    """A table of a study: nothing in it is guessed, nothing unknown is passed over."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RecordPlant(Table):
+    """A plant fitted to a record: columns by name or number, parts in samples."""
+
+    record: Path
+    model: str
+    time: str | int | None = None
+    input: str | int = 0
+    output: str | int = 1
+    record_rate: Positive | None = None
+    train: tuple[int, int] | None = None
+
+    @field_validator("model")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        return one_of(name, MODELS)
+
+
+class References(Table):
+    """Signals to follow: names, um, s. ``unseen`` are kept from the optimiser."""
+
+    tune: tuple[str, ...] = Field(min_length=1)
+    unseen: tuple[str, ...] = ()
+    amplitude: Positive = 5.0
+    offset: Finite = 0.0
+    duration: Positive = 1.0
+    settle: NotNegative = 0.5
+
+    @field_validator("tune", "unseen")
+    @classmethod
+    def _signals(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for name in names:
+            signals.parse(name)
+        return names
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "References":
+        if self.settle >= self.duration:
+            raise ValueError(
+                f"settle is {self.settle:g} s; it must be below the duration, "
+                f"{self.duration:g} s"
+            )
+        for name in self.unseen:
+            if name in self.tune:
+                raise ValueError(f"{name} is in both tune and unseen")
+        return self
+
+
+class Bounds(Table):
+    """Bounds of a tuned parameter, in its own unit; ``start`` replaces its value."""
+
+    lower: Finite
+    upper: Finite
+    transform: Transform = "linear"
+    start: Finite | None = None
+
+
+class Actuator(Table):
+    """Limits of the drive, V and V/s; ``resolution`` of its converter, V."""
+
+    lower: Finite
+    upper: Finite
+    slew_rate: Positive | None = None
+    resolution: Positive | None = None
+
+
+class SensorTable(Table):
+    """Noise and resolution of the sensor, um."""
+
+    noise_rms: NotNegative = 0.0
+    resolution: Positive | None = None
+
+
+class ObjectiveTable(Table):
+    """What is minimised; see piezojax.tune.objective.Objective."""
+
+    aggregate: Literal["geometric_mean", "mean_square", "worst"] = "geometric_mean"
+    effort_weight: NotNegative = 0.0
+    slew_weight: NotNegative = 0.0
+    noise_draws: Annotated[int, Field(ge=1, le=64)] = 1
+
+
+class OptimiserTable(Table):
+    """How it is minimised.
+
+    ``candidates`` points of the box are simulated, the best become ``starts`` together
+    with the study's own start, and each takes up to ``steps`` steps.
+    """
+
+    method: str = "bfgs"
+    starts: Annotated[int, Field(ge=1, le=256)] = 8
+    candidates: Annotated[int, Field(ge=0, le=65536)] = 64
+    steps: Annotated[int, Field(ge=1, le=10000)] = 60
+    tolerance: Positive = 1e-4
+
+    @field_validator("method")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        return one_of(name, METHODS)
+
+
+class Study(Table):
+    """A whole study; README and tuning/ show examples."""
+
+    title: str
+    rate: Positive
+    seed: Annotated[int, Field(ge=0)] = 0
+    plant: dict[str, Any]
+    actuator: Actuator
+    sensor: SensorTable = SensorTable()
+    controller: dict[str, Any]
+    references: References
+    parameters: dict[str, Bounds] = Field(min_length=1)
+    objective: ObjectiveTable = ObjectiveTable()
+    optimiser: OptimiserTable = OptimiserTable()
+    holdout_draws: Annotated[int, Field(ge=1, le=64)] = 1
+
+    @model_validator(mode="after")
+    def _least_squares(self) -> "Study":
+        least_squares = self.optimiser.method == "levenberg_marquardt"
+        if least_squares and self.objective.aggregate != "mean_square":
+            raise ValueError(
+                "optimiser.method levenberg_marquardt minimises squares; "
+                f"objective.aggregate is {self.objective.aggregate!r}, "
+                "it must be 'mean_square'"
+            )
+        return self
+
+    @property
+    def dt(self) -> float:
+        """Sample time, s."""
+        return 1.0 / self.rate
+
+
+def one_of(name: str, allowed: Any) -> str:
+    """Return ``name``; raise ValueError, listing ``allowed``, if it is not in there."""
+    if name not in allowed:
+        raise ValueError(f"{name!r} is unknown; there are {', '.join(allowed)}")
+    return name
+
+
+def validated(kind: type[Any], data: Any, where: str) -> Any:
+    """Return ``data`` as ``kind``; one line naming key, value and what is allowed."""
+    try:
+        return kind.model_validate(data)
+    except ValidationError as error:
+        raise ValueError(_first_line(error, kind, where)) from None
+
+
+def _first_line(error: ValidationError, kind: type[BaseModel], where: str) -> str:
+    first = error.errors()[0]
+    key = ".".join([where, *(str(part) for part in first["loc"])]).strip(".")
+    if first["type"] == "extra_forbidden":
+        table: Any = kind
+        for part in first["loc"][:-1]:
+            field = getattr(table, "model_fields", {}).get(part)
+            table = field.annotation if field else Bounds
+        known = list(getattr(table, "model_fields", Bounds.model_fields))
+        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        return f"{key} is unknown; allowed are {', '.join(known)}{hint}"
+    if first["type"] == "missing":
+        return f"{key} is missing"
+    message = first["msg"].removeprefix("Value error, ")
+    value = first["input"]
+    shown = f" is {value!r}" if isinstance(value, str | int | float) else ""
+    return f"{key}{shown}: {message}"
+
+
+def load(path: str | Path) -> Study:
+    """Read and validate a study file, without building anything.
+
+    Raises ValueError, one line naming the key, the value and what is allowed.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"study {path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"study {path} is no TOML file: {error}") from None
+    return validated(Study, data, "")

@@ -1,0 +1,181 @@
+"""The search: screen the box, then descend from the best starts, all at once."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.stats import qmc
+
+from .._types import as_array
+from ..optimisers import METHODS
+from ..progress import Progress
+from ..rollout import BLOCK, in_blocks
+from ..study import Case
+from .objective import HOPELESS, Objective, with_finite_gradient
+from .result import Status
+
+STALL_STEPS, STALL_GAIN = 20, 1e-3
+"""Stop when the best start gained less than this in so many steps."""
+
+FORWARD_BELOW = 5
+"""Fewer parameters than this are differentiated in forward mode."""
+
+
+class Clock:
+    """Wall time since it was made, and how much of it went into compiling (s)."""
+
+    def __init__(self):
+        self._began = time.perf_counter()
+        self.compile_s = 0.0
+
+    def compiled(self, function: Callable, *arguments: Any) -> Callable:
+        """Return ``function`` compiled for ``arguments``, its time counted."""
+        start = time.perf_counter()
+        program = jax.jit(function).lower(*arguments).compile()
+        self.compile_s += time.perf_counter() - start
+        return program
+
+    def wall_s(self) -> float:
+        """Return the seconds since the start."""
+        return time.perf_counter() - self._began
+
+
+@dataclass
+class Search:
+    """The best point found so far, in [0, 1]^n, and how it was found.
+
+    ``history`` holds the lowest loss of each start after each step, None while it
+    diverges.
+    """
+
+    unit: np.ndarray
+    loss: float = np.inf
+    status: Status = "step limit"
+    evaluations: int = 0
+    history: list[list[float | None]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def offer(self, units: np.ndarray, losses: np.ndarray) -> None:
+        """Take the best of ``units`` if it beats what is there."""
+        leader = int(np.argmin(losses))
+        if losses[leader] < self.loss:
+            self.loss, self.unit = float(losses[leader]), units[leader]
+
+
+def search_box(
+    objective: Objective, case: Case, clock: Clock, progress: Progress
+) -> Search:
+    """Return the best point of the case's box.
+
+    ``Ctrl-C`` ends the search with the best point so far. Raises ValueError when the
+    loop diverges at every point tried.
+    """
+    own = np.asarray(case.space.start(case.loop))
+    search = Search(own)
+    try:
+        points = np.concatenate([own[None], _candidates(case)])
+        losses = _screen(objective, points, clock, progress)
+        search.evaluations += losses.size
+        chosen = _starts(losses, case.study.optimiser.starts, search)
+        search.offer(points, losses)
+        _descend(objective, points[chosen], search, case, clock, progress)
+    except KeyboardInterrupt:
+        search.status = "interrupted"
+    return search
+
+
+def _candidates(case: Case) -> np.ndarray:
+    table, size = case.study.optimiser, len(case.space.paths)
+    count = max(table.candidates, table.starts - 1)
+    sampler = qmc.Sobol(size, rng=np.random.default_rng(case.study.seed))
+    # Sobol points are balanced in powers of two.
+    return sampler.random_base2(int(np.ceil(np.log2(max(count, 1)))))[:count]
+
+
+def _screen(
+    objective: Objective, points: np.ndarray, clock: Clock, progress: Progress
+) -> np.ndarray:
+    progress.stage(f"screening {len(points)} points of the box")
+    runs = objective.signals.noise.shape[0] * objective.signals.noise.shape[1]
+    at_once = max(1, BLOCK // runs)
+    program = clock.compiled(
+        lambda objective, units: in_blocks(
+            lambda unit: objective.loss(unit), units, size=at_once
+        ),
+        objective,
+        as_array(points),
+    )
+    return np.asarray(program(objective, as_array(points)))
+
+
+def _starts(losses: np.ndarray, count: int, search: Search) -> np.ndarray:
+    """Choose the study's own start and the best candidates, none that diverges."""
+    stable = losses < HOPELESS
+    if not stable.any():
+        raise ValueError(
+            f"the loop diverges at the start and at all {losses.size - 1} other points "
+            "tried in the box: lower the bounds of the gains, raise 'candidates', or "
+            "check the plant's sign and sample rate"
+        )
+    if not stable[0]:
+        search.warnings.append(
+            "the study's own start diverges; tuning began from the best of "
+            f"{losses.size - 1} other points of the box instead"
+        )
+    best = 1 + np.argsort(losses[1:], kind="stable")
+    ranked = np.concatenate([[0], best])
+    return ranked[stable[ranked]][:count]
+
+
+def _descend(
+    objective: Objective,
+    starts: np.ndarray,
+    search: Search,
+    case: Case,
+    clock: Clock,
+    progress: Progress,
+) -> None:
+    table = case.study.optimiser
+    forward = len(case.space.paths) < FORWARD_BELOW
+
+    def optimiser(objective):
+        # A lambda, because a bound method would be hashed with its arrays.
+        loss = with_finite_gradient(lambda u: objective.loss(u), forward=forward)
+        return METHODS[table.method](
+            loss, lambda u: objective.residuals(u), table.tolerance
+        )
+
+    progress.stage("compiling the gradient")
+    carry = jax.jit(
+        lambda objective, units: jax.vmap(optimiser(objective).start)(units)
+    )(objective, as_array(starts))
+
+    def advance(objective, carry):
+        solver = optimiser(objective)
+        carry = jax.vmap(solver.step)(carry)
+        return carry, jax.vmap(solver.view)(carry)
+
+    program = clock.compiled(advance, objective, carry)
+    progress.stage(f"tuning from {len(starts)} starts", table.steps)
+    bests: list[float] = []
+    lowest = np.full(len(starts), np.inf)
+    for _ in range(table.steps):
+        carry, view = program(objective, carry)
+        view = jax.tree.map(np.asarray, view)
+        search.evaluations += len(starts)
+        losses = np.where(np.isfinite(view.loss), view.loss, np.inf)
+        lowest = np.minimum(lowest, losses)
+        search.history.append([float(x) if np.isfinite(x) else None for x in lowest])
+        search.offer(view.unit, losses)
+        bests.append(search.loss)
+        progress.advance(search.loss)
+        if np.all(view.done) or _stalled(bests):
+            search.status = "converged"
+            break
+
+
+def _stalled(bests: list[float]) -> bool:
+    return len(bests) > STALL_STEPS and bests[-1 - STALL_STEPS] - bests[-1] < STALL_GAIN
