@@ -155,11 +155,12 @@ class LoopInput(NamedTuple):
     """What drives a loop at sample k.
 
     ``next_reference`` r(k+1) in um; ``noise``, a unit-variance draw that the sensor
-    scales.
+    scales; ``disturbance`` in um, if any, moves the displacement itself at k+1.
     """
 
     next_reference: Scalar
     noise: Scalar
+    disturbance: Scalar | None = None
 
 
 class LoopSample(NamedTuple):
@@ -229,6 +230,8 @@ class Feedback(System):
         controller, command = self.controller.step(state.controller, seen)
         actuator, voltage = self.actuator.step(state.actuator, command)
         plant, displacement = self.plant.step(state.plant, voltage)
+        if input.disturbance is not None:
+            displacement = displacement + input.disturbance
         sample = LoopSample(
             state.reference, state.displacement, measured, command, voltage
         )
@@ -245,16 +248,20 @@ class Feedback(System):
 
 
 def loop_inputs(
-    reference: Float[Array, " samples"], noise: Float[Array, " samples"] | None = None
+    reference: Float[Array, " samples"],
+    noise: Float[Array, " samples"] | None = None,
+    disturbance: Float[Array, " samples"] | None = None,
 ) -> LoopInput:
     """Return the inputs that make a loop follow ``reference`` (um).
 
-    ``noise`` holds unit-variance draws, zero if left out. The last sample is repeated
+    ``noise`` holds unit-variance draws, zero if left out; ``disturbance`` (um) is added
+    to what the plant does. The last sample is repeated
     as its own successor; what it influences lies after the end of the record.
     """
     reference = as_array(reference)
     following = jnp.concatenate([reference[1:], reference[-1:]])
-    return LoopInput(following, jnp.zeros_like(reference) if noise is None else noise)
+    noise = jnp.zeros_like(reference) if noise is None else noise
+    return LoopInput(following, noise, disturbance)
 
 
 def holding_input(plant: System, output: ScalarLike) -> Scalar:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..files import write_bytes
@@ -33,6 +34,18 @@ def figure(width: float, height: float) -> Figure:
     Made without pyplot: nothing global, no window, no backend to choose.
     """
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def legend_above(ax: Axes) -> None:
+    """Put the legend of ``ax`` above it, where it hides no data."""
+    ax.legend(
+        loc="lower right",
+        bbox_to_anchor=(1.0, 0.98),
+        ncols=3,
+        borderaxespad=0.0,
+        columnspacing=1.2,
+        handlelength=1.4,
+    )
 
 
 def styled():

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from ..files import write_text
 from ..identify.output_error import Fit
 from ..serial import save
-from .figures import AFTER, BEFORE, MEASURED, figure, styled, write
+from .figures import AFTER, BEFORE, MEASURED, figure, legend_above, styled, write
 
 MODEL_FILE, FIT_FILE, PICTURE_FILE = "model.json", "fit.json", "fit.png"
 
@@ -47,15 +47,15 @@ def fit_figure(fit: Fit) -> Figure:
     loop.legend()
     course.plot(time, record.output, color=MEASURED, label="measured")
     course.plot(time, fit.simulated, color=AFTER, lw=0.9, label="free-run simulation")
-    course.set(xlabel="time (s)", ylabel=f"output ({unit})", title="Whole record")
-    course.legend(loc="upper right")
+    course.set(xlabel="time (s)", ylabel=f"output ({unit})", title="Whole record\n")
+    legend_above(course)
     residual.plot(time, error, color=BEFORE, lw=0.7)
     residual.axvspan(time[part.start], time[part.stop - 1], color="#eef4f6", zorder=0)
     residual.set(
         xlabel="time (s)",
         ylabel=f"residual ({unit})",
-        title=f"Residual: {report.train.rmse:.3g} {unit} rms in training, "
-        f"{report.validation.rmse:.3g} in validation (shaded)",
+        title=f"Residual, {unit} rms: {report.train.rmse:.3g} training, "
+        f"{report.validation.rmse:.3g} validation",
     )
     density = np.abs(np.fft.rfft(error[part])) * 2.0 / error[part].size
     frequency = np.fft.rfftfreq(error[part].size, record.dt)

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -14,7 +13,7 @@ from ..serial import save
 from ..system import LoopSample, loop_inputs
 from ..tune.result import GAINS_FILE, RESULT_FILE
 from ..tune.tuner import Outcome
-from .figures import AFTER, BEFORE, REFERENCE, figure, styled, write
+from .figures import AFTER, BEFORE, REFERENCE, figure, legend_above, styled, write
 
 _SHOWN = 3  # references in the tracking picture
 _PERIODS = 4.0  # of the reference, at the end of the run
@@ -36,23 +35,23 @@ Logs = dict[str, tuple[LoopSample, LoopSample]]
 
 
 def _logs(outcome: Outcome) -> Logs:
-    """Run both loops over the shown references, with noise no run has seen."""
-    table = outcome.case.study.references
-    time = signals.time_grid(table.duration, outcome.case.study.rate)
-    noise = np.random.default_rng(outcome.case.study.seed + 1).standard_normal(
-        time.size
-    )
+    """Run both loops over the shown references, as in the hold-out."""
 
     @jax.jit
-    def run(loop, reference):
-        inputs = loop_inputs(reference, jnp.asarray(noise))
+    def run(loop, reference, noise):
+        inputs = loop_inputs(reference, noise, outcome.holdout.disturbance)
         return simulate(loop, inputs, loop.init(reference[0]))[1]
 
     logs = {}
+    names = list(outcome.result.before.per_reference_rms_um)
     for name in _shown(outcome):
-        reference = signals.signal(name, time, table.amplitude, table.offset)
-        both = (run(loop, reference) for loop in (outcome.before, outcome.after))
-        logs[name] = tuple(jax.tree.map(np.asarray, log) for log in both)
+        i = names.index(name)
+        reference, noise = outcome.holdout.references[i], outcome.holdout.noise[i, 0]
+        before, after = (
+            jax.tree.map(np.asarray, run(loop, reference, noise))
+            for loop in (outcome.before, outcome.after)
+        )
+        logs[name] = (before, after)
     return logs
 
 
@@ -76,41 +75,37 @@ def _window(name: str, duration: float, settle: float) -> float:
 def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
     """Displacement and error against time, before and after."""
     table, dt = outcome.case.study.references, outcome.case.study.dt
-    picture = figure(9.0, 2.2 * len(logs) + 0.4)
+    picture = figure(9.0, 2.3 * len(logs) + 0.4)
     axes = picture.subplots(len(logs), 2, squeeze=False)
     for (name, (before, after)), (left, right) in zip(logs.items(), axes, strict=True):
         time = np.arange(before.reference.size) * dt
         shown = time >= _window(name, table.duration, table.settle)
-        milliseconds = 1e3 * time[shown]
+        for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
+            error = 1e3 * (log.displacement - log.reference)
+            rms = np.sqrt(np.mean(error[time >= table.settle] ** 2))
+            left.plot(time[shown], log.displacement[shown], color=colour, label=label)
+            right.plot(
+                time[shown],
+                error[shown],
+                color=colour,
+                lw=0.9,
+                label=f"{label}, {rms:.3g} nm rms",
+            )
         left.plot(
-            milliseconds, before.displacement[shown], color=BEFORE, label="before"
-        )
-        left.plot(milliseconds, after.displacement[shown], color=AFTER, label="tuned")
-        left.plot(
-            milliseconds,
+            time[shown],
             before.reference[shown],
             color=REFERENCE,
             ls="--",
             lw=0.9,
             label="reference",
         )
-        left.set(ylabel="displacement (µm)", title=f"{name}: displacement")
-        for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
-            error = 1e3 * (log.displacement - log.reference)
-            rms = np.sqrt(np.mean(error[time >= table.settle] ** 2))
-            right.plot(
-                milliseconds,
-                error[shown],
-                color=colour,
-                lw=0.9,
-                label=f"{label}: {rms:.1f} nm rms",
-            )
-        right.set(ylabel="tracking error (nm)", title=f"{name}: error")
-        right.legend(loc="upper right")
-    axes[0][0].legend(loc="upper right")
+        left.set(ylabel=f"{name}\ndisplacement (µm)")
+        right.set(ylabel="tracking error (nm)")
+        legend_above(left)
+        legend_above(right)
     for ax in axes[-1]:
-        ax.set_xlabel("time (ms)")
-    picture.suptitle(outcome.result.title)
+        ax.set_xlabel("time (s)")
+    picture.suptitle(f"{outcome.result.title}: hold-out runs")
     return picture
 
 
@@ -136,9 +131,9 @@ def hysteresis_figure(outcome: Outcome, logs: Logs) -> Figure:
     right.set(
         xlabel="reference (µm)",
         ylabel="displacement less reference (nm)",
-        title=f"{name}: what is left in closed loop",
+        title=f"{name}: what is left in closed loop\n",
     )
-    right.legend(loc="upper right")
+    legend_above(right)
     return picture
 
 

@@ -22,10 +22,11 @@ _FLOOR = 1e-9  # um: an error below a femtometre is as good as none
 
 
 class Signals(eqx.Module):
-    """References (um) and unit-variance noise draws to run a loop on."""
+    """References (um), unit-variance noise draws and a disturbance (um) for a loop."""
 
     references: Float[Array, "references samples"]
     noise: Float[Array, "references draws samples"]
+    disturbance: Float[Array, " samples"] | None = None
 
 
 def evaluate(loop: Feedback, signals: Signals, start: int) -> TrackingFigures:
@@ -36,7 +37,7 @@ def evaluate(loop: Feedback, signals: Signals, start: int) -> TrackingFigures:
     metric = Tracking(start=start)
 
     def one(reference, noise):
-        inputs = loop_inputs(reference, noise)
+        inputs = loop_inputs(reference, noise, signals.disturbance)
         return simulate(loop, inputs, loop.init(reference[0]), metric=metric)[1]
 
     draws = jax.vmap(one, in_axes=(None, 0))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,7 @@ class Outcome:
     before: Feedback
     after: Feedback
     case: Case
+    holdout: Signals
 
     @property
     def controller(self):
@@ -69,8 +71,37 @@ def _make_data(case: Case) -> _Data:
     return _Data(
         names,
         count,
-        tuning=Signals(references[:count], draws[0][:count]),
-        holdout=Signals(references, draws[1]),
+        tuning=Signals(
+            references[:count], draws[0][:count], _unexplained(case, time_s, "train")
+        ),
+        holdout=Signals(references, draws[1], _unexplained(case, time_s, "validate")),
+    )
+
+
+def _unexplained(
+    case: Case, time_s: jax.Array, part: Literal["train", "validate"]
+) -> jax.Array | None:
+    """Return what the fitted plant leaves unexplained of its record, as a disturbance.
+
+    A controller that contains the fitted model would otherwise be tuned and judged as
+    if the stage were that model. Run forth and back to last as long as the references.
+    """
+    if case.fit is None:
+        return None
+    fit = case.fit
+    where = getattr(fit, part)
+    # The first half of the training part holds the initial loading, a single event.
+    start = where.start if part == "validate" else (where.start + where.stop) // 2
+    residual = (fit.record.output - fit.simulated)[start : where.stop]
+    there_and_back = np.concatenate([residual, residual[-2:0:-1]])
+    dt = fit.record.dt
+    return as_array(
+        np.interp(
+            np.asarray(time_s),
+            np.arange(there_and_back.size) * dt,
+            there_and_back,
+            period=there_and_back.size * dt,
+        )
     )
 
 
@@ -119,7 +150,7 @@ def tune(
     progress.stage("judging on held-out noise")
     after = space.put(case.loop, as_array(search.unit))
     result = _report(case, data, judge, judge_tuning, before, after, search, clock)
-    return Outcome(result, case.loop, after, case)
+    return Outcome(result, case.loop, after, case, data.holdout)
 
 
 def _scale(before: Scores, references: jax.Array) -> jax.Array:
@@ -188,8 +219,9 @@ def _warnings(
     if case.fit is not None:
         part = case.fit.report.validation
         found.append(
-            f"the plant simulates its own record to {part.rmse:.3g} {part.unit} rms: "
-            "tracking errors below that are the model's, not the stage's"
+            f"the fitted plant leaves {part.rmse:.3g} {part.unit} rms of its record "
+            "unexplained; that acts on the loop as a disturbance, the training part's "
+            "while tuning, the validation part's in the hold-out"
         )
     if at_bound:
         found.append(f"at the edge of its bounds: {', '.join(at_bound)}")
