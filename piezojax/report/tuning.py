@@ -89,7 +89,7 @@ def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
                 error[shown],
                 color=colour,
                 lw=0.9,
-                label=f"{label}, {rms:.3g} nm rms",
+                label=f"{label}, {rms:.4g} nm rms",
             )
         left.plot(
             time[shown],

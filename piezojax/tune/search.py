@@ -149,9 +149,12 @@ def _descend(
         )
 
     progress.stage("compiling the gradient")
-    carry = jax.jit(
-        lambda objective, units: jax.vmap(optimiser(objective).start)(units)
-    )(objective, as_array(starts))
+    begin = clock.compiled(
+        lambda objective, units: jax.vmap(optimiser(objective).start)(units),
+        objective,
+        as_array(starts),
+    )
+    carry = begin(objective, as_array(starts))
 
     def advance(objective, carry):
         solver = optimiser(objective)
