@@ -96,12 +96,12 @@ class DisturbanceObserverControl(System):
         u1, (u2, u3) = input.applied, state.applied
         w1, w2 = state.disturbance
         # Both filters of (5.26) have the denominator c: one recursion serves both.
-        w = (
+        w = (1.0 / c0) * (
             (z - a1 * z1 - a2 * z2) / self.gain
             - (b0 * u1 + b1 * u2 + b2 * u3)
             - c1 * w1
             - c2 * w2
-        ) / c0
+        )
         force = self.gain * (u1 + w1)
         feedback, f = self.feedback.step(state.feedback, input._replace(applied=force))
         state = DisturbanceObserverState(feedback, (z, z1), (u1, u2), (w, w1))

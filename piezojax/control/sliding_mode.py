@@ -106,7 +106,7 @@ class SlidingModePID(System):
         # x(k+1) = A x + B v with x = [y, (y - y')/T], B = [b0, b0/T].
         next_e1 = (a1 + a2) * e1 - a2 * dt * e2
         next_e2 = ((a1 + a2 - 1.0) * e1 / dt) - a2 * e2
-        equivalent = -(m * next_e1 + next_e2) / (m * b0 + b0 / dt)
+        equivalent = -(1.0 / (m * b0 + b0 / dt)) * (m * next_e1 + next_e2)
 
         integral = state.integral - self.integral * dt * s
         switching = (
