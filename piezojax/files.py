@@ -11,8 +11,14 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write ``content`` to ``path`` in one move."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    """Write ``content`` to ``path`` in one move.
+
+    Raises ValueError if its folder is missing or cannot be written.
+    """
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from None
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
@@ -32,7 +38,7 @@ def fresh_folder(path: Path) -> Path:
         path.mkdir(parents=True, exist_ok=True)
         occupied = any(path.iterdir())
         if not occupied:
-            write_text(path / ".probe", "")
+            (path / ".probe").touch()
             (path / ".probe").unlink()
     except OSError as error:
         raise ValueError(f"--out {path} cannot be written: {error.strerror}") from None

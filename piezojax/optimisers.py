@@ -81,12 +81,13 @@ def _optimistix(
 
     def step(carry):
         state = eqx.combine(carry.state, fixed(carry.point))
-        point, state, loss = solver.step(
+        # The step returns the loss of the point before; the state has this one's.
+        point, state, _ = solver.step(
             objective, carry.point, None, options, state, frozenset()
         )
         done, _ = solver.terminate(objective, point, None, options, state, frozenset())
         arrays = eqx.filter(state, eqx.is_array)
-        return _advanced(carry, _Carry(point, arrays, loss, carry.done | done))
+        return _advanced(carry, _Carry(point, arrays, state.aux, carry.done | done))
 
     def view(carry):
         return View(squash(carry.point), carry.loss, carry.done)

@@ -5,7 +5,7 @@ import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import equinox as eqx
 import numpy as np
@@ -44,21 +44,19 @@ def _value_to_data(value: Any) -> Any:
     return value
 
 
-def from_data(data: Mapping[str, Any], where: str = "system") -> System:
+def from_data(data: Any, where: str = "system") -> System:
     """Return the System that ``data``, as made by ``to_data``, describes.
 
     Raises ValueError naming the key, the value and what is allowed.
     """
     kinds = _kinds()
+    allowed = ", ".join(sorted(kinds))
     if not isinstance(data, Mapping) or "type" not in data:
-        raise ValueError(
-            f"{where} needs a key 'type'; one of {', '.join(sorted(kinds))}"
-        )
-    kind = kinds.get(data["type"])
+        raise ValueError(f"{where} needs a key 'type'; one of {allowed}")
+    kind = kinds.get(data["type"]) if isinstance(data["type"], str) else None
     if kind is None:
         raise ValueError(
-            f"{where}.type is {data['type']!r}; "
-            f"it must be one of {', '.join(sorted(kinds))}"
+            f"{where}.type is {data['type']!r}; it must be one of {allowed}"
         )
     fields = {field.name: field for field in dataclasses.fields(kind)}
     arguments = {key: value for key, value in data.items() if key != "type"}
@@ -68,23 +66,50 @@ def from_data(data: Mapping[str, Any], where: str = "system") -> System:
                 f"{where}.{key} is unknown; {kind.__name__} has {', '.join(fields)}"
             )
     built = {
-        key: _value_from_data(value, f"{where}.{key}")
+        key: _value_from_data(value, fields[key].type, f"{where}.{key}")
         for key, value in arguments.items()
     }
+    missing = [
+        name
+        for name, field in fields.items()
+        if name not in built and field.default is dataclasses.MISSING
+    ]
+    if missing:
+        raise ValueError(f"{where}.{missing[0]} is missing")
     try:
         return kind(**built)
-    except TypeError as error:
-        raise ValueError(f"{where}: {error}".replace("__init__() ", "")) from None
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
 
-def _value_from_data(value: Any, where: str) -> Any:
-    if isinstance(value, Mapping):
-        return from_data(value, where)
-    if isinstance(value, list):
-        return tuple(_value_from_data(v, f"{where}.{i}") for i, v in enumerate(value))
+def _value_from_data(value: Any, kind: Any, where: str) -> Any:
+    """Return ``value`` as a field of type ``kind`` takes it."""
+    if get_origin(kind) is tuple:
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{where} is {value!r}; it must be a list")
+        (item, _) = get_args(kind)
+        return tuple(
+            _value_from_data(v, item, f"{where}.{i}") for i, v in enumerate(value)
+        )
+    if isinstance(kind, type) and issubclass(kind, System):
+        system = from_data(value, where)
+        if not isinstance(system, kind):
+            raise ValueError(
+                f"{where} is of type {type(system).__name__}; "
+                f"it must be {kind.__name__}"
+            )
+        return system
+    accepted, name = _PLAIN.get(kind, ((int, float), "a number"))
+    if not isinstance(value, accepted) or isinstance(value, bool):
+        raise ValueError(f"{where} is {value!r}; it must be {name}")
     return value
+
+
+_PLAIN: dict[Any, tuple[Any, str]] = {
+    str: (str, "a text"),
+    int: (int, "a whole number"),
+}
+"""What fields that are not parameters take; every other field takes a number."""
 
 
 def save(system: System, path: str | Path) -> None:
@@ -109,6 +134,8 @@ def load(path: str | Path) -> System:
         data = tomllib.loads(text) if kind == "toml" else json.loads(text)
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}") from None
+    except RecursionError:
+        raise ValueError(f"{path} is no {kind.upper()} file: nested too deep") from None
     except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is no {kind.upper()} file: {error}") from None
     return from_data(data, path.name)

@@ -27,7 +27,7 @@ def time_grid(duration: float, rate: float) -> Time:
         raise ValueError(
             f"{duration:g} s at {rate:g} Hz hold {samples} samples; it takes 2 or more"
         )
-    return jnp.arange(samples) / rate
+    return jnp.arange(samples, dtype=jnp.float64) / rate
 
 
 def constant(
@@ -47,7 +47,7 @@ def step(
     offset: ScalarLike = 0.0,
 ) -> Time:
     """Step from ``offset`` up by ``amplitude`` after a tenth of a period."""
-    return offset + amplitude * (time * frequency >= 0.1)
+    return offset + amplitude * (time * frequency >= 0.1).astype(time.dtype)
 
 
 def square(
@@ -57,7 +57,8 @@ def square(
     offset: ScalarLike = 0.0,
 ) -> Time:
     """Alternate between ``offset`` and ``offset + 2 amplitude``."""
-    return offset + 2.0 * amplitude * (jnp.mod(time * frequency, 1.0) >= 0.5)
+    high = jnp.mod(time * frequency, 1.0) >= 0.5
+    return offset + 2.0 * amplitude * high.astype(time.dtype)
 
 
 def triangle(

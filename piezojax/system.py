@@ -115,6 +115,10 @@ class Affine(System):
     gain: Scalar = eqx.field(converter=as_array, default=1.0)
     offset: Scalar = eqx.field(converter=as_array, default=0.0)
 
+    def __check_init__(self):
+        check("gain", self.gain)
+        check("offset", self.offset)
+
     def init(self, input: ScalarLike = 0.0) -> State:
         return ()
 
@@ -128,6 +132,8 @@ class Delay(System):
     samples: int = eqx.field(static=True)
 
     def __check_init__(self):
+        if not isinstance(self.samples, int):
+            raise ValueError(f"delay in samples is {self.samples!r}; it must be whole")
         check("delay in samples", self.samples, least=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> State:

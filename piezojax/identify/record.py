@@ -1,6 +1,9 @@
 """A lab's record: time, input, output, read from a file and checked."""
 
 import csv
+import re
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,12 +85,33 @@ def read_record(
     """
     path = Path(path)
     columns = _read_columns(path)
-    values = {
-        role: _column(columns, key, role, path)
-        for role, key in (("input", input), ("output", output))
-    }
+    wanted = {"input": input, "output": output}
     if time is not None:
-        dt = _time_step(_column(columns, time, "time", path)[1], path)
+        wanted["time"] = time
+    names = {
+        role: _named(columns, key, role, path.name) for role, key in wanted.items()
+    }
+    for role, name in names.items():
+        twin = next(other for other, n in names.items() if n == name)
+        if twin != role:
+            raise ValueError(
+                f"{path.name}: column {name!r} is named both as {twin} and as {role}"
+            )
+    values = {
+        role: _numbers(columns[name], f"{role} column {name!r}", path.name)
+        for role, name in names.items()
+    }
+    if len({column.size for column in values.values()}) > 1:
+        lengths = ", ".join(f"{names[r]} {c.size}" for r, c in values.items())
+        raise ValueError(f"{path.name}: columns differ in length: {lengths}")
+    if time is not None:
+        seconds = _SECONDS.get(_unit(names["time"]) or "s")
+        if seconds is None:
+            raise ValueError(
+                f"{path.name}: time column {names['time']!r} is in an unknown unit; "
+                f"it must be one of {', '.join(_SECONDS)}"
+            )
+        dt = _time_step(seconds * values["time"], path.name)
     elif rate is not None:
         if not (np.isfinite(rate) and rate > 0):
             raise ValueError(f"{path.name}: rate is {rate:g} Hz; it must be above 0")
@@ -95,32 +119,58 @@ def read_record(
     else:
         raise ValueError(f"{path.name}: name the time column, or give its rate in Hz")
     return Record(
-        values["input"][1],
-        values["output"][1],
+        values["input"],
+        values["output"],
         dt,
-        input_unit=_unit(values["input"][0], "V"),
-        output_unit=_unit(values["output"][0], "um"),
+        input_unit=_unit(names["input"]) or "V",
+        output_unit=_unit(names["output"]) or "um",
         source=path.name,
     )
 
 
-def _unit(name: str, default: str) -> str:
-    head, _, tail = name.rpartition("_")
-    return tail if head and tail.isalpha() else default
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
+
+_UNIT = re.compile(r"[_\s]+([^\W\d_]+)$|[\[(]\s*([^\])]+?)\s*[\])]\s*$")
+
+
+def _unit(name: str) -> str | None:
+    """Return the unit in ``drive_V``, ``drive [V]`` or ``drive (V)``, if any."""
+    found = _UNIT.search(name)
+    unit = (found[1] or found[2]) if found else None
+    return "um" if unit == "µm" else unit
+
+
+def _numbers(column: np.ndarray, name: str, source: str) -> np.ndarray:
+    """Return ``column`` as finite floats."""
+    if column.size != max(column.shape):
+        raise ValueError(f"{source}: {name} has shape {column.shape}")
+    if not (np.issubdtype(column.dtype, np.floating) or column.dtype.kind in "iub"):
+        raise ValueError(f"{source}: {name} is {column.dtype}, not real numbers")
+    column = column.astype(float).ravel()
+    bad = np.flatnonzero(~np.isfinite(column))
+    if bad.size:
+        raise ValueError(
+            f"{source}: {name} is missing or not finite at sample {bad[0]} "
+            f"({bad.size} in all)"
+        )
+    return column
 
 
 def _read_columns(path: Path) -> dict[str, np.ndarray]:
     try:
         if path.suffix.lower() == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
+            with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
                 return {
-                    name: np.asarray(archive[name], float).ravel() for name in archive
+                    name: np.asarray(archive[name])
+                    for name in archive.files
+                    if archive[name].size > 1
                 }
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise ValueError(f"record {path}: {error.strerror}") from None
-    except (ValueError, UnicodeDecodeError) as error:
-        raise ValueError(f"record {path} cannot be read: {error}") from None
+        raise ValueError(f"record {path}: {error.strerror or error}") from None
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error):
+        kind = "NPZ archive of plain arrays" if path.suffix == ".npz" else "text file"
+        raise ValueError(f"record {path} cannot be read: it is no {kind}") from None
     return _parse_table(text, path)
 
 
@@ -136,8 +186,13 @@ def _parse_table(text: str, path: Path) -> dict[str, np.ndarray]:
         ]
     else:
         rows = [line.split() for line in lines]
-    header = None if _numeric(rows[0]) else rows.pop(0)
-    names = header or [str(i) for i in range(len(rows[0]) if rows else 0)]
+    # A header is mostly text; one text among numbers is a broken sample.
+    numbers = sum(map(_numeric, rows[0]))
+    header = rows.pop(0) if 2 * numbers < len(rows[0]) else None
+    names = header or [str(i) for i in range(len(rows[0]))]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{path.name}: two columns are called {name!r}")
     table = np.full((len(rows), len(names)), np.nan)
     for i, row in enumerate(rows):
         if len(row) != len(names):
@@ -156,47 +211,46 @@ def _parse_table(text: str, path: Path) -> dict[str, np.ndarray]:
     return dict(zip(names, table.T, strict=True))
 
 
-def _numeric(cells: list[str]) -> bool:
+def _numeric(cell: str) -> bool:
     try:
-        [float(cell) for cell in cells if cell]
+        float(cell)
     except ValueError:
         return False
     return True
 
 
-def _column(
-    columns: dict[str, np.ndarray], key: str | int, role: str, path: Path
-) -> tuple[str, np.ndarray]:
+def _named(
+    columns: dict[str, np.ndarray], key: str | int, role: str, source: str
+) -> str:
+    """Return the name of the column that ``key`` names or counts."""
     names = list(columns)
     if isinstance(key, int) or (key not in columns and key.isdigit()):
         number = int(key)
-        if number < len(names):
-            return names[number], columns[names[number]]
+        if 0 <= number < len(names):
+            return names[number]
     elif key in columns:
-        return key, columns[key]
+        return key
     raise ValueError(
-        f"{path.name}: {role} column {key!r} is missing; there are {', '.join(names)}"
+        f"{source}: {role} column {key!r} is missing; there are {', '.join(names)}"
     )
 
 
-def _time_step(time: np.ndarray, path: Path) -> float:
-    bad = np.flatnonzero(~np.isfinite(time))
-    if bad.size:
-        raise ValueError(f"{path.name}: time is missing at sample {bad[0]}")
+def _time_step(time: np.ndarray, source: str) -> float:
+    """Return the step of a uniform time axis, s."""
     if time.size < 2:
         raise ValueError(
-            f"{path.name}: {time.size} samples; at least {SHORTEST} are needed"
+            f"{source}: {time.size} samples; at least {SHORTEST} are needed"
         )
     steps = np.diff(time)
     if np.any(steps <= 0):
         sample = int(np.flatnonzero(steps <= 0)[0]) + 1
-        raise ValueError(f"{path.name}: time does not increase at sample {sample}")
+        raise ValueError(f"{source}: time does not increase at sample {sample}")
     dt = float(np.median(steps))
     uneven = np.flatnonzero(np.abs(steps - dt) > UNIFORM * dt)
     if uneven.size:
         sample = int(uneven[0]) + 1
         raise ValueError(
-            f"{path.name}: time is not uniform: step {steps[sample - 1]:g} s at sample "
+            f"{source}: time is not uniform: step {steps[sample - 1]:g} s at sample "
             f"{sample}, {dt:g} s elsewhere"
         )
     return float((time[-1] - time[0]) / (time.size - 1))

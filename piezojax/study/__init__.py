@@ -20,8 +20,7 @@ def shipped(name: str = DEFAULT) -> Path:
     here = Path(__file__).parents[1]
     # In an installed package the studies lie inside it, in a checkout beside it.
     folder = here / "studies" if (here / "studies").is_dir() else here.parent / "tuning"
-    path = folder / f"{name}.toml"
-    if not path.is_file():
-        known = sorted(file.stem for file in folder.glob("*.toml"))
+    known = {file.stem: file for file in sorted(folder.glob("*.toml"))}
+    if name not in known:
         raise ValueError(f"study {name!r} is unknown; there are {', '.join(known)}")
-    return path
+    return known[name]

@@ -1,21 +1,23 @@
 """A study made ready to run: files read, plant fitted, loop and search space built."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
+from .._types import as_array
 from ..catalog import CONTROLLERS, PLANTS
 from ..control.design import DESIGNS
 from ..hardware import Quantiser, Saturation, Sensor, SlewLimit
 from ..identify import Fit, identify, read_record
 from ..paths import replace, static_fields
-from ..serial import from_data
+from ..serial import from_data, to_data
 from ..serial import load as load_system
 from ..space import Space, space_of
-from ..system import Feedback, System, series
+from ..system import Feedback, Observation, System, rest_output, series
 from .schema import RecordPlant, Study, load, one_of, validated
 
 
@@ -50,6 +52,10 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         CONTROLLERS,
         design=lambda name: DESIGNS[one_of(name, DESIGNS)](plant, study.dt),
     )
+    zero = as_array(0.0)
+    _check_role(plant, zero, "plant", "a voltage to a displacement")
+    seen = Observation(zero, zero, zero, zero)
+    _check_role(controller, seen, "controller", "an Observation to a command")
     loop = Feedback(controller, plant, _actuator(study), _sensor(study))
     loop, space = _search_space(study, loop)
     _check_rates(study, loop)
@@ -65,6 +71,8 @@ def _plant(study: Study, folder: Path) -> tuple[System, Fit | None]:
     table = study.plant
     if "record" not in table:
         return _choice(table, "plant", folder, PLANTS), None
+    if set(table) & {"catalog", "file", "type"}:
+        raise _not_one_way(table, "plant", ("catalog", "file", "type", "record"))
     wanted = validated(RecordPlant, table, "plant")
     record = read_record(
         folder / wanted.record,
@@ -114,16 +122,49 @@ def _search_space(study: Study, loop: Feedback) -> tuple[Feedback, Space]:
         {path: (b.lower, b.upper, b.transform) for path, b in bounds.items()}
     )
     space.start(loop)
+    _check_values(study, loop)
     return loop, space
+
+
+def _check_values(study: Study, loop: Feedback) -> None:
+    """Build the controller at every start and bound, so that its own checks speak."""
+    for path, bound in study.parameters.items():
+        values = {"start": bound.start, "lower": bound.lower, "upper": bound.upper}
+        for name, value in values.items():
+            if value is None:
+                continue
+            try:
+                from_data(to_data(replace(loop, {path: value}).controller))
+            except ValueError as error:
+                raise ValueError(f"parameters.{path}.{name}: {error}") from None
+
+
+def _check_role(system: System, example: Any, where: str, role: str) -> None:
+    """Raise ValueError unless ``system`` can start at and step on ``example``."""
+    try:
+        eqx.filter_eval_shape(rest_output, system, example)
+    except (AttributeError, TypeError):
+        raise ValueError(
+            f"{where} is a {type(system).__name__}; it must map {role}"
+        ) from None
 
 
 def _check_rates(study: Study, loop: Feedback) -> None:
     for dt in static_fields(loop, "dt"):
-        if not np.isclose(dt, study.dt, rtol=1e-9):
+        if not np.isclose(dt, study.dt, rtol=1e-9, atol=0.0):
             raise ValueError(
                 f"rate is {study.rate:g} Hz, but the controller or plant was made for "
                 f"{1.0 / dt:g} Hz"
             )
+
+
+def _not_one_way(
+    table: Mapping[str, Any], where: str, allowed: Iterable[str]
+) -> ValueError:
+    return ValueError(
+        f"{where} has the keys {', '.join(table) or 'none'}; "
+        f"it must have exactly one of {', '.join(allowed)}"
+    )
 
 
 def _choice(
@@ -144,11 +185,8 @@ def _choice(
     given = [way for way in ways if way in table]
     extra = [key for key in table if key not in ways] if "type" not in table else []
     if len(given) != 1 or extra:
-        allowed = ", ".join([*ways, *(["record"] if where == "plant" else [])])
-        raise ValueError(
-            f"{where} has the keys {', '.join(table) or 'none'}; "
-            f"it must have exactly one of {allowed}"
-        )
+        allowed = (*ways, *(["record"] if where == "plant" else []))
+        raise _not_one_way(table, where, allowed)
     try:
         return ways[given[0]]()
     except ValueError as error:

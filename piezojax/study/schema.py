@@ -19,9 +19,9 @@ from ..identify import MODELS
 from ..optimisers import METHODS
 from ..space import Transform
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 
 
 class Table(BaseModel):
@@ -62,6 +62,8 @@ class References(Table):
     def _signals(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         for name in names:
             signals.parse(name)
+            if names.count(name) > 1:
+                raise ValueError(f"{name} is listed twice")
         return names
 
     @model_validator(mode="after")
@@ -94,6 +96,15 @@ class Actuator(Table):
     slew_rate: Positive | None = None
     resolution: Positive | None = None
 
+    @model_validator(mode="after")
+    def _ordered(self) -> "Actuator":
+        if self.lower >= self.upper:
+            raise ValueError(
+                f"lower is {self.lower:g} V and upper {self.upper:g} V; "
+                "lower must be below upper"
+            )
+        return self
+
 
 class SensorTable(Table):
     """Noise and resolution of the sensor, um."""
@@ -108,7 +119,7 @@ class ObjectiveTable(Table):
     aggregate: Literal["geometric_mean", "mean_square", "worst"] = "geometric_mean"
     effort_weight: NotNegative = 0.0
     slew_weight: NotNegative = 0.0
-    noise_draws: Annotated[int, Field(ge=1, le=64)] = 1
+    noise_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
 
 
 class OptimiserTable(Table):
@@ -119,9 +130,9 @@ class OptimiserTable(Table):
     """
 
     method: str = "bfgs"
-    starts: Annotated[int, Field(ge=1, le=256)] = 8
-    candidates: Annotated[int, Field(ge=0, le=65536)] = 64
-    steps: Annotated[int, Field(ge=1, le=10000)] = 60
+    starts: Annotated[int, Field(strict=True, ge=1, le=256)] = 8
+    candidates: Annotated[int, Field(strict=True, ge=0, le=65536)] = 64
+    steps: Annotated[int, Field(strict=True, ge=1, le=10000)] = 60
     tolerance: Positive = 1e-4
 
     @field_validator("method")
@@ -135,7 +146,7 @@ class Study(Table):
 
     title: str
     rate: Positive
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(strict=True, ge=0)] = 0
     plant: dict[str, Any]
     actuator: Actuator
     sensor: SensorTable = SensorTable()
@@ -144,7 +155,34 @@ class Study(Table):
     parameters: dict[str, Bounds] = Field(min_length=1)
     objective: ObjectiveTable = ObjectiveTable()
     optimiser: OptimiserTable = OptimiserTable()
-    holdout_draws: Annotated[int, Field(ge=1, le=64)] = 1
+    holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _quoted(cls, tables: Any) -> Any:
+        for key, table in tables.items() if isinstance(tables, dict) else ():
+            if isinstance(table, dict) and any(
+                isinstance(value, dict) for value in table.values()
+            ):
+                raise ValueError(
+                    f'a path must stand in quotes, as in "{key}.{next(iter(table))}"'
+                )
+        return tables
+
+    @model_validator(mode="after")
+    def _sampled(self) -> "Study":
+        table = self.references
+        samples = round(table.duration * self.rate)
+        if samples < 2:
+            raise ValueError(
+                f"references.duration is {table.duration:g} s, {samples} samples; "
+                "it takes 2 or more"
+            )
+        if round(table.settle * self.rate) >= samples:
+            raise ValueError(
+                f"references.settle is {table.settle:g} s; no sample is left after it"
+            )
+        return self
 
     @model_validator(mode="after")
     def _least_squares(self) -> "Study":
@@ -165,7 +203,7 @@ class Study(Table):
 
 def one_of(name: str, allowed: Any) -> str:
     """Return ``name``; raise ValueError, listing ``allowed``, if it is not in there."""
-    if name not in allowed:
+    if not isinstance(name, str) or name not in allowed:
         raise ValueError(f"{name!r} is unknown; there are {', '.join(allowed)}")
     return name
 
@@ -195,7 +233,7 @@ def _first_line(error: ValidationError, kind: type[BaseModel], where: str) -> st
     message = first["msg"].removeprefix("Value error, ")
     value = first["input"]
     shown = f" is {value!r}" if isinstance(value, str | int | float) else ""
-    return f"{key}{shown}: {message}"
+    return f"{key}{shown}: {message}" if key else message
 
 
 def load(path: str | Path) -> Study:

@@ -1,0 +1,130 @@
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from piezojax import PID, Tracking, loop_inputs, paths, signals, simulate
+from piezojax.catalog import p753
+
+SAMPLES = 1000
+TIME = signals.time_grid(SAMPLES / p753.RATE, p753.RATE)
+DRAWS = np.random.default_rng(12).normal(size=SAMPLES)
+QUIET = np.zeros(SAMPLES)
+
+LOOPS = {
+    "pid": p753.loop(PID(0.5, 3000.0, 1e-5, 1e-4, 100.0, dt=p753.DT)),
+    "sliding mode": p753.loop(p753.sliding_mode()),
+    "inversion": p753.loop(p753.inversion()),
+    "observer": p753.loop(p753.disturbance_observer()),
+}
+
+
+def reference(name, **options):
+    return np.asarray(signals.signal(name, TIME, **options))
+
+
+RUNS = {
+    "with noise": (reference("SIN50"), DRAWS),
+    "turning points on samples": (reference("TRI50"), QUIET),
+    "a jump": (reference("STEP20"), QUIET),
+    "rest at zero": (QUIET, QUIET),
+    "rest at 5 um": (QUIET + 5.0, QUIET),
+    "saturation": (reference("SIN50", amplitude=15.0), DRAWS),
+}
+
+
+class Compiled(NamedTuple):
+    names: list[str]
+    values: np.ndarray
+    scale: np.ndarray  # relative steps, but absolute for what is zero
+    reverse: jax.stages.Wrapped
+    forward: jax.stages.Wrapped
+    batch: jax.stages.Wrapped
+
+
+@pytest.fixture(scope="module", params=LOOPS)
+def loop(request):
+    """One compilation each of everything, for all parameters and runs at once."""
+    loop = LOOPS[request.param]
+    arrays, static = eqx.partition(loop, eqx.is_array)
+    flat, unravel = ravel_pytree(arrays)
+
+    def rebuilt(values):
+        return eqx.combine(unravel(values), static)
+
+    def figures(values, run):
+        loop, (reference, draws) = rebuilt(values), run
+        inputs, state = loop_inputs(reference, draws), loop.init(reference[0])
+        return simulate(loop, inputs, state, metric=Tracking(10))[1]
+
+    def loss(values, run):
+        return figures(values, run).rms_error
+
+    values = np.array(flat)
+    return Compiled(
+        names=list(paths.parameters(loop)),
+        values=values,
+        scale=np.where(values == 0.0, 1.0, np.abs(values)),
+        reverse=jax.jit(jax.value_and_grad(loss)),
+        forward=jax.jit(jax.jacfwd(loss)),
+        batch=jax.jit(jax.vmap(figures, in_axes=(0, None))),
+    )
+
+
+def differences(loop, run, step=1e-6):
+    """Fourth-order central differences for a relative change of each parameter.
+
+    Small steps: the slope of hysteresis and limits jumps where a voltage turns or
+    reaches its limit, which is between two points of a larger one.
+    """
+    moves = step * np.diag(loop.scale)
+    points = [loop.values + times * moves for times in (1, -1, 2, -2)]
+    losses = loop.batch(np.concatenate(points), run).rms_error.reshape(4, -1)
+    return (8.0 * (losses[0] - losses[1]) - (losses[2] - losses[3])) / (12.0 * step)
+
+
+def assert_close(found, expected, names, rtol, atol):
+    for name, one, other in zip(names, found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=rtol, atol=atol, err_msg=name)
+
+
+@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
+def test_reverse_is_forward_and_finite(loop, run):
+    reverse = loop.reverse(loop.values, run)[1] * loop.scale
+    forward = loop.forward(loop.values, run) * loop.scale
+    assert np.all(np.isfinite(reverse))
+    floor = 1e-12 * max(np.abs(forward).max(), 1.0)
+    assert_close(reverse, forward, loop.names, rtol=1e-9, atol=floor)
+
+
+@pytest.mark.parametrize(
+    "name", ["with noise", "turning points on samples", "a jump", "saturation"]
+)
+def test_gradient_is_that_of_differences(loop, name):
+    loss, gradient = loop.reverse(loop.values, RUNS[name])
+    expected = differences(loop, RUNS[name])
+    assert np.count_nonzero(expected) > len(loop.names) / 2
+    assert_close(
+        gradient * loop.scale, expected, loop.names, rtol=1e-4, atol=3e-9 * loss
+    )
+
+
+@pytest.mark.parametrize("name", ["rest at zero", "rest at 5 um"])
+def test_no_parameter_moves_a_loop_at_rest(loop, name):
+    loss, gradient = loop.reverse(loop.values, RUNS[name])
+    assert loss < 1e-9
+    np.testing.assert_allclose(gradient * loop.scale, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_runs_are_what_they_are_called(loop, name):
+    points = np.tile(loop.values, (4 * loop.values.size, 1))
+    figures = jax.tree.map(lambda x: x[0], loop.batch(points, RUNS[name]))
+    if name == "saturation":
+        assert 0.1 < figures.saturated < 1.0
+    if name in ("with noise", "rest at zero", "rest at 5 um"):
+        assert figures.saturated == 0.0
+    assert (figures.peak_error < 1e-9) == name.startswith("rest")

@@ -1,0 +1,258 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import control, signals
+from oracles.loop import closed_loop
+from oracles.published import plant_t2, smc_gains
+
+from piezojax import (
+    ARMA,
+    PID,
+    AlphaBeta,
+    Delay,
+    DisturbanceObserverControl,
+    Feedback,
+    Sensor,
+    SlidingModePID,
+    series,
+    simulate,
+)
+from piezojax.catalog import p753
+from piezojax.system import LoopInput
+
+SAMPLES = 20_000  # 1 s
+NOISE_RMS = 0.012
+DRAWS = np.random.default_rng(11).normal(size=SAMPLES)
+
+PID_GAINS = {
+    "P": 0.5,
+    "I": 3000.0,
+    "D": 1e-5,
+    "derivative_filter": 1e-4,
+    "anti_windup": 100.0,
+}
+
+
+def pid():
+    return PID(*PID_GAINS.values(), dt=p753.DT)
+
+
+# Name: the package's controller; the oracle's kind and gains.
+CONTROLLERS = {
+    "pid": (pid(), "pid", PID_GAINS),
+    "sliding mode": (p753.sliding_mode("5-4"), "smc", smc_gains("smc", "5-5")),
+    "inversion": (p753.inversion(), "inversion", smc_gains("inversion", "5-3")),
+    "observer": (p753.disturbance_observer(), "dob", smc_gains("dob", "5-3")),
+    "printed observer": (
+        p753.disturbance_observer(coefficients="printed"),
+        "dob",
+        {**smc_gains("dob", "5-3"), "q_corrected": False},
+    ),
+}
+PLANTS = {
+    "exact": (p753.plant("exact"), plant_t2("exact")),
+    "trapezoid": (p753.plant(), plant_t2("trapezoid")),
+    "delayed": (
+        series(
+            hysteresis=p753.hysteresis("exact"),
+            delay=Delay(1),
+            dynamics=p753.plant().parts[1],
+        ),
+        plant_t2("exact", delay=1),
+    ),
+}
+
+
+def published_references():
+    found = signals.ten_references()
+    return np.stack([found["SIN10"], found["SW50"], found["PWSW30"]])
+
+
+def gentle_references():
+    # All within reach, and from rest: SW starts at 8 um and is faded in.
+    references = published_references()
+    references[1] *= np.minimum(np.arange(SAMPLES + 1) / 2000, 1.0)
+    return references
+
+
+def hard_references():
+    # SW jumps to its start; 20 um are out of reach, so the voltage saturates.
+    references = published_references()
+    references[1, :2] = 0.0
+    return np.stack([*references, signals.sine(7, 10.0, 1.0 + 1.0 / p753.RATE)])
+
+
+REFERENCES = {
+    "pid": hard_references,
+    "sliding mode": hard_references,
+    # Where the inverse clips, the oracle goes on from what was asked for, the package
+    # from what was applied: see the test below.
+    "inversion": gentle_references,
+    # Out of reach, the observer winds up and rounding errors grow on the way back.
+    "observer": lambda: hard_references()[:3],
+    "printed observer": lambda: hard_references()[:3],
+}
+
+
+@jax.jit
+def run(loop, references):
+    def one(reference):
+        inputs = LoopInput(reference[1:], DRAWS)
+        return simulate(loop, inputs, loop.init(0.0))
+
+    return jax.vmap(one)(references)
+
+
+def around(controller, plant):
+    return Feedback(controller, plant, p753.actuator(), Sensor(NOISE_RMS))
+
+
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS)
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_loop_is_the_published_one(name, plant):
+    controller, kind, gains = CONTROLLERS[name]
+    references = REFERENCES[name]()
+    if plant is PLANTS["delayed"]:
+        references = references[1:]
+    samples = run(around(controller, plant[0]), references)[1]
+    clipped = False
+    for lane, reference in enumerate(references):
+        expected = closed_loop(
+            kind, reference, plant[1], gains, noise=NOISE_RMS * DRAWS
+        )
+        clipped |= np.any(expected["command"] != expected["voltage"])
+        assert np.abs(expected["displacement"]).max() < 25.0  # stable
+        for column, values in expected.items():
+            found = getattr(samples, column)[lane]
+            np.testing.assert_allclose(
+                found, values, rtol=0.0, atol=1e-9, err_msg=column
+            )
+        np.testing.assert_array_equal(samples.reference[lane], reference[:-1])
+    assert clipped == (name != "inversion")
+
+
+def test_the_model_of_the_inverse_is_the_stage_also_after_clipping():
+    loop = around(p753.inversion(), p753.plant())
+    state, samples = run(loop, hard_references()[-1:])
+    clipped = samples.command != samples.voltage
+    assert 0.1 < np.mean(clipped) < 0.9
+    state = jax.tree.map(lambda x: x[0], state)
+    # The controller has yet to see the last voltage.
+    model = loop.controller.inverse.model
+    ahead = model.step(state.controller.hysteresis, state.voltage)[0]
+    stage = state.plant[0]
+    np.testing.assert_allclose(ahead[:2], stage[:2], rtol=0.0, atol=1e-12)
+    # Back within reach it follows again.
+    error = samples.displacement - samples.reference
+    assert np.abs(error[0, -200:]).max() < 0.5
+
+
+def test_anti_windup_brings_the_stage_back_sooner():
+    reference = hard_references()[-1:]
+    late = []
+    for rate in (0.0, 1e3):
+        controller = eqx.tree_at(lambda c: c.anti_windup, pid(), jnp.array(rate))
+        samples = run(around(controller, p753.plant()), reference)[1]
+        late.append(np.mean((samples.voltage == 120.0) & (reference[:, :-1] < 16.0)))
+    assert late[1] < 0.1 * late[0]
+
+
+def test_alpha_beta_is_the_published_filter():
+    measured = np.cumsum(DRAWS)[:2000]
+    oracle = control.AlphaBeta(0.1, 1e-4, p753.DT)
+    expected = np.array([oracle.step(z) for z in measured])
+    found = simulate(AlphaBeta(0.1, 1e-4, p753.DT), jnp.array(measured))[1]
+    np.testing.assert_allclose(found.position, expected[:, 0], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(found.velocity, expected[:, 1], rtol=1e-9, atol=1e-6)
+
+
+def test_q_filter_is_the_published_one():
+    for name, corrected in (("corrected", True), ("printed", False)):
+        controller = p753.disturbance_observer(coefficients=name)
+        expected = control.q_filter(
+            controller.model.moving, 500.0, p753.RATE, corrected
+        )
+        np.testing.assert_allclose(controller.denominator(), expected, rtol=1e-12)
+
+
+def test_corrected_q_filter_has_its_double_pole_at_the_cut_off():
+    controller = p753.disturbance_observer()
+    wt = 500.0 * p753.DT
+    mapped = (2.0 - wt) / (2.0 + wt)  # bilinear image of -cutoff
+    c = np.array(controller.denominator())
+    np.testing.assert_allclose(c[1:] / c[0], [-2.0 * mapped, mapped**2], rtol=1e-9)
+    np.testing.assert_allclose(c.sum(), sum(controller.model.moving), rtol=1e-9)
+
+
+DT = p753.DT
+SECOND_ORDER = p753.disturbance_observer().model
+FIRST_ORDER = ARMA((0.5,), (0.5,))
+
+
+def sliding_mode(**changes):
+    parameters = {
+        "proportional": 0.01,
+        "integral": 30.0,
+        "derivative": 1e-6,
+        "surface": 18e3,
+        "error_weight": 1.0,
+        "control_weight": 100.0,
+        "model": SECOND_ORDER,
+        "filter": AlphaBeta(0.1, 1e-4, DT),
+    }
+    return SlidingModePID(**{**parameters, **changes})
+
+
+def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
+    return DisturbanceObserverControl(pid(), model, gain, cutoff, dt, **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PID(1.0, 1.0, dt=0.0), "sample time in s is 0; it must be finite"),
+        (
+            lambda: PID(1.0, 1.0, derivative_filter=-1e-4, dt=DT),
+            "derivative filter in s is -0.0001; it must be finite and at least 0",
+        ),
+        (
+            lambda: PID(1.0, 1.0, anti_windup=-1.0, dt=DT),
+            "anti-windup rate in 1/s is -1; it must be finite and at least 0",
+        ),
+        (
+            lambda: sliding_mode(model=FIRST_ORDER),
+            "the model has 1 a and 1 b coefficients; it must have 2 and 3",
+        ),
+        (
+            lambda: sliding_mode(error_weight=0.0),
+            "error_weight Q is 0; it must be finite and above 0",
+        ),
+        (
+            lambda: sliding_mode(control_weight=-1.0),
+            "control_weight R is -1; it must be finite and at least 0",
+        ),
+        (lambda: AlphaBeta(0.0, 0.1, DT), "alpha is 0; it must be finite and above 0"),
+        (lambda: AlphaBeta(1.1, 0.1, DT), r"alpha is 1\.1; .* at most 1"),
+        (lambda: AlphaBeta(0.1, 2.0, DT), "beta is 2; it must be finite and at least"),
+        (lambda: AlphaBeta(0.1, 0.1, -DT), "sample time in s is -5e-05"),
+        (
+            lambda: observer(FIRST_ORDER),
+            "the model has 1 a and 1 b coefficients; it must have 2 and 3",
+        ),
+        (lambda: observer(gain=0.0), "gain K_e in um/V is 0; it must be finite and"),
+        (
+            lambda: observer(cutoff=7e4),
+            "cut-off in rad/s is 70000; it must be finite and above 0 and below 62831",
+        ),
+        (lambda: observer(dt=0.0), "sample time in s is 0"),
+        (
+            lambda: observer(coefficients="right"),
+            "coefficients 'right'; it must be one of .*'corrected', 'printed'",
+        ),
+    ],
+)
+def test_bad_parameters_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

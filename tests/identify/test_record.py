@@ -1,0 +1,423 @@
+"""Reading a lab's record, and what is said about a bad one."""
+
+import re
+
+import numpy as np
+import pytest
+
+from piezojax import Record, read_record
+from piezojax.identify.record import SHORTEST
+
+SAMPLES = 60
+TIME = np.arange(SAMPLES) * 1e-3
+DRIVE = 10.0 * np.sin(2.0 * np.pi * 50.0 * TIME)
+SENSOR = 0.1 * DRIVE + 3.0
+ROWS = [
+    [repr(float(cell)) for cell in row] for row in zip(TIME, DRIVE, SENSOR, strict=True)
+]
+HEADER = ["time_s", "drive_V", "sensor_um"]
+COLUMNS = {"time": "time_s", "input": "drive_V", "output": "sensor_um"}
+
+
+def text_of(rows, header=HEADER, delimiter=","):
+    lines = [header, *rows] if header else rows
+    return "".join(delimiter.join(line) + "\n" for line in lines)
+
+
+def changed(sample, column, cell):
+    rows = [list(row) for row in ROWS]
+    rows[sample][column] = cell
+    return rows
+
+
+@pytest.fixture
+def write(tmp_path):
+    def written(content, name="record.csv"):
+        path = tmp_path / name
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        else:
+            path.write_text(content, encoding="utf-8")
+        return path
+
+    return written
+
+
+@pytest.fixture
+def write_npz(tmp_path):
+    def written(**arrays):
+        path = tmp_path / "record.npz"
+        np.savez(path, **arrays)
+        return path
+
+    return written
+
+
+def assert_is_the_record(record):
+    np.testing.assert_array_equal(record.input, DRIVE)
+    np.testing.assert_array_equal(record.output, SENSOR)
+    assert record.dt == pytest.approx(1e-3, rel=1e-12)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", " ", "   "])
+@pytest.mark.parametrize("header", [HEADER, None])
+@pytest.mark.parametrize("name", ["record.csv", "record.txt", "record.dat"])
+def test_text_files(write, delimiter, header, name):
+    path = write(text_of(ROWS, header, delimiter), name)
+    assert_is_the_record(read_record(path, time=0, input=1, output=2))
+
+
+def test_columns_by_name_by_number_and_by_number_as_text(write):
+    path = write(text_of(ROWS))
+    assert_is_the_record(read_record(path, **COLUMNS))
+    assert_is_the_record(read_record(path, time="0", input="1", output="2"))
+    assert_is_the_record(read_record(str(path), time=0, input="drive_V", output=2))
+
+
+def test_the_order_of_the_columns_is_free(write):
+    rows = [row[::-1] for row in ROWS]
+    path = write(text_of(rows, HEADER[::-1]))
+    assert_is_the_record(read_record(path, **COLUMNS))
+
+
+def test_a_column_called_by_a_digit_goes_before_the_number(write):
+    rows = [[row[0], row[2], row[1]] for row in ROWS]
+    path = write(text_of(rows, ["time", "2", "drive"]))
+    assert_is_the_record(read_record(path, time="time", input="drive", output="2"))
+
+
+def test_without_time_the_rate_counts(write):
+    path = write(text_of([row[1:] for row in ROWS], HEADER[1:]))
+    record = read_record(path, rate=250.0)
+    np.testing.assert_array_equal(record.input, DRIVE)
+    assert record.dt == pytest.approx(1.0 / 250.0)
+    np.testing.assert_allclose(record.time, 4.0 * TIME, atol=1e-12)
+
+
+def test_windows_line_ends_byte_order_mark_and_blank_lines(write):
+    text = "\n" + text_of(ROWS).replace("\n", "\r\n") + "\r\n\r\n"
+    record = read_record(write(b"\xef\xbb\xbf" + text.encode()), **COLUMNS)
+    assert_is_the_record(record)
+
+
+def test_quoted_cells(write):
+    rows = [[f'"{cell}"' for cell in row] for row in ROWS]
+    path = write(text_of(rows, ['"time, s"', '"drive_V"', '"sensor_um"']))
+    assert_is_the_record(
+        read_record(path, time="time, s", input="drive_V", output="sensor_um")
+    )
+
+
+def test_npz(write_npz):
+    path = write_npz(t=TIME, drive_V=DRIVE, sensor_um=SENSOR[:, None])
+    record = read_record(path, time="t", input="drive_V", output="sensor_um")
+    assert_is_the_record(record)
+    assert (record.input_unit, record.output_unit) == ("V", "um")
+
+
+@pytest.mark.parametrize(
+    ("header", "units"),
+    [
+        (["t", "drive_V", "sensor_um"], ("V", "um")),
+        (["t", "current_mA", "angle_urad"], ("mA", "urad")),
+        (["t", "the_long_name_kV", "z_nm"], ("kV", "nm")),
+        (["t", "drive", "sensor"], ("V", "um")),
+        (["t", "_V2", "sensor_1"], ("V", "um")),
+        (None, ("V", "um")),
+    ],
+)
+def test_units_come_from_the_names(write, header, units):
+    record = read_record(write(text_of(ROWS, header)), time=0, input=1, output=2)
+    assert (record.input_unit, record.output_unit) == units
+
+
+def test_what_a_record_says_about_itself(write):
+    record = read_record(write(text_of(ROWS), "stage.csv"), **COLUMNS)
+    assert record.source == "stage.csv"
+    assert record.span == pytest.approx(2.0, rel=1e-2)
+    np.testing.assert_allclose(record.time, TIME, atol=1e-15)
+
+
+def test_small_jitter_of_the_clock_is_no_fault(write):
+    jitter = 2e-7 * np.random.default_rng(1).uniform(-1.0, 1.0, SAMPLES)
+    rows = [
+        [repr(float(t)), *row[1:]] for t, row in zip(TIME + jitter, ROWS, strict=True)
+    ]
+    record = read_record(write(text_of(rows)), **COLUMNS)
+    # The mean step, so that the jitter of one sample does not count.
+    assert record.dt == pytest.approx(1e-3, rel=1e-4)
+
+
+def refused(path, message, **options):
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        read_record(path, **(options or COLUMNS))
+    text = str(caught.value)
+    assert path.name in text
+    assert "\n" not in text
+
+
+def test_missing_file(tmp_path):
+    refused(tmp_path / "nowhere.csv", "No such file or directory")
+
+
+def test_a_folder_is_no_record(tmp_path):
+    folder = tmp_path / "folder.csv"
+    folder.mkdir()
+    refused(folder, "Is a directory")
+
+
+@pytest.mark.parametrize("content", ["", "\n\n  \n"])
+def test_empty_file(write, content):
+    refused(write(content), "the file is empty")
+
+
+def test_header_without_rows(write):
+    refused(write(text_of([])), f"0 samples; at least {SHORTEST} are needed")
+
+
+@pytest.mark.parametrize("name", ["record.csv", "record.dat", "record.npz"])
+def test_binary_garbage(write, name):
+    garbage = np.random.default_rng(0).bytes(4096)
+    refused(write(garbage, name), "cannot be read")
+
+
+@pytest.mark.parametrize("role", ["time", "input", "output"])
+@pytest.mark.parametrize("key", ["voltage", 3, "3"])
+def test_missing_column_lists_what_there_is(write, role, key):
+    refused(
+        write(text_of(ROWS)),
+        f"{role} column {key!r} is missing; there are time_s, drive_V, sensor_um",
+        **(COLUMNS | {role: key}),
+    )
+
+
+@pytest.mark.parametrize("cell", ["", "nan", "NaN", "inf", "-inf"])
+@pytest.mark.parametrize(("column", "role"), [(1, "input"), (2, "output")])
+def test_missing_numbers_name_column_and_sample(write, cell, column, role):
+    refused(
+        write(text_of(changed(17, column, cell))),
+        f"{role} column {HEADER[column]!r} is missing or not finite at sample 17 (1",
+    )
+
+
+def test_missing_numbers_are_counted(write):
+    rows = changed(17, 1, "")
+    rows[40][1] = rows[41][1] = ""
+    refused(write(text_of(rows)), "at sample 17 (3 in all)")
+
+
+@pytest.mark.parametrize("cell", ["", "nan", "inf"])
+def test_missing_time(write, cell):
+    refused(
+        write(text_of(changed(9, 0, cell))),
+        "time column 'time_s' is missing or not finite at sample 9",
+    )
+
+
+def test_missing_numbers_in_other_columns_do_not_matter(write):
+    rows = [[*row, ""] for row in ROWS]
+    record = read_record(write(text_of(rows, [*HEADER, "remark"])), **COLUMNS)
+    assert_is_the_record(record)
+
+
+@pytest.mark.parametrize("cell", ["overload", "1,5", "1.2.3", "0x10", "#N/A"])
+def test_text_names_column_sample_and_cell(write, cell):
+    refused(
+        write(text_of(changed(3, 1, cell), delimiter=";")),
+        f"column 'drive_V', sample 3: {cell!r} is no number",
+    )
+
+
+def test_decimal_commas_are_not_taken_for_something_else(write):
+    refused(
+        write(text_of(ROWS, delimiter=";").replace(".", ",")),
+        "column 'time_s', sample 0: '0,0' is no number",
+    )
+
+
+@pytest.mark.parametrize(("width", "found"), [(2, 2), (4, 4)])
+def test_ragged_rows(write, width, found):
+    rows = [list(row) for row in ROWS]
+    rows[12] = (rows[12] + ["1.0"])[:width]
+    refused(
+        write(text_of(rows)), f"sample 12 has {found} columns; the first line has 3"
+    )
+
+
+def test_a_title_above_the_header(write):
+    refused(
+        write("my record\n" + text_of(ROWS)),
+        "sample 0 has 1 columns; the first line has 2",
+    )
+
+
+@pytest.mark.parametrize("samples", [0, 1, 2, SHORTEST - 1])
+def test_short_record(write, samples):
+    refused(
+        write(text_of(ROWS[:samples])),
+        f"{samples} samples; at least {SHORTEST} are needed",
+    )
+
+
+def test_the_shortest_record_that_will_do(write):
+    record = read_record(write(text_of(ROWS[:SHORTEST])), **COLUMNS)
+    assert record.input.size == SHORTEST
+
+
+def test_unsorted_time(write):
+    rows = list(ROWS)
+    rows[20], rows[21] = rows[21], rows[20]
+    refused(write(text_of(rows)), "time does not increase at sample 21")
+
+
+def test_repeated_time(write):
+    refused(
+        write(text_of(changed(30, 0, ROWS[29][0]))),
+        "time does not increase at sample 30",
+    )
+
+
+def test_a_gap_in_time(write):
+    rows = ROWS[:25] + ROWS[27:]
+    refused(
+        write(text_of(rows)),
+        "time is not uniform: step 0.003 s at sample 25, 0.001 s elsewhere",
+    )
+
+
+def test_neither_time_nor_rate(write):
+    refused(
+        write(text_of(ROWS)),
+        "name the time column, or give its rate in Hz",
+        input=1,
+        output=2,
+    )
+
+
+@pytest.mark.parametrize("rate", [0.0, -200.0, float("nan"), float("inf")])
+def test_impossible_rate(write, rate):
+    refused(
+        write(text_of(ROWS)),
+        f"rate is {rate:g} Hz; it must be above 0",
+        input=1,
+        output=2,
+        rate=rate,
+    )
+
+
+@pytest.mark.parametrize(("column", "role"), [(1, "input"), (2, "output")])
+def test_constant_column(write, column, role):
+    rows = [list(row) for row in ROWS]
+    for row in rows:
+        row[column] = "4.0"
+    refused(write(text_of(rows)), f"{role} never changes")
+
+
+def test_columns_of_an_npz_of_different_length(write_npz):
+    path = write_npz(t=TIME, u=DRIVE[:-5], y=SENSOR)
+    refused(path, "columns differ in length: u 55, y 60", time="t", input=1, output=2)
+
+
+def test_npz_with_pickled_objects_is_not_opened(tmp_path):
+    opened = tmp_path / "opened"
+
+    class Trap:
+        def __reduce__(self):
+            return (opened.touch, ())
+
+    path = tmp_path / "record.npz"
+    np.savez(path, u=np.array([Trap()] * 60, dtype=object), y=SENSOR)
+    refused(path, "cannot be read", input="u", output="y", rate=1000.0)
+    assert not opened.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dt": 0.0}, "the sample time is 0 s; it must be above 0"),
+        ({"dt": float("nan")}, "the sample time is nan s; it must be above 0"),
+        ({"input": DRIVE[:10]}, "input has shape (10,) and output (60,)"),
+        ({"input": np.zeros(SAMPLES)}, "input never changes"),
+        ({"output": np.full(SAMPLES, np.nan)}, "not finite at sample 0 (60 in all)"),
+    ],
+)
+def test_a_record_made_by_hand_is_checked_too(change, message):
+    good = {"input": DRIVE, "output": SENSOR, "dt": 1e-3, "source": "bench"}
+    assert Record(**good).span > 0
+    with pytest.raises(ValueError, match="^bench: .*" + re.escape(message)):
+        Record(**(good | change))
+
+
+def test_missing_numbers_name_the_column_as_the_file_does(write):
+    refused(write(text_of(changed(17, 1, ""))), "drive_V")
+
+
+def test_repeated_column_names(write):
+    # Numbers count the columns that are left: input=1 is then the sensor.
+    path = write(text_of(ROWS, ["t", "t", "sensor_um"]))
+    refused(path, "'t'", rate=1000.0, input=1, output=2)
+
+
+def test_one_column_for_two_roles(write):
+    # The default input is column 0, which is the time in most files.
+    refused(write(text_of(ROWS)), "time_s", time="time_s", output=2)
+
+
+def test_time_in_milliseconds_is_not_taken_for_seconds(write):
+    path = write(text_of(ROWS, ["time_ms", "drive_V", "sensor_um"]))
+    try:
+        record = read_record(path, time=0, input=1, output=2)
+    except ValueError:
+        return
+    assert record.dt == pytest.approx(1e-6)
+
+
+def test_a_unit_in_brackets_is_not_taken_for_micrometres(write):
+    path = write(text_of(ROWS, ["time [s]", "drive [V]", "sensor [nm]"]))
+    assert read_record(path, time=0, input=1, output=2).output_unit == "nm"
+
+
+def test_text_in_the_first_row_of_a_file_without_header(write):
+    refused(
+        write(text_of(changed(0, 1, "oops"), None)), "oops", time=0, input=1, output=2
+    )
+
+
+def test_npz_time_of_another_length(write_npz):
+    path = write_npz(t=TIME[:-5], u=DRIVE, y=SENSOR)
+    refused(path, "length", time="t", input="u", output="y")
+
+
+def test_npz_matrix_is_no_column(write_npz):
+    pair = np.stack([DRIVE, SENSOR], axis=1)
+    refused(write_npz(u=pair, y=pair), "u", input="u", output="y", rate=1000.0)
+
+
+def test_npz_remark_does_not_spoil_the_columns(write_npz):
+    path = write_npz(t=TIME, u=DRIVE, y=SENSOR, remark="bench 3")
+    assert_is_the_record(read_record(path, time="t", input="u", output="y"))
+
+
+def test_npz_complex_column(write_npz):
+    path = write_npz(u=DRIVE + 1j, y=SENSOR)
+    refused(path, "complex", input="u", output="y", rate=1000.0)
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_npz_cut_short(write_npz):
+    path = write_npz(u=DRIVE, y=SENSOR)
+    path.write_bytes(path.read_bytes()[:600])
+    try:
+        read_record(path, input="u", output="y", rate=1000.0)
+    except Exception as error:
+        # Not the error itself: it would keep the file open beyond this test.
+        kind, text = type(error), str(error)
+    assert issubclass(kind, ValueError)
+    assert "cannot be read" in text
+
+
+def test_npz_garbage_does_not_advise_to_unpickle(write):
+    path = write(b"garbage", "record.npz")
+    with pytest.raises(ValueError, match="cannot be read") as caught:
+        read_record(path, rate=1000.0)
+    assert "unsafely" not in str(caught.value)

@@ -1,0 +1,149 @@
+"""Results are written whole or not at all, and never over older ones."""
+
+import os
+import stat
+
+import pytest
+
+from piezojax import files
+from piezojax.files import fresh_folder, numbered_folder, write_bytes, write_text
+
+
+def names(folder):
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_write_text(tmp_path):
+    write_text(tmp_path / "a.txt", "µm\n")
+    assert (tmp_path / "a.txt").read_bytes() == b"\xc2\xb5m\n"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_written_files_can_be_read_by_others(tmp_path):
+    write_text(tmp_path / "a.txt", "x")
+    assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == 0o644
+
+
+def test_writing_again_replaces(tmp_path):
+    write_bytes(tmp_path / "a.bin", b"a long first version")
+    write_bytes(tmp_path / "a.bin", b"short")
+    assert (tmp_path / "a.bin").read_bytes() == b"short"
+
+
+class DiskFullError(OSError):
+    pass
+
+
+def disk_full(*_):
+    raise DiskFullError(28, "No space left on device")
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("step", ["fdopen", "chmod", "replace"])
+@pytest.mark.parametrize(
+    ("fault", "kind"), [(disk_full, DiskFullError), (interrupt, KeyboardInterrupt)]
+)
+def test_a_fault_in_the_middle_leaves_the_old_file(
+    tmp_path, monkeypatch, step, fault, kind
+):
+    path = tmp_path / "result.json"
+    write_text(path, "old")
+    if step == "fdopen":
+        opened = os.fdopen
+
+        class HalfWritten:
+            def __init__(self, handle, mode):
+                self.file = opened(handle, mode)
+
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *_):
+                self.file.close()
+
+            def write(self, content):
+                self.file.write(content[:1])
+                fault()
+
+        monkeypatch.setattr(files.os, "fdopen", HalfWritten)
+    else:
+        monkeypatch.setattr(files.os, step, fault)
+    with pytest.raises(kind):
+        write_text(path, "new and longer")
+    monkeypatch.undo()
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["result.json"]
+
+
+def test_fresh_folder_is_made_with_its_parents(tmp_path):
+    path = tmp_path / "a" / "b"
+    assert fresh_folder(path) == path
+    assert path.is_dir()
+    assert names(path) == []
+
+
+def test_an_empty_folder_will_do(tmp_path):
+    assert fresh_folder(tmp_path) == tmp_path
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("occupant", ["result.json", ".hidden"])
+def test_a_used_folder_is_refused_and_left_alone(tmp_path, occupant):
+    (tmp_path / occupant).write_text("mine")
+    with pytest.raises(ValueError, match="already holds results; name a new") as caught:
+        fresh_folder(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+    assert names(tmp_path) == [occupant]
+    assert (tmp_path / occupant).read_text() == "mine"
+
+
+def test_a_file_is_no_folder(tmp_path):
+    path = tmp_path / "out"
+    path.write_text("mine")
+    with pytest.raises(ValueError, match=f"--out {path} cannot be written: File exi"):
+        fresh_folder(path)
+    assert path.read_text() == "mine"
+
+
+def test_a_folder_under_a_file_cannot_be_written(tmp_path):
+    # Fails even for root, unlike a folder without write permission.
+    (tmp_path / "file").write_text("mine")
+    path = tmp_path / "file" / "sub"
+    with pytest.raises(ValueError, match=f"--out {path} cannot be written: Not a dir"):
+        fresh_folder(path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+@pytest.mark.parametrize("below", ["", "sub"])
+def test_a_folder_without_permission(tmp_path, below):
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(ValueError, match="cannot be written: Permission denied"):
+            fresh_folder(tmp_path / below)
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_a_folder_that_takes_no_files(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(files.Path, "touch", refuse)
+    with pytest.raises(ValueError, match="cannot be written: Permission denied"):
+        fresh_folder(tmp_path / "new")
+
+
+def test_numbered_folders(tmp_path):
+    stem = tmp_path / "p753"
+    assert numbered_folder(stem) == stem
+    assert not stem.exists()
+    stem.mkdir()
+    assert numbered_folder(stem) == stem  # empty: still free
+    (stem / "result.json").write_text("{}")
+    assert numbered_folder(stem) == tmp_path / "p753-2"
+    (tmp_path / "p753-2").write_text("a file of that name is in the way")
+    assert numbered_folder(stem) == tmp_path / "p753-3"
+    assert numbered_folder(stem) == fresh_folder(numbered_folder(stem))

@@ -1,0 +1,106 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from piezojax import Tracking
+from piezojax.system import LoopSample
+
+SAMPLES = 300
+
+
+def record(seed=10):
+    """A made-up run: no loop is needed to check its figures."""
+    draw = np.random.default_rng(seed).normal
+    reference, voltage = 5.0 + draw(size=SAMPLES), 20.0 * draw(size=SAMPLES)
+    displacement = reference + 0.1 * draw(size=SAMPLES)
+    shortfall = np.random.default_rng(seed).choice([0.0, 0.05, 30.0], SAMPLES)
+    columns = reference, displacement, displacement, voltage + shortfall, voltage
+    return LoopSample(*map(jnp.array, columns))
+
+
+@jax.jit
+def figures(metric, samples):
+    def add(carry, sample):
+        total, index = carry
+        return (metric.update(total, index, sample), index + 1), None
+
+    (total, _), _ = jax.lax.scan(add, (metric.init(), 0), samples)
+    return metric.result(total)
+
+
+@pytest.mark.parametrize("start", [0, 1, 100, SAMPLES - 1])
+def test_figures_are_those_of_the_window(start):
+    run = record()
+    found = figures(Tracking(start), run)
+    error = np.asarray(run.displacement - run.reference)[start:]
+    voltage = np.asarray(run.voltage)[start:]
+    # A change counts if both of its samples are inside.
+    changes = np.diff(voltage)
+    expected = {
+        "rms_error": np.sqrt(np.mean(error**2)),
+        "peak_error": np.abs(error).max(),
+        "rms_effort": np.sqrt(np.mean(voltage**2)),
+        "rms_slew": np.sqrt(np.sum(changes**2) / error.size),
+        "saturated": np.mean((np.asarray(run.command)[start:] - voltage) > 0.1),
+        "peak_voltage": np.abs(voltage).max(),
+    }
+    assert set(expected) == set(found._fields)
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(found, name), value, rtol=1e-12, atol=1e-15)
+
+
+def test_tolerance_says_what_counts_as_saturated():
+    run = record()
+    shortfall = np.abs(run.command - run.voltage)
+    for tolerance in (0.01, 0.1, 50.0):
+        found = figures(Tracking(tolerance=tolerance), run).saturated
+        np.testing.assert_allclose(found, np.mean(shortfall > tolerance), rtol=1e-12)
+    assert figures(Tracking(tolerance=0.01), run).saturated > 0.5
+
+
+def test_both_signs_of_a_shortfall_count():
+    run = record()
+    mirrored = run._replace(command=-run.command, voltage=-run.voltage)
+    assert figures(Tracking(), run) == figures(Tracking(), mirrored)
+
+
+def test_a_window_beyond_the_run_is_zero():
+    assert figures(Tracking(SAMPLES), record()) == (0.0,) * 6
+
+
+def test_gradient_at_zero_error_is_zero():
+    run = record()
+    run = run._replace(
+        displacement=run.reference, voltage=0.0 * run.voltage, command=0.0 * run.command
+    )
+
+    def total(displacement, voltage):
+        found = figures(
+            Tracking(), run._replace(displacement=displacement, voltage=voltage)
+        )
+        return sum(found)
+
+    assert float(total(run.displacement, run.voltage)) == 0.0
+    for slope in jax.grad(total, argnums=(0, 1))(run.displacement, run.voltage):
+        assert np.all(np.isfinite(slope))
+    smooth = jax.grad(
+        lambda d: figures(Tracking(), run._replace(displacement=d)).rms_error
+    )
+    np.testing.assert_array_equal(smooth(run.displacement), np.zeros(SAMPLES))
+
+
+def test_gradient_is_the_closed_form():
+    run = record()
+    slope = jax.grad(
+        lambda d: figures(Tracking(100), run._replace(displacement=d)).rms_error
+    )(run.displacement)
+    error = np.array(run.displacement - run.reference)
+    error[:100] = 0.0
+    rms = np.sqrt(np.sum(error**2) / 200)
+    np.testing.assert_allclose(slope, error / (200 * rms), rtol=1e-12)
+
+
+def test_figures_are_float64():
+    found = figures(Tracking(), record())
+    assert {value.dtype for value in found} == {jnp.dtype("float64")}

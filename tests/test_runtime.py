@@ -1,0 +1,133 @@
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from piezojax import _runtime
+
+THRESHOLD = (
+    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+)
+FLAGS = (
+    THRESHOLD,
+    "--xla_cpu_prefer_vector_width=512",
+    "--xla_cpu_copy_insertion_use_region_analysis=true",
+)
+
+
+OURS = (
+    "XLA_FLAGS",
+    "PIEZOJAX_COMPILATION_CACHE",
+    "JAX_COMPILATION_CACHE_DIR",
+    "JAX_ENABLE_X64",
+)
+
+
+def python(code, **variables):
+    """Run ``code`` in a fresh interpreter that knows nothing of this one's flags."""
+    environment = {
+        name: value for name, value in os.environ.items() if name not in OURS
+    }
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**environment, **variables},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+SIMULATE = """
+from piezojax.catalog import p753
+from piezojax import simulate
+state, outputs = simulate(p753.plant(), jnp.ones(10))
+print(outputs.dtype)
+"""
+
+
+def test_doubles_are_on():
+    assert jax.config.read("jax_enable_x64")
+    assert jnp.zeros(()).dtype == jnp.float64
+
+
+def test_a_fresh_import_sets_every_flag_once_and_keeps_no_programs():
+    done = python(
+        "import os, piezojax, jax, jax.numpy as jnp\n"
+        "print(os.environ['XLA_FLAGS'])\n"
+        "print(jax.config.jax_compilation_cache_dir)" + SIMULATE
+    )
+    assert done.returncode == 0, done.stderr
+    flags, folder, dtype = done.stdout.splitlines()
+    assert sorted(flags.split()) == sorted(FLAGS)
+    assert folder == "None"
+    assert dtype == "float64"
+    assert "Warning" not in done.stderr
+
+
+def test_the_users_own_flags_are_kept():
+    own = "--xla_cpu_prefer_vector_width=256 --xla_cpu_enable_fast_math=false"
+    done = python(
+        "import jax, piezojax, os, jax.numpy as jnp; print(os.environ['XLA_FLAGS'])"
+        + SIMULATE,
+        XLA_FLAGS=own,
+    )
+    assert done.returncode == 0, done.stderr
+    flags = done.stdout.splitlines()[0]
+    assert flags.startswith(own)
+    assert sorted(flags.split()) == sorted([*own.split(), FLAGS[0], FLAGS[2]])
+
+
+TOO_LATE = "import jax; jax.devices(); import piezojax; print(jax.numpy.ones(1).dtype)"
+
+
+def test_an_import_after_jax_started_warns():
+    done = python(TOO_LATE)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "float64"
+    assert "RuntimeWarning: piezojax was imported after JAX had started" in done.stderr
+
+
+def test_no_warning_if_the_flags_were_there_before():
+    done = python(TOO_LATE, XLA_FLAGS=" ".join(FLAGS), PYTHONWARNINGS="error")
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+
+
+def test_programs_are_kept_where_asked(tmp_path):
+    folder = tmp_path / "cache"
+    done = python(
+        "import piezojax, jax, jax.numpy as jnp\n"
+        "print(jax.config.jax_compilation_cache_dir)\n"
+        "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0.0)"
+        + SIMULATE,
+        PIEZOJAX_COMPILATION_CACHE=str(folder),
+    )
+    assert done.returncode == 0, done.stderr
+    (inside,) = folder.iterdir()  # named after the versions and the CPU
+    assert inside.name.startswith(f"jax{jax.__version__}-jaxlib")
+    assert done.stdout.splitlines()[0] == str(inside)
+    assert any(inside.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("version", "expected"),
+    [
+        ("0.9.1", ""),
+        ("0.9.2", " ".join(FLAGS)),
+        ("0.12.0", " ".join(FLAGS)),
+        ("0.13.0", ""),
+        ("1.0.0", ""),
+    ],
+)
+def test_flags_are_set_only_where_they_are_known(version, expected, monkeypatch):
+    # An unknown flag would abort the process.
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.delenv(_runtime.CACHE_VARIABLE, raising=False)
+    monkeypatch.setattr(_runtime, "version", lambda package: version)
+    monkeypatch.setattr(_runtime, "_backend_is_running", lambda: False)
+    _runtime.configure()
+    assert os.environ["XLA_FLAGS"] == expected

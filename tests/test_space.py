@@ -1,0 +1,232 @@
+"""The box of tuned parameters: never left, and seen alike from both sides."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from piezojax import PID, Affine
+from piezojax.space import INSIDE, TRANSFORMS, space_of, squash, unsquash
+
+UNIT = st.floats(0.0, 1.0)
+SIDES = {
+    "linear": st.floats(-1e6, 1e6),
+    "log": st.floats(-9.0, 9.0).map(lambda exponent: 10.0**exponent),
+    "logit": st.floats(1e-6, 1.0 - 1e-6),
+}
+
+examples = settings(max_examples=60, deadline=None)
+
+
+@st.composite
+def bounds(draw):
+    transform = draw(st.sampled_from(sorted(TRANSFORMS)))
+    low, high = sorted((draw(SIDES[transform]), draw(SIDES[transform])))
+    # Sides that differ by rounding only leave nothing to invert.
+    assume(high - low > 1e-3 * max(abs(low), abs(high)))
+    return low, high, transform
+
+
+# Plain numbers are drawn and the box is built in the test: checking its types draws
+# random numbers, which a strategy must not.
+BOXES = st.lists(bounds(), min_size=1, max_size=4)
+POINTS = st.lists(UNIT, min_size=4, max_size=4).map(np.array)
+
+
+def box_of(several):
+    return space_of({f"p{i}": bound for i, bound in enumerate(several)})
+
+
+@examples
+@given(BOXES, POINTS)
+def test_from_unit_never_leaves_the_bounds(several, point):
+    space = box_of(several)
+    values = np.asarray(space.from_unit(jnp.asarray(point[: len(several)])))
+    assert np.all(values >= np.asarray(space.lower))
+    assert np.all(values <= np.asarray(space.upper))
+
+
+@examples
+@given(BOXES, st.sampled_from([0.0, 1.0]))
+def test_corners_are_the_bounds_themselves(several, side):
+    space = box_of(several)
+    values = space.from_unit(jnp.full(len(several), side))
+    expected = space.upper if side else space.lower
+    np.testing.assert_allclose(values, expected, rtol=1e-12, atol=1e-9)
+
+
+@examples
+@given(BOXES, POINTS)
+def test_to_unit_undoes_from_unit(several, point):
+    space, unit = box_of(several), jnp.asarray(point[: len(several)])
+    back = space.to_unit(space.from_unit(unit))
+    np.testing.assert_allclose(back, unit, rtol=0, atol=1e-8)
+
+
+@examples
+@given(BOXES, POINTS)
+def test_from_unit_undoes_to_unit(several, point):
+    space, share = box_of(several), point[: len(several)]
+    low, high = np.asarray(space.lower), np.asarray(space.upper)
+    values = np.clip(low + share * (high - low), low, high)
+    back = space.from_unit(space.to_unit(jnp.asarray(values)))
+    np.testing.assert_allclose(back, values, rtol=1e-9, atol=1e-9)
+
+
+@examples
+@given(bounds(), UNIT, UNIT)
+def test_larger_in_the_box_is_larger_in_the_parameter(bound, one, other):
+    assume(abs(one - other) > 1e-6)
+    space = box_of([bound])
+    low, high = (
+        float(space.from_unit(jnp.array([u]))[0]) for u in sorted([one, other])
+    )
+    assert low < high
+
+
+def test_middle_of_each_scale():
+    space = space_of(
+        {
+            "linear": (-2.0, 4.0, "linear"),
+            "log": (1e-3, 1e3, "log"),
+            "logit": (0.1, 0.9, "logit"),
+        }
+    )
+    np.testing.assert_allclose(space.from_unit(jnp.full(3, 0.5)), [1.0, 1.0, 0.5])
+
+
+@pytest.mark.parametrize("outside", [-0.2, 1.3])
+def test_beyond_the_unit_cube_the_bounds_still_hold(outside):
+    space = space_of({"a": (1.0, 2.0, "linear"), "b": (1.0, 2.0, "log")})
+    values = np.asarray(space.from_unit(jnp.full(2, outside)))
+    assert set(values) == {1.0 if outside < 0 else 2.0}
+
+
+@pytest.mark.parametrize("transform", sorted(TRANSFORMS))
+def test_the_map_has_a_slope_everywhere_inside(transform):
+    space = space_of({"p": (0.1, 0.9, transform)})
+    slope = jax.jacfwd(lambda u: space.from_unit(u)[0])
+    for place in (1e-6, 0.3, 1.0 - 1e-6):
+        assert slope(jnp.array([place]))[0] > 1e-3
+
+
+@examples
+@given(st.floats(-15.0, 15.0))
+def test_unsquash_undoes_squash(free):
+    back = unsquash(squash(jnp.asarray(free)))
+    np.testing.assert_allclose(back, free, rtol=1e-8, atol=1e-8)
+
+
+@examples
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_squash_stays_in_the_cube_with_a_finite_slope(free):
+    value, slope = jax.value_and_grad(squash)(jnp.asarray(free))
+    assert 0.0 <= value <= 1.0
+    assert np.isfinite(slope)
+    assert slope >= 0.0
+
+
+def box(**changes):
+    entry = {"lower": 1.0, "upper": 10.0, "transform": "log"} | changes
+    return space_of({"controller.gain": tuple(entry.values())})
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper"),
+    [
+        (10.0, 1.0),
+        (1.0, 1.0),
+        (float("-inf"), 1.0),
+        (0.0, float("inf")),
+        (float("nan"), 1.0),
+        (0.0, float("nan")),
+    ],
+)
+@pytest.mark.parametrize("transform", sorted(TRANSFORMS))
+def test_bounds_that_are_none(lower, upper, transform):
+    message = (
+        f"controller.gain: bounds are {lower:g} and {upper:g}; "
+        "they must be finite and the lower below the upper"
+    )
+    with pytest.raises(ValueError, match=re.escape(message)):
+        box(lower=lower, upper=upper, transform=transform)
+
+
+@pytest.mark.parametrize("lower", [0.0, -1.0])
+def test_log_needs_what_is_positive(lower):
+    message = (
+        f"controller.gain: the lower bound is {lower:g}; "
+        "with transform 'log' it must be above 0"
+    )
+    with pytest.raises(ValueError, match=re.escape(message)):
+        box(lower=lower)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper"), [(0.0, 0.5), (0.5, 1.0), (-0.5, 0.5), (0.5, 3.0)]
+)
+def test_logit_needs_what_lies_between_0_and_1(lower, upper):
+    message = (
+        f"controller.gain: the bounds are {lower:g} and {upper:g}; "
+        "with transform 'logit' they must lie between 0 and 1"
+    )
+    with pytest.raises(ValueError, match=re.escape(message)):
+        box(lower=lower, upper=upper, transform="logit")
+
+
+def test_the_first_bad_path_is_named():
+    with pytest.raises(ValueError, match=r"^offset: bounds are 2 and 1"):
+        space_of({"gain": (0.0, 1.0, "linear"), "offset": (2.0, 1.0, "linear")})
+
+
+GAIN = space_of({"gain": (1.0, 10.0, "log"), "offset": (-1.0, 1.0, "linear")})
+
+
+def test_start_is_where_the_system_lies():
+    unit = GAIN.start(Affine(gain=10.0**0.25, offset=0.5))
+    np.testing.assert_allclose(unit, [0.25, 0.75], rtol=1e-12)
+
+
+@pytest.mark.parametrize("gain", [0.99, 10.01, -3.0, float("nan")])
+def test_start_outside_the_bounds(gain):
+    message = f"gain starts at {gain:g}; its bounds 1 to 10 must include the start"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        GAIN.start(Affine(gain=gain))
+
+
+@pytest.mark.parametrize(("gain", "place"), [(1.0, INSIDE), (10.0, 1.0 - INSIDE)])
+def test_start_on_a_bound_is_moved_inside(gain, place):
+    unit = GAIN.start(Affine(gain=gain))
+    assert unit[0] == pytest.approx(place, abs=1e-15)
+    assert unit[1] == 0.5
+    # As far as anyone can tell it is still the same gain.
+    assert float(GAIN.from_unit(unit)[0]) == pytest.approx(gain, rel=1e-5)
+    assert np.isfinite(unsquash(unit)).all()
+
+
+def test_start_names_a_parameter_that_is_not_there():
+    with pytest.raises(ValueError, match=r"no parameter 'gian'; .* gain"):
+        space_of({"gian": (0.0, 1.0, "linear")}).start(Affine())
+
+
+def test_put_changes_its_parameters_and_no_other():
+    pid = PID(1.0, 2.0, 3.0, 4.0, 5.0, dt=1e-4)
+    space = space_of({"integral": (0.5, 8.0, "log"), "proportional": (0, 4, "linear")})
+    moved = space.put(pid, jnp.array([0.5, 0.25]))
+    found = [float(value) for value in jax.tree.leaves(moved)]
+    assert found == pytest.approx([1.0, 2.0, 3.0, 4.0, 5.0])
+    moved = space.put(pid, jnp.array([1.0, 0.0]))
+    found = [float(value) for value in jax.tree.leaves(moved)]
+    assert found == pytest.approx([0.0, 8.0, 3.0, 4.0, 5.0])
+    assert moved.dt == pid.dt
+
+
+def test_named_and_put_agree():
+    unit = jnp.array([0.3, 0.6])
+    moved, named = GAIN.put(Affine(2.0), unit), GAIN.named(unit)
+    assert list(named) == ["gain", "offset"]
+    assert (moved.gain, moved.offset) == (named["gain"], named["offset"])
