@@ -12,12 +12,13 @@ from .system import LoopSample
 
 
 class TrackingFigures(NamedTuple):
-    """What a run of a loop came to, over the window of its Tracking metric.
+    """What a run of a loop came to.
 
-    ``rms_error`` and ``peak_error`` of the true displacement against the reference in
-    um; ``rms_effort`` of the voltage in V; ``rms_slew`` of its change a sample in V;
-    ``saturated``, the share of samples at which the actuator did not give what was
-    asked for (0 to 1); ``peak_voltage`` in V.
+    Over the window of its Tracking metric: ``rms_error`` and ``peak_error`` of the true
+    displacement against the reference in um; ``rms_effort`` of the voltage in V;
+    ``rms_slew`` of its change a sample in V. Over the whole run, because an actuator
+    that rails at the start has railed: ``saturated``, the share of samples at which it
+    did not give what was asked for (0 to 1), and ``peak_voltage`` in V.
     """
 
     rms_error: Scalar
@@ -42,6 +43,7 @@ class Tracking(Metric):
     def init(self) -> State:
         zero = jnp.zeros(())
         return {
+            "samples": zero,
             "count": zero,
             "error": zero,
             "peak": zero,
@@ -59,13 +61,14 @@ class Tracking(Metric):
         change = jnp.where(index > self.start, voltage - total["last"], 0.0)
         clipped = jnp.abs(output.command - voltage) > self.tolerance
         return {
+            "samples": total["samples"] + 1.0,
             "count": total["count"] + inside,
             "error": total["error"] + inside * error**2,
             "peak": jnp.maximum(total["peak"], inside * jnp.abs(error)),
             "effort": total["effort"] + inside * voltage**2,
             "slew": total["slew"] + inside * change**2,
-            "saturated": total["saturated"] + inside * jnp.where(clipped, 1.0, 0.0),
-            "voltage": jnp.maximum(total["voltage"], inside * jnp.abs(voltage)),
+            "saturated": total["saturated"] + jnp.where(clipped, 1.0, 0.0),
+            "voltage": jnp.maximum(total["voltage"], jnp.abs(voltage)),
             "last": voltage,
         }
 
@@ -76,7 +79,7 @@ class Tracking(Metric):
             peak_error=total["peak"],
             rms_effort=_root(total["effort"] / count),
             rms_slew=_root(total["slew"] / count),
-            saturated=total["saturated"] / count,
+            saturated=total["saturated"] / jnp.maximum(total["samples"], 1.0),
             peak_voltage=total["voltage"],
         )
 

@@ -1,6 +1,7 @@
 """What tuning minimises: normalised tracking errors over references and noise draws."""
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -29,19 +30,28 @@ class Signals(eqx.Module):
     disturbance: Float[Array, " samples"] | None = None
 
 
-def evaluate(loop: Feedback, signals: Signals, start: int) -> TrackingFigures:
-    """Return the figures of ``loop`` for each reference and noise draw.
+def evaluate(
+    loop_of: Callable[[Any], Feedback], parameters: Any, signals: Signals, start: int
+) -> TrackingFigures:
+    """Return the figures of ``loop_of(parameters)`` for each reference and noise draw.
 
     Every run starts at rest at its reference; samples before ``start`` do not count.
     """
     metric = Tracking(start=start)
 
-    def one(reference, noise):
+    def one(parameters, reference, noise):
+        loop = loop_of(parameters)
         inputs = loop_inputs(reference, noise, signals.disturbance)
         return simulate(loop, inputs, loop.init(reference[0]), metric=metric)[1]
 
-    draws = jax.vmap(one, in_axes=(None, 0))
-    return jax.vmap(draws)(signals.references, signals.noise)
+    # A copy of the parameters for each run: their gradients are then summed once, at
+    # the end, and not in each step.
+    runs = signals.noise.shape[:2]
+    copies = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (*runs, *jnp.shape(x))), parameters
+    )
+    draws = jax.vmap(one, in_axes=(0, None, 0))
+    return jax.vmap(draws)(copies, signals.references, signals.noise)
 
 
 class Objective(eqx.Module):
@@ -65,8 +75,9 @@ class Objective(eqx.Module):
     slew_weight: float = eqx.field(static=True, default=0.0)
 
     def _parts(self, unit: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        loop = self.space.put(self.loop, unit)
-        figures = evaluate(loop, self.signals, self.start)
+        figures = evaluate(
+            lambda unit: self.space.put(self.loop, unit), unit, self.signals, self.start
+        )
         square = jnp.mean(figures.rms_error**2, axis=1)
         normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
         effort = jnp.mean(figures.rms_effort) / self.voltage_span

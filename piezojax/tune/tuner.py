@@ -1,5 +1,6 @@
 """Tuning: screen the box, descend from the best starts, judge on what was held out."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -12,12 +13,13 @@ import numpy as np
 from .. import __version__
 from .. import signals as signal_library
 from .._types import as_array
+from ..metrics import TrackingFigures
 from ..progress import Progress, Silent
 from ..study import Case, read, shipped
 from ..system import Feedback
 from .objective import Objective, Signals, evaluate
 from .result import Result, Scores, scores
-from .search import Clock, search_box
+from .search import Clock, Search, search_box
 
 
 @dataclass
@@ -34,6 +36,31 @@ class Outcome:
     def controller(self):
         """The tuned controller."""
         return self.after.controller
+
+
+class _Judge:
+    """Simulates a loop on signals; compiled once for each shape of them."""
+
+    def __init__(self, clock: Clock, start: int):
+        self._clock, self._start = clock, start
+        self._programs: dict[tuple[int, ...], Callable] = {}
+
+    def figures(self, loop: Feedback, signals: Signals) -> TrackingFigures:
+        """Return the figures by reference and draw."""
+        shape = signals.noise.shape
+        if shape not in self._programs:
+            self._programs[shape] = self._clock.compiled(
+                lambda loop, signals: evaluate(lambda x: x, loop, signals, self._start),
+                loop,
+                signals,
+            )
+        return self._programs[shape](loop, signals)
+
+    def __call__(
+        self, loop: Feedback, signals: Signals, names: tuple[str, ...]
+    ) -> Scores:
+        """Return the scores by reference."""
+        return scores(self.figures(loop, signals), names)
 
 
 @dataclass
@@ -123,17 +150,8 @@ def tune(
     first = round(table.references.settle * table.rate)
 
     progress.stage("simulating the start")
-    judge = clock.compiled(
-        lambda loop, signals: evaluate(loop, signals, first), case.loop, data.holdout
-    )
-    judge_tuning = (
-        judge
-        if data.tuning.noise.shape == data.holdout.noise.shape
-        else clock.compiled(
-            lambda loop, signals: evaluate(loop, signals, first), case.loop, data.tuning
-        )
-    )
-    before = scores(judge_tuning(case.loop, data.tuning), data.names[: data.tuned])
+    judge = _Judge(clock, first)
+    before = judge(case.loop, data.tuning, data.names[: data.tuned])
     objective = Objective(
         loop=case.loop,
         space=space,
@@ -149,7 +167,7 @@ def tune(
 
     progress.stage("judging on held-out noise")
     after = space.put(case.loop, as_array(search.unit))
-    result = _report(case, data, judge, judge_tuning, before, after, search, clock)
+    result = _report(case, data, judge, before, after, search, clock)
     return Outcome(result, case.loop, after, case, data.holdout)
 
 
@@ -161,19 +179,26 @@ def _scale(before: Scores, references: jax.Array) -> jax.Array:
     return as_array([rms or 1e-9 for rms in before.per_reference_rms_um.values()])
 
 
-def _report(case, data, judge, judge_tuning, before, after, search, clock) -> Result:
-    tuned = data.names[: data.tuned]
-    unseen = data.names[data.tuned :]
+def _report(
+    case: Case,
+    data: _Data,
+    judge: _Judge,
+    before: Scores,
+    after: Feedback,
+    search: Search,
+    clock: Clock,
+) -> Result:
+    tuned, unseen = data.names[: data.tuned], data.names[data.tuned :]
 
     def held(loop: Feedback) -> tuple[Scores, Scores | None]:
-        figures = judge(loop, data.holdout)
+        figures = judge.figures(loop, data.holdout)
         head = jax.tree.map(lambda x: x[: data.tuned], figures)
         tail = jax.tree.map(lambda x: x[data.tuned :], figures)
         return scores(head, tuned), scores(tail, unseen) if unseen else None
 
     holdout_before, unseen_before = held(case.loop)
     holdout, unseen_after = held(after)
-    after_scores = scores(judge_tuning(after, data.tuning), tuned)
+    after_scores = judge(after, data.tuning, tuned)
     unit = np.asarray(search.unit)
     values = case.space.from_unit(as_array(unit))
     at_bound = [
