@@ -66,6 +66,13 @@ def check(
             raise ValueError(f"{name} is {_shown(number)}; it must be {allowed}")
 
 
+def check_not_zero(name: str, value: Any) -> None:
+    """Raise ValueError if ``value`` is known to be zero."""
+    number = _known(value)
+    if number is not None and np.any(number == 0.0):
+        raise ValueError(f"{name} is 0; it must be another number")
+
+
 def check_order(low_name: str, low: Any, high_name: str, high: Any) -> None:
     """Raise ValueError unless ``low < high`` wherever both are known."""
     lower, upper = _known(low), _known(high)

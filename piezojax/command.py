@@ -1,6 +1,7 @@
 """What all commands share: options, the results folder, errors in one line."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +39,31 @@ def common(function: Callable) -> Callable:
     return function
 
 
-def results_folder(out: Path | None, name: str) -> Path:
-    """Return an empty folder for results: ``out``, or a fresh one named after ``name``.
+class Command(click.Command):
+    """A command whose usage errors, too, are one line."""
 
-    Raises ValueError if ``out`` is in use or cannot be written.
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse as click does."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.UsageError as error:
+            raise _one_line(error.format_message()) from None
+
+
+@contextmanager
+def results_folder(out: Path | None, name: str) -> Iterator[Path]:
+    """Give an empty folder for results: ``out``, or a fresh one named after ``name``.
+
+    It is taken away again if the work fails before anything is in it. Raises ValueError
+    if ``out`` is in use or cannot be written.
     """
-    return fresh_folder(out if out is not None else numbered_folder(RESULTS / name))
+    folder = fresh_folder(out if out is not None else numbered_folder(RESULTS / name))
+    try:
+        yield folder
+    except BaseException:
+        if not any(folder.iterdir()):
+            folder.rmdir()
+        raise
 
 
 def run(quiet: bool, body: Callable[[Console], Any]) -> None:
@@ -51,6 +71,10 @@ def run(quiet: bool, body: Callable[[Console], Any]) -> None:
     try:
         body(console(quiet))
     except ValueError as error:
-        raise click.ClickException(" ".join(str(error).split())) from None
+        raise _one_line(str(error)) from None
     except KeyboardInterrupt:
         raise SystemExit(INTERRUPTED) from None
+
+
+def _one_line(message: str) -> click.ClickException:
+    return click.ClickException(" ".join(message.split()))

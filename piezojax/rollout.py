@@ -63,6 +63,9 @@ def simulate(
     ``jax.vmap``, or ``in_blocks`` for many lanes. Raises ValueError for empty or
     ragged inputs.
     """
+    for name, value in (("every", every), ("segment", segment)):
+        if value < 1:
+            raise ValueError(f"{name} is {value}; it must be at least 1")
     samples = _length(inputs)
     state = system.init() if state is None else state
     if metric is not None:

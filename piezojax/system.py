@@ -4,7 +4,6 @@ import abc
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
@@ -275,7 +274,8 @@ def holding_input(plant: System, output: ScalarLike) -> Scalar:
 
     Solved by Newton's method on the loading curve from the plant's own rest point;
     where no input reaches ``output`` the last iterate is returned and the loop starts
-    with an error.
+    with an error. Limits belong in the loop's actuator, not in the plant: the curve is
+    flat behind them.
     """
     output = as_array(output)
 
@@ -286,6 +286,4 @@ def holding_input(plant: System, output: ScalarLike) -> Scalar:
     solution = optx.root_find(
         residual, solver, jnp.zeros_like(output), max_steps=64, throw=False
     )
-    return jax.tree.map(
-        lambda value: jnp.where(jnp.isfinite(value), value, 0.0), solution.value
-    )
+    return jnp.where(jnp.isfinite(solution.value), solution.value, 0.0)

@@ -25,7 +25,7 @@ def test_time_grid_counts_from_zero(second):
 
 @pytest.mark.parametrize("kind", signals.SIGNALS)
 def test_signals_are_of_one_type(kind, second):
-    # Of two types, a compiled loop would be compiled twice: PWSW is strongly typed.
+    # With weak types among them, a compiled loop would be compiled twice.
     assert not signals.SIGNALS[kind](second).weak_type
 
 

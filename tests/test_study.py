@@ -654,6 +654,7 @@ UNSAID = {
     "a list for a type": ({"plant": {"type": ["Affine"]}}, "plant.type"),
     "one reference twice": ({"references/tune": ["SW50", "SW50"]}, "SW50"),
     "a window without a sample": ({"references/settle": 0.04999}, "settle"),
+    "a reference beyond Nyquist": ({"references/tune": ["SIN15000"]}, "SIN15000"),
     "a run without a sample": (
         {"references/duration": 1e-5, "references/settle": 0.0},
         "duration",

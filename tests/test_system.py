@@ -117,6 +117,13 @@ def test_negative_delay_is_refused():
         Delay(-1)
 
 
+def test_fractional_delay_is_refused():
+    # While the tests run, the check of the annotations comes first.
+    message = r"delay in samples is 1\.5; it must be whole|parameter 'samples'"
+    with pytest.raises((ValueError, TypeError), match=message):
+        Delay(1.5)
+
+
 ELEMENTS = {
     **{
         f"hysteresis {s}": ColemanHodgdon(*HYSTERESIS, scheme=s)
@@ -200,9 +207,11 @@ def test_holding_input_has_the_gradient_of_the_inverse_function():
     np.testing.assert_allclose(found, 1.0 / (a * voltage + b + c * 6.0), rtol=1e-9)
 
 
+LIMITED = series(limits=Saturation(-20.0, 120.0), stage=p753.plant())
+
+
 def test_holding_input_beyond_reach_is_finite():
-    limited = series(limits=Saturation(-20.0, 120.0), stage=p753.plant())
-    assert np.isfinite(holding(limited, 40.0))
+    assert np.isfinite(holding(LIMITED, 40.0))
 
 
 LOOPS = {
@@ -212,11 +221,17 @@ LOOPS = {
     "observer": p753.loop(p753.disturbance_observer()),
     "printed observer": p753.loop(p753.disturbance_observer(coefficients="printed")),
     "pid behind the inverse": p753.loop(
-        InversionControl(PID(0.05, 1e3, 1e-6, DT, dt=DT), p753.inversion().inverse)
+        InversionControl(
+            PID(0.05, 1e3, 1e-6, DT, 100.0, dt=DT), p753.inversion().inverse
+        )
     ),
     "pid with observer": p753.loop(
         DisturbanceObserverControl(
-            PID(0.05, 100.0, dt=DT), ARMA(T2_P, T2_G), p753.GAIN, 500.0, DT
+            PID(0.05, 100.0, anti_windup=100.0, dt=DT),
+            ARMA(T2_P, T2_G),
+            p753.GAIN,
+            500.0,
+            DT,
         )
     ),
     # A plant that the controller's model does not match.

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 
-from .._types import Scalar, State, as_array, check
+from .._types import Scalar, State, as_array, check, check_not_zero
 from ..dynamics.arma import ARMA
 from ..system import Observation, System
 
@@ -51,6 +51,7 @@ class DisturbanceObserverControl(System):
                 f"the model has {orders[0]} a and {orders[1]} b coefficients; "
                 "it must have 2 and 3"
             )
+        check_not_zero("DC gain of the model", sum(self.model.moving))
         check("sample time in s", self.dt, above=0.0)
         check("gain K_e in um/V", self.gain, above=0.0)
         check("cut-off in rad/s", self.cutoff, above=0.0, below=math.pi / self.dt)

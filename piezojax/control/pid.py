@@ -38,6 +38,9 @@ class PID(System):
 
     def __check_init__(self):
         check("sample time in s", self.dt, above=0.0)
+        check("proportional in V/um", self.proportional)
+        check("integral in V/(um s)", self.integral)
+        check("derivative in V s/um", self.derivative)
         check("derivative filter in s", self.derivative_filter, least=0.0)
         check("anti-windup rate in 1/s", self.anti_windup, least=0.0)
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, as_array, check
+from .._types import Scalar, as_array, check, check_not_zero
 from ..dynamics.arma import ARMA
 from ..system import Observation, System
 from .alpha_beta import AlphaBeta, Motion
@@ -56,6 +56,11 @@ class SlidingModePID(System):
                 f"the model has {orders[0]} a and {orders[1]} b coefficients; "
                 "it must have 2 and 3"
             )
+        check_not_zero("b_0 of the model", self.model.moving[0])
+        check("proportional", self.proportional)
+        check("integral", self.integral)
+        check("derivative", self.derivative)
+        check("surface in 1/s", self.surface)
         check("error_weight Q", self.error_weight, above=0.0)
         check("control_weight R", self.control_weight, least=0.0)
 

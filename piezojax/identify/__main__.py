@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from ..command import common, results_folder, run
+from ..command import Command, common, results_folder, run
 from ..report.console import fit_table
 from ..report.identification import write_fit
 from .models import MODELS
@@ -23,8 +23,8 @@ class _Part(click.ParamType):
         return slice(start, stop)
 
 
-@click.command()
-@click.argument("record", type=click.Path(path_type=Path))
+@click.command(cls=Command)
+@click.argument("record", required=False, type=click.Path(path_type=Path))
 @click.option(
     "--model",
     default="coleman_hodgdon",
@@ -46,9 +46,13 @@ def main(record, model, time, input, output, rate, train, validate, out, seed, q
         if model == "help":
             console.print("\n".join(MODELS))
             return
+        if record is None:
+            raise ValueError("name the RECORD to fit a model to")
         loaded = read_record(record, time=time, input=input, output=output, rate=rate)
-        folder = results_folder(out, record.stem)
-        with console.status(f"fitting {model} to {loaded.input.size} samples"):
+        with (
+            results_folder(out, record.stem) as folder,
+            console.status(f"fitting {model} to {loaded.input.size} samples"),
+        ):
             fit = identify(loaded, model, train=train, validate=validate)
             write_fit(fit, folder)
         console.print(fit_table(fit.report))

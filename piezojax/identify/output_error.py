@@ -20,6 +20,12 @@ from ..system import System, rest_output
 from .models import MODELS, REST_INPUT
 from .record import Record
 
+AS_GOOD = 1e-3
+"""Starts whose mean square comes this close (as a share) to the best fit as well."""
+
+POOR = 0.2
+"""A validation error above this share of the output's deviation gives a warning."""
+
 CYCLES = 3
 """Fewer full hysteresis cycles than this in the training part give a warning."""
 
@@ -135,7 +141,11 @@ def identify(
         },
         train=_fit_error(error[train], record),
         validation=_fit_error(error[validate], record),
-        warnings=_warnings(record, train, structure.space, unit[best], deviations),
+        warnings=[
+            *_record_warnings(record, train, validate),
+            *_fit_warnings(structure.space, np.asarray(unit), losses, deviations),
+            *_error_warnings(error[validate], record.output[validate]),
+        ],
         wall_s=time.perf_counter() - began,
     )
     return Fit(system, report, record, simulated, train, validate)
@@ -145,8 +155,8 @@ def _parts(
     record: Record, train: slice | None, validate: slice | None
 ) -> tuple[slice, slice]:
     samples = record.input.size
-    train = train or slice(0, samples // 2)
-    validate = validate or slice(min(train.stop, samples), samples)
+    train = _closed(train or slice(0, samples // 2), samples)
+    validate = _closed(validate or slice(min(train.stop, samples), samples), samples)
     for name, part in (("train", train), ("validate", validate)):
         if not 0 <= part.start < part.stop <= samples:
             raise ValueError(
@@ -154,6 +164,11 @@ def _parts(
                 f"it must lie in 0:{samples} and hold a sample"
             )
     return train, validate
+
+
+def _closed(part: slice, samples: int) -> slice:
+    stop = samples if part.stop is None else part.stop
+    return slice(part.start or 0, stop)
 
 
 @eqx.filter_jit
@@ -222,7 +237,7 @@ def cycles(input: np.ndarray) -> int:
     return int(np.sum(~above[:-1] & above[1:]))
 
 
-def _warnings(record, train, space, unit, deviations) -> list[str]:
+def _record_warnings(record: Record, train: slice, validate: slice) -> list[str]:
     found = []
     count = cycles(record.input[train])
     if count < CYCLES:
@@ -237,10 +252,43 @@ def _warnings(record, train, space, unit, deviations) -> list[str]:
             "told apart by the shape of the loop alone, and the model says nothing "
             "about other frequencies"
         )
-    for path, place in zip(space.paths, np.asarray(unit), strict=True):
-        if place < 1e-3 or place > 1.0 - 1e-3:
-            found.append(f"{path} lies at the edge of its bounds")
-    for path, deviation in zip(space.paths, deviations, strict=True):
-        if deviation is None:
-            found.append(f"{path} is not determined by this record")
+    if validate.start < train.stop and train.start < validate.stop:
+        found.append(
+            "the validation part shares samples with the training part: "
+            "its error is no measure of prediction"
+        )
     return found
+
+
+def _fit_warnings(
+    space: Space,
+    units: np.ndarray,
+    losses: np.ndarray,
+    deviations: Sequence[float | None],
+) -> list[str]:
+    found = []
+    best = int(np.argmin(losses))
+    as_good = units[losses <= losses[best] * (1.0 + AS_GOOD) + 1e-30]
+    spread = np.ptp(as_good, axis=0)
+    for i, path in enumerate(space.paths):
+        if units[best, i] < 1e-3 or units[best, i] > 1.0 - 1e-3:
+            found.append(f"{path} lies at the edge of its bounds")
+        if deviations[i] is None:
+            found.append(f"{path} is not determined by this record")
+        elif spread[i] > AS_GOOD:
+            values = [float(space.from_unit(jnp.asarray(u))[i]) for u in as_good]
+            found.append(
+                f"{path} is ambiguous: values from {min(values):.4g} to "
+                f"{max(values):.4g} fit equally well"
+            )
+    return found
+
+
+def _error_warnings(error: np.ndarray, output: np.ndarray) -> list[str]:
+    share = float(np.sqrt(np.mean(error**2)) / max(np.std(output), 1e-30))
+    if share <= POOR:
+        return []
+    return [
+        f"the model explains little: its validation error is {100.0 * share:.0f} % of "
+        "the output's own deviation"
+    ]

@@ -4,7 +4,7 @@ import json
 
 import click
 
-from ..command import common, results_folder, run
+from ..command import Command, common, results_folder, run
 from ..files import write_text
 from ..report.console import reproduction_table
 from ..report.reproduction import write_picture
@@ -12,7 +12,7 @@ from . import TABLES, reproduce
 from .summary import as_csv, summarise
 
 
-@click.command()
+@click.command(cls=Command)
 @click.option(
     "--table",
     "tables",
@@ -32,17 +32,19 @@ def main(tables, out, seed, quiet):
                 raise ValueError(
                     f"--table {table} is unknown; there are {', '.join(TABLES)}"
                 )
-        folder = results_folder(out, "reproduce")
         cells = []
-        with console.status("simulating") as status:
+        with (
+            results_folder(out, "reproduce") as folder,
+            console.status("simulating") as status,
+        ):
             for table in wanted:
                 status.update(f"simulating Table {table}")
                 cells += reproduce(table)
-        summary = summarise(cells)
-        write_text(folder / "cells.csv", as_csv(cells))
-        plain = {table: entry.model_dump() for table, entry in summary.items()}
-        write_text(folder / "summary.json", json.dumps(plain, indent=2) + "\n")
-        write_picture(cells, folder)
+            summary = summarise(cells)
+            write_text(folder / "cells.csv", as_csv(cells))
+            plain = {table: entry.model_dump() for table, entry in summary.items()}
+            write_text(folder / "summary.json", json.dumps(plain, indent=2) + "\n")
+            write_picture(cells, folder)
         for table in wanted:
             console.print(
                 reproduction_table(

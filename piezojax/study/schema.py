@@ -178,6 +178,13 @@ class Study(Table):
                 f"references.duration is {table.duration:g} s, {samples} samples; "
                 "it takes 2 or more"
             )
+        for name in (*table.tune, *table.unseen):
+            frequency = signals.parse(name)[1] or 0.0
+            if frequency >= 0.5 * self.rate:
+                raise ValueError(
+                    f"references: {name} is not below half the rate, "
+                    f"{0.5 * self.rate:g} Hz"
+                )
         if round(table.settle * self.rate) >= samples:
             raise ValueError(
                 f"references.settle is {table.settle:g} s; no sample is left after it"

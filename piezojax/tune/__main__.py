@@ -5,14 +5,14 @@ from pathlib import Path
 import click
 
 from .. import study as studies
-from ..command import INTERRUPTED, common, results_folder, run
+from ..command import INTERRUPTED, Command, common, results_folder, run
 from ..report.console import Bar, gains_table, tuning_table
 from ..report.identification import write_fit
 from ..report.tuning import write_results
 from .tuner import tune
 
 
-@click.command()
+@click.command(cls=Command)
 @click.argument("study", required=False, type=click.Path(path_type=Path))
 @common
 def main(study: Path | None, out: Path | None, seed: int | None, quiet: bool) -> None:
@@ -27,13 +27,13 @@ def main(study: Path | None, out: Path | None, seed: int | None, quiet: bool) ->
         with Bar(console) as bar:
             bar.stage(f"reading {path.name}")
             description = studies.load(path)
-            folder = results_folder(out, path.stem)
-            case = studies.build(description, path, seed=seed)
-            outcome = tune(case, progress=bar)
-            bar.stage("drawing")
-            write_results(outcome, folder)
-            if case.fit is not None:
-                write_fit(case.fit, folder)
+            with results_folder(out, path.stem) as folder:
+                case = studies.build(description, path, seed=seed)
+                outcome = tune(case, progress=bar)
+                bar.stage("drawing")
+                write_results(outcome, folder)
+                if case.fit is not None:
+                    write_fit(case.fit, folder)
         result = outcome.result
         console.print(tuning_table(result))
         console.print(gains_table(result))

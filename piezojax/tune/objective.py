@@ -18,6 +18,9 @@ Aggregate = Literal["geometric_mean", "mean_square", "worst"]
 HOPELESS = 1e6
 """Objective of a run that diverged: finite, so that a line search can step back."""
 
+RAILED = 0.5
+"""A run whose actuator saturates for more than this share of it has lost its loop."""
+
 _SHARPNESS = 20.0  # of the smooth maximum in "worst"
 _FLOOR = 1e-9  # um: an error below a femtometre is as good as none
 
@@ -80,12 +83,15 @@ class Objective(eqx.Module):
         )
         square = jnp.mean(figures.rms_error**2, axis=1)
         normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
+        # Limits turn divergence into a limit cycle between them.
+        railed = jnp.any(figures.saturated > RAILED)
+        normalised = jnp.where(railed, jnp.inf, normalised)
         effort = jnp.mean(figures.rms_effort) / self.voltage_span
         slew = jnp.mean(figures.rms_slew) / self.voltage_span
         return normalised, effort, slew
 
     def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
-        """Return the objective; ``HOPELESS`` where the loop diverges."""
+        """Return the objective; ``HOPELESS`` where the loop diverges or rails."""
         normalised, effort, slew = self._parts(unit)
         if self.aggregate == "mean_square":
             joined = jnp.mean(normalised**2)

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ..metrics import TrackingFigures
+from .objective import RAILED
 
 Status = Literal["converged", "step limit", "interrupted"]
 
@@ -26,8 +27,9 @@ class Scores(BaseModel):
 
     @property
     def stable(self) -> bool:
-        """Whether every run stayed finite."""
-        return self.geomean_rms_um is not None
+        """Whether every run stayed finite and off the limits most of the time."""
+        railed = max(self.saturated_percent.values()) > 100.0 * RAILED
+        return self.geomean_rms_um is not None and not railed
 
 
 class Result(BaseModel):

@@ -116,13 +116,13 @@ def _starts(losses: np.ndarray, count: int, search: Search) -> np.ndarray:
     stable = losses < HOPELESS
     if not stable.any():
         raise ValueError(
-            f"the loop diverges at the start and at all {losses.size - 1} other points "
+            f"the loop diverges or rails at the start and all {losses.size - 1} points "
             "tried in the box: lower the bounds of the gains, raise 'candidates', or "
             "check the plant's sign and sample rate"
         )
     if not stable[0]:
         search.warnings.append(
-            "the study's own start diverges; tuning began from the best of "
+            "the study's own start diverges or rails; tuning began from the best of "
             f"{losses.size - 1} other points of the box instead"
         )
     best = 1 + np.argsort(losses[1:], kind="stable")

@@ -165,9 +165,14 @@ def tune(
     )
     search = search_box(objective, case, clock, progress)
 
-    progress.stage("judging on held-out noise")
     after = space.put(case.loop, as_array(search.unit))
-    result = _report(case, data, judge, before, after, search, clock)
+    try:
+        progress.stage("judging on held-out noise")
+        result = _report(case, data, judge, before, after, search, clock)
+    except KeyboardInterrupt:
+        # What was found is kept; only a second interrupt ends this too.
+        search.status = "interrupted"
+        result = _report(case, data, judge, before, after, search, clock)
     return Outcome(result, case.loop, after, case, data.holdout)
 
 
@@ -257,5 +262,5 @@ def _warnings(
                 f"the actuator saturates on {where} runs of {', '.join(railed)}"
             )
         if not figures.stable:
-            found.append(f"the tuned loop diverges on {where} runs")
+            found.append(f"the tuned loop diverges or rails on {where} runs")
     return found

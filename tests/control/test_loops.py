@@ -71,7 +71,7 @@ def published_references():
 
 
 def gentle_references():
-    # All within reach, and from rest: SW starts at 8 um and is faded in.
+    # All within reach, and from rest: SW starts at 12 um and is faded in.
     references = published_references()
     references[1] *= np.minimum(np.arange(SAMPLES + 1) / 2000, 1.0)
     return references
@@ -254,5 +254,19 @@ def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
     ],
 )
 def test_bad_parameters_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PID(np.nan, 1.0, dt=DT), "proportional.* is nan; it must be finite"),
+        (lambda: sliding_mode(surface=np.inf), "surface.* is inf; it must be finite"),
+        (lambda: sliding_mode(model=ARMA((0.5, 0.1), (0.0, 0.1, 0.1))), "b_0"),
+        (lambda: observer(ARMA((0.5, 0.1), (1.0, -2.0, 1.0))), "DC gain"),
+    ],
+)
+def test_parameters_that_give_nan_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -257,20 +257,11 @@ def test_bad_parts(record, parts, message):
         identify(record, **parts)
 
 
-# What should be said and is not
-
-
-def broken(reason):
-    return pytest.mark.xfail(strict=True, reason=reason)
-
-
-@broken("TypeError: '<=' between int and None")
 def test_a_part_with_an_open_end(clean, fits):
     fit = identify(record_of(INPUT, noisy(clean, 0)), train=slice(None, TRAIN.stop))
     assert fit.report.parameters == fits[0].report.parameters
 
 
-@broken("two rest points give the same simulation; one is given with a small error")
 def test_the_rest_point_is_found_or_said_to_be_ambiguous(fits):
     for fit in fits:
         rest = fit.report.parameters["hysteresis.rest_input"]
@@ -278,7 +269,6 @@ def test_the_rest_point_is_found_or_said_to_be_ambiguous(fits):
         assert found or any("rest_input" in text for text in fit.report.warnings)
 
 
-@broken("nothing compares the error with the span: only 'at the edge of its bounds'")
 @pytest.mark.parametrize("output", ["falling", "noise"])
 def test_a_model_that_explains_nothing_is_said_to(clean, output):
     if output == "falling":
@@ -290,7 +280,6 @@ def test_a_model_that_explains_nothing_is_said_to(clean, output):
     assert any("error" in text or "fit" in text for text in fit.report.warnings)
 
 
-@broken("validation on the training part itself passes without a word")
 def test_validation_on_training_samples_is_said(clean):
     record = record_of(INPUT, noisy(clean, 0))
     try:

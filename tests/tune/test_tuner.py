@@ -103,7 +103,12 @@ def progress():
 @pytest.fixture(scope="module")
 def outcome(progress, kept_programs):
     """The P-753 with its hysteresis, a reference kept unseen."""
-    changes = {"plant": {"catalog": "p753"}, "references/unseen": ["TRI50"]}
+    changes = {
+        "plant": {"catalog": "p753"},
+        "references/unseen": ["TRI50"],
+        "objective/noise_draws": 2,
+        "holdout_draws": 3,
+    }
     return pj.tune(case_of(changes), progress=progress)
 
 
@@ -406,27 +411,25 @@ def effort_and_slew(loop):
     return np.sqrt(np.mean(voltage**2)), np.sqrt(np.mean(np.diff(voltage) ** 2))
 
 
-@pytest.fixture(scope="module", params=["effort_weight", "slew_weight"])
-def weighted(request, kept_programs):
-    return request.param, pj.tune(
-        case_of(WEIGHTED | {f"objective/{request.param}": 1e6})
-    )
+@pytest.fixture(scope="module")
+def light(kept_programs):
+    return pj.tune(case_of(WEIGHTED | {"objective/effort_weight": 1e5}))
 
 
-def test_a_weight_lowers_what_it_weighs(weighted):
-    weight, found = weighted
-    figure = ("effort_weight", "slew_weight").index(weight)
-    after = effort_and_slew(found.after)[figure]
-    assert after < 0.5 * effort_and_slew(found.before)[figure]
+def test_a_weight_on_effort_lowers_the_effort(light):
+    assert effort_and_slew(light.after)[0] < 0.5 * effort_and_slew(light.before)[0]
 
 
-def test_gains_at_the_edge_are_said(weighted):
-    weight, found = weighted
-    if weight == "slew_weight":
-        pytest.skip("its way to the bound is longer than these few steps")
-    assert found.result.at_bound == [INTEGRAL]
-    assert f"at the edge of its bounds: {INTEGRAL}" in found.result.warnings
-    assert found.result.gains[INTEGRAL] == pytest.approx(1.0, rel=0.2)
+def test_gains_at_the_edge_are_said(light):
+    result = light.result
+    assert result.at_bound == [INTEGRAL]
+    assert f"at the edge of its bounds: {INTEGRAL}" in result.warnings
+    assert result.gains[INTEGRAL] == pytest.approx(1.0, rel=0.2)
+
+
+def test_a_weight_on_slew_lowers_the_slew(kept_programs):
+    found = pj.tune(case_of(WEIGHTED | {"objective/slew_weight": 1e5}))
+    assert effort_and_slew(found.after)[1] < 0.5 * effort_and_slew(found.before)[1]
 
 
 @pytest.mark.parametrize(
@@ -456,14 +459,6 @@ def test_a_study_that_is_not_there(tmp_path):
         pj.tune(tmp_path / "no.toml")
 
 
-# What should be said and is not
-
-
-def broken(reason):
-    return pytest.mark.xfail(strict=True, reason=reason)
-
-
-@broken("limits turn divergence into a limit cycle, which counts as stable")
 def test_a_box_in_which_every_loop_rails_is_refused_or_called_unstable(kept_programs):
     bounds = {"lower": 3e6, "upper": 1e7, "start": 5e6}
     try:
@@ -473,7 +468,6 @@ def test_a_box_in_which_every_loop_rails_is_refused_or_called_unstable(kept_prog
     assert not result.before.stable
 
 
-@broken("only the tuned loop is checked for saturation")
 def test_a_start_that_rails_is_said(kept_programs):
     changes = {
         f"parameters/{INTEGRAL}/upper": 1e7,
@@ -482,3 +476,12 @@ def test_a_start_that_rails_is_said(kept_programs):
     result = pj.tune(case_of(changes)).result
     assert min(result.before.saturated_percent.values()) > 50.0
     assert any("start" in text or "before" in text for text in result.warnings)
+
+
+def test_ctrl_c_while_judging_keeps_the_gains(kept_programs):
+    recorder = Recorder(stop_stage="judging")
+    try:
+        found = pj.tune(case_of({}), progress=recorder)
+    except KeyboardInterrupt:
+        pytest.fail("nothing came back")
+    assert set(found.result.gains) == {PROPORTIONAL, INTEGRAL}

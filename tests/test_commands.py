@@ -1,0 +1,605 @@
+"""The commands, as they are typed."""
+
+import csv
+import importlib
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+import tomli_w
+from click.testing import CliRunner
+from jax.experimental.compilation_cache import compilation_cache
+from rich.console import Console
+
+import piezojax as pj
+from piezojax.identify import MODELS
+from piezojax.report.console import Bar, tuning_table
+from piezojax.reproduce import TABLES
+from piezojax.reproduce.chapter5 import Cell
+from piezojax.study import read
+
+COMMANDS = {
+    name: importlib.import_module(f"piezojax.{name}.__main__").main
+    for name in ("tune", "identify", "reproduce")
+}
+PNG = b"\x89PNG\r\n\x1a\n"
+STUDY = {
+    "title": "a PID on a lag",
+    "rate": 20_000.0,
+    "seed": 3,
+    "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
+    "actuator": {"lower": -20.0, "upper": 120.0},
+    "sensor": {"noise_rms": 0.012},
+    "controller": {"catalog": "p753_pid"},
+    "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
+    "parameters": {
+        "controller.proportional": {"lower": 0.1, "upper": 5.0, "transform": "log"},
+        "controller.integral": {"lower": 100.0, "upper": 2e4, "transform": "log"},
+    },
+    "optimiser": {"starts": 2, "candidates": 4, "steps": 5},
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs(tmp_path_factory):
+    """A folder of compiled programs: loops of one structure are compiled once."""
+    folder = str(tmp_path_factory.mktemp("programs"))
+    options = {
+        "jax_compilation_cache_dir": folder,
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    before = {name: getattr(jax.config, name) for name in options}
+    for name, value in options.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+    yield folder
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def call(command, *arguments):
+    return CliRunner().invoke(COMMANDS[command], [str(a) for a in arguments])
+
+
+def succeeded(result):
+    assert result.exit_code == 0, result.output
+    assert result.stderr == ""
+    return result
+
+
+def failed(result, message, code=1):
+    """Check that there is one line of error and nothing that looks like a crash."""
+    assert result.exit_code == code
+    assert isinstance(result.exception, SystemExit)
+    assert result.stderr.startswith("Error: ")
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.endswith("\n")
+    assert message in result.stderr
+    assert "Traceback" not in result.output
+
+
+def names(folder):
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def assert_pictures(folder, *pictures):
+    for picture in pictures:
+        content = (folder / picture).read_bytes()
+        assert content.startswith(PNG)
+        assert len(content) > 5_000
+
+
+def write_study(folder, name="small.toml", **tables):
+    path = folder / name
+    path.write_text(tomli_w.dumps(STUDY | tables), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def study(tmp_path):
+    return write_study(tmp_path)
+
+
+@pytest.fixture
+def record(tmp_path):
+    return write_record(tmp_path)
+
+
+def write_record(folder):
+    """A stage with lag and no hysteresis, 300 samples; two amplitudes."""
+    steps = np.arange(300)
+    drive = np.where(steps < 150, 20.0, 10.0) * (1.0 - np.cos(2 * np.pi * steps / 25))
+    lagged = np.convolve(drive, 0.5 ** np.arange(1, 12))[: steps.size]
+    path = folder / "bench.csv"
+    rows = zip(1e-3 * steps, drive, 0.12 * lagged + 4.0, strict=True)
+    path.write_text(
+        "time_s,drive_V,sensor_um\n"
+        + "".join(f"{t:.4f},{u:.6f},{y:.6f}\n" for t, u, y in rows)
+    )
+    return path
+
+
+COLUMNS = ("--time", "time_s", "--input", "drive_V", "--output", "sensor_um")
+
+
+# What they all do
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help(command):
+    result = succeeded(call(command, "--help"))
+    for option in ("--out", "--seed", "--quiet", "--help"):
+        assert option in result.stdout
+
+
+def test_help_names_what_can_be_chosen():
+    assert "STUDY" in call("tune", "--help").stdout
+    assert all(table in call("reproduce", "--help").stdout for table in TABLES)
+    text = call("identify", "--help").stdout
+    options = ("--time", "--input", "--output", "--rate", "--train", "--validate")
+    assert all(option in text for option in (*options, "--model"))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_python_m(command):
+    # As typed, and what the user's shell sees: status, one line, no traceback.
+    argument = {"reproduce": ["--table", "9-9"]}.get(command, ["nowhere.csv"])
+    done = subprocess.run(
+        [sys.executable, "-m", f"piezojax.{command}", *argument],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def arguments_for(command, request):
+    if command == "tune":
+        return [request.getfixturevalue("study")]
+    if command == "identify":
+        return [request.getfixturevalue("record"), *COLUMNS]
+    return ["--table", "5-3"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_used_folder_is_refused(command, request, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "result.json").write_text("mine")
+    result = call(command, *arguments_for(command, request), "--out", out)
+    failed(result, f"--out {out} already holds results; name a new folder")
+    assert (out / "result.json").read_text() == "mine"
+    assert names(out) == ["result.json"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_folder_that_cannot_be_written_is_refused(command, request, tmp_path):
+    # Under a file no folder can be made, not even by root.
+    (tmp_path / "file").write_text("mine")
+    out = tmp_path / "file" / "sub"
+    result = call(command, *arguments_for(command, request), "--out", out)
+    failed(result, f"--out {out} cannot be written: Not a directory")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_file_in_the_place_of_the_folder(command, request, tmp_path):
+    (tmp_path / "out").write_text("mine")
+    result = call(command, *arguments_for(command, request), "--out", tmp_path / "out")
+    failed(result, "cannot be written: File exists")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+# tune
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tuned")
+    result = call("tune", write_study(folder), "--out", folder / "out")
+    return succeeded(result), folder / "out"
+
+
+def test_tune_writes_its_results(tuned):
+    _, out = tuned
+    assert set(names(out)) >= {
+        *("result.json", "gains.toml"),
+        *("tracking.png", "hysteresis.png", "convergence.png"),
+    }
+    assert not [name for name in names(out) if name.startswith(".")]
+    assert_pictures(out, "tracking.png", "hysteresis.png", "convergence.png")
+
+
+def test_tune_result_and_gains_load(tuned):
+    _, out = tuned
+    result = pj.load_result(out)
+    assert result.status in ("converged", "step limit")
+    assert result.study == "small"
+    controller = pj.load(out / "gains.toml")
+    assert isinstance(controller, pj.PID)
+    assert float(controller.integral) == result.gains["controller.integral"]
+    assert float(controller.proportional) == result.gains["controller.proportional"]
+    raw = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    assert raw["holdout"]["geomean_rms_um"] < raw["holdout_before"]["geomean_rms_um"]
+
+
+def test_tune_tells_where_it_stands_and_ends_with_a_table(tuned):
+    printed, out = tuned
+    lines = printed.stdout.splitlines()
+    assert lines[0] == "reading small.toml"
+    assert "tuning from 2 starts" in lines
+    text = printed.stdout
+    for part in ("SIN50", "SW50", "geometric mean", "controller.integral"):
+        assert part in text
+    assert "results in" in text
+    assert "\x1b" not in text  # no colours where there is no terminal
+    assert " ".join(text.split()).endswith(str(out))
+
+
+def test_tuned_gains_can_be_tuned_again(tuned, tmp_path):
+    _, out = tuned
+    (tmp_path / "gains.toml").write_bytes((out / "gains.toml").read_bytes())
+    case = read(write_study(tmp_path, controller={"file": "gains.toml"}))
+    assert float(case.loop.controller.integral) == pytest.approx(
+        pj.load_result(out).gains["controller.integral"]
+    )
+
+
+def test_quiet_seeded_and_without_a_folder(study, monkeypatch):
+    monkeypatch.chdir(study.parent)
+    used = study.parent / "results" / "small"
+    used.mkdir(parents=True)
+    (used / "result.json").write_text("mine")
+    result = succeeded(call("tune", "small.toml", "--quiet", "--seed", 5))
+    assert result.output == ""
+    assert (used / "result.json").read_text() == "mine"
+    assert names(study.parent / "results") == ["small", "small-2"]
+    assert pj.load_result("results/small-2").seed == 5
+
+
+def test_tune_bad_studies(tmp_path):
+    out = ("--out", tmp_path / "out")
+    failed(call("tune", "p754", *out), "study 'p754' is unknown; there are ")
+    failed(call("tune", tmp_path / "no.toml", *out), "No such file or directory")
+    (tmp_path / "a.toml").write_text("title = = 3")
+    failed(call("tune", tmp_path / "a.toml", *out), "a.toml is no TOML file")
+    path = write_study(tmp_path, sead=3)
+    failed(call("tune", path, *out), "sead is unknown; allowed are title, rate, seed")
+    path = write_study(tmp_path, rate=-3.0)
+    failed(call("tune", path, *out), "rate is -3.0: Input should be greater than 0")
+    path = write_study(tmp_path, plant={"record": "no.csv", "model": "coleman_hodgdon"})
+    failed(call("tune", path, *out), "no.csv: No such file or directory")
+    failed(call("tune", path, *out, "--quiet"), "no.csv: No such file or directory")
+
+
+def test_tune_a_box_in_which_everything_diverges(tmp_path):
+    path = write_study(
+        tmp_path,
+        actuator={"lower": -1e300, "upper": 1e300},
+        parameters={"controller.integral": {"lower": 3e6, "upper": 1e7, "start": 5e6}},
+    )
+    result = call("tune", path, "--out", tmp_path / "out")
+    failed(result, "the loop diverges at the start and at all 4 other points")
+
+
+def assert_interrupted(out):
+    result = pj.load_result(out)
+    assert result.status == "interrupted"
+    assert result.holdout.stable
+    controller = pj.load(out / "gains.toml")
+    assert float(controller.integral) == result.gains["controller.integral"]
+    assert_pictures(out, "tracking.png", "hysteresis.png")
+    return result
+
+
+def test_ctrl_c_in_mid_run(study, tmp_path, monkeypatch):
+    def press(self, best):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Bar, "advance", press)
+    result = call("tune", study, "--out", tmp_path / "out")
+    assert result.exit_code == 130
+    assert "interrupted after 7 evaluations" in " ".join(result.stdout.split())
+    assert "Traceback" not in result.output
+    assert len(assert_interrupted(tmp_path / "out").history) == 1
+
+
+def test_ctrl_c_before_anything_is_found(study, tmp_path, monkeypatch):
+    def press(self, text, steps=0):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Bar, "stage", press)
+    result = call("tune", study, "--out", tmp_path / "out")
+    assert result.exit_code == 130
+    assert "Traceback" not in result.output
+
+
+def test_ctrl_c_while_drawing_loses_no_result(study, tmp_path, monkeypatch):
+    def press(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("piezojax.report.tuning.tracking_figure", press)
+    result = call("tune", study, "--out", tmp_path / "out")
+    assert result.exit_code == 130
+    assert "Traceback" not in result.output
+    assert names(tmp_path / "out") == ["gains.toml", "result.json"]
+    assert pj.load_result(tmp_path / "out").status == "step limit"
+
+
+@pytest.mark.slow
+def test_a_real_ctrl_c(tmp_path, programs):
+    # Long steps, and more of them than it could take before the signal arrives.
+    study = write_study(
+        tmp_path,
+        references={
+            "tune": ["SIN50", "SW50", "PWSW50", "SIN10"],
+            "duration": 2.0,
+            "settle": 0.5,
+        },
+        optimiser={"starts": 16, "candidates": 16, "steps": 10_000},
+    )
+    out = tmp_path / "out"
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-m", "piezojax.tune", str(study), "--out", str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PIEZOJAX_COMPILATION_CACHE": programs},
+    )
+    with process:
+        try:
+            for line in process.stdout:
+                if line.startswith("tuning from"):
+                    break
+            time.sleep(1.0)
+            process.send_signal(signal.SIGINT)
+            printed, complaint = process.communicate(timeout=120)
+        finally:
+            process.kill()
+    assert complaint == ""
+    assert process.returncode == 130
+    assert "interrupted after" in " ".join(printed.split())
+    assert_interrupted(out)
+
+
+# identify
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("identified")
+    record = write_record(folder)
+    arguments = (*COLUMNS, "--train", "0:200", "--validate", "220:300")
+    result = call("identify", record, *arguments, "--out", folder / "out")
+    return succeeded(result), folder / "out"
+
+
+def test_identify_writes_its_results(identified):
+    _, out = identified
+    assert names(out) == ["fit.json", "fit.png", "model.json"]
+    assert_pictures(out, "fit.png")
+
+
+def test_fit_json_has_the_agreed_keys(identified):
+    _, out = identified
+    fit = json.loads((out / "fit.json").read_text(encoding="utf-8"))
+    assert set(fit) >= {"model", "parameters", "train", "warnings", "wall_s"}
+    assert fit["model"] == "coleman_hodgdon"
+    for part in ("train", "validate"):
+        assert set(fit[part]) == {"rmse", "rmse_percent_of_span", "unit"}
+        assert fit[part]["unit"] == "um"
+        assert fit[part]["rmse_percent_of_span"] < 5.0
+    for parameter in fit["parameters"].values():
+        assert set(parameter) == {"value", "standard_error"}
+
+
+def test_the_model_is_a_plant_for_a_study(identified, tmp_path):
+    _, out = identified
+    fit = json.loads((out / "fit.json").read_text(encoding="utf-8"))
+    model = pj.load(out / "model.json")
+    assert float(model.parts[0].b) == fit["parameters"]["hysteresis.b"]["value"]
+    (tmp_path / "model.json").write_bytes((out / "model.json").read_bytes())
+    path = write_study(
+        tmp_path,
+        rate=1000.0,
+        plant={"file": "model.json"},
+        controller={"design": "inversion_sliding_mode"},
+        parameters={"controller.feedback.integral": {"lower": 1e-3, "upper": 1e6}},
+    )
+    case = read(path)
+    assert float(case.loop.plant.parts[0].b) == float(model.parts[0].b)
+
+
+def test_identify_ends_with_a_table(identified):
+    printed, _ = identified
+    for part in ("hysteresis.a", "standard error", "training", "validation", "um"):
+        assert part in printed.stdout
+    assert "results in" in printed.stdout
+
+
+def test_model_help_lists_the_models(record):
+    result = succeeded(call("identify", record, "--model", "help"))
+    assert result.stdout.split() == list(MODELS)
+
+
+def test_identify_bad_input(record, tmp_path):
+    out = ("--out", tmp_path / "out")
+    failed(call("identify", tmp_path / "no.csv", *out), "no.csv: No such file or dir")
+    failed(call("identify", record, *out), "name the time column, or give its rate")
+    failed(
+        call("identify", record, *out, "--rate", -5.0),
+        "bench.csv: rate is -5 Hz; it must be above 0",
+    )
+    failed(
+        call("identify", record, *out, *COLUMNS, "--input", "volts"),
+        "input column 'volts' is missing; there are time_s, drive_V, sensor_um",
+    )
+    failed(
+        call("identify", record, *out, *COLUMNS, "--model", "bouc_wen"),
+        "model 'bouc_wen' is unknown; there are coleman_hodgdon",
+    )
+    failed(
+        call("identify", record, *out, *COLUMNS, "--train", "100:50"),
+        "train is 100:50; it must lie in 0:300 and hold a sample",
+    )
+    failed(
+        call("identify", record, *out, *COLUMNS, "--validate", "0:5000"),
+        "validate is 0:5000; it must lie in 0:300 and hold a sample",
+    )
+    text = record.read_text().replace("0.0100,", "0.0100,nan", 1)
+    record.write_text(text)
+    failed(call("identify", record, *out, *COLUMNS), "sample 10")
+
+
+# reproduce
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    """Tables without their simulation, which tests/reproduce has."""
+    asked = []
+
+    def reproduce(table):
+        asked.append(table)
+        return [
+            Cell(table, row, column, "um", 0.1, 0.11)
+            for row in ("SIN1", "SW10")
+            for column in ("pid_smc", "dob")
+        ]
+
+    module = sys.modules["piezojax.reproduce.__main__"]
+    monkeypatch.setattr(module, "reproduce", reproduce)
+    return asked
+
+
+def test_reproduce_writes_its_results(made_up, tmp_path):
+    out = tmp_path / "out"
+    result = succeeded(call("reproduce", "--table", "5-5", "--out", out))
+    assert made_up == ["5-5"]
+    assert names(out) == ["cells.csv", "cells.png", "summary.json"]
+    assert_pictures(out, "cells.png")
+    with (out / "cells.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["table", "row", "column", "unit", "paper", "sim"]
+    assert len(rows) == 4
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["5-5"]["geomean_ratio"] == pytest.approx(1.1)
+    assert summary["5-5"]["columns"]["dob"]["worst_ratio"] == pytest.approx(1.1)
+    assert "Table 5-5" in result.stdout
+    assert "geometric-mean ratio 1.100" in result.stdout
+
+
+def test_reproduce_all_tables_or_each_once(made_up, tmp_path):
+    succeeded(call("reproduce", "--out", tmp_path / "a", "--quiet"))
+    assert made_up == list(TABLES)
+    made_up.clear()
+    twice = ("--table", "5-5", "--table", "5-3", "--table", "5-5")
+    succeeded(call("reproduce", *twice, "--out", tmp_path / "b"))
+    assert made_up == ["5-5", "5-3"]
+
+
+def test_quiet_reproduce_prints_nothing(made_up, tmp_path):
+    result = call("reproduce", "--quiet", "--out", tmp_path / "out")
+    assert succeeded(result).output == ""
+
+
+def test_reproduce_unknown_table(made_up, tmp_path):
+    out = tmp_path / "out"
+    result = call("reproduce", "--table", "5-3", "--table", "9-9", "--out", out)
+    failed(result, "--table 9-9 is unknown; there are 5-3, 5-5")
+    assert not out.exists()
+    assert made_up == []
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("tune", ["--seed", "-1"]),
+        ("tune", ["--sead", "1"]),
+        ("tune", ["a.toml", "b.toml"]),
+        ("identify", ["r.csv", "--train", "first half"]),
+        ("identify", ["r.csv", "--rate", "fast"]),
+        ("identify", []),
+    ],
+)
+def test_usage_errors_in_one_line(command, arguments):
+    result = call(command, *arguments)
+    assert result.exit_code != 0
+    assert result.stderr.count("\n") == 1
+
+
+def test_model_help_needs_no_record():
+    succeeded(call("identify", "--model", "help"))
+
+
+def test_bad_input_leaves_no_empty_folder(record, tmp_path):
+    out = tmp_path / "out"
+    result = call("identify", record, *COLUMNS, "--model", "x", "--out", out)
+    assert result.exit_code == 1
+    assert not out.exists()
+
+
+def test_an_early_ctrl_c_is_acknowledged(study, tmp_path, monkeypatch):
+    def press(self, text, steps=0):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Bar, "stage", press)
+    result = call("tune", study, "--out", tmp_path / "out")
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("title", ["gain [um/V]", "a [bold] stage", "[/um] per volt"])
+def test_titles_with_brackets(tuned, title):
+    result = pj.load_result(tuned[1]).model_copy(update={"title": title})
+    stream = io.StringIO()
+    Console(file=stream, width=200).print(tuning_table(result))
+    assert title in stream.getvalue()
+
+
+def test_names_with_brackets(tmp_path):
+    path = write_study(tmp_path, name="run[bold]1.toml", rate=10_000.0)
+    result = call("tune", path, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert result.stdout.splitlines()[0] == "reading run[bold]1.toml"
+
+
+def test_a_long_path_is_printed_in_one_piece(made_up, tmp_path):
+    out = tmp_path / ("a_long_name_" * 8) / "out"
+    result = succeeded(call("reproduce", "--table", "5-5", "--out", out))
+    assert str(out) in result.stdout
+
+
+def test_a_full_disk_is_said_in_one_line(study, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("piezojax.report.tuning.write_text", full)
+    result = call("tune", study, "--out", tmp_path / "out")
+    failed(result, "No space left on device")
+
+
+def test_pictures_of_a_start_that_diverges(tmp_path):
+    path = write_study(
+        tmp_path,
+        actuator={"lower": -1e300, "upper": 1e300},
+        parameters={
+            "controller.integral": {
+                **{"lower": 100.0, "upper": 1e7, "start": 5e6},
+                "transform": "log",
+            }
+        },
+    )
+    out = tmp_path / "out"
+    result = call("tune", path, "--out", out)
+    assert result.exit_code == 0
+    assert "diverges" in result.stdout
+    assert_pictures(out, "tracking.png", "hysteresis.png", "convergence.png")
