@@ -72,7 +72,11 @@ def run(quiet: bool, body: Callable[[Console], Any]) -> None:
         body(console(quiet))
     except ValueError as error:
         raise _one_line(str(error)) from None
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        raise _one_line(f"{where}{error.strerror or error}") from None
     except KeyboardInterrupt:
+        click.echo("interrupted before there was anything to keep", err=True)
         raise SystemExit(INTERRUPTED) from None
 
 

@@ -88,7 +88,6 @@ class SlidingModePID(System):
         zero = jnp.zeros_like(integral)
         return SlidingModeState(
             filter=self.filter.init(input.measured),
-            # A start with an error keeps the plain zero: there is nothing to hold.
             integral=integral,
             surface=zero,
             older_reference=reference + zero,

@@ -57,8 +57,8 @@ def main(record, model, time, input, output, rate, train, validate, out, seed, q
             write_fit(fit, folder)
         console.print(fit_table(fit.report))
         for warning in fit.report.warnings:
-            console.print(f"note: {warning}")
-        console.print(f"{fit.report.wall_s:.1f} s; results in {folder}")
+            console.print(f"note: {warning}", soft_wrap=True)
+        console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
 
     run(quiet, body)
 

@@ -13,6 +13,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 from ..identify.output_error import FitReport
 from ..reproduce.chapter5 import Cell
@@ -28,7 +29,7 @@ class Bar:
         self._live = console.is_terminal
         self._progress = Progress(
             SpinnerColumn(),
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=30),
             MofNCompleteColumn(),
             TextColumn("{task.fields[note]}"),
@@ -61,7 +62,8 @@ class Bar:
 
 def console(quiet: bool) -> Console:
     """Return where a command prints: standard output, or nowhere."""
-    return Console(quiet=quiet, file=sys.stdout, highlight=False)
+    # Titles and paths may hold brackets: nothing printed is markup.
+    return Console(quiet=quiet, file=sys.stdout, highlight=False, markup=False)
 
 
 def _nanometres(value: float | None) -> str:
@@ -74,7 +76,9 @@ def _ratio(before: float | None, after: float | None) -> str:
 
 def tuning_table(result: Result) -> Table:
     """Return the before/after table on held-out noise, in nm rms."""
-    table = Table(title=f"{result.title}\nrms tracking error on held-out noise, nm")
+    table = Table(
+        title=Text(f"{result.title}\nrms tracking error on held-out noise, nm")
+    )
     table.add_column("reference")
     for heading in ("before", "tuned", "better", "peak, tuned"):
         table.add_column(heading, justify="right")

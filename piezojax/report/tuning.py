@@ -16,6 +16,7 @@ from ..tune.tuner import Outcome
 from .figures import AFTER, BEFORE, REFERENCE, figure, legend_above, styled, write
 
 _SHOWN = 3  # references in the tracking picture
+_BEYOND = 1e9  # um or V
 _PERIODS = 4.0  # of the reference, at the end of the run
 
 
@@ -48,11 +49,17 @@ def _logs(outcome: Outcome) -> Logs:
         i = names.index(name)
         reference, noise = outcome.holdout.references[i], outcome.holdout.noise[i, 0]
         before, after = (
-            jax.tree.map(np.asarray, run(loop, reference, noise))
+            jax.tree.map(_drawable, run(loop, reference, noise))
             for loop in (outcome.before, outcome.after)
         )
         logs[name] = (before, after)
     return logs
+
+
+def _drawable(values: jax.Array) -> np.ndarray:
+    # A run that diverges ends at the edge of the picture, not in an overflow.
+    array = np.asarray(values)
+    return np.where(np.abs(array) < _BEYOND, array, np.nan)
 
 
 def _shown(outcome: Outcome) -> list[str]:
@@ -89,7 +96,7 @@ def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
                 error[shown],
                 color=colour,
                 lw=0.9,
-                label=f"{label}, {rms:.4g} nm rms",
+                label=f"{label}, {rms:.4g} nm rms" if np.isfinite(rms) else label,
             )
         left.plot(
             time[shown],

@@ -51,7 +51,7 @@ def main(tables, out, seed, quiet):
                     table, [c for c in cells if c.table == table], summary[table]
                 )
             )
-        console.print(f"results in {folder}")
+        console.print(f"results in {folder}", soft_wrap=True)
 
     run(quiet, body)
 

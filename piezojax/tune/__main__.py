@@ -38,11 +38,12 @@ def main(study: Path | None, out: Path | None, seed: int | None, quiet: bool) ->
         console.print(tuning_table(result))
         console.print(gains_table(result))
         for warning in result.warnings:
-            console.print(f"note: {warning}")
+            console.print(f"note: {warning}", soft_wrap=True)
         console.print(
             f"{result.status} after {result.evaluations} evaluations, "
             f"{result.wall_s:.1f} s ({result.compile_s:.1f} s of it compiling); "
-            f"results in {folder}"
+            f"results in {folder}",
+            soft_wrap=True,
         )
         if result.status == "interrupted":
             raise SystemExit(INTERRUPTED)

@@ -18,7 +18,7 @@ Aggregate = Literal["geometric_mean", "mean_square", "worst"]
 HOPELESS = 1e6
 """Objective of a run that diverged: finite, so that a line search can step back."""
 
-RAILED = 0.5
+RAILED = 0.9
 """A run whose actuator saturates for more than this share of it has lost its loop."""
 
 _SHARPNESS = 20.0  # of the smooth maximum in "worst"

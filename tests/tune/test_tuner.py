@@ -315,7 +315,8 @@ def test_a_diverging_start_is_replaced_and_said(kept_programs):
     assert result.before.geomean_rms_um is None
     assert result.before.per_reference_rms_um == {"SIN50": None, "SW50": None}
     assert any(
-        "the study's own start diverges; tuning began from the best of 4 other" in text
+        "the study's own start diverges or rails; tuning began from the best of 4"
+        in text
         for text in result.warnings
     )
     assert result.holdout.geomean_rms_um < 1.0
@@ -329,10 +330,12 @@ def test_a_box_in_which_everything_diverges(kept_programs):
         "actuator": WIDE,
         f"parameters/{INTEGRAL}": {"lower": 3e6, "upper": 1e7, "start": 5e6},
     }
-    with pytest.raises(ValueError, match="the loop diverges at the start and") as got:
+    with pytest.raises(
+        ValueError, match="the loop diverges or rails at the start and"
+    ) as got:
         pj.tune(case_of(changes))
     assert str(got.value) == (
-        "the loop diverges at the start and at all 4 other points tried in the box: "
+        "the loop diverges or rails at the start and all 4 points tried in the box: "
         "lower the bounds of the gains, raise 'candidates', or check the plant's sign "
         "and sample rate"
     )
@@ -382,7 +385,7 @@ def test_saturation_is_reported(kept_programs):
     }
     result = pj.tune(case_of(changes)).result
     for part in (result.after, result.holdout):
-        assert all(share > 10.0 for share in part.saturated_percent.values())
+        assert all(share > 1.0 for share in part.saturated_percent.values())
         assert part.peak_voltage_V == 40.0
     for where in ("tuning", "hold-out"):
         text = f"the actuator saturates on {where} runs of SIN50, SW50"
