@@ -10,12 +10,10 @@ import subprocess
 import sys
 import time
 
-import jax
 import numpy as np
 import pytest
 import tomli_w
 from click.testing import CliRunner
-from jax.experimental.compilation_cache import compilation_cache
 from rich.console import Console
 
 import piezojax as pj
@@ -47,23 +45,7 @@ STUDY = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def programs(tmp_path_factory):
-    """A folder of compiled programs: loops of one structure are compiled once."""
-    folder = str(tmp_path_factory.mktemp("programs"))
-    options = {
-        "jax_compilation_cache_dir": folder,
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-        "jax_persistent_cache_min_entry_size_bytes": -1,
-    }
-    before = {name: getattr(jax.config, name) for name in options}
-    for name, value in options.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-    yield folder
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
+pytestmark = pytest.mark.usefixtures("kept_programs")
 
 
 def call(command, *arguments):
@@ -336,7 +318,7 @@ def test_ctrl_c_while_drawing_loses_no_result(study, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_real_ctrl_c(tmp_path, programs):
+def test_a_real_ctrl_c(tmp_path, kept_programs):
     # Long steps, and more of them than it could take before the signal arrives.
     study = write_study(
         tmp_path,
@@ -353,7 +335,7 @@ def test_a_real_ctrl_c(tmp_path, programs):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PIEZOJAX_COMPILATION_CACHE": programs},
+        env=os.environ | {"PIEZOJAX_COMPILATION_CACHE": kept_programs},
     )
     with process:
         try:

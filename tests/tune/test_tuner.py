@@ -4,11 +4,9 @@ import copy
 import json
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
 
 import piezojax as pj
 from piezojax import signals
@@ -48,22 +46,7 @@ RESULT_KEYS = {
 SCORE_KEYS = {"per_reference_rms_um", "geomean_rms_um", "worst_rms_um"}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def kept_programs(tmp_path_factory):
-    """Loops of one structure are compiled once in this module."""
-    options = {
-        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("programs")),
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-        "jax_persistent_cache_min_entry_size_bytes": -1,
-    }
-    before = {name: getattr(jax.config, name) for name in options}
-    for name, value in options.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
+pytestmark = pytest.mark.usefixtures("kept_programs")
 
 
 def case_of(changes, seed=None):
