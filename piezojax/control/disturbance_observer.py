@@ -13,12 +13,15 @@ COEFFICIENTS = ("corrected", "printed")
 
 
 class DisturbanceObserverState(NamedTuple):
-    """State of the controller; past measurements, voltages and estimates."""
+    """State of the controller, the last estimate w, and the memory of the filter.
+
+    ``memory`` is what past samples add to c_0 w one and two samples later, in V: the
+    transposed direct form of (5.26), with the fewest numbers to carry.
+    """
 
     feedback: State
-    measured: tuple[Scalar, Scalar]
-    applied: tuple[Scalar, Scalar]
-    disturbance: tuple[Scalar, Scalar]
+    disturbance: Scalar
+    memory: tuple[Scalar, Scalar]
 
 
 class DisturbanceObserverControl(System):
@@ -80,30 +83,31 @@ class DisturbanceObserverControl(System):
         # At rest Q = 1: w = z / (gain G(1)) - u.
         w = input.measured / (self.gain * self.model.dc_gain()) - input.applied
         force = self.gain * (input.applied + w)
+        next_term, last_term = self._past(input, w)
         return DisturbanceObserverState(
             feedback=self.feedback.init(input._replace(applied=force)),
-            measured=(input.measured, input.measured),
-            applied=(input.applied, input.applied),
-            disturbance=(w, w),
+            disturbance=w,
+            memory=(next_term + last_term, last_term),
         )
+
+    def _past(self, input: Observation, w: Scalar) -> tuple[Scalar, Scalar]:
+        """What one sample adds to c_0 w one and two samples later."""
+        _, b1, b2 = self.model.moving
+        a1, a2 = self.model.autoregressive
+        _, c1, c2 = self.denominator()
+        z, u = input.measured / self.gain, input.applied
+        return -a1 * z - b1 * u - c1 * w, -a2 * z - b2 * u - c2 * w
 
     def step(
         self, state: DisturbanceObserverState, input: Observation
     ) -> tuple[DisturbanceObserverState, Scalar]:
-        a1, a2 = self.model.autoregressive
-        b0, b1, b2 = self.model.moving
-        c0, c1, c2 = self.denominator()
-        z, (z1, z2) = input.measured, state.measured
-        u1, (u2, u3) = input.applied, state.applied
-        w1, w2 = state.disturbance
+        c0, _, _ = self.denominator()
+        z, u = input.measured / self.gain, input.applied
         # Both filters of (5.26) have the denominator c: one recursion serves both.
-        w = (1.0 / c0) * (
-            (z - a1 * z1 - a2 * z2) / self.gain
-            - (b0 * u1 + b1 * u2 + b2 * u3)
-            - c1 * w1
-            - c2 * w2
-        )
-        force = self.gain * (u1 + w1)
+        w = (1.0 / c0) * (z - self.model.moving[0] * u + state.memory[0])
+        next_term, last_term = self._past(input, w)
+        memory = (next_term + state.memory[1], last_term)
+        force = self.gain * (u + state.disturbance)
         feedback, f = self.feedback.step(state.feedback, input._replace(applied=force))
-        state = DisturbanceObserverState(feedback, (z, z1), (u1, u2), (w, w1))
+        state = DisturbanceObserverState(feedback, w, memory)
         return state, f / self.gain - w

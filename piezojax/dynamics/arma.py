@@ -1,20 +1,12 @@
 """Autoregressive moving-average dynamics of any order."""
 
-from typing import NamedTuple
+import itertools
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from .._types import Scalar, ScalarLike, as_array, as_scalars, check
 from ..system import System
-
-
-class ARMAState(NamedTuple):
-    """Past outputs and inputs, newest first."""
-
-    outputs: tuple[Scalar, ...]
-    inputs: tuple[Scalar, ...]
 
 
 class ARMA(System):
@@ -22,8 +14,9 @@ class ARMA(System):
 
     ``autoregressive`` holds a_1, a_2, ... with the sign of the thesis (on the
     right-hand side), ``moving`` holds b_0, b_1, ...; x and y in the units of the
-    neighbours in the chain. Raises ValueError for empty ``moving`` or non-finite
-    coefficients.
+    neighbours in the chain. The state is that of the transposed direct form, with the
+    fewest numbers to carry: element i is what the past adds to the output i + 1 samples
+    ahead. Raises ValueError for empty ``moving`` or non-finite coefficients.
     """
 
     autoregressive: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
@@ -47,23 +40,30 @@ class ARMA(System):
         """Return the zeros in the z plane (concrete parameters only)."""
         return np.roots([float(b) for b in self.moving])
 
-    def init(self, input: ScalarLike = 0.0) -> ARMAState:
+    def init(self, input: ScalarLike = 0.0) -> tuple[Scalar, ...]:
         input = as_array(input)
-        output = self.dc_gain() * input
-        return ARMAState(
-            outputs=(output,) * len(self.autoregressive),
-            inputs=(input,) * (len(self.moving) - 1),
-        )
+        terms = self._past(input, self.dc_gain() * input)
+        return tuple(itertools.accumulate(reversed(terms)))[::-1]
 
-    def step(self, state: ARMAState, input: ScalarLike) -> tuple[ARMAState, Scalar]:
-        inputs = (as_array(input), *state.inputs)
-        output = jnp.zeros_like(inputs[0])
-        for coefficient, value in zip(self.moving, inputs, strict=True):
-            output = output + coefficient * value
-        for coefficient, value in zip(self.autoregressive, state.outputs, strict=True):
-            output = output + coefficient * value
-        outputs = (output, *state.outputs)[: len(self.autoregressive)]
-        return ARMAState(outputs, inputs[:-1]), output
+    def step(
+        self, state: tuple[Scalar, ...], input: ScalarLike
+    ) -> tuple[tuple[Scalar, ...], Scalar]:
+        input = as_array(input)
+        output = self.moving[0] * input
+        if not state:
+            return state, output
+        output = output + state[0]
+        *terms, last = self._past(input, output)
+        later = (x + rest for x, rest in zip(terms, state[1:], strict=True))
+        return (*later, last), output
+
+    def _past(self, input: Scalar, output: Scalar) -> list[Scalar]:
+        """What one sample adds to the outputs 1, 2, ... samples later."""
+        fed_back = [a * output for a in self.autoregressive]
+        fed_forward = [b * input for b in self.moving[1:]]
+        longer, shorter = sorted((fed_back, fed_forward), key=len, reverse=True)
+        both = [x + y for x, y in zip(longer, shorter, strict=False)]
+        return both + longer[len(shorter) :]
 
 
 def scaled_to_dc(model: ARMA, gain: ScalarLike) -> ARMA:
