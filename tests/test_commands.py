@@ -18,7 +18,7 @@ from rich.console import Console
 
 import piezojax as pj
 from piezojax.identify import MODELS
-from piezojax.report.console import Bar, tuning_table
+from piezojax.report.console import Bar, console, tuning_table
 from piezojax.reproduce import TABLES
 from piezojax.reproduce.chapter5 import Cell
 from piezojax.study import read
@@ -293,6 +293,29 @@ def test_ctrl_c_in_mid_run(study, tmp_path, monkeypatch):
     assert "interrupted after 7 evaluations" in " ".join(result.stdout.split())
     assert "Traceback" not in result.output
     assert len(assert_interrupted(tmp_path / "out").history) == 1
+
+
+def test_ctrl_c_waits_for_the_next_word_of_progress():
+    with Bar(console(quiet=True)) as bar:
+        bar.stage("compiling")
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            bar.advance(1.0)
+        bar.stage("judging")  # the press is spent: what was found can be judged
+
+
+def test_ctrl_c_twice_acts_at_once():
+    with Bar(console(quiet=True)):
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_ctrl_c_is_left_as_it_was():
+    before = signal.getsignal(signal.SIGINT)
+    with Bar(console(quiet=True)):
+        assert signal.getsignal(signal.SIGINT) != before
+    assert signal.getsignal(signal.SIGINT) == before
 
 
 def test_ctrl_c_before_anything_is_found(study, tmp_path, monkeypatch):

@@ -1,7 +1,10 @@
 """What the commands print: progress while they work, one table at the end."""
 
+import signal
 import sys
+import threading
 from collections.abc import Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -22,7 +25,12 @@ from ..tune.result import Result, Scores
 
 
 class Bar:
-    """Progress of tuning on a terminal; plain lines where there is none."""
+    """Progress of tuning on a terminal; plain lines where there is none.
+
+    While it runs, the first ``Ctrl-C`` waits for the next word of progress, because an
+    exception in the midst of JAX's compiler can be lost or crash it; the second acts at
+    once.
+    """
 
     def __init__(self, console: Console):
         self._console = console
@@ -38,16 +46,36 @@ class Bar:
             disable=not self._live,
         )
         self._task = None
+        self._interrupted = False
+        self._handler: Any = None
 
     def __enter__(self) -> "Bar":
+        # Only the main thread may handle signals.
+        if threading.current_thread() is threading.main_thread():
+            self._handler = signal.signal(signal.SIGINT, self._interrupt)
         self._progress.start()
         return self
 
     def __exit__(self, *exception) -> None:
         self._progress.stop()
+        if self._handler is not None:
+            signal.signal(signal.SIGINT, self._handler)
+
+    def _interrupt(self, number: int, frame: object) -> None:
+        if self._interrupted:
+            raise KeyboardInterrupt
+        self._interrupted = True
+        if self._task is not None:
+            self._progress.update(self._task, note="stopping; Ctrl-C again: at once")
+
+    def _stop_if_asked(self) -> None:
+        if self._interrupted:
+            self._interrupted = False
+            raise KeyboardInterrupt
 
     def stage(self, text: str, steps: int = 0) -> None:
         """Show a new stage; without ``steps`` its length is unknown."""
+        self._stop_if_asked()
         if not self._live:
             self._console.print(text)
         if self._task is not None:
@@ -56,6 +84,7 @@ class Bar:
 
     def advance(self, best: float) -> None:
         """Move the bar by one step."""
+        self._stop_if_asked()
         if self._task is not None:
             self._progress.update(self._task, advance=1, note=f"objective {best:.3f}")
 
