@@ -18,53 +18,121 @@ UNIFORM = 1e-3
 
 @dataclass(frozen=True)
 class Record:
-    """A measured record of one input and one output, uniformly sampled.
+    """A measured record, uniformly sampled.
 
-    ``input`` and ``output``: arrays of one length, in ``input_unit`` and
-    ``output_unit``; ``dt`` in s; ``source``: where it came from.
+    ``inputs`` [samples, m] and ``outputs`` [samples, p] in ``input_units`` and
+    ``output_units``, one name a column; a single column may be given as [samples] and
+    its unit as one name. ``dt`` in s; ``source``: where it came from; ``period``: the
+    samples of one period where the input repeats itself. Raises ValueError, naming
+    column and sample, for columns of different length, too few samples, numbers that
+    are missing, a column that never changes, or a sample time that is not positive.
     """
 
-    input: np.ndarray
-    output: np.ndarray
+    inputs: np.ndarray
+    outputs: np.ndarray
     dt: float
-    input_unit: str = "V"
-    output_unit: str = "um"
+    input_units: str | tuple[str, ...] = "V"
+    output_units: str | tuple[str, ...] = "um"
     source: str = ""
+    period: int | None = None
 
     def __post_init__(self):
-        if self.input.shape != self.output.shape or self.input.ndim != 1:
-            raise ValueError(
-                f"{self.source}: input has shape {self.input.shape} and output "
-                f"{self.output.shape}; both must be one column of the same length"
-            )
-        if self.input.size < SHORTEST:
-            raise ValueError(
-                f"{self.source}: {self.input.size} samples; "
-                f"at least {SHORTEST} are needed"
-            )
-        for name, column in (("input", self.input), ("output", self.output)):
-            bad = np.flatnonzero(~np.isfinite(column))
-            if bad.size:
+        for side in ("input", "output"):
+            columns = np.asarray(getattr(self, side + "s"), dtype=float)
+            if columns.ndim == 1:
+                columns = columns[:, None]
+            if columns.ndim != 2:
                 raise ValueError(
-                    f"{self.source}: {name} is missing or not finite at sample "
-                    f"{bad[0]} ({bad.size} in all)"
+                    f"{self.source}: {side} has shape {columns.shape}; "
+                    "it must be [samples] or [samples, channels]"
                 )
-            if np.ptp(column) == 0:
-                raise ValueError(f"{self.source}: {name} never changes")
+            units = getattr(self, side + "_units")
+            units = (units,) * columns.shape[1] if isinstance(units, str) else units
+            if len(units) != columns.shape[1]:
+                raise ValueError(
+                    f"{self.source}: {len(units)} units for {columns.shape[1]} "
+                    f"{side} columns"
+                )
+            object.__setattr__(self, side + "s", columns)
+            object.__setattr__(self, side + "_units", tuple(units))
+        samples = len(self.inputs)
+        if len(self.outputs) != samples:
+            raise ValueError(
+                f"{self.source}: input has {samples} samples and output "
+                f"{len(self.outputs)}; they must be of the same length"
+            )
+        if samples < SHORTEST:
+            raise ValueError(
+                f"{self.source}: {samples} samples; at least {SHORTEST} are needed"
+            )
+        for side, columns in (("input", self.inputs), ("output", self.outputs)):
+            for i, column in enumerate(columns.T):
+                name = side if columns.shape[1] == 1 else f"{side} {i}"
+                bad = np.flatnonzero(~np.isfinite(column))
+                if bad.size:
+                    raise ValueError(
+                        f"{self.source}: {name} is missing or not finite at sample "
+                        f"{bad[0]} ({bad.size} in all)"
+                    )
+                if np.ptp(column) == 0:
+                    raise ValueError(f"{self.source}: {name} never changes")
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise ValueError(
                 f"{self.source}: the sample time is {self.dt:g} s; it must be above 0"
             )
+        if self.period is not None and not 1 < self.period <= samples:
+            raise ValueError(
+                f"{self.source}: the period is {self.period} samples; "
+                f"it must lie in 2..{samples}"
+            )
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return len(self.inputs)
+
+    @property
+    def input(self) -> np.ndarray:
+        """The input [samples] of a record with one; ValueError if it has several."""
+        return self._only("input", self.inputs)
+
+    @property
+    def output(self) -> np.ndarray:
+        """The output [samples] of a record with one; ValueError if it has several."""
+        return self._only("output", self.outputs)
+
+    def _only(self, side: str, columns: np.ndarray) -> np.ndarray:
+        if columns.shape[1] != 1:
+            raise ValueError(
+                f"{self.source}: the record has {columns.shape[1]} {side}s; "
+                "this needs one"
+            )
+        return columns[:, 0]
+
+    @property
+    def input_unit(self) -> str:
+        """Unit of the first input."""
+        return self.input_units[0]
+
+    @property
+    def output_unit(self) -> str:
+        """Unit of the first output."""
+        return self.output_units[0]
+
+    @property
+    def spans(self) -> np.ndarray:
+        """Largest less smallest of each output [p]."""
+        return np.ptp(self.outputs, axis=0)
 
     @property
     def span(self) -> float:
-        """Largest less smallest output."""
+        """Largest less smallest of the only output."""
         return float(np.ptp(self.output))
 
     @property
     def time(self) -> np.ndarray:
         """Sample instants from 0, s."""
-        return np.arange(self.input.size) * self.dt
+        return np.arange(self.samples) * self.dt
 
 
 def read_record(
@@ -122,8 +190,8 @@ def read_record(
         values["input"],
         values["output"],
         dt,
-        input_unit=_unit(names["input"]) or "V",
-        output_unit=_unit(names["output"]) or "um",
+        input_units=_unit(names["input"]) or "V",
+        output_units=_unit(names["output"]) or "um",
         source=path.name,
     )
 

@@ -336,13 +336,16 @@ def test_npz_with_pickled_objects_is_not_opened(tmp_path):
     [
         ({"dt": 0.0}, "the sample time is 0 s; it must be above 0"),
         ({"dt": float("nan")}, "the sample time is nan s; it must be above 0"),
-        ({"input": DRIVE[:10]}, "input has shape (10,) and output (60,)"),
-        ({"input": np.zeros(SAMPLES)}, "input never changes"),
-        ({"output": np.full(SAMPLES, np.nan)}, "not finite at sample 0 (60 in all)"),
+        ({"inputs": DRIVE[:10]}, "input has 10 samples and output 60"),
+        ({"inputs": np.zeros(SAMPLES)}, "input never changes"),
+        ({"outputs": np.full(SAMPLES, np.nan)}, "not finite at sample 0 (60 in all)"),
+        ({"inputs": np.zeros((SAMPLES, 1, 1))}, "input has shape (60, 1, 1)"),
+        ({"input_units": ("V", "V")}, "2 units for 1 input columns"),
+        ({"period": 61}, "the period is 61 samples; it must lie in 2..60"),
     ],
 )
 def test_a_record_made_by_hand_is_checked_too(change, message):
-    good = {"input": DRIVE, "output": SENSOR, "dt": 1e-3, "source": "bench"}
+    good = {"inputs": DRIVE, "outputs": SENSOR, "dt": 1e-3, "source": "bench"}
     assert Record(**good).span > 0
     with pytest.raises(ValueError, match="^bench: .*" + re.escape(message)):
         Record(**(good | change))
@@ -421,3 +424,13 @@ def test_npz_garbage_does_not_advise_to_unpickle(write):
     with pytest.raises(ValueError, match="cannot be read") as caught:
         read_record(path, rate=1000.0)
     assert "unsafely" not in str(caught.value)
+
+
+def test_a_record_of_several_channels():
+    pair = np.stack([DRIVE, SENSOR], axis=1)
+    record = Record(pair, SENSOR, 1e-3, input_units=("V", "mV"), source="bench")
+    assert record.inputs.shape == (SAMPLES, 2) and record.outputs.shape == (SAMPLES, 1)
+    assert record.output_units == ("um",)
+    np.testing.assert_array_equal(record.output, SENSOR)
+    with pytest.raises(ValueError, match="^bench: the record has 2 inputs"):
+        _ = record.input
