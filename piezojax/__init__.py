@@ -14,13 +14,21 @@ from .control import DisturbanceObserverControl as DisturbanceObserverControl
 from .control import InversionControl as InversionControl
 from .control import SlidingModePID as SlidingModePID
 from .dynamics import ARMA as ARMA
+from .dynamics import ExponentialCreep as ExponentialCreep
 from .dynamics import FirstOrderLag as FirstOrderLag
+from .dynamics import FractionalDelay as FractionalDelay
+from .dynamics import LogarithmicCreep as LogarithmicCreep
 from .hardware import Quantiser as Quantiser
 from .hardware import Saturation as Saturation
 from .hardware import Sensor as Sensor
 from .hardware import SlewLimit as SlewLimit
+from .hysteresis import (
+    AsymmetricPrandtlIshlinskii as AsymmetricPrandtlIshlinskii,
+)
 from .hysteresis import ColemanHodgdon as ColemanHodgdon
 from .hysteresis import InverseColemanHodgdon as InverseColemanHodgdon
+from .hysteresis import PrandtlIshlinskii as PrandtlIshlinskii
+from .hysteresis import ShapedColemanHodgdon as ShapedColemanHodgdon
 from .identify import Record as Record
 from .identify import identify as identify
 from .identify import read_record as read_record

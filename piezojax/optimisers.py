@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
@@ -111,7 +112,11 @@ def levenberg_marquardt(
 ) -> Optimiser:
     """Levenberg-Marquardt (optimistix) on the residuals, forward Jacobian."""
     del loss
-    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    # Far more residuals than unknowns: their normal equations are small, where a QR of
+    # the tall Jacobian takes most of a step, and many times more on a busy machine.
+    solver = optx.LevenbergMarquardt(
+        rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
+    )
     return _optimistix(
         solver, residuals, lambda value: jnp.sum(value**2), {"jac": "fwd"}
     )

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from rich.console import Console
 
 import piezojax as pj
-from piezojax.identify import MODELS
+from piezojax.identify import PARTS
 from piezojax.report.console import Bar, console, tuning_table
 from piezojax.reproduce import TABLES
 from piezojax.reproduce.chapter5 import Cell
@@ -433,7 +433,7 @@ def test_identify_ends_with_a_table(identified):
 
 def test_model_help_lists_the_models(record):
     result = succeeded(call("identify", record, "--model", "help"))
-    assert result.stdout.split() == list(MODELS)
+    assert all(name in result.stdout.split() for name in PARTS)
 
 
 def test_identify_bad_input(record, tmp_path):

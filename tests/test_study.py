@@ -315,13 +315,13 @@ def test_unknown_keys(refusal, place, value, message):
         ),
         (
             "plant",
-            {"record": "r.csv", "model": "bouc_wen"},
-            "plant.model is 'bouc_wen': 'bouc_wen' is unknown; there are coleman_hodg",
+            {"record": "r.csv", "model": "preisach"},
+            "plant.model is 'preisach': a model has no part 'preisach'; there are co",
         ),
         (
             "plant",
             {"type": "Lag", "time_constant": 1e-3},
-            "plant.type is 'Lag'; it must be one of ARMA, Affine, AlphaBeta, Cole",
+            "plant.type is 'Lag'; it must be one of ARMA, Affine, AlphaBeta, Asym",
         ),
         (
             "plant",

@@ -2,3 +2,8 @@
 
 from .coleman_hodgdon import ColemanHodgdon as ColemanHodgdon
 from .coleman_hodgdon import InverseColemanHodgdon as InverseColemanHodgdon
+from .prandtl_ishlinskii import (
+    AsymmetricPrandtlIshlinskii as AsymmetricPrandtlIshlinskii,
+)
+from .prandtl_ishlinskii import PrandtlIshlinskii as PrandtlIshlinskii
+from .shaped import ShapedColemanHodgdon as ShapedColemanHodgdon

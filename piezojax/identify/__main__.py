@@ -5,10 +5,9 @@ from pathlib import Path
 import click
 
 from ..command import Command, common, results_folder, run
-from ..report.console import fit_table
+from ..report.console import Bar, fit_table, models_table
 from ..report.identification import write_fit
-from .models import MODELS
-from .output_error import identify
+from .fit import identify
 from .record import read_record
 
 
@@ -44,16 +43,16 @@ def main(record, model, time, input, output, rate, train, validate, out, seed, q
 
     def body(console):
         if model == "help":
-            console.print("\n".join(MODELS))
+            console.print(models_table())
             return
         if record is None:
             raise ValueError("name the RECORD to fit a model to")
         loaded = read_record(record, time=time, input=input, output=output, rate=rate)
-        with (
-            results_folder(out, record.stem) as folder,
-            console.status(f"fitting {model} to {loaded.input.size} samples"),
-        ):
-            fit = identify(loaded, model, train=train, validate=validate)
+        with Bar(console) as bar, results_folder(out, record.stem) as folder:
+            fit = identify(
+                loaded, model, train=train, validate=validate, progress=bar
+            )
+            bar.stage("drawing")
             write_fit(fit, folder)
         console.print(fit_table(fit.report))
         for warning in fit.report.warnings:

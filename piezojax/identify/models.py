@@ -1,80 +1,366 @@
-"""Model structures that can be fitted, with starts and bounds taken from the record."""
+"""Models that can be fitted: chains of parts, with starts and bounds from the record."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._types import as_array
-from ..dynamics import FirstOrderLag
-from ..hysteresis import ColemanHodgdon
-from ..space import Space, space_of
-from ..system import Affine, Series, series
+from ..dynamics import (
+    ARMA,
+    ExponentialCreep,
+    FirstOrderLag,
+    FractionalDelay,
+    LogarithmicCreep,
+)
+from ..hysteresis import (
+    AsymmetricPrandtlIshlinskii,
+    ColemanHodgdon,
+    PrandtlIshlinskii,
+    ShapedColemanHodgdon,
+)
+from ..paths import get, replace
+from ..space import INSIDE, Space, Transform, space_of
+from ..system import Affine, Series, System, series
 from .record import Record
 
 REST_INPUT = "hysteresis.rest_input"
-"""Path of the input in force before the record: every structure here has it."""
+"""Path of the input in force before the record, where the model has a memory of it."""
+
+PLAYS = 10
+"""Play operators of a fitted Prandtl-Ishlinskii model."""
+
+Bounds = Mapping[str, tuple[float, float, Transform]]
+
+
+class Part(NamedTuple):
+    """One part of a chain: its System, bounds by path in it, other starts to try.
+
+    ``gain`` is the path of a parameter that only scales its output, ``own`` holds the
+    paths of what each record has its own value of: the state before it began.
+    """
+
+    system: System
+    bounds: Bounds
+    alternatives: Sequence[Mapping[str, float]] = ({},)
+    gain: str | None = None
+    own: tuple[str, ...] = ()
 
 
 class Structure(NamedTuple):
-    """A model to fit: its System, the box of its parameters, starts in the box."""
+    """A model to fit: its System, the box of its parameters, starts in the box.
 
-    system: Series
+    ``own`` holds the paths of which every record has its own value.
+    """
+
+    system: System
     space: Space
     starts: np.ndarray
+    own: tuple[str, ...] = ()
 
 
-def coleman_hodgdon(record: Record) -> Structure:
-    """Return Coleman-Hodgdon hysteresis, a first-order lag and an offset.
+class Extent(NamedTuple):
+    """What the bounds are taken from: ranges of a record's signals."""
 
-    The lag holds what trails the hysteresis (amplifier, sensor filter); at a single
-    frequency it is told apart from the hysteresis only by the shape of the loop. The
-    rest point before the first sample is fitted too, so a record that begins with a
-    step of the voltage, or on its initial loading curve, is described from its start.
-    """
-    x, y, dt = record.input, record.output, record.dt
-    width = float(np.ptp(x))
-    slope = record.span / width
-    centre = float(np.mean(y) - slope * np.mean(x))
-    system = series(
-        hysteresis=ColemanHodgdon(
+    low: float  # V
+    high: float  # V
+    first: tuple[float, float]  # V, um: the first sample
+    slope: float  # um/V, mean
+    centre: float  # um, the output for no input
+    span: float  # um
+    dt: float  # s
+    duration: float  # s
+
+    @property
+    def width(self) -> float:
+        """Range of the input, V."""
+        return self.high - self.low
+
+
+def _extent(record: Record) -> Extent:
+    x, y = record.input, record.output
+    slope = record.span / float(np.ptp(x)) * float(np.sign(np.cov(x, y)[0, 1]) or 1.0)
+    return Extent(
+        low=float(x.min()),
+        high=float(x.max()),
+        first=(float(x[0]), float(y[0])),
+        slope=slope,
+        centre=float(np.mean(y) - slope * np.mean(x)),
+        span=record.span,
+        dt=record.dt,
+        duration=record.dt * record.samples,
+    )
+
+
+def _rest_bounds(extent: Extent) -> Bounds:
+    margin = 0.5 * extent.width
+    return {"rest_input": (extent.low - margin, extent.high + margin, "linear")}
+
+
+def _rests(extent: Extent) -> list[dict[str, float]]:
+    return [{"rest_input": extent.first[0]}, {"rest_input": extent.low}]
+
+
+def _around(value: float, below: float, above: float) -> tuple[float, float, Transform]:
+    """Bounds at multiples of ``value``, which may be negative."""
+    low, high = sorted((below * value, above * value))
+    return low, high, "linear"
+
+
+def _coleman_hodgdon(extent: Extent) -> Part:
+    """Coleman-Hodgdon: y' = |x'| (a x + c y) + b x'"""
+    width, slope = extent.width, extent.slope
+    rest = extent.first[1] - extent.centre
+    reach = 2.0 * extent.span
+    return Part(
+        ColemanHodgdon(
             a=slope / width,
             b=0.7 * slope,
             c=-1.0 / width,
-            rest_input=x[0],
-            rest_output=y[0] - centre,
+            rest_input=extent.first[0],
+            rest_output=rest,
         ),
-        lag=FirstOrderLag(dt, dt),
-        calibration=Affine(1.0, centre),
-    )
-    reach = 2.0 * record.span
-    rest = y[0] - centre
-    space = space_of(
         {
-            "hysteresis.a": (0.0, 20.0 * slope / width, "linear"),
-            "hysteresis.b": (0.0, 3.0 * slope, "linear"),
-            "hysteresis.c": (-20.0 / width, -0.01 / width, "linear"),
-            REST_INPUT: (x.min() - 0.5 * width, x.max() + 0.5 * width, "linear"),
-            "hysteresis.rest_output": (rest - reach, rest + reach, "linear"),
-            "lag.time_constant": (0.05 * dt, 50.0 * dt, "log"),
-            "calibration.offset": (centre - reach, centre + reach, "linear"),
-        }
+            "a": _around(slope / width, 0.0, 20.0),
+            "b": _around(slope, 0.0, 3.0),
+            "c": (-20.0 / width, -0.01 / width, "linear"),
+            **_rest_bounds(extent),
+            "rest_output": (rest - reach, rest + reach, "linear"),
+        },
+        # Keep the slope -a/c of the loop's axis while its decay c changes.
+        [
+            {"c": -steep / width, "a": steep * slope / width, **before}
+            for steep in (0.3, 1.0, 3.0, 8.0)
+            for before in _rests(extent)
+        ],
+        gain="b",
+        own=("rest_input", "rest_output"),
     )
-    names = list(space.paths)
-    middle = np.asarray(space.from_unit(space.start(system)))
-    starts = []
-    for steepness in (0.3, 1.0, 3.0, 8.0):
-        for before in (x[0], x.min()):
-            values = middle.copy()
-            # Keep the slope -a/c of the loop's axis while its decay c changes.
-            values[names.index("hysteresis.c")] = -steepness / width
-            values[names.index("hysteresis.a")] = steepness * slope / width
-            values[names.index(REST_INPUT)] = before
-            starts.append(np.asarray(space.to_unit(as_array(values))))
-    return Structure(system, space, np.stack(starts))
 
 
-MODELS: dict[str, Callable[[Record], Structure]] = {
-    "coleman_hodgdon": coleman_hodgdon,
+def _shaped_coleman_hodgdon(extent: Extent) -> Part:
+    """Coleman-Hodgdon with cubic shape functions: y' = |x'| (p(x) + c y) + g(x) x'"""
+    width, slope = extent.width, extent.slope
+    rest = extent.first[1] - extent.centre
+    reach = 2.0 * extent.span
+    scales = [abs(slope) / width**i for i in range(4)]
+    return Part(
+        ShapedColemanHodgdon(
+            pull=(0.0, slope / width, 0.0, 0.0),
+            slope=(0.7 * slope, 0.0, 0.0),
+            c=-1.0 / width,
+            rest_input=extent.first[0],
+            rest_output=rest,
+        ),
+        {
+            # A constant pull and an offset of the output are the same thing.
+            **{
+                f"pull.{i}": (-50 * s, 50 * s, "linear")
+                for i, s in enumerate(scales)
+                if i > 0
+            },
+            **{
+                f"slope.{i}": (-10 * s, 10 * s, "linear")
+                for i, s in enumerate(scales[:3])
+            },
+            "c": (-50.0 / width, -0.01 / width, "linear"),
+            **_rest_bounds(extent),
+            "rest_output": (rest - reach, rest + reach, "linear"),
+        },
+        [
+            {"c": -steep / width, "pull.1": steep * slope / width, **before}
+            for steep in (1.0, 3.0, 10.0)
+            for before in _rests(extent)
+        ],
+        gain="slope.0",
+        own=("rest_input", "rest_output"),
+    )
+
+
+def _plays(extent: Extent) -> tuple[dict[str, Any], Bounds]:
+    """Fields and bounds that both Prandtl-Ishlinskii models share."""
+    width, slope = extent.width, extent.slope
+    # A play wider than half the range of the input never moves.
+    thresholds = 0.5 * width * np.arange(1, PLAYS + 1) / (PLAYS + 1)
+    scales = [slope / width**i for i in range(3)]
+    return (
+        {
+            "polynomial": (0.7 * slope, 0.0, 0.0),
+            "thresholds": thresholds,
+            "weights": (0.3 * slope / PLAYS,) * PLAYS,
+            "rest_input": extent.first[0],
+        },
+        {
+            **{f"polynomial.{i}": _around(s, -10.0, 10.0) for i, s in enumerate(scales)},
+            **{f"weights.{i}": _around(slope, 0.0, 1.0) for i in range(PLAYS)},
+            **_rest_bounds(extent),
+        },
+    )
+
+
+def _prandtl_ishlinskii(extent: Extent) -> Part:
+    """Prandtl-Ishlinskii: ten play operators and a cubic polynomial"""
+    fields, bounds = _plays(extent)
+    return Part(
+        PrandtlIshlinskii(**fields),
+        bounds,
+        _rests(extent),
+        gain="polynomial.0",
+        own=("rest_input",),
+    )
+
+
+def _asymmetric_prandtl_ishlinskii(extent: Extent) -> Part:
+    """Prandtl-Ishlinskii with ten more plays that skew the loop"""
+    fields, bounds = _plays(extent)
+    return Part(
+        AsymmetricPrandtlIshlinskii(
+            **fields, skew=(0.0,) * PLAYS, origin=extent.low, scale=extent.width
+        ),
+        {
+            **bounds,
+            **{f"skew.{i}": _around(extent.slope, -2.0, 2.0) for i in range(PLAYS)},
+        },
+        _rests(extent),
+        gain="polynomial.0",
+        own=("rest_input",),
+    )
+
+
+def _lag(extent: Extent) -> Part:
+    """First-order lag: amplifier, sensor filter"""
+    dt = extent.dt
+    return Part(
+        FirstOrderLag(dt, dt), {"time_constant": (0.05 * dt, 50.0 * dt, "log")}
+    )
+
+
+def _arma(extent: Extent) -> Part:
+    """Second-order dynamics (3.30) with two zeros"""
+    del extent
+    return Part(
+        ARMA((0.9, -0.2), (0.3, 0.0, 0.0)),
+        {
+            "autoregressive.0": (-2.0, 2.0, "linear"),
+            "autoregressive.1": (-1.0, 1.0, "linear"),
+            **{f"moving.{i}": (-3.0, 3.0, "linear") for i in range(3)},
+        },
+        [
+            {"autoregressive.0": 2.0 * p, "autoregressive.1": -p * p, "moving.0": q}
+            for p, q in ((0.3, 0.49), (0.8, 0.04))
+        ],
+        gain="moving.0",
+    )
+
+
+def _delay(extent: Extent) -> Part:
+    """Delay of up to five samples"""
+    return Part(
+        FractionalDelay(0.5 * extent.dt, extent.dt, 5),
+        {"delay": (0.0, 5.0 * extent.dt, "linear")},
+        [{"delay": n * extent.dt} for n in (0.5, 2.5)],
+    )
+
+
+def _creep_times(extent: Extent) -> tuple[float, float]:
+    """Fastest and slowest creep that a record can show."""
+    longest = 2.0 * extent.duration
+    return max(10.0 * extent.dt, 1e-3 * longest), longest
+
+
+def _exponential_creep(extent: Extent) -> Part:
+    """Creep as four exponentials"""
+    times = np.geomspace(*_creep_times(extent), 4)
+    return Part(
+        ExponentialCreep((0.01,) * 4, times, extent.dt),
+        {f"gains.{i}": (-0.5, 0.5, "linear") for i in range(4)},
+    )
+
+
+def _logarithmic_creep(extent: Extent) -> Part:
+    """Creep with the logarithm of time"""
+    return Part(
+        LogarithmicCreep(0.01, *_creep_times(extent), extent.dt),
+        {"gain_per_decade": (-0.2, 0.2, "linear")},
+    )
+
+
+PARTS: dict[str, tuple[str, Callable[[Extent], Part]]] = {
+    "coleman_hodgdon": ("hysteresis", _coleman_hodgdon),
+    "shaped_coleman_hodgdon": ("hysteresis", _shaped_coleman_hodgdon),
+    "prandtl_ishlinskii": ("hysteresis", _prandtl_ishlinskii),
+    "asymmetric_prandtl_ishlinskii": ("hysteresis", _asymmetric_prandtl_ishlinskii),
+    "exponential_creep": ("creep", _exponential_creep),
+    "logarithmic_creep": ("creep", _logarithmic_creep),
+    "arma": ("dynamics", _arma),
+    "lag": ("lag", _lag),
+    "delay": ("delay", _delay),
 }
-"""Model structures by the name the command line and a study use."""
+"""Parts of a chain by name: the name they have in the fitted plant, their builder."""
+
+
+def chain(name: str) -> list[str]:
+    """Return the parts of a model such as ``"coleman_hodgdon+logarithmic_creep+lag"``.
+
+    A hysteresis by itself is followed by a lag. Raises ValueError for a part that is
+    not in PARTS, or for two in one place.
+    """
+    parts = [part.strip() for part in name.split("+")]
+    for part in parts:
+        if part not in PARTS:
+            raise ValueError(
+                f"a model has no part {part!r}; there are {', '.join(PARTS)}, "
+                "joined by '+'"
+            )
+    places = [PARTS[part][0] for part in parts]
+    for place in places:
+        if places.count(place) > 1:
+            raise ValueError(f"model {name!r} has two parts for its {place}")
+    return [*parts, "lag"] if places == ["hysteresis"] else parts
+
+
+def structure(name: str, record: Record) -> Structure:
+    """Return the chain ``name`` with starts and bounds that suit ``record``.
+
+    An offset of the output is always added. Raises ValueError as ``chain``.
+    """
+    extent = _extent(record)
+    parts = {PARTS[part][0]: PARTS[part][1](extent) for part in chain(name)}
+    reach = 2.0 * extent.span
+    parts["calibration"] = Part(
+        # Without a hysteresis nothing else turns volts into the output's unit.
+        Affine(1.0 if "hysteresis" in parts else extent.slope, extent.centre),
+        {"offset": (extent.centre - reach, extent.centre + reach, "linear")},
+    )
+    system = series(**{place: part.system for place, part in parts.items()})
+    gains = [f"{place}.{part.gain}" for place, part in parts.items() if part.gain]
+    bounds = {
+        f"{place}.{path}": bound
+        for place, part in parts.items()
+        for path, bound in part.bounds.items()
+        # Of two gains in a row only the product shows in the record.
+        if f"{place}.{path}" not in gains[:-1]
+    }
+    space = space_of(bounds)
+    return Structure(
+        system,
+        space,
+        _starts(system, space, parts),
+        tuple(f"{place}.{path}" for place, part in parts.items() for path in part.own),
+    )
+
+
+def _starts(system: Series, space: Space, parts: Mapping[str, Part]) -> np.ndarray:
+    """Return every combination of the parts' alternatives, in the unit box."""
+    choices = [
+        [{f"{place}.{path}": value for path, value in one.items()} for one in part[2]]
+        for place, part in parts.items()
+    ]
+    found = []
+    for combination in product(*choices):
+        changes = {path: value for one in combination for path, value in one.items()}
+        changed = replace(system, changes)
+        values = as_array([get(changed, path) for path in space.paths])
+        found.append(np.asarray(space.to_unit(values)))
+    return np.clip(np.stack(found), INSIDE, 1.0 - INSIDE)

@@ -1,79 +1,92 @@
-"""Fitting any System to a record by its free-run simulation error."""
+"""Fitting any System to records by its free-run simulation error."""
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float
-from pydantic import AliasChoices, BaseModel, Field
+from jaxtyping import Array, Float, Int
 
-from .._types import ScalarLike
-from ..paths import get, replace
+from .._types import ScalarLike, as_array
+from ..optimisers import Optimiser, levenberg_marquardt
+from ..paths import parameters, replace
+from ..progress import Progress, Silent
 from ..rollout import simulate
-from ..space import Space, squash, unsquash
+from ..space import Space, squash
 from ..system import System, rest_output
-from .models import MODELS, REST_INPUT
+from .models import REST_INPUT, Structure
 from .record import Record
 
-AS_GOOD = 1e-3
-"""Starts whose mean square comes this close (as a share) to the best fit as well."""
+AT_ONCE = 4
+"""Starts that descend together in one program."""
 
-POOR = 0.2
-"""A validation error above this share of the output's deviation gives a warning."""
+TRIAL_STEPS = 12
+"""Steps after which only the best starts go on."""
 
-CYCLES = 3
-"""Fewer full hysteresis cycles than this in the training part give a warning."""
+TOLERANCE = 1e-10
+"""Relative change of the loss and of the point at which a start is done."""
 
+STALL_STEPS, STALL = 15, 1e-6
+"""Steps in which the best mean square must fall by this share, or the fit has ended."""
 
-class FittedParameter(BaseModel):
-    """A fitted value and its standard error, in the parameter's own unit."""
+HOPELESS = 1e11
+"""A mean square this large stands for a simulation that is not finite."""
 
-    value: float
-    standard_error: float | None
-
-
-class FitError(BaseModel):
-    """RMS of the free-run simulation error over a part of the record."""
-
-    rmse: float
-    rmse_percent_of_span: float
-    unit: str
+UNDETERMINED = 1e-12
+"""A parameter direction whose share of the Jacobian is below this is not determined."""
 
 
-class FitReport(BaseModel):
-    """What a fit found: the content of ``fit.json``."""
+class Optimum(NamedTuple):
+    """Points the starts led to, best first: [starts, n] in the unit box, mean squares.
 
-    model: str
-    parameters: dict[str, FittedParameter]
-    train: FitError
-    validation: FitError = Field(
-        serialization_alias="validate",
-        validation_alias=AliasChoices("validate", "validation"),
-    )
-    warnings: list[str]
-    wall_s: float
+    ``deviations``: standard errors at the best, None where a parameter is not
+    determined. ``finished``: whether the best start came to an end.
+    """
+
+    problem: "Problem"
+    names: tuple[str, ...]
+    units: np.ndarray
+    losses: np.ndarray
+    values: np.ndarray
+    deviations: list[float | None]
+    finished: bool
 
 
-@dataclass(frozen=True)
-class Fit:
-    """A fitted plant, its report, the record and the simulated output (its unit)."""
+class Problem(eqx.Module):
+    """Records side by side: padded to one length, with weights that leave out the rest.
+
+    ``which`` [records, n] tells which of the unknowns each record's parameters are:
+    all records share them but for what was in force before each began.
+    """
 
     system: System
-    report: FitReport
-    record: Record
-    simulated: np.ndarray
-    train: slice
-    validate: slice
+    space: Space
+    which: Int[Array, "records n"]
+    inputs: Float[Array, "records samples"]
+    outputs: Float[Array, "records samples"]
+    weights: Float[Array, "records samples"]
+
+    def simulated(self, unknown: Float[Array, " unknowns"]) -> Float[Array, "..."]:
+        """Return the free run of every record, [records, samples]."""
+
+        def one(unit, input):
+            return from_rest(self.space.put(self.system, unit), input)
+
+        return jax.vmap(one)(unknown[self.which], self.inputs)
+
+    def residuals(self, unknown: Float[Array, " unknowns"]) -> Float[Array, " all"]:
+        """Return the weighted errors; their sum of squares is the mean square."""
+        error = self.simulated(unknown) - self.outputs
+        # A start that diverges must not poison the others of its batch.
+        error = jnp.where(jnp.isfinite(error), jnp.clip(error, -1e6, 1e6), 1e6)
+        return (self.weights * error).ravel()
 
 
 def free_run(
-    system: System, input: Float[Array, " n"], before: ScalarLike
-) -> Float[Array, " n"]:
+    system: System, input: Float[Array, "n ..."], before: ScalarLike | Array
+) -> Float[Array, "n ..."]:
     """Return the output samples that ``system`` predicts from ``input`` alone.
 
     A plant maps u(k) to y(k+1), as in the loop; the first output is that at rest under
@@ -84,211 +97,169 @@ def free_run(
     return jnp.concatenate([first[None], outputs[:-1]])
 
 
-def _from_rest(system: System, input: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Free run from the rest point that the model itself carries."""
-    return free_run(system, input, get(system, REST_INPUT))
+def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """Free run from the rest point the model carries, or from the first input."""
+    return free_run(system, input, parameters(system).get(REST_INPUT, input[0]))
 
 
-def identify(
-    record: Record,
-    model: str = "coleman_hodgdon",
-    *,
-    train: slice | None = None,
-    validate: slice | None = None,
-    steps: int = 200,
-) -> Fit:
-    """Fit ``model`` (a name in MODELS) to ``record``.
+def problem_of(
+    structure: Structure, records: Sequence[Record], train: slice
+) -> tuple[Problem, tuple[str, ...]]:
+    """Return the fit of ``structure`` to ``records``, and the names of its unknowns.
 
-    Levenberg-Marquardt with the forward Jacobian on the free-run error over ``train``
-    (the first half if left out), from several starts at once; judged on ``validate``
-    (the rest). Free-run means that the model sees the input alone, from the first
-    sample on. Raises ValueError for an unknown model, an empty part, or when no start
-    leads to a finite fit.
+    Errors count over the samples ``train`` of each record.
     """
-    began = time.perf_counter()
-    if model not in MODELS:
-        raise ValueError(f"model {model!r} is unknown; there are {', '.join(MODELS)}")
-    train, validate = _parts(record, train, validate)
-    structure = MODELS[model](record)
-    input, output = jnp.asarray(record.input), jnp.asarray(record.output)
-    unit, losses = _least_squares(
+    space, count = structure.space, len(records)
+    samples = max(len(range(*train.indices(r.samples))) + train.start for r in records)
+    names = [path for path in space.paths if path not in structure.own]
+    which = np.empty((count, len(space.paths)), int)
+    for column, path in enumerate(space.paths):
+        if path not in structure.own:
+            which[:, column] = names.index(path)
+    for row in range(count):
+        for column, path in enumerate(space.paths):
+            if path in structure.own:
+                which[row, column] = len(names)
+                names.append(path if count == 1 else f"{path} of record {row}")
+    inputs, outputs, weights = np.zeros((3, count, samples))
+    for row, record in enumerate(records):
+        size = min(record.samples, samples)
+        inputs[row] = np.pad(record.input[:size], (0, samples - size), mode="edge")
+        outputs[row, :size] = record.output[:size]
+        weights[row, train.start : size] = 1.0
+    weights /= np.sqrt(np.sum(weights))
+    problem = Problem(
         structure.system,
-        structure.space,
-        jnp.asarray(structure.starts),
-        input[: train.stop],
-        output[: train.stop],
-        train.start,
-        steps,
+        space,
+        jnp.asarray(which),
+        as_array(inputs),
+        as_array(outputs),
+        as_array(weights),
     )
-    losses = np.where(np.isfinite(losses), losses, np.inf)
-    best = int(np.argmin(losses))
-    if not np.isfinite(losses[best]):
-        raise ValueError(
-            f"no start of {model} led to a finite simulation of the record"
-        )
-    system = structure.space.put(structure.system, unit[best])
-    simulated = np.asarray(jax.jit(_from_rest)(system, input))
-    error = simulated - record.output
-    values = structure.space.from_unit(unit[best])
-    deviations = _standard_errors(structure, values, input, train, error)
-    report = FitReport(
-        model=model,
-        parameters={
-            path: FittedParameter(value=float(value), standard_error=deviation)
-            for path, value, deviation in zip(
-                structure.space.paths, values, deviations, strict=True
-            )
-        },
-        train=_fit_error(error[train], record),
-        validation=_fit_error(error[validate], record),
-        warnings=[
-            *_record_warnings(record, train, validate),
-            *_fit_warnings(structure.space, np.asarray(unit), losses, deviations),
-            *_error_warnings(error[validate], record.output[validate]),
-        ],
-        wall_s=time.perf_counter() - began,
-    )
-    return Fit(system, report, record, simulated, train, validate)
+    return problem, tuple(names)
 
 
-def _parts(
-    record: Record, train: slice | None, validate: slice | None
-) -> tuple[slice, slice]:
-    samples = record.input.size
-    train = _closed(train or slice(0, samples // 2), samples)
-    validate = _closed(validate or slice(min(train.stop, samples), samples), samples)
-    for name, part in (("train", train), ("validate", validate)):
-        if not 0 <= part.start < part.stop <= samples:
-            raise ValueError(
-                f"{name} is {part.start}:{part.stop}; "
-                f"it must lie in 0:{samples} and hold a sample"
-            )
-    return train, validate
+def output_error(
+    structure: Structure,
+    records: Sequence[Record],
+    train: slice,
+    *,
+    steps: int = 200,
+    progress: Progress | None = None,
+) -> Optimum:
+    """Fit ``structure`` to ``records`` by the mean square of the free-run error.
+
+    Levenberg-Marquardt with the forward Jacobian, from all starts of the structure;
+    after a few steps the best go on, to at most ``steps``. The error counts over the
+    samples ``train`` of each record; the model sees the input alone, from the first
+    sample on. Raises ValueError when no start leads to a finite simulation.
+    """
+    progress = progress or Silent()
+    problem, names = problem_of(structure, records, train)
+    starts = _for_every_record(structure, problem)
+    width = min(AT_ONCE, len(starts))
+    progress.stage(f"compiling the fit of {len(names)} parameters")
+    carries = [
+        _begin(problem, as_array(np.resize(starts[i : i + width], (width, len(names)))))
+        for i in range(0, len(starts), width)
+    ]
+    trial = min(TRIAL_STEPS, steps)
+    progress.stage(f"trying {len(starts)} starts", trial * len(carries))
+    carries = [_descended(problem, carry, trial, progress)[0] for carry in carries]
+    every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *carries)
+    best = np.argsort(np.asarray(every.loss))[:width]
+    carry = jax.tree.map(lambda leaf: leaf[best], every)
+    progress.stage(f"fitting from the best {width}", steps - trial)
+    carry, finished = _descended(problem, carry, steps - trial, progress)
+    order = np.argsort(np.asarray(carry.loss))
+    losses = np.asarray(carry.loss)[order]
+    if losses[0] >= HOPELESS:
+        raise ValueError("no start led to a finite simulation of the record")
+    units = np.asarray(squash(carry.point))[order]
+    values, deviations = _with_errors(problem, as_array(units[0]), losses[0])
+    return Optimum(problem, names, units, losses, values, deviations, finished)
 
 
-def _closed(part: slice, samples: int) -> slice:
-    stop = samples if part.stop is None else part.stop
-    return slice(part.start or 0, stop)
+def _for_every_record(structure: Structure, problem: Problem) -> np.ndarray:
+    """Return the starts with the values of its own for every record."""
+    unknowns = int(np.max(problem.which)) + 1
+    starts = np.empty((len(structure.starts), unknowns))
+    for row in np.asarray(problem.which):
+        starts[:, row] = structure.starts
+    return starts
+
+
+def _optimiser(problem: Problem) -> Optimiser:
+    # A lambda, because a bound method would be hashed with its arrays.
+    residuals = lambda unknown: problem.residuals(unknown)  # noqa: E731
+    return levenberg_marquardt(residuals, residuals, TOLERANCE)
 
 
 @eqx.filter_jit
-def _least_squares(
-    system: System,
-    space: Space,
-    starts: Float[Array, "starts n"],
-    input: Array,
-    output: Array,
-    skip: int,
-    steps: int,
-) -> tuple[Float[Array, "starts n"], Float[Array, " starts"]]:
-    def residuals(free, _):
-        error = _from_rest(space.put(system, squash(free)), input) - output
-        # A start that diverges must not poison the others of its batch.
-        return jnp.where(jnp.isfinite(error), error, 1e6)[skip:]
-
-    solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
-
-    def one(start):
-        solution = optx.least_squares(
-            residuals,
-            solver,
-            unsquash(start),
-            options={"jac": "fwd"},
-            max_steps=steps,
-            throw=False,
-        )
-        return squash(solution.value), jnp.mean(residuals(solution.value, None) ** 2)
-
-    return jax.vmap(one)(jnp.clip(starts, 1e-6, 1.0 - 1e-6))
+def _begin(problem: Problem, starts: Float[Array, "starts unknowns"]) -> Any:
+    return jax.vmap(_optimiser(problem).start)(starts)
 
 
-def _standard_errors(structure, values, input, train, error) -> Sequence[float | None]:
-    """Gauss-Newton covariance s^2 (J'J)^-1 at the fit, white residuals assumed."""
+@eqx.filter_jit
+def _advance(problem: Problem, carry: Any) -> Any:
+    return jax.vmap(_optimiser(problem).step)(carry)
 
-    def predicted(values):
-        named = dict(zip(structure.space.paths, values, strict=True))
-        return _from_rest(replace(structure.system, named), input[: train.stop])
 
-    jacobian = np.asarray(jax.jit(jax.jacfwd(predicted))(values))[train.start :]
+def _descended(
+    problem: Problem, carry: Any, steps: int, progress: Progress
+) -> tuple[Any, bool]:
+    """Step until all starts are done or the best gets no better."""
+    bests = [np.inf]
+    for _ in range(steps):
+        carry = _advance(problem, carry)
+        bests.append(float(np.min(carry.loss)))
+        progress.advance(float(np.sqrt(bests[-1])))
+        if np.all(carry.done) or _stalled(bests):
+            break
+    return carry, bool(np.any(carry.done)) or _stalled(bests)
+
+
+def _stalled(bests: Sequence[float]) -> bool:
+    # Where a parameter runs to its bound the point itself never comes to rest.
+    return len(bests) > STALL_STEPS and bests[-1] > bests[-STALL_STEPS] * (1 - STALL)
+
+
+@eqx.filter_jit
+def _sensitivity(problem: Problem, unit: Array) -> tuple[Array, Array]:
+    """Return the unknowns' values and the weighted Jacobian of the residuals."""
+
+    def of_values(unknown):
+        return problem.residuals(unknown)
+
+    return _values(problem, unit), jax.jacfwd(of_values)(unit)
+
+
+def _values(problem: Problem, unit: Array) -> Array:
+    """Return the values of all unknowns at ``unit``."""
+    values = jnp.zeros_like(unit)
+    for row in problem.which:
+        values = values.at[row].set(problem.space.from_unit(unit[row]))
+    return values
+
+
+def _with_errors(
+    problem: Problem, unit: Array, loss: float
+) -> tuple[np.ndarray, list[float | None]]:
+    """Return values and Gauss-Newton standard errors, white residuals assumed.
+
+    The covariance is s^2 (J'J)^-1; a parameter in a direction that the record says
+    nothing about has no standard error.
+    """
+    values, jacobian = map(np.asarray, _sensitivity(problem, unit))
+    slopes = np.asarray(jax.jacfwd(lambda u: _values(problem, u))(unit)).diagonal()
+    jacobian = jacobian / np.where(slopes == 0.0, 1.0, slopes)
     scale = np.linalg.norm(jacobian, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    freedom = max(jacobian.shape[0] - jacobian.shape[1], 1)
-    variance = float(np.sum(error[train] ** 2)) / freedom
-    try:
-        covariance = np.linalg.inv((jacobian / scale).T @ (jacobian / scale)) * variance
-    except np.linalg.LinAlgError:
-        return [None] * len(structure.space.paths)
-    diagonal = np.diag(covariance) / scale**2
-    return [float(np.sqrt(d)) if np.isfinite(d) and d >= 0 else None for d in diagonal]
-
-
-def _fit_error(error: np.ndarray, record: Record) -> FitError:
-    rmse = float(np.sqrt(np.mean(error**2)))
-    return FitError(
-        rmse=rmse,
-        rmse_percent_of_span=100.0 * rmse / record.span,
-        unit=record.output_unit,
-    )
-
-
-def cycles(input: np.ndarray) -> int:
-    """Return the number of full cycles of ``input`` through its mid-level."""
-    above = input > 0.5 * (input.min() + input.max())
-    return int(np.sum(~above[:-1] & above[1:]))
-
-
-def _record_warnings(record: Record, train: slice, validate: slice) -> list[str]:
-    found = []
-    count = cycles(record.input[train])
-    if count < CYCLES:
-        found.append(
-            f"{count} full hysteresis cycles in the training part; "
-            f"{CYCLES} or more separate the loop from its initial loading"
-        )
-    spectrum = np.abs(np.fft.rfft(record.input[train] - np.mean(record.input[train])))
-    if np.sum(spectrum > 0.05 * spectrum.max()) <= 5:
-        found.append(
-            "the input has essentially one frequency: hysteresis and linear lag are "
-            "told apart by the shape of the loop alone, and the model says nothing "
-            "about other frequencies"
-        )
-    if validate.start < train.stop and train.start < validate.stop:
-        found.append(
-            "the validation part shares samples with the training part: "
-            "its error is no measure of prediction"
-        )
-    return found
-
-
-def _fit_warnings(
-    space: Space,
-    units: np.ndarray,
-    losses: np.ndarray,
-    deviations: Sequence[float | None],
-) -> list[str]:
-    found = []
-    best = int(np.argmin(losses))
-    as_good = units[losses <= losses[best] * (1.0 + AS_GOOD) + 1e-30]
-    spread = np.ptp(as_good, axis=0)
-    for i, path in enumerate(space.paths):
-        if units[best, i] < 1e-3 or units[best, i] > 1.0 - 1e-3:
-            found.append(f"{path} lies at the edge of its bounds")
-        if deviations[i] is None:
-            found.append(f"{path} is not determined by this record")
-        elif spread[i] > AS_GOOD:
-            values = [float(space.from_unit(jnp.asarray(u))[i]) for u in as_good]
-            found.append(
-                f"{path} is ambiguous: values from {min(values):.4g} to "
-                f"{max(values):.4g} fit equally well"
-            )
-    return found
-
-
-def _error_warnings(error: np.ndarray, output: np.ndarray) -> list[str]:
-    share = float(np.sqrt(np.mean(error**2)) / max(np.std(output), 1e-30))
-    if share <= POOR:
-        return []
-    return [
-        f"the model explains little: its validation error is {100.0 * share:.0f} % of "
-        "the output's own deviation"
-    ]
+    scale = np.where(scale > 0.0, scale, 1.0)
+    _, strength, directions = np.linalg.svd(jacobian / scale, full_matrices=False)
+    weak = strength < UNDETERMINED * strength[0]
+    known = np.sum(directions[weak] ** 2, axis=0) < 1e-6
+    counted = int(np.sum(np.asarray(problem.weights) > 0))
+    variance = loss / max(counted - unit.size, 1)
+    inverse = np.where(weak, 0.0, 1.0 / np.where(weak, 1.0, strength))
+    spread = np.sqrt(variance * np.sum((directions.T * inverse) ** 2, axis=1)) / scale
+    return values, [float(d) if k else None for d, k in zip(spread, known, strict=True)]

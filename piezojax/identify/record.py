@@ -1,6 +1,7 @@
 """A lab's record: time, input, output, read from a file and checked."""
 
 import csv
+import dataclasses
 import re
 import zipfile
 import zlib
@@ -128,6 +129,16 @@ class Record:
     def span(self) -> float:
         """Largest less smallest of the only output."""
         return float(np.ptp(self.output))
+
+    def until(self, stop: int) -> "Record":
+        """Return the record of the first ``stop`` samples; ValueError as the record."""
+        return dataclasses.replace(
+            self,
+            inputs=self.inputs[:stop],
+            outputs=self.outputs[:stop],
+            period=None,
+            source=f"{self.source}, first {stop} samples",
+        )
 
     @property
     def time(self) -> np.ndarray:

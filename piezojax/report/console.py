@@ -18,7 +18,8 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from ..identify.output_error import FitReport
+from ..identify.fit import FitReport
+from ..identify.models import PARTS
 from ..reproduce.chapter5 import Cell
 from ..reproduce.summary import TableAgreement
 from ..tune.result import Result, Scores
@@ -87,6 +88,16 @@ class Bar:
         self._stop_if_asked()
         if self._task is not None:
             self._progress.update(self._task, advance=1, note=f"objective {best:.3f}")
+
+
+def models_table() -> Table:
+    """Return the parts of which a model to identify is made."""
+    table = Table(title="parts of a model, joined by '+'")
+    for column in ("part", "place", "what it is"):
+        table.add_column(column)
+    for name, (place, build) in PARTS.items():
+        table.add_row(name, place, (build.__doc__ or "").strip())
+    return table
 
 
 def console(quiet: bool) -> Console:

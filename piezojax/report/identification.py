@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..files import write_text
-from ..identify.output_error import Fit
+from ..identify.fit import Fit
 from ..serial import save
 from .figures import AFTER, BEFORE, MEASURED, figure, legend_above, styled, write
 

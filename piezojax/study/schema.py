@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from .. import signals
-from ..identify import MODELS
+from ..identify import chain
 from ..optimisers import METHODS
 from ..space import Transform
 
@@ -44,7 +44,8 @@ class RecordPlant(Table):
     @field_validator("model")
     @classmethod
     def _known(cls, name: str) -> str:
-        return one_of(name, MODELS)
+        chain(name)
+        return name
 
 
 class References(Table):

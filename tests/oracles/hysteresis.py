@@ -153,3 +153,32 @@ def inverse_trapezoid(f, a, b, c, f_init, u_init, lower=-20.0, upper=120.0):
         f0 = f1
         outputs.append(u0)
     return np.array(outputs)
+
+
+def play(x, threshold, start):
+    """A backlash of half-width `threshold`, pushed and pulled by x, from `start`."""
+    w, out = start, []
+    for value in x:
+        if value - w > threshold:
+            w = value - threshold
+        elif value - w < -threshold:
+            w = value + threshold
+        out.append(w)
+    return np.array(out)
+
+
+def shaped_trapezoid(x, pull, slope, c, y_init):
+    """y' = |x'| (p(x) + c y) + g(x) x' along x from (x[0], y_init).
+
+    Polynomials with the lowest power first; their integrals are exact, that of y is the
+    trapezoid rule: (1 - s c dx/2) y1 = (1 + s c dx/2) y0 + s [P] + [G].
+    """
+    big_p = np.polynomial.Polynomial(pull).integ()
+    big_g = np.polynomial.Polynomial(slope).integ()
+    y = [y_init]
+    for x0, x1 in zip(x[:-1], x[1:], strict=True):
+        s = 1.0 if x1 >= x0 else -1.0
+        h = 0.5 * s * c * (x1 - x0)
+        force = s * (big_p(x1) - big_p(x0)) + big_g(x1) - big_g(x0)
+        y.append((force + (1.0 + h) * y[-1]) / (1.0 - h))
+    return np.array(y)

@@ -1,0 +1,45 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from piezojax import FractionalDelay, simulate
+
+DT = 1e-3
+INPUT = np.random.default_rng(0).normal(size=40)
+
+
+@jax.jit
+def response(system, inputs, start):
+    return simulate(system, inputs, system.init(start))[1]
+
+
+@pytest.mark.parametrize("samples", [0.0, 0.4, 1.0, 2.7, 4.0])
+def test_it_interpolates_between_samples(samples):
+    at = np.arange(40) - samples
+    expected = np.interp(at, np.arange(-10, 40), np.r_[np.full(10, 0.5), INPUT])
+    found = response(FractionalDelay(samples * DT, DT, 4), INPUT, 0.5)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_its_gradient_is_a_central_difference():
+    def loss(delay):
+        system = FractionalDelay(delay, DT, 4)
+        return jnp.sum(simulate(system, jnp.asarray(INPUT), system.init(0.0))[1] ** 2)
+
+    slope = (loss(2.3e-3 + 1e-9) - loss(2.3e-3 - 1e-9)) / 2e-9
+    np.testing.assert_allclose(jax.grad(loss)(2.3e-3), slope, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((-1e-3, DT, 4), "delay in s is -0.001; it must be finite and at least 0"),
+        ((5e-3, DT, 4), "at most 0.004"),
+        ((0.0, 0.0, 4), "sample time in s is 0"),
+        ((0.0, DT, 0), "longest delay in samples is 0"),
+    ],
+)
+def test_bad_parameters(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        FractionalDelay(*arguments)
