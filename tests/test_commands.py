@@ -450,7 +450,7 @@ def test_identify_bad_input(record, tmp_path):
     )
     failed(
         call("identify", record, *out, *COLUMNS, "--model", "bouc_wen"),
-        "model 'bouc_wen' is unknown; there are coleman_hodgdon",
+        "a model has no part 'bouc_wen'; there are coleman_hodgdon",
     )
     failed(
         call("identify", record, *out, *COLUMNS, "--train", "100:50"),
