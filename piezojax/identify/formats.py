@@ -23,8 +23,8 @@ def read_columns(path: Path) -> Columns:
     kind = path.suffix.lower()
     if kind not in FORMATS:
         raise ValueError(
-            f"record {path}: files in {kind or 'no suffix'!r} are not read; "
-            f"it must end in one of {', '.join(FORMATS)}"
+            f"record {path}: its suffix {kind!r} is unknown; "
+            f"it must be one of {', '.join(FORMATS)}"
         )
     form = FORMATS[kind]
     try:

@@ -47,6 +47,13 @@ def multisine():
     return np.where(TIME < 0.05, 0.0, drive)
 
 
+def smooth_steps():
+    """Moves of least jerk between 0 and 1, and rests, of 0.1 s each."""
+    share = np.clip((TIME[:400] % 0.2) / 0.1 - 1.0, 0.0, 1.0)
+    move = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    return np.tile(np.where(TIME[:400] < 0.2, move, 1.0 - move), 10)
+
+
 SINE = 10.0 * np.sin(2.0 * np.pi * 5.0 * TIME)
 GOOD = {
     "multisine": multisine(),
@@ -60,6 +67,10 @@ GOOD = {
     "staircase": np.repeat(
         [0.0, *np.random.default_rng(2).integers(0, 9, SAMPLES // 40 - 1)], 40
     ),
+    "levels": np.repeat(
+        [0.0, *np.random.default_rng(2).uniform(0.0, 9.0, SAMPLES // 40 - 1)], 40
+    ),
+    "smooth moves": 50.0 * smooth_steps(),
     "noise": np.append(0.0, np.random.default_rng(4).standard_normal(SAMPLES - 1)),
 }
 
@@ -117,8 +128,8 @@ def test_a_clipped_input_among_several():
 
 
 @given(
-    amplitude=st.floats(8.0, 1e6),
-    period=st.floats(8.0, 2e4),
+    amplitude=st.floats(0.9, 6.0).map(lambda x: 10.0**x),
+    period=st.floats(0.9, 4.3).map(lambda x: 10.0**x),
     phase=st.floats(0.0, 1.0),
     wave=st.sampled_from([lambda x: np.sin(2.0 * np.pi * x), triangle]),
 )
@@ -132,8 +143,8 @@ def test_a_rounded_wave_is_never_taken_for_a_clipped_one(
 
 
 @given(
-    amplitude=st.floats(200.0, 1e6),
-    period=st.floats(50.0, 1500.0),
+    amplitude=st.floats(2.3, 6.0).map(lambda x: 10.0**x),
+    period=st.floats(1.7, 3.2).map(lambda x: 10.0**x),
     share=st.floats(0.3, 0.9),
 )
 def test_a_rounded_wave_cut_off_is_always_found(amplitude, period, share):

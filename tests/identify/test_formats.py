@@ -332,8 +332,11 @@ def test_a_text_table_of_another_name_is_one_clear_error(tmp_path, suffix):
 
 
 def test_an_unknown_suffix_lists_those_known(tmp_path):
-    refused(tmp_path / "record.doc", "files in '.doc' are not read; it must end in")
-    refused(tmp_path / "record", "files in 'no suffix' are not read")
+    for name, suffix in (("record.doc", ".doc"), ("record", "")):
+        message = (
+            f"its suffix {suffix!r} is unknown; it must be one of .csv, .txt, .dat"
+        )
+        refused(tmp_path / name, message)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".mat", ".h5", ".xlsx"])
