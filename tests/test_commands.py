@@ -383,7 +383,8 @@ def test_a_real_ctrl_c(tmp_path, kept_programs):
 def identified(tmp_path_factory):
     folder = tmp_path_factory.mktemp("identified")
     record = write_record(folder)
-    arguments = (*COLUMNS, "--train", "0:200", "--validate", "220:300")
+    parts = ("--train", "0:200", "--validate", "220:300")
+    arguments = (*COLUMNS, *parts, "--model", "coleman_hodgdon")
     result = call("identify", record, *arguments, "--out", folder / "out")
     return succeeded(result), folder / "out"
 

@@ -61,9 +61,7 @@ class ShapedColemanHodgdon(System):
         output = _value(q, input) + (self.rest_output - _value(q, start)) * change
         return LastPoint(input, output)
 
-    def step(
-        self, state: LastPoint, input: ScalarLike
-    ) -> tuple[LastPoint, Scalar]:
+    def step(self, state: LastPoint, input: ScalarLike) -> tuple[LastPoint, Scalar]:
         x, last = as_array(input), state.input
         dx = x - last
         sign = jnp.where(dx >= 0.0, 1.0, -1.0)

@@ -8,6 +8,7 @@ from ..command import Command, common, results_folder, run
 from ..report.console import Bar, fit_table, models_table
 from ..report.identification import write_fit
 from .fit import identify
+from .models import DEFAULT
 from .record import read_record
 
 
@@ -23,35 +24,41 @@ class _Part(click.ParamType):
 
 
 @click.command(cls=Command)
-@click.argument("record", required=False, type=click.Path(path_type=Path))
+@click.argument(
+    "records", nargs=-1, type=click.Path(path_type=Path), metavar="RECORD..."
+)
 @click.option(
     "--model",
-    default="coleman_hodgdon",
+    default=DEFAULT,
     show_default=True,
-    help="Model to fit; 'help' lists them.",
+    help="Model to fit, parts joined by '+'; 'help' lists them.",
 )
 @click.option("--time", help="Time column, by name or number from zero.")
 @click.option("--input", default="0", show_default=True, help="Input column.")
 @click.option("--output", default="1", show_default=True, help="Output column.")
 @click.option("--rate", type=float, help="Sampling rate, Hz, if no time column.")
+@click.option("--period", type=int, help="Samples in a period of a periodic input.")
+@click.option("--resample", type=float, help="Put the record on this rate, Hz.")
 @click.option("--train", type=_Part(), help="Samples to fit (default: first half).")
 @click.option("--validate", type=_Part(), help="Samples to judge on (default: rest).")
 @common
-def main(record, model, time, input, output, rate, train, validate, out, seed, quiet):
-    """Fit a plant model to the measured RECORD (.csv, .txt, .dat or .npz)."""
+def main(records, model, train, validate, out, seed, quiet, **columns):
+    """Fit a plant model to measured RECORDs of one stage.
+
+    Text (.csv, .txt, .dat), .npz, .mat and .h5 files; .tdms, .lvm and .xlsx with
+    piezojax[lab].
+    """
     del seed  # this fit draws nothing
 
     def body(console):
         if model == "help":
             console.print(models_table())
             return
-        if record is None:
+        if not records:
             raise ValueError("name the RECORD to fit a model to")
-        loaded = read_record(record, time=time, input=input, output=output, rate=rate)
-        with Bar(console) as bar, results_folder(out, record.stem) as folder:
-            fit = identify(
-                loaded, model, train=train, validate=validate, progress=bar
-            )
+        loaded = [read_record(record, **columns) for record in records]
+        with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
+            fit = identify(loaded, model, train=train, validate=validate, progress=bar)
             bar.stage("drawing")
             write_fit(fit, folder)
         console.print(fit_table(fit.report))

@@ -9,9 +9,11 @@ import numpy as np
 from pydantic import AliasChoices, BaseModel, Field
 
 from .._types import as_array
+from ..paths import parameters
 from ..progress import Progress
 from ..system import System
-from .models import structure
+from .checks import record_warnings
+from .models import DEFAULT, REST_INPUT, structure
 from .output_error import Optimum, from_rest, output_error
 from .record import Record
 
@@ -20,9 +22,6 @@ AS_GOOD = 1e-3
 
 POOR = 0.2
 """A validation error above this share of the output's deviation gives a warning."""
-
-CYCLES = 3
-"""Fewer full hysteresis cycles than this in the training part give a warning."""
 
 
 class FittedParameter(BaseModel):
@@ -81,7 +80,7 @@ class Fit:
 
 def identify(
     records: Record | Sequence[Record],
-    model: str = "coleman_hodgdon",
+    model: str = DEFAULT,
     *,
     train: slice | None = None,
     validate: slice | None = None,
@@ -125,7 +124,17 @@ def identify(
         train=_fit_error(records, simulations, train),
         validation=_fit_error(records, simulations, validate),
         warnings=[
-            *_record_warnings(records[0], train, validate),
+            *(
+                f"{record.source}: {text}" if len(records) > 1 else text
+                for record in records
+                for text in record_warnings(
+                    record,
+                    train,
+                    validate,
+                    order=shape.order,
+                    hysteresis=REST_INPUT in parameters(shape.system),
+                )
+            ),
             *_fit_warnings(optimum, steps),
             *_error_warnings(records, simulations, validate),
         ],
@@ -188,35 +197,6 @@ def _fit_error(
         rmse_percent_of_span=100.0 * rmse / max(r.span for r in records),
         unit=records[0].output_unit,
     )
-
-
-def cycles(input: np.ndarray) -> int:
-    """Return the number of full cycles of ``input`` through its mid-level."""
-    above = input > 0.5 * (input.min() + input.max())
-    return int(np.sum(~above[:-1] & above[1:]))
-
-
-def _record_warnings(record: Record, train: slice, validate: slice) -> list[str]:
-    found = []
-    count = cycles(record.input[train])
-    if count < CYCLES:
-        found.append(
-            f"{count} full hysteresis cycles in the training part; "
-            f"{CYCLES} or more separate the loop from its initial loading"
-        )
-    spectrum = np.abs(np.fft.rfft(record.input[train] - np.mean(record.input[train])))
-    if np.sum(spectrum > 0.05 * spectrum.max()) <= 5:
-        found.append(
-            "the input has essentially one frequency: hysteresis and linear lag are "
-            "told apart by the shape of the loop alone, and the model says nothing "
-            "about other frequencies"
-        )
-    if validate.start < train.stop and train.start < validate.stop:
-        found.append(
-            "the validation part shares samples with the training part: "
-            "its error is no measure of prediction"
-        )
-    return found
 
 
 def _fit_warnings(optimum: Optimum, steps: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""Models that can be fitted: chains of parts, with starts and bounds from the record."""
+"""Models to fit: chains of parts, with starts and bounds taken from the record."""
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
@@ -51,13 +51,15 @@ class Part(NamedTuple):
 class Structure(NamedTuple):
     """A model to fit: its System, the box of its parameters, starts in the box.
 
-    ``own`` holds the paths of which every record has its own value.
+    ``own`` holds the paths of which every record has its own value, ``order`` counts
+    the parameters of linear dynamics.
     """
 
     system: System
     space: Space
     starts: np.ndarray
     own: tuple[str, ...] = ()
+    order: int = 0
 
 
 class Extent(NamedTuple):
@@ -192,7 +194,9 @@ def _plays(extent: Extent) -> tuple[dict[str, Any], Bounds]:
             "rest_input": extent.first[0],
         },
         {
-            **{f"polynomial.{i}": _around(s, -10.0, 10.0) for i, s in enumerate(scales)},
+            **{
+                f"polynomial.{i}": _around(s, -10.0, 10.0) for i, s in enumerate(scales)
+            },
             **{f"weights.{i}": _around(slope, 0.0, 1.0) for i in range(PLAYS)},
             **_rest_bounds(extent),
         },
@@ -231,9 +235,7 @@ def _asymmetric_prandtl_ishlinskii(extent: Extent) -> Part:
 def _lag(extent: Extent) -> Part:
     """First-order lag: amplifier, sensor filter"""
     dt = extent.dt
-    return Part(
-        FirstOrderLag(dt, dt), {"time_constant": (0.05 * dt, 50.0 * dt, "log")}
-    )
+    return Part(FirstOrderLag(dt, dt), {"time_constant": (0.05 * dt, 50.0 * dt, "log")})
 
 
 def _arma(extent: Extent) -> Part:
@@ -300,6 +302,13 @@ PARTS: dict[str, tuple[str, Callable[[Extent], Part]]] = {
 """Parts of a chain by name: the name they have in the fitted plant, their builder."""
 
 
+LINEAR = ("dynamics", "lag", "delay")
+"""Places of linear dynamics, which a record must hold frequencies enough for."""
+
+DEFAULT = "shaped_coleman_hodgdon+exponential_creep+lag"
+"""The model that is fitted if none is named."""
+
+
 def chain(name: str) -> list[str]:
     """Return the parts of a model such as ``"coleman_hodgdon+logarithmic_creep+lag"``.
 
@@ -348,6 +357,7 @@ def structure(name: str, record: Record) -> Structure:
         space,
         _starts(system, space, parts),
         tuple(f"{place}.{path}" for place, part in parts.items() for path in part.own),
+        sum(path.split(".")[0] in LINEAR for path in bounds),
     )
 
 

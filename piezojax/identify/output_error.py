@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .._types import ScalarLike, as_array
 from ..optimisers import Optimiser, levenberg_marquardt
-from ..paths import parameters, replace
+from ..paths import parameters
 from ..progress import Progress, Silent
 from ..rollout import simulate
 from ..space import Space, squash

@@ -1,20 +1,24 @@
 """A lab's record: time, input, output, read from a file and checked."""
 
-import csv
 import dataclasses
-import re
-import zipfile
-import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from .formats import read_columns
+from .table import Column, Columns, ContentError
+from .units import seconds_of, unit_of
+
+Key = str | int
+"""A column's name, or its number from zero."""
+
 SHORTEST = 50
 """Fewest samples a record may have."""
 
 UNIFORM = 1e-3
-"""Largest deviation of a time step from their median, as a share of it."""
+"""How far, as a share, time steps may lie from each other to be one sample time."""
 
 
 @dataclass(frozen=True)
@@ -149,187 +153,155 @@ class Record:
 def read_record(
     path: str | Path,
     *,
-    time: str | int | None = None,
-    input: str | int = 0,
-    output: str | int = 1,
+    time: Key | None = None,
+    input: Key | Sequence[Key] = 0,
+    output: Key | Sequence[Key] = 1,
     rate: float | None = None,
+    period: int | None = None,
+    resample: float | None = None,
 ) -> Record:
-    """Read a record from a ``.csv``, ``.txt``, ``.dat`` or ``.npz`` file.
+    """Read a record from a file of any kind in ``formats.FORMATS``.
 
-    ``time``, ``input`` and ``output`` are column names or zero-based numbers; without
-    ``time``, ``rate`` (Hz) must be given. Units are taken from names such as
-    ``displacement_um``. Raises ValueError, naming the column and the sample, for a
-    missing file or column, missing numbers, unsorted or uneven time, or a record that
-    is too short.
+    ``time``, ``input`` and ``output`` are column names or zero-based numbers; several
+    inputs or outputs are a sequence of them, or one text with commas. The sample time
+    is that of the column ``time``, or ``rate`` (Hz), or what the file itself says of
+    its channels; those that are there must agree within 0.1 %. Units are those the file
+    holds, or stand in names such as ``displacement_um`` or ``drive [V]``. ``period``:
+    see Record, in samples of the record returned. ``resample`` (Hz) puts the columns on
+    a uniform grid by straight lines between the samples, whatever the steps of time.
+
+    Raises ValueError, naming the column and the sample, for a file that cannot be read,
+    a missing column, missing numbers, unsorted time, uneven time without ``resample``,
+    sample times that contradict each other, or a record that is too short.
     """
     path = Path(path)
-    columns = _read_columns(path)
-    wanted = {"input": input, "output": output}
-    if time is not None:
-        wanted["time"] = time
-    names = {
-        role: _named(columns, key, role, path.name) for role, key in wanted.items()
-    }
-    for role, name in names.items():
-        twin = next(other for other, n in names.items() if n == name)
-        if twin != role:
-            raise ValueError(
-                f"{path.name}: column {name!r} is named both as {twin} and as {role}"
-            )
-    values = {
-        role: _numbers(columns[name], f"{role} column {name!r}", path.name)
-        for role, name in names.items()
-    }
-    if len({column.size for column in values.values()}) > 1:
-        lengths = ", ".join(f"{names[r]} {c.size}" for r, c in values.items())
-        raise ValueError(f"{path.name}: columns differ in length: {lengths}")
-    if time is not None:
-        seconds = _SECONDS.get(_unit(names["time"]) or "s")
-        if seconds is None:
-            raise ValueError(
-                f"{path.name}: time column {names['time']!r} is in an unknown unit; "
-                f"it must be one of {', '.join(_SECONDS)}"
-            )
-        dt = _time_step(seconds * values["time"], path.name)
-    elif rate is not None:
-        if not (np.isfinite(rate) and rate > 0):
-            raise ValueError(f"{path.name}: rate is {rate:g} Hz; it must be above 0")
-        dt = 1.0 / rate
-    else:
-        raise ValueError(f"{path.name}: name the time column, or give its rate in Hz")
+    columns = read_columns(path)
+    try:
+        clock = _named(columns, [] if time is None else [time], "time")
+        inputs = _named(columns, input, "input")
+        outputs = _named(columns, output, "output")
+        values = _numbers(columns, {"time": clock, "input": inputs, "output": outputs})
+        steps = {f"column {n!r}": columns[n].dt for n in inputs + outputs}
+        if rate is not None:
+            steps = {"the rate": 1.0 / _above_zero(rate, "rate")} | steps
+        instants = None
+        for name in clock:
+            instants = values[name] * seconds_of(name, columns[name])
+            step = _time_step(instants, even=resample is None)
+            steps = {f"column {name!r}": step} | steps
+        dt = _agreed(steps)
+        if resample is not None:
+            if instants is None:
+                instants = dt * np.arange(values[inputs[0]].size)
+            values, dt = _resampled(values, instants, resample)
+    except ContentError as error:
+        raise ValueError(f"{path.name}: {error}") from None
     return Record(
-        values["input"],
-        values["output"],
+        np.stack([values[name] for name in inputs], axis=1),
+        np.stack([values[name] for name in outputs], axis=1),
         dt,
-        input_units=_unit(names["input"]) or "V",
-        output_units=_unit(names["output"]) or "um",
+        input_units=tuple(unit_of(n, columns[n]) or "V" for n in inputs),
+        output_units=tuple(unit_of(n, columns[n]) or "um" for n in outputs),
         source=path.name,
+        period=period,
     )
 
 
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
-
-_UNIT = re.compile(r"[_\s]+([^\W\d_]+)$|[\[(]\s*([^\])]+?)\s*[\])]\s*$")
-
-
-def _unit(name: str) -> str | None:
-    """Return the unit in ``drive_V``, ``drive [V]`` or ``drive (V)``, if any."""
-    found = _UNIT.search(name)
-    unit = (found[1] or found[2]) if found else None
-    return "um" if unit == "µm" else unit
-
-
-def _numbers(column: np.ndarray, name: str, source: str) -> np.ndarray:
-    """Return ``column`` as finite floats."""
-    if column.size != max(column.shape):
-        raise ValueError(f"{source}: {name} has shape {column.shape}")
-    if not (np.issubdtype(column.dtype, np.floating) or column.dtype.kind in "iub"):
-        raise ValueError(f"{source}: {name} is {column.dtype}, not real numbers")
-    column = column.astype(float).ravel()
-    bad = np.flatnonzero(~np.isfinite(column))
-    if bad.size:
-        raise ValueError(
-            f"{source}: {name} is missing or not finite at sample {bad[0]} "
-            f"({bad.size} in all)"
-        )
-    return column
-
-
-def _read_columns(path: Path) -> dict[str, np.ndarray]:
-    try:
-        if path.suffix.lower() == ".npz":
-            with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-                return {
-                    name: np.asarray(archive[name])
-                    for name in archive.files
-                    if archive[name].size > 1
-                }
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise ValueError(f"record {path}: {error.strerror or error}") from None
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error):
-        kind = "NPZ archive of plain arrays" if path.suffix == ".npz" else "text file"
-        raise ValueError(f"record {path} cannot be read: it is no {kind}") from None
-    return _parse_table(text, path)
-
-
-def _parse_table(text: str, path: Path) -> dict[str, np.ndarray]:
-    lines = [line for line in text.splitlines() if line.strip()]
-    if not lines:
-        raise ValueError(f"{path.name}: the file is empty")
-    delimiter = next((d for d in (",", ";", "\t") if d in lines[0]), None)
-    if delimiter:
-        rows = [
-            [cell.strip() for cell in row]
-            for row in csv.reader(lines, delimiter=delimiter)
-        ]
-    else:
-        rows = [line.split() for line in lines]
-    # A header is mostly text; one text among numbers is a broken sample.
-    numbers = sum(map(_numeric, rows[0]))
-    header = rows.pop(0) if 2 * numbers < len(rows[0]) else None
-    names = header or [str(i) for i in range(len(rows[0]))]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"{path.name}: two columns are called {name!r}")
-    table = np.full((len(rows), len(names)), np.nan)
-    for i, row in enumerate(rows):
-        if len(row) != len(names):
-            raise ValueError(
-                f"{path.name}: sample {i} has {len(row)} columns; "
-                f"the first line has {len(names)}"
-            )
-        for j, cell in enumerate(row):
-            try:
-                table[i, j] = float(cell) if cell else np.nan
-            except ValueError:
-                raise ValueError(
-                    f"{path.name}: column {names[j]!r}, sample {i}: "
-                    f"{cell!r} is no number"
-                ) from None
-    return dict(zip(names, table.T, strict=True))
-
-
-def _numeric(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _named(
-    columns: dict[str, np.ndarray], key: str | int, role: str, source: str
-) -> str:
-    """Return the name of the column that ``key`` names or counts."""
+def _named(columns: Columns, wanted: Key | Sequence[Key], role: str) -> list[str]:
+    """Return the names of the columns that ``wanted`` names or counts."""
+    if isinstance(wanted, str) and wanted not in columns and "," in wanted:
+        wanted = [key.strip() for key in wanted.split(",")]
     names = list(columns)
-    if isinstance(key, int) or (key not in columns and key.isdigit()):
-        number = int(key)
-        if 0 <= number < len(names):
-            return names[number]
-    elif key in columns:
-        return key
-    raise ValueError(
-        f"{source}: {role} column {key!r} is missing; there are {', '.join(names)}"
-    )
+    found = []
+    for key in [wanted] if isinstance(wanted, Key) else wanted:
+        number = isinstance(key, int) or (key not in columns and key.isdecimal())
+        name = dict(enumerate(names)).get(int(key)) if number else key
+        if name not in columns:
+            raise ContentError(
+                f"{role} column {key!r} is missing; there are {', '.join(names)}"
+            )
+        found.append(name)
+    if role != "time" and not found:
+        raise ContentError(f"no {role} column is named")
+    return found
 
 
-def _time_step(time: np.ndarray, source: str) -> float:
-    """Return the step of a uniform time axis, s."""
-    if time.size < 2:
-        raise ValueError(
-            f"{source}: {time.size} samples; at least {SHORTEST} are needed"
+def _numbers(columns: Columns, roles: dict[str, list[str]]) -> dict[str, np.ndarray]:
+    """Return the columns named for ``roles`` as finite floats of one length."""
+    values, role_of = {}, {}
+    for role, name in ((role, name) for role, names in roles.items() for name in names):
+        if name in role_of:
+            raise ContentError(
+                f"column {name!r} is named twice: as {role_of[name]} and as {role}"
+            )
+        role_of[name] = role
+        values[name] = _finite(columns[name], f"{role} column {name!r}")
+    if len({column.size for column in values.values()}) > 1:
+        lengths = ", ".join(f"{name} {column.size}" for name, column in values.items())
+        raise ContentError(f"columns differ in length: {lengths}")
+    return values
+
+
+def _finite(column: Column, name: str) -> np.ndarray:
+    if column.fault:
+        raise ContentError(f"{name}, {column.fault}")
+    if column.values.dtype.kind not in "fiub":
+        raise ContentError(f"{name} is {column.values.dtype}, not real numbers")
+    values = column.values.astype(float)
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        raise ContentError(
+            f"{name} is missing or not finite at sample {bad[0]} ({bad.size} in all)"
         )
+    return values
+
+
+def _above_zero(value: float, name: str) -> float:
+    if not (np.isfinite(value) and value > 0):
+        raise ContentError(f"{name} is {value:g} Hz; it must be above 0")
+    return value
+
+
+def _time_step(time: np.ndarray, even: bool) -> float:
+    """Return the mean step of an increasing and, if so asked, even time axis, s."""
+    if time.size < 2:
+        raise ContentError(f"{time.size} samples; at least {SHORTEST} are needed")
     steps = np.diff(time)
     if np.any(steps <= 0):
         sample = int(np.flatnonzero(steps <= 0)[0]) + 1
-        raise ValueError(f"{source}: time does not increase at sample {sample}")
+        raise ContentError(f"time does not increase at sample {sample}")
     dt = float(np.median(steps))
     uneven = np.flatnonzero(np.abs(steps - dt) > UNIFORM * dt)
-    if uneven.size:
+    if even and uneven.size:
         sample = int(uneven[0]) + 1
-        raise ValueError(
-            f"{source}: time is not uniform: step {steps[sample - 1]:g} s at sample "
-            f"{sample}, {dt:g} s elsewhere"
+        raise ContentError(
+            f"time is not uniform: step {steps[sample - 1]:g} s at sample {sample}, "
+            f"{dt:g} s elsewhere; resample=HZ puts it on a uniform grid"
         )
     return float((time[-1] - time[0]) / (time.size - 1))
+
+
+def _agreed(steps: dict[str, float | None]) -> float:
+    """Return the sample time, s, that all who know it say."""
+    known = [(who, step) for who, step in steps.items() if step is not None]
+    if not known:
+        raise ContentError("name the time column, or give its rate in Hz")
+    first, dt = known[0]
+    for other, step in known:
+        if abs(step - dt) > UNIFORM * dt:
+            raise ContentError(
+                f"the sample rate is {1.0 / dt:.6g} Hz by {first} and {1.0 / step:.6g} "
+                f"Hz by {other}; they must agree within {100.0 * UNIFORM:g} %"
+            )
+    return dt
+
+
+def _resampled(
+    values: dict[str, np.ndarray], instants: np.ndarray, rate: float
+) -> tuple[dict[str, np.ndarray], float]:
+    """Return ``values`` on a uniform grid of ``rate``, Hz, and its step, s."""
+    dt = 1.0 / _above_zero(rate, "resample")
+    # A hair more, so that rounding does not cost the last sample.
+    count = int((instants[-1] - instants[0]) / dt * (1.0 + 1e-12)) + 1
+    grid = instants[0] + dt * np.arange(count)
+    return {name: np.interp(grid, instants, v) for name, v in values.items()}, dt

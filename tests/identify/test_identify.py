@@ -23,6 +23,7 @@ from piezojax.study import shipped
 
 DT = 1e-3
 SAMPLES = 1200
+MODEL = "coleman_hodgdon"
 TRAIN = slice(0, 900)
 NOISE = 0.01
 TRUTH = {
@@ -73,7 +74,7 @@ def record_of(input, output):
 @pytest.fixture(scope="module")
 def fits(clean):
     return [
-        identify(record_of(INPUT, noisy(clean, seed)), train=TRAIN)
+        identify(record_of(INPUT, noisy(clean, seed)), MODEL, train=TRAIN)
         for seed in range(DRAWS)
     ]
 
@@ -153,14 +154,14 @@ def test_the_report_has_the_agreed_keys(fits):
 def test_what_lies_outside_training_has_no_say(clean, fits):
     output = noisy(clean, 0)
     output[TRAIN.stop :] += 50.0
-    fit = identify(record_of(INPUT, output), train=TRAIN)
+    fit = identify(record_of(INPUT, output), MODEL, train=TRAIN)
     assert fit.report.parameters == fits[0].report.parameters
     assert fit.report.train.rmse == fits[0].report.train.rmse
     assert fit.report.validation.rmse == pytest.approx(50.0, rel=1e-3)
 
 
 def test_other_units_change_nothing_but_the_units(clean, fits):
-    fit = identify(record_of(1e3 * INPUT, 1e-3 * noisy(clean, 0)), train=TRAIN)
+    fit = identify(record_of(1e3 * INPUT, 1e-3 * noisy(clean, 0)), MODEL, train=TRAIN)
     for path, factor in {
         "hysteresis.a": 1e-9,
         "hysteresis.b": 1e-6,
@@ -181,7 +182,7 @@ def test_a_training_part_without_motion_is_refused(clean):
     record = record_of(np.where(early, 5.0, INPUT), noisy(clean, 1))
     message = "made up, first 900 samples: input never changes"
     with pytest.raises(ValueError, match=message):
-        identify(record, train=TRAIN)
+        identify(record, MODEL, train=TRAIN)
 
 
 # The record that comes with piezojax
@@ -195,7 +196,7 @@ def shipped_fit():
         input="input_V",
         output="displacement_um",
     )
-    return identify(record)
+    return identify(record, MODEL)
 
 
 @pytest.mark.slow
@@ -264,7 +265,9 @@ def test_bad_parts(record, parts, message):
 
 
 def test_a_part_with_an_open_end(clean, fits):
-    fit = identify(record_of(INPUT, noisy(clean, 0)), train=slice(None, TRAIN.stop))
+    fit = identify(
+        record_of(INPUT, noisy(clean, 0)), model=MODEL, train=slice(None, TRAIN.stop)
+    )
     assert fit.report.parameters == fits[0].report.parameters
 
 
@@ -276,13 +279,13 @@ def test_the_rest_point_is_found_or_said_to_be_ambiguous(fits):
 
 
 def test_a_stage_that_moves_backwards_is_fitted_as_well(clean):
-    fit = identify(record_of(INPUT, -noisy(clean, 0)), train=TRAIN)
+    fit = identify(record_of(INPUT, -noisy(clean, 0)), MODEL, train=TRAIN)
     assert fit.report.validation.rmse == pytest.approx(NOISE, rel=0.1)
 
 
 def test_a_model_that_explains_nothing_is_said_to():
     measured = np.random.default_rng(5).standard_normal(SAMPLES)
-    fit = identify(record_of(INPUT, measured), train=TRAIN)
+    fit = identify(record_of(INPUT, measured), MODEL, train=TRAIN)
     assert fit.report.validation.rmse > 0.2 * np.std(measured)
     assert any("error" in text or "fit" in text for text in fit.report.warnings)
 
@@ -290,7 +293,7 @@ def test_a_model_that_explains_nothing_is_said_to():
 def test_validation_on_training_samples_is_said(clean):
     record = record_of(INPUT, noisy(clean, 0))
     try:
-        fit = identify(record, train=TRAIN, validate=slice(600, 900))
+        fit = identify(record, MODEL, train=TRAIN, validate=slice(600, 900))
     except ValueError:
         return
     assert any("validat" in text for text in fit.report.warnings)

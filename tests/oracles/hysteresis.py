@@ -5,6 +5,7 @@ x[k-1] to x[k]; sample 0 steps from (x_init, y_init) to x[0]. The direction is
 s = +1 if x(k+1) >= x(k), else -1.
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -176,7 +177,7 @@ def shaped_trapezoid(x, pull, slope, c, y_init):
     big_p = np.polynomial.Polynomial(pull).integ()
     big_g = np.polynomial.Polynomial(slope).integ()
     y = [y_init]
-    for x0, x1 in zip(x[:-1], x[1:], strict=True):
+    for x0, x1 in itertools.pairwise(x):
         s = 1.0 if x1 >= x0 else -1.0
         h = 0.5 * s * c * (x1 - x0)
         force = s * (big_p(x1) - big_p(x0)) + big_g(x1) - big_g(x0)

@@ -1,0 +1,155 @@
+"""Tables of text: rows of cells, in whatever dialect, into columns of numbers."""
+
+import codecs
+import csv
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+SEPARATORS = (";", "\t", ",", None)
+"""What may stand between two cells; None: blanks. The first that fits as well wins."""
+
+DECIMALS = (".", ",")
+
+COMMENT = ("#", "%")
+"""Lines that begin so are no data."""
+
+
+class ContentError(Exception):
+    """What is wrong with a file's content, in words; the file is named elsewhere."""
+
+
+class Column(NamedTuple):
+    """A column of a file.
+
+    ``values`` [samples]; ``unit`` and ``dt`` (s) where the file holds them; ``fault``:
+    what keeps ``values`` from being numbers, of no matter until the column is used.
+    """
+
+    values: np.ndarray
+    unit: str | None = None
+    dt: float | None = None
+    fault: str | None = None
+
+
+Columns = dict[str, Column]
+
+
+def decoded(content: bytes) -> str:
+    """Return text in UTF-8, in UTF-16 with its mark, or in a Western Windows code page.
+
+    Raises ValueError for what is no text.
+    """
+    marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = content.decode("utf-16" if marked else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("cp1252")  # where "µ" is one byte
+    if "\0" in text:
+        raise ValueError("a zero byte is no text")
+    return text
+
+
+def parsed(text: str) -> Columns:
+    """Return the columns of a text table; its dialect is found from its lines.
+
+    Cells are separated by ``;``, tabs, commas or blanks, numbers have a point or a
+    comma; a header and a row of units below it may be there or not. Raises ContentError
+    for an empty file, rows of different length, or two columns of one name.
+    """
+    lines = [
+        line
+        for line in text.splitlines()
+        if line.strip() and not line.lstrip().startswith(COMMENT)
+    ]
+    if not lines:
+        raise ContentError("the file is empty")
+    separator, decimal = _dialect(lines[:: max(1, len(lines) // 100)])
+    return table(_cells(lines, separator), decimal)
+
+
+def table(rows: Sequence[Sequence[str]], decimal: str = ".") -> Columns:
+    """Return the columns of ``rows`` of cells. Raises ContentError as ``parsed``."""
+    rows = [row for row in rows if any(row)]
+    if not rows:
+        raise ContentError("the file is empty")
+    width = len(rows[0])
+    names = [str(i) for i in range(width)]
+    units: Sequence[str] = [""] * width
+    if _mostly_text(rows[0], decimal):
+        names = [cell.strip() or str(i) for i, cell in enumerate(rows.pop(0))]
+        if rows and len(rows[0]) == width and _mostly_text(rows[0], decimal):
+            units = rows.pop(0)
+    for name in names:
+        if names.count(name) > 1:
+            raise ContentError(f"two columns are called {name!r}")
+    for i, row in enumerate(rows):
+        if len(row) < width or any(row[width:]):
+            raise ContentError(
+                f"sample {i} has {len(row)} columns; the first line has {width} "
+                f"(lines that are no data begin with {' or '.join(COMMENT)})"
+            )
+    return {
+        name: _column([row[j] for row in rows], units[j].strip() or None, decimal)
+        for j, name in enumerate(names)
+    }
+
+
+def _dialect(lines: Sequence[str]) -> tuple[str | None, str]:
+    """Return separator and decimal sign under which most lines are all numbers."""
+
+    def score(dialect):
+        separator, decimal = dialect
+        rows = [
+            [_numeric(cell, decimal) if cell else None for cell in row]
+            for row in _cells(lines, separator)
+        ]
+        # An empty cell is a missing number: it neither speaks for nor against.
+        full = sum(False not in row for row in rows)
+        return full, sum(row.count(True) for row in rows), sum(map(len, rows))
+
+    return max(product(SEPARATORS, DECIMALS), key=score)
+
+
+def _cells(lines: Sequence[str], separator: str | None) -> list[list[str]]:
+    if separator is None:
+        return [line.split() for line in lines]
+    return list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
+
+
+# A comma becomes a point and a point a comma, so that 1.234,5 is no number.
+_SWAP = str.maketrans(",.", ".,")
+
+
+def _pointed(cell: str, decimal: str) -> str:
+    return cell if decimal == "." else cell.translate(_SWAP)
+
+
+def _numeric(cell: str, decimal: str) -> bool:
+    try:
+        float(_pointed(cell, decimal))
+    except ValueError:
+        return False
+    return True
+
+
+def _mostly_text(row: Sequence[str], decimal: str) -> bool:
+    # One text among numbers is a broken sample, no header and no units.
+    filled = [cell for cell in row if cell]
+    return 2 * sum(_numeric(cell, decimal) for cell in filled) < len(filled)
+
+
+def _column(cells: Sequence[str], unit: str | None, decimal: str) -> Column:
+    pointed = (_pointed(cell, decimal) or "nan" for cell in cells)
+    try:
+        return Column(np.array([float(cell) for cell in pointed]), unit)
+    except ValueError:
+        sample, cell = next(
+            (i, cell)
+            for i, cell in enumerate(cells)
+            if cell and not _numeric(cell, decimal)
+        )
+        fault = f"sample {sample}: {cell!r} is no number"
+        return Column(np.full(len(cells), np.nan), unit, fault=fault)
