@@ -15,6 +15,7 @@ from .control import InversionControl as InversionControl
 from .control import SlidingModePID as SlidingModePID
 from .dynamics import ARMA as ARMA
 from .dynamics import FirstOrderLag as FirstOrderLag
+from .dynamics import StateSpace as StateSpace
 from .hardware import Quantiser as Quantiser
 from .hardware import Saturation as Saturation
 from .hardware import Sensor as Sensor
