@@ -122,7 +122,8 @@ def channels(chapter: str = "7") -> tuple[StateSpace, ...]:
     """
     if chapter not in MODELS:
         raise ValueError(
-            f"chapter {chapter!r} prints no model; it must be one of {', '.join(MODELS)}"
+            f"chapter {chapter!r} prints no model; "
+            f"it must be one of {', '.join(MODELS)}"
         )
     return tuple(
         StateSpace(

@@ -123,12 +123,20 @@ def stacked(channels: Sequence[StateSpace]) -> StateSpace:
 
 
 def stabilised(model: StateSpace) -> tuple[StateSpace, int]:
-    """Return ``model`` with every pole inside the unit circle, and how many moved.
+    """Return ``model`` with every pole inside the unit circle, and how many moved."""
+    A, moved = reflected(np.asarray(model.A))
+    return StateSpace(A, model.B, model.C, model.D, model.dt), moved
 
-    A pole on or outside the circle is reflected to 1/conj(z), which keeps the shape of
-    its resonance, in the real Schur form, where it is a block of its own.
+
+def reflected(
+    A: Float[np.ndarray, "n n"],
+) -> tuple[Float[np.ndarray, "n n"], int]:
+    """Return ``A`` with every eigenvalue inside the unit circle, and how many moved.
+
+    One on or outside the circle becomes 1/conj(z), which keeps the shape of its
+    resonance, in the real Schur form, where it is a block of its own.
     """
-    schur, basis = linalg.schur(np.asarray(model.A), output="real")
+    schur, basis = linalg.schur(A, output="real")
     moved, first = 0, 0
     while first < len(schur):
         pair = bool(np.any(schur[first + 1 : first + 2, first]))
@@ -138,7 +146,4 @@ def stabilised(model: StateSpace) -> tuple[StateSpace, int]:
             schur[block, block] *= min(modulus**-2, INNERMOST / modulus)
             moved += 1 + pair
         first = block.stop
-    if not moved:
-        return model, 0
-    A = basis @ schur @ basis.T
-    return StateSpace(A, model.B, model.C, model.D, model.dt), moved
+    return (basis @ schur @ basis.T, moved) if moved else (A, 0)
