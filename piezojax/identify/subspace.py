@@ -14,7 +14,7 @@ from functools import partial
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy import linalg
 
 from ..dynamics import StateSpace, stabilised
@@ -24,11 +24,15 @@ from .record import Record
 Theta = Float[np.ndarray, "outputs regressors"]
 Rows = Float[np.ndarray, "rows regressors"]
 Targets = Float[np.ndarray, "rows outputs"]
+Estimate = Callable[[Rows, Targets], Theta]
 
 
-def least_squares(X: Rows, Y: Targets) -> Theta:
-    """Return the theta that fits ``Y = X theta^T`` best, without any prior, (6.16)."""
-    return linalg.lstsq(X, Y)[0].T
+def least_squares(X: Rows, Y: Targets, tolerance: float = 1e-15) -> Theta:
+    """Return the smallest theta that fits ``Y = X theta^T`` best, (6.16).
+
+    Directions in which X is weaker than ``tolerance`` times its strongest are left out.
+    """
+    return linalg.lstsq(X, Y, cond=tolerance)[0].T
 
 
 def maximum_a_posteriori(X: Rows, Y: Targets, variance: float, prior: float) -> Theta:
@@ -174,7 +178,7 @@ def identify_channel(
     record: Record,
     p: int,
     order: int,
-    estimate: Callable[[Rows, Targets], Theta] = PRIOR,
+    estimate: Estimate = PRIOR,
 ) -> ChannelFit:
     """Fit a model with ``order`` states to a record with one input.
 
@@ -194,21 +198,29 @@ def identify_channel(
     return ChannelFit(model, markov, hankel_singular_values(markov), moved)
 
 
-def simulation_errors(model: StateSpace, record: Record) -> Float[np.ndarray, " q"]:
-    """Return the rms error of each output in a free run from rest, in its unit."""
-    return np.asarray(_errors(model, record.inputs, record.outputs))
+def simulation_errors(
+    model: StateSpace, record: Record, start: int = 0
+) -> Float[np.ndarray, " q"]:
+    """Return the rms error of each output in a free run from rest, in its unit.
+
+    The run begins with the record; samples from ``start`` on count.
+    """
+    simulated = np.asarray(_free_run(model, jnp.asarray(record.inputs)))
+    error = (simulated - record.outputs)[start:]
+    return np.sqrt(np.mean(error**2, axis=0))
 
 
 @eqx.filter_jit
-def _errors(model, inputs, outputs):
-    _, simulated = simulate(model, jnp.asarray(inputs), model.init(inputs[0]))
-    return jnp.sqrt(jnp.mean((simulated - outputs) ** 2, axis=0))
+def _free_run(model: StateSpace, inputs: Float[Array, "n m"]) -> Float[Array, "n q"]:
+    return simulate(model, inputs, model.init(inputs[0]))[1]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What ``choose`` found: ``errors`` [len(ps), len(orders)]: the norm of the outputs'
-    rms errors as a share of the largest span, infinite where p cannot hold the order.
+    """What ``choose`` found.
+
+    ``errors`` [len(ps), len(orders)]: the norm of the outputs' rms errors as a share of
+    the largest span, infinite where p cannot hold the order.
     """
 
     p: int
@@ -221,7 +233,7 @@ def choose(
     validate: Record,
     ps: Sequence[int],
     orders: Sequence[int],
-    estimate: Callable[[Rows, Targets], Theta] = PRIOR,
+    estimate: Estimate = PRIOR,
 ) -> Choice:
     """Choose p and the order by the free-run error on a record not fitted.
 
