@@ -136,7 +136,7 @@ def reflected(
     One on or outside the circle becomes 1/conj(z), which keeps the shape of its
     resonance, in the real Schur form, where it is a block of its own.
     """
-    schur, basis = linalg.schur(A, output="real")
+    schur, basis = linalg.schur(A, output="real")[:2]
     moved, first = 0, 0
     while first < len(schur):
         pair = bool(np.any(schur[first + 1 : first + 2, first]))

@@ -58,7 +58,7 @@ def empirical_response(
     )
     weight = np.asarray(weights, float)[:, None, None, None]
     power = np.sum(weight * _outer(inputs, inputs), axis=0)
-    strength = np.trace(power, axis1=1, axis2=2).real
+    strength = np.real(np.trace(power, axis1=1, axis2=2))
     lines = np.flatnonzero(strength > EXCITED * strength.max())
     power, inputs, outputs, noise = (
         power[lines],
@@ -73,7 +73,7 @@ def empirical_response(
     # Row i of the response has the covariance inverse (sum w^2 s_i^2 U U^H) inverse.
     spread = np.einsum("rli,rlab->liab", noise, weight**2 * _outer(inputs, inputs))
     covariance = inverse[:, None] @ spread @ inverse[:, None]
-    variance = np.diagonal(covariance, axis1=2, axis2=3).real
+    variance = np.real(np.diagonal(covariance, axis1=2, axis2=3))
     return EmpiricalResponse(frequency, response, variance, power, records[0].dt)
 
 

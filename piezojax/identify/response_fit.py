@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Complex, Float
+from jaxtyping import Array, Complex, Float
 from scipy import linalg, special
 
 from ..dynamics import StateSpace, reflected
@@ -36,7 +36,11 @@ class ResponseFit:
 
 
 def fit_response(
-    measured: EmpiricalResponse, order: int, *, rows: int = 30, steps: int = STEPS
+    measured: EmpiricalResponse,
+    order: int,
+    *,
+    rows: int = 30,
+    steps: int = STEPS,
 ) -> ResponseFit:
     """Fit a stable model with ``order`` states to ``measured``.
 
@@ -63,49 +67,51 @@ def fit_response(
 
 
 class _Data(NamedTuple):
-    z: Complex[ArrayLike, " lines"]
-    root: Complex[ArrayLike, "lines m m"]  # of twice the power
-    target: Complex[ArrayLike, "lines p m"]  # response @ root: squares sum to outputs'
+    z: Complex[Array, " lines"]
+    root: Complex[Array, "lines m m"]  # of twice the power
+    target: Complex[Array, "lines p m"]  # response @ root: squares sum to outputs'
 
 
 def _data(measured: EmpiricalResponse) -> _Data:
     z = np.exp(2j * np.pi * measured.dt * measured.frequency)
     root = np.linalg.cholesky(2.0 * measured.power)
-    return _Data(z, root, measured.response @ root)
+    return _Data(*map(jnp.asarray, (z, root, measured.response @ root)))
 
 
 def _observability(data: _Data, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Basis of the extended observability matrix, and the singular values."""
 
     def stack(columns):
-        powers = data.z ** np.arange(rows)[:, None]
+        powers = np.asarray(data.z) ** np.arange(rows)[:, None]
         blocks = np.einsum("rl,lij->rilj", powers, columns)
         flat = blocks.reshape(rows * columns.shape[1], -1)
-        return np.hstack([flat.real, flat.imag])
+        return np.hstack([np.real(flat), np.imag(flat)])
 
-    inputs = stack(data.root)
-    both = np.vstack([inputs, stack(data.target)])
-    (triangle,) = linalg.qr(both.T, mode="r")
+    inputs = stack(np.asarray(data.root))
+    both = np.vstack([inputs, stack(np.asarray(data.target))])
+    triangle = np.asarray(np.linalg.qr(both.T, mode="r"))
     known = len(inputs)
-    basis, values, _ = linalg.svd(triangle[known : len(both), known:].T)
+    basis, values, _ = np.linalg.svd(triangle[known : len(both), known:].T)
     return basis, values
 
 
 def _realised(basis: np.ndarray, measured: EmpiricalResponse) -> tuple[StateSpace, int]:
     """Shift invariance gives A and C; B and D follow by linear least squares."""
     n, p = basis.shape[1], measured.response.shape[1]
-    A, moved = reflected(linalg.lstsq(basis[:-p], basis[p:])[0])
+    A, moved = reflected(np.linalg.lstsq(basis[:-p], basis[p:])[0])
     C, eye = basis[:p], np.eye(p)
     states = StateSpace(A, np.eye(n), C, np.zeros((p, n)), measured.dt)
     resolvent = np.asarray(states.frequency_response(measured.frequency))
     known = np.dstack([resolvent, np.broadcast_to(eye, (len(resolvent), p, p))])
-    strength = np.sqrt(np.trace(measured.power, axis1=1, axis2=2).real)[:, None, None]
+    strength = np.sqrt(np.real(np.trace(measured.power, axis1=1, axis2=2)))[
+        :, None, None
+    ]
 
     def flat(blocks):
         rows = (strength * blocks).reshape(-1, blocks.shape[2])
-        return np.vstack([rows.real, rows.imag])
+        return np.vstack([np.real(rows), np.imag(rows)])
 
-    solution = linalg.lstsq(flat(known), flat(measured.response))[0]
+    solution = np.linalg.lstsq(flat(known), flat(measured.response))[0]
     return StateSpace(A, solution[:n], C, solution[n:], measured.dt), moved
 
 
@@ -124,27 +130,21 @@ class _Modes(NamedTuple):
 
 
 def _modes_of(model: StateSpace) -> _Modes:
-    poles, vectors = np.linalg.eig(np.asarray(model.A))
+    poles, vectors = map(np.asarray, np.linalg.eig(np.asarray(model.A)))
     left = np.asarray(model.C) @ vectors
     right = np.linalg.solve(vectors, np.asarray(model.B) + 0j)
     # Both sides of a residue alike in size: the descent is then well scaled.
     scale = np.sqrt(np.linalg.norm(right, axis=1) / np.linalg.norm(left, axis=0))
     left, right = (left * scale).T, right / scale[:, None]
     size = special.logit(np.clip(np.abs(poles), 1e-9, 1.0 - 1e-9))[:, None]
-    pair, single = poles.imag > 0.0, poles.imag == 0.0
-    pairs = [
-        size,
-        np.angle(poles)[:, None],
-        left.real,
-        left.imag,
-        right.real,
-        right.imag,
-    ]
-    singles = [size, left.real, right.real]
+    sides = [part(side) for side in (left, right) for part in (np.real, np.imag)]
+    pairs = np.hstack([size, np.angle(poles)[:, None], *sides])
+    singles = np.hstack([size, *sides[::2]])
+    pair, single = np.imag(poles) > 0.0, np.imag(poles) == 0.0
     return _Modes(
-        jnp.hstack([part[pair] for part in pairs]),
-        jnp.hstack([part[single] for part in singles]),
-        jnp.where(poles[single].real < 0.0, -1.0, 1.0),
+        jnp.asarray(pairs[pair]),
+        jnp.asarray(singles[single]),
+        jnp.where(np.real(poles[single]) < 0.0, -1.0, 1.0),
         model.D,
     )
 
@@ -274,13 +274,13 @@ def _model_of(modes: _Modes, dt: float) -> StateSpace:
     outputs = len(modes.feedthrough)
     A, B, C = [], [], []
     for parts in modes.pairs:
-        pole, left, right = map(np.asarray, _pair(parts, outputs))
-        A.append([[pole.real, -pole.imag], [pole.imag, pole.real]])
+        pole, left, right = _pair(parts, outputs)
+        A.append(np.array([[pole.real, -pole.imag], [pole.imag, pole.real]]))
         B += [right.real, right.imag]
         C += [2.0 * left.real, -2.0 * left.imag]
     for parts, sign in zip(modes.singles, modes.signs, strict=True):
-        pole, left, right = map(np.asarray, _single(parts, sign, outputs))
-        A.append(pole)
+        pole, left, right = _single(parts, sign, outputs)
+        A.append(np.array([[pole]]))
         B.append(right)
         C.append(left)
     return StateSpace(

@@ -32,7 +32,7 @@ def least_squares(X: Rows, Y: Targets, tolerance: float = 1e-15) -> Theta:
 
     Directions in which X is weaker than ``tolerance`` times its strongest are left out.
     """
-    return linalg.lstsq(X, Y, cond=tolerance)[0].T
+    return np.linalg.lstsq(X, Y, rcond=tolerance)[0].T
 
 
 def maximum_a_posteriori(X: Rows, Y: Targets, variance: float, prior: float) -> Theta:
@@ -111,7 +111,7 @@ def hankel_singular_values(
     markov: Float[np.ndarray, "count q"],
 ) -> Float[np.ndarray, " values"]:
     """Return the singular values of Hbar(0), largest first."""
-    return linalg.svdvals(_hankel(markov, 0))
+    return np.linalg.svdvals(_hankel(markov, 0))
 
 
 def order_at_gap(singular_values: Float[np.ndarray, " values"], most: int) -> int:
@@ -135,7 +135,7 @@ def realised(
             f"order is {order}; {len(markov)} Markov parameters allow "
             f"1..{_most(len(markov))}"
         )
-    left, values, right = linalg.svd(first, full_matrices=False)
+    left, values, right = np.linalg.svd(first, full_matrices=False)
     root = np.sqrt(values[:order])
     left, right = left[:, :order], right[:order]
     A = left.T @ _hankel(markov, 1) @ right.T / np.outer(root, root)
