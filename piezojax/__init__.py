@@ -14,6 +14,7 @@ from .control import DisturbanceObserverControl as DisturbanceObserverControl
 from .control import InversionControl as InversionControl
 from .control import SlidingModePID as SlidingModePID
 from .dynamics import ARMA as ARMA
+from .dynamics import AmplitudeScheduled as AmplitudeScheduled
 from .dynamics import FirstOrderLag as FirstOrderLag
 from .dynamics import StateSpace as StateSpace
 from .hardware import Quantiser as Quantiser

@@ -3,6 +3,7 @@
 from .arma import ARMA as ARMA
 from .arma import scaled_to_dc as scaled_to_dc
 from .lag import FirstOrderLag as FirstOrderLag
+from .scheduled import AmplitudeScheduled as AmplitudeScheduled
 from .state_space import StateSpace as StateSpace
 from .state_space import reflected as reflected
 from .state_space import stabilised as stabilised

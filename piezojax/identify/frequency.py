@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..dynamics import StateSpace
 from ..rollout import simulate
+from ..system import System
 from .record import Record
 
 EXCITED = 1e-4
@@ -144,7 +144,7 @@ def _check_independent(power: np.ndarray, frequency: np.ndarray) -> None:
 
 
 def periodic_errors(
-    model: StateSpace, records: Sequence[Record]
+    model: System, records: Sequence[Record]
 ) -> Float[np.ndarray, "records periods p"]:
     """Return the rms simulation error of each record, period and output, in its unit.
 
@@ -162,5 +162,5 @@ def periodic_errors(
     return np.stack(found)
 
 
-def _outputs(model: StateSpace, inputs: Float[Array, "n m"]) -> Float[Array, "n p"]:
+def _outputs(model: System, inputs: Float[Array, "n m"]) -> Float[Array, "n p"]:
     return simulate(model, inputs)[1]

@@ -36,20 +36,15 @@ class ResponseFit:
 
 
 def fit_response(
-    measured: EmpiricalResponse,
-    order: int,
-    *,
-    rows: int = 30,
-    steps: int = STEPS,
+    measured: EmpiricalResponse, order: int, *, rows: int = 30, steps: int = STEPS
 ) -> ResponseFit:
     """Fit a stable model with ``order`` states to ``measured``.
 
     The cost is the mean square of the outputs' error under the records' own inputs, not
     noise-weighted: what a simulation will be judged by. It starts at the subspace
     estimate of McKelvey, Akcay and Ljung (IEEE Trans. Automatic Control 41, 1996,
-    algorithm 1) with ``rows`` block rows, stabilised where need be, and descends by
-    Levenberg-Marquardt over modes whose poles are ``sigmoid(a) exp(j b)``: stable
-    whatever a and b are. Raises ValueError unless 1 <= order < rows * p.
+    algorithm 1) with ``rows`` block rows, stabilised where need be, and is ``refined``
+    from there. Raises ValueError unless 1 <= order < rows * p.
     """
     outputs = measured.response.shape[1]
     if not 1 <= order < rows * outputs:
@@ -57,13 +52,24 @@ def fit_response(
             f"order is {order}; with {rows} block rows of {outputs} outputs it must "
             f"lie in 1..{rows * outputs - 1}"
         )
-    data = _data(measured)
-    basis, singular_values = _observability(data, rows)
-    model, moved = _realised(basis[:, :order], measured)
-    modes, costs = _descend(_modes_of(model), data, steps)
-    return ResponseFit(
-        _model_of(modes, measured.dt), singular_values, np.array(costs), moved
-    )
+    basis, singular_values = _observability(_data(measured), rows)
+    start, moved = _realised(basis[:, :order], measured)
+    model, costs = refined(start, measured, steps)
+    return ResponseFit(model, singular_values, costs, moved)
+
+
+def refined(
+    model: StateSpace, measured: EmpiricalResponse, steps: int = STEPS
+) -> tuple[StateSpace, Float[np.ndarray, " steps"]]:
+    """Return ``model`` moved to fit ``measured`` best, and the cost of each step.
+
+    Levenberg-Marquardt over modes whose poles are ``sigmoid(a) exp(j b)``, stable
+    whatever a and b are, from the modes of ``model``, which must have as many poles as
+    states. Its matrices are blocks of one mode each, in the order and scale of the
+    start: models refined from one start can be compared block by block.
+    """
+    modes, costs = _descend(_modes_of(model), _data(measured), steps)
+    return _model_of(modes, measured.dt), np.array(costs)
 
 
 class _Data(NamedTuple):
@@ -247,9 +253,9 @@ def _descend(modes: _Modes, data: _Data, steps: int) -> tuple[_Modes, list[float
     costs, damping = [float(_cost(modes, data))], 1e-3
     for _ in range(steps):
         gradient, curvature = map(np.asarray, _normal_equations(modes, data))
-        # Unit diagonal; an unknown without effect has none and stays where it is.
+        # Unit diagonal, but for unknowns of next to no effect, which then stay put.
         size = np.sqrt(np.diag(curvature))
-        size = np.where(size > 0.0, size, np.inf)
+        size = np.maximum(size, 1e-6 * size.max())
         curvature, gradient = curvature / np.outer(size, size), gradient / size
         while damping < 1e6:
             damped = curvature + damping * np.eye(len(size))

@@ -1,7 +1,5 @@
 """Periodic records: transfer matrix, noise, and the model fitted to them."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from oracles import state_space as oracle
@@ -200,53 +198,3 @@ def test_bad_orders_are_refused(order):
     data = empirical_response([measured(0), measured(1)])
     with pytest.raises(ValueError, match=rf"order is {order}; .* must lie in 1\.\.17"):
         fit_response(data, order, rows=6)
-
-
-# The fine-steering mirror
-
-MIRROR = Path(__file__).parents[2].parent / "shared" / "data" / "fsm_mirror"
-LEVELS = {100: 2.2, 200: 1.0, 300: 0.23}
-"""Level in mV: its weight. 100 and 300 mV pull the resonance apart; these weights bring
-both training errors equally far below the published ones."""
-
-PUBLISHED = {100: 0.252, 200: 0.179, 300: 0.658}
-"""Test error of the published linear model for all three levels, um."""
-
-HELD_OUT = 0
-
-
-@pytest.fixture(scope="module")
-def mirror():
-    if not MIRROR.is_dir():
-        pytest.skip(f"{MIRROR} is not here: the mirror's records are not shipped")
-
-    def records(level):
-        u, y = (np.load(MIRROR / f"{side}_{level}mV_train.npy") for side in "uy")
-        return [
-            Record(
-                *(x[:, :, r].transpose(2, 0, 1).reshape(-1, 3) for x in (u, 1e6 * y)),
-                1.0 / 6400.0,
-                source=f"{level} mV, realisation {r}",
-                period=8192,
-            )
-            for r in range(6)
-        ]
-
-    return {level: records(level) for level in LEVELS}
-
-
-@pytest.mark.slow
-def test_one_linear_model_of_the_mirror_beats_the_published_one(mirror):
-    known = [
-        (record, weight)
-        for level, weight in LEVELS.items()
-        for r, record in enumerate(mirror[level])
-        if r != HELD_OUT
-    ]
-    data = empirical_response(*zip(*known, strict=True))
-    assert data.frequency[[0, -1]] == pytest.approx([0.78125, 2999.21875])
-    fit = fit_response(data, 36, steps=6)
-    assert np.abs(fit.model.poles()).max() < 1.0
-    for level, published in PUBLISHED.items():
-        error = periodic_errors(fit.model, [mirror[level][HELD_OUT]]).mean()
-        assert error < published, level
