@@ -155,6 +155,9 @@ PRIOR = partial(maximum_a_posteriori, variance=1.0, prior=10.0)
 """The estimate ``identify_channel`` uses unless told otherwise. Least squares without a
 prior fails on a chirp: above its last frequency nothing but noise speaks."""
 
+OPEN = 1e-3
+"""Directions of the input weaker than this share of the strongest count as open."""
+
 CLOSE = 1.1
 """``choose`` takes the smallest model whose error is within this factor of the best."""
 
@@ -163,15 +166,15 @@ CLOSE = 1.1
 class ChannelFit:
     """A model of one input channel.
 
-    ``markov`` [3p-1, q]: the estimates it was realised from; ``singular_values`` of
-    their Hankel matrix; ``moved``: how many poles had to be brought into the unit
-    circle.
+    ``markov`` [3p-1, q]: the estimates it was realised from, C A^s B for s = 0, 1, ...;
+    ``singular_values`` of their Hankel matrix; ``notes``: one line each on poles that
+    had to be brought into the unit circle and on an input that leaves directions open.
     """
 
     model: StateSpace
     markov: np.ndarray
     singular_values: np.ndarray
-    moved: int
+    notes: tuple[str, ...]
 
 
 def identify_channel(
@@ -195,7 +198,20 @@ def identify_channel(
     X, Y = regression(record.input / scale, record.outputs / scale, p)
     markov = markov_parameters(estimate(X, Y), p)
     model, moved = realised(markov, order, record.dt)
-    return ChannelFit(model, markov, hankel_singular_values(markov), moved)
+    notes = []
+    if moved:
+        notes.append(
+            f"{moved} of {order} poles lay outside the unit circle and were reflected"
+        )
+    inputs = np.hstack([X[:, :p], X[:, -p:]])
+    strength = np.linalg.svdvals(inputs)
+    excited = int(np.sum(strength > OPEN * strength[0]))
+    if excited < 2 * p:
+        notes.append(
+            f"the input excites {excited} of the {2 * p} directions of {2 * p} "
+            "samples: the response in the others is up to noise and prior"
+        )
+    return ChannelFit(model, markov, hankel_singular_values(markov), tuple(notes))
 
 
 def simulation_errors(

@@ -12,6 +12,7 @@ from scipy import signal
 from piezojax import StateSpace, load, save, simulate
 from piezojax.catalog import p558
 from piezojax.dynamics import stabilised, stacked
+from piezojax.serial import from_data, to_data
 from piezojax.system import rest_output
 
 DT = 2e-3
@@ -198,6 +199,21 @@ EYE, ONE = np.eye(2), np.ones((2, 1))
 def test_bad_models_are_refused(matrices, dt, message):
     with pytest.raises(ValueError, match=message):
         StateSpace(*matrices, dt)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (3.0, r"system.A is 3.0; it must be a list of rows"),
+        ([["a"]], "system: a matrix must be rows of numbers of one length"),
+        ([[1.0], [1.0, 2.0]], "system: a matrix must be rows of numbers of one length"),
+        ([1.0], "system: a matrix has shape"),
+    ],
+)
+def test_a_file_with_a_bad_matrix_is_refused(value, message):
+    data = to_data(StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], DT))
+    with pytest.raises(ValueError, match=message):
+        from_data({**data, "A": value})
 
 
 def test_channels_that_do_not_fit_are_refused():

@@ -144,7 +144,7 @@ def fits():
 def test_the_printed_stage_is_recovered(fits, chapter):
     for fit, true in zip(fits[chapter], p558.channels(chapter), strict=True):
         assert distance(fit.model.markov(3 * P), true_markov(true, 3 * P)) <= 0.05
-        assert fit.moved == 0
+        assert not any("reflected" in note for note in fit.notes)
     whole, true = stacked([fit.model for fit in fits[chapter]]), p558.model(chapter)
     assert whole.order == true.order
     assert np.abs(whole.poles()).max() < 1.0
@@ -160,6 +160,29 @@ def test_without_a_prior_a_noisy_chirp_is_not_enough(fits, channel):
     assert distance(fits["7"][channel].model.markov(3 * P), exact) < 0.1 * distance(
         free.model.markov(3 * P), exact
     )
+
+
+def test_what_an_input_leaves_open_is_said():
+    model, draw = p558.channels("7")[0], np.random.default_rng(3)
+    rich = measured(model, draw.standard_normal(1000))
+    assert subspace.identify_channel(rich, 5, 3).notes == ()
+    sine = measured(model, np.sin(0.3 * np.arange(1000)), 1)
+    (note,) = subspace.identify_channel(sine, 5, 3).notes
+    assert note.startswith("the input excites 2 of the 10 directions of 10 samples")
+
+
+def test_a_projection_is_said():
+    model, steps = p558.channels("7")[0], np.random.default_rng(3).standard_normal(500)
+    record = measured(model, steps)
+
+    def growing(X, Y):
+        # h(s) = 1.1^s from H0 = Gamma and H1 = Phi H0, for p = 2 and q = 3.
+        gamma = np.kron(1.1 ** np.array([[1, 0], [2, 1]]), np.ones((3, 1)))
+        return np.hstack([gamma, 1.21 * np.eye(6), np.zeros((6, 2))])
+
+    fit = subspace.identify_channel(record, 2, 1, growing)
+    assert fit.notes == ("1 of 1 poles lay outside the unit circle and were reflected",)
+    assert fit.model.poles()[0] == pytest.approx(1.0 / 1.1)
 
 
 def test_any_estimate_can_be_used(fits):
