@@ -14,10 +14,12 @@ from .control import DisturbanceObserverControl as DisturbanceObserverControl
 from .control import InversionControl as InversionControl
 from .control import SlidingModePID as SlidingModePID
 from .dynamics import ARMA as ARMA
+from .dynamics import AmplitudeScheduled as AmplitudeScheduled
 from .dynamics import ExponentialCreep as ExponentialCreep
 from .dynamics import FirstOrderLag as FirstOrderLag
 from .dynamics import FractionalDelay as FractionalDelay
 from .dynamics import LogarithmicCreep as LogarithmicCreep
+from .dynamics import StateSpace as StateSpace
 from .hardware import Quantiser as Quantiser
 from .hardware import Saturation as Saturation
 from .hardware import Sensor as Sensor

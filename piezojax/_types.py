@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
 ScalarLike = Float[Array, ""] | float | int
+Matrix = Float[Array, "rows columns"]
 State = Any  # a pytree of arrays; every System defines its own
 
 
@@ -24,6 +25,20 @@ def as_scalars(values: Iterable[Any]) -> tuple[Array, ...]:
     Scalars, not one packed array: XLA keeps them in registers inside the loop.
     """
     return tuple(as_array(value) for value in values)
+
+
+def as_matrix(value: Any) -> Array:
+    """Return ``value`` as a float64 matrix.
+
+    Raises ValueError unless it holds rows of numbers, all of one length.
+    """
+    try:
+        matrix = as_array(value)
+    except (TypeError, ValueError):
+        raise ValueError("a matrix must be rows of numbers of one length") from None
+    if matrix.ndim != 2:
+        raise ValueError(f"a matrix has shape {matrix.shape}; it must be 2-dimensional")
+    return matrix
 
 
 def _known(value: Any) -> np.ndarray | None:

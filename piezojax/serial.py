@@ -11,6 +11,7 @@ import equinox as eqx
 import numpy as np
 import tomli_w
 
+from ._types import Matrix
 from .files import write_text
 from .system import System
 
@@ -108,6 +109,7 @@ def _value_from_data(value: Any, kind: Any, where: str) -> Any:
 _PLAIN: dict[Any, tuple[Any, str]] = {
     str: (str, "a text"),
     int: (int, "a whole number"),
+    Matrix: (list, "a list of rows"),
 }
 """What fields that are not parameters take; every other field takes a number."""
 

@@ -6,3 +6,8 @@ from .creep import ExponentialCreep as ExponentialCreep
 from .creep import LogarithmicCreep as LogarithmicCreep
 from .delay import FractionalDelay as FractionalDelay
 from .lag import FirstOrderLag as FirstOrderLag
+from .scheduled import AmplitudeScheduled as AmplitudeScheduled
+from .state_space import StateSpace as StateSpace
+from .state_space import reflected as reflected
+from .state_space import stabilised as stabilised
+from .state_space import stacked as stacked

@@ -1,0 +1,84 @@
+"""Dynamics that change with the amplitude they are driven at."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from .._types import Scalar, as_array, as_scalars, check, check_order
+from ..system import System
+from .state_space import StateSpace
+
+
+class AmplitudeScheduled(System):
+    """State-space dynamics interpolated between models of several drive levels.
+
+    ``models``: one a level, alike in size and sample time, their states alike in
+    meaning (as ``refined`` from one start gives them); ``levels``: the rms of the input
+    over all channels at which each holds, rising, in the input's unit;
+    ``time_constant`` in s of the mean square that measures the level. Between two
+    levels the matrices are interpolated linearly in the level, outside they stay those
+    of the nearest. Where every A is built of scaled rotations it never stretches a
+    state, whatever the level does: the interpolation is as stable as its models.
+
+    Raises ValueError for fewer than two models, models that differ in size or sample
+    time, levels that do not rise, or a time constant shorter than a sample.
+    """
+
+    models: tuple[StateSpace, ...]
+    levels: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
+    time_constant: Scalar = eqx.field(converter=as_array)
+
+    def __check_init__(self):
+        if not 2 <= len(self.models) == len(self.levels):
+            raise ValueError(
+                f"{len(self.models)} models for {len(self.levels)} levels; "
+                "there must be one a level, and two or more"
+            )
+        kinds = {(model.order, *model.D.shape, model.dt) for model in self.models}
+        if len(kinds) > 1:
+            raise ValueError(
+                f"models differ in (states, outputs, inputs, sample time): "
+                f"{sorted(kinds)}; they must be the same"
+            )
+        check("levels", self.levels, least=0.0)
+        for low, high in zip(self.levels[:-1], self.levels[1:], strict=True):
+            check_order("a level", low, "the next", high)
+        check("time constant in s", self.time_constant, least=self.models[0].dt)
+
+    def at(self, level: Scalar) -> StateSpace:
+        """Return the linear model at the rms input ``level``."""
+        weights = _hats(level, jnp.stack(self.levels))
+
+        return jax.tree.map(
+            lambda *matrices: jnp.tensordot(weights, jnp.stack(matrices), 1),
+            *self.models,
+        )
+
+    def init(self, input: ArrayLike = 0.0) -> tuple[Array, Scalar]:
+        inputs = jnp.broadcast_to(as_array(input), self.models[0].B.shape[1:])
+        square = jnp.mean(inputs**2)
+        return self.at(_root(square)).init(inputs), square
+
+    def step(
+        self, state: tuple[Array, Scalar], input: Float[Array, " m"]
+    ) -> tuple[tuple[Array, Scalar], Float[Array, " p"]]:
+        states, square = state
+        input = as_array(input)
+        states, output = self.at(_root(square)).step(states, input)
+        change = self.models[0].dt / self.time_constant
+        return (states, square + change * (jnp.mean(input**2) - square)), output
+
+
+def _hats(level: Scalar, levels: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Weights of linear interpolation at ``level``, held at both ends."""
+    share = jnp.clip((level - levels[:-1]) / jnp.diff(levels), 0.0, 1.0)
+    left = jnp.concatenate([jnp.ones(1), share])
+    right = jnp.concatenate([share, jnp.zeros(1)])
+    return left - right
+
+
+def _root(square: Scalar) -> Scalar:
+    # The slope of sqrt at 0 is infinite; at rest the gradient must be 0.
+    positive = square > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)

@@ -1,0 +1,149 @@
+"""Linear state-space models with any number of inputs and outputs."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Complex, Float
+from scipy import linalg
+
+from .._types import Matrix, as_array, as_matrix, check
+from ..system import System
+
+INNERMOST = 1.0 - 1e-6
+"""Largest modulus that ``stabilised`` gives to a pole it has moved."""
+
+
+class StateSpace(System):
+    """``x(k+1) = A x(k) + B u(k)``, ``y(k) = C x(k) + D u(k)``, (6.1).
+
+    ``A`` [n, n], ``B`` [n, m], ``C`` [p, n], ``D`` [p, m] for n states, m inputs and p
+    outputs in the units of the neighbours in the chain; ``dt`` in s. Inputs and outputs
+    are vectors, also where there is only one.
+
+    A loop and ``free_run`` expect a plant that answers u(k) with y(k+1): see ``ahead``.
+    Raises ValueError for matrices that do not fit together, numbers that are not finite
+    or a sample time that is not positive.
+    """
+
+    A: Matrix = eqx.field(converter=as_matrix)
+    B: Matrix = eqx.field(converter=as_matrix)
+    C: Matrix = eqx.field(converter=as_matrix)
+    D: Matrix = eqx.field(converter=as_matrix)
+    dt: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        (n, m), p = self.B.shape, len(self.C)
+        for name, shape in (("A", (n, n)), ("C", (p, n)), ("D", (p, m))):
+            matrix = getattr(self, name)
+            if matrix.shape != shape:
+                raise ValueError(
+                    f"{name} has shape {matrix.shape}; with B of shape {self.B.shape} "
+                    f"and {p} outputs it must be {shape}"
+                )
+        for name in "ABCD":
+            check(name, getattr(self, name))
+        check("sample time in s", self.dt, above=0.0)
+
+    @property
+    def order(self) -> int:
+        """Number of states n."""
+        return len(self.A)
+
+    def poles(self) -> np.ndarray:
+        """Return the poles in the z plane (concrete parameters only)."""
+        return np.linalg.eigvals(np.asarray(self.A))
+
+    def dc_gain(self) -> Float[Array, "p m"]:
+        """Return outputs over inputs at rest."""
+        return self.C @ _at_rest(self.A, self.B) + self.D
+
+    def markov(self, count: int) -> Float[Array, "count p m"]:
+        """Return ``C A^s B`` for s = 0 .. count-1: the impulse response behind D."""
+        _, powers = jax.lax.scan(
+            lambda power, _: (self.A @ power, self.C @ power), self.B, length=count
+        )
+        return powers
+
+    def frequency_response(
+        self, frequency: Float[ArrayLike, " lines"]
+    ) -> Complex[Array, "lines p m"]:
+        """Return ``C (z I - A)^-1 B + D`` at ``frequency`` in Hz."""
+        z = jnp.exp(2j * jnp.pi * self.dt * as_array(frequency))
+        resolvent = z[:, None, None] * jnp.eye(self.order) - self.A
+        return self.C @ jnp.linalg.solve(resolvent, self.B + 0j) + self.D
+
+    def ahead(self) -> "StateSpace":
+        """Return the model that answers u(k) with y(k+1), the plant a loop expects.
+
+        Raises ValueError where u(k) reaches y(k): a loop would be algebraic.
+        """
+        if np.any(np.asarray(self.D)):
+            raise ValueError("D is not zero; an input must not reach its own sample")
+        return StateSpace(self.A, self.B, self.C @ self.A, self.C @ self.B, self.dt)
+
+    def init(self, input: ArrayLike = 0.0) -> Float[Array, " n"]:
+        inputs = jnp.broadcast_to(as_array(input), self.B.shape[1:])
+        return _at_rest(self.A, self.B @ inputs)
+
+    def step(
+        self, state: Float[Array, " n"], input: Float[Array, " m"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " p"]]:
+        input = as_array(input)
+        return self.A @ state + self.B @ input, self.C @ state + self.D @ input
+
+
+def _at_rest(A: Array, forcing: Array) -> Array:
+    return jnp.linalg.solve(jnp.eye(len(A)) - A, forcing)
+
+
+def stacked(channels: Sequence[StateSpace]) -> StateSpace:
+    """Return one model from models of its input channels, (6.19)-(6.22).
+
+    Each has its own states; their outputs are summed. Raises ValueError for channels
+    that differ in their outputs or sample time, or for none.
+    """
+    if not channels:
+        raise ValueError("there are no channels to stack")
+    kinds = {(len(channel.C), channel.dt) for channel in channels}
+    if len(kinds) > 1:
+        raise ValueError(
+            f"channels differ in (outputs, sample time): {sorted(kinds)}; "
+            "they must be the same"
+        )
+    return StateSpace(
+        jax.scipy.linalg.block_diag(*(channel.A for channel in channels)),
+        jax.scipy.linalg.block_diag(*(channel.B for channel in channels)),
+        jnp.hstack([channel.C for channel in channels]),
+        jnp.hstack([channel.D for channel in channels]),
+        channels[0].dt,
+    )
+
+
+def stabilised(model: StateSpace) -> tuple[StateSpace, int]:
+    """Return ``model`` with every pole inside the unit circle, and how many moved."""
+    A, moved = reflected(np.asarray(model.A))
+    return StateSpace(A, model.B, model.C, model.D, model.dt), moved
+
+
+def reflected(
+    A: Float[np.ndarray, "n n"],
+) -> tuple[Float[np.ndarray, "n n"], int]:
+    """Return ``A`` with every eigenvalue inside the unit circle, and how many moved.
+
+    One on or outside the circle becomes 1/conj(z), which keeps the shape of its
+    resonance, in the real Schur form, where it is a block of its own.
+    """
+    schur, basis = linalg.schur(A, output="real")[:2]
+    moved, first = 0, 0
+    while first < len(schur):
+        pair = bool(np.any(schur[first + 1 : first + 2, first]))
+        block = slice(first, first + 1 + pair)
+        modulus = np.abs(linalg.eigvals(schur[block, block])).max()
+        if modulus >= 1.0:
+            schur[block, block] *= min(modulus**-2, INNERMOST / modulus)
+            moved += 1 + pair
+        first = block.stop
+    return (basis @ schur @ basis.T, moved) if moved else (A, 0)
