@@ -15,10 +15,13 @@ from .control import InversionControl as InversionControl
 from .control import SlidingModePID as SlidingModePID
 from .dynamics import ARMA as ARMA
 from .dynamics import FirstOrderLag as FirstOrderLag
+from .dynamics import HystereticOscillator as HystereticOscillator
+from .dynamics import NeuralStateSpace as NeuralStateSpace
 from .hardware import Quantiser as Quantiser
 from .hardware import Saturation as Saturation
 from .hardware import Sensor as Sensor
 from .hardware import SlewLimit as SlewLimit
+from .hysteresis import BoucWen as BoucWen
 from .hysteresis import ColemanHodgdon as ColemanHodgdon
 from .hysteresis import InverseColemanHodgdon as InverseColemanHodgdon
 from .identify import Record as Record
