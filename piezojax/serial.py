@@ -99,10 +99,24 @@ def _value_from_data(value: Any, kind: Any, where: str) -> Any:
                 f"it must be {kind.__name__}"
             )
         return system
+    rank = len(getattr(kind, "dims", ()))
+    if rank:
+        return _array_from_data(value, rank, where)
     accepted, name = _PLAIN.get(kind, ((int, float), "a number"))
     if not isinstance(value, accepted) or isinstance(value, bool):
         raise ValueError(f"{where} is {value!r}; it must be {name}")
     return value
+
+
+def _array_from_data(value: Any, rank: int, where: str) -> np.ndarray:
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.ndim != rank:
+        kind = "a list" if rank == 1 else "lists of one length in a list"
+        raise ValueError(f"{where} is {value!r}; it must be numbers in {kind}")
+    return array
 
 
 _PLAIN: dict[Any, tuple[Any, str]] = {

@@ -1,4 +1,4 @@
-"""A linear state space with a layer of neurons beside it: dynamics without a structure."""
+"""A linear state space with neurons beside it: dynamics of unknown structure."""
 
 from typing import Any
 
@@ -59,7 +59,7 @@ class NeuralStateSpace(System):
                     f"{name} has shape {value.shape}; with {n} states, {h} neurons, "
                     f"{m} inputs and {p} outputs it must be {shape}"
                 )
-            check(name, value)
+            check(name, value.ravel())
 
     def init(self, input: Any = 0.0) -> Float[Array, " n"]:
         """Return the state that ``input`` holds, found by Newton's method from zero."""

@@ -66,7 +66,7 @@ def linear_oscillator(record: Record) -> tuple[float, float, float]:
     mass, damping, stiffness = np.linalg.lstsq(split, target, rcond=None)[0]
     if not (mass > 0.0 and stiffness > 0.0):
         raise ValueError(
-            f"{record.source}: the record looks like an oscillator of mass {mass:g} and "
+            f"{record.source}: the best linear oscillator has mass {mass:g} and "
             f"stiffness {stiffness:g}; both must be above 0"
         )
     return float(mass), float(damping), float(stiffness)

@@ -52,7 +52,7 @@ def branch_of_unit_nu(change, force, alpha, beta_gamma, beta_delta):
 
 
 @numba.njit
-def _slopes(y, v, z, u, mass, damping, stiffness, alpha, beta, gamma, delta, nu):
+def slopes(y, v, z, u, mass, damping, stiffness, alpha, beta, gamma, delta, nu):
     magnitude = abs(z)
     inner = 0.0 if magnitude == 0.0 else magnitude ** (nu - 1.0) * z
     loop = gamma * abs(v) * inner + delta * v * magnitude**nu
@@ -67,8 +67,8 @@ def _heun(u, dt, mass, damping, stiffness, alpha, beta, gamma, delta, nu):
     for i in range(u.size):
         out[i] = y
         following = u[(i + 1) % u.size]
-        a0, b0, c0 = _slopes(y, v, z, u[i], *p)
-        a1, b1, c1 = _slopes(y + dt * a0, v + dt * b0, z + dt * c0, following, *p)
+        a0, b0, c0 = slopes(y, v, z, u[i], *p)
+        a1, b1, c1 = slopes(y + dt * a0, v + dt * b0, z + dt * c0, following, *p)
         y += 0.5 * dt * (a0 + a1)
         v += 0.5 * dt * (b0 + b1)
         z += 0.5 * dt * (c0 + c1)
