@@ -11,8 +11,13 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..rollout import simulate
+from ..space import INSIDE, Space, squash, unsquash
 from ..system import System
+from .models import Structure
 from .record import Record
+
+DIVERGED = 1e6
+"""What counts as the error of a sample where the simulation is not finite."""
 
 
 @eqx.filter_jit
@@ -72,8 +77,28 @@ def fit_steady_state(
     return found[best], errors
 
 
-DIVERGED = 1e6
-"""What counts as the error of a sample where the simulation is not finite."""
+def fit_structure(
+    structure: Structure,
+    record: Record,
+    *,
+    settle: int | None = None,
+    steps: int = 200,
+) -> tuple[System, np.ndarray]:
+    """Fit ``structure``, from its own starts and inside its box; else as above.
+
+    Returns the fitted system and the error that each start led to, as a share.
+    """
+    starts = jnp.clip(jnp.asarray(structure.starts), INSIDE, 1.0 - INSIDE)
+    # A Partial, not a closure: another record of that length is no new compilation.
+    put = eqx.Partial(_inside, structure.space, structure.system)
+    best, errors = fit_steady_state(
+        put, unsquash(starts), record, settle=settle, steps=steps
+    )
+    return put(best), errors
+
+
+def _inside(space: Space, system: System, free: Float[Array, " n"]) -> System:
+    return space.put(system, squash(free))
 
 
 @eqx.filter_jit
