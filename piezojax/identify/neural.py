@@ -1,5 +1,6 @@
 """Training a neural state space on one steady period of a record."""
 
+import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
@@ -22,18 +23,26 @@ def fit_neural_state_space(
     order: int = 3,
     neurons: int = 8,
     *,
+    starts: int = 1,
     seed: int = 0,
     settle: int | None = None,
     steps: int = 200,
 ) -> NeuralStateSpace:
     """Fit a state space of ``order`` with ``neurons`` to ``record``, one steady period.
 
-    From ``neural_start``, ``fit_steady_state`` moves all numbers, by the simulated
-    output alone. Nothing of what made the record is known; it may have any number of
-    inputs and outputs. Raises ValueError as these two do.
+    From each ``neural_start`` with the seeds ``seed``, ``seed + 1``, ...,
+    ``fit_steady_state`` moves all numbers, by the simulated output alone, and the best
+    is kept. Nothing of what made the record is known; it may have any number of inputs
+    and outputs. Raises ValueError as these two do, or if ``starts`` is below 1.
     """
-    numbers, put = ravel_pytree(neural_start(record, order, neurons, seed=seed))
-    best, _ = fit_steady_state(put, numbers[None], record, settle=settle, steps=steps)
+    if starts < 1:
+        raise ValueError(f"starts is {starts}; it must be at least 1")
+    drawn = [
+        ravel_pytree(neural_start(record, order, neurons, seed=seed + k))
+        for k in range(starts)
+    ]
+    numbers, put = jnp.stack([flat for flat, _ in drawn]), drawn[0][1]
+    best, _ = fit_steady_state(put, numbers, record, settle=settle, steps=steps)
     return put(best)
 
 

@@ -14,17 +14,18 @@ def average_periods(record: Record, skip: int = 1) -> Record:
     noise by sqrt(P) and keeps all that repeats. Samples after the last whole period are
     left out. Raises ValueError for a record without ``period``, or too few periods.
     """
-    if record.period is None:
+    period = record.period
+    if period is None:
         raise ValueError(f"{record.source}: the record has no period to average over")
-    count = record.samples // record.period
+    count = record.samples // period
     if not 0 <= skip < count:
         raise ValueError(
             f"skip is {skip}; it must be at least 0 and below the {count} whole periods"
         )
-    kept = slice(skip * record.period, count * record.period)
+    kept = slice(skip * period, count * period)
 
     def mean(columns: np.ndarray) -> np.ndarray:
-        periods = columns[kept].reshape(count - skip, record.period, -1)
+        periods = columns[kept].reshape(count - skip, period, -1)
         return periods.mean(axis=0)
 
     return replace(record, inputs=mean(record.inputs), outputs=mean(record.outputs))

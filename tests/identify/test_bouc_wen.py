@@ -8,10 +8,15 @@ import pytest
 from oracles import bouc_wen as oracle
 
 from piezojax import Record
-from piezojax.identify.model_bouc_wen import bouc_wen, linear_oscillator
-from piezojax.identify.neural import fit_neural_state_space
-from piezojax.identify.resample import average_periods, resample
-from piezojax.identify.steady_state import fit_structure, steady_response
+from piezojax.identify import (
+    average_periods,
+    bouc_wen,
+    fit_neural_state_space,
+    fit_structure,
+    resample,
+    steady_response,
+)
+from piezojax.identify.model_bouc_wen import linear_oscillator
 
 RATE = 750.0
 SHARED = Path(__file__).parents[2].parent / "shared/data/bouc_wen/train.h5"

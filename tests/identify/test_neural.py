@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from piezojax import Record
-from piezojax.identify.neural import fit_neural_state_space, neural_start
-from piezojax.identify.steady_state import steady_response
+from piezojax.identify import fit_neural_state_space, neural_start, steady_response
 
 SAMPLES = 256
 
@@ -73,10 +72,11 @@ def bent(state, u):
 
 def test_training_finds_what_no_linear_model_can():
     made = record(bent, 1, 1)
-    fitted = fit_neural_state_space(made, 1, 4, steps=60)
+    # Of three draws of four neurons, the first ends in a poor minimum.
+    fitted = fit_neural_state_space(made, 1, 4, starts=3, steps=60)
     fresh = record(bent, 1, 1, seed=1)
     assert np.max(share(neural_start(made, 1, 4), fresh)) > 0.1
-    assert np.max(share(fitted, fresh)) < 0.01
+    assert np.max(share(fitted, fresh)) < 1e-6
 
 
 def test_seed_decides_the_start_and_the_model():
@@ -85,6 +85,23 @@ def test_seed_decides_the_start_and_the_model():
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(same), strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(one.neuron_state, other.neuron_state)
+
+
+def test_several_inputs_and_outputs_are_trained_at_once():
+    def saturating(state, u):
+        state, output = linear(state, u)
+        return state - 0.5 * np.tanh(2.0 * state), output
+
+    made = record(saturating, 2, 3)
+    fitted = fit_neural_state_space(made, 3, 6, steps=60)
+    fresh = record(saturating, 2, 3, seed=1)
+    assert np.max(share(neural_start(made, 3, 6), fresh)) > 0.1
+    assert np.max(share(fitted, fresh)) < 0.02
+
+
+def test_no_start_is_refused():
+    with pytest.raises(ValueError, match="starts is 0; it must be at least 1"):
+        fit_neural_state_space(record(bent, 1, 1), 1, 4, starts=0)
 
 
 @pytest.mark.parametrize(

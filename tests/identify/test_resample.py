@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from piezojax import Record
-from piezojax.identify.resample import average_periods, resample
+from piezojax.identify import average_periods, resample
 
 DT = 2e-3
 SAMPLES = 64

@@ -4,12 +4,8 @@ import pytest
 from scipy.signal import lfilter
 
 from piezojax import ARMA, Affine, FirstOrderLag, Record
+from piezojax.identify import fit_steady_state, fit_structure, steady_response
 from piezojax.identify.models import Structure
-from piezojax.identify.steady_state import (
-    fit_steady_state,
-    fit_structure,
-    steady_response,
-)
 from piezojax.space import space_of
 
 DT = 1e-3
