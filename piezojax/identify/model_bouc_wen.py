@@ -12,6 +12,12 @@ from .record import Record
 SHARES = (0.25, 0.5, 0.75)
 """Parts of the stiffness seen in the record that the hysteretic element may have."""
 
+NU = 1.5
+"""Exponent of the starts."""
+
+WIDE = 100.0
+"""Upper bound of the bends, in bends of the starts: their unit depends on nu."""
+
 
 def bouc_wen(record: Record) -> Structure:
     """Return a mass on a spring, a damper and a Bouc-Wen element, driven by a force.
@@ -22,12 +28,15 @@ def bouc_wen(record: Record) -> Structure:
     comes close to the record.
     """
     mass, damping, stiffness = linear_oscillator(record)
-    bend = 1.0 / float(np.std(record.output))
+    # At the typical force the loop is to bend over the typical displacement; of the
+    # exponents in the box none is preferred.
+    displacement = float(np.std(record.output))
+    bend = (0.5 * stiffness * displacement) ** (1.0 - NU) / displacement
     system = HystereticOscillator(
         mass,
         damping,
         0.5 * stiffness,
-        BoucWen(0.5 * stiffness, 0.5 * bend, 0.0),
+        BoucWen(0.5 * stiffness, 0.5 * bend, 0.0, NU),
         record.dt,
     )
     space = space_of(
@@ -36,13 +45,13 @@ def bouc_wen(record: Record) -> Structure:
             "damping": (1e-3 * abs(damping), 10.0 * abs(damping), "log"),
             "stiffness": (0.01 * stiffness, 2.0 * stiffness, "log"),
             "hysteresis.alpha": (0.01 * stiffness, 2.0 * stiffness, "log"),
-            "hysteresis.beta_gamma": (0.0, 20.0 * bend, "linear"),
-            "hysteresis.beta_delta": (-20.0 * bend, 20.0 * bend, "linear"),
+            "hysteresis.beta_gamma": (0.0, WIDE * bend, "linear"),
+            "hysteresis.beta_delta": (-WIDE * bend, WIDE * bend, "linear"),
             "hysteresis.nu": (0.5, 3.0, "linear"),
         }
     )
     starts = [
-        [mass, 0.5 * damping, (1.0 - share) * stiffness, share * stiffness, g, d, 1.0]
+        [mass, 0.5 * damping, (1.0 - share) * stiffness, share * stiffness, g, d, NU]
         for share in SHARES
         for g, d in ((0.5 * bend, 0.5 * bend), (0.5 * bend, -0.5 * bend))
     ]
