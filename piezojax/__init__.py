@@ -18,7 +18,9 @@ from .dynamics import AmplitudeScheduled as AmplitudeScheduled
 from .dynamics import ExponentialCreep as ExponentialCreep
 from .dynamics import FirstOrderLag as FirstOrderLag
 from .dynamics import FractionalDelay as FractionalDelay
+from .dynamics import HystereticOscillator as HystereticOscillator
 from .dynamics import LogarithmicCreep as LogarithmicCreep
+from .dynamics import NeuralStateSpace as NeuralStateSpace
 from .dynamics import StateSpace as StateSpace
 from .hardware import Quantiser as Quantiser
 from .hardware import Saturation as Saturation
@@ -27,6 +29,7 @@ from .hardware import SlewLimit as SlewLimit
 from .hysteresis import (
     AsymmetricPrandtlIshlinskii as AsymmetricPrandtlIshlinskii,
 )
+from .hysteresis import BoucWen as BoucWen
 from .hysteresis import ColemanHodgdon as ColemanHodgdon
 from .hysteresis import InverseColemanHodgdon as InverseColemanHodgdon
 from .hysteresis import PrandtlIshlinskii as PrandtlIshlinskii

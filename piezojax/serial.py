@@ -11,7 +11,6 @@ import equinox as eqx
 import numpy as np
 import tomli_w
 
-from ._types import Matrix
 from .files import write_text
 from .system import System
 
@@ -100,16 +99,29 @@ def _value_from_data(value: Any, kind: Any, where: str) -> Any:
                 f"it must be {kind.__name__}"
             )
         return system
+    rank = len(getattr(kind, "dims", ()))
+    if rank:
+        return _array_from_data(value, rank, where)
     accepted, name = _PLAIN.get(kind, ((int, float), "a number"))
     if not isinstance(value, accepted) or isinstance(value, bool):
         raise ValueError(f"{where} is {value!r}; it must be {name}")
     return value
 
 
+def _array_from_data(value: Any, rank: int, where: str) -> np.ndarray:
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.ndim != rank:
+        kind = "a list" if rank == 1 else "lists of one length in a list"
+        raise ValueError(f"{where} is {value!r}; it must be numbers in {kind}")
+    return array
+
+
 _PLAIN: dict[Any, tuple[Any, str]] = {
     str: (str, "a text"),
     int: (int, "a whole number"),
-    Matrix: (list, "a list of rows"),
 }
 """What fields that are not parameters take; every other field takes a number."""
 

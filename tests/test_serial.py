@@ -23,6 +23,21 @@ SCALAR = {
     "delay": pj.Delay(3),
     "no delay": pj.Delay(0),
     "lag": pj.FirstOrderLag(2.5e-3, 5e-5),
+    "restoring force": pj.BoucWen(5e4, 800.0, -1100.0, 1.2, substeps=3),
+    "oscillator": pj.HystereticOscillator(
+        2.0, 10.0, 5e4, pj.BoucWen(5e4, 800.0, -1100.0), 1e-3
+    ),
+    "neural state space": pj.NeuralStateSpace(
+        state_matrix=[[0.8, 0.1], [-0.2, 0.5]],
+        input_matrix=[[1.0], [0.3]],
+        output_matrix=[[1.0, -2.0]],
+        neuron_output=[[0.1, 0.2, -0.1], [0.0, 0.3, 0.1]],
+        neuron_state=[[1.0, 0.5], [-0.3, 0.7], [0.2, 0.2]],
+        neuron_input=[[0.5], [1.0], [-0.4]],
+        neuron_bias=[0.1, -0.2, 0.0],
+        input_offset=[0.3],
+        output_offset=[-1.0],
+    ),
     "saturation": pj.Saturation(-20.0, 120.0),
     "slew limit": pj.SlewLimit(1e4, 5e-5),
     "quantiser": pj.Quantiser(0.01),

@@ -1,11 +1,13 @@
-"""Linear dynamics that follow the hysteresis."""
+"""Dynamics: linear ones that follow the hysteresis, and those that contain it."""
 
 from .arma import ARMA as ARMA
 from .arma import scaled_to_dc as scaled_to_dc
 from .creep import ExponentialCreep as ExponentialCreep
 from .creep import LogarithmicCreep as LogarithmicCreep
 from .delay import FractionalDelay as FractionalDelay
+from .hysteretic_oscillator import HystereticOscillator as HystereticOscillator
 from .lag import FirstOrderLag as FirstOrderLag
+from .neural_state_space import NeuralStateSpace as NeuralStateSpace
 from .scheduled import AmplitudeScheduled as AmplitudeScheduled
 from .state_space import StateSpace as StateSpace
 from .state_space import reflected as reflected

@@ -61,7 +61,7 @@ class LogarithmicCreep(System):
     to ``longest``: the logarithmic law of section 2.4.1, carried over to any input by
     equally strong exponentials, two a decade from a decade before to a decade after,
     which follow it within 3 % of a decade's creep. ``shortest``, ``longest``, ``dt``
-    in s, y in the unit of x. Raises ValueError unless dt > 0 and 0 < shortest < longest.
+    in s, y in the unit of x. Raises ValueError unless dt > 0, 0 < shortest < longest.
     """
 
     gain_per_decade: Scalar = eqx.field(converter=as_array)

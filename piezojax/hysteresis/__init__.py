@@ -1,5 +1,6 @@
 """Hysteresis models, one file each, with their inverses beside them."""
 
+from .bouc_wen import BoucWen as BoucWen
 from .coleman_hodgdon import ColemanHodgdon as ColemanHodgdon
 from .coleman_hodgdon import InverseColemanHodgdon as InverseColemanHodgdon
 from .prandtl_ishlinskii import (

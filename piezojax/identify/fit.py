@@ -13,9 +13,10 @@ from ..paths import parameters
 from ..progress import Progress
 from ..system import System
 from .checks import record_warnings
-from .models import DEFAULT, REST_INPUT, structure
+from .models import DEFAULT, structure
 from .output_error import Optimum, from_rest, output_error
 from .record import Record
+from .structure import REST_INPUT
 
 AS_GOOD = 1e-3
 """Starts whose mean square comes this close (as a share) to the best fit as well."""

@@ -24,9 +24,7 @@ from ..paths import get, replace
 from ..space import INSIDE, Space, Transform, space_of
 from ..system import Affine, Series, System, series
 from .record import Record
-
-REST_INPUT = "hysteresis.rest_input"
-"""Path of the input in force before the record, where the model has a memory of it."""
+from .structure import Structure
 
 PLAYS = 10
 """Play operators of a fitted Prandtl-Ishlinskii model."""
@@ -46,20 +44,6 @@ class Part(NamedTuple):
     alternatives: Sequence[Mapping[str, float]] = ({},)
     gain: str | None = None
     own: tuple[str, ...] = ()
-
-
-class Structure(NamedTuple):
-    """A model to fit: its System, the box of its parameters, starts in the box.
-
-    ``own`` holds the paths of which every record has its own value, ``order`` counts
-    the parameters of linear dynamics.
-    """
-
-    system: System
-    space: Space
-    starts: np.ndarray
-    own: tuple[str, ...] = ()
-    order: int = 0
 
 
 class Extent(NamedTuple):

@@ -16,8 +16,8 @@ from ..progress import Progress, Silent
 from ..rollout import simulate
 from ..space import Space, squash
 from ..system import System, rest_output
-from .models import REST_INPUT, Structure
 from .record import Record
+from .structure import REST_INPUT, Structure
 
 AT_ONCE = 4
 """Starts that descend together in one program."""

@@ -1,0 +1,89 @@
+"""A linear state space with neurons beside it: dynamics of unknown structure."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from .._types import as_array, check
+from ..system import System
+
+
+class NeuralStateSpace(System):
+    """``x(k+1) = A x + B v + F tanh(G x + H v + b)``, ``y(k+1) = C x(k+1) + y_0``.
+
+    v = u - u_0; the input u(k) moves the output y(k+1). A single input or output is a
+    plain number, m inputs or p outputs are vectors. Shapes, with n states and h
+    neurons: ``state_matrix`` A [n, n], ``input_matrix`` B [n, m], ``output_matrix``
+    C [p, n], ``neuron_output`` F [n, h], ``neuron_state`` G [h, n], ``neuron_input``
+    H [h, m], ``neuron_bias`` b [h], ``input_offset`` u_0 [m] and ``output_offset``
+    y_0 [p] in the units of input and output; the states have none. Source: Suykens et
+    al., Nonlinear system identification using neural state space models, 1995.
+
+    Raises ValueError for shapes that do not belong together or non-finite numbers.
+    """
+
+    state_matrix: Float[Array, "n n"] = eqx.field(converter=as_array)
+    input_matrix: Float[Array, "n m"] = eqx.field(converter=as_array)
+    output_matrix: Float[Array, "p n"] = eqx.field(converter=as_array)
+    neuron_output: Float[Array, "n h"] = eqx.field(converter=as_array)
+    neuron_state: Float[Array, "h n"] = eqx.field(converter=as_array)
+    neuron_input: Float[Array, "h m"] = eqx.field(converter=as_array)
+    neuron_bias: Float[Array, " h"] = eqx.field(converter=as_array)
+    input_offset: Float[Array, " m"] = eqx.field(converter=as_array)
+    output_offset: Float[Array, " p"] = eqx.field(converter=as_array)
+
+    def __check_init__(self):
+        n, m, p = (
+            len(self.state_matrix),
+            len(self.input_offset),
+            len(self.output_offset),
+        )
+        h = len(self.neuron_bias)
+        for name, shape in {
+            "state_matrix": (n, n),
+            "input_matrix": (n, m),
+            "output_matrix": (p, n),
+            "neuron_output": (n, h),
+            "neuron_state": (h, n),
+            "neuron_input": (h, m),
+            "neuron_bias": (h,),
+            "input_offset": (m,),
+            "output_offset": (p,),
+        }.items():
+            value = getattr(self, name)
+            if value.shape != shape:
+                raise ValueError(
+                    f"{name} has shape {value.shape}; with {n} states, {h} neurons, "
+                    f"{m} inputs and {p} outputs it must be {shape}"
+                )
+            check(name, value.ravel())
+
+    def init(self, input: Any = 0.0) -> Float[Array, " n"]:
+        """Return the state that ``input`` holds, found by Newton's method from zero."""
+        zero = jnp.zeros_like(self.state_matrix[0])
+        rest = optx.root_find(
+            lambda state, _: self._next(state, input) - state,
+            optx.Newton(rtol=1e-12, atol=1e-12),
+            zero,
+            max_steps=64,
+            throw=False,
+        ).value
+        return jnp.where(jnp.isfinite(rest), rest, zero)
+
+    def step(
+        self, state: Float[Array, " n"], input: Any
+    ) -> tuple[Float[Array, " n"], Any]:
+        state = self._next(state, input)
+        output = self.output_matrix @ state + self.output_offset
+        return state, output[0] if len(output) == 1 else output
+
+    def _next(self, state: Float[Array, " n"], input: Any) -> Float[Array, " n"]:
+        moved = jnp.atleast_1d(as_array(input)) - self.input_offset
+        neurons = jnp.tanh(
+            self.neuron_state @ state + self.neuron_input @ moved + self.neuron_bias
+        )
+        linear = self.state_matrix @ state + self.input_matrix @ moved
+        return linear + self.neuron_output @ neurons

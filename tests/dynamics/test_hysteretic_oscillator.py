@@ -1,0 +1,148 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import bouc_wen as oracle
+from scipy.integrate import solve_ivp
+from scipy.signal import cont2discrete
+
+from piezojax import BoucWen, HystereticOscillator, simulate
+
+DT = 1e-3
+TRUE = oracle.BENCHMARK
+
+
+def model(dt=DT, substeps=4, **changed):
+    values = TRUE | changed
+    beta = values["beta"]
+    return HystereticOscillator(
+        values["mass"],
+        values["damping"],
+        values["stiffness"],
+        BoucWen(
+            values["alpha"],
+            beta * values["gamma"],
+            beta * values["delta"],
+            values["nu"],
+            substeps,
+        ),
+        dt,
+    )
+
+
+@jax.jit
+def displacement(system, force):
+    return simulate(system, force, system.init(0.0))[1]
+
+
+def force(samples=60, seed=0):
+    return 50.0 * np.random.default_rng(seed).standard_normal(samples)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{}, {"delta": 0.4}, {"beta": 30.0, "nu": 1.7}],
+    ids=["benchmark", "saturating", "bent"],
+)
+def test_held_force_moves_it_as_the_differential_equations_say(changed):
+    values = tuple((TRUE | changed).values())
+    point, expected = (0.0, 0.0, 0.0), []
+    for held in force():
+        point = solve_ivp(
+            lambda _, p, held=held: oracle.slopes(*p, held, *values),
+            (0.0, DT),
+            point,
+            "DOP853",
+            rtol=1e-10,
+            atol=1e-13,
+        ).y[:, -1]
+        expected.append(point[0])
+    found = displacement(model(**changed, substeps=16), force())
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-4 * np.std(expected))
+
+
+def test_without_bend_it_is_the_linear_oscillator():
+    # The element is then a spring beside the other.
+    stiffness = TRUE["stiffness"] + TRUE["alpha"]
+    continuous = (
+        np.array([[0.0, 1.0], [-stiffness / 2.0, -TRUE["damping"] / 2.0]]),
+        np.array([[0.0], [0.5]]),
+        np.array([[1.0, 0.0]]),
+        np.zeros((1, 1)),
+    )
+    A, B, C, _, _ = cont2discrete(continuous, DT, "zoh")
+    state, expected = np.zeros((2, 1)), []
+    for held in force(200):
+        state = A @ state + B * held
+        expected.append((C @ state).item())
+    found = displacement(model(beta=0.0, substeps=8), force(200))
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6 * np.std(expected))
+
+
+def test_finer_samples_of_the_same_held_force_change_nothing():
+    coarse = displacement(model(substeps=4), force())
+    fine = displacement(model(dt=DT / 4, substeps=1), np.repeat(force(), 4))
+    np.testing.assert_allclose(fine[3::4], coarse, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("held", [-30.0, 0.0, 80.0])
+def test_rest_stays_at_rest(held):
+    system = model()
+    state = system.init(held)
+    assert float(state.displacement) == held / TRUE["stiffness"]
+    after, output = system.step(state, held)
+    np.testing.assert_allclose(after, state, rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(output, state.displacement, rtol=1e-15)
+
+
+@jax.jit
+@jax.value_and_grad
+def weighted(system_and_force):
+    system, force = system_and_force
+    outputs = simulate(system, force, system.init(0.0))[1]
+    return jnp.sin(jnp.arange(outputs.size)) @ outputs
+
+
+@pytest.mark.parametrize("name", ["mass", "damping", "stiffness", "alpha", "nu"])
+def test_gradient_is_that_of_differences(name):
+    found = weighted((model(substeps=1), force()))[1][0]
+    found = getattr(found if hasattr(found, name) else found.hysteresis, name)
+    step = 1e-5 * TRUE[name]
+    above, below = (
+        float(weighted((model(substeps=1, **{name: TRUE[name] + by}), force()))[0])
+        for by in (step, -step)
+    )
+    np.testing.assert_allclose(found, (above - below) / (2.0 * step), rtol=1e-4)
+
+
+def test_gradient_at_rest_is_finite():
+    found = weighted((model(substeps=1), np.zeros(60)))[1]
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
+
+
+def test_a_batch_is_a_loop():
+    forces = np.stack([force(seed=seed) for seed in range(3)])
+    batch = jax.vmap(displacement, in_axes=(None, 0))(model(), forces)
+    for row, one in zip(batch, forces, strict=True):
+        np.testing.assert_allclose(row, displacement(model(), one), rtol=1e-12)
+
+
+def test_compiled_and_eager_agree():
+    with jax.disable_jit():
+        eager = displacement(model(substeps=1), force(3))
+    compiled = displacement(model(substeps=1), force(3))
+    np.testing.assert_allclose(compiled, eager, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"mass": 0.0}, "mass in kg is 0; it must be finite and above 0"),
+        ({"damping": np.nan}, "damping in N s/m is nan; it must be finite"),
+        ({"stiffness": -1.0}, "stiffness in N/m is -1; it must be finite and above 0"),
+        ({"dt": 0.0}, "sample time in s is 0; it must be finite and above 0"),
+    ],
+)
+def test_bad_parameters_are_refused(changed, message):
+    with pytest.raises(ValueError, match=message):
+        model(**changed)
