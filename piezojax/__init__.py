@@ -20,8 +20,10 @@ from .hardware import Saturation as Saturation
 from .hardware import Sensor as Sensor
 from .hardware import SlewLimit as SlewLimit
 from .hysteresis import ColemanHodgdon as ColemanHodgdon
+from .hysteresis import HystereticARMA as HystereticARMA
 from .hysteresis import InverseColemanHodgdon as InverseColemanHodgdon
 from .identify import Record as Record
+from .identify import RecursiveLeastSquares as RecursiveLeastSquares
 from .identify import identify as identify
 from .identify import read_record as read_record
 from .metrics import Tracking as Tracking

@@ -2,3 +2,4 @@
 
 from .coleman_hodgdon import ColemanHodgdon as ColemanHodgdon
 from .coleman_hodgdon import InverseColemanHodgdon as InverseColemanHodgdon
+from .hysteretic_arma import HystereticARMA as HystereticARMA

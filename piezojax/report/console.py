@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..identify.output_error import FitReport
-from ..reproduce.chapter5 import Cell
+from ..reproduce.cell import Cell
 from ..reproduce.summary import TableAgreement
 from ..tune.result import Result, Scores
 
