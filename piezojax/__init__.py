@@ -31,10 +31,12 @@ from .hysteresis import (
 )
 from .hysteresis import BoucWen as BoucWen
 from .hysteresis import ColemanHodgdon as ColemanHodgdon
+from .hysteresis import HystereticARMA as HystereticARMA
 from .hysteresis import InverseColemanHodgdon as InverseColemanHodgdon
 from .hysteresis import PrandtlIshlinskii as PrandtlIshlinskii
 from .hysteresis import ShapedColemanHodgdon as ShapedColemanHodgdon
 from .identify import Record as Record
+from .identify import RecursiveLeastSquares as RecursiveLeastSquares
 from .identify import identify as identify
 from .identify import read_record as read_record
 from .metrics import Tracking as Tracking

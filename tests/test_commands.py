@@ -20,7 +20,7 @@ import piezojax as pj
 from piezojax.identify import PARTS
 from piezojax.report.console import Bar, console, tuning_table
 from piezojax.reproduce import TABLES
-from piezojax.reproduce.chapter5 import Cell
+from piezojax.reproduce.cell import Cell
 from piezojax.study import read
 
 COMMANDS = {
@@ -521,7 +521,7 @@ def test_quiet_reproduce_prints_nothing(made_up, tmp_path):
 def test_reproduce_unknown_table(made_up, tmp_path):
     out = tmp_path / "out"
     result = call("reproduce", "--table", "5-3", "--table", "9-9", "--out", out)
-    failed(result, "--table 9-9 is unknown; there are 5-3, 5-5")
+    failed(result, "--table 9-9 is unknown; there are 3-6, 3-7, 5-3, 5-5")
     assert not out.exists()
     assert made_up == []
 

@@ -41,6 +41,9 @@ SCALAR = {
     "saturation": pj.Saturation(-20.0, 120.0),
     "slew limit": pj.SlewLimit(1e4, 5e-5),
     "quantiser": pj.Quantiser(0.01),
+    "hysteretic ARMA": pj.HystereticARMA(
+        -0.03, (1.6, -0.6), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), 0.5, -2.0, "quadratic"
+    ),
     "inverse": pj.InverseColemanHodgdon(p753.hysteresis()),
     "alpha-beta": pj.AlphaBeta(0.1, 1e-4, 5e-5),
     "named series": pj.series(gain=pj.Affine(3.0), lag=pj.FirstOrderLag(1e-3, 5e-5)),
@@ -66,7 +69,10 @@ RICH = pj.Feedback(
     pj.series(noise=pj.Sensor(0.012), adc=pj.Quantiser(0.001)),
 )
 LOOP = {name: p753.loop(make()) for name, make in CONTROLLERS.items()} | {"rich": RICH}
-SENSOR = {"sensor": pj.Sensor(0.012)}
+SENSOR = {
+    "sensor": pj.Sensor(0.012),
+    "recursive": pj.RecursiveLeastSquares(-0.03, 0.99, 1e4, 0.0, 1, 2, "voros"),
+}
 
 
 @pytest.fixture(params=["toml", "json"])

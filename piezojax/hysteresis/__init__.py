@@ -8,3 +8,4 @@ from .prandtl_ishlinskii import (
 )
 from .prandtl_ishlinskii import PrandtlIshlinskii as PrandtlIshlinskii
 from .shaped import ShapedColemanHodgdon as ShapedColemanHodgdon
+from .hysteretic_arma import HystereticARMA as HystereticARMA

@@ -11,6 +11,14 @@ from .neural import neural_start as neural_start
 from .output_error import free_run as free_run
 from .record import Record as Record
 from .record import read_record as read_record
+from .recursive import Measured as Measured
+from .recursive import RecursiveLeastSquares as RecursiveLeastSquares
+from .recursive import recursive_least_squares as recursive_least_squares
+from .regression import Estimate as Estimate
+from .regression import instrumental_variables as instrumental_variables
+from .regression import least_squares as least_squares
+from .regressors import Orders as Orders
+from .regressors import rows as rows
 from .resample import average_periods as average_periods
 from .resample import resample as resample
 from .steady_state import fit_steady_state as fit_steady_state

@@ -20,7 +20,7 @@ from rich.text import Text
 
 from ..identify.fit import FitReport
 from ..identify.models import PARTS
-from ..reproduce.chapter5 import Cell
+from ..reproduce.cell import Cell
 from ..reproduce.summary import TableAgreement
 from ..tune.result import Result, Scores
 

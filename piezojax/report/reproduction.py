@@ -5,7 +5,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from ..reproduce.chapter5 import Cell
+from ..reproduce.cell import Cell
 from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
 
 _MARKS = (("o", BEFORE), ("s", AFTER), ("^", MEASURED))

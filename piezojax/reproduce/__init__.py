@@ -1,12 +1,17 @@
-"""The thesis' result tables, simulated with its printed gains."""
+"""The thesis' result tables, simulated with its printed numbers."""
 
 from collections.abc import Callable
 
-from .chapter5 import Cell as Cell
-from .chapter5 import cells as _chapter5
+from . import chapter3, chapter5, chapter6
+from .cell import Cell as Cell
 from .summary import summarise as summarise
 
-TABLES: dict[str, Callable[[str], list[Cell]]] = {"5-3": _chapter5, "5-5": _chapter5}
+CHAPTERS = (chapter3, chapter5, chapter6)
+"""One module a chapter: its ``TABLES``, and ``cells`` that simulates one of them."""
+
+TABLES: dict[str, Callable[[str], list[Cell]]] = {
+    table: chapter.cells for chapter in CHAPTERS for table in chapter.TABLES
+}
 """Tables that can be reproduced, by their number."""
 
 

@@ -1,9 +1,7 @@
 """Tables 6-7 and 6-8: predictions by models identified with and without a prior."""
 
-import csv
 from dataclasses import dataclass
 from functools import partial
-from importlib.resources import files
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,7 +19,7 @@ from ..identify.subspace import (
     simulation_errors,
 )
 from ..rollout import simulate
-from .chapter5 import Cell
+from .cell import Cell, printed
 
 ORDERS = (7, 4, 4)
 """States of the three channel models, section 6.5.4.2."""
@@ -40,6 +38,9 @@ METHODS = {
     "6-8": Method(partial(least_squares, tolerance=1e-4), (21, 4, 7)),
 }
 """6-7: p beside the chosen orders in Tables 6-4 to 6-6; 6-8: p of section 6.5.4.3."""
+
+TABLES = tuple(METHODS)
+"""The tables of this chapter."""
 
 FREQUENCIES = (1, 5, 10)
 """Hz, of the sines that are predicted."""
@@ -72,9 +73,7 @@ def cells(table: str) -> list[Cell]:
     a linear stand-in has none of the coupling that a linear model fails to predict.
     """
     method = METHODS[table]
-    printed = {
-        (row["row"], row["column"]): row for row in _printed() if row["table"] == table
-    }
+    prints = printed("ch6", table)
     errors = {}
     for channel, stage in enumerate(p558.channels("6")):
         train = _record(stage, channel, _chirp(channel))
@@ -87,14 +86,7 @@ def cells(table: str) -> list[Cell]:
                 fit.model, wave, start=wave.samples // 2
             )
     return [
-        Cell(
-            table,
-            name := f"{frequency}Hz_ch{channel + 1}",
-            column,
-            printed[name, column]["unit"],
-            float(printed[name, column]["paper"]),
-            float(error),
-        )
+        prints[f"{frequency}Hz_ch{channel + 1}", column].simulated(float(error))
         for frequency in FREQUENCIES
         for channel in range(3)
         for column, error in zip(p558.OUTPUTS, errors[frequency, channel], strict=True)
@@ -148,8 +140,3 @@ def _record(stage: StateSpace, channel: int, command: np.ndarray) -> Record:
 def _outputs(hysteresis, stage, command):
     moved = simulate(hysteresis, command, hysteresis.init(command[0]))[1]
     return simulate(stage, moved[:, None], stage.init(moved[0]))[1]
-
-
-def _printed() -> list[dict[str, str]]:
-    source = files("piezojax.reproduce").joinpath("data/ch6.csv")
-    return list(csv.DictReader(source.read_text(encoding="utf-8").splitlines()))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import BaseModel
 
-from .chapter5 import Cell
+from .cell import Cell
 
 
 class Agreement(BaseModel):

@@ -1,0 +1,129 @@
+"""The ARMA-based hysteresis model of chapter 3 against its equations."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import regression
+
+from piezojax import ARMA, Affine, ColemanHodgdon, HystereticARMA, series, simulate
+
+POLES = (1.6, -0.62)
+FIRST = (0.0003, -0.0002, 0.0006)
+SECOND = (0.004, 0.001, 0.009)
+TIME = np.arange(300) / 300.0
+VOLTAGE = 40.0 * np.sin(9.0 * TIME) * np.exp(-TIME) + 5.0 * np.sin(80.0 * TIME)
+
+
+def made(**changes):
+    parts = {
+        "c": -0.05,
+        "autoregressive": POLES,
+        "moving_1": FIRST,
+        "moving_2": SECOND,
+        "offset": 0.7,
+    }
+    return HystereticARMA(**parts | changes)
+
+
+@pytest.mark.parametrize("scheme", ["trapezoid", "quadratic", "voros"])
+def test_the_equation_step_by_step(scheme):
+    _, found = simulate(made(scheme=scheme), jnp.asarray(VOLTAGE))
+    expected = regression.model(VOLTAGE, -0.05, POLES, FIRST, SECOND, scheme, 0.7)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("voltage", [0.0, 35.0, -12.0])
+def test_rest_stays_at_rest(voltage):
+    system = made(rest_input=-12.0)
+    state = system.init(voltage)
+    after, output = system.step(state, voltage)
+    again, _ = system.step(after, voltage)
+    for one, other in zip(jax.tree.leaves(state), jax.tree.leaves(again), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-11)
+    if voltage == -12.0:
+        np.testing.assert_allclose(output, 0.7, rtol=1e-12)
+
+
+def test_a_batch_is_a_loop_and_compiled_is_eager():
+    several = jnp.array([-0.02, -0.05, -0.2])
+
+    def last(c):
+        return simulate(made(c=c), jnp.asarray(VOLTAGE))[1]
+
+    batch = jax.jit(jax.vmap(last))(several)
+    for c, run in zip(several, batch, strict=True):
+        np.testing.assert_allclose(run, last(c), rtol=0, atol=1e-11)
+
+
+def test_the_gradient_at_rest_is_finite():
+    def loss(system):
+        return jnp.sum(simulate(system, jnp.zeros(20))[1] ** 2)
+
+    slopes = jax.grad(loss)(made(scheme="quadratic"))
+    assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(slopes))
+    assert float(slopes.offset) == pytest.approx(20 * 2 * 0.7)
+
+
+# One hysteresis
+
+
+def test_one_hysteresis_and_dynamics_come_back():
+    moving = (0.1, -0.2, 0.12)  # DC gain 1 behind these poles
+    one = series(
+        hysteresis=ColemanHodgdon(0.0077, 0.1167, -0.05),
+        dynamics=ARMA(POLES, moving),
+        calibration=Affine(1.0, 0.7),
+    )
+    two = made(
+        moving_1=[0.0077 * b for b in moving], moving_2=[0.1167 * b for b in moving]
+    )
+    found = two.cascade(1e-12)
+    assert jax.tree.structure(found) == jax.tree.structure(one)
+    for leaf, expected in zip(
+        jax.tree.leaves(found), jax.tree.leaves(one), strict=True
+    ):
+        np.testing.assert_allclose(leaf, expected, rtol=1e-9)
+
+
+def test_two_hystereses_are_projected_on_request_only():
+    cosine = np.dot(FIRST, SECOND) / np.linalg.norm(FIRST) / np.linalg.norm(SECOND)
+    sine = np.sqrt(1.0 - cosine**2)
+    message = f"moving_1 and moving_2 is {sine:.3g}; it must be at most 0.001"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        made().cascade()
+    found = made().cascade(tolerance=1.0)
+    gain = 1.0 / (1.0 - sum(POLES))
+    np.testing.assert_allclose(found.parts[0].a, gain * sum(FIRST), rtol=1e-12)
+    np.testing.assert_allclose(found.parts[0].b, gain * sum(SECOND), rtol=1e-12)
+    np.testing.assert_allclose(found.parts[1].dc_gain(), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("numerators", "message"),
+    [
+        (((0.0, 0.0), (0.0, 0.0)), "moving_1 and moving_2 are zero"),
+        (((1.0, -1.0), (2.0, -2.0)), "the shared numerator sums to 0"),
+    ],
+)
+def test_no_single_hysteresis(numerators, message):
+    first, second = numerators
+    with pytest.raises(ValueError, match=message):
+        made(moving_1=first, moving_2=second).cascade()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"c": 0.0}, "c in 1/V is 0; it must be finite and below 0"),
+        ({"moving_1": (1.0,)}, "moving_1 holds 1 and moving_2 3 coefficients"),
+        ({"moving_1": (), "moving_2": ()}, "moving is empty"),
+        ({"autoregressive": (np.nan,)}, "autoregressive is nan"),
+        ({"scheme": "euler"}, "scheme 'euler'; it must be one of"),
+    ],
+)
+def test_bad_models_are_refused(changes, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        made(**changes)
