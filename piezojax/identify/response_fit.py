@@ -44,13 +44,19 @@ def fit_response(
     noise-weighted: what a simulation will be judged by. It starts at the subspace
     estimate of McKelvey, Akcay and Ljung (IEEE Trans. Automatic Control 41, 1996,
     algorithm 1) with ``rows`` block rows, stabilised where need be, and is ``refined``
-    from there. Raises ValueError unless 1 <= order < rows * p.
+    from there. Raises ValueError unless 1 <= order < rows * p, or for fewer lines than
+    the block rows need.
     """
-    outputs = measured.response.shape[1]
+    lines, outputs, inputs = measured.response.shape
     if not 1 <= order < rows * outputs:
         raise ValueError(
             f"order is {order}; with {rows} block rows of {outputs} outputs it must "
             f"lie in 1..{rows * outputs - 1}"
+        )
+    if 2 * lines * inputs < rows * (inputs + outputs):
+        raise ValueError(
+            f"{lines} lines are too few for {rows} block rows; take "
+            f"{2 * lines * inputs // (inputs + outputs)} or less"
         )
     basis, singular_values = _observability(_data(measured), rows)
     start, moved = _realised(basis[:, :order], measured)
@@ -109,12 +115,10 @@ def _realised(basis: np.ndarray, measured: EmpiricalResponse) -> tuple[StateSpac
     states = StateSpace(A, np.eye(n), C, np.zeros((p, n)), measured.dt)
     resolvent = np.asarray(states.frequency_response(measured.frequency))
     known = np.dstack([resolvent, np.broadcast_to(eye, (len(resolvent), p, p))])
-    strength = np.sqrt(np.real(np.trace(measured.power, axis1=1, axis2=2)))[
-        :, None, None
-    ]
+    strength = np.sqrt(np.real(np.trace(measured.power, axis1=1, axis2=2)))
 
     def flat(blocks):
-        rows = (strength * blocks).reshape(-1, blocks.shape[2])
+        rows = (strength[:, None, None] * blocks).reshape(-1, blocks.shape[2])
         return np.vstack([np.real(rows), np.imag(rows)])
 
     solution = np.linalg.lstsq(flat(known), flat(measured.response))[0]

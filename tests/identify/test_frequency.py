@@ -198,3 +198,10 @@ def test_bad_orders_are_refused(order):
     data = empirical_response([measured(0), measured(1)])
     with pytest.raises(ValueError, match=rf"order is {order}; .* must lie in 1\.\.17"):
         fit_response(data, order, rows=6)
+
+
+def test_too_few_lines_are_refused():
+    data = empirical_response([measured(0), measured(1)])
+    message = "99 lines are too few for 80 block rows; take 79 or less"
+    with pytest.raises(ValueError, match=message):
+        fit_response(data, 5, rows=80)
