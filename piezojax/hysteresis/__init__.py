@@ -3,9 +3,9 @@
 from .bouc_wen import BoucWen as BoucWen
 from .coleman_hodgdon import ColemanHodgdon as ColemanHodgdon
 from .coleman_hodgdon import InverseColemanHodgdon as InverseColemanHodgdon
+from .hysteretic_arma import HystereticARMA as HystereticARMA
 from .prandtl_ishlinskii import (
     AsymmetricPrandtlIshlinskii as AsymmetricPrandtlIshlinskii,
 )
 from .prandtl_ishlinskii import PrandtlIshlinskii as PrandtlIshlinskii
 from .shaped import ShapedColemanHodgdon as ShapedColemanHodgdon
-from .hysteretic_arma import HystereticARMA as HystereticARMA

@@ -1,14 +1,16 @@
 """From a lab's records to a plant model."""
 
+from .estimate import Options as Options
 from .fit import Fit as Fit
 from .fit import FitReport as FitReport
 from .fit import identify as identify
+from .methods import METHODS as METHODS
 from .model_bouc_wen import bouc_wen as bouc_wen
-from .models import PARTS as PARTS
 from .models import chain as chain
 from .neural import fit_neural_state_space as fit_neural_state_space
 from .neural import neural_start as neural_start
 from .output_error import free_run as free_run
+from .parts import PARTS as PARTS
 from .record import Record as Record
 from .record import read_record as read_record
 from .recursive import Measured as Measured

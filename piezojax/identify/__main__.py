@@ -7,6 +7,7 @@ import click
 from ..command import Command, common, results_folder, run
 from ..report.console import Bar, fit_table, models_table
 from ..report.identification import write_fit
+from .estimate import Options
 from .fit import identify
 from .models import DEFAULT
 from .record import read_record
@@ -39,10 +40,53 @@ class _Part(click.ParamType):
 @click.option("--rate", type=float, help="Sampling rate, Hz, if no time column.")
 @click.option("--period", type=int, help="Samples in a period of a periodic input.")
 @click.option("--resample", type=float, help="Put the record on this rate, Hz.")
+@click.option("--method", help="How to fit it (default: the first that can).")
+@click.option(
+    "--order",
+    type=click.IntRange(min=1),
+    default=Options.order,
+    show_default=True,
+    help="States of a linear or neural model.",
+)
+@click.option(
+    "--window",
+    type=click.IntRange(min=1),
+    default=Options.window,
+    show_default=True,
+    help="p of the Hankel-Toeplitz regression, samples.",
+)
+@click.option(
+    "--oversample",
+    type=click.IntRange(min=1),
+    default=Options.oversample,
+    show_default=True,
+    help="Steps of bouc_wen in a sample.",
+)
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    default=Options.steps,
+    show_default=True,
+    help="Most steps of a descent.",
+)
 @click.option("--train", type=_Part(), help="Samples to fit (default: first half).")
 @click.option("--validate", type=_Part(), help="Samples to judge on (default: rest).")
 @common
-def main(records, model, train, validate, out, seed, quiet, **columns):
+def main(
+    records,
+    model,
+    method,
+    order,
+    window,
+    oversample,
+    steps,
+    train,
+    validate,
+    out,
+    seed,
+    quiet,
+    **columns,
+):
     """Fit a plant model to measured RECORDs of one stage.
 
     Text (.csv, .txt, .dat), .npz, .mat and .h5 files; .tdms, .lvm and .xlsx with
@@ -58,7 +102,15 @@ def main(records, model, train, validate, out, seed, quiet, **columns):
             raise ValueError("name the RECORD to fit a model to")
         loaded = [read_record(record, **columns) for record in records]
         with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
-            fit = identify(loaded, model, train=train, validate=validate, progress=bar)
+            fit = identify(
+                loaded,
+                model,
+                method=method,
+                train=train,
+                validate=validate,
+                options=Options(order, window, oversample, steps),
+                progress=bar,
+            )
             bar.stage("drawing")
             write_fit(fit, folder)
         console.print(fit_table(fit.report))

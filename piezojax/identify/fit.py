@@ -4,40 +4,31 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from pydantic import AliasChoices, BaseModel, Field
 
-from .._types import as_array
-from ..paths import parameters
-from ..progress import Progress
+from ..progress import Progress, Silent
 from ..system import System
 from .checks import record_warnings
-from .models import DEFAULT, structure
-from .output_error import Optimum, from_rest, output_error
+from .estimate import FittedParameter, LinearDetail, Options
+from .methods import method_for
+from .models import DEFAULT
 from .record import Record
-from .structure import REST_INPUT
-
-AS_GOOD = 1e-3
-"""Starts whose mean square comes this close (as a share) to the best fit as well."""
 
 POOR = 0.2
 """A validation error above this share of the output's deviation gives a warning."""
 
 
-class FittedParameter(BaseModel):
-    """A fitted value and its standard error, in the parameter's own unit."""
-
-    value: float
-    standard_error: float | None
-
-
 class FitError(BaseModel):
-    """RMS of the free-run simulation error over a part of the records."""
+    """RMS of the free-run simulation error over a part of the records.
+
+    ``rmse`` is that over all outputs, ``each`` has one an output.
+    """
 
     rmse: float
     rmse_percent_of_span: float
     unit: str
+    each: list[float] = []
 
 
 class FitReport(BaseModel):
@@ -67,6 +58,7 @@ class Fit:
     simulations: tuple[np.ndarray, ...]
     train: slice
     validate: slice
+    linear: LinearDetail | None = None
 
     @property
     def record(self) -> Record:
@@ -75,73 +67,66 @@ class Fit:
 
     @property
     def simulated(self) -> np.ndarray:
-        """The simulated output of the first record."""
-        return self.simulations[0]
+        """The simulated output of the first record, which has only one."""
+        if self.simulations[0].shape[1] != 1:
+            raise ValueError(
+                f"the model has {self.simulations[0].shape[1]} outputs; this needs one"
+            )
+        return self.simulations[0][:, 0]
 
 
 def identify(
     records: Record | Sequence[Record],
     model: str = DEFAULT,
     *,
+    method: str | None = None,
     train: slice | None = None,
     validate: slice | None = None,
-    steps: int = 200,
+    options: Options | None = None,
     progress: Progress | None = None,
 ) -> Fit:
     """Fit ``model`` to one record or to several with the same sample time.
 
     ``model`` is a chain of parts such as ``"prandtl_ishlinskii+logarithmic_creep+lag"``
-    (see ``identify.PARTS``). Fitted by ``output_error`` over the samples ``train`` of
-    each record (its first half if left out), judged on ``validate`` (the rest). Raises
-    ValueError for an unknown model, an empty part, records that do not go together, or
-    when no start leads to a finite fit.
+    (see ``identify.PARTS``) or one of the models of ``identify.METHODS``, ``method`` a
+    name there (left out, the first that can fit the model). Fitted over the samples
+    ``train`` of each record (its first half if left out), judged by its free run on
+    ``validate`` (the rest). Raises ValueError for an unknown model or method, an empty
+    part, records that do not go together, or when no start leads to a finite fit.
     """
     began = time.perf_counter()
+    chosen = method_for(model, method)
     records = (records,) if isinstance(records, Record) else tuple(records)
     _check_together(records)
     train, validate = _parts(min(r.samples for r in records), train, validate)
-    # Bounds and starts, too, must not see what the fit is judged on.
-    seen = [record.until(train.stop) for record in records]
-    shape = structure(model, max(seen, key=lambda record: record.span))
-    optimum = output_error(shape, records, train, steps=steps, progress=progress)
-    problem = optimum.problem
-    systems = [
-        shape.space.put(shape.system, as_array(optimum.units[0][row]))
-        for row in np.asarray(problem.which)
-    ]
-    run = jax.jit(from_rest)
-    simulations = tuple(
-        np.asarray(run(system, as_array(record.input)))
-        for system, record in zip(systems, records, strict=True)
+    estimate = chosen.estimate(
+        model, records, train, options or Options(), progress or Silent()
     )
+    warnings = [
+        f"{record.source}: {text}" if len(records) > 1 else text
+        for record in records
+        for text in record_warnings(
+            record,
+            train,
+            validate,
+            order=estimate.order,
+            hysteresis=estimate.hysteresis,
+        )
+    ]
+    runs = estimate.simulations
     report = FitReport(
         model=model,
-        parameters={
-            name: FittedParameter(value=float(value), standard_error=deviation)
-            for name, value, deviation in zip(
-                optimum.names, optimum.values, optimum.deviations, strict=True
-            )
-        },
-        train=_fit_error(records, simulations, train),
-        validation=_fit_error(records, simulations, validate),
+        parameters=estimate.parameters,
+        train=_fit_error(records, runs, train),
+        validation=_fit_error(records, runs, validate),
         warnings=[
-            *(
-                f"{record.source}: {text}" if len(records) > 1 else text
-                for record in records
-                for text in record_warnings(
-                    record,
-                    train,
-                    validate,
-                    order=shape.order,
-                    hysteresis=REST_INPUT in parameters(shape.system),
-                )
-            ),
-            *_fit_warnings(optimum, steps),
-            *_error_warnings(records, simulations, validate),
+            *warnings,
+            *estimate.warnings,
+            *_error_warnings(records, runs, validate),
         ],
         wall_s=time.perf_counter() - began,
     )
-    return Fit(systems[0], report, records, simulations, train, validate)
+    return Fit(estimate.system, report, records, runs, train, validate, estimate.linear)
 
 
 def _check_together(records: tuple[Record, ...]) -> None:
@@ -182,51 +167,34 @@ def _closed(part: slice, samples: int) -> slice:
 
 
 def _errors(
-    records: Sequence[Record], simulations: Sequence[np.ndarray], part: slice
+    records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
 ) -> np.ndarray:
+    """Return the errors over ``part`` of all records, [samples, p]."""
     return np.concatenate(
-        [(s - r.output)[part] for r, s in zip(records, simulations, strict=True)]
+        [(run - r.outputs)[part] for r, run in zip(records, runs, strict=True)]
     )
 
 
 def _fit_error(
-    records: Sequence[Record], simulations: Sequence[np.ndarray], part: slice
+    records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
 ) -> FitError:
-    rmse = float(np.sqrt(np.mean(_errors(records, simulations, part) ** 2)))
+    each = np.sqrt(np.mean(_errors(records, runs, part) ** 2, axis=0))
+    rmse = float(np.sqrt(np.mean(each**2)))
+    span = max(float(r.spans.max()) for r in records)
     return FitError(
         rmse=rmse,
-        rmse_percent_of_span=100.0 * rmse / max(r.span for r in records),
+        rmse_percent_of_span=100.0 * rmse / span,
         unit=records[0].output_unit,
+        each=[float(e) for e in each],
     )
 
 
-def _fit_warnings(optimum: Optimum, steps: int) -> list[str]:
-    found = []
-    if not optimum.finished:
-        found.append(
-            f"the fit was still getting better when its {steps} steps were used up"
-        )
-    as_good = optimum.units[optimum.losses <= optimum.losses[0] * (1.0 + AS_GOOD)]
-    spread = np.ptp(as_good, axis=0)
-    for i, name in enumerate(optimum.names):
-        place = optimum.units[0, i]
-        if place < 1e-3 or place > 1.0 - 1e-3:
-            found.append(f"{name} lies at the edge of its bounds")
-        if optimum.deviations[i] is None:
-            found.append(f"{name} is not determined by this record")
-        elif spread[i] > AS_GOOD:
-            found.append(
-                f"{name} is ambiguous: other values fit equally well, over "
-                f"{100.0 * spread[i]:.2g} % of its range"
-            )
-    return found
-
-
 def _error_warnings(
-    records: Sequence[Record], simulations: Sequence[np.ndarray], part: slice
+    records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
 ) -> list[str]:
-    error = _errors(records, simulations, part)
-    deviation = np.std(np.concatenate([r.output[part] for r in records]))
+    error = _errors(records, runs, part)
+    outputs = np.concatenate([r.outputs[part] for r in records])
+    deviation = np.sqrt(np.mean(np.var(outputs, axis=0)))
     share = float(np.sqrt(np.mean(error**2)) / max(deviation, 1e-30))
     if share <= POOR:
         return []

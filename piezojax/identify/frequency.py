@@ -59,6 +59,7 @@ def empirical_response(
     weight = np.asarray(weights, float)[:, None, None, None]
     power = np.sum(weight * _outer(inputs, inputs), axis=0)
     strength = np.real(np.trace(power, axis1=1, axis2=2))
+    strength[0] = 0.0  # a mean is an operating point, no response
     lines = np.flatnonzero(strength > EXCITED * strength.max())
     power, inputs, outputs, noise = (
         power[lines],

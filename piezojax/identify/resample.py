@@ -31,6 +31,23 @@ def average_periods(record: Record, skip: int = 1) -> Record:
     return replace(record, inputs=mean(record.inputs), outputs=mean(record.outputs))
 
 
+def whole_periods(record: Record, train: slice) -> Record:
+    """Return the samples ``train`` of a periodic record, cut to whole periods.
+
+    Raises ValueError for a record without ``period`` or a part without a whole one.
+    """
+    if record.period is None:
+        raise ValueError(f"{record.source}: this method needs the record's period")
+    count = (train.stop - train.start) // record.period
+    if count == 0:
+        raise ValueError(
+            f"{record.source}: {train.stop - train.start} samples to fit on hold no "
+            f"whole period of {record.period}"
+        )
+    part = slice(train.start, train.start + count * record.period)
+    return replace(record, inputs=record.inputs[part], outputs=record.outputs[part])
+
+
 def resample(record: Record, factor: int = 1) -> Record:
     """Return ``record``, one period, with ``factor`` samples for each of its own.
 

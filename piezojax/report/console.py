@@ -19,7 +19,8 @@ from rich.table import Table
 from rich.text import Text
 
 from ..identify.fit import FitReport
-from ..identify.models import PARTS
+from ..identify.methods import METHODS
+from ..identify.parts import PARTS
 from ..reproduce.cell import Cell
 from ..reproduce.summary import TableAgreement
 from ..tune.result import Result, Scores
@@ -91,12 +92,15 @@ class Bar:
 
 
 def models_table() -> Table:
-    """Return the parts of which a model to identify is made."""
-    table = Table(title="parts of a model, joined by '+'")
-    for column in ("part", "place", "what it is"):
-        table.add_column(column)
+    """Return what can be identified: whole models, and parts to be joined by '+'."""
+    table = Table(title="models; parts are joined by '+', as in coleman_hodgdon+lag")
+    for column in ("model", "kind", "what it is, or how it is fitted"):
+        table.add_column(column, no_wrap=column == "model")
     for name, (place, build) in PARTS.items():
-        table.add_row(name, place, (build.__doc__ or "").strip())
+        table.add_row(name, f"part: {place}", (build.__doc__ or "").strip())
+    for name, method in METHODS.items():
+        for model in method.models:
+            table.add_row(model, f"method: {name}", method.summary)
     return table
 
 
@@ -155,7 +159,7 @@ def tuning_table(result: Result) -> Table:
 def gains_table(result: Result) -> Table:
     """Return the tuned parameters beside their start."""
     table = Table(title="gains")
-    table.add_column("parameter")
+    table.add_column("parameter", no_wrap=True)
     table.add_column("before", justify="right")
     table.add_column("tuned", justify="right")
     for path, value in result.gains.items():
@@ -173,7 +177,7 @@ def fit_table(report: FitReport) -> Table:
         )
     )
     table = Table(title=f"{report.model}: free-run rms error\n{errors}")
-    table.add_column("parameter")
+    table.add_column("parameter", no_wrap=True)
     table.add_column("value", justify="right")
     table.add_column("standard error", justify="right")
     for path, parameter in report.parameters.items():

@@ -6,20 +6,83 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..files import write_text
+from ..identify.estimate import LinearDetail
 from ..identify.fit import Fit
+from ..identify.record import Record
 from ..serial import save
 from .figures import AFTER, BEFORE, MEASURED, figure, legend_above, styled, write
+from .response import response_figure, singular_values_figure
+
+SHOWN = 400
+"""Samples of an output drawn over time where there are several outputs."""
 
 MODEL_FILE, FIT_FILE, PICTURE_FILE = "model.json", "fit.json", "fit.png"
 
 
 def write_fit(fit: Fit, folder: Path) -> None:
-    """Write model.json, fit.json and fit.png into ``folder``."""
+    """Write model.json, fit.json and the pictures into ``folder``."""
     save(fit.system, folder / MODEL_FILE)
     text = fit.report.model_dump_json(indent=2, by_alias=True)
     write_text(folder / FIT_FILE, text + "\n")
     with styled():
-        write(fit_figure(fit), folder / PICTURE_FILE)
+        single = fit.simulations[0].shape[1] == 1
+        picture = fit_figure(fit) if single else outputs_figure(fit)
+        write(picture, folder / PICTURE_FILE)
+        if fit.linear is not None:
+            _write_linear(fit.linear, fit.record, folder)
+
+
+def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> None:
+    for number, (title, values) in enumerate(linear.singular_values.items()):
+        picture = singular_values_figure(values, linear.order, title)
+        write(picture, folder / f"singular_values_{number}.png")
+    if linear.measured is not None:
+        names = [
+            [f"{side} {i}" for i in range(count)]
+            for side, count in (
+                ("input", record.inputs.shape[1]),
+                ("output", record.outputs.shape[1]),
+            )
+        ]
+        unit = f"{record.output_unit}/{record.input_unit}"
+        picture = response_figure(
+            linear.measured, linear.model, names[0], names[1], unit
+        )
+        write(picture, folder / "response.png")
+
+
+def outputs_figure(fit: Fit) -> Figure:
+    """Every output of the first record: the end of it, and the residual's spectrum."""
+    record, run, part = fit.record, fit.simulations[0], fit.validate
+    error = run - record.outputs
+    shown = slice(max(part.start, part.stop - SHOWN), part.stop)
+    picture = figure(9.0, 2.4 * run.shape[1] + 0.8)
+    panels = picture.subplots(run.shape[1], 2, squeeze=False)
+    for i, (course, spectrum) in enumerate(panels):
+        unit = _shown(record.output_units[i])
+        time = record.time[shown]
+        course.plot(time, record.outputs[shown, i], color=MEASURED, label="measured")
+        course.plot(time, run[shown, i], color=AFTER, lw=0.9, label="simulated")
+        course.set(ylabel=f"output {i} ({unit})")
+        frequency = np.fft.rfftfreq(error[part].shape[0], record.dt)[1:]
+        for signal, colour, label in (
+            (record.outputs[part, i], MEASURED, "measured"),
+            (error[part, i], BEFORE, "residual"),
+        ):
+            size = np.abs(np.fft.rfft(signal - signal.mean()))[1:] * 2.0 / signal.size
+            spectrum.loglog(frequency, size, color=colour, lw=0.7, label=label)
+        rmse = fit.report.validation.each[i]
+        spectrum.set(
+            ylabel=f"amplitude ({unit})",
+            title=f"validation residual {rmse:.3g} {unit} rms",
+        )
+        if i == 0:
+            course.legend()
+            spectrum.legend()
+    panels[-1, 0].set(xlabel="time (s)")
+    panels[-1, 1].set(xlabel="frequency (Hz)")
+    picture.suptitle(f"{fit.report.model} fitted to {record.source}")
+    return picture
 
 
 def fit_figure(fit: Fit) -> Figure:

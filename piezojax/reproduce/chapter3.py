@@ -10,7 +10,7 @@ from .. import signals
 from ..catalog import p753
 from ..dynamics import ARMA, scaled_to_dc
 from ..hysteresis import ColemanHodgdon
-from ..identify import Record, Orders, free_run, instrumental_variables
+from ..identify import Orders, Record, free_run, instrumental_variables
 from ..system import Series, System, series
 from .cell import Cell, printed, window
 

@@ -5,7 +5,7 @@ from scipy.signal import lfilter
 
 from piezojax import ARMA, Affine, FirstOrderLag, Record
 from piezojax.identify import fit_steady_state, fit_structure, steady_response
-from piezojax.identify.models import Structure
+from piezojax.identify.structure import Structure
 from piezojax.space import space_of
 
 DT = 1e-3

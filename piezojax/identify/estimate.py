@@ -1,0 +1,62 @@
+"""What every method of identification takes and gives."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import BaseModel
+
+from ..dynamics import StateSpace
+from ..system import System
+from .frequency import EmpiricalResponse
+
+
+class FittedParameter(BaseModel):
+    """A fitted value and its standard error, in the parameter's own unit."""
+
+    value: float
+    standard_error: float | None
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the methods may be told; each uses what it needs.
+
+    ``order``: states of a linear model; ``window``: p, the past and future samples of
+    the Hankel-Toeplitz regression; ``oversample``: simulated samples for each of a
+    periodic record; ``steps``: most steps of a descent.
+    """
+
+    order: int = 4
+    window: int = 20
+    oversample: int = 8
+    steps: int = 200
+
+
+class LinearDetail(NamedTuple):
+    """What the pictures of a linear model show.
+
+    ``singular_values`` by input (or "" for all), of which ``order`` are kept;
+    ``measured``: the transfer matrix that ``model`` was fitted to, if one was.
+    """
+
+    model: StateSpace
+    order: int
+    singular_values: dict[str, np.ndarray]
+    measured: EmpiricalResponse | None = None
+
+
+class Estimate(NamedTuple):
+    """A fitted system, its free run over every record [samples, p], what to say.
+
+    ``order`` counts the parameters of linear dynamics that the records had to excite,
+    ``hysteresis`` tells whether they also had to show full cycles.
+    """
+
+    system: System
+    simulations: tuple[np.ndarray, ...]
+    parameters: dict[str, FittedParameter]
+    warnings: list[str]
+    order: int = 0
+    hysteresis: bool = False
+    linear: LinearDetail | None = None
