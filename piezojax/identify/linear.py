@@ -14,7 +14,7 @@ from ..progress import Progress
 from ..rollout import simulate
 from ..system import Affine, System, series
 from .estimate import Estimate, FittedParameter, LinearDetail, Options
-from .frequency import empirical_response
+from .frequency import EmpiricalResponse, empirical_response
 from .record import Record
 from .resample import whole_periods
 from .response_fit import fit_response
@@ -101,6 +101,7 @@ def by_frequency_response(
     measured = empirical_response([whole_periods(record, train) for record in records])
     progress.stage(f"fitting {options.order} states to it")
     fit = fit_response(measured, options.order)
+    stage = _without_feedthrough(fit.model, measured, fit.costs[-1])
     warnings = (
         [f"{fit.moved} poles of the start lay outside the unit circle; reflected"]
         if fit.moved
@@ -108,13 +109,27 @@ def by_frequency_response(
     )
     runs = tuple(
         np.asarray(
-            _run(fit.model, as_array(record.inputs - centre.input), record.period or 0)
+            _run(stage, as_array(record.inputs - centre.input), record.period or 0)
         )
         + centre.output
         for record, centre in zip(records, centres, strict=True)
     )
-    detail = LinearDetail(fit.model, options.order, {"": fit.singular_values}, measured)
+    detail = LinearDetail(stage, options.order, {"": fit.singular_values}, measured)
     return _linear(detail, runs, warnings, centres[0])
+
+
+def _without_feedthrough(
+    model: StateSpace, measured: EmpiricalResponse, left: float
+) -> StateSpace:
+    """Drop D where what it adds is no more than the mean square ``left`` by the fit.
+
+    A held input reaches a sampled output a sample later, which a loop relies on.
+    """
+    D = np.asarray(model.D)
+    added = 2.0 * np.real(np.einsum("pa,lab,pb->", D, measured.power, D))
+    if added > left:
+        return model
+    return replace(model, D=np.zeros_like(D))
 
 
 @eqx.filter_jit

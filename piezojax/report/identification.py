@@ -64,6 +64,7 @@ def outputs_figure(fit: Fit) -> Figure:
         course.plot(time, record.outputs[shown, i], color=MEASURED, label="measured")
         course.plot(time, run[shown, i], color=AFTER, lw=0.9, label="simulated")
         course.set(ylabel=f"output {i} ({unit})")
+        course.locator_params(axis="x", nbins=5)
         frequency = np.fft.rfftfreq(error[part].shape[0], record.dt)[1:]
         for signal, colour, label in (
             (record.outputs[part, i], MEASURED, "measured"),
