@@ -12,6 +12,7 @@ from piezojax.catalog import p753
 from piezojax.identify import free_run
 from piezojax.identify.models import structure
 from piezojax.identify.output_error import problem_of
+from piezojax.paths import replace
 
 MICROMANIPULATOR = (
     Path(__file__).parents[2].parent / "shared/data/micromanipulator/Model_Vi_Do.dat"
@@ -92,3 +93,39 @@ def test_a_record_that_says_nothing_of_a_parameter_gives_it_no_error():
     fit = identify(Record(u, y, p753.DT, source="one tone"), MODEL)
     text = " ".join(fit.report.warnings)
     assert "not exciting enough" in text or "one frequency" in text
+
+
+@pytest.mark.slow
+def test_hysteresis_creep_lag_and_delay_are_told_apart():
+    # Three frequencies a decade apart: a lag and a delay turn with frequency, a loop
+    # of hysteresis does not, creep fades with it.
+    model, dt = "coleman_hodgdon+logarithmic_creep+lag+delay", 2e-3
+    time = np.arange(3000) * dt
+    level = np.select([time < 2.5, time < 4.5], [1.0, 0.7], 0.5)
+    tone = [np.sin(2 * np.pi * f * time) for f in (0.8, 8.0, 40.0)]
+    u = 40.0 + level * (25.0 * tone[0] + 12.0 * tone[1] + 5.0 * tone[2])
+    shape = structure(model, Record(u, 0.12 * u, dt))
+    truth = {
+        "hysteresis.a": 0.0077,
+        "hysteresis.b": 0.1167,
+        "hysteresis.c": -0.0487,
+        "hysteresis.rest_input": 30.0,
+        "hysteresis.rest_output": 0.0,
+        "creep.gain_per_decade": 0.02,
+        "lag.time_constant": 4e-3,
+        "delay.delay": 3.3e-3,
+        "calibration.offset": 2.0,
+    }
+    clean = free_run(replace(shape.system, truth), jnp.asarray(u), 30.0)
+    noise = 3e-3 * np.random.default_rng(3).standard_normal(u.size)
+    fit = identify(Record(u, np.asarray(clean) + noise, dt, source="made"), model)
+    assert fit.report.validation.rmse == pytest.approx(3e-3, rel=0.1)
+    for path, accuracy in {
+        "hysteresis.c": 0.05,
+        "creep.gain_per_decade": 0.05,
+        "lag.time_constant": 0.03,
+        "delay.delay": 0.03,
+    }.items():
+        found = fit.report.parameters[path]
+        assert found.value == pytest.approx(truth[path], rel=accuracy), path
+        assert abs(found.value - truth[path]) < 4.0 * found.standard_error, path
