@@ -401,7 +401,7 @@ def test_fit_json_has_the_agreed_keys(identified):
     assert set(fit) >= {"model", "parameters", "train", "warnings", "wall_s"}
     assert fit["model"] == "coleman_hodgdon"
     for part in ("train", "validate"):
-        assert set(fit[part]) == {"rmse", "rmse_percent_of_span", "unit"}
+        assert set(fit[part]) >= {"rmse", "rmse_percent_of_span", "unit"}
         assert fit[part]["unit"] == "um"
         assert fit[part]["rmse_percent_of_span"] < 5.0
     for parameter in fit["parameters"].values():
@@ -450,8 +450,8 @@ def test_identify_bad_input(record, tmp_path):
         "input column 'volts' is missing; there are time_s, drive_V, sensor_um",
     )
     failed(
-        call("identify", record, *out, *COLUMNS, "--model", "bouc_wen"),
-        "a model has no part 'bouc_wen'; there are coleman_hodgdon",
+        call("identify", record, *out, *COLUMNS, "--model", "preisach"),
+        "a model has no part 'preisach'; there are coleman_hodgdon",
     )
     failed(
         call("identify", record, *out, *COLUMNS, "--train", "100:50"),

@@ -321,7 +321,7 @@ def test_unknown_keys(refusal, place, value, message):
         (
             "plant",
             {"type": "Lag", "time_constant": 1e-3},
-            "plant.type is 'Lag'; it must be one of ARMA, Affine, AlphaBeta, Asym",
+            "plant.type is 'Lag'; it must be one of ARMA, Affine, AlphaBeta, Ampl",
         ),
         (
             "plant",

@@ -1,5 +1,6 @@
 """Fitting any System to records by its free-run simulation error."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -110,17 +111,15 @@ def problem_of(
     Errors count over the samples ``train`` of each record.
     """
     space, count = structure.space, len(records)
-    samples = max(len(range(*train.indices(r.samples))) + train.start for r in records)
-    names = [path for path in space.paths if path not in structure.own]
-    which = np.empty((count, len(space.paths)), int)
-    for column, path in enumerate(space.paths):
-        if path not in structure.own:
-            which[:, column] = names.index(path)
-    for row in range(count):
-        for column, path in enumerate(space.paths):
-            if path in structure.own:
-                which[row, column] = len(names)
-                names.append(path if count == 1 else f"{path} of record {row}")
+
+    def name(path: str, row: int) -> str:
+        alone = path not in structure.own or count == 1
+        return path if alone else f"{path} of record {row}"
+
+    used = [[name(path, row) for path in space.paths] for row in range(count)]
+    names = list(dict.fromkeys(itertools.chain(*used)))
+    which = [[names.index(name) for name in row] for row in used]
+    samples = min(train.stop, max(record.samples for record in records))
     inputs, outputs, weights = np.zeros((3, count, samples))
     for row, record in enumerate(records):
         size = min(record.samples, samples)
@@ -227,11 +226,8 @@ def _stalled(bests: Sequence[float]) -> bool:
 @eqx.filter_jit
 def _sensitivity(problem: Problem, unit: Array) -> tuple[Array, Array]:
     """Return the unknowns' values and the weighted Jacobian of the residuals."""
-
-    def of_values(unknown):
-        return problem.residuals(unknown)
-
-    return _values(problem, unit), jax.jacfwd(of_values)(unit)
+    jacobian = jax.jacfwd(lambda unknown: problem.residuals(unknown))(unit)
+    return _values(problem, unit), jacobian
 
 
 def _values(problem: Problem, unit: Array) -> Array:

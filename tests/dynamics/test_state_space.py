@@ -204,10 +204,10 @@ def test_bad_models_are_refused(matrices, dt, message):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (3.0, r"system.A is 3.0; it must be a list of rows"),
-        ([["a"]], "system: a matrix must be rows of numbers of one length"),
-        ([[1.0], [1.0, 2.0]], "system: a matrix must be rows of numbers of one length"),
-        ([1.0], "system: a matrix has shape"),
+        (3.0, "system.A is 3.0; it must be numbers in lists of one length in a list"),
+        ([["a"]], "it must be numbers in lists of one length in a list"),
+        ([[1.0], [1.0, 2.0]], "it must be numbers in lists of one length in a list"),
+        ([1.0], "it must be numbers in lists of one length in a list"),
     ],
 )
 def test_a_file_with_a_bad_matrix_is_refused(value, message):
