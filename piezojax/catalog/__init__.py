@@ -1,6 +1,7 @@
 """Published stages and controllers, each number with its source."""
 
 from . import p753 as p753
+from . import p753_chapter4 as p753_chapter4
 
 PLANTS = {"p753": p753.plant}
 """Plants a study can name."""
