@@ -4,6 +4,9 @@ Every number carries its table or section in Y. Cao's thesis (2013); the models 
 ``p753.DYNAMICS_BY_RATE`` (Table 4-1). Rates in Hz.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 from .._types import ScalarLike
 from ..control import (
     AlphaBeta,
@@ -215,7 +218,7 @@ def loop(
     return Feedback(controller, Held(stage, held), p753.actuator(), Sensor(noise_rms))
 
 
-def _printed(name: str, values: dict, key):
+def _printed(name: str, values: Mapping[Any, Any], key: Any) -> Any:
     if key not in values:
         raise ValueError(
             f"{name} is {key}; it must be one of {', '.join(map(str, values))}"

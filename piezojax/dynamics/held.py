@@ -20,7 +20,7 @@ class Held(System):
 
     def __check_init__(self):
         if not isinstance(self.samples, int):
-            raise ValueError(f"samples held are {self.samples!r}; they must be whole")
+            raise ValueError(f"samples held is {self.samples!r}; it must be whole")
         check("samples held", self.samples, least=1.0)
 
     def init(self, input: Any = 0.0) -> State:
