@@ -71,7 +71,7 @@ def displacement(
 
 def rms_error(column: Column, name: str, rate: int) -> float:
     """Return the RMS error (um) of a column's controller on the reference ``name``."""
-    reference = signals.signal(name, signals.time_grid(2.0 * window(name), rate))
+    reference = signals.signal(name, signals.time_grid(2.0 * window(name), float(rate)))
     controller = column.make(rate)
     error = displacement(controller, reference, rate) - _target(
         column, controller, reference
