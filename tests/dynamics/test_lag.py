@@ -79,8 +79,10 @@ def test_bad_times_are_refused(tau, dt, message):
 def test_second_order_is_the_held_transfer_function(damping):
     inputs = np.random.default_rng(8).normal(size=400)
     found = response(SecondOrderLag(3000.0, damping, DT), inputs, 0.0)
-    matrices = ([[0, 1], [-9e6, -6e3 * damping]], [[0], [9e6]], [[1, 0]], [[0]])
-    held = scipy.signal.cont2discrete(matrices, DT, method="zoh")
+    matrices = map(
+        np.array, ([[0, 1], [-9e6, -6e3 * damping]], [[0], [9e6]], [[1, 0]], [[0]])
+    )
+    held = scipy.signal.cont2discrete(tuple(matrices), DT, method="zoh")
     expected = scipy.signal.dlsim(held, np.append(inputs, 0.0))[1][1:, 0]
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 

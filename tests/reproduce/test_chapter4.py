@@ -143,8 +143,8 @@ def test_a_cell_against_a_loop_written_from_the_equations(tables):
     reference = signals.sine(50.0, duration=2.0)
     reference = np.append(reference, reference[-1])
     output = closed_loop("model reference", reference, plant, gains, limits=LIMITS)
-    matrices = ([[0, 1], [-9e6, -1.5e3]], [[0], [9e6]], [[1, 0]], [[0]])
-    held = scipy.signal.cont2discrete(matrices, 5e-5, method="zoh")
+    matrices = map(np.array, ([[0, 1], [-9e6, -1.5e3]], [[0], [9e6]], [[1, 0]], [[0]]))
+    held = scipy.signal.cont2discrete(tuple(matrices), 5e-5, method="zoh")
     desired = scipy.signal.dlsim(held, reference)[1][:-1, 0]
     error = (output["displacement"] - desired)[20_000:]
     found = {(cell.row, cell.column): cell.sim for cell in tables["4-5"]}
