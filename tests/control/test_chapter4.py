@@ -19,6 +19,8 @@ from piezojax import (
     ModelReferencePID,
     SecondOrderLag,
     Sensor,
+    Tracking,
+    loop_inputs,
     series,
     simulate,
 )
@@ -256,6 +258,25 @@ def test_bang_bang_starts_from_what_holds_the_stage():
         for tiny in (-1e-12, 1e-12)
     ]
     np.testing.assert_allclose(sides[0] - sides[1], 2.0 * 0.5, rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("level", [0.0, 5.0])
+def test_gradients_of_bang_bang_are_finite_where_it_switches(level):
+    arrays, static = eqx.partition(
+        catalog.loop(catalog.bang_bang(), stage=p753.plant()), eqx.is_array
+    )
+
+    @jax.jit
+    @jax.grad
+    def gradient(arrays):
+        loop = eqx.combine(arrays, static)
+        inputs = loop_inputs(jnp.full(100, level), jnp.asarray(DRAWS[:100]))
+        metric = Tracking(10)
+        return simulate(loop, inputs, loop.init(0.0), metric=metric)[1].rms_error
+
+    slopes = gradient(arrays)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))
+    assert np.any(jax.tree.leaves(slopes.controller)[0] != 0.0)
 
 
 def test_both_inverses_are_that_of_b0_without_weight_and_keep_their_cost():
