@@ -1,8 +1,9 @@
 """Published stages and controllers, each number with its source."""
 
 from . import p753 as p753
+from . import p753_chapter4 as p753_chapter4
 
-PLANTS = {"p753": p753.plant}
+PLANTS = {"p753": p753.plant, "p753_chapter4": p753_chapter4.plant}
 """Plants a study can name."""
 
 CONTROLLERS = {
@@ -10,5 +11,9 @@ CONTROLLERS = {
     "p753_sliding_mode": p753.sliding_mode,
     "p753_inversion": p753.inversion,
     "p753_disturbance_observer": p753.disturbance_observer,
+    "p753_model_reference": p753_chapter4.model_reference,
+    "p753_traditional": p753_chapter4.traditional,
+    "p753_bang_bang": p753_chapter4.bang_bang,
+    "p753_continuous": p753_chapter4.continuous,
 }
 """Controllers a study can name, with their printed gains."""

@@ -4,6 +4,8 @@ Every number carries its equation or table in Y. Cao's thesis (2013). All sets h
 20 kHz unless their name says otherwise.
 """
 
+from typing import Any
+
 from .._types import ScalarLike
 from ..control import (
     PID,
@@ -153,7 +155,7 @@ def plant(scheme: str = "trapezoid") -> Series:
     return series(hysteresis=hysteresis(scheme), dynamics=dynamics)
 
 
-def _sliding_mode(model: ARMA, gains: dict[str, float]) -> SlidingModePID:
+def _sliding_mode(model: ARMA, gains: dict[str, Any]) -> SlidingModePID:
     return SlidingModePID(
         **gains,
         surface=SURFACE,

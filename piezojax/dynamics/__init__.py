@@ -5,8 +5,10 @@ from .arma import scaled_to_dc as scaled_to_dc
 from .creep import ExponentialCreep as ExponentialCreep
 from .creep import LogarithmicCreep as LogarithmicCreep
 from .delay import FractionalDelay as FractionalDelay
+from .held import Held as Held
 from .hysteretic_oscillator import HystereticOscillator as HystereticOscillator
 from .lag import FirstOrderLag as FirstOrderLag
+from .lag import SecondOrderLag as SecondOrderLag
 from .neural_state_space import NeuralStateSpace as NeuralStateSpace
 from .scheduled import AmplitudeScheduled as AmplitudeScheduled
 from .state_space import StateSpace as StateSpace

@@ -1,4 +1,4 @@
-"""First-order lag: an amplifier, a low-pass, a sensor's own filter."""
+"""Lags of first and second order: an amplifier, a filter, a reference model."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -38,3 +38,52 @@ class FirstOrderLag(System):
         input = as_array(input)
         output = input + self.pole() * (state - input)
         return output, output
+
+
+class SecondOrderLag(System):
+    """``y'' + 2 zeta w y' + w^2 y = w^2 x``, unit DC gain: the reference model (4.47).
+
+    ``frequency`` w in rad/s, ``damping`` zeta without unit (any, above 1 too), ``dt``
+    in s; y in the unit of x. Exact for an input held between samples: the output
+    belongs to the end of the sample. The state is y and dy/dt. Raises ValueError for
+    w <= 0, zeta < 0 or ``dt <= 0``.
+    """
+
+    frequency: Scalar = eqx.field(converter=as_array)
+    damping: Scalar = eqx.field(converter=as_array)
+    dt: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        check("frequency in rad/s", self.frequency, above=0.0)
+        check("damping", self.damping, least=0.0)
+        check("sample time in s", self.dt, above=0.0)
+
+    def init(self, input: ScalarLike = 0.0) -> tuple[Scalar, Scalar]:
+        position = as_array(input)
+        return position, jnp.zeros_like(position)
+
+    def step(
+        self, state: tuple[Scalar, Scalar], input: ScalarLike
+    ) -> tuple[tuple[Scalar, Scalar], Scalar]:
+        distance, velocity = state[0] - input, state[1]
+        decay = self.damping * self.frequency
+        even, odd = _cosine_and_sinc((self.frequency**2 - decay**2) * self.dt**2)
+        odd = odd * self.dt
+        fade = jnp.exp(-decay * self.dt)
+        position = input + fade * ((even + decay * odd) * distance + odd * velocity)
+        velocity = fade * (
+            (even - decay * odd) * velocity - self.frequency**2 * odd * distance
+        )
+        return (position, velocity), position
+
+
+def _cosine_and_sinc(square: Scalar) -> tuple[Scalar, Scalar]:
+    """cos x and sin(x)/x of x^2 = ``square``, of either sign, smooth through zero."""
+    small = jnp.abs(square) < 1e-3  # the series is exact to rounding there
+    x = jnp.sqrt(jnp.where(small, 1.0, jnp.abs(square)))
+    real = square > 0.0
+    cosine = jnp.where(real, jnp.cos(x), jnp.cosh(x))
+    sinc = jnp.where(real, jnp.sin(x), jnp.sinh(x)) / x
+    near = 1.0 + square * (-1 / 2 + square * (1 / 24 - square / 720))
+    near_sinc = 1.0 + square * (-1 / 6 + square * (1 / 120 - square / 5040))
+    return jnp.where(small, near, cosine), jnp.where(small, near_sinc, sinc)

@@ -21,7 +21,7 @@ from rich.text import Text
 from ..identify.fit import FitReport
 from ..identify.methods import METHODS
 from ..identify.parts import PARTS
-from ..reproduce.cell import Cell
+from ..reproduce.cell import Cell, heading
 from ..reproduce.summary import TableAgreement
 from ..tune.result import Result, Scores
 
@@ -192,8 +192,9 @@ def reproduction_table(
 ) -> Table:
     """Return paper beside simulation, a row a reference."""
     columns = list(agreement.columns)
+    units = ", ".join(dict.fromkeys(cell.unit for cell in cells))
     table = Table(
-        title=f"Table {name}: rms error in {cells[0].unit}, paper / simulation\n"
+        title=f"{heading(name)}: paper / simulation in {units}\n"
         f"geometric-mean ratio {agreement.geomean_ratio:.3f}, "
         f"worst {agreement.worst_ratio:.2f}"
     )

@@ -5,8 +5,11 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from ..reproduce.cell import Cell
+from ..reproduce.cell import Cell, heading
 from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
+
+ACROSS = 4
+"""Most panels in a row."""
 
 _MARKS = (("o", BEFORE), ("s", AFTER), ("^", MEASURED))
 
@@ -20,12 +23,16 @@ def write_picture(cells: Sequence[Cell], folder: Path) -> None:
 def cells_figure(cells: Sequence[Cell]) -> Figure:
     """Simulation against print, a panel a table; the diagonal is agreement."""
     tables = list(dict.fromkeys(cell.table for cell in cells))
-    picture = figure(4.2 * len(tables), 4.2)
-    for ax, table in zip(
-        picture.subplots(1, len(tables), squeeze=False)[0], tables, strict=True
-    ):
+    across = min(len(tables), ACROSS)
+    down = -(-len(tables) // across)
+    picture = figure(4.2 * across, 4.2 * down)
+    panels = picture.subplots(down, across, squeeze=False).ravel()
+    for ax in panels[len(tables) :]:
+        ax.set_axis_off()
+    for ax, table in zip(panels, tables, strict=False):
         inside = [cell for cell in cells if cell.table == table]
-        unit = inside[0].unit.replace("um", "µm")
+        units = dict.fromkeys(cell.unit.replace("um", "µm") for cell in inside)
+        unit = ", ".join(units)
         columns = dict.fromkeys(cell.column for cell in inside)
         for column, (marker, colour) in zip(columns, _MARKS, strict=False):
             points = [c for c in inside if c.column == column]
@@ -51,9 +58,9 @@ def cells_figure(cells: Sequence[Cell]) -> Figure:
         ax.set(
             xlim=(low, high),
             ylim=(low, high),
-            title=f"Table {table}",
-            xlabel=f"printed rms error ({unit})",
-            ylabel=f"simulated rms error ({unit})",
+            title=heading(table),
+            xlabel=f"printed ({unit})",
+            ylabel=f"simulated ({unit})",
         )
         ax.legend(loc="upper left")
     return picture

@@ -39,6 +39,11 @@ class Cell:
         return self.sim / self.paper
 
 
+def heading(table: str) -> str:
+    """Return the title of a table, or of a figure whose numbers are redone."""
+    return table.capitalize() if table.startswith("figure") else f"Table {table}"
+
+
 def window(name: str) -> float:
     """Return the shortest whole number of repeats of a signal that lasts 1 s, in s."""
     kind, frequency = signals.parse(name)

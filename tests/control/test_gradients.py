@@ -7,7 +7,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from piezojax import PID, Tracking, loop_inputs, paths, signals, simulate
-from piezojax.catalog import p753
+from piezojax.catalog import p753, p753_chapter4
 
 SAMPLES = 1000
 TIME = signals.time_grid(SAMPLES / p753.RATE, p753.RATE)
@@ -19,6 +19,8 @@ LOOPS = {
     "sliding mode": p753.loop(p753.sliding_mode()),
     "inversion": p753.loop(p753.inversion()),
     "observer": p753.loop(p753.disturbance_observer()),
+    "model reference": p753_chapter4.loop(p753_chapter4.model_reference()),
+    "continuous": p753_chapter4.loop(p753_chapter4.continuous()),
 }
 
 

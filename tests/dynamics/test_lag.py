@@ -1,10 +1,11 @@
 import jax
 import numpy as np
 import pytest
+import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piezojax import FirstOrderLag, simulate
+from piezojax import FirstOrderLag, SecondOrderLag, simulate
 
 DT = 5e-5
 
@@ -72,3 +73,44 @@ def test_pole_and_its_gradient_are_the_closed_form():
 def test_bad_times_are_refused(tau, dt, message):
     with pytest.raises(ValueError, match=message):
         FirstOrderLag(tau, dt)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.25, 0.7, 1.0, 1.0 + 1e-7, 1.001, 3.0])
+def test_second_order_is_the_held_transfer_function(damping):
+    inputs = np.random.default_rng(8).normal(size=400)
+    found = response(SecondOrderLag(3000.0, damping, DT), inputs, 0.0)
+    matrices = map(
+        np.array, ([[0, 1], [-9e6, -6e3 * damping]], [[0], [9e6]], [[1, 0]], [[0]])
+    )
+    held = scipy.signal.cont2discrete(tuple(matrices), DT, method="zoh")
+    expected = scipy.signal.dlsim(held, np.append(inputs, 0.0))[1][1:, 0]
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("damping", [0.7, 1.0, 1.5])
+def test_gradient_of_second_order_is_that_of_differences(damping):
+    def last(parameters):
+        return response(SecondOrderLag(*parameters, DT), np.ones(40), 0.0)[-1]
+
+    point = np.array([1000.0, damping])
+    steps = np.diag(1e-5 * point)
+    differences = [(last(point + h) - last(point - h)) / (2 * h.sum()) for h in steps]
+    np.testing.assert_allclose(jax.grad(last)(point), differences, rtol=1e-6)
+
+
+def test_second_order_rests_at_its_input():
+    lag = SecondOrderLag(1000.0, 0.7, DT)
+    np.testing.assert_array_equal(response(lag, np.full(50, 7.0), 7.0), 7.0)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ((0.0, 0.7, DT), "frequency in rad/s is 0; it must be finite and above 0"),
+        ((1e3, -0.1, DT), "damping is -0.1; it must be finite and at least 0"),
+        ((1e3, 0.7, 0.0), "sample time in s is 0; it must be finite and above 0"),
+    ],
+)
+def test_bad_second_order_lags_are_refused(parameters, message):
+    with pytest.raises(ValueError, match=message):
+        SecondOrderLag(*parameters)

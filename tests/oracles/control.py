@@ -1,9 +1,10 @@
-"""Discrete controllers of thesis Chapter 5 and a plain PID baseline.
+"""Discrete controllers of thesis Chapters 4 and 5 and a plain PID baseline.
 
 At time k a controller gets z(k), r(k+1), r(k), r(k-1) and returns the command
 u(k); it is then told the applied (clipped) u(k) through `applied`.
 """
 
+import math
 from dataclasses import dataclass
 
 from .hysteresis import inverse_trapezoid_step
@@ -86,9 +87,9 @@ class PID:
 
 
 class PIDSMC:
-    """Discrete PID-based SMC; variant "smc", "inversion" or "dob".
+    """Discrete PID-based SMC; variant "smc", "bang-bang", "inversion" or "dob".
 
-    gains: P, I, D, m, R, Q, alpha, beta, model_a = (a1, a2),
+    gains: P, I, D (K for "bang-bang"), m, R, Q, alpha, beta, model_a = (a1, a2),
     model_b = (b0, b1, b2); Ke and cutoff for "dob"; hysteresis = (a, b, c) for
     "inversion". Optional q_corrected (default True) chooses the form of the
     Q filter. All stored values start at zero.
@@ -139,11 +140,14 @@ class PIDSMC:
         veq = -(m * (a11 * e1 + a12 * e2) + a21 * e1 + a22 * e2)
         veq = veq / (m * b0 + b0 / period)
         self.s_sum += s
-        dv = -(
-            self.gains["P"] * s
-            + self.gains["I"] * period * self.s_sum
-            + self.gains["D"] * (s - self.s_prev) / period
-        )
+        if self.variant == "bang-bang":
+            dv = -self.gains["K"] * ((s > 0.0) - (s < 0.0))
+        else:
+            dv = -(
+                self.gains["P"] * s
+                + self.gains["I"] * period * self.s_sum
+                + self.gains["D"] * (s - self.s_prev) / period
+            )
         self.s_prev = s
         return v1 + veq + dv
 
@@ -171,7 +175,7 @@ class PIDSMC:
         """The command u(k), not yet clipped."""
         v = self.sliding_mode(z, r_next, r, r_prev)
         f = self.optimal_inverse(v)
-        if self.variant == "smc":
+        if self.variant in ("smc", "bang-bang"):
             u = f
         elif self.variant == "inversion":
             a, b, c = self.gains["hysteresis"]
@@ -186,10 +190,117 @@ class PIDSMC:
         self.u1, self.u2, self.u3 = u, self.u1, self.u2
 
 
+class ModelReference:
+    """Model-reference PID-SMC of section 4.5.3.3 for a model of order n.
+
+    gains: P, I, D, m = (m_1, ..., m_{n-1}) with S = [m, 1] on the errors
+    e(k-n+1), ..., e(k); R, Q, alpha, beta, model_a = (a_1, ..., a_n), model_b =
+    (b_0, b_1, ...), frequency and damping (below 1) of the reference model, and
+    inversion: "tikhonov" (default) or "printed" (4.21). Histories hold the value of
+    k - i at index i; all start at zero.
+    """
+
+    def __init__(self, gains, rate):
+        self.gains = gains
+        self.period = 1.0 / rate
+        self.observer = AlphaBeta(gains["alpha"], gains["beta"], self.period)
+        # Impulse-invariant difference equation of the zero-order-hold equivalent:
+        # y_d(k+1) = p1 y_d(k) + p2 y_d(k-1) + q0 r(k) + q1 r(k-1).
+        w, zeta, t = gains["frequency"], gains["damping"], self.period
+        decay = math.exp(-zeta * w * t)
+        ratio = math.sqrt(1.0 - zeta * zeta)
+        cosine, sine = math.cos(ratio * w * t), math.sin(ratio * w * t)
+        self.p1, self.p2 = 2.0 * decay * cosine, -decay * decay
+        self.q0 = 1.0 - decay * (cosine + zeta / ratio * sine)
+        self.q1 = decay * decay + decay * (zeta / ratio * sine - cosine)
+        order, lags = len(gains["model_a"]), len(gains["model_b"]) - 1
+        self.yd = [0.0] * (max(order, 2) + 1)
+        self.r_prev = 0.0
+        self.e = [0.0] * order
+        self.forward = [0.0] * lags
+        self.feedback = [0.0] * lags
+        self.s_sum = 0.0
+        self.s_prev = 0.0
+
+    def step(self, z, r_next, r, r_prev):
+        """The command u(k), not yet clipped; neither r(k+1) nor r(k-1) is used."""
+        gains, period = self.gains, self.period
+        a, (b0, *b) = gains["model_a"], gains["model_b"]
+        order = len(a)
+        q, weight = gains["Q"], gains["R"]
+        if gains.get("inversion", "tikhonov") == "tikhonov":
+            g = b0 * q / (b0 * b0 * q + weight)
+        else:
+            g = q / (b0 * (q + weight))
+
+        yh, _ = self.observer.step(z)
+        e = [yh - self.yd[0], *self.e][:order]
+        yd_next = self.p1 * self.yd[0] + self.p2 * self.yd[1]
+        yd_next += self.q0 * r + self.q1 * self.r_prev
+        self.r_prev = r
+
+        u1 = yd_next
+        for i in range(order):
+            u1 -= a[i] * self.yd[i]
+        for i in range(len(b)):
+            u1 -= b[i] * self.forward[i]
+        u1 *= g
+
+        s = e[0]
+        pushed = 0.0  # S A_e delta
+        for i in range(order):
+            pushed += a[i] * e[i]
+        for j in range(order - 1):  # m_{j+1} weighs e(k-n+1+j)
+            s += gains["m"][j] * e[order - 1 - j]
+            pushed += gains["m"][j] * e[order - 2 - j]
+        for i in range(len(b)):
+            pushed += b[i] * self.feedback[i]
+        self.s_sum += s
+        u2 = -g * pushed - (
+            gains["P"] * s
+            + gains["I"] * period * self.s_sum
+            + gains["D"] * (s - self.s_prev) / period
+        )
+        self.s_prev = s
+        self.e = e
+        self.yd = [yd_next, *self.yd[:-1]]
+        self.forward = [u1, *self.forward][: len(b)]
+        self.feedback = [u2, *self.feedback][: len(b)]
+        return u1 + u2
+
+    def applied(self, u):
+        """Nothing here depends on the limits."""
+
+
+class Continuous:
+    """Continuous PID-SMC, sampled: u = -(P s + I int s + D ds/dt), s = m e + de/dt."""
+
+    def __init__(self, gains, rate):
+        self.gains = gains
+        self.period = 1.0 / rate
+        self.observer = AlphaBeta(gains["alpha"], gains["beta"], self.period)
+        self.s_sum = 0.0
+        self.s_prev = 0.0
+
+    def step(self, z, r_next, r, r_prev):
+        """The command u(k), not yet clipped."""
+        yh, vh = self.observer.step(z)
+        s = self.gains["m"] * (yh - r) + vh - (r - r_prev) / self.period
+        self.s_sum += s
+        slope = (s - self.s_prev) / self.period
+        self.s_prev = s
+        total = self.gains["P"] * s + self.gains["I"] * self.period * self.s_sum
+        return -(total + self.gains["D"] * slope)
+
+    def applied(self, u):
+        """Nothing here depends on the limits."""
+
+
 def make_controller(kind, gains, rate):
-    """kind: "pid", "smc", "inversion" or "dob"."""
-    if kind == "pid":
-        return PID(gains, rate)
-    if kind in ("smc", "inversion", "dob"):
+    """kind: a key of the table below, or a variant of PIDSMC."""
+    kinds = {"pid": PID, "model reference": ModelReference, "continuous": Continuous}
+    if kind in kinds:
+        return kinds[kind](gains, rate)
+    if kind in ("smc", "bang-bang", "inversion", "dob"):
         return PIDSMC(kind, gains, rate)
     raise ValueError(f"unknown kind {kind!r}")

@@ -225,6 +225,6 @@ def test_csv_has_the_agreed_header_and_loses_no_digit_that_counts(tables):
 
 @pytest.mark.parametrize("name", ["9-9", "", "5-4", "5_3"])
 def test_unknown_table(name):
-    message = f"table {name!r} is unknown; there are 3-6, 3-7, 5-3, 5-5"
+    message = f"table {name!r} is unknown; there are 3-6, 3-7, 4-5, 4-6"
     with pytest.raises(ValueError, match=re.escape(message)):
         reproduce(name)

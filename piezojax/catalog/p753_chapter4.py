@@ -1,0 +1,226 @@
+"""The P-753 under the controllers of chapter 4, at sampling rates from 1 to 20 kHz.
+
+Every number carries its table or section in Y. Cao's thesis (2013); the models are
+``p753.DYNAMICS_BY_RATE`` (Table 4-1). Rates in Hz.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from .._types import ScalarLike
+from ..control import (
+    AlphaBeta,
+    BangBangSlidingMode,
+    ContinuousSlidingModePID,
+    ModelReferencePID,
+    SlidingModePID,
+)
+from ..dynamics import ARMA, Held, SecondOrderLag, scaled_to_dc
+from ..hardware import Sensor
+from ..system import Feedback, Series, System, series
+from . import p753
+
+TRADITIONAL_GAINS = {
+    1_000: {
+        "proportional": 0.6,
+        "integral": 240.0,
+        "derivative": 5e-4,
+        "surface": 1_000.0,
+        "error_weight": 1.0,
+        "control_weight": 100.0,
+    },
+    20_000: {
+        "proportional": 0.001,
+        "integral": 10.0,
+        "derivative": 1e-6,
+        "surface": 18_000.0,
+        "error_weight": 1.0,
+        "control_weight": 400.0,
+    },
+}
+"""Table 4-2, tuned for a step. Those behind Tables 4-5 and 4-6 are not printed."""
+
+MODEL_REFERENCE_GAINS = {
+    "4-3": {
+        1_000: {
+            "proportional": 4.2,
+            "integral": 1_150.0,
+            "derivative": 0.001,
+            "control_weight": 0.5,
+        },
+        20_000: {
+            "proportional": 10.0,
+            "integral": 25_000.0,
+            "derivative": 2e-5,
+            "control_weight": 0.001,
+        },
+    },
+    "4-4": {
+        1_000: {
+            "proportional": 9.6,
+            "integral": 1_500.0,
+            "derivative": 0.001,
+            "control_weight": 0.05,
+        },
+        2_000: {
+            "proportional": 4.0,
+            "integral": 1_000.0,
+            "derivative": 2e-5,
+            "control_weight": 0.001,
+        },
+        5_000: {
+            "proportional": 2.0,
+            "integral": 1_500.0,
+            "derivative": 2e-5,
+            "control_weight": 0.001,
+        },
+        10_000: {
+            "proportional": 1.5,
+            "integral": 3_500.0,
+            "derivative": 2e-5,
+            "control_weight": 0.001,
+        },
+        20_000: {
+            "proportional": 1.0,
+            "integral": 12_000.0,
+            "derivative": 2e-5,
+            "control_weight": 0.001,
+        },
+    },
+}
+"""Tables 4-3 (steps) and 4-4 (tracking); m and Q are the same throughout."""
+
+SURFACE = (0.99,)
+"""m in S = [m, 1], Tables 4-3 and 4-4."""
+
+ERROR_WEIGHT = 1.0
+"""Q, Tables 4-3 and 4-4."""
+
+REFERENCE_MODELS = {
+    "4-3": {"frequency": 1_000.0, "damping": 0.7},
+    "4-4": {"frequency": 3_000.0, "damping": 0.25},
+}
+"""The second-order model (4.47) behind each table, sections 4.5.4.2 and 4.5.4.3."""
+
+CONTINUOUS_GAINS = {
+    5_000: {"proportional": 1e-4, "integral": 0.03, "derivative": 1e-7},
+    10_000: {"proportional": 0.002, "integral": 0.6, "derivative": 1e-7},
+    20_000: {"proportional": 0.001, "integral": 1.0, "derivative": 1e-7},
+}
+"""Section 4.5.4.3, by Ziegler and Nichols; the surface is ``p753.SURFACE``."""
+
+BANG_BANG_GAINS = {1_000: 3.0, 20_000: 1.0}
+"""K, section 4.5.4.1."""
+
+BANG_BANG_CONTROL_WEIGHT = 1.0
+"""R of the nominal DSMC beside Q = 1: ours, not printed. With the R = 400 of Table 4-2
+K = 1 is too small to move the stage; from about 1 on the voltage limits set what is
+seen."""
+
+FILTERS = {1_000: (0.3, 0.001), 20_000: (0.1, 1e-4)}
+"""Alpha and beta, section 4.5.4.1, where the other rates are missing."""
+
+UNPRINTED_FILTER = (0.1, 1e-4)
+"""Alpha and beta where none are printed: those of 20 kHz, an assumption."""
+
+
+def alpha_beta(rate: int = 20_000) -> AlphaBeta:
+    """Return the printed filter at ``rate``, or that of 20 kHz where there is none."""
+    return AlphaBeta(*FILTERS.get(rate, UNPRINTED_FILTER), 1.0 / rate)
+
+
+def unfiltered(rate: int = 20_000) -> AlphaBeta:
+    """Return a filter that passes the measured displacement as it is."""
+    return AlphaBeta(1.0, 0.0, 1.0 / rate)
+
+
+def model(rate: int = 20_000) -> ARMA:
+    """Return the row of Table 4-1 for ``rate``, V to um."""
+    return ARMA(**_printed("rate in Hz", p753.DYNAMICS_BY_RATE, rate))
+
+
+def model_reference(
+    rate: int = 20_000, table: str = "4-4", filter: AlphaBeta | None = None
+) -> ModelReferencePID:
+    """Return the model-reference PID-SMC of ``table`` "4-3" or "4-4", um to V.
+
+    ``filter`` stands in for the printed one. Raises ValueError for a rate or a table
+    that is not printed.
+    """
+    gains = _printed("table", MODEL_REFERENCE_GAINS, table)
+    return ModelReferencePID(
+        **_printed("rate in Hz", gains, rate),
+        surface=SURFACE,
+        error_weight=ERROR_WEIGHT,
+        model=model(rate),
+        reference_model=SecondOrderLag(**REFERENCE_MODELS[table], dt=1.0 / rate),
+        filter=alpha_beta(rate) if filter is None else filter,
+    )
+
+
+def traditional(rate: int = 20_000) -> SlidingModePID:
+    """Return the traditional PID-SMC of Table 4-2 (1 or 20 kHz), um to V."""
+    return SlidingModePID(
+        **_printed("rate in Hz", TRADITIONAL_GAINS, rate),
+        model=model(rate),
+        filter=alpha_beta(rate),
+    )
+
+
+def bang_bang(rate: int = 20_000) -> BangBangSlidingMode:
+    """Return the nominal DSMC with bang-bang switching (1 or 20 kHz), um to V."""
+    return BangBangSlidingMode(
+        gain=_printed("rate in Hz", BANG_BANG_GAINS, rate),
+        surface=TRADITIONAL_GAINS[rate]["surface"],
+        error_weight=ERROR_WEIGHT,
+        control_weight=BANG_BANG_CONTROL_WEIGHT,
+        model=model(rate),
+        filter=alpha_beta(rate),
+    )
+
+
+def continuous(rate: int = 20_000) -> ContinuousSlidingModePID:
+    """Return the continuous PID-SMC (5, 10 or 20 kHz), um to V."""
+    return ContinuousSlidingModePID(
+        **_printed("rate in Hz", CONTINUOUS_GAINS, rate),
+        surface=p753.SURFACE,
+        filter=alpha_beta(rate),
+    )
+
+
+def plant() -> Series:
+    """Return the stage at 20 kHz, V to um, with the dynamics of Table 3-2.
+
+    The hysteresis of chapter 5, then the denominator and the y_2 numerator of Table 3-2
+    scaled to unit DC gain. Its slowest pole is faster than that of ``p753.plant``,
+    under which the gains of Table 4-4 are unstable with the printed filter.
+    """
+    printed = p753.ARMA_HYSTERESIS["3-2"]
+    dynamics = ARMA(printed["autoregressive"], printed["moving_2"])
+    return series(hysteresis=p753.hysteresis(), dynamics=scaled_to_dc(dynamics, 1.0))
+
+
+def loop(
+    controller: System,
+    rate: int = 20_000,
+    stage: System | None = None,
+    noise_rms: ScalarLike = p753.NOISE_RMS,
+) -> Feedback:
+    """Return ``controller``, running at ``rate``, around a stage simulated at 20 kHz.
+
+    ``stage`` (V to um) is ``plant`` if left out. Raises ValueError for a rate of which
+    20 kHz is no multiple.
+    """
+    held, rest = divmod(int(p753.RATE), rate)
+    if rest:
+        raise ValueError(f"rate in Hz is {rate}; it must divide {p753.RATE:g}")
+    stage = plant() if stage is None else stage
+    return Feedback(controller, Held(stage, held), p753.actuator(), Sensor(noise_rms))
+
+
+def _printed(name: str, values: Mapping[Any, Any], key: Any) -> Any:
+    if key not in values:
+        raise ValueError(
+            f"{name} is {key}; it must be one of {', '.join(map(str, values))}"
+        )
+    return values[key]

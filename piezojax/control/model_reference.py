@@ -1,0 +1,152 @@
+"""PID-based sliding mode control by the model-reference design (section 4.5.3.3)."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._types import Scalar, State, as_array, as_scalars, check
+from ..dynamics.arma import ARMA
+from ..system import Observation, System
+from .alpha_beta import AlphaBeta, Motion
+from .output_tracking import INVERSIONS, check_inversion
+
+
+class ModelReferenceState(NamedTuple):
+    """Newest first: y_d from r(k) on in um, past errors in um, past u1 and u2 in V."""
+
+    filter: Motion
+    reference_model: State
+    desired: tuple[Scalar, ...]
+    errors: tuple[Scalar, ...]
+    forward: tuple[Scalar, ...]
+    feedback: tuple[Scalar, ...]
+    integral: Scalar
+    sliding: Scalar
+
+
+class ModelReferencePID(System):
+    """Makes a model of any order n follow a reference model with output y_d.
+
+    With e = y - y_d, the output y from ``filter``, the sliding variable is
+    ``s(k) = surface[0] e(k-n+1) + ... + surface[n-2] e(k-1) + e(k)`` in um, (4.41) at
+    the last n errors that are known: the printed one holds e(k+1), which is not. The
+    voltage is u1 + u_eq + du, of which u1 moves ``model`` (a_1, ..., a_n | b_0, ...,
+    b_0 not zero) along y_d (4.32), u_eq takes s to zero (4.42) and du is a PID of s
+    (4.43) with ``proportional`` in V/um, ``integral`` in V/(um s) and ``derivative``
+    in V s/um. Both u1 and u_eq divide by b_0, in the form ``inversion`` of
+    ``INVERSIONS`` with the weights ``error_weight`` Q and ``control_weight`` R; du does
+    not. ``reference_model`` turns r(k) into y_d(k+1).
+
+    Input an Observation (the next reference is not looked at), output in V. Raises
+    ValueError for a model without a_1, a surface of another length than n - 1, b_0 = 0,
+    Q <= 0, R < 0 or an unknown inversion.
+    """
+
+    proportional: Scalar = eqx.field(converter=as_array)
+    integral: Scalar = eqx.field(converter=as_array)
+    derivative: Scalar = eqx.field(converter=as_array)
+    surface: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
+    error_weight: Scalar = eqx.field(converter=as_array)
+    control_weight: Scalar = eqx.field(converter=as_array)
+    model: ARMA
+    reference_model: System
+    filter: AlphaBeta
+    inversion: str = eqx.field(static=True, default="tikhonov")
+
+    def __check_init__(self):
+        order = len(self.model.autoregressive)
+        if order < 1:
+            raise ValueError("the model has no a coefficient; it must have at least 1")
+        if len(self.surface) != order - 1:
+            raise ValueError(
+                f"surface holds {len(self.surface)} weights; it must hold {order - 1} "
+                f"for a model of order {order}"
+            )
+        check("proportional in V/um", self.proportional)
+        check("integral in V/(um s)", self.integral)
+        check("derivative in V s/um", self.derivative)
+        check("surface", self.surface)
+        check_inversion(
+            self.inversion, self.model, self.error_weight, self.control_weight
+        )
+
+    def _inverse(self, wanted: Scalar, past: tuple[Scalar, ...]) -> Scalar:
+        """Return the input that makes the model add ``wanted`` (um) to its output."""
+        b0, *later = self.model.moving
+        gain = INVERSIONS[self.inversion](b0, self.error_weight, self.control_weight)
+        return gain * (wanted - _dot(later, past))
+
+    def _advanced(self, outputs: tuple[Scalar, ...]) -> Scalar:
+        """Return what the model's past ``outputs`` alone add to the next one."""
+        return as_array(_dot(self.model.autoregressive, outputs))
+
+    def _sliding(self, errors: tuple[Scalar, ...]) -> Scalar:
+        newest, *older = errors
+        return newest + _dot(reversed(self.surface), older)
+
+    def init(self, input: Observation) -> ModelReferenceState:
+        reference = as_array(input.reference)
+        order, lags = len(self.model.autoregressive), len(self.model.moving) - 1
+        desired = (reference,) * order
+        # At rest u1 is its own past: linear, so two values give the fixed point.
+        wanted = reference - self._advanced(desired)
+        start = self._inverse(wanted, (jnp.zeros_like(reference),) * lags)
+        slope = self._inverse(jnp.zeros_like(reference), (as_array(1.0),) * lags)
+        forward = start / (1.0 - slope)
+        feedback = input.applied - forward
+        errors = (input.measured - reference,) * order
+        return ModelReferenceState(
+            filter=self.filter.init(input.measured),
+            reference_model=self.reference_model.init(reference),
+            desired=desired,
+            errors=errors[1:],
+            forward=(forward,) * lags,
+            feedback=(feedback,) * lags,
+            integral=feedback - slope * feedback,  # s = 0: the rest is u_eq
+            sliding=self._sliding(errors),
+        )
+
+    def step(
+        self, state: ModelReferenceState, input: Observation
+    ) -> tuple[ModelReferenceState, Scalar]:
+        dt = self.filter.dt
+        filter_state, motion = self.filter.step(state.filter, input.measured)
+        errors = (motion.position - state.desired[0], *state.errors)
+        reference_model, following = self.reference_model.step(
+            state.reference_model, input.reference
+        )
+
+        wanted = following - self._advanced(state.desired)
+        forward = self._inverse(wanted, state.forward)
+
+        sliding = self._sliding(errors)
+        # S A_e delta: each error one sample older, the newest as the model has it.
+        kept = _dot(reversed(self.surface), errors)
+        equivalent = self._inverse(-(self._advanced(errors) + kept), state.feedback)
+        integral = state.integral - self.integral * dt * sliding
+        switching = (
+            integral
+            - self.proportional * sliding
+            - self.derivative * (sliding - state.sliding) / dt
+        )
+        feedback = equivalent + switching
+
+        state = ModelReferenceState(
+            filter=filter_state,
+            reference_model=reference_model,
+            desired=(following, *state.desired[:-1]),
+            errors=errors[:-1],
+            forward=(forward, *state.forward)[: len(state.forward)],
+            feedback=(feedback, *state.feedback)[: len(state.feedback)],
+            integral=integral,
+            sliding=sliding,
+        )
+        return state, forward + feedback
+
+
+def _dot(weights: Iterable[Scalar], values: Iterable[Scalar]) -> Scalar:
+    """Sum of the products of two sequences, as far as both go."""
+    pairs = zip(weights, values, strict=False)
+    return sum((weight * value for weight, value in pairs), start=as_array(0.0))

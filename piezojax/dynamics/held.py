@@ -1,0 +1,33 @@
+"""A system that runs faster than what drives it."""
+
+from typing import Any
+
+import equinox as eqx
+
+from .._types import State, check
+from ..system import System
+
+
+class Held(System):
+    """``system`` stepped ``samples`` times under each input, its last output taken.
+
+    A stage simulated at one rate behind a converter that holds the voltage of a slower
+    loop. Raises ValueError unless ``samples`` is a whole number of at least 1.
+    """
+
+    system: System
+    samples: int = eqx.field(static=True)
+
+    def __check_init__(self):
+        if not isinstance(self.samples, int):
+            raise ValueError(f"samples held is {self.samples!r}; it must be whole")
+        check("samples held", self.samples, least=1.0)
+
+    def init(self, input: Any = 0.0) -> State:
+        return self.system.init(input)
+
+    def step(self, state: State, input: Any) -> tuple[State, Any]:
+        state, output = self.system.step(state, input)
+        for _ in range(self.samples - 1):
+            state, output = self.system.step(state, input)
+        return state, output

@@ -1,0 +1,36 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from piezojax import Held, simulate
+from piezojax.catalog import p753
+
+STAGE = p753.plant()
+
+
+@pytest.mark.parametrize("samples", [1, 4, 20])
+def test_output_is_every_nth_of_the_stage_under_a_held_input(samples):
+    inputs = 40.0 + 40.0 * np.random.default_rng(3).uniform(-1.0, 1.0, 50)
+    found = simulate(Held(STAGE, samples), jnp.asarray(inputs))[1]
+    repeated = simulate(STAGE, jnp.asarray(np.repeat(inputs, samples)))[1]
+    np.testing.assert_allclose(
+        found, repeated[samples - 1 :: samples], rtol=0.0, atol=1e-12
+    )
+
+
+def test_rest_stays_at_rest():
+    held = Held(STAGE, 4)
+    output = simulate(held, jnp.full(20, 30.0), held.init(30.0))[1]
+    np.testing.assert_allclose(output, output[0], rtol=0.0, atol=1e-12)
+    assert output[0] > 3.0
+
+
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        (0, "samples held is 0; it must be finite and at least 1"),
+    ],
+)
+def test_bad_numbers_of_samples_are_refused(samples, message):
+    with pytest.raises(ValueError, match=message):
+        Held(STAGE, samples)
