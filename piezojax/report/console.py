@@ -124,8 +124,8 @@ def tuning_table(result: Result) -> Table:
         title=Text(f"{result.title}\nrms tracking error on held-out noise, nm")
     )
     table.add_column("reference")
-    for heading in ("before", "tuned", "better", "peak, tuned"):
-        table.add_column(heading, justify="right")
+    for title in ("before", "tuned", "better", "peak, tuned"):
+        table.add_column(title, justify="right")
     sections: list[tuple[str, Scores | None, Scores | None]] = [
         ("geometric mean", result.holdout_before, result.holdout),
         ("geometric mean, not tuned on", result.unseen_before, result.unseen),

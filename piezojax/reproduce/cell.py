@@ -41,7 +41,8 @@ class Cell:
 
 def heading(table: str) -> str:
     """Return the title of a table, or of a figure whose numbers are redone."""
-    return table.capitalize() if table.startswith("figure") else f"Table {table}"
+    number = table.removeprefix("figure-")
+    return f"Table {table}" if number == table else f"Figure {number}"
 
 
 def window(name: str) -> float:
