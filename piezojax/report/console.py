@@ -21,7 +21,7 @@ from rich.text import Text
 from ..identify.fit import FitReport
 from ..identify.methods import METHODS
 from ..identify.parts import PARTS
-from ..reproduce.cell import Cell, heading
+from ..reproduce.cell import Cell, title_of
 from ..reproduce.summary import TableAgreement
 from ..tune.result import Result, Scores
 
@@ -194,7 +194,7 @@ def reproduction_table(
     columns = list(agreement.columns)
     units = ", ".join(dict.fromkeys(cell.unit for cell in cells))
     table = Table(
-        title=f"{heading(name)}: paper / simulation in {units}\n"
+        title=f"{title_of(name)}: paper / simulation in {units}\n"
         f"geometric-mean ratio {agreement.geomean_ratio:.3f}, "
         f"worst {agreement.worst_ratio:.2f}"
     )

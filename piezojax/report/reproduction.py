@@ -5,7 +5,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from ..reproduce.cell import Cell, heading
+from ..reproduce.cell import Cell, title_of
 from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
 
 ACROSS = 4
@@ -58,7 +58,7 @@ def cells_figure(cells: Sequence[Cell]) -> Figure:
         ax.set(
             xlim=(low, high),
             ylim=(low, high),
-            title=heading(table),
+            title=title_of(table),
             xlabel=f"printed ({unit})",
             ylabel=f"simulated ({unit})",
         )

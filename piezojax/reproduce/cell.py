@@ -39,7 +39,7 @@ class Cell:
         return self.sim / self.paper
 
 
-def heading(table: str) -> str:
+def title_of(table: str) -> str:
     """Return the title of a table, or of a figure whose numbers are redone."""
     number = table.removeprefix("figure-")
     return f"Table {table}" if number == table else f"Figure {number}"
