@@ -32,9 +32,8 @@ def p753_record(samples, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_noise_does_not_bias_the_p753(seed):
-    record = p753_record(20_000, seed)
+def test_noise_does_not_bias_the_p753():
+    record = p753_record(20_000, 1)
     fit = identify(record, MODEL, train=slice(0, 18_000))
     truth = p753.plant()
     np.testing.assert_allclose(
@@ -49,19 +48,12 @@ def test_noise_does_not_bias_the_p753(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "model",
-    [
-        "shaped_coleman_hodgdon+exponential_creep+lag",
-        "asymmetric_prandtl_ishlinskii+exponential_creep+lag",
-    ],
-)
-def test_the_measured_micromanipulator(model):
+def test_the_measured_micromanipulator():
     if not MICROMANIPULATOR.is_file():
         pytest.skip(f"{MICROMANIPULATOR} is not here; its excerpt is tested elsewhere")
     columns = np.loadtxt(MICROMANIPULATOR)
     record = Record(columns[:, 0], columns[:, 4], 1.0 / 200.0, source="Model_Vi_Do.dat")
-    fit = identify(record, model)
+    fit = identify(record)
     assert (fit.train.start, fit.validate.stop) == (0, record.samples)
     # Its sensor's noise is 0.067 um, cycles differ by as much.
     assert fit.report.validation.rmse < 0.15
