@@ -9,9 +9,14 @@ import jax
 _CPU_FLAGS = {
     # A scan whose carry exceeds about 1 kB is otherwise run kernel by kernel,
     # which costs microseconds a step; with this the loop is one function.
-    "xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=1000000000",
-    "xla_cpu_prefer_vector_width": "512",
-    "xla_cpu_copy_insertion_use_region_analysis": "true",
+    # Given beside a user's own extra options, it is added to them.
+    "xla_cpu_small_while_loop_byte_threshold": (
+        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+    ),
+    "xla_cpu_prefer_vector_width": "--xla_cpu_prefer_vector_width=512",
+    "xla_cpu_copy_insertion_use_region_analysis": (
+        "--xla_cpu_copy_insertion_use_region_analysis=true"
+    ),
 }
 # Internal options: an unknown one aborts the process, so they are only set for the
 # jaxlib versions on which they were seen to parse.
@@ -31,9 +36,7 @@ def _backend_is_running() -> bool:
 
 
 def _missing_flags(current: str) -> list[str]:
-    return [
-        f"--{key}={value}" for key, value in _CPU_FLAGS.items() if key not in current
-    ]
+    return [flag for name, flag in _CPU_FLAGS.items() if name not in current]
 
 
 def configure() -> None:

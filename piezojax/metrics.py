@@ -34,7 +34,8 @@ class Tracking(Metric):
 
     ``start`` is the first sample counted: the thesis leaves the start-up transient out.
     A voltage that differs from the command by more than ``tolerance`` (V) counts as
-    saturated, so that a converter's rounding does not.
+    saturated, so that a converter's rounding does not. The figures of a run that ends
+    before ``start`` are NaN: it was not perfect, nothing of it was counted.
     """
 
     start: int = eqx.field(static=True, default=0)
@@ -74,11 +75,12 @@ class Tracking(Metric):
 
     def result(self, total: State) -> TrackingFigures:
         count = jnp.maximum(total["count"], 1.0)
+        counted = jnp.where(total["count"] > 0.0, 0.0, jnp.nan)
         return TrackingFigures(
-            rms_error=_root(total["error"] / count),
-            peak_error=total["peak"],
-            rms_effort=_root(total["effort"] / count),
-            rms_slew=_root(total["slew"] / count),
+            rms_error=_root(total["error"] / count) + counted,
+            peak_error=total["peak"] + counted,
+            rms_effort=_root(total["effort"] / count) + counted,
+            rms_slew=_root(total["slew"] / count) + counted,
             saturated=total["saturated"] / jnp.maximum(total["samples"], 1.0),
             peak_voltage=total["voltage"],
         )

@@ -61,11 +61,15 @@ def simulate(
     is one plain loop: for runs that are not differentiated in reverse, and a third
     faster where a batch of inputs lies time first (``in_axes=1``). Batches:
     ``jax.vmap``, or ``in_blocks`` for many lanes. Raises ValueError for empty or
-    ragged inputs.
+    ragged inputs, and for ``every`` beside a ``metric``.
     """
     for name, value in (("every", every), ("segment", segment)):
         if value < 1:
             raise ValueError(f"{name} is {value}; it must be at least 1")
+    if metric is not None and every > 1:
+        raise ValueError(
+            f"every is {every}; with a metric, which counts every sample, it must be 1"
+        )
     samples = _length(inputs)
     state = system.init() if state is None else state
     if metric is not None:

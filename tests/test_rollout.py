@@ -254,6 +254,11 @@ def test_ragged_and_empty_inputs_are_refused(options):
         simulate(Affine(), jnp.zeros(0), **options)
 
 
+def test_a_metric_counts_every_sample():
+    with pytest.raises(ValueError, match="every is 5; with a metric"):
+        simulate(PLANT, VOLTAGES, every=5, metric=WeightedSum())
+
+
 @pytest.mark.parametrize(
     "options", [{"every": 0}, {"every": -2}, {"metric": WeightedSum(), "segment": 0}]
 )

@@ -81,6 +81,17 @@ def test_the_users_own_flags_are_kept():
     assert sorted(flags.split()) == sorted([*own.split(), FLAGS[0], FLAGS[2]])
 
 
+def test_the_threshold_is_added_to_extra_options_of_the_user():
+    own = "--xla_backend_extra_options=xla_cpu_emitter_verification_level=0"
+    done = python(
+        "import jax, piezojax, os, jax.numpy as jnp; print(os.environ['XLA_FLAGS'])"
+        + SIMULATE,
+        XLA_FLAGS=own,
+    )
+    assert done.returncode == 0, done.stderr
+    assert sorted(done.stdout.splitlines()[0].split()) == sorted([own, *FLAGS])
+
+
 TOO_LATE = "import jax; jax.devices(); import piezojax; print(jax.numpy.ones(1).dtype)"
 
 
