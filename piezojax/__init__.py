@@ -50,6 +50,7 @@ from .rollout import in_blocks as in_blocks
 from .rollout import simulate as simulate
 from .serial import load as load
 from .serial import save as save
+from .stability import stability_report as stability_report
 from .study import Case as Case
 from .system import Affine as Affine
 from .system import Delay as Delay

@@ -23,7 +23,9 @@ from ..identify.methods import METHODS
 from ..identify.parts import PARTS
 from ..reproduce.cell import Cell, title_of
 from ..reproduce.summary import TableAgreement
+from ..stability import StabilityReport
 from ..tune.result import Result, Scores
+from .stability import Comparison
 
 
 class Bar:
@@ -165,6 +167,42 @@ def gains_table(result: Result) -> Table:
     for path, value in result.gains.items():
         table.add_row(path, f"{result.start[path]:.4g}", f"{value:.4g}")
     return table
+
+
+def stability_table(comparison: Comparison) -> Table:
+    """Return the margins of each loop, those of the worse branch of a hysteresis."""
+    table = Table(title="stability for small motions, worse branch of the hysteresis")
+    table.add_column("loop")
+    for title in ("Ms", "gain margin", "phase margin", "delay margin"):
+        table.add_column(title, justify="right")
+    for name, branches in comparison.reports.items():
+        shown = "tuned" if name == "after" else name
+        if not all(report.stable for report in branches.values()):
+            table.add_row(shown, "unstable", "-", "-", "-")
+            continue
+        peak, gain, phase, delay = _worst(list(branches.values()))
+        table.add_row(
+            shown,
+            f"{peak:.2f}",
+            f"{gain:.1f} dB",
+            f"{phase:.1f}°",
+            f"{delay:.2f} samples",
+        )
+    for name in comparison.problems:
+        table.add_row("tuned" if name == "after" else name, "-", "-", "-", "-")
+    return table
+
+
+def _worst(reports: Sequence[StabilityReport]) -> tuple[float, float, float, float]:
+    def every(name: str) -> list[float]:
+        return [getattr(report, name) for report in reports]
+
+    return (
+        max(every("sensitivity_peak")),
+        min(every("gain_margin_dB")),
+        min(every("phase_margin_deg")),
+        min(every("delay_margin_samples")),
+    )
 
 
 def fit_table(report: FitReport) -> Table:

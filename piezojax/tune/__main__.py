@@ -6,8 +6,9 @@ import click
 
 from .. import study as studies
 from ..command import INTERRUPTED, Command, common, results_folder, run
-from ..report.console import Bar, gains_table, tuning_table
+from ..report.console import Bar, gains_table, stability_table, tuning_table
 from ..report.identification import write_fit
+from ..report.stability import compared, write_stability
 from ..report.tuning import write_results
 from .tuner import tune
 
@@ -34,9 +35,20 @@ def main(study: Path | None, out: Path | None, seed: int | None, quiet: bool) ->
                 write_results(outcome, folder)
                 if case.fit is not None:
                     write_fit(case.fit, folder)
+                bar.stage("working out margins")
+                stability = compared(
+                    case.study.references.offset,
+                    case.study.dt,
+                    before=outcome.before,
+                    after=outcome.after,
+                )
+                write_stability(stability, folder, outcome.result.title)
         result = outcome.result
         console.print(tuning_table(result))
         console.print(gains_table(result))
+        console.print(stability_table(stability))
+        for name, why in stability.problems.items():
+            console.print(f"note: no margins {name} tuning: {why}", soft_wrap=True)
         for warning in result.warnings:
             console.print(f"note: {warning}", soft_wrap=True)
         console.print(

@@ -1,0 +1,82 @@
+"""What a loop only remembers: modes at z = 1 that nothing moves."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import linalg
+
+TOLERANCE = 1e-9
+"""A direction counts as conserved if rows scaled to length 1 cancel this well."""
+
+
+class LinearLoop(NamedTuple):
+    """L as NumPy matrices: A [n, n], B [n], C [n]; ``dt`` in s.
+
+    ``conserved`` modes have been taken out.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    dt: float
+    conserved: int = 0
+
+    def closed(self) -> np.ndarray:
+        """Return the state matrix of the closed loop."""
+        return self.A - np.outer(self.B, self.C)
+
+    def integrates(self) -> bool:
+        """Return whether L has a pole at z = 1, as far as rounding lets one see."""
+        rows = self.A - np.eye(len(self.A))
+        length = np.linalg.norm(rows, axis=1, keepdims=True)
+        singular = np.linalg.svd(rows / length, compute_uv=False)
+        return bool(np.any(singular < TOLERANCE))
+
+    def response(self, angle: np.ndarray) -> np.ndarray:
+        """Return L at z = exp(i angle), angle [m] in rad a sample."""
+        z = np.exp(1j * np.atleast_1d(angle))
+        resolvent = z[:, None, None] * np.eye(len(self.A)) - self.A
+        states = np.linalg.solve(resolvent, self.B[:, None] + 0j)
+        return states[..., 0] @ self.C
+
+
+def without_conserved(
+    A: np.ndarray, B: np.ndarray, C: np.ndarray, dt: float
+) -> LinearLoop:
+    """Return the loop without the combinations of states that never change.
+
+    Hysteresis linearises to ``y(k) - y(k-1) = slope (x(k) - x(k-1))``: it remembers
+    ``y - slope x`` for ever, a pole at z = 1 that no input moves. The same holds for
+    the frozen bias of a start at rest, or an integral with zero gain. They say where
+    the operating point is, not whether it is stable, and are exactly the left
+    null space of [A - I, B]. Other modes stay, hidden ones too.
+    """
+    rows = np.hstack([A - np.eye(len(A)), B[:, None]])
+    length = np.linalg.norm(rows, axis=1)
+    length[length == 0.0] = 1.0
+    left, singular, _ = np.linalg.svd(rows / length[:, None], full_matrices=True)
+    count = len(A) - int(np.sum(singular > TOLERANCE))
+    if count == 0:
+        return LinearLoop(A, B, C, dt)
+    kept_sum = left[:, len(A) - count :] / length[:, None]  # w' x is conserved
+    # Solve w' x = 0 for the states with the largest share in it.
+    order = linalg.qr(kept_sum.T, pivoting=True, mode="r")[1]
+    out, stay = np.sort(order[:count]), np.sort(order[count:])
+    back = -np.linalg.solve(kept_sum[out].T, kept_sum[stay].T)
+    return LinearLoop(
+        A[np.ix_(stay, stay)] + A[np.ix_(stay, out)] @ back,
+        B[stay],
+        C[stay] + C[out] @ back,
+        dt,
+        count,
+    )
+
+
+def balanced(
+    A: np.ndarray, B: np.ndarray, C: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the same system with its states in units that suit each other."""
+    if len(A) == 0:
+        return A, B, C
+    A, (scale, _) = linalg.matrix_balance(A, permute=False, separate=True)
+    return A, B / scale, C * scale

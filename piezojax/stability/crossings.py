@@ -1,0 +1,75 @@
+"""Where the frequency response of a loop crosses, and where it peaks."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy import optimize
+
+from .conserved import LinearLoop
+
+PER_DECADE = 400
+"""Grid points a decade, before those around the poles."""
+
+_AROUND = np.concatenate(
+    [-np.geomspace(30.0, 0.03, 40), [0.0], np.geomspace(0.03, 30.0, 40)]
+)
+_PEAKS = 8  # highest points of the grid that are refined
+
+Function = Callable[[np.ndarray], np.ndarray]
+
+
+def angle_grid(loop: LinearLoop) -> np.ndarray:
+    """Return angles (rad a sample) from far below the slowest pole to pi.
+
+    Logarithmic, and denser around each pole of the open and the closed loop, so that no
+    resonance falls between two points.
+    """
+    poles = np.concatenate(
+        [np.linalg.eigvals(loop.A), np.linalg.eigvals(loop.closed())]
+    )
+    poles = poles[np.abs(poles) > 1e-6]
+    logs = np.log(poles.astype(complex))
+    speeds = np.abs(logs)[np.abs(logs) > 1e-9]
+    slowest = min(1e-2, speeds.min(initial=1.0)) * 1e-3
+    count = int(PER_DECADE * np.log10(np.pi / slowest))
+    around = np.abs(logs.imag)[:, None] + np.abs(logs.real)[:, None] * _AROUND
+    near = np.unique(around[(around > slowest) & (around < np.pi)])
+    return np.unique(
+        np.concatenate([np.geomspace(slowest, np.pi, count), near, [np.pi]])
+    )
+
+
+def roots(function: Function, grid: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the zeros of ``function`` between points where it changes its sign."""
+    places = np.flatnonzero(values[:-1] * values[1:] < 0.0)
+    found = [
+        optimize.brentq(
+            lambda x: float(function(np.array([x]))[0]),
+            grid[i],
+            grid[i + 1],
+            xtol=1e-15,
+            rtol=1e-14,
+        )
+        for i in places
+    ]
+    return np.array([*found, *grid[values == 0.0]])
+
+
+def peak(
+    function: Function, grid: np.ndarray, values: np.ndarray
+) -> tuple[float, float]:
+    """Return the largest value of ``function`` and where it lies."""
+    inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:]))
+    highest = (inner + 1)[np.argsort(values[inner + 1])[::-1][:_PEAKS]]
+    best = int(np.argmax(values))
+    found = [(float(values[best]), float(grid[best]))]
+    for i in highest:
+        low, high = grid[i - 1], grid[i + 1]
+        refined = optimize.minimize_scalar(
+            lambda x: -float(function(np.array([x]))[0]),
+            bounds=(low, high),
+            method="bounded",
+            options={"xatol": 1e-12 * high},
+        )
+        found.append((-float(refined.fun), float(refined.x)))
+    return max(found)

@@ -1,0 +1,259 @@
+"""Poles, margins and sensitivity peaks of a discrete loop."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from .._types import Scalar, ScalarLike, as_array
+from ..dynamics import StateSpace
+from ..system import Feedback, LoopState
+from .broken_loop import check_operating_point, cut, loop_sample_time, side_of
+from .conserved import LinearLoop, balanced, without_conserved
+from .crossings import angle_grid, peak, roots
+from .linearise import linearise
+
+
+@dataclass(frozen=True)
+class StabilityReport:
+    """How far a discrete loop, cut at the plant's input, is from instability.
+
+    L is its loop transfer function (see ``BrokenLoop``), S = 1/(1+L), T = L/(1+L). All
+    hold for the sampled loop up to the Nyquist frequency. Of an unstable loop only the
+    poles are given, all else is None. A limit that no change reaches is infinite, a
+    frequency that then does not exist None.
+
+    - ``stable``: every pole of the closed loop inside the unit circle;
+    - ``poles``: of the closed loop in the z plane, largest first, without ``conserved``
+      poles at z = 1: what hysteresis remembers and nothing moves;
+    - ``slowest_time_constant_s``: of the pole nearest to the unit circle;
+    - ``gain_margin``: factor above 1 on the loop gain at which it becomes unstable
+      (``gain_margin_dB`` the same), and at which frequency it then oscillates;
+      ``gain_reduction_margin``: the factor below 1, 0 where there is none;
+    - ``phase_margin_deg``: smallest phase, lag or lead, that makes it unstable;
+    - ``delay_margin_s``, ``delay_margin_samples``: smallest delay that does, exact
+      for whole samples: the loop is stable with any whole number below it;
+    - ``disk_margin``: alpha, 1 / max |(S - T)/2|; gain and phase may vary at once
+      within ``disk_gain_margin`` (that factor up, or its inverse) and
+      ``disk_phase_margin_deg``. Source: Seiler, Packard and Gahinet, An introduction to
+      disk margins, 2020;
+    - ``sensitivity_peak``: Ms = max |S|, ``complementary_peak``: Mt = max |T|.
+
+    ``reference_um``, ``voltage_V`` and ``branch`` say where the loop was linearised.
+    Frequencies in Hz, angles in degrees.
+    """
+
+    stable: bool
+    dt_s: float
+    poles: tuple[complex, ...]
+    conserved: int
+    slowest_time_constant_s: float | None
+    gain_margin: float | None
+    gain_margin_dB: float | None  # noqa: N815
+    phase_crossover_Hz: float | None  # noqa: N815
+    gain_reduction_margin: float | None
+    phase_margin_deg: float | None
+    gain_crossover_Hz: float | None  # noqa: N815
+    delay_margin_s: float | None
+    delay_margin_samples: float | None
+    disk_margin: float | None
+    disk_gain_margin: float | None
+    disk_phase_margin_deg: float | None
+    sensitivity_peak: float | None
+    sensitivity_peak_Hz: float | None  # noqa: N815
+    complementary_peak: float | None
+    complementary_peak_Hz: float | None  # noqa: N815
+    reference_um: float | None = None
+    voltage_V: float | None = None  # noqa: N815
+    branch: str | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON: poles as [real, imaginary], infinity None."""
+        values = dataclasses.asdict(self)
+        values["poles"] = [[pole.real, pole.imag] for pole in self.poles]
+        for name, value in values.items():
+            if isinstance(value, float) and not math.isfinite(value):
+                values[name] = None
+        return values
+
+
+@eqx.filter_jit
+def _linearised(
+    loop: Feedback,
+    reference: Scalar,
+    side: Scalar,
+    state: LoopState | None,
+    dt: float,
+) -> tuple[StateSpace, LoopState]:
+    broken = cut(loop, reference, side, state)
+    model = linearise(broken, broken.start.voltage, broken.init(), dt)
+    return model, broken.start
+
+
+def stability_report(
+    loop: Feedback,
+    reference: ScalarLike = 0.0,
+    branch: str = "ascending",
+    state: LoopState | None = None,
+    dt: float | None = None,
+) -> StabilityReport:
+    """Return the stability of ``loop`` for small motions around ``reference`` (um).
+
+    ``branch`` is "ascending" or "descending": the side from which the slope of a
+    hysteresis is taken, see ``broken_loop``. ``state`` is an operating point other than
+    rest on the virgin curve, such as the last state of a simulation; ``dt`` (s) is
+    needed only if the loop names no sample time.
+
+    Raises ValueError if the loop cannot rest at ``reference``, its derivatives are not
+    finite, the sample time is not known or the branch is none.
+    """
+    model, start = linear_loop(loop, reference, branch, state, dt)
+    return located_report(model, float(reference), start, branch)
+
+
+def located_report(
+    model: LinearLoop, reference: float, start: LoopState, branch: str
+) -> StabilityReport:
+    """Return the report on ``model`` with the operating point it was made for."""
+    return dataclasses.replace(
+        report_of(model),
+        reference_um=reference,
+        voltage_V=float(start.voltage),
+        branch=branch,
+    )
+
+
+def linear_loop(
+    loop: Feedback,
+    reference: ScalarLike = 0.0,
+    branch: str = "ascending",
+    state: LoopState | None = None,
+    dt: float | None = None,
+) -> tuple[LinearLoop, LoopState]:
+    """Return L in matrices, for ``report_of`` and pictures, and the operating point.
+
+    Arguments and errors as for ``stability_report``.
+    """
+    side = as_array(side_of(branch))
+    dt = loop_sample_time(loop) if dt is None else dt
+    model, start = _linearised(loop, as_array(reference), side, state, dt)
+    if state is None:
+        check_operating_point(start, float(reference))
+    A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
+    if not all(np.isfinite(m).all() for m in (A, B, C)):
+        raise ValueError(
+            f"the loop has no finite derivative at {float(reference):g} um; "
+            "it cannot be linearised there"
+        )
+    assert not D.any()  # the plant answers one sample later
+    return without_conserved(*balanced(A, B[:, 0], C[0]), dt), start
+
+
+def report_of(loop: LinearLoop) -> StabilityReport:
+    """Return the report on a loop that is linear already."""
+    poles = np.linalg.eigvals(loop.closed())
+    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
+    largest = float(np.abs(poles).max(initial=0.0))
+    known: dict[str, Any] = {
+        "stable": largest < 1.0,
+        "dt_s": loop.dt,
+        "poles": tuple(complex(pole) for pole in poles),
+        "conserved": loop.conserved,
+    }
+    figures: dict[str, float | None] = dict.fromkeys(_FIGURES)
+    if known["stable"]:
+        speed = -math.log(largest) if largest > 0.0 else math.inf
+        figures["slowest_time_constant_s"] = loop.dt / speed
+        figures |= _figures(loop)
+    return StabilityReport(**known, **figures)
+
+
+_FIGURES = [
+    field.name
+    for field in dataclasses.fields(StabilityReport)
+    if field.default is dataclasses.MISSING
+    and field.name not in ("stable", "dt_s", "poles", "conserved")
+]
+
+
+def _figures(loop: LinearLoop) -> dict[str, float | None]:
+    grid = angle_grid(loop)
+    response = loop.response(grid)
+    peaks = {
+        name: peak(lambda x, f=f: f(loop.response(x)), grid, f(response))
+        for name, f in (
+            ("sensitivity_peak", lambda L: np.abs(1.0 / (1.0 + L))),
+            ("complementary_peak", lambda L: np.abs(L / (1.0 + L))),
+            ("disk", lambda L: np.abs(0.5 * (1.0 - L) / (1.0 + L))),
+        )
+    }
+    figures: dict[str, float | None] = {}
+    for name in ("sensitivity_peak", "complementary_peak"):
+        figures[name] = peaks[name][0]
+        figures[f"{name}_Hz"] = _hertz(peaks[name][1], loop.dt)
+    alpha = 1.0 / peaks["disk"][0]
+    figures["disk_margin"] = alpha
+    figures["disk_gain_margin"] = (2 + alpha) / (2 - alpha) if alpha < 2 else math.inf
+    figures["disk_phase_margin_deg"] = math.degrees(2.0 * math.atan(alpha / 2.0))
+    return (
+        figures
+        | _gain_margins(loop, grid, response)
+        | _phase_margins(loop, grid, response)
+    )
+
+
+def _gain_margins(
+    loop: LinearLoop, grid: np.ndarray, response: np.ndarray
+) -> dict[str, float | None]:
+    places = roots(lambda x: loop.response(x).imag, grid[:-1], response.imag[:-1])
+    # At the Nyquist frequency, and at rest, L is real: a pole can leave there too.
+    places = np.append(places, np.pi)
+    crossing = loop.response(places).real
+    if not loop.integrates():
+        places = np.append(places, 0.0)
+        crossing = np.append(crossing, loop.response(np.zeros(1)).real)
+    places, crossing = places[crossing < 0.0], crossing[crossing < 0.0]
+    factors = -1.0 / crossing
+    up, down = factors > 1.0, factors < 1.0
+    found = bool(up.any())
+    first = int(np.argmin(np.where(up, factors, np.inf))) if found else 0
+    margin = float(factors[first]) if found else math.inf
+    return {
+        "gain_margin": margin,
+        "gain_margin_dB": 20.0 * math.log10(margin),
+        "phase_crossover_Hz": _hertz(float(places[first]), loop.dt) if found else None,
+        "gain_reduction_margin": float(factors[down].max(initial=0.0)),
+    }
+
+
+def _phase_margins(
+    loop: LinearLoop, grid: np.ndarray, response: np.ndarray
+) -> dict[str, float | None]:
+    def gain(x: np.ndarray) -> np.ndarray:
+        return np.log(np.abs(loop.response(x)) + 1e-300)
+
+    places = roots(gain, grid, np.log(np.abs(response) + 1e-300))
+    if places.size == 0:
+        return {
+            "phase_margin_deg": math.inf,
+            "gain_crossover_Hz": None,
+            "delay_margin_s": math.inf,
+            "delay_margin_samples": math.inf,
+        }
+    lag = np.mod(np.angle(loop.response(places)) + np.pi, 2.0 * np.pi)
+    either = np.minimum(lag, 2.0 * np.pi - lag)
+    worst = int(np.argmin(either))
+    samples = float((lag / places).min())
+    return {
+        "phase_margin_deg": math.degrees(float(either[worst])),
+        "gain_crossover_Hz": _hertz(float(places[worst]), loop.dt),
+        "delay_margin_s": samples * loop.dt,
+        "delay_margin_samples": samples,
+    }
+
+
+def _hertz(angle: float, dt: float) -> float:
+    return angle / (2.0 * math.pi * dt)

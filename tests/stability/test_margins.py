@@ -1,0 +1,240 @@
+"""Margins of linear loops against python-control, and against loops set going."""
+
+import json
+import math
+
+import control
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import published, transfer
+
+import piezojax as pj
+from piezojax.catalog import p753
+from piezojax.stability.conserved import LinearLoop
+from piezojax.stability.margins import linear_loop, report_of
+from piezojax.system import LoopInput
+
+DT = 5e-5
+A, B = published.T2_P, published.T2_G
+SLOPE = 0.15  # um/V
+GAINS = published.smc_gains("dob", "5-3")
+PIDS = {
+    "integral": (0.0, 3000.0, 0.0, 0.0),
+    "all": (1.0, 6000.0, 1e-4, 1e-4),
+    "hard": (12.0, 9000.0, 1e-3, 2e-4),
+}
+
+
+def around(controller, gain=1.0, delay=0):
+    parts = {"slope": pj.Affine(gain * SLOPE), "dynamics": pj.ARMA(A, B)}
+    if delay:
+        parts["delay"] = pj.Delay(delay)
+    limits = pj.Saturation(-1e300, 1e300)
+    return pj.Feedback(controller, pj.series(**parts), limits, pj.Sensor(0.0))
+
+
+def pid(name):
+    return pj.PID(*PIDS[name], 50.0, dt=DT)
+
+
+def dob():
+    return p753.disturbance_observer()
+
+
+LOOPS = {
+    **{f"pid, {name}": (pid, name) for name in PIDS},
+    "disturbance observer": (lambda _: dob(), ""),
+}
+
+
+def loop_of(name):
+    make, argument = LOOPS[name]
+    return around(make(argument))
+
+
+def written(name):
+    num, den = transfer.plant(A, B, SLOPE)
+    if name.startswith("pid"):
+        gains = PIDS[name.removeprefix("pid, ")]
+        return transfer.pid_loop(*gains, DT, num, den)
+    return transfer.disturbance_observer_loop(GAINS, DT, num, den)
+
+
+@pytest.fixture(scope="module", params=list(LOOPS))
+def pair(request):
+    loop = loop_of(request.param)
+    return loop, written(request.param), pj.stability_report(loop, 3.0)
+
+
+def test_the_transfer_function_is_that_of_the_equations(pair):
+    loop, oracle, _ = pair
+    frequency = np.geomspace(1.0, 10_000.0, 200)
+    ours = linear_loop(loop, 3.0)[0].response(2.0 * np.pi * frequency * DT)
+    theirs = oracle(np.exp(2j * np.pi * frequency * DT))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-7)
+
+
+def test_poles(pair):
+    _, oracle, report = pair
+    ours = np.array(report.poles)
+    ours = ours[np.abs(ours) > 0.1]  # deadbeat states add poles at 0
+    slope = (oracle(ours * (1 + 1e-7)) - oracle(ours * (1 - 1e-7))) / (2e-7 * ours)
+    miss = np.abs((1.0 + oracle(ours)) / slope)
+    assert miss.max() < 1e-6
+    assert report.stable
+    assert report.conserved == 0
+    if isinstance(oracle, control.TransferFunction):
+        theirs = control.feedback(oracle, 1).poles()
+        theirs = theirs[np.abs(theirs) > 0.1]
+        assert len(theirs) == len(ours)
+        assert max(np.abs(ours - pole).min() for pole in theirs) < 1e-6
+
+
+def sampled(oracle):
+    """A response that python-control interpolates: any order, and no lost digits."""
+    omega = np.geomspace(3.0, 0.99999 * np.pi / DT, 8_000)
+    return control.frd(oracle(np.exp(1j * omega * DT)), omega, smooth=True)
+
+
+def test_gain_phase_and_delay_margins(pair):
+    _, oracle, report = pair
+    factors, phases, _, at_factor, at_phase, _ = control.stability_margins(
+        sampled(oracle), returnall=True
+    )
+    factors = np.append(factors, -1.0 / oracle(-1.0 + 0j).real)
+    at_factor = np.append(at_factor, np.pi / DT)
+    first = np.argmin(np.where(factors > 1.0, factors, np.inf))
+    assert report.gain_margin == pytest.approx(factors[first], rel=1e-6)
+    assert report.gain_margin_dB == pytest.approx(
+        20.0 * math.log10(factors[first]), rel=1e-6
+    )
+    hertz = at_factor[first] / (2.0 * np.pi)
+    assert report.phase_crossover_Hz == pytest.approx(hertz, rel=1e-6)
+    worst = np.argmin(np.abs(phases))
+    assert report.phase_margin_deg == pytest.approx(np.abs(phases[worst]), rel=1e-6)
+    hertz = at_phase[worst] / (2.0 * np.pi)
+    assert report.gain_crossover_Hz == pytest.approx(hertz, rel=1e-6)
+    delay = np.min(np.radians(phases % 360.0) / at_phase)
+    assert report.delay_margin_s == pytest.approx(delay, rel=1e-6)
+    assert report.delay_margin_samples == pytest.approx(delay / DT, rel=1e-6)
+
+
+def test_sensitivity_peaks_and_disk_margins(pair):
+    loop, oracle, report = pair
+    distance = control.stability_margins(sampled(oracle))[2]
+    assert report.sensitivity_peak == pytest.approx(1.0 / distance, rel=1e-6)
+    # Around the peaks we name, the oracle has that value and none above it.
+    for name, function in (
+        ("complementary_peak", lambda L: L / (1.0 + L)),
+        ("sensitivity_peak", lambda L: 1.0 / (1.0 + L)),
+    ):
+        top = 2.0 * np.pi * getattr(report, f"{name}_Hz")
+        grid = np.append(np.geomspace(1e-2, np.pi / DT, 8_000), top)
+        values = np.abs(function(oracle(np.exp(1j * grid * DT))))
+        assert values.max() == pytest.approx(getattr(report, name), rel=1e-7)
+    linear = linear_loop(loop, 3.0)[0]  # compared with the oracle above
+    model = control.ss(linear.A, linear.B[:, None], linear.C[None], 0.0, DT)
+    grid = np.geomspace(10.0, np.pi / DT, 400)
+    worst = grid[np.argmin(disk(model, grid)[0])]
+    fine = np.minimum(worst * np.linspace(0.98, 1.02, 2_001), np.pi / DT)
+    alpha, decibel, phase = (values.min() for values in disk(model, fine))
+    assert report.disk_margin == pytest.approx(alpha, rel=1e-6)
+    ours = 20.0 * math.log10(report.disk_gain_margin)
+    assert ours == pytest.approx(decibel, rel=1e-6)
+    assert report.disk_phase_margin_deg == pytest.approx(phase, rel=1e-6)
+
+
+def disk(model, omega):
+    """python-control's disk margin, gain in dB and phase in degrees at ``omega``."""
+    return control.disk_margins(model, omega, skew=0.0, returnall=True)
+
+
+def error_growth(loop, samples=4_000):
+    """How much larger the last tenth of a kicked run is than the tenth before."""
+    inputs = LoopInput(
+        jnp.zeros(samples), jnp.zeros(samples), jnp.zeros(samples).at[0].set(1e-3)
+    )
+    _, log = pj.simulate(loop, inputs)
+    size = np.abs(np.asarray(log.displacement))
+    tenth = samples // 10
+    return size[-tenth:].max() / size[-2 * tenth : -tenth].max()
+
+
+@pytest.mark.parametrize("name", ["pid, hard", "disturbance observer"])
+def test_added_delay_makes_it_unstable_where_the_margin_says(name):
+    make, argument = LOOPS[name]
+    report = pj.stability_report(loop_of(name))
+    assert 1.0 < report.delay_margin_samples < 50.0
+    whole = math.floor(report.delay_margin_samples)
+    below, above = (around(make(argument), delay=n) for n in (whole, whole + 1))
+    assert pj.stability_report(below).stable
+    assert not pj.stability_report(above).stable
+    assert error_growth(below) < 1.0 < error_growth(above)
+
+
+@pytest.mark.parametrize("name", ["pid, hard", "disturbance observer"])
+def test_a_higher_gain_makes_it_unstable_where_the_margin_says(name):
+    make, argument = LOOPS[name]
+    margin = pj.stability_report(loop_of(name)).gain_margin
+    below, above = (around(make(argument), gain=margin * x) for x in (0.98, 1.02))
+    assert pj.stability_report(below).stable
+    assert not pj.stability_report(above).stable
+    assert error_growth(below) < 1.0 < error_growth(above)
+
+
+def test_the_slowest_pole_is_the_decay_of_a_run():
+    report = pj.stability_report(loop_of("disturbance observer"))
+    samples = 12_000
+    kick = jnp.zeros(samples).at[0].set(1.0)
+    inputs = LoopInput(jnp.zeros(samples), jnp.zeros(samples), kick)
+    _, log = pj.simulate(loop_of("disturbance observer"), inputs)
+    left = np.abs(np.asarray(log.displacement))
+    first, last = 9_000, 11_000
+    pole = (left[last] / left[first]) ** (1.0 / (last - first))
+    assert abs(report.poles[0]) == pytest.approx(pole, abs=1e-7)
+    assert report.slowest_time_constant_s == pytest.approx(
+        -DT / math.log(pole), rel=1e-3
+    )
+
+
+def test_an_unstable_loop_has_poles_and_no_margins():
+    report = pj.stability_report(around(pid("hard"), gain=10.0))
+    assert not report.stable
+    assert abs(report.poles[0]) > 1.0
+    assert report.gain_margin is None
+    assert report.sensitivity_peak is None
+    assert report.slowest_time_constant_s is None
+    json.dumps(report.as_dict(), allow_nan=False)
+
+
+def test_a_loop_that_nothing_makes_unstable():
+    """L = 0.5 p, a circle of radius 0.5: only the gain can grow too large."""
+    one = np.ones(1)
+    report = report_of(LinearLoop(np.zeros((1, 1)), one, 0.5 * one, DT))
+    assert report.gain_margin == pytest.approx(2.0)  # at the Nyquist frequency
+    assert report.phase_crossover_Hz == pytest.approx(0.5 / DT)
+    assert report.gain_reduction_margin == 0.0
+    assert report.phase_margin_deg == math.inf
+    assert report.delay_margin_s == math.inf
+    assert report.sensitivity_peak == pytest.approx(2.0)
+    assert report.complementary_peak == pytest.approx(1.0)
+    values = report.as_dict()
+    assert values["phase_margin_deg"] is None
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+
+
+def test_positive_feedback_becomes_unstable_at_rest():
+    one = np.ones(1)
+    report = report_of(LinearLoop(np.array([[0.5]]), one, -0.25 * one, DT))
+    assert report.gain_margin == pytest.approx(2.0)
+    assert report.phase_crossover_Hz == 0.0
+
+
+def test_a_conditionally_stable_loop_can_lose_too_much_gain():
+    """An unstable plant y(k+1) = 1.2 y + u under u = -0.5 y: 0.2 < gain < 2.2."""
+    one = np.ones(1)
+    report = report_of(LinearLoop(np.array([[1.2]]), one, 0.5 * one, DT))
+    assert report.stable
+    assert report.gain_reduction_margin == pytest.approx(0.4)
+    assert report.gain_margin == pytest.approx(4.4)
