@@ -12,4 +12,8 @@ from .model_reference import ModelReferencePID as ModelReferencePID
 from .observer import Motion as Motion
 from .observer import Observer as Observer
 from .pid import PID as PID
+from .preview import PreviewInverse as PreviewInverse
+from .preview import direct_inverse as direct_inverse
+from .preview import stable_inverse as stable_inverse
+from .preview import zero_phase_inverse as zero_phase_inverse
 from .sliding_mode import SlidingModePID as SlidingModePID
