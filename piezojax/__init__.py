@@ -14,6 +14,7 @@ from .control import BangBangSlidingMode as BangBangSlidingMode
 from .control import ContinuousSlidingModePID as ContinuousSlidingModePID
 from .control import DisturbanceObserverControl as DisturbanceObserverControl
 from .control import InversionControl as InversionControl
+from .control import KalmanFilter as KalmanFilter
 from .control import ModelReferencePID as ModelReferencePID
 from .control import SlidingModePID as SlidingModePID
 from .dynamics import ARMA as ARMA

@@ -45,7 +45,6 @@ SCALAR = {
         -0.03, (1.6, -0.6), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), 0.5, -2.0, "quadratic"
     ),
     "inverse": pj.InverseColemanHodgdon(p753.hysteresis()),
-    "alpha-beta": pj.AlphaBeta(0.1, 1e-4, 5e-5),
     "named series": pj.series(gain=pj.Affine(3.0), lag=pj.FirstOrderLag(1e-3, 5e-5)),
     "series": pj.Affine(3.0) >> pj.Delay(1) >> pj.Quantiser(0.1),
     "parallel": pj.Affine(3.0) + pj.Delay(2) + pj.FirstOrderLag(1e-3, 5e-5),
@@ -58,7 +57,9 @@ SCALAR = {
 }
 PLANT = {name: make() for name, make in PLANTS.items()}
 CONTROLLER = {name: make() for name, make in CONTROLLERS.items()} | {
-    "printed Q-filter": p753.disturbance_observer("5-4", coefficients="printed")
+    "alpha-beta": pj.AlphaBeta(0.1, 1e-4, 5e-5),
+    "kalman": p753.kalman(pj.ARMA((0.9,), (0.1, 0.2))),
+    "printed Q-filter": p753.disturbance_observer("5-4", coefficients="printed"),
 }
 RICH = pj.Feedback(
     p753.inversion(),

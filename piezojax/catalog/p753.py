@@ -12,8 +12,11 @@ from ..control import (
     AlphaBeta,
     DisturbanceObserverControl,
     InversionControl,
+    KalmanFilter,
+    Observer,
     SlidingModePID,
 )
+from ..control.kalman import model_kalman
 from ..dynamics import ARMA, scaled_to_dc
 from ..hardware import Saturation, Sensor
 from ..hysteresis import ColemanHodgdon, InverseColemanHodgdon
@@ -138,6 +141,9 @@ ALPHA, BETA = 0.1, 1e-4
 CUTOFF = 500.0
 """Q-filter cut-off, rad/s, section 5.5.6.2."""
 
+PROCESS_RMS, DRIFT_RMS = 1e-3, 1e-4
+"""Of a Kalman filter, um a sample: ours, to start tuning from."""
+
 
 def hysteresis(scheme: str = "trapezoid") -> ColemanHodgdon:
     """Return the chapter 5 hysteresis, V to um."""
@@ -155,14 +161,21 @@ def plant(scheme: str = "trapezoid") -> Series:
     return series(hysteresis=hysteresis(scheme), dynamics=dynamics)
 
 
-def _sliding_mode(model: ARMA, gains: dict[str, Any]) -> SlidingModePID:
+def kalman(model: ARMA) -> KalmanFilter:
+    """Return a Kalman filter on ``model`` with the printed sensor noise: ours."""
+    return model_kalman(model, NOISE_RMS, PROCESS_RMS, DRIFT_RMS, DT)
+
+
+def _sliding_mode(
+    model: ARMA, gains: dict[str, Any], observer: Observer | None = None
+) -> SlidingModePID:
     return SlidingModePID(
         **gains,
         surface=SURFACE,
         error_weight=ERROR_WEIGHT,
         control_weight=CONTROL_WEIGHT,
         model=model,
-        filter=AlphaBeta(ALPHA, BETA, DT),
+        filter=AlphaBeta(ALPHA, BETA, DT) if observer is None else observer,
     )
 
 
@@ -201,6 +214,28 @@ def pid() -> PID:
     An integral action of 60 V/(um s) crosses over near 400 rad/s.
     """
     return PID(0.5, 3000.0, 0.0, 1e-4, 100.0, dt=DT)
+
+
+def kalman_sliding_mode(table: str = "5-2") -> SlidingModePID:
+    """Return ``sliding_mode`` with a Kalman filter for its alpha-beta filter."""
+    model = ARMA(**DYNAMICS_FROM_VOLTAGE)
+    return _sliding_mode(model, GAINS[table]["pid"], kalman(model))
+
+
+def kalman_disturbance_observer(table: str = "5-2") -> DisturbanceObserverControl:
+    """Return ``disturbance_observer`` with a Kalman filter for its alpha-beta filter.
+
+    The filter sees what the controller sees: K_e times the voltage and the disturbance
+    that is observed.
+    """
+    model = ARMA(**DYNAMICS_BEHIND_HYSTERESIS)
+    return DisturbanceObserverControl(
+        _sliding_mode(model, GAINS[table]["dob"], kalman(model)),
+        model,
+        gain=GAIN,
+        cutoff=CUTOFF,
+        dt=DT,
+    )
 
 
 def actuator() -> Saturation:

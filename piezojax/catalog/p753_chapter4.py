@@ -13,6 +13,7 @@ from ..control import (
     BangBangSlidingMode,
     ContinuousSlidingModePID,
     ModelReferencePID,
+    Observer,
     SlidingModePID,
 )
 from ..dynamics import ARMA, Held, SecondOrderLag, scaled_to_dc
@@ -140,7 +141,7 @@ def model(rate: int = 20_000) -> ARMA:
 
 
 def model_reference(
-    rate: int = 20_000, table: str = "4-4", filter: AlphaBeta | None = None
+    rate: int = 20_000, table: str = "4-4", filter: Observer | None = None
 ) -> ModelReferencePID:
     """Return the model-reference PID-SMC of ``table`` "4-3" or "4-4", um to V.
 

@@ -1,13 +1,19 @@
 """Controllers: each a System from an Observation to a command."""
 
 from .alpha_beta import AlphaBeta as AlphaBeta
-from .alpha_beta import Motion as Motion
 from .bang_bang import BangBangSlidingMode as BangBangSlidingMode
 from .continuous import ContinuousSlidingModePID as ContinuousSlidingModePID
 from .disturbance_observer import (
     DisturbanceObserverControl as DisturbanceObserverControl,
 )
 from .inversion import InversionControl as InversionControl
+from .kalman import KalmanFilter as KalmanFilter
 from .model_reference import ModelReferencePID as ModelReferencePID
+from .observer import Motion as Motion
+from .observer import Observer as Observer
 from .pid import PID as PID
+from .preview import PreviewInverse as PreviewInverse
+from .preview import direct_inverse as direct_inverse
+from .preview import stable_inverse as stable_inverse
+from .preview import zero_phase_inverse as zero_phase_inverse
 from .sliding_mode import SlidingModePID as SlidingModePID

@@ -1,28 +1,20 @@
 """Alpha-beta filter: displacement and velocity from a noisy measurement."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, check
-from ..system import System
+from .._types import Scalar, as_array, check
+from ..system import Observation
+from .observer import Motion, Observer
 
 
-class Motion(NamedTuple):
-    """Displacement in um and velocity in um/s."""
-
-    position: Scalar
-    velocity: Scalar
-
-
-class AlphaBeta(System):
+class AlphaBeta(Observer):
     """Fixed-gain observer of position and velocity (section 4.5.4.1).
 
-    Input z(k) in um, output a Motion. ``alpha`` in (0, 1] corrects the position,
-    ``beta`` in (0, 2) the velocity, both without unit; ``dt`` in s. A ramp is followed
-    without lag only as fast as ``beta`` lets the velocity in; until then the position
-    lags by (1 - alpha) / alpha samples.
+    Of an Observation only z(k) in um is looked at; output a Motion. ``alpha`` in (0, 1]
+    corrects the position, ``beta`` in (0, 2) the velocity, both without unit; ``dt`` in
+    s. A ramp is followed without lag only as fast as ``beta`` lets the velocity in;
+    until then the position lags by (1 - alpha) / alpha samples.
     """
 
     alpha: Scalar = eqx.field(converter=as_array)
@@ -34,13 +26,13 @@ class AlphaBeta(System):
         check("beta", self.beta, least=0.0, below=2.0)
         check("sample time in s", self.dt, above=0.0)
 
-    def init(self, input: ScalarLike = 0.0) -> Motion:
-        position = as_array(input)
+    def init(self, input: Observation) -> Motion:
+        position = as_array(input.measured)
         return Motion(position, jnp.zeros_like(position))
 
-    def step(self, state: Motion, input: ScalarLike) -> tuple[Motion, Motion]:
+    def step(self, state: Motion, input: Observation) -> tuple[Motion, Motion]:
         predicted = state.position + self.dt * state.velocity
-        residual = input - predicted
+        residual = input.measured - predicted
         motion = Motion(
             predicted + self.alpha * residual,
             state.velocity + (self.beta / self.dt) * residual,

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, as_array, check
+from .._types import Scalar, State, as_array, check
 from ..dynamics.arma import ARMA
 from ..system import Observation, System
-from .alpha_beta import AlphaBeta, Motion
+from .observer import Observer
 from .output_tracking import (
     INVERSIONS,
     check_inversion,
@@ -23,7 +23,7 @@ from .output_tracking import (
 class BangBangState(NamedTuple):
     """Filter state, last reference, past outputs, and what holds a start at rest."""
 
-    filter: Motion
+    filter: State
     older_reference: Scalar
     outputs: tuple[Scalar, Scalar]
     bias: Scalar
@@ -47,7 +47,7 @@ class BangBangSlidingMode(System):
     error_weight: Scalar = eqx.field(converter=as_array)
     control_weight: Scalar = eqx.field(converter=as_array)
     model: ARMA
-    filter: AlphaBeta
+    filter: Observer
     inversion: str = eqx.field(static=True, default="printed")
 
     def __check_init__(self):
@@ -69,7 +69,7 @@ class BangBangSlidingMode(System):
         outputs = (input.applied, input.applied)
         v = feedforward(self.model, reference, reference, reference)
         return BangBangState(
-            filter=self.filter.init(input.measured),
+            filter=self.filter.init(input),
             older_reference=reference,
             outputs=outputs,
             bias=input.applied - self._inverse(v, outputs),
@@ -79,7 +79,7 @@ class BangBangSlidingMode(System):
         self, state: BangBangState, input: Observation
     ) -> tuple[BangBangState, Scalar]:
         dt = self.filter.dt
-        filter_state, motion = self.filter.step(state.filter, input.measured)
+        filter_state, motion = self.filter.step(state.filter, input)
         reference, older = input.reference, state.older_reference
         error = tracking_error(motion, reference, older, dt)
         s = self.surface * error.position + error.velocity

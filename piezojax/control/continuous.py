@@ -5,16 +5,16 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, as_array, check
+from .._types import Scalar, State, as_array, check
 from ..system import Observation, System
-from .alpha_beta import AlphaBeta, Motion
+from .observer import Observer
 from .output_tracking import tracking_error
 
 
 class ContinuousSlidingModeState(NamedTuple):
     """Filter state, integral part in V, last s in um/s, last reference in um."""
 
-    filter: Motion
+    filter: State
     integral: Scalar
     sliding: Scalar
     older_reference: Scalar
@@ -34,7 +34,7 @@ class ContinuousSlidingModePID(System):
     integral: Scalar = eqx.field(converter=as_array)
     derivative: Scalar = eqx.field(converter=as_array)
     surface: Scalar = eqx.field(converter=as_array)
-    filter: AlphaBeta
+    filter: Observer
 
     def __check_init__(self):
         check("proportional in V s/um", self.proportional)
@@ -45,7 +45,7 @@ class ContinuousSlidingModePID(System):
     def init(self, input: Observation) -> ContinuousSlidingModeState:
         reference = as_array(input.reference)
         return ContinuousSlidingModeState(
-            filter=self.filter.init(input.measured),
+            filter=self.filter.init(input),
             integral=as_array(input.applied),
             sliding=jnp.zeros_like(reference),
             older_reference=reference,
@@ -55,7 +55,7 @@ class ContinuousSlidingModePID(System):
         self, state: ContinuousSlidingModeState, input: Observation
     ) -> tuple[ContinuousSlidingModeState, Scalar]:
         dt = self.filter.dt
-        filter_state, motion = self.filter.step(state.filter, input.measured)
+        filter_state, motion = self.filter.step(state.filter, input)
         error = tracking_error(motion, input.reference, state.older_reference, dt)
         s = self.surface * error.position + error.velocity
         integral = state.integral - self.integral * dt * s

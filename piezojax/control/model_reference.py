@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from .._types import Scalar, State, as_array, as_scalars, check
 from ..dynamics.arma import ARMA
 from ..system import Observation, System
-from .alpha_beta import AlphaBeta, Motion
+from .observer import Observer
 from .output_tracking import INVERSIONS, check_inversion
 
 
 class ModelReferenceState(NamedTuple):
     """Newest first: y_d from r(k) on in um, past errors in um, past u1 and u2 in V."""
 
-    filter: Motion
+    filter: State
     reference_model: State
     desired: tuple[Scalar, ...]
     errors: tuple[Scalar, ...]
@@ -52,7 +52,7 @@ class ModelReferencePID(System):
     control_weight: Scalar = eqx.field(converter=as_array)
     model: ARMA
     reference_model: System
-    filter: AlphaBeta
+    filter: Observer
     inversion: str = eqx.field(static=True, default="tikhonov")
 
     def __check_init__(self):
@@ -98,7 +98,7 @@ class ModelReferencePID(System):
         feedback = input.applied - forward
         errors = (input.measured - reference,) * order
         return ModelReferenceState(
-            filter=self.filter.init(input.measured),
+            filter=self.filter.init(input),
             reference_model=self.reference_model.init(reference),
             desired=desired,
             errors=errors[1:],
@@ -112,7 +112,7 @@ class ModelReferencePID(System):
         self, state: ModelReferenceState, input: Observation
     ) -> tuple[ModelReferenceState, Scalar]:
         dt = self.filter.dt
-        filter_state, motion = self.filter.step(state.filter, input.measured)
+        filter_state, motion = self.filter.step(state.filter, input)
         errors = (motion.position - state.desired[0], *state.errors)
         reference_model, following = self.reference_model.step(
             state.reference_model, input.reference

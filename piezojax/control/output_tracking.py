@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from .._types import Scalar, check, check_not_zero
 from ..dynamics.arma import ARMA
-from .alpha_beta import Motion
+from .observer import Motion
 
 INVERSIONS: dict[str, Callable[[Scalar, Scalar, Scalar], Scalar]] = {
     "printed": lambda b0, error, control: error / (b0 * (error + control)),

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, as_array, check
+from .._types import Scalar, State, as_array, check
 from ..dynamics.arma import ARMA
 from ..system import Observation, System
-from .alpha_beta import AlphaBeta, Motion
+from .observer import Observer
 from .output_tracking import (
     INVERSIONS,
     check_inversion,
@@ -23,7 +23,7 @@ from .output_tracking import (
 class SlidingModeState(NamedTuple):
     """Filter state, PID memory of s, past references and past outputs."""
 
-    filter: Motion
+    filter: State
     integral: Scalar
     surface: Scalar
     older_reference: Scalar
@@ -33,7 +33,7 @@ class SlidingModeState(NamedTuple):
 class SlidingModePID(System):
     """PID-based sliding mode control of a second-order model, output tracking.
 
-    The state is x = [y, dy/dt] from the alpha-beta filter and the sliding variable
+    The state is x = [y, dy/dt] from ``filter``, an observer, and the sliding variable
     ``s = surface * e1 + e2`` (5.15): ``surface`` m in 1/s. The equivalent control and
     the reference part v1 come from ``model`` (a_1, a_2 | b_0, b_1, b_2, b_0 not zero),
     a PID of s with ``proportional``, ``integral``, ``derivative`` replaces the
@@ -58,7 +58,7 @@ class SlidingModePID(System):
     error_weight: Scalar = eqx.field(converter=as_array)
     control_weight: Scalar = eqx.field(converter=as_array)
     model: ARMA
-    filter: AlphaBeta
+    filter: Observer
     inversion: str = eqx.field(static=True, default="printed")
 
     def __check_init__(self):
@@ -89,7 +89,7 @@ class SlidingModePID(System):
         integral = needed - feedforward(self.model, reference, reference, reference)
         zero = jnp.zeros_like(integral)
         return SlidingModeState(
-            filter=self.filter.init(input.measured),
+            filter=self.filter.init(input),
             integral=integral,
             surface=zero,
             older_reference=reference + zero,
@@ -100,7 +100,7 @@ class SlidingModePID(System):
         self, state: SlidingModeState, input: Observation
     ) -> tuple[SlidingModeState, Scalar]:
         dt = self.dt
-        filter_state, motion = self.filter.step(state.filter, input.measured)
+        filter_state, motion = self.filter.step(state.filter, input)
         reference, older = input.reference, state.older_reference
         error = tracking_error(motion, reference, older, dt)
         s = self.surface * error.position + error.velocity

@@ -20,7 +20,7 @@ from piezojax import (
     simulate,
 )
 from piezojax.catalog import p753
-from piezojax.system import LoopInput
+from piezojax.system import LoopInput, Observation
 
 SAMPLES = 20_000  # 1 s
 NOISE_RMS = 0.012
@@ -159,11 +159,18 @@ def test_anti_windup_brings_the_stage_back_sooner():
     assert late[1] < 0.1 * late[0]
 
 
+def observed(observer, measured):
+    zero = jnp.zeros(len(measured))
+    seen = Observation(zero, zero, jnp.asarray(measured), zero)
+    rest = Observation(*map(jnp.asarray, (0.0, 0.0, 0.0, 0.0)))
+    return simulate(observer, seen, observer.init(rest))[1]
+
+
 def test_alpha_beta_is_the_published_filter():
     measured = np.cumsum(DRAWS)[:2000]
     oracle = control.AlphaBeta(0.1, 1e-4, p753.DT)
     expected = np.array([oracle.step(z) for z in measured])
-    found = simulate(AlphaBeta(0.1, 1e-4, p753.DT), jnp.array(measured))[1]
+    found = observed(AlphaBeta(0.1, 1e-4, p753.DT), measured)
     np.testing.assert_allclose(found.position, expected[:, 0], rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(found.velocity, expected[:, 1], rtol=1e-9, atol=1e-6)
 

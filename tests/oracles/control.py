@@ -7,6 +7,8 @@ u(k); it is then told the applied (clipped) u(k) through `applied`.
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from .hysteresis import inverse_trapezoid_step
 
 
@@ -49,6 +51,47 @@ class AlphaBeta:
         self.yh = prediction + self.alpha * residual
         self.vh = self.vh + self.beta / self.period * residual
         return self.yh, self.vh
+
+    def applied(self, u):
+        """It does not see the voltage."""
+
+
+class Kalman:
+    """Fixed-gain filter on x = [y(k), ..., y(k-n+1), d], from z and past inputs.
+
+    model_a, model_b as elsewhere; gain of x. The rest before the start is at zero.
+    """
+
+    def __init__(self, model_a, model_b, gain, period):
+        n = len(gain) - 1
+        self.A = np.zeros((n + 1, n + 1))
+        self.A[0, : len(model_a)] = model_a
+        self.A[0, n] = self.A[n, n] = 1.0
+        for i in range(1, n):
+            self.A[i, i - 1] = 1.0
+        self.b = np.array(model_b, dtype=float)
+        self.u = np.zeros_like(self.b)
+        self.gain = np.array(gain, dtype=float)
+        self.period = period
+        self.x = np.zeros(n + 1)
+
+    def step(self, z):
+        """Predict with the inputs, then correct; returns y and (y - y') / T."""
+        x = self.A @ self.x
+        x[0] += self.b @ self.u
+        self.x = x + self.gain * (z - x[0])
+        return self.x[0], (self.x[0] - self.x[1]) / self.period
+
+    def applied(self, u):
+        """Store u(k), in the unit of the model's input."""
+        self.u = np.array([u, *self.u[:-1]])
+
+
+def make_observer(gains, period):
+    """The Kalman filter if the gains have one (its gain as "kalman")."""
+    if "kalman" in gains:
+        return Kalman(gains["model_a"], gains["model_b"], gains["kalman"], period)
+    return AlphaBeta(gains["alpha"], gains["beta"], period)
 
 
 class PID:
@@ -99,9 +142,10 @@ class PIDSMC:
         self.variant = variant
         self.gains = gains
         self.period = 1.0 / rate
-        self.observer = AlphaBeta(gains["alpha"], gains["beta"], self.period)
+        self.observer = make_observer(gains, self.period)
         self.s_sum = 0.0
         self.s_prev = 0.0
+        self.w = 0.0  # the disturbance behind the last command
         self.f1 = 0.0  # f(k-1), as produced
         self.f2 = 0.0  # f(k-2)
         self.u1 = 0.0  # u(k-1), as applied
@@ -181,13 +225,17 @@ class PIDSMC:
             a, b, c = self.gains["hysteresis"]
             u = inverse_trapezoid_step(self.f1, self.u1, f, a, b, c)
         else:
-            u = f / self.gains["Ke"] - self.observer_term(z)
+            self.w = self.observer_term(z)
+            u = f / self.gains["Ke"] - self.w
         self.f1, self.f2 = f, self.f1
         return u
 
     def applied(self, u):
         """Store the applied voltage u(k)."""
         self.u1, self.u2, self.u3 = u, self.u1, self.u2
+        if self.variant == "dob":
+            u = self.gains["Ke"] * (u + self.w)
+        self.observer.applied(u)
 
 
 class ModelReference:
@@ -203,7 +251,7 @@ class ModelReference:
     def __init__(self, gains, rate):
         self.gains = gains
         self.period = 1.0 / rate
-        self.observer = AlphaBeta(gains["alpha"], gains["beta"], self.period)
+        self.observer = make_observer(gains, self.period)
         # Impulse-invariant difference equation of the zero-order-hold equivalent:
         # y_d(k+1) = p1 y_d(k) + p2 y_d(k-1) + q0 r(k) + q1 r(k-1).
         w, zeta, t = gains["frequency"], gains["damping"], self.period
@@ -269,7 +317,8 @@ class ModelReference:
         return u1 + u2
 
     def applied(self, u):
-        """Nothing here depends on the limits."""
+        """Only the observer depends on the limits."""
+        self.observer.applied(u)
 
 
 class Continuous:
@@ -278,7 +327,7 @@ class Continuous:
     def __init__(self, gains, rate):
         self.gains = gains
         self.period = 1.0 / rate
-        self.observer = AlphaBeta(gains["alpha"], gains["beta"], self.period)
+        self.observer = make_observer(gains, self.period)
         self.s_sum = 0.0
         self.s_prev = 0.0
 
@@ -293,7 +342,8 @@ class Continuous:
         return -(total + self.gains["D"] * slope)
 
     def applied(self, u):
-        """Nothing here depends on the limits."""
+        """Only the observer depends on the limits."""
+        self.observer.applied(u)
 
 
 def make_controller(kind, gains, rate):

@@ -1,0 +1,177 @@
+"""Steady-state Kalman filter: state estimation from the voltage and the measurement."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from scipy import linalg
+
+from .._types import Scalar, ScalarLike, as_array, as_scalars, check
+from ..dynamics.arma import ARMA
+from ..system import Observation
+from .observer import Motion, Observer
+
+DOUBLINGS = 40
+"""Passes of the Riccati equation: 2^40 steps of it."""
+
+
+class KalmanState(NamedTuple):
+    """Estimates given z(k): y(k), y(k-1), ... and the drift, in um; past inputs.
+
+    ``inputs`` holds u(k-2), u(k-3), ..., in the unit of the model's input.
+    """
+
+    positions: tuple[Scalar, ...]
+    drift: Scalar
+    inputs: tuple[Scalar, ...]
+
+
+class KalmanFilter(Observer):
+    """Kalman filter on ``model``, as far as its gain has settled.
+
+    The model (a_1, ..., a_n | b_0, ...) answers u(k) with
+    ``y(k+1) = a_1 y(k) + a_2 y(k-1) + ... + b_0 u(k) + b_1 u(k-1) + ... + d(k)``, where
+    the drift d in um stands for all that it leaves out: hysteresis, creep, a wrong gain
+    at rest. u is what was applied. ``gain`` corrects y(k), y(k-1), ..., as many as the
+    model has a coefficients and two at least, and then d, by so much of the innovation;
+    no unit. ``dt`` in s. The velocity of the Motion is (y(k) - y(k-1)) / dt with both
+    estimated, the state of chapter 4's second-order models; with a gain of zero the
+    model runs on its own.
+
+    Raises ValueError for a model without a_1, a gain of another length, numbers that
+    are not finite or ``dt <= 0``.
+    """
+
+    model: ARMA
+    gain: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
+    dt: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        if not self.model.autoregressive:
+            raise ValueError("the model has no a coefficient; it must have at least 1")
+        needed = positions_of(self.model) + 1
+        if len(self.gain) != needed:
+            raise ValueError(
+                f"gain holds {len(self.gain)} numbers; it must hold {needed} for this "
+                "model, the last for the drift"
+            )
+        check("gain", self.gain)
+        check("sample time in s", self.dt, above=0.0)
+
+    def init(self, input: Observation) -> KalmanState:
+        measured, applied = as_array(input.measured), as_array(input.applied)
+        moved = sum(self.model.autoregressive) * measured
+        forced = sum(self.model.moving) * applied
+        return KalmanState(
+            positions=(measured,) * positions_of(self.model),
+            drift=measured - moved - forced,
+            inputs=(applied,) * (len(self.model.moving) - 1),
+        )
+
+    def step(
+        self, state: KalmanState, input: Observation
+    ) -> tuple[KalmanState, Motion]:
+        inputs = (as_array(input.applied), *state.inputs)
+        predicted = state.drift
+        for a, position in zip(
+            self.model.autoregressive, state.positions, strict=False
+        ):
+            predicted = predicted + a * position
+        for b, past in zip(self.model.moving, inputs, strict=True):
+            predicted = predicted + b * past
+        innovation = input.measured - predicted
+
+        *gains, drift_gain = self.gain
+        before = (predicted, *state.positions[:-1])
+        newest, older, *rest = (
+            position + gain * innovation
+            for position, gain in zip(before, gains, strict=True)
+        )
+        state = KalmanState(
+            (newest, older, *rest),
+            state.drift + drift_gain * innovation,
+            inputs[: len(state.inputs)],
+        )
+        return state, Motion(newest, (newest - older) / self.dt)
+
+
+def positions_of(model: ARMA) -> int:
+    """Return how many positions a filter on ``model`` estimates: a velocity takes 2."""
+    return max(len(model.autoregressive), 2)
+
+
+def steady_gain(
+    A: Float[np.ndarray, "n n"], Q: Float[np.ndarray, "n n"], noise_rms: float
+) -> Float[np.ndarray, " n"]:
+    """Return the settled gain for x(k+1) = A x(k) + w, z = x_1 + v, cov w = ``Q``.
+
+    It corrects the estimate at k by the measurement at k. ``noise_rms`` of v in the
+    unit of z. Raises ValueError where no gain settles: something that is seen by no
+    measurement, or kept at the edge of stability by no process noise.
+    """
+    # Doubling: each pass does twice as many steps of the Riccati recursion as the one
+    # before. Sums of positive parts only, so it also serves where the noise is small
+    # and the pencil of a Schur method has its eigenvalues next to the unit circle.
+    eye, seen = np.eye(len(A)), np.eye(len(A))[0]
+    F, G, P = A.T, np.outer(seen, seen), Q / noise_rms**2
+    for _ in range(DOUBLINGS):
+        both = linalg.solve(eye + G @ P, np.hstack([F, G @ F.T]))
+        forward, across = both[:, : len(A)], both[:, len(A) :]
+        F, G, P = F @ forward, G + F @ across, P + F.T @ P @ forward
+    gain = P[:, 0] / (P[0, 0] + 1.0)
+    poles = np.linalg.eigvals(A - np.outer(A @ gain, seen))
+    if not np.abs(poles).max() < 1.0 - 1e-9:
+        raise ValueError(
+            "the filter has no steady state; every mode of the model at the edge of "
+            "stability needs process noise above 0"
+        )
+    return gain
+
+
+def model_kalman(
+    model: ARMA,
+    noise_rms: ScalarLike,
+    process_rms: ScalarLike,
+    drift_rms: ScalarLike,
+    dt: float,
+) -> KalmanFilter:
+    """Return the Kalman filter that sees both the input of ``model`` and the sensor.
+
+    All in um: ``noise_rms`` of the sensor, ``process_rms`` of what moves the
+    displacement each sample, ``drift_rms`` of the change of the drift each sample.
+    Raises ValueError for a value that is not above 0 (``process_rms``: below 0).
+    """
+    check("noise_rms in um", noise_rms, above=0.0)
+    check("process_rms in um", process_rms, least=0.0)
+    check("drift_rms in um", drift_rms, above=0.0)
+    n = positions_of(model)
+    A = np.zeros((n + 1, n + 1))
+    A[0, : len(model.autoregressive)] = [float(a) for a in model.autoregressive]
+    A[0, n] = A[n, n] = 1.0
+    A[1:n, : n - 1] = np.eye(n - 1)
+    Q = np.zeros_like(A)
+    Q[0, 0], Q[n, n] = float(process_rms) ** 2, float(drift_rms) ** 2
+    return KalmanFilter(model, tuple(steady_gain(A, Q, float(noise_rms))), dt)
+
+
+def kinematic_kalman(
+    noise_rms: ScalarLike, acceleration_rms: ScalarLike, dt: float
+) -> KalmanFilter:
+    """Return the Kalman filter of constant velocity, which needs no model of a stage.
+
+    ``noise_rms`` of the sensor in um; ``acceleration_rms`` in um/s^2 of a random
+    acceleration that is constant within a sample and anew in the next. It is an
+    alpha-beta filter: the gains are alpha and alpha - beta, functions of
+    ``acceleration_rms dt^2 / noise_rms`` alone (Kalata, 1984). Raises ValueError for
+    values that are not above 0.
+    """
+    check("noise_rms in um", noise_rms, above=0.0)
+    check("acceleration_rms in um/s^2", acceleration_rms, above=0.0)
+    check("sample time in s", dt, above=0.0)
+    # y(k-1) stands for y(k) - dt dy/dt, so the acceleration moves both, either way.
+    push = 0.5 * float(acceleration_rms) * dt**2 * np.array([1.0, -1.0])
+    model = ARMA((2.0, -1.0), (0.0,))
+    A = np.array([[2.0, -1.0], [1.0, 0.0]])
+    gain = steady_gain(A, np.outer(push, push), float(noise_rms))
+    return KalmanFilter(model, (*gain, 0.0), dt)
