@@ -1,21 +1,45 @@
 """Published stages and controllers, each number with its source."""
 
+import inspect
+from collections.abc import Callable, Mapping
+
+from ..system import System
 from . import p753 as p753
+from . import p753_by_rate as p753_by_rate
 from . import p753_chapter4 as p753_chapter4
 
-PLANTS = {"p753": p753.plant, "p753_chapter4": p753_chapter4.plant}
+PLANTS: dict[str, Callable[..., System]] = {
+    "p753": p753_by_rate.plant,
+    "p753_chapter4": p753_by_rate.chapter4_plant,
+}
 """Plants a study can name."""
 
-CONTROLLERS = {
+CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_pid": p753.pid,
+    "p753_ziegler_nichols": p753_by_rate.ziegler_nichols,
     "p753_sliding_mode": p753.sliding_mode,
-    "p753_inversion": p753.inversion,
-    "p753_disturbance_observer": p753.disturbance_observer,
+    "p753_inversion": p753_by_rate.inversion,
+    "p753_disturbance_observer": p753_by_rate.disturbance_observer,
     "p753_kalman_sliding_mode": p753.kalman_sliding_mode,
     "p753_kalman_disturbance_observer": p753.kalman_disturbance_observer,
     "p753_model_reference": p753_chapter4.model_reference,
-    "p753_traditional": p753_chapter4.traditional,
-    "p753_bang_bang": p753_chapter4.bang_bang,
-    "p753_continuous": p753_chapter4.continuous,
+    "p753_traditional": p753_by_rate.traditional,
+    "p753_bang_bang": p753_by_rate.bang_bang,
+    "p753_continuous": p753_by_rate.continuous,
 }
-"""Controllers a study can name: printed gains, except where they say 'ours'."""
+"""Controllers a study can name, with printed gains except where they say "ours";
+those that take a ``rate`` (Hz) come at the study's."""
+
+
+def at_rate(
+    catalog: Mapping[str, Callable[..., System]], name: str, rate: float | int
+) -> System:
+    """Return ``catalog[name]``, made for ``rate`` (Hz) if it comes at several.
+
+    Raises ValueError for a rate at which there is none.
+    """
+    make = catalog[name]
+    if "rate" not in inspect.signature(make).parameters:
+        return make()
+    whole = int(rate) == rate
+    return make(rate=int(rate) if whole else rate)

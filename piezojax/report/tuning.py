@@ -22,14 +22,19 @@ _PERIODS = 4.0  # of the reference, at the end of the run
 
 def write_results(outcome: Outcome, folder: Path) -> None:
     """Write result.json, gains.toml and the pictures into ``folder``."""
-    write_text(folder / RESULT_FILE, outcome.result.model_dump_json(indent=2) + "\n")
-    save(outcome.controller, folder / GAINS_FILE)
+    write_numbers(outcome, folder)
     logs = _logs(outcome)
     with styled():
         write(tracking_figure(outcome, logs), folder / "tracking.png")
         write(hysteresis_figure(outcome, logs), folder / "hysteresis.png")
         if outcome.result.history:
             write(convergence_figure(outcome), folder / "convergence.png")
+
+
+def write_numbers(outcome: Outcome, folder: Path) -> None:
+    """Write result.json and gains.toml into ``folder``."""
+    write_text(folder / RESULT_FILE, outcome.result.model_dump_json(indent=2) + "\n")
+    save(outcome.controller, folder / GAINS_FILE)
 
 
 Logs = dict[str, tuple[LoopSample, LoopSample]]

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from .._types import as_array
-from ..catalog import CONTROLLERS, PLANTS
+from ..catalog import CONTROLLERS, PLANTS, at_rate
 from ..control.design import DESIGNS
 from ..hardware import Quantiser, Saturation, Sensor, SlewLimit
 from ..identify import Fit, identify, read_record
@@ -50,6 +50,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         "controller",
         path.parent,
         CONTROLLERS,
+        study.rate,
         design=lambda name: DESIGNS[one_of(name, DESIGNS)](plant, study.dt),
     )
     zero = as_array(0.0)
@@ -70,7 +71,7 @@ def read(path: str | Path, seed: int | None = None) -> Case:
 def _plant(study: Study, folder: Path) -> tuple[System, Fit | None]:
     table = study.plant
     if "record" not in table:
-        return _choice(table, "plant", folder, PLANTS), None
+        return _choice(table, "plant", folder, PLANTS, study.rate), None
     if set(table) & {"catalog", "file", "type"}:
         raise _not_one_way(table, "plant", ("catalog", "file", "type", "record"))
     wanted = validated(RecordPlant, table, "plant")
@@ -171,12 +172,13 @@ def _choice(
     table: dict[str, Any],
     where: str,
     folder: Path,
-    catalog: Mapping[str, Callable[[], System]],
+    catalog: Mapping[str, Callable[..., System]],
+    rate: float,
     design: Callable[[str], System] | None = None,
 ) -> System:
     """Build the System that exactly one of catalog, file, type (and design) names."""
     ways = {
-        "catalog": lambda: catalog[one_of(table["catalog"], catalog)](),
+        "catalog": lambda: at_rate(catalog, one_of(table["catalog"], catalog), rate),
         "file": lambda: load_system(folder / str(table["file"])),
         "type": lambda: from_data(table, where),
     }

@@ -3,7 +3,7 @@
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     BaseModel,
@@ -231,7 +231,8 @@ def _first_line(error: ValidationError, kind: type[BaseModel], where: str) -> st
         table: Any = kind
         for part in first["loc"][:-1]:
             field = getattr(table, "model_fields", {}).get(part)
-            table = field.annotation if field else Bounds
+            inner = get_args(table)[-1] if get_args(table) else Bounds
+            table = field.annotation if field else inner
         known = list(getattr(table, "model_fields", Bounds.model_fields))
         near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""

@@ -1,5 +1,7 @@
 """From a study to gains."""
 
+from .comparison import Comparison as Comparison
+from .comparison import compare as compare
 from .result import Result as Result
 from .result import load_result as load_result
 from .tuner import Outcome as Outcome

@@ -1,71 +1,119 @@
-"""``python -m piezojax.tune [STUDY.toml] --out DIR``."""
+"""``python -m piezojax.tune [STUDY.toml ...] --out DIR``."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
+import tomli_w
+from rich.console import Console
 
 from .. import study as studies
 from ..command import INTERRUPTED, Command, common, results_folder, run
+from ..files import write_text
+from ..report.comparison import comparison_table, write_comparison
 from ..report.console import Bar, gains_table, stability_table, tuning_table
 from ..report.identification import write_fit
 from ..report.stability import compared, write_stability
-from ..report.tuning import write_results
-from .tuner import tune
+from ..report.tuning import write_numbers, write_results
+from .comparison import compare
+from .tuner import Outcome, tune
 
 
 @click.command(cls=Command)
-@click.argument("study", required=False, type=click.Path(path_type=Path))
+@click.argument("study", nargs=-1, type=click.Path(path_type=Path))
 @common
-def main(study: Path | None, out: Path | None, seed: int | None, quiet: bool) -> None:
+def main(
+    study: tuple[Path, ...], out: Path | None, seed: int | None, quiet: bool
+) -> None:
     """Tune the controller that STUDY describes, by gradients through the simulation.
 
     STUDY is a TOML file or the name of a study that comes with piezojax; without it,
-    the DOB-based PID-SMC of the P-753 stage is tuned.
+    the DOB-based PID-SMC of the P-753 stage is tuned. Several studies, or a comparison
+    (controllers and rates in one file, as comparison/p753), are tuned one after
+    another, each into its own folder, and end in one table and picture.
     """
 
-    def body(console):
-        path = _path_of(study)
-        with Bar(console) as bar:
-            bar.stage(f"reading {path.name}")
-            description = studies.load(path)
-            with results_folder(out, path.stem) as folder:
-                case = studies.build(description, path, seed=seed)
-                outcome = tune(case, progress=bar)
-                bar.stage("drawing")
-                write_results(outcome, folder)
-                if case.fit is not None:
-                    write_fit(case.fit, folder)
-                bar.stage("working out margins")
-                stability = compared(
-                    case.study.references.offset,
-                    case.study.dt,
-                    before=outcome.before,
-                    after=outcome.after,
-                )
-                write_stability(stability, folder, outcome.result.title)
-        result = outcome.result
-        console.print(tuning_table(result))
-        console.print(gains_table(result))
-        console.print(stability_table(stability))
-        for name, why in stability.problems.items():
-            console.print(f"note: no margins {name} tuning: {why}", soft_wrap=True)
-        for warning in result.warnings:
-            console.print(f"note: {warning}", soft_wrap=True)
-        console.print(
-            f"{result.status} after {result.evaluations} evaluations, "
-            f"{result.wall_s:.1f} s ({result.compile_s:.1f} s of it compiling); "
-            f"results in {folder}",
-            soft_wrap=True,
-        )
-        if result.status == "interrupted":
-            raise SystemExit(INTERRUPTED)
+    def body(console: Console) -> None:
+        paths = [_path_of(name) for name in study] or [studies.shipped()]
+        if len(paths) > 1 or studies.is_comparison(paths[0]):
+            _compare(paths, out, seed, console)
+        else:
+            _tune(paths[0], out, seed, console)
 
     run(quiet, body)
 
 
-def _path_of(study: Path | None) -> Path:
-    if study is None:
-        return studies.shipped()
+def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> None:
+    with Bar(console) as bar:
+        bar.stage(f"reading {path.name}")
+        description = studies.load(path)
+        with results_folder(out, path.stem) as folder:
+            case = studies.build(description, path, seed=seed)
+            outcome = tune(case, progress=bar)
+            bar.stage("drawing")
+            write_results(outcome, folder)
+            if case.fit is not None:
+                write_fit(case.fit, folder)
+            bar.stage("working out margins")
+            stability = compared(
+                case.study.references.offset,
+                case.study.dt,
+                before=outcome.before,
+                after=outcome.after,
+            )
+            write_stability(stability, folder, outcome.result.title)
+    result = outcome.result
+    console.print(tuning_table(result))
+    console.print(gains_table(result))
+    console.print(stability_table(stability))
+    for name, why in stability.problems.items():
+        console.print(f"note: no margins {name} tuning: {why}", soft_wrap=True)
+    for warning in result.warnings:
+        console.print(f"note: {warning}", soft_wrap=True)
+    console.print(
+        f"{result.status} after {result.evaluations} evaluations, "
+        f"{result.wall_s:.1f} s ({result.compile_s:.1f} s of it compiling); "
+        f"results in {folder}",
+        soft_wrap=True,
+    )
+    if result.status == "interrupted":
+        raise SystemExit(INTERRUPTED)
+
+
+def _compare(
+    paths: Sequence[Path], out: Path | None, seed: int | None, console: Console
+) -> None:
+    with Bar(console) as bar:
+        bar.stage(f"reading {', '.join(path.name for path in paths)}")
+        title, entries = studies.read_entries(paths, seed)
+        with results_folder(out, "comparison") as folder:
+
+            def keep(outcome: Outcome) -> None:
+                own = folder / outcome.case.name
+                own.mkdir()
+                write_numbers(outcome, own)
+                text = tomli_w.dumps(
+                    outcome.case.study.model_dump(mode="json", exclude_none=True)
+                )
+                write_text(own / "study.toml", text)
+
+            comparison = compare(title, entries, progress=bar, done=keep)
+            bar.stage("drawing")
+            write_comparison(comparison, folder)
+    console.print(comparison_table(comparison))
+    for row in comparison.rows:
+        for note in row.notes:
+            console.print(f"note: {row.study}: {note}", soft_wrap=True)
+    console.print(
+        f"{comparison.status}: {len(comparison.rows)} of {len(entries)} studies, "
+        f"{comparison.wall_s:.0f} s; results in {folder}",
+        soft_wrap=True,
+    )
+    if comparison.status == "interrupted":
+        raise SystemExit(INTERRUPTED)
+
+
+def _path_of(study: Path) -> Path:
     if study.suffix or study.exists():
         return study
     return studies.shipped(str(study))

@@ -1,0 +1,109 @@
+"""The P-753's controllers by rate: printed where printed, one rule elsewhere."""
+
+import control
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from piezojax.catalog import CONTROLLERS, PLANTS, at_rate, p753, p753_by_rate
+from piezojax.catalog import p753_chapter4 as printed
+from piezojax.paths import get, parameters
+from piezojax.rollout import simulate
+
+RATES = tuple(p753.DYNAMICS_BY_RATE)
+SAME = {
+    "traditional": (p753_by_rate.traditional, printed.traditional, (1_000, 20_000)),
+    "bang-bang": (p753_by_rate.bang_bang, printed.bang_bang, (1_000, 20_000)),
+    "continuous": (
+        p753_by_rate.continuous,
+        printed.continuous,
+        (5_000, 10_000, 20_000),
+    ),
+    "inversion": (p753_by_rate.inversion, lambda rate: p753.inversion(), (20_000,)),
+    "DOB": (
+        p753_by_rate.disturbance_observer,
+        lambda rate: p753.disturbance_observer(),
+        (20_000,),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_printed_gains_where_they_are_printed(name):
+    make, source, rates = SAME[name]
+    for rate in rates:
+        expected = parameters(source(rate))
+        found = parameters(make(rate))
+        assert found.keys() == expected.keys()
+        for path, value in expected.items():
+            np.testing.assert_allclose(found[path], value, rtol=1e-15, err_msg=path)
+
+
+def test_scaled_gains_are_the_same_loop_in_samples():
+    near, far = p753_by_rate.inversion(20_000), p753_by_rate.inversion(5_000)
+    power = {"proportional": 1, "integral": 0, "derivative": 2, "surface": -1}
+    for name, exponent in power.items():
+        path = f"feedback.{name}"
+        assert float(get(far, path)) == pytest.approx(
+            float(get(near, path)) * 4.0**exponent, rel=1e-12
+        )
+    assert far.feedback.filter.dt == pytest.approx(2e-4)
+    # The 5 kHz set, printed but out of line, is not what 2 kHz is scaled from.
+    slow = p753_by_rate.continuous(2_000)
+    assert float(slow.integral) == printed.CONTINUOUS_GAINS[10_000]["integral"]
+
+
+def held_response(rate):
+    """Impulse response of the linear stage at ``rate``, from its coefficients."""
+    dynamics = printed.plant().parts[1]
+    a = [float(x) for x in dynamics.autoregressive]
+    b = [float(x) for x in dynamics.moving]
+    stage = control.tf([p753.GAIN * x for x in b], [1.0, -a[0], -a[1]], 1.0 / p753.RATE)
+    samples = int(p753.RATE) // rate
+    steps = np.arange(samples * 100)
+    response = np.squeeze(control.step_response(stage, steps / p753.RATE).outputs)
+    return np.diff(response[samples - 1 :: samples], prepend=0.0)
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_ultimate_gain_and_period(rate):
+    """The slowest pole of a loop with a sample of delay meets the unit circle there."""
+    response = held_response(rate)
+    kept = response[: np.flatnonzero(np.abs(response) > 1e-9)[-1] + 1]
+    gain, period = p753_by_rate.ULTIMATE[rate]
+
+    def slowest(gain):
+        poles = np.roots([1.0, *(gain * kept)])
+        return poles[np.argmax(np.abs(poles))]
+
+    pole = slowest(gain)
+    assert abs(pole) == pytest.approx(1.0, abs=1e-3)
+    assert 2 * np.pi / abs(np.angle(pole)) / rate == pytest.approx(period, rel=1e-3)
+    for share in (0.5, 0.9, 0.98):
+        assert abs(slowest(share * gain)) < 1.0
+    assert abs(slowest(1.02 * gain)) > 1.0
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_plants_at_a_slower_rate_hold_their_input(name):
+    voltage = jnp.asarray(np.random.default_rng(0).uniform(0.0, 60.0, 20))
+    run = jax.jit(lambda plant, u: simulate(plant, u)[1])
+    fine, coarse = at_rate(PLANTS, name, 20_000), at_rate(PLANTS, name, 5_000.0)
+    held = run(fine, jnp.repeat(voltage, 4))[3::4]
+    np.testing.assert_allclose(run(coarse, voltage), held, rtol=0.0, atol=1e-12)
+    with pytest.raises(ValueError, match="rate in Hz is 3000; it must divide 20000"):
+        at_rate(PLANTS, name, 3_000.0)
+
+
+BY_RATE = (
+    *("p753_ziegler_nichols", "p753_traditional", "p753_model_reference"),
+    *("p753_continuous", "p753_bang_bang", "p753_inversion"),
+    "p753_disturbance_observer",
+)
+
+
+@pytest.mark.parametrize("name", BY_RATE)
+def test_a_rate_without_a_model_is_refused(name):
+    with pytest.raises(ValueError, match="rate in Hz is 3000; it must be one of"):
+        at_rate(CONTROLLERS, name, 3_000.0)
