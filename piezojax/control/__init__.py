@@ -3,11 +3,20 @@
 from .alpha_beta import AlphaBeta as AlphaBeta
 from .alpha_beta import Motion as Motion
 from .bang_bang import BangBangSlidingMode as BangBangSlidingMode
+from .boundary_layer import BoundaryLayer as BoundaryLayer
 from .continuous import ContinuousSlidingModePID as ContinuousSlidingModePID
 from .disturbance_observer import (
     DisturbanceObserverControl as DisturbanceObserverControl,
 )
+from .feedforward import FeedforwardFeedback as FeedforwardFeedback
+from .feedforward import InverseFeedforward as InverseFeedforward
 from .inversion import InversionControl as InversionControl
+from .iterative_learning import LearningLaw as LearningLaw
+from .iterative_learning import Trials as Trials
+from .iterative_learning import learn as learn
 from .model_reference import ModelReferencePID as ModelReferencePID
 from .pid import PID as PID
+from .repetitive import RepetitiveControl as RepetitiveControl
 from .sliding_mode import SlidingModePID as SlidingModePID
+from .super_twisting import SuperTwisting as SuperTwisting
+from .switched import SwitchedSlidingMode as SwitchedSlidingMode
