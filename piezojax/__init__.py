@@ -8,15 +8,24 @@ _runtime.configure()
 
 from . import catalog as catalog
 from . import signals as signals
+from .charge_drive import ChargeDrive as ChargeDrive
 from .control import PID as PID
 from .control import AlphaBeta as AlphaBeta
 from .control import BangBangSlidingMode as BangBangSlidingMode
+from .control import BoundaryLayer as BoundaryLayer
 from .control import ContinuousSlidingModePID as ContinuousSlidingModePID
 from .control import DisturbanceObserverControl as DisturbanceObserverControl
+from .control import FeedforwardFeedback as FeedforwardFeedback
+from .control import InverseFeedforward as InverseFeedforward
 from .control import InversionControl as InversionControl
 from .control import KalmanFilter as KalmanFilter
+from .control import LearningLaw as LearningLaw
 from .control import ModelReferencePID as ModelReferencePID
+from .control import RepetitiveControl as RepetitiveControl
 from .control import SlidingModePID as SlidingModePID
+from .control import SuperTwisting as SuperTwisting
+from .control import SwitchedSlidingMode as SwitchedSlidingMode
+from .control import learn as learn
 from .dynamics import ARMA as ARMA
 from .dynamics import AmplitudeScheduled as AmplitudeScheduled
 from .dynamics import ExponentialCreep as ExponentialCreep

@@ -7,6 +7,7 @@ from ..system import System
 from . import p753 as p753
 from . import p753_by_rate as p753_by_rate
 from . import p753_chapter4 as p753_chapter4
+from . import p753_survey as p753_survey
 
 PLANTS: dict[str, Callable[..., System]] = {
     "p753": p753_by_rate.plant,
@@ -26,6 +27,11 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_traditional": p753_by_rate.traditional,
     "p753_bang_bang": p753_by_rate.bang_bang,
     "p753_continuous": p753_by_rate.continuous,
+    "p753_boundary_layer": p753_survey.boundary_layer,
+    "p753_super_twisting": p753_survey.super_twisting,
+    "p753_feedforward": p753_survey.inverse_feedforward,
+    "p753_feedforward_pid": p753_survey.feedforward_pid,
+    "p753_repetitive": p753_survey.repetitive,
 }
 """Controllers a study can name, with printed gains except where they say "ours";
 those that take a ``rate`` (Hz) come at the study's."""

@@ -2,11 +2,17 @@
 
 from .alpha_beta import AlphaBeta as AlphaBeta
 from .bang_bang import BangBangSlidingMode as BangBangSlidingMode
+from .boundary_layer import BoundaryLayer as BoundaryLayer
 from .continuous import ContinuousSlidingModePID as ContinuousSlidingModePID
 from .disturbance_observer import (
     DisturbanceObserverControl as DisturbanceObserverControl,
 )
+from .feedforward import FeedforwardFeedback as FeedforwardFeedback
+from .feedforward import InverseFeedforward as InverseFeedforward
 from .inversion import InversionControl as InversionControl
+from .iterative_learning import LearningLaw as LearningLaw
+from .iterative_learning import Trials as Trials
+from .iterative_learning import learn as learn
 from .kalman import KalmanFilter as KalmanFilter
 from .model_reference import ModelReferencePID as ModelReferencePID
 from .observer import Motion as Motion
@@ -16,4 +22,7 @@ from .preview import PreviewInverse as PreviewInverse
 from .preview import direct_inverse as direct_inverse
 from .preview import stable_inverse as stable_inverse
 from .preview import zero_phase_inverse as zero_phase_inverse
+from .repetitive import RepetitiveControl as RepetitiveControl
 from .sliding_mode import SlidingModePID as SlidingModePID
+from .super_twisting import SuperTwisting as SuperTwisting
+from .switched import SwitchedSlidingMode as SwitchedSlidingMode

@@ -26,6 +26,8 @@ def closed_loop(
     and z(k) = y(k) + noise(k); y(0) = 0. The reference before sample 0 is
     reference[0].
 
+    kind names a controller of `control`, or is one of `survey`, gains then None.
+
     Returns arrays of length N: displacement y, measured z, voltage u (applied)
     and command (u before clipping).
     """
@@ -38,7 +40,8 @@ def closed_loop(
     p1, p2 = plant["p"]
     g0, g1, g2 = plant["g"]
     delay = plant.get("delay", 0)
-    controller = make_controller(kind, gains, rate)
+    made = not isinstance(kind, str)
+    controller = kind if made else make_controller(kind, gains, rate)
 
     u_prev = 0.0
     f_prev = 0.0

@@ -1,0 +1,93 @@
+"""The P-753 under the control schemes that the thesis surveys, section 2.5 and 2.6.
+
+The thesis prints no gains for them. Every number here is ours: start values at 20 kHz
+that hold SIN10 of 5 um with the printed noise, to be tuned. Models, filter and surface
+are the printed ones of ``p753``.
+"""
+
+from ..charge_drive import ChargeDrive
+from ..control import (
+    AlphaBeta,
+    BoundaryLayer,
+    FeedforwardFeedback,
+    InverseFeedforward,
+    LearningLaw,
+    RepetitiveControl,
+    SuperTwisting,
+    SwitchedSlidingMode,
+)
+from ..dynamics import ARMA, FirstOrderLag
+from ..hysteresis import InverseColemanHodgdon
+from ..system import Affine, System
+from . import p753
+
+BOUNDARY_LAYER = {"gain": 1e4, "width": 4e4}
+"""K in V and the layer in um/s. The inverse passes 1 % of v, hence the large K."""
+
+SUPER_TWISTING = {"root_gain": 10.0, "sign_gain": 1e6, "layer": 1e4}
+"""In V/(um/s)^(1/2), V/s and um/s."""
+
+REPETITIVE = {"gain": 0.7, "lead": 40, "advance": 8}
+"""Learning gain, and samples; the Q-filter is a lag of ``advance`` samples."""
+
+LEARNING = {"gain": 0.7, "lead": 40, "smoothing": (0.25,)}
+"""Of a loop's reference, from trial to trial."""
+
+CHARGE_TIME = 1.0
+"""R C of amplifier and load, s: charge is followed from 0.16 Hz on."""
+
+
+def _switched(law: System) -> SwitchedSlidingMode:
+    return SwitchedSlidingMode(
+        law=law,
+        surface=p753.SURFACE,
+        error_weight=p753.ERROR_WEIGHT,
+        control_weight=p753.CONTROL_WEIGHT,
+        model=ARMA(**p753.DYNAMICS_FROM_VOLTAGE),
+        filter=AlphaBeta(p753.ALPHA, p753.BETA, p753.DT),
+    )
+
+
+def _inverse() -> InverseColemanHodgdon:
+    return InverseColemanHodgdon(p753.hysteresis())
+
+
+def boundary_layer() -> SwitchedSlidingMode:
+    """Return sliding mode control with a boundary layer, um to V; gains ours."""
+    return _switched(BoundaryLayer(**BOUNDARY_LAYER))
+
+
+def super_twisting() -> SwitchedSlidingMode:
+    """Return super-twisting sliding mode control, um to V; gains ours."""
+    return _switched(SuperTwisting(**SUPER_TWISTING, dt=p753.DT))
+
+
+def inverse_feedforward() -> InverseFeedforward:
+    """Return the inverse of the printed hysteresis, open loop, um to V."""
+    return InverseFeedforward(_inverse())
+
+
+def feedforward_pid() -> FeedforwardFeedback:
+    """Return the inverse of the printed hysteresis beside ``p753.pid``, um to V."""
+    return FeedforwardFeedback(_inverse(), p753.pid())
+
+
+def repetitive(period: int = 2_000) -> RepetitiveControl:
+    """Return repetitive control around ``p753.pid``, um to V; gains ours.
+
+    ``period`` in samples at 20 kHz: 2000 is that of SIN10 and of whatever repeats
+    itself in 100 ms. Other references need their own.
+    """
+    lag = FirstOrderLag(REPETITIVE["advance"] * p753.DT, p753.DT)
+    return RepetitiveControl(p753.pid(), lag, **REPETITIVE, period=period)
+
+
+def learning() -> LearningLaw:
+    """Return a learning law for the reference of a ``p753.pid`` loop; gains ours."""
+    return LearningLaw(**LEARNING)
+
+
+def charge_drive() -> ChargeDrive:
+    """Return a charge amplifier on the stage's own hysteresis, V to V; times ours."""
+    load = Affine(p753.GAIN) >> _inverse()
+    return ChargeDrive(1.0, CHARGE_TIME, CHARGE_TIME, load, p753.DT)

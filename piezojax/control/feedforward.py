@@ -1,0 +1,81 @@
+"""Inverse feedforward, alone and beside a feedback controller (section 2.5.3)."""
+
+from typing import NamedTuple
+
+from .._types import Scalar, State, as_array
+from ..system import Observation, System, rest_output
+
+
+class FeedforwardState(NamedTuple):
+    """State of the inverse, and the voltage that it misses at the start's rest."""
+
+    inverse: State
+    bias: Scalar
+
+
+class InverseFeedforward(System):
+    """``u(k) = inverse(r(k+1))``: open loop, Figure 2.8.
+
+    ``inverse`` maps the wanted displacement in um to a voltage in V: an
+    ``InverseColemanHodgdon``, or inverse dynamics in series with one. u(k) moves the
+    stage to y(k+1), hence the next reference. The measurement is not looked at: what
+    the inverse gets wrong stays wrong. Started at rest where the inverse asks for
+    another voltage than was applied, the difference is kept as a constant bias.
+    """
+
+    inverse: System
+
+    def init(self, input: Observation) -> FeedforwardState:
+        reference = as_array(input.reference)
+        return FeedforwardState(
+            self.inverse.init(reference),
+            input.applied - rest_output(self.inverse, reference),
+        )
+
+    def step(
+        self, state: FeedforwardState, input: Observation
+    ) -> tuple[FeedforwardState, Scalar]:
+        inverse, voltage = self.inverse.step(
+            state.inverse, as_array(input.next_reference)
+        )
+        return FeedforwardState(inverse, state.bias), voltage + state.bias
+
+
+class FeedforwardFeedbackState(NamedTuple):
+    """States of both parts, and the last feedforward voltage."""
+
+    inverse: State
+    feedback: State
+    forward: Scalar
+
+
+class FeedforwardFeedback(System):
+    """``u(k) = inverse(r(k+1)) + feedback``, Figure 2.9.
+
+    ``inverse`` as in ``InverseFeedforward``; ``feedback`` any controller from an
+    Observation to V. It sees as applied what was applied beyond the feedforward
+    voltage, so that its start and its anti-windup stay right. The inverse runs along
+    the reference alone: unlike in ``InversionControl``, what the feedback adds does not
+    move it, so the gain of the stage's hysteresis stays in the feedback loop.
+    """
+
+    inverse: System
+    feedback: System
+
+    def init(self, input: Observation) -> FeedforwardFeedbackState:
+        reference = as_array(input.reference)
+        forward = rest_output(self.inverse, reference)
+        seen = input._replace(applied=input.applied - forward)
+        return FeedforwardFeedbackState(
+            self.inverse.init(reference), self.feedback.init(seen), forward
+        )
+
+    def step(
+        self, state: FeedforwardFeedbackState, input: Observation
+    ) -> tuple[FeedforwardFeedbackState, Scalar]:
+        inverse, forward = self.inverse.step(
+            state.inverse, as_array(input.next_reference)
+        )
+        seen = input._replace(applied=input.applied - state.forward)
+        feedback, voltage = self.feedback.step(state.feedback, seen)
+        return FeedforwardFeedbackState(inverse, feedback, forward), forward + voltage

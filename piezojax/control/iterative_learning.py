@@ -1,0 +1,143 @@
+"""Iterative learning control: one trial's error makes the next trial's feedforward."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._types import Scalar, as_array, as_scalars, check
+from ..rollout import simulate
+from ..system import Feedback, System, loop_inputs
+
+Signal = Float[Array, " samples"]
+
+
+class Trials(NamedTuple):
+    """What ``learn`` returns.
+
+    ``feedforward``, that of a next trial, and ``error``, r - y of the last one in um,
+    of the length of the reference; ``rms_error`` of each trial in um, in their order.
+    """
+
+    feedforward: Signal
+    error: Signal
+    rms_error: Float[Array, " trials"]
+
+
+class LearningLaw(eqx.Module):
+    """``u_next = Q (u + gain z^lead e)``, with e = r - y of the trial in um.
+
+    (2.14) in time: its learning function rho / G is a gain and the ``lead`` in samples
+    that takes off the lag of what u drives. ``gain`` in the unit of u per um: V/um for
+    the stage itself, without unit for a loop whose reference is corrected. Q is a
+    zero-phase FIR filter with unit gain at zero: ``smoothing`` holds the weights w_1,
+    w_2, ... of the neighbours one, two, ... samples away on either side, the middle has
+    what is missing to 1; none is Q = 1. Beyond the ends of a trial, both signals are
+    taken as their end values.
+
+    On a linear system with the matrix G from u to y, the trials contract to the fixed
+    point ``(I - Q (I - L G))^-1 Q L r`` if ``Q (I - L G)`` has norm below 1; for trials
+    that are long against the transients, if ``|Q (1 - gain z^lead G)| < 1`` at all
+    frequencies. The error that stays is zero only where Q = 1.
+
+    Raises ValueError for values that are not finite or a lead that is not whole.
+    """
+
+    gain: Scalar = eqx.field(converter=as_array)
+    smoothing: tuple[Scalar, ...] = eqx.field(converter=as_scalars, default=())
+    lead: int = eqx.field(static=True, default=0)
+
+    def __check_init__(self):
+        check("learning gain", self.gain)
+        check("smoothing", self.smoothing)
+        if not isinstance(self.lead, int):
+            raise ValueError(f"lead in samples is {self.lead!r}; it must be whole")
+        check("lead in samples", self.lead, least=0.0)
+
+    def next(self, feedforward: Signal, error: Signal) -> Signal:
+        """Return the next trial's feedforward. Both signals have one length."""
+        samples = error.shape[0]
+        ahead = jnp.minimum(jnp.arange(samples) + self.lead, samples - 1)
+        wanted = feedforward + self.gain * error[ahead]
+        taps = len(self.smoothing)
+        padded = jnp.pad(wanted, taps, mode="edge")
+        smooth = wanted
+        for away, weight in enumerate(self.smoothing, start=1):
+            before = padded[taps - away : taps - away + samples]
+            after = padded[taps + away : taps + away + samples]
+            smooth = smooth + weight * (before + after - 2.0 * wanted)
+        return smooth
+
+
+def learn(
+    law: LearningLaw,
+    system: System,
+    reference: Signal,
+    trials: int,
+    noise: Float[Array, "trials samples"] | None = None,
+    feedforward: Signal | None = None,
+) -> Trials:
+    """Repeat ``reference`` (um) on ``system``, learning from trial to trial.
+
+    Each trial starts from the same rest. ``system`` is a stage, V to um, whose input u
+    is learned (y(k) is the output of the step with u(k)), or a Feedback loop, whose
+    reference is corrected to r + u. ``noise`` in um is added to what a stage's trial
+    learns from; to a loop, whose sensor scales it, it gives unit-variance draws.
+    ``feedforward`` of the first trial is zero if left out, as (2.14) has it. Pure, and
+    differentiable in the law as in the system. The errors returned are those of the
+    true displacement.
+
+    Raises ValueError for fewer than one trial or signals of different lengths.
+    """
+    reference = as_array(reference)
+    start = jnp.zeros_like(reference) if feedforward is None else as_array(feedforward)
+    check("trials", trials, least=1.0)
+    if noise is None:
+        noise = jnp.zeros((trials, *reference.shape))
+    if start.shape != reference.shape or noise.shape != (trials, *reference.shape):
+        raise ValueError(
+            f"reference, feedforward and noise have the shapes {reference.shape}, "
+            f"{start.shape} and {noise.shape}; they must be (samples,), (samples,) and "
+            f"({trials}, samples)"
+        )
+    run = _loop_trial if isinstance(system, Feedback) else _stage_trial
+
+    def trial(feedforward, draws):
+        displacement, measured = run(system, reference, feedforward, draws)
+        error = reference - displacement
+        following = law.next(feedforward, reference - measured)
+        return following, (error, jnp.mean(error**2))
+
+    # The errors of all trials but the last are dropped, so only one is carried.
+    def step(carry, draws):
+        following, (error, square) = trial(carry[0], draws)
+        return (following, error), square
+
+    carry = (start, jnp.zeros_like(reference))
+    (following, error), squares = jax.lax.scan(step, carry, noise)
+    positive = squares > 0.0  # the slope of the root at 0 is infinite
+    roots = jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1.0)), 0.0)
+    return Trials(following, error, roots)
+
+
+Trial = Callable[[System, Signal, Signal, Signal], tuple[Signal, Signal]]
+
+
+def _stage_trial(
+    system: System, reference: Signal, feedforward: Signal, noise: Signal
+) -> tuple[Signal, Signal]:
+    del reference
+    outputs = simulate(system, feedforward, system.init(feedforward[0]))[1]
+    return outputs, outputs + noise
+
+
+def _loop_trial(
+    system: System, reference: Signal, feedforward: Signal, noise: Signal
+) -> tuple[Signal, Signal]:
+    # At rest at r itself: a correction of the first sample is a step of the loop.
+    inputs = loop_inputs(reference + feedforward, noise)
+    samples = simulate(system, inputs, system.init(reference[0]))[1]
+    return samples.displacement, samples.measured

@@ -1,0 +1,96 @@
+"""Repetitive control: the error of one period corrects the reference of the next."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._types import Scalar, State, as_array, check
+from ..system import Observation, System
+
+
+class RepetitiveState(NamedTuple):
+    """States of controller and Q-filter, w(k) in um, and the delay line.
+
+    ``line`` is one array of ``period - advance`` samples, um, ``index`` the place of
+    sample k in it: a step writes two samples and reads one, whatever the period.
+    """
+
+    feedback: State
+    filter: State
+    correction: Scalar
+    line: Float[Array, " period"]
+    index: Int[Array, ""]
+
+
+class RepetitiveControl(System):
+    """``feedback`` with its reference corrected by what the last periods left over.
+
+    Plugged in as in section 2.6.3, Figure 2.17: ``feedback``, any controller, sees
+    r + w in place of r, with
+
+    ``w = Q z^-period (w + gain z^lead e)``, e = r - z in um.
+
+    ``gain`` without unit; ``period`` in samples, that of the reference; ``lead`` in
+    samples, about the lag of the inner loop; ``filter`` Q, any low pass from um to um
+    with unit gain at zero, 0 at rest; ``advance`` in samples, Q's own delay, taken off
+    the line. A ``FirstOrderLag`` of tau has about tau / dt; ``ARMA`` coefficients that
+    are symmetric about the middle make Q exactly zero-phase.
+
+    With T the inner loop from r to z and Q with its delay taken off, the error of a
+    linear loop dies out from period to period if ``|Q (1 - gain z^lead T)| < 1`` at all
+    frequencies. Limits are not known to it: a reference out of reach winds it up.
+
+    Input an Observation, output that of ``feedback``. At rest without error it does
+    nothing. Raises ValueError for a negative gain, counts that are not whole and
+    ``lead + advance >= period``.
+    """
+
+    feedback: System
+    filter: System
+    gain: Scalar = eqx.field(converter=as_array)
+    period: int = eqx.field(static=True)
+    lead: int = eqx.field(static=True, default=0)
+    advance: int = eqx.field(static=True, default=0)
+
+    def __check_init__(self):
+        check("learning gain", self.gain, least=0.0)
+        for name in ("period", "lead", "advance"):
+            value, least = getattr(self, name), 2.0 if name == "period" else 0.0
+            if not isinstance(value, int):
+                raise ValueError(f"{name} in samples is {value!r}; it must be whole")
+            check(f"{name} in samples", value, least=least)
+        if self.lead + self.advance >= self.period:
+            raise ValueError(
+                f"lead is {self.lead} and advance {self.advance} samples; "
+                f"their sum must be below the period, {self.period}"
+            )
+
+    def init(self, input: Observation) -> RepetitiveState:
+        zero = jnp.zeros_like(as_array(input.reference))
+        return RepetitiveState(
+            feedback=self.feedback.init(input),
+            filter=self.filter.init(zero),
+            correction=zero,
+            line=jnp.zeros(self.period - self.advance),
+            index=jnp.zeros((), jnp.int32),
+        )
+
+    def step(
+        self, state: RepetitiveState, input: Observation
+    ) -> tuple[RepetitiveState, Scalar]:
+        length = self.period - self.advance
+        error = input.reference - input.measured
+        # e(k) belongs to w(k - lead), which has been in the line since then.
+        line = state.line.at[state.index].set(state.correction)
+        learned = jnp.mod(state.index - self.lead, length)
+        line = line.at[learned].add(self.gain * error)
+        index = jnp.mod(state.index + 1, length)
+        filter_state, correction = self.filter.step(state.filter, line[index])
+        seen = input._replace(
+            reference=input.reference + state.correction,
+            next_reference=input.next_reference + correction,
+        )
+        feedback, command = self.feedback.step(state.feedback, seen)
+        return RepetitiveState(feedback, filter_state, correction, line, index), command
