@@ -17,6 +17,7 @@ from .control import InversionControl as InversionControl
 from .control import KalmanFilter as KalmanFilter
 from .control import ModelReferencePID as ModelReferencePID
 from .control import SlidingModePID as SlidingModePID
+from .control import StateSpaceController as StateSpaceController
 from .dynamics import ARMA as ARMA
 from .dynamics import AmplitudeScheduled as AmplitudeScheduled
 from .dynamics import ExponentialCreep as ExponentialCreep

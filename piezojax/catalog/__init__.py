@@ -13,6 +13,7 @@ CONTROLLERS = {
     "p753_disturbance_observer": p753.disturbance_observer,
     "p753_kalman_sliding_mode": p753.kalman_sliding_mode,
     "p753_kalman_disturbance_observer": p753.kalman_disturbance_observer,
+    "p753_mixed_sensitivity": p753.mixed_sensitivity_inversion,
     "p753_model_reference": p753_chapter4.model_reference,
     "p753_traditional": p753_chapter4.traditional,
     "p753_bang_bang": p753_chapter4.bang_bang,

@@ -8,6 +8,9 @@ from .disturbance_observer import (
 )
 from .inversion import InversionControl as InversionControl
 from .kalman import KalmanFilter as KalmanFilter
+from .linear import StateSpaceController as StateSpaceController
+from .mixed_sensitivity import first_order_weight as first_order_weight
+from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
 from .model_reference import ModelReferencePID as ModelReferencePID
 from .observer import Motion as Motion
 from .observer import Observer as Observer
