@@ -23,6 +23,7 @@ from .control import LearningLaw as LearningLaw
 from .control import ModelReferencePID as ModelReferencePID
 from .control import RepetitiveControl as RepetitiveControl
 from .control import SlidingModePID as SlidingModePID
+from .control import StateSpaceController as StateSpaceController
 from .control import SuperTwisting as SuperTwisting
 from .control import SwitchedSlidingMode as SwitchedSlidingMode
 from .control import learn as learn

@@ -23,6 +23,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_disturbance_observer": p753_by_rate.disturbance_observer,
     "p753_kalman_sliding_mode": p753.kalman_sliding_mode,
     "p753_kalman_disturbance_observer": p753.kalman_disturbance_observer,
+    "p753_mixed_sensitivity": p753.mixed_sensitivity_inversion,
     "p753_model_reference": p753_chapter4.model_reference,
     "p753_traditional": p753_by_rate.traditional,
     "p753_bang_bang": p753_by_rate.bang_bang,

@@ -15,6 +15,8 @@ from ..control import (
     KalmanFilter,
     Observer,
     SlidingModePID,
+    first_order_weight,
+    mixed_sensitivity,
 )
 from ..control.kalman import model_kalman
 from ..dynamics import ARMA, scaled_to_dc
@@ -144,6 +146,10 @@ CUTOFF = 500.0
 PROCESS_RMS, DRIFT_RMS = 1e-3, 1e-4
 """Of a Kalman filter, um a sample: ours, to start tuning from."""
 
+SENSITIVITY_WEIGHT = {"low": 1e3, "crossover": 3000.0, "high": 0.5}
+EFFORT_WEIGHT = 0.1
+"""Weights of the H-infinity design, the crossover in rad/s: ours."""
+
 
 def hysteresis(scheme: str = "trapezoid") -> ColemanHodgdon:
     """Return the chapter 5 hysteresis, V to um."""
@@ -236,6 +242,18 @@ def kalman_disturbance_observer(table: str = "5-2") -> DisturbanceObserverContro
         cutoff=CUTOFF,
         dt=DT,
     )
+
+
+def mixed_sensitivity_inversion() -> InversionControl:
+    """Return an H-infinity controller of (5.33) behind the inverse hysteresis: ours."""
+    error, effort = SENSITIVITY_WEIGHT, EFFORT_WEIGHT
+    design = mixed_sensitivity(
+        scaled_to_dc(ARMA(**DYNAMICS_BEHIND_HYSTERESIS), 1.0),
+        first_order_weight(**error, dt=DT),
+        effort,
+        dt=DT,
+    )
+    return InversionControl(design.controller, InverseColemanHodgdon(hysteresis()))
 
 
 def actuator() -> Saturation:

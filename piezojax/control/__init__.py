@@ -14,6 +14,9 @@ from .iterative_learning import LearningLaw as LearningLaw
 from .iterative_learning import Trials as Trials
 from .iterative_learning import learn as learn
 from .kalman import KalmanFilter as KalmanFilter
+from .linear import StateSpaceController as StateSpaceController
+from .mixed_sensitivity import first_order_weight as first_order_weight
+from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
 from .model_reference import ModelReferencePID as ModelReferencePID
 from .observer import Motion as Motion
 from .observer import Observer as Observer
