@@ -36,8 +36,10 @@ def main(study: Path | None, out: Path | None, seed: int | None, quiet: bool) ->
                 if case.fit is not None:
                     write_fit(case.fit, folder)
                 bar.stage("working out margins")
+                # At the top of the references the branches differ most.
+                table = case.study.references
                 stability = compared(
-                    case.study.references.offset,
+                    table.offset + table.amplitude,
                     case.study.dt,
                     before=outcome.before,
                     after=outcome.after,
