@@ -196,9 +196,25 @@ def test_tune_writes_its_results(tuned):
     assert set(names(out)) >= {
         *("result.json", "gains.toml"),
         *("tracking.png", "hysteresis.png", "convergence.png"),
+        *("stability.json", "stability.png"),
     }
     assert not [name for name in names(out) if name.startswith(".")]
     assert_pictures(out, "tracking.png", "hysteresis.png", "convergence.png")
+    assert_pictures(out, "stability.png")
+
+
+def test_tune_reports_margins_before_and_after(tuned):
+    printed, out = tuned
+    found = json.loads((out / "stability.json").read_text(encoding="utf-8"))
+    assert set(found) == {"before", "after"}
+    lag, drive = pj.FirstOrderLag(1e-3, 5e-5), pj.Saturation(-20.0, 120.0)
+    loop = pj.Feedback(pj.load(out / "gains.toml"), lag, drive, pj.Sensor(0.0))
+    for branch in ("ascending", "descending"):
+        report = found["after"][branch]
+        assert report["stable"]
+        expected = pj.stability_report(loop, report["reference_um"], branch)
+        assert report["sensitivity_peak"] == pytest.approx(expected.sensitivity_peak)
+    assert "delay margin" in printed.stdout
 
 
 def test_tune_result_and_gains_load(tuned):

@@ -108,7 +108,7 @@ def stability_figure(comparison: Comparison, title: str = "") -> Figure:
             # Drawn in the turn in which it starts between -360 and 0.
             degrees -= 360.0 * np.ceil(degrees[0] / 360.0 - 1e-6)
             phase.semilogx(hertz, degrees, **style)
-            nyquist.plot(response.real, response.imag, label=label, **style)
+            nyquist.plot(np.real(response), np.imag(response), label=label, **style)
             _sensitivities(sensitivity, hertz, response, report, label, style)
     gain.axhline(1.0, color=REFERENCE, lw=0.8)
     gain.set(ylabel="|L| (-)", title="Loop transfer function, cut at the plant's input")
@@ -125,9 +125,9 @@ def stability_figure(comparison: Comparison, title: str = "") -> Figure:
         title="Sensitivity |S|, and thin |T|",
     )
     low, high = sensitivity.get_ylim()
-    sensitivity.set_ylim(max(low, 1e-3), high)
+    sensitivity.set_ylim(max(low, 1e-3), 30.0 * high)  # room for the legend
     if sensitivity.get_legend_handles_labels()[1]:
-        sensitivity.legend(fontsize=7.5, loc="lower center")
+        sensitivity.legend(fontsize=7.5, loc="upper left")
     if title:
         picture.suptitle(title)
     return picture

@@ -60,7 +60,7 @@ def without_conserved(
         return LinearLoop(A, B, C, dt)
     kept_sum = left[:, len(A) - count :] / length[:, None]  # w' x is conserved
     # Solve w' x = 0 for the states with the largest share in it.
-    order = linalg.qr(kept_sum.T, pivoting=True, mode="r")[1]
+    order = linalg.qr(kept_sum.T, mode="economic", pivoting=True)[-1]
     out, stay = np.sort(order[:count]), np.sort(order[count:])
     back = -np.linalg.solve(kept_sum[out].T, kept_sum[stay].T)
     return LinearLoop(
@@ -78,5 +78,6 @@ def balanced(
     """Return the same system with its states in units that suit each other."""
     if len(A) == 0:
         return A, B, C
-    A, (scale, _) = linalg.matrix_balance(A, permute=False, separate=True)
-    return A, B / scale, C * scale
+    balanced_A, change = linalg.matrix_balance(A, permute=False)
+    scale = np.diagonal(change)
+    return balanced_A, B / scale, C * scale

@@ -1,6 +1,7 @@
 """Where the frequency response of a loop crosses, and where it peaks."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -32,7 +33,7 @@ def angle_grid(loop: LinearLoop) -> np.ndarray:
     speeds = np.abs(logs)[np.abs(logs) > 1e-9]
     slowest = min(1e-2, speeds.min(initial=1.0)) * 1e-3
     count = int(PER_DECADE * np.log10(np.pi / slowest))
-    around = np.abs(logs.imag)[:, None] + np.abs(logs.real)[:, None] * _AROUND
+    around = np.abs(np.imag(logs))[:, None] + np.abs(np.real(logs))[:, None] * _AROUND
     near = np.unique(around[(around > slowest) & (around < np.pi)])
     return np.unique(
         np.concatenate([np.geomspace(slowest, np.pi, count), near, [np.pi]])
@@ -48,7 +49,7 @@ def roots(function: Function, grid: np.ndarray, values: np.ndarray) -> np.ndarra
             grid[i],
             grid[i + 1],
             xtol=1e-15,
-            rtol=1e-14,
+            rtol=np.float64(1e-14),
         )
         for i in places
     ]
@@ -65,7 +66,7 @@ def peak(
     found = [(float(values[best]), float(grid[best]))]
     for i in highest:
         low, high = grid[i - 1], grid[i + 1]
-        refined = optimize.minimize_scalar(
+        refined: Any = optimize.minimize_scalar(
             lambda x: -float(function(np.array([x]))[0]),
             bounds=(low, high),
             method="bounded",

@@ -157,18 +157,19 @@ def report_of(loop: LinearLoop) -> StabilityReport:
     poles = np.linalg.eigvals(loop.closed())
     poles = poles[np.argsort(-np.abs(poles), kind="stable")]
     largest = float(np.abs(poles).max(initial=0.0))
-    known: dict[str, Any] = {
-        "stable": largest < 1.0,
-        "dt_s": loop.dt,
-        "poles": tuple(complex(pole) for pole in poles),
-        "conserved": loop.conserved,
-    }
-    figures: dict[str, float | None] = dict.fromkeys(_FIGURES)
-    if known["stable"]:
+    stable = largest < 1.0
+    figures: dict[str, Any] = dict.fromkeys(_FIGURES)
+    if stable:
         speed = -math.log(largest) if largest > 0.0 else math.inf
         figures["slowest_time_constant_s"] = loop.dt / speed
         figures |= _figures(loop)
-    return StabilityReport(**known, **figures)
+    return StabilityReport(
+        stable=stable,
+        dt_s=loop.dt,
+        poles=tuple(complex(pole) for pole in poles),
+        conserved=loop.conserved,
+        **figures,
+    )
 
 
 _FIGURES = [
@@ -208,13 +209,15 @@ def _figures(loop: LinearLoop) -> dict[str, float | None]:
 def _gain_margins(
     loop: LinearLoop, grid: np.ndarray, response: np.ndarray
 ) -> dict[str, float | None]:
-    places = roots(lambda x: loop.response(x).imag, grid[:-1], response.imag[:-1])
+    places = roots(
+        lambda x: np.imag(loop.response(x)), grid[:-1], np.imag(response)[:-1]
+    )
     # At the Nyquist frequency, and at rest, L is real: a pole can leave there too.
     places = np.append(places, np.pi)
-    crossing = loop.response(places).real
+    crossing = np.real(loop.response(places))
     if not loop.integrates():
         places = np.append(places, 0.0)
-        crossing = np.append(crossing, loop.response(np.zeros(1)).real)
+        crossing = np.append(crossing, np.real(loop.response(np.zeros(1))))
     places, crossing = places[crossing < 0.0], crossing[crossing < 0.0]
     factors = -1.0 / crossing
     up, down = factors > 1.0, factors < 1.0

@@ -55,8 +55,10 @@ def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> N
             if case.fit is not None:
                 write_fit(case.fit, folder)
             bar.stage("working out margins")
+            # At the top of the references the branches differ most.
+            table = case.study.references
             stability = compared(
-                case.study.references.offset,
+                table.offset + table.amplitude,
                 case.study.dt,
                 before=outcome.before,
                 after=outcome.after,
