@@ -16,7 +16,6 @@ PLANTS: dict[str, Callable[..., System]] = {
 
 CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_pid": p753.pid,
-    "p753_ziegler_nichols": p753_by_rate.ziegler_nichols,
     "p753_sliding_mode": p753.sliding_mode,
     "p753_inversion": p753_by_rate.inversion,
     "p753_disturbance_observer": p753_by_rate.disturbance_observer,
@@ -24,6 +23,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_traditional": p753_by_rate.traditional,
     "p753_bang_bang": p753_by_rate.bang_bang,
     "p753_continuous": p753_by_rate.continuous,
+    "p753_ziegler_nichols": p753_by_rate.ziegler_nichols,
 }
 """Controllers a study can name, with their printed gains; those that take a ``rate``
 (Hz) come at the study's."""

@@ -84,16 +84,8 @@ def comparison_figure(comparison: Comparison) -> Figure:
     for i, (controller, ax) in enumerate(zip(controllers, places, strict=False)):
         _before_and_tuned(ax, _of(comparison, controller), lowest)
         better = comparison.better[controller]
-        ax.set_title(f"({chr(97 + i)}) {controller}", fontsize=8.0)
-        if better:
-            ax.text(
-                *(0.97, 0.95),
-                f"{better:.3g}x better",
-                transform=ax.transAxes,
-                ha="right",
-                va="top",
-                fontsize=8.0,
-            )
+        shown = f"{better:.3g}x better" if better else "no factor"
+        ax.set_title(f"({chr(97 + i)}) {controller}\n{shown}", fontsize=8.0)
     every = places[len(controllers)]
     for i, controller in enumerate(controllers):
         rows = [row for row in _of(comparison, controller) if row.after_um]
