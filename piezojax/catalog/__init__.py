@@ -17,7 +17,6 @@ PLANTS: dict[str, Callable[..., System]] = {
 
 CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_pid": p753.pid,
-    "p753_ziegler_nichols": p753_by_rate.ziegler_nichols,
     "p753_sliding_mode": p753.sliding_mode,
     "p753_inversion": p753_by_rate.inversion,
     "p753_disturbance_observer": p753_by_rate.disturbance_observer,
@@ -33,6 +32,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_feedforward": p753_survey.inverse_feedforward,
     "p753_feedforward_pid": p753_survey.feedforward_pid,
     "p753_repetitive": p753_survey.repetitive,
+    "p753_ziegler_nichols": p753_by_rate.ziegler_nichols,
 }
 """Controllers a study can name, with printed gains except where they say "ours";
 those that take a ``rate`` (Hz) come at the study's."""

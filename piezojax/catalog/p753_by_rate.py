@@ -11,6 +11,7 @@ All functions raise ValueError, listing the known rates, for a rate without a mo
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -67,6 +68,7 @@ def _resampled(stage: Series, rate: int) -> Series:
     if rest:
         raise ValueError(f"rate in Hz is {rate:g}; it must divide {p753.RATE:g}")
     hysteresis, dynamics = stage.parts
+    assert isinstance(dynamics, ARMA)
     # At a constant voltage the hysteresis rests: only its dynamics go on.
     return series(hysteresis=hysteresis, dynamics=held(dynamics, samples))
 
@@ -189,7 +191,7 @@ def _filter(near: int, rate: int) -> AlphaBeta:
     return AlphaBeta(printed.alpha, printed.beta, 1.0 / rate)
 
 
-def _scaled(gains: Mapping[str, float], ratio: float) -> dict[str, float]:
+def _scaled(gains: Mapping[str, float], ratio: float) -> dict[str, Any]:
     return {
         name: value * ratio ** SCALING.get(name, 0) for name, value in gains.items()
     }

@@ -38,7 +38,7 @@ def comparison_table(comparison: Comparison) -> Table:
         )
     )
     table.add_column("controller")
-    for title in ("kHz", "before", "tuned", "better", "new", "tuned", "better"):
+    for title in ("kHz", "before", "tuned", "better", "new: before", "tuned", "better"):
         table.add_column(title, justify="right")
     for controller in dict.fromkeys(row.controller for row in comparison.rows):
         for row in _of(comparison, controller):
@@ -84,8 +84,8 @@ def comparison_figure(comparison: Comparison) -> Figure:
     for i, (controller, ax) in enumerate(zip(controllers, places, strict=False)):
         _before_and_tuned(ax, _of(comparison, controller), lowest)
         better = comparison.better[controller]
-        shown = f": {better:.3g}x" if better else ""
-        ax.set_title(f"({chr(97 + i)}) {controller}{shown}")
+        shown = f"{better:.3g}x better" if better else "no factor"
+        ax.set_title(f"({chr(97 + i)}) {controller}\n{shown}", fontsize=8.0)
     every = places[len(controllers)]
     for i, controller in enumerate(controllers):
         rows = [row for row in _of(comparison, controller) if row.after_um]
@@ -96,7 +96,7 @@ def comparison_figure(comparison: Comparison) -> Figure:
             ms=3.5,
             label=controller,
         )
-    every.set_title(f"({chr(97 + len(controllers))}) all, tuned")
+    every.set_title(f"({chr(97 + len(controllers))}) all, tuned", fontsize=8.0)
     for ax in places[len(controllers) + 1 :]:
         ax.set_visible(False)
     rates = sorted({row.rate_Hz for row in comparison.rows})
@@ -111,7 +111,11 @@ def comparison_figure(comparison: Comparison) -> Figure:
         ax.set_ylabel("rms error (nm)")
     handles = _legend_of(axes)
     picture.legend(
-        handles.values(), handles.keys(), loc="outside lower center", ncols=6
+        handles.values(),
+        handles.keys(),
+        loc="outside lower center",
+        ncols=columns,
+        fontsize=7.5,
     )
     return picture
 

@@ -1,8 +1,8 @@
 """Several studies in one go: what is compared, what is written, what is refused."""
 
 import json
-import math
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -47,10 +47,10 @@ FILE = {
         },
         "continuous": {
             "catalog": "p753_continuous",
-            "printed": [5000.0, 10_000.0],
-            "rates": [10_000.0],
+            "printed": [5000.0],
+            "rates": [5000.0],
             "tune": ["integral", "surface"],
-            "bounds": {"surface": {"lower": 0.1, "upper": 2.0, "per_sample": True}},
+            "bounds": {"surface": {"lower": 0.1, "upper": 5.0, "per_sample": True}},
         },
     },
 }
@@ -58,6 +58,14 @@ KEYS = {
     *("title", "status", "rows", "better", "unseen_better", "best"),
     *("versions", "seed", "wall_s"),
 }
+
+
+def entries(file):
+    return entries_of(file, "both.toml")
+
+
+def hopeless(case, progress):
+    raise ValueError("the loop diverges everywhere")
 
 
 def file_with(**tables):
@@ -72,7 +80,7 @@ def with_controller(**changes):
 def compared(tmp_path_factory, kept_programs):
     folder = tmp_path_factory.mktemp("compared")
     path = folder / "both.toml"
-    path.write_text(tomli_w.dumps(FILE), encoding="utf-8")
+    path.write_text(tomli_w.dumps(FILE | {"rates": [5000.0]}), encoding="utf-8")
     done = CliRunner().invoke(main, [str(path), "--out", str(folder / "out")])
     assert done.exit_code == 0, done.output
     assert done.stderr == ""
@@ -87,8 +95,7 @@ def test_a_row_for_each_controller_and_rate(compared):
     found = [(row["controller"], row["rate_Hz"], row["start"]) for row in data["rows"]]
     assert found == [
         ("PID", 5000.0, "rule"),
-        ("PID", 10_000.0, "rule"),
-        ("continuous", 10_000.0, "printed"),
+        ("continuous", 5000.0, "printed"),
     ]
 
 
@@ -107,12 +114,44 @@ def test_rows_are_the_studies_results(compared):
         assert (out / row["study"] / "gains.toml").exists()
 
 
-def test_means_and_winners_follow_from_the_rows(compared):
-    _, _, data = compared
-    pid = [r["before_um"] / r["after_um"] for r in data["rows"][:2]]
-    assert data["better"]["PID"] == pytest.approx(math.sqrt(pid[0] * pid[1]), rel=1e-12)
-    at_10 = sorted(data["rows"][1:], key=lambda row: row["after_um"])
-    assert data["best"] == {"5000": "PID", "10000": at_10[0]["controller"]}
+def with_errors(result, before, after):
+    def scores(error):
+        return result.holdout.model_copy(update={"geomean_rms_um": error})
+
+    return result.model_copy(
+        update={"holdout_before": scores(before), "holdout": scores(after)}
+    )
+
+
+def tuned_to(monkeypatch, result, errors):
+    """Let tuning find the given errors (um), before and after, one after another."""
+    results = iter([with_errors(result, *pair) for pair in errors])
+    monkeypatch.setattr(
+        comparing,
+        "tune",
+        lambda case, progress: SimpleNamespace(result=next(results), case=case),
+    )
+
+
+def test_means_and_winners_follow_from_the_rows(compared, monkeypatch):
+    _, out, data = compared
+    result = load_result(out / data["rows"][0]["study"])
+    # PID at 5 and 10 kHz, then the continuous one at 5 kHz.
+    tuned_to(monkeypatch, result, [(0.8, 0.1), (0.6, 0.3), (0.5, 0.05)])
+    comparison = compare("made up", entries(file_with()))
+    assert comparison.better["PID"] == pytest.approx(4.0, rel=1e-12)
+    assert comparison.better["continuous"] == pytest.approx(10.0, rel=1e-12)
+    assert comparison.best == {"5000": "continuous", "10000": "PID"}
+
+
+def test_a_start_that_diverges_has_no_ratio(compared, monkeypatch):
+    _, out, data = compared
+    result = load_result(out / data["rows"][0]["study"])
+    tuned_to(monkeypatch, result, [(None, 0.1), (0.6, 0.3), (0.5, None)])
+    comparison = compare("made up", entries(file_with()))
+    assert [row.ratio for row in comparison.rows] == [None, 2.0, None]
+    assert comparison.better == {"PID": None, "continuous": None}
+    assert comparison.best["5000"] == "PID"
 
 
 def test_its_studies_can_be_tuned_alone(compared):
@@ -127,30 +166,28 @@ def test_its_studies_can_be_tuned_alone(compared):
 
 def test_the_command_ends_with_the_table(compared):
     printed, out, _ = compared
-    assert "2 of 3: PID at 10 kHz" in printed
+    assert "2 of 2: continuous at 5 kHz" in printed
     assert "rms tracking error, nm" in printed
     assert "geometric mean" in printed
-    assert "complete: 3 of 3 studies" in printed
+    assert "complete: 2 of 2 studies" in printed
     assert (out / "comparison.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_several_studies_are_compared(compared, tmp_path):
+def test_several_studies_are_compared(compared, tmp_path, monkeypatch):
     _, out, data = compared
     paths = []
-    for name in ("first", "second"):
-        text = (out / data["rows"][1]["study"] / "study.toml").read_text()
-        paths.append(tmp_path / f"{name}.toml")
-        paths[-1].write_text(text.replace("PID at", f"{name} at"), encoding="utf-8")
+    for row in data["rows"]:
+        paths.append(tmp_path / f"{row['controller']}.toml")
+        paths[-1].write_text((out / row["study"] / "study.toml").read_text())
+    monkeypatch.setattr(comparing, "tune", hopeless)
     done = CliRunner().invoke(main, [*map(str, paths), "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     comparison = Comparison.model_validate_json(
         (tmp_path / "out" / "comparison.json").read_text(encoding="utf-8")
     )
-    assert [row.study for row in comparison.rows] == ["first", "second"]
-    assert {row.start for row in comparison.rows} == {"own"}
-    # The same study as in the comparison, so the same figures.
-    for row in comparison.rows:
-        assert row.after_um == pytest.approx(data["rows"][1]["after_um"], rel=1e-9)
+    assert [row.study for row in comparison.rows] == ["PID", "continuous"]
+    assert [row.start for row in comparison.rows] == ["own", "own"]
+    assert "note: PID: the loop diverges everywhere" in done.stdout
 
 
 def test_two_studies_of_one_name_are_refused(compared, tmp_path):
@@ -160,17 +197,13 @@ def test_two_studies_of_one_name_are_refused(compared, tmp_path):
         read_entries([path, path])
 
 
-def entries(file):
-    return entries_of(file, "both.toml")
-
-
 def test_bounds_by_factor_and_by_sample():
     pid, _, continuous = entries(file_with())
     start = float(get(pid.case.loop, "controller.integral"))
     bounds = pid.case.study.parameters["controller.integral"]
     np.testing.assert_allclose([bounds.lower, bounds.upper], [start / 30, start * 30])
     bounds = continuous.case.study.parameters["controller.surface"]
-    assert (bounds.lower, bounds.upper) == (1000.0, 20_000.0)
+    assert (bounds.lower, bounds.upper) == (500.0, 25_000.0)
 
 
 def test_a_bound_gives_way_to_the_start():
@@ -202,7 +235,7 @@ def test_bad_controllers(changes, message):
         ({"bounds": {"integral": {"lower": 1.0}}}, "lower and upper, or a factor"),
         ({"controllers": {"pid": {"label": "PID"}}}, "controllers.pid.catalog is miss"),
         (
-            {"controllers": {"pid": {"catalogue": "x"}}},
+            {"controllers": {"pid": {**FILE["controllers"]["pid"], "catalogue": "x"}}},
             "controllers.pid.catalogue is unknown; allowed are catalog, tune, label",
         ),
     ],
@@ -218,9 +251,6 @@ def test_bad_files_in_one_line(changes, message, tmp_path):
 
 
 def test_a_study_that_cannot_be_tuned_is_a_row(monkeypatch):
-    def hopeless(case, progress):
-        raise ValueError("the loop diverges everywhere")
-
     monkeypatch.setattr(comparing, "tune", hopeless)
     comparison = compare("none", entries(file_with()))
     assert {row.status for row in comparison.rows} == {"failed"}
