@@ -1,4 +1,4 @@
-"""``python -m piezojax.reproduce [--table T ...] --out DIR``."""
+"""``python -m piezojax.reproduce [--table T ... | --calibrate] --out DIR``."""
 
 import json
 
@@ -6,9 +6,13 @@ import click
 
 from ..command import Command, common, results_folder, run
 from ..files import write_text
-from ..report.console import reproduction_table
+from ..report.calibration import calibration_table, write_calibration
+from ..report.console import Bar, reproduction_table
 from ..report.reproduction import write_picture
 from . import TABLES, reproduce
+from .calibration import EXPERIMENTS
+from .calibration import calibrate as calibrated
+from .judged import as_plain
 from .summary import as_csv, summarise
 
 
@@ -20,8 +24,14 @@ from .summary import as_csv, summarise
     metavar="T",
     help=f"Table to redo, repeatable (default: all): {', '.join(TABLES)}.",
 )
+@click.option(
+    "--calibrate",
+    is_flag=True,
+    help="Fit the stage to half of the cells and predict the others, then swap "
+    "(minutes).",
+)
 @common
-def main(tables, out, seed, quiet):
+def main(tables, calibrate, out, seed, quiet):
     """Redo result tables of the thesis in simulation, with the printed gains."""
     del seed  # these runs are free of noise
 
@@ -53,7 +63,20 @@ def main(tables, out, seed, quiet):
             )
         console.print(f"results in {folder}", soft_wrap=True)
 
-    run(quiet, body)
+    def calibration(console):
+        if tables:
+            raise ValueError("--calibrate has tables of its own; leave --table out")
+        with results_folder(out, "calibrate") as folder:
+            with Bar(console) as bar:
+                found = {n: calibrated(n, progress=bar) for n in EXPERIMENTS}
+            plain = {n: as_plain(n, swaps) for n, swaps in found.items()}
+            write_text(folder / "calibration.json", json.dumps(plain, indent=2) + "\n")
+            write_calibration(found, folder)
+        for name, swaps in found.items():
+            console.print(calibration_table(name, swaps))
+        console.print(f"results in {folder}", soft_wrap=True)
+
+    run(quiet, calibration if calibrate else body)
 
 
 if __name__ == "__main__":

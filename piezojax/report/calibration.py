@@ -1,0 +1,78 @@
+"""Picture and table of a stage fitted to half of the cells."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from ..reproduce.calibration import EXPERIMENTS, Swap
+from ..reproduce.judged import BAR, ratio_of
+from .figures import AFTER, BEFORE, REFERENCE, figure, styled, write
+
+
+def write_calibration(found: Mapping[str, Sequence[Swap]], folder: Path) -> None:
+    """Write calibration.png into ``folder``."""
+    with styled():
+        write(calibration_figure(found), folder / "calibration.png")
+
+
+def calibration_figure(found: Mapping[str, Sequence[Swap]]) -> Figure:
+    """Simulation against print: a row an experiment, a panel a fitted half."""
+    picture = figure(8.4, 4.2 * len(found))
+    panels = picture.subplots(len(found), 2, squeeze=False)
+    for row, (name, swaps) in zip(panels, found.items(), strict=True):
+        for ax, swap in zip(row, swaps, strict=True):
+            both = [*swap.train, *swap.held_out]
+            low = 0.8 * min(min(c.paper, c.sim) for c in both)
+            high = 1.25 * max(max(c.paper, c.sim) for c in both)
+            ax.plot([low, high], [low, high], color=REFERENCE, lw=0.8)
+            for label, cells, marker, colour in (
+                ("fitted", swap.train, "o", BEFORE),
+                ("held out", swap.held_out, "s", AFTER),
+            ):
+                ax.loglog(
+                    [c.paper for c in cells],
+                    [c.sim for c in cells],
+                    marker,
+                    ms=4,
+                    color=colour,
+                    label=f"{label}: {ratio_of(cells):.3f}",
+                )
+            ax.set(
+                title=f"{name}\nfitted to the {swap.half} cells",
+                xlabel="printed (µm)",
+                ylabel="simulated (µm)",
+            )
+            ax.legend(loc="upper left")
+    return picture
+
+
+def calibration_table(name: str, swaps: Sequence[Swap]) -> Table:
+    """Return ratios and fitted values, a column a half."""
+    table = Table(title=f"{name}: fitted to one half of the cells, judged on the other")
+    table.add_column("")
+    for swap in swaps:
+        table.add_column(f"fitted: {swap.half}", justify="right")
+    train = (f"{ratio_of(swap.train):.3f}" for swap in swaps)
+    table.add_row("geometric-mean ratio, fitted", *train)
+    held_out = [ratio_of(swap.held_out) for swap in swaps]
+    table.add_row(
+        "geometric-mean ratio, held out", *(f"{x:.3f}" for x in held_out), style="bold"
+    )
+    judged = ("met" if x <= BAR else "missed" for x in held_out)
+    table.add_row(f"bar of {BAR:g}", *judged)
+    table.add_section()
+    places = sorted({(c.table, c.column) for swap in swaps for c in swap.held_out})
+    for place in places:
+        inside = (
+            [c for c in swap.held_out if (c.table, c.column) == place] for swap in swaps
+        )
+        table.add_row(
+            f"held out, {' '.join(place)}", *(f"{ratio_of(c):.3f}" for c in inside)
+        )
+    table.add_section()
+    for quantity, about in EXPERIMENTS[name].quantities().items():
+        values = (f"{swap.values[quantity]:.4g}" for swap in swaps)
+        table.add_row(f"{quantity} ({about.unit})", *values)
+    return table

@@ -1,0 +1,50 @@
+"""A calibration as plain numbers: ratios of fitted and held-out cells, and values."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .calibration import EXPERIMENTS, Swap, geomean
+from .cell import Cell
+
+BAR = 1.25
+"""Most that the held-out geometric-mean ratio may be."""
+
+
+def ratio_of(cells: Sequence[Cell]) -> float:
+    """Return the geometric-mean ratio exp(mean |ln(sim/print)|) of ``cells``."""
+    return geomean(np.log([cell.ratio for cell in cells]))
+
+
+def _ratios(cells: Sequence[Cell]) -> dict[str, Any]:
+    places = sorted({(cell.table, cell.column) for cell in cells})
+    return {
+        "geomean_ratio": ratio_of(cells),
+        "cells": len(cells),
+        "columns": {
+            f"{table} {column}": ratio_of(
+                [c for c in cells if (c.table, c.column) == (table, column)]
+            )
+            for table, column in places
+        },
+    }
+
+
+def as_plain(name: str, swaps: Sequence[Swap]) -> dict[str, Any]:
+    """Return both fits of ``EXPERIMENTS[name]`` as they go into calibration.json."""
+    units = {n: q.unit for n, q in EXPERIMENTS[name].quantities().items()}
+    return {
+        swap.half: {
+            "values": {
+                n: {"value": value, "unit": units[n]}
+                for n, value in swap.values.items()
+            },
+            "pull_towards_print": swap.strength,
+            "fitted": _ratios(swap.train),
+            "held_out": _ratios(swap.held_out),
+            "bar": BAR,
+            "met": ratio_of(swap.held_out) <= BAR,
+        }
+        for swap in swaps
+    }

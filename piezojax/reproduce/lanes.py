@@ -1,0 +1,161 @@
+"""Cells of Tables 4-5, 5-3 and 5-5 simulated at once, for a stage that is fitted."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .. import signals
+from .._types import State
+from ..catalog import p753
+from ..control import DisturbanceObserverControl
+from ..hardware import Sensor
+from ..rollout import Metric, simulate
+from ..system import Feedback, LoopInput, System, loop_inputs, series
+from . import chapter4, chapter5
+from .cell import Cell, window
+
+WARM_UP = 0.3
+"""Of a shortened run, before errors count, s: a jump of SW at its start rings off."""
+
+SHORT = 1.0
+"""Longest window of a shortened run, s: less than SW10 and SW30 take to repeat."""
+
+DOUBTED = ("5-5", "dob")
+"""Table and column whose printed P = 0.05 is suspect (docs/errata.md)."""
+
+
+class Lanes(eqx.Module):
+    """Loops of one kind of controller, a lane a cell; time first, in um.
+
+    ``weight`` is one over the number of samples counted, or zero outside the window;
+    ``doubted`` marks the lanes of the disturbance observer of Table 5-4.
+    """
+
+    controller: System
+    reference: Float[Array, "samples lanes"]
+    target: Float[Array, "samples lanes"]
+    weight: Float[Array, "samples lanes"]
+    doubted: Bool[Array, " lanes"]
+
+    def with_observer_proportional(self, value: Array) -> "Lanes":
+        """Return the lanes with another P where Table 5-4 prints 0.05."""
+        if not isinstance(self.controller, DisturbanceObserverControl):
+            return self
+        return eqx.tree_at(
+            lambda lanes: lanes.controller.feedback.proportional,
+            self,
+            replace_fn=lambda printed: jnp.where(self.doubted, value, printed),
+        )
+
+
+def _maker(cell: Cell) -> Callable[[], System]:
+    if cell.table in chapter5.TABLES:
+        make = chapter5.COLUMNS[cell.column]
+        return lambda: make(chapter5.TABLES[cell.table])
+    make = chapter4.COLUMNS[cell.table][cell.column].make
+    return lambda: make(chapter4.RATES[cell.table])
+
+
+def _target(cell: Cell, controller: System, reference: Array) -> Array:
+    if cell.table in chapter5.TABLES:
+        return reference
+    return chapter4.COLUMNS[cell.table][cell.column].target(controller, reference)
+
+
+def _spans(name: str, short: bool) -> tuple[int, int]:
+    """Return first and last sample that count."""
+    repeat = window(name)
+    first, length = (WARM_UP, min(repeat, SHORT)) if short else (repeat, repeat)
+    start = round(first * p753.RATE)
+    return start, start + round(length * p753.RATE)
+
+
+def lanes_of(cells: Sequence[Cell], *, short: bool) -> list[Lanes]:
+    """Return ``cells``, a Lanes for each column, in the order of ``by_column``.
+
+    ``short`` starts to count after ``WARM_UP`` and for at most ``SHORT`` seconds;
+    otherwise the second of two windows counts, as in the tables.
+    """
+    longest = max(_spans(cell.row, short)[1] for cell in cells)
+    return [_together(group, longest, short) for group in by_column(cells)]
+
+
+def by_column(cells: Sequence[Cell]) -> list[list[Cell]]:
+    """Return ``cells`` in groups of one controller's kind."""
+    columns = sorted({cell.column for cell in cells})
+    return [[cell for cell in cells if cell.column == name] for name in columns]
+
+
+def _together(cells: Sequence[Cell], longest: int, short: bool) -> Lanes:
+    time = jnp.arange(longest) / p753.RATE
+    controllers = [_maker(cell)() for cell in cells]
+    references = [signals.signal(cell.row, time) for cell in cells]
+    targets = [
+        _target(cell, controller, reference)
+        for cell, controller, reference in zip(
+            cells, controllers, references, strict=True
+        )
+    ]
+    weight = np.zeros((longest, len(cells)))
+    for lane, cell in enumerate(cells):
+        start, stop = _spans(cell.row, short)
+        weight[start:stop, lane] = 1.0 / (stop - start)
+    return Lanes(
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *controllers),
+        jnp.stack(references, axis=1),
+        jnp.stack(targets, axis=1),
+        jnp.asarray(weight),
+        jnp.asarray([(cell.table, cell.column) == DOUBTED for cell in cells]),
+    )
+
+
+class _Judged(System):
+    """A loop whose output is its squared error, weighted, in um^2."""
+
+    loop: Feedback
+
+    def init(self, input: Any = 0.0) -> State:
+        return self.loop.init(input)
+
+    def step(
+        self, state: State, input: tuple[LoopInput, Array, Array]
+    ) -> tuple[State, Array]:
+        drive, target, weight = input
+        state, sample = self.loop.step(state, drive)
+        return state, weight * (sample.displacement - target) ** 2
+
+
+class _Sum(Metric):
+    def init(self) -> State:
+        return jnp.zeros(())
+
+    def update(self, total: State, index: Array, output: Array) -> State:
+        return total + output
+
+    def result(self, total: State) -> Array:
+        return total
+
+
+def mean_squares(stage: System, sensor: System, lanes: Lanes) -> Float[Array, " lanes"]:
+    """Return the mean squared error (um^2) of the true displacement, a lane a cell.
+
+    ``stage`` turns V into um, ``sensor`` what it is into what is seen; from rest at
+    zero.
+    """
+
+    def one(controller, reference, target, weight):
+        seen = series(noise=Sensor(0.0), lag=sensor)
+        loop = _Judged(Feedback(controller, stage, p753.actuator(), seen))
+        inputs = (loop_inputs(reference), target, weight)
+        return simulate(
+            loop, inputs, loop.init(0.0), metric=_Sum(), segment=reference.shape[0]
+        )[1]
+
+    return jax.vmap(one, in_axes=(0, 1, 1, 1))(
+        lanes.controller, lanes.reference, lanes.target, lanes.weight
+    )
