@@ -11,7 +11,7 @@ from . import signals as signals
 from .charge_drive import ChargeDrive as ChargeDrive
 from .control import PID as PID
 from .control import AlphaBeta as AlphaBeta
-from .control import BangBangSlidingMode as BangBangSlidingMode
+from .control import BangBang as BangBang
 from .control import BoundaryLayer as BoundaryLayer
 from .control import ContinuousSlidingModePID as ContinuousSlidingModePID
 from .control import DisturbanceObserverControl as DisturbanceObserverControl

@@ -18,11 +18,12 @@ import numpy as np
 from ..control import (
     PID,
     AlphaBeta,
-    BangBangSlidingMode,
+    BangBang,
     ContinuousSlidingModePID,
     DisturbanceObserverControl,
     InversionControl,
     SlidingModePID,
+    SwitchedSlidingMode,
 )
 from ..dynamics import ARMA, scaled_to_dc
 from ..hysteresis import InverseColemanHodgdon
@@ -128,13 +129,13 @@ def continuous(rate: int = 20_000) -> ContinuousSlidingModePID:
     return ContinuousSlidingModePID(**gains, filter=_filter(near, rate))
 
 
-def bang_bang(rate: int = 20_000) -> BangBangSlidingMode:
+def bang_bang(rate: int = 20_000) -> SwitchedSlidingMode:
     """Return the nominal DSMC with bang-bang switching (1 and 20 kHz), um to V."""
     model = p753_chapter4.model(rate)
     near = _start("bang_bang", p753_chapter4.BANG_BANG_GAINS, rate)
     surface = p753_chapter4.TRADITIONAL_GAINS[near]["surface"]
-    return BangBangSlidingMode(
-        gain=p753_chapter4.BANG_BANG_GAINS[near],
+    return SwitchedSlidingMode(
+        BangBang(p753_chapter4.BANG_BANG_GAINS[near]),
         **_scaled({"surface": surface}, near / rate),
         error_weight=p753_chapter4.ERROR_WEIGHT,
         control_weight=p753_chapter4.BANG_BANG_CONTROL_WEIGHT,

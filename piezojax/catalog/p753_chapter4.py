@@ -10,11 +10,12 @@ from typing import Any
 from .._types import ScalarLike
 from ..control import (
     AlphaBeta,
-    BangBangSlidingMode,
+    BangBang,
     ContinuousSlidingModePID,
     ModelReferencePID,
     Observer,
     SlidingModePID,
+    SwitchedSlidingMode,
 )
 from ..dynamics import ARMA, Held, SecondOrderLag, scaled_to_dc
 from ..hardware import Sensor
@@ -168,10 +169,10 @@ def traditional(rate: int = 20_000) -> SlidingModePID:
     )
 
 
-def bang_bang(rate: int = 20_000) -> BangBangSlidingMode:
+def bang_bang(rate: int = 20_000) -> SwitchedSlidingMode:
     """Return the nominal DSMC with bang-bang switching (1 or 20 kHz), um to V."""
-    return BangBangSlidingMode(
-        gain=_printed("rate in Hz", BANG_BANG_GAINS, rate),
+    return SwitchedSlidingMode(
+        BangBang(_printed("rate in Hz", BANG_BANG_GAINS, rate)),
         surface=TRADITIONAL_GAINS[rate]["surface"],
         error_weight=ERROR_WEIGHT,
         control_weight=BANG_BANG_CONTROL_WEIGHT,

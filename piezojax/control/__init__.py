@@ -1,7 +1,7 @@
 """Controllers: each a System from an Observation to a command."""
 
 from .alpha_beta import AlphaBeta as AlphaBeta
-from .bang_bang import BangBangSlidingMode as BangBangSlidingMode
+from .bang_bang import BangBang as BangBang
 from .boundary_layer import BoundaryLayer as BoundaryLayer
 from .continuous import ContinuousSlidingModePID as ContinuousSlidingModePID
 from .disturbance_observer import (

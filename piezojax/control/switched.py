@@ -7,7 +7,7 @@ import equinox as eqx
 from .._types import Scalar, State, as_array, check
 from ..dynamics.arma import ARMA
 from ..system import Observation, System
-from .observer import Motion, Observer
+from .observer import Observer
 from .output_tracking import (
     INVERSIONS,
     check_inversion,
@@ -22,7 +22,7 @@ from .output_tracking import (
 class SwitchedState(NamedTuple):
     """Filter and law, last reference, past outputs, what holds a start at rest."""
 
-    filter: Motion
+    filter: State
     law: State
     older_reference: Scalar
     outputs: tuple[Scalar, Scalar]
@@ -34,10 +34,10 @@ class SwitchedSlidingMode(System):
 
     (2.20) with the equivalent control and reference part of chapter 4: ``law`` maps the
     sliding variable s in um/s to the switching part of v, 0 at s = 0, and is at rest
-    there: ``BoundaryLayer``, ``SuperTwisting``. All else is as in ``SlidingModePID``
-    and ``BangBangSlidingMode``; as in the latter, what a start at rest away from zero
-    needs beyond the model's feed-forward is kept as the constant ``bias`` of the state,
-    which is zero from rest at zero.
+    there: ``BangBang``, ``BoundaryLayer``, ``SuperTwisting``. All else is as in
+    ``SlidingModePID``. Not every law has an integral, so what a start at rest away from
+    zero needs beyond the model's own feed-forward is frozen as the constant ``bias`` of
+    the state; from rest at zero it is zero.
 
     Input an Observation, output in the unit of the model's input. Raises ValueError for
     a model of another order, b_0 = 0, Q <= 0, R < 0 or an unknown inversion.

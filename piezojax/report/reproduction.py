@@ -1,4 +1,4 @@
-"""Picture of simulated tables against print."""
+"""Pictures of simulated tables against print, and of errors against the rate."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,16 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from ..reproduce.cell import Cell, title_of
-from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
+from ..reproduce.rates import FIGURE, RateError
+from .figures import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    REFERENCE,
+    figure,
+    styled,
+    write,
+)
 
 ACROSS = 4
 """Most panels in a row."""
@@ -63,4 +72,35 @@ def cells_figure(cells: Sequence[Cell]) -> Figure:
             ylabel=f"simulated ({unit})",
         )
         ax.legend(loc="upper left")
+    return picture
+
+
+def write_rates(errors: Sequence[RateError], folder: Path) -> None:
+    """Write figure-4-10.png into ``folder``."""
+    with styled():
+        write(rates_figure(errors), folder / f"{FIGURE}.png")
+
+
+def rates_figure(errors: Sequence[RateError]) -> Figure:
+    """RMS error against sampling rate, a panel a signal, a line a controller."""
+    rows = list(dict.fromkeys(e.row for e in errors))
+    columns = list(dict.fromkeys(e.column for e in errors))
+    picture = figure(3.2 * len(rows), 3.4)
+    panels = picture.subplots(1, len(rows), squeeze=False, sharey=True)[0]
+    for ax, row in zip(panels, rows, strict=True):
+        for column, (marker, colour) in zip(columns, _MARKS, strict=False):
+            points = [e for e in errors if (e.row, e.column) == (row, column)]
+            ax.loglog(
+                [1e-3 * e.rate for e in points],
+                [e.error for e in points],
+                f"{marker}-",
+                color=colour,
+                label=column.replace("_", " "),
+            )
+        rates = sorted({e.rate for e in errors})
+        ax.set_xticks([1e-3 * r for r in rates], [f"{1e-3 * r:g}" for r in rates])
+        ax.minorticks_off()
+        ax.set(title=row, xlabel="sampling rate (kHz)")
+    panels[0].set_ylabel("simulated rms error (µm)")
+    panels[0].legend(loc="upper right")
     return picture

@@ -106,7 +106,7 @@ def broken_loop(
 
     Limits of the voltage (Saturation) are taken out of the actuator, since margins are
     about small motions; slew limits and converters count with their slope at rest, 1. A
-    switching term (``BangBangSlidingMode``) has no slope and is left out.
+    switching term (``BangBang``) has no slope and is left out.
 
     Raises ValueError for an unknown branch.
     """

@@ -42,7 +42,7 @@ def test_a_layer_of_no_width_is_bang_bang_switching():
         lambda c: (c.law, c.control_weight, c.model),
         p753_survey.boundary_layer(),
         (
-            BoundaryLayer(printed.gain, 1e-9),
+            BoundaryLayer(printed.law.gain, 1e-9),
             printed.control_weight,
             ARMA(**p753.DYNAMICS_BY_RATE[20_000]),
         ),

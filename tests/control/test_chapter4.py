@@ -342,7 +342,7 @@ def changed(controller, **values):
         (lambda: changed(PRINTED, control_weight=-1.0), "R is -1; .* at least 0"),
         (lambda: changed(PRINTED, surface=(np.nan,)), "surface is nan"),
         (lambda: changed(PRINTED, integral=np.inf), "integral in .* is inf"),
-        (lambda: changed(SWITCHED, gain=-1.0), "gain K is -1; .* at least 0"),
+        (lambda: changed(SWITCHED.law, gain=-1.0), "gain K is -1; .* at least 0"),
         (
             lambda: changed(SWITCHED, model=LONGER),
             "the model has 3 a and 1 b coefficients; it must have 2 and 3",

@@ -1,0 +1,53 @@
+"""Figure 4.10: tracking error against sampling rate, with the printed gains."""
+
+import csv
+import io
+from typing import NamedTuple
+
+from ..catalog import p753_chapter4
+from .chapter4 import COLUMNS, rms_errors
+
+FIGURE = "figure-4-10"
+
+SIGNALS = ("SIN1", "SIN10", "SIN30", "SIN50")
+"""The figure has sinusoids; which ones is not printed."""
+
+RATES = {
+    "model_reference": tuple(p753_chapter4.MODEL_REFERENCE_GAINS["4-4"]),
+    "continuous": tuple(p753_chapter4.CONTINUOUS_GAINS),
+}
+"""Rates (Hz) by column for which gains are printed."""
+
+
+class RateError(NamedTuple):
+    """RMS error (um) of a controller on a signal at a sampling rate (Hz)."""
+
+    rate: int
+    column: str
+    row: str
+    error: float
+
+
+def errors_by_rate(signals: tuple[str, ...] = SIGNALS) -> list[RateError]:
+    """Return the errors of both columns at each rate with printed gains.
+
+    The reading is that of Tables 4-5 and 4-6. The figure's numbers are not printed:
+    what the text says of it is that the model reference is the better one, the more so
+    the lower the rate.
+    """
+    return [
+        RateError(rate, column, row, error)
+        for column, rates in RATES.items()
+        for rate in sorted(rates)
+        for row, error in rms_errors(COLUMNS["4-5"][column], signals, rate).items()
+    ]
+
+
+def rates_as_csv(errors: list[RateError]) -> str:
+    """Return ``errors`` as comma-separated text with a header."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(["rate_Hz", "column", "row", "sim_um"])
+    for each in errors:
+        writer.writerow([each.rate, each.column, each.row, f"{each.error:.6g}"])
+    return buffer.getvalue()
