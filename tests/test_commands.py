@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -320,6 +319,21 @@ def test_ctrl_c_waits_for_the_next_word_of_progress():
         bar.stage("judging")  # the press is spent: what was found can be judged
 
 
+def test_ctrl_c_while_judging_loses_nothing(study, tmp_path, monkeypatch):
+    stage = Bar.stage
+
+    def press(self, text, steps=0):
+        stage(self, text, steps)
+        if text.startswith("judging"):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Bar, "stage", press)
+    result = call("tune", study, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert pj.load_result(tmp_path / "out").status != "interrupted"
+    assert (tmp_path / "out" / "stability.json").exists()
+
+
 def test_ctrl_c_twice_acts_at_once():
     with Bar(console(quiet=True)):
         signal.raise_signal(signal.SIGINT)
@@ -381,7 +395,6 @@ def test_a_real_ctrl_c(tmp_path, kept_programs):
             for line in process.stdout:
                 if line.startswith("tuning from"):
                     break
-            time.sleep(1.0)
             process.send_signal(signal.SIGINT)
             printed, complaint = process.communicate(timeout=120)
         finally:

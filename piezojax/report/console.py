@@ -51,6 +51,7 @@ class Bar:
         )
         self._task = None
         self._interrupted = False
+        self._finishing = False
         self._handler: Any = None
 
     def __enter__(self) -> "Bar":
@@ -72,8 +73,15 @@ class Bar:
         if self._task is not None:
             self._progress.update(self._task, note="stopping; Ctrl-C again: at once")
 
+    def finish(self) -> None:
+        """From here on let the first ``Ctrl-C`` pass: what was found is being written.
+
+        One that waits already has come too late to stop anything.
+        """
+        self._finishing = True
+
     def _stop_if_asked(self) -> None:
-        if self._interrupted:
+        if self._interrupted and not self._finishing:
             self._interrupted = False
             raise KeyboardInterrupt
 

@@ -50,6 +50,7 @@ def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> N
         with results_folder(out, path.stem) as folder:
             case = studies.build(description, path, seed=seed)
             outcome = tune(case, progress=bar)
+            bar.finish()
             bar.stage("drawing")
             write_results(outcome, folder)
             if case.fit is not None:
@@ -100,6 +101,7 @@ def _compare(
                 write_text(own / "study.toml", text)
 
             comparison = compare(title, entries, progress=bar, done=keep)
+            bar.finish()
             bar.stage("drawing")
             write_comparison(comparison, folder)
     console.print(comparison_table(comparison))
