@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 Scalar = Float[Array, ""]
 ScalarLike = Float[Array, ""] | float | int
 Matrix = Float[Array, "rows columns"]
+Signal = Any  # a Scalar, or a tuple of one Scalar an axis
 State = Any  # a pytree of arrays; every System defines its own
 
 
@@ -25,6 +26,13 @@ def as_scalars(values: Iterable[Any]) -> tuple[Array, ...]:
     Scalars, not one packed array: XLA keeps them in registers inside the loop.
     """
     return tuple(as_array(value) for value in values)
+
+
+def as_signal(value: Any) -> Any:
+    """Return a number as a scalar, a vector or sequence as a tuple of one an axis."""
+    if isinstance(value, tuple | list) or jnp.ndim(value) == 1:
+        return as_scalars(value)
+    return as_array(value)
 
 
 def as_matrix(value: Any) -> Array:
