@@ -8,6 +8,7 @@ _runtime.configure()
 
 from . import catalog as catalog
 from . import signals as signals
+from .axes import PerAxis as PerAxis
 from .charge_drive import ChargeDrive as ChargeDrive
 from .control import PID as PID
 from .control import AlphaBeta as AlphaBeta
@@ -16,11 +17,14 @@ from .control import BoundaryLayer as BoundaryLayer
 from .control import ContinuousSlidingModePID as ContinuousSlidingModePID
 from .control import DisturbanceObserverControl as DisturbanceObserverControl
 from .control import FeedforwardFeedback as FeedforwardFeedback
+from .control import Filtered as Filtered
 from .control import InverseFeedforward as InverseFeedforward
 from .control import InversionControl as InversionControl
 from .control import KalmanFilter as KalmanFilter
 from .control import LearningLaw as LearningLaw
 from .control import ModelReferencePID as ModelReferencePID
+from .control import MultiAxisSlidingModePID as MultiAxisSlidingModePID
+from .control import NominalSlidingModePID as NominalSlidingModePID
 from .control import RepetitiveControl as RepetitiveControl
 from .control import SlidingModePID as SlidingModePID
 from .control import StateSpaceController as StateSpaceController
@@ -29,12 +33,15 @@ from .control import SwitchedSlidingMode as SwitchedSlidingMode
 from .control import learn as learn
 from .dynamics import ARMA as ARMA
 from .dynamics import AmplitudeScheduled as AmplitudeScheduled
+from .dynamics import Channel as Channel
+from .dynamics import Channels as Channels
 from .dynamics import ExponentialCreep as ExponentialCreep
 from .dynamics import FirstOrderLag as FirstOrderLag
 from .dynamics import FractionalDelay as FractionalDelay
 from .dynamics import Held as Held
 from .dynamics import HystereticOscillator as HystereticOscillator
 from .dynamics import LogarithmicCreep as LogarithmicCreep
+from .dynamics import MatrixARMA as MatrixARMA
 from .dynamics import NeuralStateSpace as NeuralStateSpace
 from .dynamics import SecondOrderLag as SecondOrderLag
 from .dynamics import StateSpace as StateSpace

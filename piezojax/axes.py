@@ -4,7 +4,7 @@ A packed array would be two to seven times slower in batches: XLA keeps scalars 
 registers, lanes side by side. Matrices are therefore rows of scalars, multiplied out.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -50,7 +50,10 @@ def as_matrix_of(rows: Rows) -> jax.Array:
 def product(matrix: Rows, vector: Axes) -> Axes:
     """Return ``matrix @ vector``."""
     return tuple(
-        sum((m * v for m, v in zip(row[1:], vector[1:], strict=True)), row[0] * vector[0])
+        sum(
+            (m * v for m, v in zip(row[1:], vector[1:], strict=True)),
+            row[0] * vector[0],
+        )
         for row in matrix
     )
 
@@ -129,9 +132,7 @@ class PerAxis(System):
             raise ValueError(f"{len(self.parts)} parts but names {self.names}")
 
     def init(self, input: Any) -> State:
-        return tuple(
-            part.init(axis_of(input, i)) for i, part in enumerate(self.parts)
-        )
+        return tuple(part.init(axis_of(input, i)) for i, part in enumerate(self.parts))
 
     def step(self, state: State, input: Any) -> tuple[State, tuple[Any, ...]]:
         stepped = [
@@ -139,11 +140,6 @@ class PerAxis(System):
             for i, (part, s) in enumerate(zip(self.parts, state, strict=True))
         ]
         return tuple(s for s, _ in stepped), tuple(output for _, output in stepped)
-
-
-def per_axis(make: Callable[..., System], *columns: Sequence[Any]) -> PerAxis:
-    """Return ``make(...)`` for each axis, its arguments taken from ``columns``."""
-    return PerAxis(tuple(make(*row) for row in zip(*columns, strict=True)))
 
 
 class PerAxisMetric(Metric):
@@ -179,7 +175,9 @@ def check_square(name: str, matrix: Rows, size: int) -> None:
     """Raise ValueError unless ``matrix`` has ``size`` rows and columns, all finite."""
     shape = len(matrix), len(matrix[0])
     if shape != (size, size):
-        raise ValueError(f"{name} is {shape[0]} x {shape[1]}; it must be {size} x {size}")
+        raise ValueError(
+            f"{name} is {shape[0]} x {shape[1]}; it must be {size} x {size}"
+        )
     for row in matrix:
         for value in row:
             if not isinstance(value, jax.core.Tracer) and not np.isfinite(value):

@@ -9,6 +9,7 @@ from .disturbance_observer import (
 )
 from .feedforward import FeedforwardFeedback as FeedforwardFeedback
 from .feedforward import InverseFeedforward as InverseFeedforward
+from .filtered import Filtered as Filtered
 from .inversion import InversionControl as InversionControl
 from .iterative_learning import LearningLaw as LearningLaw
 from .iterative_learning import Trials as Trials
@@ -18,6 +19,8 @@ from .linear import StateSpaceController as StateSpaceController
 from .mixed_sensitivity import first_order_weight as first_order_weight
 from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
 from .model_reference import ModelReferencePID as ModelReferencePID
+from .multi_axis import MultiAxisSlidingModePID as MultiAxisSlidingModePID
+from .nominal import NominalSlidingModePID as NominalSlidingModePID
 from .observer import Motion as Motion
 from .observer import Observer as Observer
 from .pid import PID as PID
