@@ -60,10 +60,9 @@ class MultiAxisSlidingModePID(System):
     [q, q], of commands in the unit of the output. PHI enters with the sign of (7.29),
     (7.31) and (7.40); that of (7.30) and (7.34) is unstable.
 
-    Input an Observation of q axes, output a tuple of q commands. (The thesis filters the
-    measurements: see ``Filtered``.) No parameter is
-    limited in sign: a loop of other gains may be unstable. The integral does not stop
-    at a limit.
+    Input an Observation of q axes, output a tuple of q commands. (The thesis filters
+    the measurements: see ``Filtered``.) No parameter is limited in sign: a loop of
+    other gains may be unstable. The integral does not stop at a limit.
 
     At rest without disturbance the state stays where it is. Where the model's DC gain
     is not the stage's, s = 0 leaves a small error: the prediction knows of no

@@ -14,10 +14,10 @@ from .state_space import StateSpace
 
 
 class Channel(System):
-    """The answer of all outputs to one input: ``x(k+1) = A x + b u``, ``y(k+1) = C x(k+1)``.
+    """What one input does to all outputs: ``x(k+1) = A x + B u``, ``y(k) = C x(k)``.
 
     ``A`` [n, n], ``B`` [n], ``C`` [outputs, n] in the units of the input and outputs;
-    ``dt`` in s. Input a scalar, output a tuple of one scalar an output. Raises
+    ``dt`` in s. Input the scalar u(k), output y(k+1), one scalar an output. Raises
     ValueError for sizes that do not fit, numbers that are not finite or ``dt <= 0``.
     """
 
