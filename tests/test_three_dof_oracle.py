@@ -49,6 +49,17 @@ def test_driven_axes(case):
     np.testing.assert_allclose(rms.ravel(), ELSEWHERE[case], rtol=0.02, atol=atol)
 
 
+@pytest.mark.parametrize(
+    ("name", "rms_of_rx_and_ry"),
+    [("dob_smc", [0.74, 0.51]), ("nominal_smc", [4.24, 3.64])],
+)
+def test_printed_models_track_worse(name, rms_of_rx_and_ry):
+    references = three_dof.table_sines(2.0)[:, 1:, 0]  # 1 Hz in Rx, then in Ry
+    y = three_dof.simulate(name, references, plant=HYSTERESIS, arx="printed")["y"]
+    rms = np.diag(three_dof.tracking_rms(y, references)[:, 1:])
+    np.testing.assert_allclose(rms, rms_of_rx_and_ry, rtol=0.02)
+
+
 def test_pid_against_the_low_frequency_limit():
     # u is about the reference over the DC gain, so e = u' / I at 1 Hz.
     A, B, C = three_dof.stacked()
