@@ -5,19 +5,19 @@ registers, lanes side by side. Matrices are therefore rows of scalars, multiplie
 """
 
 from collections.abc import Iterable
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from ._types import Scalar, State, as_array, as_scalars
+from ._types import Scalar, State, as_array, as_scalars, check
 from .rollout import Metric
 from .system import System
 
 Axes: TypeAlias = tuple[Scalar, ...]
 Rows: TypeAlias = tuple[tuple[Scalar, ...], ...]
+T = TypeVar("T")
 
 
 def as_rows(values: Any) -> Rows:
@@ -64,12 +64,12 @@ def matrix_product(left: Rows, right: Rows) -> Rows:
     return tuple(zip(*(product(left, column) for column in columns), strict=True))
 
 
-def plus(*terms: Axes) -> Axes:
+def plus(*terms: T) -> T:
     """Return the sum of vectors, or, row by row, of matrices."""
     return jax.tree.map(lambda *values: sum(values[1:], values[0]), *terms)
 
 
-def minus(left: Any, right: Any) -> Any:
+def minus(left: T, right: T) -> T:
     """Return the difference of two vectors or matrices."""
     return jax.tree.map(lambda a, b: a - b, left, right)
 
@@ -179,6 +179,4 @@ def check_square(name: str, matrix: Rows, size: int) -> None:
             f"{name} is {shape[0]} x {shape[1]}; it must be {size} x {size}"
         )
     for row in matrix:
-        for value in row:
-            if not isinstance(value, jax.core.Tracer) and not np.isfinite(value):
-                raise ValueError(f"{name} holds {float(value):g}; it must be finite")
+        check(name, row)

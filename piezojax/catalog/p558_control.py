@@ -1,7 +1,7 @@
 """Controllers of the P-558.TCD with the printed gains of chapters 7 and 8, at 500 Hz.
 
-Every number carries its table or section in Y. Cao's thesis (2013). Commands and outputs
-are in um, urad, urad.
+Every number carries its table or section in Y. Cao's thesis (2013). Commands and
+outputs are in um, urad, urad.
 """
 
 import math

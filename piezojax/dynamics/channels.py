@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Scalar, as_scalars, check
+from .._types import Scalar, ScalarLike, as_scalars, check
 from ..axes import Axes, Rows, as_rows, check_square, plus, product
 from ..system import System
 from .state_space import StateSpace
@@ -36,7 +36,7 @@ class Channel(System):
         check("B", self.B)
         check("sample time in s", self.dt, above=0.0)
 
-    def init(self, input: Scalar = 0.0) -> Axes:
+    def init(self, input: ScalarLike = 0.0) -> Axes:
         A = jnp.stack([jnp.stack(row) for row in self.A])
         gain = jnp.linalg.solve(jnp.eye(len(A)) - A, jnp.stack(self.B))
         return tuple(gain[i] * input for i in range(len(self.B)))
