@@ -7,11 +7,13 @@ __version__ = "0.1.0"
 _runtime.configure()
 
 from . import catalog as catalog
+from . import motions as motions
 from . import signals as signals
 from .axes import PerAxis as PerAxis
 from .charge_drive import ChargeDrive as ChargeDrive
 from .control import PID as PID
 from .control import AlphaBeta as AlphaBeta
+from .control import Anticipation as Anticipation
 from .control import BangBang as BangBang
 from .control import BoundaryLayer as BoundaryLayer
 from .control import ContinuousSlidingModePID as ContinuousSlidingModePID

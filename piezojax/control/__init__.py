@@ -1,6 +1,7 @@
 """Controllers: each a System from an Observation to a command."""
 
 from .alpha_beta import AlphaBeta as AlphaBeta
+from .anticipation import Anticipation as Anticipation
 from .bang_bang import BangBang as BangBang
 from .boundary_layer import BoundaryLayer as BoundaryLayer
 from .continuous import ContinuousSlidingModePID as ContinuousSlidingModePID
