@@ -42,6 +42,10 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_ziegler_nichols": p753_by_rate.ziegler_nichols,
     "p558_pid": p558_control.pid,
     "p558_multi_axis": p558_control.multi_axis,
+    "p558_anticipating_multi_axis": p558_control.anticipating_multi_axis,
+    "p558_anticipating_disturbance_observer": (
+        p558_control.anticipating_disturbance_observer
+    ),
     "p558_nominal": p558_control.nominal,
     "p558_disturbance_observer": p558_control.disturbance_observer,
 }

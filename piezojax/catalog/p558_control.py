@@ -9,6 +9,7 @@ from typing import Any
 
 from ..axes import PerAxis
 from ..control.alpha_beta import AlphaBeta
+from ..control.anticipation import Anticipation
 from ..control.disturbance_observer import DisturbanceObserverControl
 from ..control.filtered import Filtered
 from ..control.multi_axis import MultiAxisSlidingModePID
@@ -121,6 +122,16 @@ def multi_axis(gains: str = "dynamic", filtered: bool = True) -> System:
         return controller
     parts = tuple(AlphaBeta(**FILTER, dt=DT) for _ in OUTPUTS)
     return Filtered(PerAxis(parts, OUTPUTS), controller)
+
+
+def anticipating_multi_axis() -> System:
+    """Return chapter 7's controller with room for a lead on its reference (ours, 0)."""
+    return Anticipation(multi_axis(), (0.0, 0.0, 0.0), DT)
+
+
+def anticipating_disturbance_observer() -> System:
+    """Return chapter 8's controller with room for a lead on its reference (ours, 0)."""
+    return Anticipation(disturbance_observer(), (0.0, 0.0, 0.0), DT)
 
 
 def nominal(arx: str = "repaired", filtered: bool = True, **options: Any) -> System:

@@ -47,9 +47,8 @@ def varied(
     (A becomes I + (1 + speed)(A - I), B is scaled alike: same gain at rest);
     ``hysteresis``, the share of play; ``coupling``, what it adds to the other axes.
     """
-    nominal = plant()
     channels: list[Channel] = []
-    for axis, part in enumerate(nominal.parts[1].parts):
+    for axis, part in enumerate(channels_of(p558.channels("7")).parts):
         faster, gain_of = 1.0 + speed[axis], 1.0 + gain[axis]
         A = tuple(
             tuple(

@@ -24,7 +24,7 @@ from ..identify.parts import PARTS
 from ..reproduce.cell import Cell, title_of
 from ..reproduce.summary import TableAgreement
 from ..stability import StabilityReport
-from ..tune.result import Result, Scores
+from ..tune.result import Perturbed, Result, Scores
 from .stability import Comparison
 
 
@@ -130,8 +130,9 @@ def _ratio(before: float | None, after: float | None) -> str:
 
 def tuning_table(result: Result) -> Table:
     """Return the before/after table on held-out noise, in nm rms."""
+    unit = " or ".join(dict.fromkeys(_SMALL[u] for u in result.units.values())) or "nm"
     table = Table(
-        title=Text(f"{result.title}\nrms tracking error on held-out noise, nm")
+        title=Text(f"{result.title}\nrms tracking error on held-out noise, {unit}")
     )
     table.add_column("reference")
     for title in ("before", "tuned", "better", "peak, tuned"):
@@ -139,11 +140,15 @@ def tuning_table(result: Result) -> Table:
     sections: list[tuple[str, Scores | None, Scores | None]] = [
         ("geometric mean", result.holdout_before, result.holdout),
         ("geometric mean, not tuned on", result.unseen_before, result.unseen),
+        ("geometric mean, axes at rest", result.coupling_before, result.coupling),
     ]
     for heading, before, after in sections:
         if before is None or after is None:
             continue
+        many = len(before.per_reference_rms_um) > _MOST_ROWS
         for name, error in before.per_reference_rms_um.items():
+            if many and heading == sections[-1][0]:
+                break  # two of three axes rest under each reference
             tuned = after.per_reference_rms_um[name]
             peak = after.peak_error_um[name]
             table.add_row(
@@ -164,6 +169,29 @@ def tuning_table(result: Result) -> Table:
         )
         table.add_section()
     return table
+
+
+_SMALL = {"um": "nm", "urad": "nrad"}
+"""Units a thousand times smaller, in which errors are shown."""
+
+_MOST_ROWS = 12  # of the axes at rest
+
+
+def perturbed_text(found: Perturbed) -> str:
+    """Return one line on the plants of the ensemble."""
+    if found.unstable or found.median_better is None:
+        return (
+            f"{found.plants} perturbed plants: {found.unstable} unstable "
+            f"({found.unstable_before} before)"
+        )
+    rest = (
+        f", axes at rest {found.coupling_better:.2f}x" if found.coupling_better else ""
+    )
+    return (
+        f"{found.plants} perturbed plants: none unstable "
+        f"({found.unstable_before} before), {found.median_better:.1f}x better in the "
+        f"median, {found.worst_better:.1f}x on the worst{rest}"
+    )
 
 
 def gains_table(result: Result) -> Table:

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from .._types import ScalarLike
 from ..files import write_text
 from ..stability.broken_loop import BRANCHES
 from ..stability.conserved import LinearLoop
@@ -48,7 +47,7 @@ class Comparison:
 
 
 def compared(
-    reference: ScalarLike = 0.0, dt: float | None = None, **loops: Feedback
+    reference: Any = 0.0, dt: float | None = None, **loops: Feedback
 ) -> Comparison:
     """Return the stability of the named loops at ``reference`` (um), both branches.
 

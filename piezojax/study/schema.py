@@ -46,6 +46,8 @@ class AxesTable(Table):
     def _consistent(self) -> "AxesTable":
         if len(self.units) != len(self.names) or len(set(self.names)) < len(self.names):
             raise ValueError("names must differ and have one unit each")
+        for unit in self.units:
+            one_of(unit, ("um", "urad"))
         for name in self.names:
             if not name.isidentifier():
                 raise ValueError(f"axis {name!r}: a name is letters, digits and _")
@@ -148,11 +150,11 @@ class ObjectiveTable(Table):
 
 
 class EnsembleTable(Table):
-    """Plants off their nominal values, drawn evenly within ``spread`` to either side.
+    """Plants off their nominal values, drawn evenly within ``spread`` to both sides.
 
     ``spread`` holds relative deviations by the names that the catalogued plant gives
-    them. ``tune`` draws take part in the objective beside the nominal plant, ``holdout``
-    others are what the gains are judged on.
+    them. ``tune`` draws take part in the objective beside the nominal plant; on
+    ``holdout`` others the gains are judged.
     """
 
     spread: dict[str, Positive] = Field(min_length=1)
@@ -269,6 +271,16 @@ class Study(Table):
     def axis_count(self) -> int:
         """Number of axes of the stage."""
         return len(self.axes.names) if self.axes else 1
+
+    @property
+    def highest(self) -> float | tuple[float, ...]:
+        """Offset and amplitude together, of each axis."""
+        table = self.references
+        values = zip(
+            self.by_axis(table.offset), self.by_axis(table.amplitude), strict=True
+        )
+        tops = tuple(offset + amplitude for offset, amplitude in values)
+        return tops if self.axes else tops[0]
 
     def by_axis(self, value: float | tuple[float, ...]) -> tuple[float, ...]:
         """Return one value for each axis."""
