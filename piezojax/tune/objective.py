@@ -82,8 +82,8 @@ class Objective(eqx.Module):
     ``aggregate`` joins them: ``geometric_mean`` (mean of logarithms: a tenfold gain
     counts the same on every reference), ``mean_square``, or ``worst`` (a smooth
     maximum of the logarithms). ``weights`` says how much each counts (alike if left
-    out). ``plants``, stacked on a leading axis, are ones the loop must serve as well as
-    its own, each counting as much. ``effort_weight`` and ``slew_weight`` add the mean
+    out). ``plants``, stacked on a leading axis, take the place of the loop's own, each
+    counting as much. ``effort_weight`` and ``slew_weight`` add the mean
     RMS voltage and RMS voltage change a sample, both as a share of ``voltage_span``.
     """
 
@@ -102,18 +102,20 @@ class Objective(eqx.Module):
     def _figures(self, unit: Float[Array, " n"]) -> TrackingFigures:
         """Return figures of shape [plants, references, draws]."""
 
-        def on(plant: System | None) -> TrackingFigures:
-            def loop_of(unit):
-                loop = self.space.put(self.loop, unit)
-                return loop if plant is None else with_plant(loop, plant)
+        def loop_of(unit):
+            return self.space.put(self.loop, unit)
 
-            return evaluate(loop_of, unit, self.signals, self.start)
-
-        figures = jax.tree.map(lambda x: x[None], on(None))
         if self.plants is None:
-            return figures
-        others = eqx.filter_vmap(on)(self.plants)
-        return jax.tree.map(lambda *parts: jnp.concatenate(parts), figures, others)
+            figures = evaluate(loop_of, unit, self.signals, self.start)
+            return jax.tree.map(lambda x: x[None], figures)
+        return eqx.filter_vmap(
+            lambda plant: evaluate(
+                lambda unit: with_plant(loop_of(unit), plant),
+                unit,
+                self.signals,
+                self.start,
+            )
+        )(self.plants)
 
     def _parts(self, unit: Float[Array, " n"]) -> tuple[Array, Array, Array]:
         figures = self._figures(unit)

@@ -194,7 +194,7 @@ def tune(
         effort_weight=table.objective.effort_weight,
         slew_weight=table.objective.slew_weight,
         weights=_weights(case, data),
-        plants=case.ensemble.plants("tune") if case.ensemble else None,
+        plants=_plants(case),
     )
     search = search_box(objective, case, clock, progress)
 
@@ -234,6 +234,16 @@ def _weights(case: Case, data: _Data) -> jax.Array | None:
     coupling = case.study.objective.coupling_weight
     tuned = data.traces[: data.tuned]
     return as_array([1.0 if trace.driven else coupling for trace in tuned])
+
+
+def _plants(case: Case) -> System | None:
+    """Return the nominal plant and those of the objective, stacked; None if alone."""
+    others = case.ensemble.plants("tune") if case.ensemble else None
+    if others is None:
+        return None
+    return jax.tree.map(
+        lambda own, drawn: jnp.concatenate([own[None], drawn]), case.loop.plant, others
+    )
 
 
 def _perturbed(
