@@ -126,12 +126,12 @@ def multi_axis(gains: str = "dynamic", filtered: bool = True) -> System:
 
 def anticipating_multi_axis() -> System:
     """Return chapter 7's controller with room for a lead on its reference (ours, 0)."""
-    return Anticipation(multi_axis(), (0.0, 0.0, 0.0), DT)
+    return Anticipation(multi_axis(), (0.0, 0.0, 0.0))
 
 
 def anticipating_disturbance_observer() -> System:
     """Return chapter 8's controller with room for a lead on its reference (ours, 0)."""
-    return Anticipation(disturbance_observer(), (0.0, 0.0, 0.0), DT)
+    return Anticipation(disturbance_observer(), (0.0, 0.0, 0.0))
 
 
 def nominal(arx: str = "repaired", filtered: bool = True, **options: Any) -> System:
