@@ -10,6 +10,7 @@ from . import catalog as catalog
 from . import signals as signals
 from .charge_drive import ChargeDrive as ChargeDrive
 from .control import PID as PID
+from .control import Allocation as Allocation
 from .control import AlphaBeta as AlphaBeta
 from .control import BangBang as BangBang
 from .control import BoundaryLayer as BoundaryLayer
@@ -34,6 +35,7 @@ from .dynamics import FirstOrderLag as FirstOrderLag
 from .dynamics import FractionalDelay as FractionalDelay
 from .dynamics import Held as Held
 from .dynamics import HystereticOscillator as HystereticOscillator
+from .dynamics import LinearMap as LinearMap
 from .dynamics import LogarithmicCreep as LogarithmicCreep
 from .dynamics import NeuralStateSpace as NeuralStateSpace
 from .dynamics import SecondOrderLag as SecondOrderLag

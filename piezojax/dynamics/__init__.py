@@ -9,6 +9,7 @@ from .held import Held as Held
 from .hysteretic_oscillator import HystereticOscillator as HystereticOscillator
 from .lag import FirstOrderLag as FirstOrderLag
 from .lag import SecondOrderLag as SecondOrderLag
+from .linear_map import LinearMap as LinearMap
 from .neural_state_space import NeuralStateSpace as NeuralStateSpace
 from .scheduled import AmplitudeScheduled as AmplitudeScheduled
 from .state_space import StateSpace as StateSpace
