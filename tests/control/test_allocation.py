@@ -64,6 +64,16 @@ def test_bounded_makes_every_pose_that_can_be_made(bounded, feasible):
     assert error[~feasible].min() > 1e-6
 
 
+def test_poses_on_the_edge_of_reach_are_made_within_bounds():
+    # Rounding puts such commands a little outside, and the pose a little out of reach.
+    draw = np.random.default_rng(11)
+    commands = np.clip(draw.uniform(-25.0, 75.0, (4000, 4)), 0.0, 50.0)
+    found = allocate_all(PLATE, commands @ oracle.PLATE.T)
+    assert missed(found).max() < 1e-9
+    assert found.commands.min() == 0.0
+    assert found.commands.max() == 50.0
+
+
 def test_bounded_shifts_along_the_twist_no_further_than_needed(bounded):
     expected, possible = oracle.shifted(POSES)
     found, expected = bounded.commands[possible], expected[possible]
