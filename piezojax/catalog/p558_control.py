@@ -61,8 +61,8 @@ ARX = (
 
 REPAIRS = (1.043, 0.404, 0.491)
 """Factors on the numerators of (8.40)-(8.42) that give the DC gains of (7.53): printed
-they are 0.995, 2.32 and 1.92. With the printed Rx and Ry neither table comes near print;
-with the printed Z the disturbance observer does worse than no observer at 5 Hz."""
+they are 0.995, 2.32 and 1.92. With the printed Rx and Ry neither table comes near
+print; with the printed Z the observer does worse than no observer at 5 Hz."""
 
 ARX_MODELS = ("repaired", "printed")
 
