@@ -1,14 +1,18 @@
 """Table 7-4 and Figure 7.4, against print and against a loop from the equations."""
 
 import csv
+import io
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 from oracles import three_dof as oracle
+from rich.console import Console
 
 from piezojax.catalog import p558
+from piezojax.report.console import reproduction_table
+from piezojax.report.reproduction import cells_figure
 from piezojax.reproduce import chapter7, summarise, three_dof
 
 PRINTED = Path(__file__).parents[3] / "shared" / "tables" / "thesis_results.csv"
@@ -107,6 +111,23 @@ def test_transposed_couplings_agree_better_than_those_as_printed(cell):
             exchanged.append(abs(math.log(other.sim / found.paper)))
     assert len(logs) == 36
     assert np.mean(logs) < 0.5 * np.mean(exchanged)
+
+
+def test_the_printed_table_is_whole_on_a_narrow_terminal(table):
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(reproduction_table("7-4", table, summarise(table)["7-4"]))
+    text = console.export_text()
+    assert "pid_smc driven 1." in text
+    assert "\N{HORIZONTAL ELLIPSIS}" not in text
+    for found in table:
+        assert f"{found.paper:.4f} / {found.sim:.4f}" in text
+
+
+def test_every_group_is_in_the_picture(table, groups):
+    (ax,) = cells_figure(table).axes
+    drawn = {line.get_label(): line.get_xdata() for line in ax.get_lines()}
+    for name, group in groups.items():
+        assert len(drawn[name]) == group["cells"]
 
 
 def test_the_combined_experiment():
