@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable, Mapping
 
 from ..system import System
+from . import mirror as mirror
 from . import p753 as p753
 from . import p753_by_rate as p753_by_rate
 from . import p753_chapter4 as p753_chapter4
