@@ -24,6 +24,7 @@ from . import chapter5
 from .cell import Cell, printed
 from .lanes import Lanes, by_column, lanes_of, mean_squares
 from .stage import DOUBT, Quantity, quantities, stage_of
+from .summary import geomean
 
 HALVES = ("even", "odd")
 """The cells' place in the printed order, row by row, table after table."""
@@ -225,11 +226,6 @@ class Swap(NamedTuple):
     values: dict[str, float]
     train: list[Cell]
     held_out: list[Cell]
-
-
-def geomean(logs: Any) -> float:
-    """Return exp(mean |ln(sim/print)|)."""
-    return float(np.exp(np.mean(np.abs(logs))))
 
 
 def choose_strength(

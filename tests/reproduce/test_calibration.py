@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.reproduce import calibration, lanes
-from piezojax.reproduce.calibration import EXPERIMENTS, HALVES, fit, geomean
+from piezojax.reproduce import lanes
+from piezojax.reproduce.calibration import EXPERIMENTS, HALVES, fit
 from piezojax.reproduce.cell import printed
-from piezojax.reproduce.judged import ratio_of
 from piezojax.reproduce.lanes import by_column
+from piezojax.reproduce.summary import geomean, ratio_of
 
 ROWS = ("SIN50", "PWSW50")
 """Short references whose errors the loop's speed sets."""
@@ -141,4 +141,4 @@ def test_geometric_mean_ratio_counts_both_directions():
         dataclasses.replace(cell, sim=0.5 * cell.paper),
     ]
     assert ratio_of(cells) == pytest.approx(2.0)
-    assert calibration.geomean(np.log([1.0, 4.0])) == pytest.approx(2.0)
+    assert geomean(np.log([1.0, 4.0])) == pytest.approx(2.0)
