@@ -2,7 +2,8 @@
 
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
@@ -30,10 +31,20 @@ class GroupedAgreement(TableAgreement):
     groups: dict[str, Agreement]
 
 
+def geomean(logs: Any) -> float:
+    """Return exp(mean |ln(sim/print)|) of ``logs``, the ln(sim/print)."""
+    return float(np.exp(np.mean(np.abs(logs))))
+
+
+def ratio_of(cells: Sequence[Cell]) -> float:
+    """Return the geometric-mean ratio of ``cells``."""
+    return geomean(np.log([cell.ratio for cell in cells]))
+
+
 def _agreement(cells: Sequence[Cell]) -> Agreement:
     distance = np.abs(np.log([cell.ratio for cell in cells]))
     return Agreement(
-        geomean_ratio=float(np.exp(distance.mean())),
+        geomean_ratio=ratio_of(cells),
         worst_ratio=float(np.exp(distance.max())),
         cells=len(cells),
     )
@@ -62,20 +73,18 @@ def summarise(cells: Sequence[Cell]) -> dict[str, TableAgreement]:
     return summary
 
 
-def as_csv(cells: Sequence[Cell]) -> str:
-    """Return ``cells`` as comma-separated text with a header."""
+def comma_separated(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return ``rows`` under ``header`` as comma-separated text."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["table", "row", "column", "unit", "paper", "sim"])
-    for cell in cells:
-        writer.writerow(
-            [
-                cell.table,
-                cell.row,
-                cell.column,
-                cell.unit,
-                cell.paper,
-                f"{cell.sim:.6g}",
-            ]
-        )
+    writer.writerow(header)
+    writer.writerows(rows)
     return buffer.getvalue()
+
+
+def as_csv(cells: Sequence[Cell]) -> str:
+    """Return ``cells`` as comma-separated text with a header."""
+    return comma_separated(
+        ["table", "row", "column", "unit", "paper", "sim"],
+        [(c.table, c.row, c.column, c.unit, c.paper, f"{c.sim:.6g}") for c in cells],
+    )

@@ -41,7 +41,7 @@ def test_each_axis_has_its_own_lead():
 
 
 def test_a_lead_takes_the_delay_off_a_follower():
-    """A loop that is late by two samples follows a slow sine without error at lead 2."""
+    """A loop that is two samples late follows a slow sine without error at lead 2."""
 
     class Follower(pj.System):
         def init(self, input):
