@@ -193,8 +193,11 @@ def with_finite_gradient(loss, *, forward: bool):
     def guarded(unit):
         fixed = jax.lax.stop_gradient(unit)
         if forward:
-            value, push = jax.linearize(loss, fixed)
-            gradient = jax.vmap(push)(jnp.eye(fixed.shape[0]))
+            # Not linearize: that would keep what every sample leaves behind.
+            value, gradient = jax.vmap(
+                lambda direction: jax.jvp(loss, (fixed,), (direction,)),
+                out_axes=(None, 0),
+            )(jnp.eye(fixed.shape[0]))
         else:
             value, gradient = jax.value_and_grad(loss)(fixed)
         usable = jnp.all(jnp.isfinite(gradient)) & (value < HOPELESS)
