@@ -12,6 +12,7 @@ from . import signals as signals
 from .axes import PerAxis as PerAxis
 from .charge_drive import ChargeDrive as ChargeDrive
 from .control import PID as PID
+from .control import Allocation as Allocation
 from .control import AlphaBeta as AlphaBeta
 from .control import Anticipation as Anticipation
 from .control import BangBang as BangBang
@@ -42,6 +43,7 @@ from .dynamics import FirstOrderLag as FirstOrderLag
 from .dynamics import FractionalDelay as FractionalDelay
 from .dynamics import Held as Held
 from .dynamics import HystereticOscillator as HystereticOscillator
+from .dynamics import LinearMap as LinearMap
 from .dynamics import LogarithmicCreep as LogarithmicCreep
 from .dynamics import MatrixARMA as MatrixARMA
 from .dynamics import NeuralStateSpace as NeuralStateSpace

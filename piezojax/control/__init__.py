@@ -1,5 +1,7 @@
 """Controllers: each a System from an Observation to a command."""
 
+from .allocation import Allocated as Allocated
+from .allocation import Allocation as Allocation
 from .alpha_beta import AlphaBeta as AlphaBeta
 from .anticipation import Anticipation as Anticipation
 from .bang_bang import BangBang as BangBang

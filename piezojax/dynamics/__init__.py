@@ -12,6 +12,7 @@ from .held import Held as Held
 from .hysteretic_oscillator import HystereticOscillator as HystereticOscillator
 from .lag import FirstOrderLag as FirstOrderLag
 from .lag import SecondOrderLag as SecondOrderLag
+from .linear_map import LinearMap as LinearMap
 from .matrix_arma import MatrixARMA as MatrixARMA
 from .matrix_arma import observability_form as observability_form
 from .neural_state_space import NeuralStateSpace as NeuralStateSpace
