@@ -121,14 +121,15 @@ def _root(square: Scalar) -> Scalar:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
-def distance_to(
+def nearest_on(
     points: Float[np.ndarray, "points 2"], path: Float[np.ndarray, "samples 2"]
-) -> Float[np.ndarray, " points"]:
-    """Return how far each point is from the polyline ``path``, all in one unit.
+) -> Float[np.ndarray, "points 2"]:
+    """Return the place on the polyline ``path`` that is nearest to each point.
 
-    From the nearest of all its segments, so where a path crosses itself the branch that
+    On the nearest of all its segments, so where a path crosses itself the branch that
     was meant is not told from the other. In NumPy, for pictures and checks: takes
-    points x samples. Raises ValueError unless the path has two points or more.
+    points x samples. NaN for a point that is not finite. Raises ValueError unless the
+    path has two points or more.
     """
     points, path = np.asarray(points, float), np.asarray(path, float)
     if len(path) < 2:
@@ -136,9 +137,16 @@ def distance_to(
     begin, leg = path[:-1], np.diff(path, axis=0)
     square = np.sum(leg**2, axis=1)
     square = np.where(square > 0.0, square, 1.0)
-    found = []
-    for point in points:
-        along = np.clip(np.sum((point - begin) * leg, axis=1) / square, 0.0, 1.0)
-        off = point - begin - along[:, None] * leg
-        found.append(np.sqrt(np.min(np.sum(off**2, axis=1))))
-    return np.array(found)
+    found = np.full_like(points, np.nan)
+    for i in np.flatnonzero(np.all(np.isfinite(points), axis=1)):
+        along = np.clip(np.sum((points[i] - begin) * leg, axis=1) / square, 0.0, 1.0)
+        places = begin + along[:, None] * leg
+        found[i] = places[np.argmin(np.sum((points[i] - places) ** 2, axis=1))]
+    return found
+
+
+def distance_to(
+    points: Float[np.ndarray, "points 2"], path: Float[np.ndarray, "samples 2"]
+) -> Float[np.ndarray, " points"]:
+    """Return how far each point is from the polyline ``path``; see ``nearest_on``."""
+    return np.linalg.norm(points - nearest_on(points, path), axis=1)
