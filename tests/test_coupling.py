@@ -175,6 +175,16 @@ def test_contour_picture_magnifies_the_distance_not_the_lag():
     assert np.all(right.lines[0].get_ydata() < 0.5)
     np.testing.assert_allclose(right.lines[1].get_ydata(), 100.0, rtol=0.005)
 
+    lost = log(1e8, 0.0)
+    lost.displacement[1][60:] = np.nan  # as a run beyond all bounds is drawn
+    with styled():
+        picture = contour_figure(study, "t", {5: (lost, log(0.1, 0.0))})
+    assert "magnified 100 times" in picture.axes[0].get_title()
+    assert np.abs(picture.axes[0].get_xlim()).max() < 120.0
+    labels = picture.axes[1].get_legend_handles_labels()[1]
+    assert labels[0] == "before"
+    assert labels[1].endswith("nrad rms")
+
 
 def test_results_of_several_axes_come_with_both_pictures(tmp_path):
     references = BASE["references"] | {"tune": ["Rx+Ry:CIRCLE10"], "unseen": []}

@@ -62,8 +62,8 @@ def contour_figure(
             points = _path(log.displacement, axes)[first::step]
             nearest = nearest_on(points, path)
             off.append((nearest, points - nearest))
-        largest = np.nanmax([np.nanmax(np.abs(error), initial=0.0) for _, error in off])
-        magnified = _round_number(_SHARE * np.ptp(path, axis=0).max() / largest)
+        extent = np.ptp(path, axis=0).max()
+        magnified = _magnification([error for _, error in off], extent)
         left.plot(*path.T, color=REFERENCE, ls="--", lw=0.9, label="reference")
         for (nearest, error), colour, label in zip(
             off, (BEFORE, AFTER), ("before", "tuned"), strict=True
@@ -79,7 +79,10 @@ def contour_figure(
             ylabel=f"{other} ({unit})",
             title=f"{names[run]}: error magnified {magnified:g} times\n",
         )
-        left.set_aspect("equal", adjustable="datalim")
+        # A run that diverges leaves the picture.
+        middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
+        (x_low, y_low), (x_high, y_high) = middle - 0.7 * extent, middle + 0.7 * extent
+        left.set(xlim=(x_low, x_high), ylim=(y_low, y_high), aspect="equal")
         right.set(xlabel="time (s)", ylabel=f"distance from the contour ({small})")
         legend_above(left)
         legend_above(right)
@@ -109,9 +112,16 @@ def _path(signals: tuple[np.ndarray, ...], axes: tuple[int, int]) -> np.ndarray:
     return np.stack([np.asarray(signals[axis]) for axis in axes], axis=1)
 
 
-def _round_number(value: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, not above ``value``, and at least 1."""
-    if not np.isfinite(value) or value < 1.0:
+def _magnification(errors: list[np.ndarray], extent: float) -> float:
+    """Return 1, 2 or 5 times a power of ten by which errors are drawn, at least 1.
+
+    The largest is drawn as a share of the contour; a run that is nowhere near does not
+    count.
+    """
+    largest = [np.abs(e[np.isfinite(e)]).max(initial=0.0) for e in errors]
+    near = max((value for value in largest if value < extent), default=extent)
+    wanted = _SHARE * extent / max(near, 1e-6 * extent)
+    if wanted < 1.0:
         return 1.0
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(max(m for m in (1.0, 2.0, 5.0) if m * power <= value) * power)
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(max(m for m in (1.0, 2.0, 5.0) if m * power <= wanted) * power)
