@@ -74,6 +74,7 @@ from .rollout import in_blocks as in_blocks
 from .rollout import simulate as simulate
 from .serial import load as load
 from .serial import save as save
+from .stability import MultiAxisReport as MultiAxisReport
 from .stability import stability_report as stability_report
 from .study import Case as Case
 from .system import Affine as Affine

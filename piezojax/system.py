@@ -42,6 +42,38 @@ class System(eqx.Module):
         return Parallel((*_parallel_parts(self), *_parallel_parts(other)))
 
 
+class Designed(System):
+    """A system whose parameters are not the numbers that it steps with.
+
+    ``law`` works those out, a gain matrix from a model say, as a system with the same
+    state, input and output. ``simulate`` does so once, before the loop over time; left
+    in the step it would be done, and differentiated, at every sample.
+    """
+
+    @abc.abstractmethod
+    def law(self) -> System:
+        """Return what is run."""
+
+    def init(self, input: Any = 0.0) -> State:
+        return self.law().init(input)
+
+    def step(self, state: State, input: Any) -> tuple[State, Any]:
+        return self.law().step(state, input)
+
+
+def worked_out(system: Any) -> Any:
+    """Return ``system`` with every part that is Designed replaced by its law."""
+
+    def is_designed(part: Any) -> bool:
+        return isinstance(part, Designed)
+
+    return jax.tree.map(
+        lambda part: worked_out(part.law()) if is_designed(part) else part,
+        system,
+        is_leaf=is_designed,
+    )
+
+
 def rest_output(system: System, input: Any) -> Any:
     """Return what ``system`` puts out at rest under the constant ``input``."""
     return system.step(system.init(input), input)[1]

@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable, Mapping
 
 from ..system import System
+from . import mirror as mirror
 from . import p558_control as p558_control
 from . import p558_stage as p558_stage
 from . import p753 as p753
@@ -15,6 +16,7 @@ PLANTS: dict[str, Callable[..., System]] = {
     "p753": p753_by_rate.plant,
     "p753_chapter4": p753_by_rate.chapter4_plant,
     "p558": p558_stage.plant,
+    "mirror": mirror.stage,
 }
 """Plants a study can name."""
 
@@ -48,6 +50,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     ),
     "p558_nominal": p558_control.nominal,
     "p558_disturbance_observer": p558_control.disturbance_observer,
+    "mirror_multi_axis": mirror.multi_axis,
 }
 """Controllers a study can name, with printed gains except where they say "ours";
 those that take a ``rate`` (Hz) come at the study's."""

@@ -20,7 +20,7 @@ from ..axes import (
     product,
 )
 from ..dynamics.matrix_arma import MatrixARMA
-from ..system import Observation, System
+from ..system import Designed, Observation, System
 
 
 class MultiAxisState(NamedTuple):
@@ -44,7 +44,7 @@ def _matrices(values) -> tuple[Rows, ...]:
     return tuple(as_rows(value) for value in values)
 
 
-class MultiAxisSlidingModePID(System):
+class MultiAxisSlidingModePID(Designed):
     """Output-tracking sliding mode control with static decoupling, (7.16)-(7.40).
 
     For ``model``, q axes with p matrices each, any p. The command is u1 + u2. u1 moves
@@ -104,20 +104,71 @@ class MultiAxisSlidingModePID(System):
         """Sample time, s."""
         return self.model.dt
 
+    def law(self) -> "MultiAxisLaw":
+        """Return the controller with its gain matrices worked out."""
+        A, surface = self.model.autoregressive, self.surface
+        q, lags = self.model.axes, len(self.model.moving) - 1
+        unit = diagonal([1.0] * q)
+        shared = plus(unit, jax.tree.map(lambda k: lags * k, self.decoupling))
+        forward = matrix_product(shared, inverse(plus(*self.model.moving)))
+        driven = plus(
+            *(
+                matrix_product(S, h)
+                for S, h in zip(surface, self.model.responses(), strict=True)
+            )
+        )
+        reach = inverse(driven)
+        equivalent = []
+        for j, S in enumerate(surface):
+            # X2 moves up by one block; the model's A make the last.
+            moved = matrix_product(surface[-1], A[-1 - j])
+            if j > 0:
+                moved = plus(moved, surface[j - 1])
+            wanted = minus(matrix_product(self.reaching, S), moved)
+            equivalent.append(matrix_product(reach, wanted))
+        return MultiAxisLaw(
+            self.proportional,
+            self.integral,
+            self.derivative,
+            self.decoupling,
+            surface,
+            self.model,
+            forward=forward,
+            past_desired=tuple(matrix_product(forward, a) for a in A),
+            rest=inverse(shared),
+            equivalent=tuple(equivalent),
+            reference_model=self.reference_model,
+        )
+
+
+class MultiAxisLaw(System):
+    """What MultiAxisSlidingModePID runs: its own matrices, and those worked out.
+
+    ``forward`` F1, ``past_desired`` F1 A_i, ``rest`` (I + (p-1) K_s)^-1 and
+    ``equivalent`` (S B)^-1 (PHI S - S A), a block for each of X2.
+    """
+
+    proportional: Rows
+    integral: Rows
+    derivative: Rows
+    decoupling: Rows
+    surface: tuple[Rows, ...]
+    model: MatrixARMA
+    forward: Rows
+    past_desired: tuple[Rows, ...]
+    rest: Rows
+    equivalent: tuple[Rows, ...]
+    reference_model: System
+
     def _forward(self, desired: tuple[Axes, ...], past: tuple[Axes, ...]) -> Axes:
         """Return u1 for y_d(k+1), ..., y_d(k-p+1) and the last p-1 values of u1."""
-        lags = len(self.model.moving) - 1
-        unit = diagonal([1.0] * self.model.axes)
-        shared = jax.tree.map(lambda k: lags * k, self.decoupling)
-        gain = matrix_product(plus(unit, shared), inverse(plus(*self.model.moving)))
         newest, *older = desired
-        wanted = product(gain, newest)
-        # F1 times each A beforehand: shared by all lanes of a batch.
-        for matrix, value in zip(self.model.autoregressive, older, strict=True):
-            wanted = minus(wanted, product(matrix_product(gain, matrix), value))
-        if not past:
-            return wanted
-        return minus(wanted, product(self.decoupling, plus(*past)))
+        wanted = product(self.forward, newest)
+        for matrix, value in zip(self.past_desired, older, strict=True):
+            wanted = minus(wanted, product(matrix, value))
+        if past:
+            wanted = minus(wanted, product(self.decoupling, plus(*past)))
+        return wanted
 
     def _predicted(
         self, error: Axes, last: tuple[Axes, ...], feedback: Axes
@@ -128,59 +179,37 @@ class MultiAxisSlidingModePID(System):
         carried, so that a compiler computes neither twice.
         """
         found = [error]
-        A, B = self.model.autoregressive, self.model.moving
+        model = self.model
+        A, B = model.autoregressive, model.moving
         p = len(B)
         for j in range(1, p):
             block = product(B[j], feedback)
             # The last block has no successor in X2(k-1); A_0 e(k-1) is in its place.
-            if j + 1 < p:
-                block = plus(block, last[j + 1])
-            else:
-                block = plus(block, product(A[j], last[0]))
+            inner = j + 1 < p
+            older = last[j + 1] if inner else product(A[j], last[0])
+            block = plus(block, older)
             for i in range(j):
                 known = found[j - 1 - i]
-                if j + 1 < p:
-                    known = minus(known, last[j - i])
+                known = minus(known, last[j - i]) if inner else known
                 block = plus(block, product(A[i], known))
             found.append(block)
         return tuple(found)
 
     def _sliding(self, predicted: tuple[Axes, ...]) -> Axes:
-        return plus(
-            *(product(S, x) for S, x in zip(self.surface, predicted, strict=True))
-        )
-
-    def _equivalent(self, predicted: tuple[Axes, ...]) -> Axes:
-        """Return (S B)^-1 (PHI S - S A) X2, its matrix made beforehand."""
-        responses, surface = self.model.responses(), self.surface
-        driven = plus(
-            *(matrix_product(S, h) for S, h in zip(surface, responses, strict=True))
-        )
-        gain = inverse(driven)
-        blocks = []
-        for j, S in enumerate(surface):
-            # X2 moves up by one block; the model's A make the last.
-            moved = matrix_product(surface[-1], self.model.autoregressive[-1 - j])
-            if j > 0:
-                moved = plus(moved, surface[j - 1])
-            blocks.append(
-                matrix_product(gain, minus(matrix_product(self.reaching, S), moved))
-            )
-        return plus(*(product(K, x) for K, x in zip(blocks, predicted, strict=True)))
+        return _summed(self.surface, predicted)
 
     def init(self, input: Observation) -> MultiAxisState:
-        q, p = self.model.axes, len(self.model.moving)
+        model = self.model
+        q, p = model.axes, len(model.moving)
         desired = (tuple(as_array(r) for r in input.reference),) * p
         zero = (jnp.zeros_like(desired[0][0]),) * q
         # At rest u1 is its own past: u1 (I + (p-1) K_s) = F1 R1.
-        shared = jax.tree.map(lambda k: (p - 1) * k, self.decoupling)
-        own = inverse(plus(diagonal([1.0] * q), shared))
         wanted = self._forward((*desired, desired[0]), (zero,) * (p - 1))
-        forward = product(own, wanted)
+        forward = product(self.rest, wanted)
         feedback = minus(tuple(as_array(u) for u in input.applied), forward)
         error = minus(tuple(as_array(z) for z in input.measured), desired[0])
         predicted = [error]
-        A, B = self.model.autoregressive, self.model.moving
+        A, B = model.autoregressive, model.moving
         for j in range(1, p):
             terms = [product(A[i], predicted[j - 1 - i]) for i in range(j)]
             terms += [product(A[i], error) for i in range(j, p)]
@@ -188,7 +217,7 @@ class MultiAxisSlidingModePID(System):
             predicted.append(plus(*terms))
         sliding = self._sliding(tuple(predicted))
         proportional = product(self.proportional, sliding)
-        equivalent = self._equivalent(tuple(predicted))
+        equivalent = _summed(self.equivalent, tuple(predicted))
         return MultiAxisState(
             reference_model=self.reference_model.init(desired[0]),
             desired=desired,
@@ -202,6 +231,7 @@ class MultiAxisSlidingModePID(System):
     def step(
         self, state: MultiAxisState, input: Observation
     ) -> tuple[MultiAxisState, Axes]:
+        dt = self.model.dt
         error = minus(input.measured, state.desired[0])
         reference_model, following = self.reference_model.step(
             state.reference_model, input.reference
@@ -213,16 +243,19 @@ class MultiAxisSlidingModePID(System):
         sliding = self._sliding(predicted)
         summed = product(self.integral, sliding)
         integral = tuple(
-            i - self.dt * s for i, s in zip(state.integral, summed, strict=True)
+            i - dt * s for i, s in zip(state.integral, summed, strict=True)
         )
         slope = tuple(
-            (s - last) / self.dt for s, last in zip(sliding, state.sliding, strict=True)
+            (s - last) / dt for s, last in zip(sliding, state.sliding, strict=True)
         )
         switching = minus(
             integral,
-            plus(product(self.proportional, sliding), product(self.derivative, slope)),
+            plus(
+                product(self.proportional, sliding),
+                product(self.derivative, slope),
+            ),
         )
-        feedback = plus(self._equivalent(predicted), switching)
+        feedback = plus(_summed(self.equivalent, predicted), switching)
         state = MultiAxisState(
             reference_model=reference_model,
             desired=desired[:-1],
@@ -233,3 +266,8 @@ class MultiAxisSlidingModePID(System):
             sliding=sliding,
         )
         return state, plus(forward, feedback)
+
+
+def _summed(matrices: tuple[Rows, ...], blocks: tuple[Axes, ...]) -> Axes:
+    pairs = zip(matrices, blocks, strict=True)
+    return plus(*(product(matrix, block) for matrix, block in pairs))

@@ -16,6 +16,8 @@ from .linear_map import LinearMap as LinearMap
 from .matrix_arma import MatrixARMA as MatrixARMA
 from .matrix_arma import observability_form as observability_form
 from .neural_state_space import NeuralStateSpace as NeuralStateSpace
+from .reduction import Reduction as Reduction
+from .reduction import balanced_reduction as balanced_reduction
 from .scheduled import AmplitudeScheduled as AmplitudeScheduled
 from .state_space import StateSpace as StateSpace
 from .state_space import reflected as reflected

@@ -99,37 +99,57 @@ class MatrixARMA(System):
         return [[memory, product(b, input)] for memory, b in kept] + [[]]
 
 
-def observability_form(model: StateSpace) -> MatrixARMA:
-    """Return a square ``model`` with n states and q outputs as a MatrixARMA, p = n/q.
+def observability_form(model: StateSpace, lags: int | None = None) -> MatrixARMA:
+    """Return a square ``model`` with n states and q outputs as a MatrixARMA.
 
-    With F = [C; CA; ...; CA^(p-1)] (7.4), F A F^-1 has the matrices A_0, ..., A_(p-1)
-    in its last rows, and B_(p-1-j) = h_j - sum_i A_(p-i) h_(j-i) for the Markov
-    parameters h (7.5). Raises ValueError for a model that is not square, an n that is
-    no multiple of q, D that is not zero, or one that cannot be observed in p samples.
+    p is ``lags``, by default the least with p q >= n. F = [C; CA; ...; CA^(p-1)] (7.4)
+    gives [A_0 ... A_(p-1)] F = C A^p, and B_(p-1-j) = h_j - sum_i A_(p-i) h_(j-i) for
+    the Markov parameters h (7.5). For n = p q the A are those of the thesis, the last
+    rows of F A F^-1. Otherwise F has more rows than columns, the A are the smallest
+    that solve it, and the model is met exactly all the same: p q - n modes are added
+    that no input moves. More lags than needed make F better conditioned.
+
+    Raises ValueError for a model that is not square, D that is not zero, one that
+    cannot be observed in p samples, or added modes outside the unit circle of a stable
+    model, which rounding would set going.
     """
     (n, inputs), q = model.B.shape, len(model.C)
     if inputs != q:
         raise ValueError(
             f"the model has {inputs} inputs and {q} outputs; as many it must be"
         )
-    if n % q:
-        raise ValueError(
-            f"{n} states are no multiple of {q} outputs; reduce or extend the model to "
-            f"{n - n % q} or {n - n % q + q} states"
-        )
     if np.any(np.asarray(model.D)):
         raise ValueError("D is not zero; an input must not reach its own sample")
-    A, C, p = np.asarray(model.A), np.asarray(model.C), n // q
+    p = -(-n // q) if lags is None else lags
+    if p * q < n:
+        raise ValueError(f"lags is {p}; {n} states and {q} outputs need {-(-n // q)}")
+    A, C = np.asarray(model.A), np.asarray(model.C)
     F = np.vstack([C @ np.linalg.matrix_power(A, i) for i in range(p)])
-    if np.linalg.matrix_rank(F) < n:
+    last, _, rank, _ = np.linalg.lstsq(
+        F.T, (C @ np.linalg.matrix_power(A, p)).T, rcond=None
+    )
+    if rank < n:
         raise ValueError(
             f"the model cannot be observed in {p} samples: (7.4) is singular"
         )
-    last = np.linalg.solve(F.T, (C @ np.linalg.matrix_power(A, p)).T).T
-    newest_first = [last[:, i * q : (i + 1) * q] for i in reversed(range(p))]
+    newest_first = [last.T[:, i * q : (i + 1) * q] for i in reversed(range(p))]
+    _check_added(model, newest_first)
     h = np.asarray(model.markov(p))
     moving = [
         h[j] - sum((newest_first[i] @ h[j - 1 - i] for i in range(j)), np.zeros((q, q)))
         for j in range(p)
     ]
     return MatrixARMA(newest_first, moving, model.dt)
+
+
+def _check_added(model: StateSpace, autoregressive: list[np.ndarray]) -> None:
+    q = len(autoregressive[0])
+    companion = np.eye(q * len(autoregressive), k=-q)
+    companion[:q] = np.hstack(autoregressive)
+    radius = np.abs(np.linalg.eigvals(companion)).max()
+    own = np.abs(model.poles()).max()
+    if own < 1.0 <= radius:
+        raise ValueError(
+            f"a mode added to fill {len(autoregressive)} lags has radius {radius:.6g}; "
+            "it must be below 1: reduce the model, or give other lags"
+        )

@@ -22,7 +22,7 @@ from ..identify.fit import FitReport
 from ..identify.methods import METHODS
 from ..identify.parts import PARTS
 from ..reproduce.cell import Cell, title_of
-from ..reproduce.summary import TableAgreement
+from ..reproduce.summary import GroupedAgreement, TableAgreement
 from ..stability import StabilityReport
 from ..tune.result import Perturbed, Result, Scores
 from .stability import Comparison
@@ -261,17 +261,42 @@ def fit_table(report: FitReport) -> Table:
     return table
 
 
+WIDE = 3
+"""Most columns of a table beside each other: what fits into 80 characters."""
+
+
 def reproduction_table(
     name: str, cells: Sequence[Cell], agreement: TableAgreement
 ) -> Table:
     """Return paper beside simulation, a row a reference."""
     columns = list(agreement.columns)
     units = ", ".join(dict.fromkeys(cell.unit for cell in cells))
-    table = Table(
-        title=f"{title_of(name)}: paper / simulation in {units}\n"
+    title = (
+        f"{title_of(name)}: paper / simulation in {units}\n"
         f"geometric-mean ratio {agreement.geomean_ratio:.3f}, "
         f"worst {agreement.worst_ratio:.2f}"
     )
+    if isinstance(agreement, GroupedAgreement):
+        title += "\n" + ", ".join(
+            f"{group} {part.geomean_ratio:.3f}"
+            for group, part in agreement.groups.items()
+        )
+    if len(columns) <= WIDE:
+        return _beside(columns, cells, agreement, title)
+    stack = Table.grid()
+    for start in range(0, len(columns), WIDE):
+        part = columns[start : start + WIDE]
+        stack.add_row(_beside(part, cells, agreement, "" if start else title))
+    return stack
+
+
+def _beside(
+    columns: Sequence[str],
+    cells: Sequence[Cell],
+    agreement: TableAgreement,
+    title: str,
+) -> Table:
+    table = Table(title=title)
     table.add_column("reference")
     for column in columns:
         table.add_column(column, justify="right")

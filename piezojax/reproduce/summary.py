@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from pydantic import BaseModel
@@ -24,6 +24,12 @@ class TableAgreement(Agreement):
     columns: dict[str, Agreement]
 
 
+class GroupedAgreement(TableAgreement):
+    """The same for groups of cells that lie across columns too."""
+
+    groups: dict[str, Agreement]
+
+
 def _agreement(cells: Sequence[Cell]) -> Agreement:
     distance = np.abs(np.log([cell.ratio for cell in cells]))
     return Agreement(
@@ -33,18 +39,26 @@ def _agreement(cells: Sequence[Cell]) -> Agreement:
     )
 
 
+def _by(key: Callable[[Cell], str], cells: Sequence[Cell]) -> dict[str, Agreement]:
+    return {
+        name: _agreement([cell for cell in cells if key(cell) == name])
+        for name in dict.fromkeys(key(cell) for cell in cells)
+    }
+
+
 def summarise(cells: Sequence[Cell]) -> dict[str, TableAgreement]:
     """Return the agreement of each table in ``cells``."""
     summary = {}
     for table in dict.fromkeys(cell.table for cell in cells):
         inside = [cell for cell in cells if cell.table == table]
-        columns = {
-            column: _agreement([c for c in inside if c.column == column])
-            for column in dict.fromkeys(cell.column for cell in inside)
-        }
-        summary[table] = TableAgreement(
-            **_agreement(inside).model_dump(), columns=columns
-        )
+        whole = _agreement(inside).model_dump()
+        columns = _by(lambda cell: cell.column, inside)
+        grouped = [cell for cell in inside if cell.group]
+        if grouped:
+            groups = _by(lambda cell: cell.group, grouped)
+            summary[table] = GroupedAgreement(**whole, columns=columns, groups=groups)
+        else:
+            summary[table] = TableAgreement(**whole, columns=columns)
     return summary
 
 
