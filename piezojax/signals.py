@@ -197,15 +197,15 @@ SIGNALS: dict[str, Callable[..., Time]] = {
     "SIN": sine,
     "SW": superposed_sine,
     "PWSW": piecewise_sine,
-    "COS": cosine,
     "TRI": triangle,
-    "SCAN": scan,
     "STEP": step,
     "SQUARE": square,
     "CONST": constant,
     "CHIRP": chirp,
     "MULTISINE": multisine,
     "PRBS": prbs,
+    "COS": cosine,
+    "SCAN": scan,
 }
 """Signals by the name a study uses; a trailing number is the frequency: ``SIN10``."""
 
