@@ -11,7 +11,7 @@ from piezojax.report.coupling import coupling_figure
 from piezojax.report.figures import styled
 from piezojax.study import Study, build
 from piezojax.system import LoopSample
-from piezojax.tune.coupling import coupling_matrix
+from piezojax.tune import coupling_matrix
 from piezojax.tune.objective import Signals
 from piezojax.tune.result import Result, Scores
 from piezojax.tune.traces import traces_of
