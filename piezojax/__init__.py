@@ -7,10 +7,12 @@ __version__ = "0.1.0"
 _runtime.configure()
 
 from . import catalog as catalog
+from . import contours as contours
 from . import motions as motions
 from . import signals as signals
 from .axes import PerAxis as PerAxis
 from .charge_drive import ChargeDrive as ChargeDrive
+from .contour_error import ContourError as ContourError
 from .control import PID as PID
 from .control import Allocation as Allocation
 from .control import AlphaBeta as AlphaBeta

@@ -142,6 +142,23 @@ class PerAxis(System):
         return tuple(s for s, _ in stepped), tuple(output for _, output in stepped)
 
 
+class Packed(System):
+    """``system``, which works on vectors, among systems of tuples of scalars.
+
+    Input and output are tuples, an axis or actuator each. Meant for a few: an
+    allocation, a geometry.
+    """
+
+    system: System
+
+    def init(self, input: Axes) -> State:
+        return self.system.init(jnp.stack(as_scalars(input)))
+
+    def step(self, state: State, input: Axes) -> tuple[State, Axes]:
+        state, output = self.system.step(state, jnp.stack(as_scalars(input)))
+        return state, tuple(output[i] for i in range(output.shape[0]))
+
+
 class PerAxisMetric(Metric):
     """``metric`` of each axis; figures of shape [axes]."""
 

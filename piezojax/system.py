@@ -324,7 +324,9 @@ def holding_input(plant: System, output: Signal) -> Signal:
     Solved by Newton's method on the loading curve from the plant's own rest point;
     where no input reaches ``output`` the last iterate is returned and the loop starts
     with an error. Limits belong in the loop's actuator, not in the plant: the curve is
-    flat behind them.
+    flat behind them. The search starts at 0; with several axes at ``output`` itself,
+    because commands are in its unit and a stage with an allocation inside may not reach
+    the pose 0, or be on the edge of its reach there.
     """
     output = jax.tree.map(as_array, output)
 
@@ -332,7 +334,7 @@ def holding_input(plant: System, output: Signal) -> Signal:
         return jax.tree.map(jnp.subtract, rest_output(plant, input), output)
 
     solver = optx.Newton(rtol=1e-12, atol=1e-12)
-    start = jax.tree.map(jnp.zeros_like, output)
+    start = output if isinstance(output, tuple) else jnp.zeros_like(output)
     solution = optx.root_find(residual, solver, start, max_steps=64, throw=False)
     return jax.tree.map(
         lambda value: jnp.where(jnp.isfinite(value), value, 0.0), solution.value

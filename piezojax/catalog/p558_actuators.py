@@ -6,12 +6,15 @@ pushing up through the same stiffness, so that the plate, which is rigid, takes 
 that fits their elongations best.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
+from ..axes import Packed, PerAxis
 from ..control.allocation import Allocation
 from ..dynamics import LinearMap, StateSpace
-from ..system import Series, series
+from ..system import Series, System, series
 
 POSITIONS = ((50.0, 50.0), (-50.0, 50.0), (-50.0, -50.0), (50.0, -50.0))
 """(x, y) of each actuator, mm; counterclockwise."""
@@ -59,4 +62,23 @@ def stage(actuator: StateSpace, method: str = "bounded") -> Series:
         allocation=allocation(method),
         actuators=StateSpace(A, B, C, D, actuator.dt),
         plate=LinearMap(geometry()),
+    )
+
+
+def axes_stage(
+    actuators: Sequence[System], sharing: Allocation | None = None
+) -> Series:
+    """Return the stage as the plant of a loop of several axes: tuples of scalars.
+
+    From a commanded pose to the pose that ``actuators``, systems of a scalar each of
+    whatever dynamics and hysteresis, make of the share that ``sharing`` gives them,
+    ``allocation()`` unless told. Named parts as in ``stage``. Raises ValueError unless
+    there are four.
+    """
+    if len(actuators) != len(POSITIONS):
+        raise ValueError(f"{len(actuators)} actuators; there must be {len(POSITIONS)}")
+    return series(
+        allocation=Packed(allocation() if sharing is None else sharing),
+        actuators=PerAxis(tuple(actuators)),
+        plate=Packed(LinearMap(geometry())),
     )

@@ -16,7 +16,18 @@ from ..system import LoopSample, loop_inputs
 from ..tune.result import GAINS_FILE, RESULT_FILE
 from ..tune.traces import Trace, traces_of
 from ..tune.tuner import Outcome
-from .figures import AFTER, BEFORE, REFERENCE, figure, legend_above, styled, write
+from .contour import contour_figure, contours_in
+from .coupling import coupling_figure
+from .figures import (
+    AFTER,
+    BEFORE,
+    REFERENCE,
+    UNITS,
+    figure,
+    legend_above,
+    styled,
+    write,
+)
 
 _SHOWN = 3  # references in the tracking picture
 _BEYOND = 1e9  # um or V
@@ -24,14 +35,28 @@ _PERIODS = 4.0  # of the reference, at the end of the run
 
 
 def write_results(outcome: Outcome, folder: Path) -> None:
-    """Write result.json, gains.toml and the pictures into ``folder``."""
+    """Write result.json, gains.toml and the pictures into ``folder``.
+
+    On a stage with several axes that of their coupling, and of the contours if there
+    are any, too.
+    """
     write_numbers(outcome, folder)
-    logs = _logs(outcome)
+    study, result = outcome.case.study, outcome.result
+    shown = _shown(outcome)
+    chosen = {trace.run for trace in shown} | {c.run for c in contours_in(study)}
+    runs = _runs(outcome, chosen)
+    logs = {trace: _of_axis(study, trace, runs[trace.run]) for trace in shown}
     with styled():
-        write(tracking_figure(outcome, logs), folder / "tracking.png")
-        write(hysteresis_figure(outcome, logs), folder / "hysteresis.png")
-        if outcome.result.history:
-            write(convergence_figure(outcome), folder / "convergence.png")
+        pictures = {
+            "tracking": tracking_figure(outcome, logs),
+            "hysteresis": hysteresis_figure(outcome, logs),
+            "convergence": convergence_figure(outcome) if result.history else None,
+            "coupling": coupling_figure(study, result),
+            "contour": contour_figure(study, result.title, runs),
+        }
+        for name, picture in pictures.items():
+            if picture:
+                write(picture, folder / f"{name}.png")
 
 
 def write_numbers(outcome: Outcome, folder: Path) -> None:
@@ -40,36 +65,40 @@ def write_numbers(outcome: Outcome, folder: Path) -> None:
     save(outcome.controller, folder / GAINS_FILE)
 
 
-Logs = dict[Trace, tuple[LoopSample, LoopSample]]
+Both = tuple[LoopSample, LoopSample]
+"""What the loop logs before and after tuning."""
 
-UNITS = {"um": ("µm", "nm"), "urad": ("µrad", "nrad")}
-"""How a unit is written, and the unit a thousand times smaller."""
+Logs = dict[Trace, Both]
 
 
 def _moved(trace: Trace) -> str:
     return "rotation" if trace.unit == "urad" else "displacement"
 
 
-def _logs(outcome: Outcome) -> Logs:
-    """Run both loops over the shown references, as in the hold-out."""
+def _runs(outcome: Outcome, chosen: set[int]) -> dict[int, Both]:
+    """Run both loops over the chosen references, as in the hold-out."""
 
     @jax.jit
     def run(loop, reference, noise):
         inputs = loop_inputs(reference, noise, outcome.holdout.disturbance)
         return simulate(loop, inputs, loop.init(reference[0]))[1]
 
-    logs = {}
-    for trace in _shown(outcome):
-        signals = outcome.holdout
-        reference, noise = signals.references[trace.run], signals.noise[trace.run, 0]
+    signals = outcome.holdout
+    runs = {}
+    for index in sorted(chosen):
         before, after = (
-            jax.tree.map(_drawable, run(loop, reference, noise))
+            run(loop, signals.references[index], signals.noise[index, 0])
             for loop in (outcome.before, outcome.after)
         )
-        if outcome.case.study.axes:
-            before, after = axis_of(before, trace.axis), axis_of(after, trace.axis)
-        logs[trace] = (before, after)
-    return logs
+        runs[index] = jax.tree.map(_drawable, (before, after))
+    return runs
+
+
+def _of_axis(study: Study, trace: Trace, both: Both) -> Both:
+    if not study.axes:
+        return both
+    before, after = (axis_of(log, trace.axis) for log in both)
+    return before, after
 
 
 def _drawable(values: jax.Array) -> np.ndarray:
