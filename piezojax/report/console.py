@@ -1,5 +1,6 @@
 """What the commands print: progress while they work, one table at the end."""
 
+import math
 import signal
 import sys
 import threading
@@ -224,6 +225,27 @@ def stability_table(comparison: Comparison) -> Table:
             f"{phase:.1f}°",
             f"{delay:.2f} samples",
         )
+    for name, found in comparison.axes.items():
+        shown = "tuned" if name == "after" else name
+        if not found.report.stable:
+            table.add_row(shown, "unstable", "-", "-", "-")
+        for axis, report in zip(comparison.axis_names, found.report.axes, strict=False):
+            peak, gain, phase, delay = _worst([report])
+            table.add_row(
+                f"{shown}, {axis}",
+                f"{peak:.2f}",
+                f"{gain:.1f} dB",
+                f"{phase:.1f}°",
+                f"{delay:.2f} samples",
+            )
+        if found.report.disk_margin is not None:
+            table.add_row(
+                f"{shown}, all axes at once",
+                f"{found.report.sensitivity_peak:.2f}",
+                f"{20.0 * math.log10(found.report.disk_gain_margin or 1.0):.1f} dB",
+                f"{found.report.disk_phase_margin_deg:.1f}°",
+                "-",
+            )
     for name in comparison.problems:
         table.add_row("tuned" if name == "after" else name, "-", "-", "-", "-")
     return table

@@ -1,6 +1,7 @@
 """The tables of a study file, validated before anything is built."""
 
 import difflib
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -124,11 +125,13 @@ class Actuator(Table):
     def _ordered(self) -> "Actuator":
         if np.ndim(self.lower) != np.ndim(self.upper):
             raise ValueError("lower and upper must both be lists, or neither")
-        if np.any(np.greater_equal(self.lower, self.upper)):
-            raise ValueError(
-                f"lower is {self.lower} V and upper {self.upper} V; "
-                "lower must be below upper"
-            )
+        pairs = zip(np.ravel(self.lower), np.ravel(self.upper), strict=False)
+        for lower, upper in pairs:
+            if lower >= upper:
+                raise ValueError(
+                    f"lower is {lower:g} V and upper {upper:g} V; "
+                    "lower must be below upper"
+                )
         return self
 
 
@@ -221,7 +224,12 @@ class Study(Table):
                 "it takes 2 or more"
             )
         for name in (*table.tune, *table.unseen):
-            for kind in self.driven(name).values():
+            try:
+                driven = self.driven(name)
+            except ValueError as error:
+                part = "tune" if name in table.tune else "unseen"
+                raise ValueError(f"references.{part}: {error}") from None
+            for kind in driven.values():
                 frequency = signals.parse(kind)[1] or 0.0
                 if frequency >= 0.5 * self.rate:
                     raise ValueError(
@@ -312,9 +320,15 @@ def validated(kind: type[Any], data: Any, where: str) -> Any:
         raise ValueError(_first_line(error, kind, where)) from None
 
 
+_UNION = re.compile(r"(constrained-)?(float|tuple\[.*)$")
+"""What pydantic adds to a place where a field takes one of several kinds."""
+
+
 def _first_line(error: ValidationError, kind: type[BaseModel], where: str) -> str:
-    first = error.errors()[0]
-    key = ".".join([where, *(str(part) for part in first["loc"])]).strip(".")
+    # Of a field that takes a number or a list, the error that fits what was given.
+    first = min(error.errors(), key=lambda found: isinstance(found["input"], list))
+    place = [str(part) for part in first["loc"] if not _UNION.match(str(part))]
+    key = ".".join([where, *place]).strip(".")
     if first["type"] == "extra_forbidden":
         table: Any = kind
         for part in first["loc"][:-1]:

@@ -66,6 +66,7 @@ def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> N
             stability = compared(
                 case.study.highest,
                 case.study.dt,
+                case.study.axes.names if case.study.axes else (),
                 before=outcome.before,
                 after=outcome.after,
             )
