@@ -82,7 +82,8 @@ class Objective(eqx.Module):
     ``aggregate`` joins them: ``geometric_mean`` (mean of logarithms: a tenfold gain
     counts the same on every reference), ``mean_square``, or ``worst`` (a smooth
     maximum of the logarithms). ``weights`` says how much each counts (alike if left
-    out). ``plants``, stacked on a leading axis, take the place of the loop's own, each
+    out); what is ``resting``, an axis that should not move, counts only as far as its
+    error exceeds its scale. ``plants``, stacked on a leading axis, take the place of the loop's own, each
     counting as much. ``effort_weight`` and ``slew_weight`` add the mean
     RMS voltage and RMS voltage change a sample, both as a share of ``voltage_span``.
     """
@@ -121,6 +122,10 @@ class Objective(eqx.Module):
         figures = self._figures(unit)
         square = jnp.mean(figures.rms_error**2, axis=2)
         normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
+        if any(self.resting):
+            # A smooth maximum with 1: no gain in stillness, a price for motion.
+            above = jnp.logaddexp(0.0, _SHARPNESS * jnp.log(normalised)) / _SHARPNESS
+            normalised = jnp.where(jnp.array(self.resting), jnp.exp(above), normalised)
         # Limits turn divergence into a limit cycle between them.
         railed = jnp.any(figures.saturated > RAILED)
         normalised = jnp.where(railed, jnp.inf, normalised)

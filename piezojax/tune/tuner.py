@@ -194,6 +194,7 @@ def tune(
         effort_weight=table.objective.effort_weight,
         slew_weight=table.objective.slew_weight,
         weights=_weights(case, data),
+        resting=tuple(not trace.driven for trace in data.traces[: data.tuned]),
         plants=_plants(case),
     )
     search = search_box(objective, case, clock, progress)
