@@ -146,7 +146,7 @@ class ObjectiveTable(Table):
     """What is minimised; see piezojax.tune.objective.Objective."""
 
     aggregate: Literal["geometric_mean", "mean_square", "worst"] = "geometric_mean"
-    coupling_weight: NotNegative = 0.1
+    coupling_weight: NotNegative = 1.0
     effort_weight: NotNegative = 0.0
     slew_weight: NotNegative = 0.0
     noise_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1

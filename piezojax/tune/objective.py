@@ -83,9 +83,10 @@ class Objective(eqx.Module):
     counts the same on every reference), ``mean_square``, or ``worst`` (a smooth
     maximum of the logarithms). ``weights`` says how much each counts (alike if left
     out); what is ``resting``, an axis that should not move, counts only as far as its
-    error exceeds its scale. ``plants``, stacked on a leading axis, take the place of the loop's own, each
-    counting as much. ``effort_weight`` and ``slew_weight`` add the mean
-    RMS voltage and RMS voltage change a sample, both as a share of ``voltage_span``.
+    error exceeds its scale. ``plants``, stacked on a leading axis, take the place of
+    the loop's own, each counting as much. ``effort_weight`` and ``slew_weight`` add the
+    mean RMS voltage and RMS voltage change a sample, both as a share of
+    ``voltage_span``.
     """
 
     loop: Feedback
@@ -96,6 +97,7 @@ class Objective(eqx.Module):
     start: int = eqx.field(static=True)
     weights: Float[Array, " references"] | None = None
     plants: System | None = None
+    resting: tuple[bool, ...] = eqx.field(static=True, default=())
     aggregate: Aggregate = eqx.field(static=True, default="geometric_mean")
     effort_weight: float = eqx.field(static=True, default=0.0)
     slew_weight: float = eqx.field(static=True, default=0.0)
