@@ -17,6 +17,10 @@ from .system import System
 
 Axes: TypeAlias = tuple[Scalar, ...]
 Rows: TypeAlias = tuple[tuple[Scalar, ...], ...]
+Plain: TypeAlias = tuple[Any, ...]
+"""Either of them where they are multiplied out: checking every scalar of every product
+for its type would take most of the time of a traced test."""
+
 T = TypeVar("T")
 
 
@@ -47,7 +51,7 @@ def as_matrix_of(rows: Rows) -> jax.Array:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-def product(matrix: Rows, vector: Axes) -> Axes:
+def product(matrix: Plain, vector: Plain) -> Plain:
     """Return ``matrix @ vector``."""
     return tuple(
         sum(
@@ -58,7 +62,7 @@ def product(matrix: Rows, vector: Axes) -> Axes:
     )
 
 
-def matrix_product(left: Rows, right: Rows) -> Rows:
+def matrix_product(left: Plain, right: Plain) -> Plain:
     """Return ``left @ right``."""
     columns = tuple(zip(*right, strict=True))
     return tuple(zip(*(product(left, column) for column in columns), strict=True))
@@ -74,7 +78,7 @@ def minus(left: T, right: T) -> T:
     return jax.tree.map(lambda a, b: a - b, left, right)
 
 
-def inverse(matrix: Rows) -> Rows:
+def inverse(matrix: Plain) -> Plain:
     """Return the inverse of a square matrix.
 
     Closed form up to 3 rows; beyond, a linear solve, which is slow inside a loop.
@@ -92,7 +96,7 @@ def inverse(matrix: Rows) -> Rows:
     )
 
 
-def _minor(matrix: Rows, row: int, column: int) -> Scalar:
+def _minor(matrix: Plain, row: int, column: int) -> Any:
     rest = [
         [value for j, value in enumerate(values) if j != column]
         for i, values in enumerate(matrix)
