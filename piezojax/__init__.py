@@ -7,20 +7,29 @@ __version__ = "0.1.0"
 _runtime.configure()
 
 from . import catalog as catalog
+from . import contours as contours
+from . import motions as motions
 from . import signals as signals
+from .axes import PerAxis as PerAxis
 from .charge_drive import ChargeDrive as ChargeDrive
+from .contour_error import ContourError as ContourError
 from .control import PID as PID
+from .control import Allocation as Allocation
 from .control import AlphaBeta as AlphaBeta
+from .control import Anticipation as Anticipation
 from .control import BangBang as BangBang
 from .control import BoundaryLayer as BoundaryLayer
 from .control import ContinuousSlidingModePID as ContinuousSlidingModePID
 from .control import DisturbanceObserverControl as DisturbanceObserverControl
 from .control import FeedforwardFeedback as FeedforwardFeedback
+from .control import Filtered as Filtered
 from .control import InverseFeedforward as InverseFeedforward
 from .control import InversionControl as InversionControl
 from .control import KalmanFilter as KalmanFilter
 from .control import LearningLaw as LearningLaw
 from .control import ModelReferencePID as ModelReferencePID
+from .control import MultiAxisSlidingModePID as MultiAxisSlidingModePID
+from .control import NominalSlidingModePID as NominalSlidingModePID
 from .control import RepetitiveControl as RepetitiveControl
 from .control import SlidingModePID as SlidingModePID
 from .control import StateSpaceController as StateSpaceController
@@ -29,12 +38,16 @@ from .control import SwitchedSlidingMode as SwitchedSlidingMode
 from .control import learn as learn
 from .dynamics import ARMA as ARMA
 from .dynamics import AmplitudeScheduled as AmplitudeScheduled
+from .dynamics import Channel as Channel
+from .dynamics import Channels as Channels
 from .dynamics import ExponentialCreep as ExponentialCreep
 from .dynamics import FirstOrderLag as FirstOrderLag
 from .dynamics import FractionalDelay as FractionalDelay
 from .dynamics import Held as Held
 from .dynamics import HystereticOscillator as HystereticOscillator
+from .dynamics import LinearMap as LinearMap
 from .dynamics import LogarithmicCreep as LogarithmicCreep
+from .dynamics import MatrixARMA as MatrixARMA
 from .dynamics import NeuralStateSpace as NeuralStateSpace
 from .dynamics import SecondOrderLag as SecondOrderLag
 from .dynamics import StateSpace as StateSpace
@@ -61,6 +74,7 @@ from .rollout import in_blocks as in_blocks
 from .rollout import simulate as simulate
 from .serial import load as load
 from .serial import save as save
+from .stability import MultiAxisReport as MultiAxisReport
 from .stability import stability_report as stability_report
 from .study import Case as Case
 from .system import Affine as Affine

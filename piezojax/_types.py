@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 Scalar = Float[Array, ""]
 ScalarLike = Float[Array, ""] | float | int
 Matrix = Float[Array, "rows columns"]
+Signal = Any  # a Scalar, or a tuple of one Scalar an axis
 State = Any  # a pytree of arrays; every System defines its own
 
 
@@ -25,6 +26,13 @@ def as_scalars(values: Iterable[Any]) -> tuple[Array, ...]:
     Scalars, not one packed array: XLA keeps them in registers inside the loop.
     """
     return tuple(as_array(value) for value in values)
+
+
+def as_signal(value: Any) -> Any:
+    """Return a number as a scalar, a vector or sequence as a tuple of one an axis."""
+    if isinstance(value, tuple | list) or jnp.ndim(value) == 1:
+        return as_scalars(value)
+    return as_array(value)
 
 
 def as_matrix(value: Any) -> Array:
@@ -88,13 +96,17 @@ def check_not_zero(name: str, value: Any) -> None:
         raise ValueError(f"{name} is 0; it must be another number")
 
 
-def check_order(low_name: str, low: Any, high_name: str, high: Any) -> None:
-    """Raise ValueError unless ``low < high`` wherever both are known."""
+def check_order(
+    low_name: str, low: Any, high_name: str, high: Any, *, equal: bool = False
+) -> None:
+    """Raise ValueError unless ``low < high``, or <=, wherever both are known."""
     lower, upper = _known(low), _known(high)
-    if lower is not None and upper is not None and not np.all(lower < upper):
+    if lower is None or upper is None:
+        return
+    if not np.all(lower <= upper if equal else lower < upper):
         raise ValueError(
             f"{low_name} is {_shown(lower)} and {high_name} is {_shown(upper)}; "
-            f"{low_name} must be below {high_name}"
+            f"{low_name} must be {'at most' if equal else 'below'} {high_name}"
         )
 
 

@@ -9,15 +9,16 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ._types import as_array
+from .axes import PerAxis
 from .system import Series, System
 
 S = TypeVar("S", bound=System)
 
 
 def _children(node: Any) -> dict[str, Any]:
-    if isinstance(node, Series) and node.names:
+    if isinstance(node, Series | PerAxis) and node.names:
         return dict(zip(node.names, node.parts, strict=True))
-    if isinstance(node, Series):
+    if isinstance(node, Series | PerAxis):
         return {str(i): part for i, part in enumerate(node.parts)}
     if isinstance(node, tuple):
         return {str(i): part for i, part in enumerate(node)}

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ._types import State
-from .system import System
+from .system import System, worked_out
 
 T = TypeVar("T")
 
@@ -71,6 +71,7 @@ def simulate(
             f"every is {every}; with a metric, which counts every sample, it must be 1"
         )
     samples = _length(inputs)
+    system = worked_out(system)
     state = system.init() if state is None else state
     if metric is not None:
         return _accumulate(system, inputs, state, metric, segment, samples)

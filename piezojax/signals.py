@@ -82,6 +82,42 @@ def sine(
     return offset + amplitude * (1.0 - jnp.cos(2.0 * jnp.pi * frequency * time))
 
 
+def cosine(
+    time: Time,
+    frequency: ScalarLike = 10.0,
+    amplitude: ScalarLike = 5.0,
+    offset: ScalarLike = 0.0,
+) -> Time:
+    """COS: ``sine`` a quarter of a period on; it starts in its middle, at full speed.
+
+    With SIN on another axis it makes a circle about the middle of both.
+    """
+    return offset + amplitude * (1.0 + jnp.sin(2.0 * jnp.pi * frequency * time))
+
+
+def scan(
+    time: Time,
+    frequency: ScalarLike = 10.0,
+    amplitude: ScalarLike = 5.0,
+    offset: ScalarLike = 0.0,
+    turnaround: float = 0.1,
+) -> Time:
+    """Triangle that turns round gently, at rest at its start.
+
+    Each of the two turns takes the share ``turnaround`` of the period, at constant
+    acceleration; the range, ``offset`` to ``offset + 2 amplitude``, is the triangle's.
+    Raises ValueError for a share outside 0 to 0.5.
+    """
+    check("turnaround", turnaround, least=0.0, most=0.5)
+    half = 0.5 * turnaround
+    below = 0.5 - jnp.abs(jnp.mod(time * frequency, 1.0) - 0.5)  # 0.5 at the top
+    near = jnp.minimum(below, 0.5 - below)  # from the turn that is nearer
+    speed = amplitude / (0.25 - 0.5 * half)
+    turning = near**2 / (2.0 * half) if half > 0.0 else near
+    gone = speed * jnp.where(near < half, turning, near - 0.5 * half)
+    return offset + jnp.where(below <= 0.25, gone, 2.0 * amplitude - gone)
+
+
 def piecewise_sine(
     time: Time,
     frequency: ScalarLike = 10.0,
@@ -168,6 +204,8 @@ SIGNALS: dict[str, Callable[..., Time]] = {
     "CHIRP": chirp,
     "MULTISINE": multisine,
     "PRBS": prbs,
+    "COS": cosine,
+    "SCAN": scan,
 }
 """Signals by the name a study uses; a trailing number is the frequency: ``SIN10``."""
 

@@ -4,11 +4,12 @@ import abc
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ._types import Scalar, ScalarLike, State, as_array, check
+from ._types import Scalar, ScalarLike, Signal, State, as_array, as_signal, check
 
 
 class System(eqx.Module):
@@ -39,6 +40,38 @@ class System(eqx.Module):
     def __add__(self, other: "System") -> "Parallel":
         """Return the sum of both systems' outputs for the same input."""
         return Parallel((*_parallel_parts(self), *_parallel_parts(other)))
+
+
+class Designed(System):
+    """A system whose parameters are not the numbers that it steps with.
+
+    ``law`` works those out, a gain matrix from a model say, as a system with the same
+    state, input and output. ``simulate`` does so once, before the loop over time; left
+    in the step it would be done, and differentiated, at every sample.
+    """
+
+    @abc.abstractmethod
+    def law(self) -> System:
+        """Return what is run."""
+
+    def init(self, input: Any = 0.0) -> State:
+        return self.law().init(input)
+
+    def step(self, state: State, input: Any) -> tuple[State, Any]:
+        return self.law().step(state, input)
+
+
+def worked_out(system: Any) -> Any:
+    """Return ``system`` with every part that is Designed replaced by its law."""
+
+    def is_designed(part: Any) -> bool:
+        return isinstance(part, Designed)
+
+    return jax.tree.map(
+        lambda part: worked_out(part.law()) if is_designed(part) else part,
+        system,
+        is_leaf=is_designed,
+    )
 
 
 def rest_output(system: System, input: Any) -> Any:
@@ -144,16 +177,16 @@ class Delay(System):
 
 
 class Observation(NamedTuple):
-    """What a controller sees at sample k.
+    """What a controller sees at sample k: scalars, or tuples of one scalar an axis.
 
     ``reference`` r(k) and ``next_reference`` r(k+1) in um; ``measured`` z(k) in um;
     ``applied``, the voltage that the actuator was given at k-1, after its limits, in V.
     """
 
-    reference: Scalar
-    next_reference: Scalar
-    measured: Scalar
-    applied: Scalar
+    reference: Signal
+    next_reference: Signal
+    measured: Signal
+    applied: Signal
 
 
 class LoopInput(NamedTuple):
@@ -163,9 +196,9 @@ class LoopInput(NamedTuple):
     scales; ``disturbance`` in um, if any, moves the displacement itself at k+1.
     """
 
-    next_reference: Scalar
-    noise: Scalar
-    disturbance: Scalar | None = None
+    next_reference: Signal
+    noise: Signal
+    disturbance: Signal | None = None
 
 
 class LoopSample(NamedTuple):
@@ -174,11 +207,11 @@ class LoopSample(NamedTuple):
     ``command`` is what the controller asked for, ``voltage`` what the actuator gave.
     """
 
-    reference: Scalar
-    displacement: Scalar
-    measured: Scalar
-    command: Scalar
-    voltage: Scalar
+    reference: Signal
+    displacement: Signal
+    measured: Signal
+    command: Signal
+    voltage: Signal
 
 
 class LoopState(NamedTuple):
@@ -188,9 +221,9 @@ class LoopState(NamedTuple):
     actuator: State
     plant: State
     sensor: State
-    reference: Scalar
-    displacement: Scalar
-    voltage: Scalar
+    reference: Signal
+    displacement: Signal
+    voltage: Signal
 
 
 class Feedback(System):
@@ -199,6 +232,9 @@ class Feedback(System):
     At sample k the sensor measures y(k), the controller sees r(k), r(k+1) and the
     measurement, the actuator turns its command into u(k), and u(k) moves the plant to
     y(k+1): one sample of delay from input to measured output, so no algebraic loop.
+
+    With several axes every signal is a tuple of scalars, one an axis, in the units of
+    its axis; nothing else changes.
     """
 
     controller: System
@@ -206,20 +242,22 @@ class Feedback(System):
     actuator: System
     sensor: System
 
-    def init(self, input: ScalarLike = 0.0) -> LoopState:
-        """Return the loop at rest at the reference ``input`` (um): a bumpless start."""
-        reference = as_array(input)
+    def init(self, input: Any = 0.0) -> LoopState:
+        """Return the loop at rest at the reference ``input`` (um): a bumpless start.
+
+        With several axes ``input`` is a vector or a tuple.
+        """
+        reference = as_signal(input)
         voltage = rest_output(self.actuator, holding_input(self.plant, reference))
         displacement = rest_output(self.plant, voltage)
-        measured = rest_output(
-            self.sensor, (displacement, jnp.zeros_like(displacement))
-        )
+        quiet = (displacement, jax.tree.map(jnp.zeros_like, displacement))
+        measured = rest_output(self.sensor, quiet)
         seen = Observation(reference, reference, measured, voltage)
         return LoopState(
             controller=self.controller.init(seen),
             actuator=self.actuator.init(voltage),
             plant=self.plant.init(voltage),
-            sensor=self.sensor.init((displacement, jnp.zeros_like(displacement))),
+            sensor=self.sensor.init(quiet),
             reference=reference,
             displacement=displacement,
             voltage=voltage,
@@ -236,7 +274,7 @@ class Feedback(System):
         actuator, voltage = self.actuator.step(state.actuator, command)
         plant, displacement = self.plant.step(state.plant, voltage)
         if input.disturbance is not None:
-            displacement = displacement + input.disturbance
+            displacement = jax.tree.map(jnp.add, displacement, input.disturbance)
         sample = LoopSample(
             state.reference, state.displacement, measured, command, voltage
         )
@@ -245,7 +283,7 @@ class Feedback(System):
             actuator,
             plant,
             sensor,
-            as_array(input.next_reference),
+            jax.tree.map(as_array, input.next_reference),
             displacement,
             voltage,
         )
@@ -253,37 +291,51 @@ class Feedback(System):
 
 
 def loop_inputs(
-    reference: Float[Array, " samples"],
-    noise: Float[Array, " samples"] | None = None,
-    disturbance: Float[Array, " samples"] | None = None,
+    reference: Float[Array, " samples"] | Float[Array, "samples axes"],
+    noise: Float[Array, " samples"] | Float[Array, "samples axes"] | None = None,
+    disturbance: Float[Array, " samples"] | Float[Array, "samples axes"] | None = None,
 ) -> LoopInput:
     """Return the inputs that make a loop follow ``reference`` (um).
 
     ``noise`` holds unit-variance draws, zero if left out; ``disturbance`` (um) is added
     to what the plant does. The last sample is repeated
-    as its own successor; what it influences lies after the end of the record.
+    as its own successor; what it influences lies after the end of the record. Several
+    axes: a column each, in the units of the axis.
     """
     reference = as_array(reference)
     following = jnp.concatenate([reference[1:], reference[-1:]])
     noise = jnp.zeros_like(reference) if noise is None else noise
-    return LoopInput(following, noise, disturbance)
+    return LoopInput(
+        _columns(following),
+        _columns(noise),
+        None if disturbance is None else _columns(disturbance),
+    )
 
 
-def holding_input(plant: System, output: ScalarLike) -> Scalar:
+def _columns(signal: Array) -> Any:
+    if signal.ndim == 1:
+        return signal
+    return tuple(signal[:, axis] for axis in range(signal.shape[1]))
+
+
+def holding_input(plant: System, output: Signal) -> Signal:
     """Return the constant input under which ``plant`` rests at ``output``.
 
     Solved by Newton's method on the loading curve from the plant's own rest point;
     where no input reaches ``output`` the last iterate is returned and the loop starts
     with an error. Limits belong in the loop's actuator, not in the plant: the curve is
-    flat behind them.
+    flat behind them. The search starts at 0; with several axes at ``output`` itself,
+    because commands are in its unit and a stage with an allocation inside may not reach
+    the pose 0, or be on the edge of its reach there.
     """
-    output = as_array(output)
+    output = jax.tree.map(as_array, output)
 
     def residual(input, _):
-        return rest_output(plant, input) - output
+        return jax.tree.map(jnp.subtract, rest_output(plant, input), output)
 
     solver = optx.Newton(rtol=1e-12, atol=1e-12)
-    solution = optx.root_find(
-        residual, solver, jnp.zeros_like(output), max_steps=64, throw=False
+    start = output if isinstance(output, tuple) else jnp.zeros_like(output)
+    solution = optx.root_find(residual, solver, start, max_steps=64, throw=False)
+    return jax.tree.map(
+        lambda value: jnp.where(jnp.isfinite(value), value, 0.0), solution.value
     )
-    return jnp.where(jnp.isfinite(solution.value), solution.value, 0.0)

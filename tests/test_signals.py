@@ -63,7 +63,10 @@ def test_superposed_sine_scales_about_the_offset(second):
 
 
 # Periods of the frequency after which the signal repeats.
-REPEATS = {"SIN": 1, "PWSW": 4, "TRI": 1, "SQUARE": 1, "SW": 20, "MULTISINE": 20}
+REPEATS = {
+    **{"SIN": 1, "COS": 1, "SCAN": 1, "TRI": 1, "SQUARE": 1},
+    **{"PWSW": 4, "SW": 20, "MULTISINE": 20},
+}
 
 
 @pytest.mark.parametrize(("kind", "repeat"), REPEATS.items())
@@ -79,13 +82,15 @@ def test_period(kind, repeat, second):
     assert moved.max() > 0.1
 
 
-@pytest.mark.parametrize("kind", ["SIN", "PWSW", "TRI", "STEP", "SQUARE", "CHIRP"])
+@pytest.mark.parametrize(
+    "kind", ["SIN", "SCAN", "PWSW", "TRI", "STEP", "SQUARE", "CHIRP"]
+)
 def test_start_is_at_the_offset(kind, second):
     values = signals.SIGNALS[kind](second, frequency=10.0, offset=3.0)
     np.testing.assert_allclose(values[0], 3.0, rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["SIN", "PWSW", "CHIRP"])
+@pytest.mark.parametrize("kind", ["SIN", "SCAN", "PWSW", "CHIRP"])
 def test_start_is_without_speed(kind, second):
     values = signals.SIGNALS[kind](second, frequency=10.0)
     assert abs(values[1] - values[0]) < 0.01 * np.abs(np.diff(values)).max()
@@ -93,6 +98,8 @@ def test_start_is_without_speed(kind, second):
 
 RANGES = {
     "SIN": (0.0, 10.0),
+    "COS": (0.0, 10.0),
+    "SCAN": (0.0, 10.0),
     "PWSW": (0.0, 10.0),
     "TRI": (0.0, 10.0),
     "SQUARE": (0.0, 10.0),

@@ -218,14 +218,14 @@ def test_start_names_a_parameter_that_is_not_there():
 
 
 def test_put_changes_its_parameters_and_no_other():
-    pid = PID(1.0, 2.0, 3.0, 4.0, 5.0, dt=1e-4)
+    pid = PID(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, dt=1e-4)
     space = space_of({"integral": (0.5, 8.0, "log"), "proportional": (0, 4, "linear")})
     moved = space.put(pid, jnp.array([0.5, 0.25]))
     found = [float(value) for value in jax.tree.leaves(moved)]
-    assert found == pytest.approx([1.0, 2.0, 3.0, 4.0, 5.0])
+    assert found == pytest.approx([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0])
     moved = space.put(pid, jnp.array([1.0, 0.0]))
     found = [float(value) for value in jax.tree.leaves(moved)]
-    assert found == pytest.approx([0.0, 8.0, 3.0, 4.0, 5.0])
+    assert found == pytest.approx([0.0, 8.0, 3.0, 4.0, 5.0, 6.0, 7.0])
     assert moved.dt == pid.dt
 
 

@@ -217,8 +217,9 @@ def test_a_cut_off_just_below_nyquist(study):
         (
             "rat",
             1.0,
-            "rat is unknown; allowed are title, rate, seed, plant, actuator, sensor, "
-            "controller, references, parameters, objective, optimiser, holdout_draws; "
+            "rat is unknown; allowed are title, rate, seed, axes, plant, actuator, "
+            "sensor, controller, references, parameters, objective, optimiser, "
+            "ensemble, holdout_draws; "
             "did you mean 'rate'?",
         ),
         ("actuator/uper", 1.0, "actuator.uper is unknown; allowed are lower, upper, "),
@@ -249,7 +250,7 @@ def test_a_cut_off_just_below_nyquist(study):
         (
             "objective/effort",
             1.0,
-            "objective.effort is unknown; allowed are aggregate, effort_weight, ",
+            "objective.effort is unknown; allowed are aggregate, coupling_weight, ",
         ),
         (
             "optimiser/start",
@@ -287,7 +288,8 @@ def test_unknown_keys(refusal, place, value, message):
             "references/tune",
             ["SIN50", "SINE50"],
             "references.tune: signal 'SINE50' is unknown; it must be one of SIN, SW, "
-            "PWSW, TRI, STEP, SQUARE, CONST, CHIRP, MULTISINE, PRBS, followed by",
+            "PWSW, TRI, STEP, SQUARE, CONST, CHIRP, MULTISINE, PRBS, COS, SCAN, "
+            "followed by",
         ),
         ("references/unseen", ["SIN5O"], "references.unseen: signal 'SIN5O' is unkn"),
         (
@@ -321,12 +323,12 @@ def test_unknown_keys(refusal, place, value, message):
         (
             "plant",
             {"type": "Lag", "time_constant": 1e-3},
-            "plant.type is 'Lag'; it must be one of ARMA, Affine, AlphaBeta, Ampl",
+            "plant.type is 'Lag'; it must be one of ARMA, Affine, Allocation, Alph",
         ),
         (
             "plant",
             {"type": "os.system"},
-            "plant.type is 'os.system'; it must be one of ARMA, Affine, AlphaBeta, ",
+            "plant.type is 'os.system'; it must be one of ARMA, Affine, Allocation, ",
         ),
         (
             "parameters/controller.integral/transform",

@@ -4,6 +4,9 @@ import inspect
 from collections.abc import Callable, Mapping
 
 from ..system import System
+from . import mirror as mirror
+from . import p558_control as p558_control
+from . import p558_stage as p558_stage
 from . import p753 as p753
 from . import p753_by_rate as p753_by_rate
 from . import p753_chapter4 as p753_chapter4
@@ -12,8 +15,14 @@ from . import p753_survey as p753_survey
 PLANTS: dict[str, Callable[..., System]] = {
     "p753": p753_by_rate.plant,
     "p753_chapter4": p753_by_rate.chapter4_plant,
+    "p558": p558_stage.plant,
+    "mirror": mirror.stage,
 }
 """Plants a study can name."""
+
+VARIATIONS: dict[str, Callable[..., System]] = {"p558": p558_stage.varied}
+"""Plants off their nominal values, by the name of the nominal one: each argument is a
+relative deviation by axis, 0 for none."""
 
 CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_pid": p753.pid,
@@ -33,6 +42,15 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_feedforward_pid": p753_survey.feedforward_pid,
     "p753_repetitive": p753_survey.repetitive,
     "p753_ziegler_nichols": p753_by_rate.ziegler_nichols,
+    "p558_pid": p558_control.pid,
+    "p558_multi_axis": p558_control.multi_axis,
+    "p558_anticipating_multi_axis": p558_control.anticipating_multi_axis,
+    "p558_anticipating_disturbance_observer": (
+        p558_control.anticipating_disturbance_observer
+    ),
+    "p558_nominal": p558_control.nominal,
+    "p558_disturbance_observer": p558_control.disturbance_observer,
+    "mirror_multi_axis": mirror.multi_axis,
 }
 """Controllers a study can name, with printed gains except where they say "ours";
 those that take a ``rate`` (Hz) come at the study's."""

@@ -1,6 +1,9 @@
 """Controllers: each a System from an Observation to a command."""
 
+from .allocation import Allocated as Allocated
+from .allocation import Allocation as Allocation
 from .alpha_beta import AlphaBeta as AlphaBeta
+from .anticipation import Anticipation as Anticipation
 from .bang_bang import BangBang as BangBang
 from .boundary_layer import BoundaryLayer as BoundaryLayer
 from .continuous import ContinuousSlidingModePID as ContinuousSlidingModePID
@@ -9,6 +12,7 @@ from .disturbance_observer import (
 )
 from .feedforward import FeedforwardFeedback as FeedforwardFeedback
 from .feedforward import InverseFeedforward as InverseFeedforward
+from .filtered import Filtered as Filtered
 from .inversion import InversionControl as InversionControl
 from .iterative_learning import LearningLaw as LearningLaw
 from .iterative_learning import Trials as Trials
@@ -18,6 +22,8 @@ from .linear import StateSpaceController as StateSpaceController
 from .mixed_sensitivity import first_order_weight as first_order_weight
 from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
 from .model_reference import ModelReferencePID as ModelReferencePID
+from .multi_axis import MultiAxisSlidingModePID as MultiAxisSlidingModePID
+from .nominal import NominalSlidingModePID as NominalSlidingModePID
 from .observer import Motion as Motion
 from .observer import Observer as Observer
 from .pid import PID as PID

@@ -2,6 +2,9 @@
 
 from .arma import ARMA as ARMA
 from .arma import scaled_to_dc as scaled_to_dc
+from .channels import Channel as Channel
+from .channels import Channels as Channels
+from .channels import channels_of as channels_of
 from .creep import ExponentialCreep as ExponentialCreep
 from .creep import LogarithmicCreep as LogarithmicCreep
 from .delay import FractionalDelay as FractionalDelay
@@ -9,7 +12,12 @@ from .held import Held as Held
 from .hysteretic_oscillator import HystereticOscillator as HystereticOscillator
 from .lag import FirstOrderLag as FirstOrderLag
 from .lag import SecondOrderLag as SecondOrderLag
+from .linear_map import LinearMap as LinearMap
+from .matrix_arma import MatrixARMA as MatrixARMA
+from .matrix_arma import observability_form as observability_form
 from .neural_state_space import NeuralStateSpace as NeuralStateSpace
+from .reduction import Reduction as Reduction
+from .reduction import balanced_reduction as balanced_reduction
 from .scheduled import AmplitudeScheduled as AmplitudeScheduled
 from .state_space import StateSpace as StateSpace
 from .state_space import reflected as reflected

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, ScalarLike, as_array, check
-from ..system import System
+from ..system import Designed, System
 from .arma import ARMA
 
 
@@ -40,7 +40,7 @@ class FirstOrderLag(System):
         return output, output
 
 
-class SecondOrderLag(System):
+class SecondOrderLag(Designed):
     """``y'' + 2 zeta w y' + w^2 y = w^2 x``, unit DC gain: the reference model (4.47).
 
     ``frequency`` w in rad/s, ``damping`` zeta without unit (any, above 1 too), ``dt``
@@ -58,6 +58,32 @@ class SecondOrderLag(System):
         check("damping", self.damping, least=0.0)
         check("sample time in s", self.dt, above=0.0)
 
+    def law(self) -> "LinearOscillator":
+        """Return the lag with its coefficients for one sample."""
+        decay = self.damping * self.frequency
+        even, odd = _cosine_and_sinc((self.frequency**2 - decay**2) * self.dt**2)
+        odd = odd * self.dt
+        fade = jnp.exp(-decay * self.dt)
+        return LinearOscillator(
+            keep=fade * (even + decay * odd),
+            carry=fade * odd,
+            slow=fade * (even - decay * odd),
+            pull=fade * self.frequency**2 * odd,
+        )
+
+
+class LinearOscillator(System):
+    """Position and velocity one sample on: what SecondOrderLag runs.
+
+    With d = y - x: y <- x + ``keep`` d + ``carry`` dy/dt (s) and
+    dy/dt <- ``slow`` dy/dt - ``pull`` d (1/s).
+    """
+
+    keep: Scalar
+    carry: Scalar
+    slow: Scalar
+    pull: Scalar
+
     def init(self, input: ScalarLike = 0.0) -> tuple[Scalar, Scalar]:
         position = as_array(input)
         return position, jnp.zeros_like(position)
@@ -66,14 +92,8 @@ class SecondOrderLag(System):
         self, state: tuple[Scalar, Scalar], input: ScalarLike
     ) -> tuple[tuple[Scalar, Scalar], Scalar]:
         distance, velocity = state[0] - input, state[1]
-        decay = self.damping * self.frequency
-        even, odd = _cosine_and_sinc((self.frequency**2 - decay**2) * self.dt**2)
-        odd = odd * self.dt
-        fade = jnp.exp(-decay * self.dt)
-        position = input + fade * ((even + decay * odd) * distance + odd * velocity)
-        velocity = fade * (
-            (even - decay * odd) * velocity - self.frequency**2 * odd * distance
-        )
+        position = input + self.keep * distance + self.carry * velocity
+        velocity = self.slow * velocity - self.pull * distance
         return (position, velocity), position
 
 

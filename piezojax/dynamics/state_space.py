@@ -84,6 +84,20 @@ class StateSpace(System):
             raise ValueError("D is not zero; an input must not reach its own sample")
         return StateSpace(self.A, self.B, self.C @ self.A, self.C @ self.B, self.dt)
 
+    def delayed(self) -> "StateSpace":
+        """Return the model with its input a sample later: D = 0, and m states more.
+
+        What a controller meets that needs a sample to compute its command.
+        """
+        n, m = self.B.shape
+        return StateSpace(
+            jnp.block([[self.A, self.B], [jnp.zeros((m, n + m))]]),
+            jnp.concatenate([jnp.zeros((n, m)), jnp.eye(m)]),
+            jnp.hstack([self.C, self.D]),
+            jnp.zeros_like(self.D),
+            self.dt,
+        )
+
     def init(self, input: ArrayLike = 0.0) -> Float[Array, " n"]:
         inputs = jnp.broadcast_to(as_array(input), self.B.shape[1:])
         return _at_rest(self.A, self.B @ inputs)

@@ -7,7 +7,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from ..reproduce.calibration import EXPERIMENTS, Swap
-from ..reproduce.judged import BAR, ratio_of
+from ..reproduce.judged import BAR
+from ..reproduce.summary import ratio_of
 from .figures import AFTER, BEFORE, REFERENCE, figure, styled, write
 
 

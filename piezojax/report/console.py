@@ -1,5 +1,6 @@
 """What the commands print: progress while they work, one table at the end."""
 
+import math
 import signal
 import sys
 import threading
@@ -22,9 +23,9 @@ from ..identify.fit import FitReport
 from ..identify.methods import METHODS
 from ..identify.parts import PARTS
 from ..reproduce.cell import Cell, title_of
-from ..reproduce.summary import TableAgreement
+from ..reproduce.summary import GroupedAgreement, TableAgreement
 from ..stability import StabilityReport
-from ..tune.result import Result, Scores
+from ..tune.result import Perturbed, Result, Scores
 from .stability import Comparison
 
 
@@ -130,8 +131,9 @@ def _ratio(before: float | None, after: float | None) -> str:
 
 def tuning_table(result: Result) -> Table:
     """Return the before/after table on held-out noise, in nm rms."""
+    unit = " or ".join(dict.fromkeys(_SMALL[u] for u in result.units.values())) or "nm"
     table = Table(
-        title=Text(f"{result.title}\nrms tracking error on held-out noise, nm")
+        title=Text(f"{result.title}\nrms tracking error on held-out noise, {unit}")
     )
     table.add_column("reference")
     for title in ("before", "tuned", "better", "peak, tuned"):
@@ -139,11 +141,15 @@ def tuning_table(result: Result) -> Table:
     sections: list[tuple[str, Scores | None, Scores | None]] = [
         ("geometric mean", result.holdout_before, result.holdout),
         ("geometric mean, not tuned on", result.unseen_before, result.unseen),
+        ("geometric mean, axes at rest", result.coupling_before, result.coupling),
     ]
     for heading, before, after in sections:
         if before is None or after is None:
             continue
+        many = len(before.per_reference_rms_um) > _MOST_ROWS
         for name, error in before.per_reference_rms_um.items():
+            if many and heading == sections[-1][0]:
+                break  # two of three axes rest under each reference
             tuned = after.per_reference_rms_um[name]
             peak = after.peak_error_um[name]
             table.add_row(
@@ -164,6 +170,29 @@ def tuning_table(result: Result) -> Table:
         )
         table.add_section()
     return table
+
+
+_SMALL = {"um": "nm", "urad": "nrad"}
+"""Units a thousand times smaller, in which errors are shown."""
+
+_MOST_ROWS = 12  # of the axes at rest
+
+
+def perturbed_text(found: Perturbed) -> str:
+    """Return one line on the plants of the ensemble."""
+    if found.unstable or found.median_better is None:
+        return (
+            f"{found.plants} perturbed plants: {found.unstable} unstable "
+            f"({found.unstable_before} before)"
+        )
+    rest = (
+        f", axes at rest {found.coupling_better:.2f}x" if found.coupling_better else ""
+    )
+    return (
+        f"{found.plants} perturbed plants: none unstable "
+        f"({found.unstable_before} before), {found.median_better:.1f}x better in the "
+        f"median, {found.worst_better:.1f}x on the worst{rest}"
+    )
 
 
 def gains_table(result: Result) -> Table:
@@ -196,6 +225,27 @@ def stability_table(comparison: Comparison) -> Table:
             f"{phase:.1f}°",
             f"{delay:.2f} samples",
         )
+    for name, found in comparison.axes.items():
+        shown = "tuned" if name == "after" else name
+        if not found.report.stable:
+            table.add_row(shown, "unstable", "-", "-", "-")
+        for axis, report in zip(comparison.axis_names, found.report.axes, strict=False):
+            peak, gain, phase, delay = _worst([report])
+            table.add_row(
+                f"{shown}, {axis}",
+                f"{peak:.2f}",
+                f"{gain:.1f} dB",
+                f"{phase:.1f}°",
+                f"{delay:.2f} samples",
+            )
+        if found.report.disk_margin is not None:
+            table.add_row(
+                f"{shown}, all axes at once",
+                f"{found.report.sensitivity_peak:.2f}",
+                f"{20.0 * math.log10(found.report.disk_gain_margin or 1.0):.1f} dB",
+                f"{found.report.disk_phase_margin_deg:.1f}°",
+                "-",
+            )
     for name in comparison.problems:
         table.add_row("tuned" if name == "after" else name, "-", "-", "-", "-")
     return table
@@ -233,17 +283,42 @@ def fit_table(report: FitReport) -> Table:
     return table
 
 
+WIDE = 3
+"""Most columns of a table beside each other: what fits into 80 characters."""
+
+
 def reproduction_table(
     name: str, cells: Sequence[Cell], agreement: TableAgreement
 ) -> Table:
     """Return paper beside simulation, a row a reference."""
     columns = list(agreement.columns)
     units = ", ".join(dict.fromkeys(cell.unit for cell in cells))
-    table = Table(
-        title=f"{title_of(name)}: paper / simulation in {units}\n"
+    title = (
+        f"{title_of(name)}: paper / simulation in {units}\n"
         f"geometric-mean ratio {agreement.geomean_ratio:.3f}, "
         f"worst {agreement.worst_ratio:.2f}"
     )
+    if isinstance(agreement, GroupedAgreement):
+        title += "\n" + ", ".join(
+            f"{group} {part.geomean_ratio:.3f}"
+            for group, part in agreement.groups.items()
+        )
+    if len(columns) <= WIDE:
+        return _beside(columns, cells, agreement, title)
+    stack = Table.grid()
+    for start in range(0, len(columns), WIDE):
+        part = columns[start : start + WIDE]
+        stack.add_row(_beside(part, cells, agreement, "" if start else title))
+    return stack
+
+
+def _beside(
+    columns: Sequence[str],
+    cells: Sequence[Cell],
+    agreement: TableAgreement,
+    title: str,
+) -> Table:
+    table = Table(title=title)
     table.add_column("reference")
     for column in columns:
         table.add_column(column, justify="right")

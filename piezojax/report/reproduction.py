@@ -20,7 +20,7 @@ from .figures import (
 ACROSS = 4
 """Most panels in a row."""
 
-_MARKS = (("o", BEFORE), ("s", AFTER), ("^", MEASURED))
+_MARKS = (("o", BEFORE), ("s", AFTER), ("^", MEASURED), ("x", REFERENCE))
 
 
 def write_picture(cells: Sequence[Cell], folder: Path) -> None:
@@ -40,18 +40,18 @@ def cells_figure(cells: Sequence[Cell]) -> Figure:
         ax.set_axis_off()
     for ax, table in zip(panels, tables, strict=False):
         inside = [cell for cell in cells if cell.table == table]
-        units = dict.fromkeys(cell.unit.replace("um", "µm") for cell in inside)
+        units = dict.fromkeys(_unit(cell) for cell in inside)
         unit = ", ".join(units)
-        columns = dict.fromkeys(cell.column for cell in inside)
-        for column, (marker, colour) in zip(columns, _MARKS, strict=False):
-            points = [c for c in inside if c.column == column]
+        series = dict.fromkeys(_series(cell) for cell in inside)
+        for name, (marker, colour) in zip(series, _MARKS, strict=False):
+            points = [c for c in inside if _series(c) == name]
             ax.loglog(
                 [c.paper for c in points],
                 [c.sim for c in points],
                 marker,
                 ms=4,
                 color=colour,
-                label=column,
+                label=name,
             )
         low = 0.8 * min(min(c.paper, c.sim) for c in inside)
         high = 1.25 * max(max(c.paper, c.sim) for c in inside)
@@ -73,6 +73,15 @@ def cells_figure(cells: Sequence[Cell]) -> Figure:
         )
         ax.legend(loc="upper left")
     return picture
+
+
+def _unit(cell: Cell) -> str:
+    return {"um": "µm", "urad": "µrad"}.get(cell.unit, cell.unit)
+
+
+def _series(cell: Cell) -> str:
+    """What a cell is drawn with: its group where there is one, or its column."""
+    return cell.group or cell.column
 
 
 def write_rates(errors: Sequence[RateError], folder: Path) -> None:

@@ -10,13 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from .._types import ScalarLike
 from ..files import write_text
 from ..stability.broken_loop import BRANCHES
 from ..stability.conserved import LinearLoop
 from ..stability.crossings import angle_grid
 from ..stability.margins import StabilityReport, linear_loop, located_report
 from ..system import Feedback
+from .axes_stability import AxesStability, axes_figure, worse_branch
 from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
 
 STABILITY_FILE, STABILITY_PICTURE = "stability.json", "stability.png"
@@ -31,12 +31,15 @@ _REACH = 2.5  # half the side of the Nyquist plot
 class Comparison:
     """Reports and linear loops by their name, then by branch.
 
-    ``problems`` says, by name, why a loop has none.
+    ``axes`` holds loops of several axes, whose names are ``axis_names``. ``problems``
+    says, by name, why a loop has none.
     """
 
     reports: dict[str, dict[str, StabilityReport]] = field(default_factory=dict)
     loops: dict[str, dict[str, LinearLoop]] = field(default_factory=dict)
     problems: dict[str, str] = field(default_factory=dict)
+    axes: dict[str, AxesStability] = field(default_factory=dict)
+    axis_names: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON: by name, then by branch, or ``problem``."""
@@ -44,19 +47,27 @@ class Comparison:
             name: {branch: report.as_dict() for branch, report in reports.items()}
             for name, reports in self.reports.items()
         }
+        found |= {n: one.report.as_dict() for n, one in self.axes.items()}
         return found | {n: {"problem": why} for n, why in self.problems.items()}
 
 
 def compared(
-    reference: ScalarLike = 0.0, dt: float | None = None, **loops: Feedback
+    reference: Any = 0.0,
+    dt: float | None = None,
+    axis_names: tuple[str, ...] = (),
+    **loops: Feedback,
 ) -> Comparison:
     """Return the stability of the named loops at ``reference`` (um), both branches.
 
-    A loop that cannot be linearised is among the problems; none is raised.
+    With several axes a reference for each of ``axis_names``, and the worse branch. A
+    loop that cannot be linearised is among the problems; none is raised.
     """
-    result = Comparison()
+    result = Comparison(axis_names=axis_names)
     for name, loop in loops.items():
         try:
+            if axis_names:
+                result.axes[name] = worse_branch(loop, reference, dt)
+                continue
             found = {
                 branch: linear_loop(loop, reference, branch, dt=dt)
                 for branch in BRANCHES
@@ -80,6 +91,10 @@ def write_stability(comparison: Comparison, folder: Path, title: str = "") -> No
     if comparison.loops:
         with styled():
             picture = stability_figure(comparison, title)
+            write(picture, folder / STABILITY_PICTURE)
+    if comparison.axes:
+        with styled():
+            picture = axes_figure(comparison.axes, comparison.axis_names, title)
             write(picture, folder / STABILITY_PICTURE)
 
 

@@ -6,14 +6,28 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from .. import signals
+from ..axes import axis_of
 from ..files import write_text
 from ..rollout import simulate
 from ..serial import save
+from ..signals import parse
+from ..study import Study
 from ..system import LoopSample, loop_inputs
 from ..tune.result import GAINS_FILE, RESULT_FILE
+from ..tune.traces import Trace, traces_of
 from ..tune.tuner import Outcome
-from .figures import AFTER, BEFORE, REFERENCE, figure, legend_above, styled, write
+from .contour import contour_figure, contours_in
+from .coupling import coupling_figure
+from .figures import (
+    AFTER,
+    BEFORE,
+    REFERENCE,
+    UNITS,
+    figure,
+    legend_above,
+    styled,
+    write,
+)
 
 _SHOWN = 3  # references in the tracking picture
 _BEYOND = 1e9  # um or V
@@ -21,14 +35,28 @@ _PERIODS = 4.0  # of the reference, at the end of the run
 
 
 def write_results(outcome: Outcome, folder: Path) -> None:
-    """Write result.json, gains.toml and the pictures into ``folder``."""
+    """Write result.json, gains.toml and the pictures into ``folder``.
+
+    On a stage with several axes that of their coupling, and of the contours if there
+    are any, too.
+    """
     write_numbers(outcome, folder)
-    logs = _logs(outcome)
+    study, result = outcome.case.study, outcome.result
+    shown = _shown(outcome)
+    chosen = {trace.run for trace in shown} | {c.run for c in contours_in(study)}
+    runs = _runs(outcome, chosen)
+    logs = {trace: _of_axis(study, trace, runs[trace.run]) for trace in shown}
     with styled():
-        write(tracking_figure(outcome, logs), folder / "tracking.png")
-        write(hysteresis_figure(outcome, logs), folder / "hysteresis.png")
-        if outcome.result.history:
-            write(convergence_figure(outcome), folder / "convergence.png")
+        pictures = {
+            "tracking": tracking_figure(outcome, logs),
+            "hysteresis": hysteresis_figure(outcome, logs),
+            "convergence": convergence_figure(outcome) if result.history else None,
+            "coupling": coupling_figure(study, result),
+            "contour": contour_figure(study, result.title, runs),
+        }
+        for name, picture in pictures.items():
+            if picture:
+                write(picture, folder / f"{name}.png")
 
 
 def write_numbers(outcome: Outcome, folder: Path) -> None:
@@ -37,28 +65,40 @@ def write_numbers(outcome: Outcome, folder: Path) -> None:
     save(outcome.controller, folder / GAINS_FILE)
 
 
-Logs = dict[str, tuple[LoopSample, LoopSample]]
+Both = tuple[LoopSample, LoopSample]
+"""What the loop logs before and after tuning."""
+
+Logs = dict[Trace, Both]
 
 
-def _logs(outcome: Outcome) -> Logs:
-    """Run both loops over the shown references, as in the hold-out."""
+def _moved(trace: Trace) -> str:
+    return "rotation" if trace.unit == "urad" else "displacement"
+
+
+def _runs(outcome: Outcome, chosen: set[int]) -> dict[int, Both]:
+    """Run both loops over the chosen references, as in the hold-out."""
 
     @jax.jit
     def run(loop, reference, noise):
         inputs = loop_inputs(reference, noise, outcome.holdout.disturbance)
         return simulate(loop, inputs, loop.init(reference[0]))[1]
 
-    logs = {}
-    names = list(outcome.result.before.per_reference_rms_um)
-    for name in _shown(outcome):
-        i = names.index(name)
-        reference, noise = outcome.holdout.references[i], outcome.holdout.noise[i, 0]
+    signals = outcome.holdout
+    runs = {}
+    for index in sorted(chosen):
         before, after = (
-            jax.tree.map(_drawable, run(loop, reference, noise))
+            run(loop, signals.references[index], signals.noise[index, 0])
             for loop in (outcome.before, outcome.after)
         )
-        logs[name] = (before, after)
-    return logs
+        runs[index] = jax.tree.map(_drawable, (before, after))
+    return runs
+
+
+def _of_axis(study: Study, trace: Trace, both: Both) -> Both:
+    if not study.axes:
+        return both
+    before, after = (axis_of(log, trace.axis) for log in both)
+    return before, after
 
 
 def _drawable(values: jax.Array) -> np.ndarray:
@@ -67,31 +107,48 @@ def _drawable(values: jax.Array) -> np.ndarray:
     return np.where(np.abs(array) < _BEYOND, array, np.nan)
 
 
-def _shown(outcome: Outcome) -> list[str]:
-    """Pick, of each kind of signal, the one that was hardest before."""
+def _shown(outcome: Outcome) -> list[Trace]:
+    """Pick, of each kind of signal on each axis, the one that was hardest before."""
     errors = outcome.result.before.per_reference_rms_um
-    by_kind: dict[str, str] = {}
-    for name, error in errors.items():
-        kind = signals.parse(name)[0]
-        current = by_kind.get(kind)
-        if current is None or (error or np.inf) > (errors[current] or np.inf):
-            by_kind[kind] = name
-    return list(by_kind.values())[:_SHOWN]
+    study = outcome.case.study
+    by_kind: dict[tuple[int, str], Trace] = {}
+    for trace in traces_of(study):
+        if trace.name not in errors:
+            continue
+        place = trace.axis, parse(_signal_of(study, trace))[0]
+        current = by_kind.get(place)
+        error = errors[trace.name] or np.inf
+        if current is None or error > (errors[current.name] or np.inf):
+            by_kind[place] = trace
+    # With several axes one of each comes before a second of the first.
+    first = {trace.axis: trace for trace in reversed(by_kind.values())}
+    rest = [trace for trace in by_kind.values() if trace not in first.values()]
+    return [*(first[axis] for axis in sorted(first)), *rest][:_SHOWN]
 
 
-def _window(name: str, duration: float, settle: float) -> float:
-    frequency = signals.parse(name)[1] or 1.0
-    return max(settle, duration - _PERIODS / frequency)
+def _signal_of(study: Study, trace: Trace) -> str:
+    """Return the name of the signal that drives a trace."""
+    run = (*study.references.tune, *study.references.unseen)[trace.run]
+    axis = study.axes.names[trace.axis] if study.axes else ""
+    return study.driven(run)[axis]
+
+
+def _window(study: Study, trace: Trace) -> float:
+    table = study.references
+    frequency = parse(_signal_of(study, trace))[1] or 1.0
+    return max(table.settle, table.duration - _PERIODS / frequency)
 
 
 def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
     """Displacement and error against time, before and after."""
-    table, dt = outcome.case.study.references, outcome.case.study.dt
+    study = outcome.case.study
+    table, dt = study.references, study.dt
     picture = figure(9.0, 2.3 * len(logs) + 0.4)
     axes = picture.subplots(len(logs), 2, squeeze=False)
-    for (name, (before, after)), (left, right) in zip(logs.items(), axes, strict=True):
+    for (trace, (before, after)), (left, right) in zip(logs.items(), axes, strict=True):
+        unit, small = UNITS[trace.unit]
         time = np.arange(before.reference.size) * dt
-        shown = time >= _window(name, table.duration, table.settle)
+        shown = time >= _window(study, trace)
         for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
             error = 1e3 * (log.displacement - log.reference)
             rms = np.sqrt(np.mean(error[time >= table.settle] ** 2))
@@ -101,7 +158,7 @@ def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
                 error[shown],
                 color=colour,
                 lw=0.9,
-                label=f"{label}, {rms:.4g} nm rms" if np.isfinite(rms) else label,
+                label=f"{label}, {rms:.4g} {small} rms" if np.isfinite(rms) else label,
             )
         left.plot(
             time[shown],
@@ -111,8 +168,8 @@ def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
             lw=0.9,
             label="reference",
         )
-        left.set(ylabel=f"{name}\ndisplacement (µm)")
-        right.set(ylabel="tracking error (nm)")
+        left.set(ylabel=f"{trace.name}\n{_moved(trace)} ({unit})")
+        right.set(ylabel=f"tracking error ({small})")
         legend_above(left)
         legend_above(right)
     for ax in axes[-1]:
@@ -124,15 +181,18 @@ def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
 def hysteresis_figure(outcome: Outcome, logs: Logs) -> Figure:
     """The stage's own loop, and what control leaves of it."""
     table, dt = outcome.case.study.references, outcome.case.study.dt
-    name = next(iter(logs))
-    before, after = logs[name]
+    trace = next(iter(logs))
+    name, (before, after) = trace.name, logs[trace]
+    unit, small = UNITS[trace.unit]
+    drive = "command" if outcome.case.study.axes else "voltage"
+    drive_unit = unit if outcome.case.study.axes else "V"
     settled = np.arange(before.reference.size) * dt >= table.settle
     picture = figure(9.0, 3.4)
     left, right = picture.subplots(1, 2)
     left.plot(after.voltage[settled], after.displacement[settled], color=AFTER)
     left.set(
-        xlabel="voltage (V)",
-        ylabel="displacement (µm)",
+        xlabel=f"{drive} ({drive_unit})",
+        ylabel=f"{_moved(trace)} ({unit})",
         title=f"{name}: the stage's hysteresis, in the tuned loop",
     )
     for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
@@ -141,8 +201,8 @@ def hysteresis_figure(outcome: Outcome, logs: Logs) -> Figure:
             log.reference[settled], error[settled], color=colour, lw=0.9, label=label
         )
     right.set(
-        xlabel="reference (µm)",
-        ylabel="displacement less reference (nm)",
+        xlabel=f"reference ({unit})",
+        ylabel=f"{_moved(trace)} less reference ({small})",
         title=f"{name}: what is left in closed loop\n",
     )
     legend_above(right)

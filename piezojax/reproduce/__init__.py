@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-from . import chapter3, chapter4, chapter5, chapter6
+from . import chapter3, chapter4, chapter5, chapter6, chapter7, chapter8
 from .cell import Cell as Cell
 from .summary import summarise as summarise
 
-CHAPTERS = (chapter3, chapter4, chapter5, chapter6)
+CHAPTERS = (chapter3, chapter4, chapter5, chapter6, chapter7, chapter8)
 """One module a chapter: its ``TABLES``, and ``cells`` that simulates one of them."""
 
 TABLES: dict[str, Callable[[str], list[Cell]]] = {

@@ -34,7 +34,7 @@ from .summary import as_csv, summarise
 @common
 def main(tables, calibrate, out, seed, quiet):
     """Redo result tables of the thesis in simulation, with the printed gains."""
-    del seed  # these runs are free of noise
+    del seed  # what noise there is has seeds of its own
 
     def body(console):
         asked = tuple(dict.fromkeys(tables)) or (*TABLES, FIGURE)

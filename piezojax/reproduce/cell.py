@@ -19,7 +19,8 @@ PERIODS = {"SIN": 1.0, "PWSW": 4.0, "SW": 20.0}
 class Cell:
     """One printed number, its simulation beside it, both in ``unit``.
 
-    ``sim`` is NaN until it has been simulated.
+    ``sim`` is NaN until it has been simulated. ``group``, if not empty, is what the
+    cell counts to in the summary besides its column.
     """
 
     table: str
@@ -28,10 +29,11 @@ class Cell:
     unit: str
     paper: float
     sim: float = float("nan")
+    group: str = ""
 
-    def simulated(self, value: float) -> "Cell":
+    def simulated(self, value: float, group: str = "") -> "Cell":
         """Return the same cell with ``value`` beside the print."""
-        return replace(self, sim=value)
+        return replace(self, sim=value, group=group)
 
     @property
     def ratio(self) -> float:

@@ -3,18 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
-from .calibration import EXPERIMENTS, Swap, geomean
+from .calibration import EXPERIMENTS, Swap
 from .cell import Cell
+from .summary import ratio_of
 
 BAR = 1.25
 """Most that the held-out geometric-mean ratio may be."""
-
-
-def ratio_of(cells: Sequence[Cell]) -> float:
-    """Return the geometric-mean ratio exp(mean |ln(sim/print)|) of ``cells``."""
-    return geomean(np.log([cell.ratio for cell in cells]))
 
 
 def _ratios(cells: Sequence[Cell]) -> dict[str, Any]:

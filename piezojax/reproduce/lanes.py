@@ -1,6 +1,6 @@
 """Cells of Tables 4-5, 5-3 and 5-5 simulated at once, for a stage that is fitted."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,9 +13,8 @@ from .. import signals
 from .._types import State
 from ..catalog import p753
 from ..control import DisturbanceObserverControl
-from ..hardware import Sensor
 from ..rollout import Metric, simulate
-from ..system import Feedback, LoopInput, System, loop_inputs, series
+from ..system import Feedback, LoopInput, System, loop_inputs
 from . import chapter4, chapter5
 from .cell import Cell, window
 
@@ -25,6 +24,9 @@ WARM_UP = 0.3
 SHORT = 1.0
 """Longest window of a shortened run, s: less than SW10 and SW30 take to repeat."""
 
+SEED = 0
+"""Of the sensor's noise."""
+
 DOUBTED = ("5-5", "dob")
 """Table and column whose printed P = 0.05 is suspect (docs/errata.md)."""
 
@@ -33,14 +35,36 @@ class Lanes(eqx.Module):
     """Loops of one kind of controller, a lane a cell; time first, in um.
 
     ``weight`` is one over the number of samples counted, or zero outside the window;
-    ``doubted`` marks the lanes of the disturbance observer of Table 5-4.
+    ``noise``, of unit variance, is the same in all lanes. ``doubted`` marks those of
+    the disturbance observer of Table 5-4, ``superposed`` those that follow SW.
     """
 
     controller: System
     reference: Float[Array, "samples lanes"]
     target: Float[Array, "samples lanes"]
     weight: Float[Array, "samples lanes"]
+    noise: Float[Array, " samples"]
     doubted: Bool[Array, " lanes"]
+    superposed: Bool[Array, " lanes"]
+
+    def with_doubts(self, values: Mapping[str, Any]) -> "Lanes":
+        """Return the lanes with those of ``stage.DOUBTS`` that ``values`` holds."""
+        lanes = self
+        if "observer_proportional" in values:
+            lanes = lanes.with_observer_proportional(values["observer_proportional"])
+        if "superposed_amplitude" in values:
+            lanes = lanes.with_superposed_amplitude(values["superposed_amplitude"])
+        return lanes
+
+    def with_superposed_amplitude(self, value: Array) -> "Lanes":
+        """Return the lanes with SW of another amplitude (um) than the printed 5."""
+        share = jnp.where(self.superposed, value / 5.0, 1.0)
+        # From rest at zero the target is linear in the reference.
+        return eqx.tree_at(
+            lambda lanes: (lanes.reference, lanes.target),
+            self,
+            (share * self.reference, share * self.target),
+        )
 
     def with_observer_proportional(self, value: Array) -> "Lanes":
         """Return the lanes with another P where Table 5-4 prints 0.05."""
@@ -110,7 +134,9 @@ def _together(cells: Sequence[Cell], longest: int, short: bool) -> Lanes:
         jnp.stack(references, axis=1),
         jnp.stack(targets, axis=1),
         jnp.asarray(weight),
+        jnp.asarray(np.random.default_rng(SEED).standard_normal(longest)),
         jnp.asarray([(cell.table, cell.column) == DOUBTED for cell in cells]),
+        jnp.asarray([signals.parse(cell.row)[0] == "SW" for cell in cells]),
     )
 
 
@@ -144,14 +170,13 @@ class _Sum(Metric):
 def mean_squares(stage: System, sensor: System, lanes: Lanes) -> Float[Array, " lanes"]:
     """Return the mean squared error (um^2) of the true displacement, a lane a cell.
 
-    ``stage`` turns V into um, ``sensor`` what it is into what is seen; from rest at
-    zero.
+    ``stage`` turns V into um, ``sensor`` that and a draw into what is seen; from rest
+    at zero.
     """
 
     def one(controller, reference, target, weight):
-        seen = series(noise=Sensor(0.0), lag=sensor)
-        loop = _Judged(Feedback(controller, stage, p753.actuator(), seen))
-        inputs = (loop_inputs(reference), target, weight)
+        loop = _Judged(Feedback(controller, stage, p753.actuator(), sensor))
+        inputs = (loop_inputs(reference, lanes.noise), target, weight)
         return simulate(
             loop, inputs, loop.init(0.0), metric=_Sum(), segment=reference.shape[0]
         )[1]

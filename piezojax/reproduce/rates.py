@@ -1,11 +1,10 @@
 """Figure 4.10: tracking error against sampling rate, with the printed gains."""
 
-import csv
-import io
 from typing import NamedTuple
 
 from ..catalog import p753_chapter4
 from .chapter4 import COLUMNS, rms_errors
+from .summary import comma_separated
 
 FIGURE = "figure-4-10"
 
@@ -45,9 +44,7 @@ def errors_by_rate(signals: tuple[str, ...] = SIGNALS) -> list[RateError]:
 
 def rates_as_csv(errors: list[RateError]) -> str:
     """Return ``errors`` as comma-separated text with a header."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["rate_Hz", "column", "row", "sim_um"])
-    for each in errors:
-        writer.writerow([each.rate, each.column, each.row, f"{each.error:.6g}"])
-    return buffer.getvalue()
+    return comma_separated(
+        ["rate_Hz", "column", "row", "sim_um"],
+        [(e.rate, e.column, e.row, f"{e.error:.6g}") for e in errors],
+    )

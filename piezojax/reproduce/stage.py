@@ -1,4 +1,4 @@
-"""The stage that is fitted: what may differ from print, and the chain it makes."""
+"""What is fitted: what may differ from print, and the stage and sensor it makes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..catalog import p753
-from ..dynamics import ARMA, FractionalDelay, scaled_to_dc
+from ..dynamics import ARMA, FirstOrderLag, FractionalDelay, scaled_to_dc
+from ..hardware import Sensor
 from ..hysteresis import ColemanHodgdon
 from ..space import Transform
 from ..system import Series, series
-
-DOUBT = "observer_proportional"
-"""P of the disturbance observer in Table 5-4, where it is fitted too."""
 
 LONGEST_DELAY = 4
 """Samples that the delay line of the stage holds."""
@@ -31,6 +29,14 @@ class Quantity:
     scale: Transform = "log"
 
 
+DOUBTS = {
+    "observer_proportional": Quantity(0.05, 5e-4, 0.1, "V s/um"),
+    "superposed_amplitude": Quantity(5.0, 2.0, 8.0, "um"),
+}
+"""What is printed, no property of the stage, and may be fitted all the same: P of the
+disturbance observer in Table 5-4, and the amplitude of SW, 5 um being (4.48)."""
+
+
 def _within(value: float, ratio: float, unit: str) -> Quantity:
     return Quantity(value, value / ratio, value * ratio, unit)
 
@@ -39,7 +45,8 @@ def quantities(dynamics: ARMA) -> dict[str, Quantity]:
     """Return what is fitted, starting from the printed ``dynamics``.
 
     ``gain`` is the DC gain behind the hysteresis. The b of the hysteresis is not among
-    them: gain, a and c already reach every curve that it could.
+    them: gain, a and c already reach every curve that it could. ``noise`` is what the
+    sensor adds, rms: the loop turns it into displacement.
     """
     slow, fast = sorted(-p753.RATE * np.log(np.abs(dynamics.poles())))
     return {
@@ -50,7 +57,7 @@ def quantities(dynamics: ARMA) -> dict[str, Quantity]:
         "hysteresis_c": _within(-p753.HYSTERESIS_CHAPTER_5["c"], 3.0, "-1/V"),
         "delay": Quantity(1e-5, 0.0, 1.5e-4, "s", "linear"),
         "sensor_lag": Quantity(1e-5, 1e-7, 3e-4, "s", "linear"),
-        "noise": Quantity(5e-4, 0.0, 5e-3, "um", "linear"),
+        "noise": Quantity(p753.NOISE_RMS, 0.0, 0.03, "um", "linear"),
     }
 
 
@@ -68,4 +75,12 @@ def stage_of(values: Mapping[str, Any], numerator: Sequence[float]) -> Series:
             -values["hysteresis_c"],
         ),
         dynamics=scaled_to_dc(dynamics, values["gain"]),
+    )
+
+
+def sensor_of(values: Mapping[str, Any]) -> Series:
+    """Return the sensor, um to um: noise, then a lag."""
+    return series(
+        noise=Sensor(values["noise"]),
+        lag=FirstOrderLag(values["sensor_lag"], p753.DT),
     )

@@ -2,7 +2,8 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
@@ -24,13 +25,36 @@ class TableAgreement(Agreement):
     columns: dict[str, Agreement]
 
 
+class GroupedAgreement(TableAgreement):
+    """The same for groups of cells that lie across columns too."""
+
+    groups: dict[str, Agreement]
+
+
+def geomean(logs: Any) -> float:
+    """Return exp(mean |ln(sim/print)|) of ``logs``, the ln(sim/print)."""
+    return float(np.exp(np.mean(np.abs(logs))))
+
+
+def ratio_of(cells: Sequence[Cell]) -> float:
+    """Return the geometric-mean ratio of ``cells``."""
+    return geomean(np.log([cell.ratio for cell in cells]))
+
+
 def _agreement(cells: Sequence[Cell]) -> Agreement:
     distance = np.abs(np.log([cell.ratio for cell in cells]))
     return Agreement(
-        geomean_ratio=float(np.exp(distance.mean())),
+        geomean_ratio=ratio_of(cells),
         worst_ratio=float(np.exp(distance.max())),
         cells=len(cells),
     )
+
+
+def _by(key: Callable[[Cell], str], cells: Sequence[Cell]) -> dict[str, Agreement]:
+    return {
+        name: _agreement([cell for cell in cells if key(cell) == name])
+        for name in dict.fromkeys(key(cell) for cell in cells)
+    }
 
 
 def summarise(cells: Sequence[Cell]) -> dict[str, TableAgreement]:
@@ -38,30 +62,29 @@ def summarise(cells: Sequence[Cell]) -> dict[str, TableAgreement]:
     summary = {}
     for table in dict.fromkeys(cell.table for cell in cells):
         inside = [cell for cell in cells if cell.table == table]
-        columns = {
-            column: _agreement([c for c in inside if c.column == column])
-            for column in dict.fromkeys(cell.column for cell in inside)
-        }
-        summary[table] = TableAgreement(
-            **_agreement(inside).model_dump(), columns=columns
-        )
+        whole = _agreement(inside).model_dump()
+        columns = _by(lambda cell: cell.column, inside)
+        grouped = [cell for cell in inside if cell.group]
+        if grouped:
+            groups = _by(lambda cell: cell.group, grouped)
+            summary[table] = GroupedAgreement(**whole, columns=columns, groups=groups)
+        else:
+            summary[table] = TableAgreement(**whole, columns=columns)
     return summary
+
+
+def comma_separated(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return ``rows`` under ``header`` as comma-separated text."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+    return buffer.getvalue()
 
 
 def as_csv(cells: Sequence[Cell]) -> str:
     """Return ``cells`` as comma-separated text with a header."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["table", "row", "column", "unit", "paper", "sim"])
-    for cell in cells:
-        writer.writerow(
-            [
-                cell.table,
-                cell.row,
-                cell.column,
-                cell.unit,
-                cell.paper,
-                f"{cell.sim:.6g}",
-            ]
-        )
-    return buffer.getvalue()
+    return comma_separated(
+        ["table", "row", "column", "unit", "paper", "sim"],
+        [(c.table, c.row, c.column, c.unit, c.paper, f"{c.sim:.6g}") for c in cells],
+    )

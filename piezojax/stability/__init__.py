@@ -9,4 +9,6 @@ from .differentiable import sensitivity_peak as sensitivity_peak
 from .linearise import linearise as linearise
 from .margins import StabilityReport as StabilityReport
 from .margins import report_of as report_of
-from .margins import stability_report as stability_report
+from .multi_axis import MultiAxisReport as MultiAxisReport
+from .multi_axis import axes_report_of as axes_report_of
+from .report import stability_report as stability_report

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Scalar, ScalarLike, State, as_array
+from .._types import ScalarLike, Signal, State, as_signal
 from ..dynamics import StateSpace
 from ..hardware import Saturation
 from ..system import Affine, Feedback, LoopState, Observation, System
@@ -31,8 +31,8 @@ class BrokenState(NamedTuple):
     actuator: State
     plant: State
     sensor: State
-    displacement: Scalar
-    applied: Scalar
+    displacement: Signal
+    applied: Signal
 
 
 class BrokenLoop(System):
@@ -40,7 +40,8 @@ class BrokenLoop(System):
 
     Input: the voltage injected into the plant, V. Output: minus the voltage that the
     actuator then returns, V, so that the loop is closed by feeding back minus the
-    output, and its transfer function L has the critical point -1.
+    output, and its transfer function L has the critical point -1. With several axes
+    both are tuples, all axes are cut at once, and L is a matrix.
 
     The cut lies behind the point where the controller learns what was applied:
     ``applied`` stays the actuator's own last voltage. A disturbance observer so keeps
@@ -55,10 +56,10 @@ class BrokenLoop(System):
     """
 
     loop: Feedback
-    reference: Scalar = eqx.field(converter=as_array)
+    reference: Signal = eqx.field(converter=as_signal)
     start: LoopState
-    voltage_push: Scalar = eqx.field(converter=as_array, default=0.0)
-    reference_push: Scalar = eqx.field(converter=as_array, default=0.0)
+    voltage_push: Signal | None = None
+    reference_push: Signal | None = None
 
     def init(self, input: Any = None) -> BrokenState:
         """Return the state of the operating point, whatever the input."""
@@ -72,28 +73,34 @@ class BrokenLoop(System):
             applied=start.voltage,
         )
 
-    def step(self, state: BrokenState, input: ScalarLike) -> tuple[BrokenState, Scalar]:
-        loop, reference = self.loop, self.reference + self.reference_push
-        sensor, measured = loop.sensor.step(
-            state.sensor, (state.displacement, jnp.zeros_like(state.displacement))
-        )
-        seen = Observation(
-            reference, reference, measured, state.applied + self.voltage_push
-        )
+    def step(self, state: BrokenState, input: Signal) -> tuple[BrokenState, Signal]:
+        loop, reference = self.loop, _pushed(self.reference, self.reference_push)
+        quiet = jax.tree.map(jnp.zeros_like, state.displacement)
+        sensor, measured = loop.sensor.step(state.sensor, (state.displacement, quiet))
+        known = _pushed(state.applied, self.voltage_push)
+        seen = Observation(reference, reference, measured, known)
         controller, command = loop.controller.step(state.controller, seen)
         actuator, applied = loop.actuator.step(state.actuator, command)
-        plant, displacement = loop.plant.step(state.plant, input + self.voltage_push)
+        plant, displacement = loop.plant.step(
+            state.plant, _pushed(input, self.voltage_push)
+        )
         state = BrokenState(controller, actuator, plant, sensor, displacement, applied)
-        return state, -applied
+        return state, jax.tree.map(jnp.negative, applied)
+
+
+def _pushed(signal: Signal, push: Signal | None) -> Signal:
+    return signal if push is None else jax.tree.map(jnp.add, signal, push)
 
 
 def broken_loop(
     loop: Feedback,
-    reference: ScalarLike = 0.0,
+    reference: Any = 0.0,
     branch: str = "ascending",
     state: LoopState | None = None,
 ) -> BrokenLoop:
     """Return ``loop`` cut at the plant's input, at rest at ``reference`` (um).
+
+    With several axes ``reference`` is a vector or a tuple, in the units of the axes.
 
     ``state`` is the operating point, by default ``loop.init(reference)``: on the virgin
     loading curve of a plant with hysteresis. There the local gain depends on where the
@@ -110,7 +117,7 @@ def broken_loop(
 
     Raises ValueError for an unknown branch.
     """
-    return cut(loop, as_array(reference), side_of(branch), state)
+    return cut(loop, as_signal(reference), side_of(branch), state)
 
 
 def side_of(branch: str) -> float:
@@ -121,25 +128,30 @@ def side_of(branch: str) -> float:
 
 
 def cut(
-    loop: Feedback, reference: Scalar, side: ScalarLike, state: LoopState | None
+    loop: Feedback, reference: Signal, side: ScalarLike, state: LoopState | None
 ) -> BrokenLoop:
     """Return the loop cut as by ``broken_loop``, ``side`` +1 or -1 for the branch."""
     start = loop.init(reference) if state is None else state
-    plain = BrokenLoop(_without_limits(loop), reference, start)
-    size = 1.0 + jnp.abs(start.voltage)
+    freed = _without_limits(loop)
     # How far the command follows the reference at once; it may go either way.
-    tried = VOLTAGE_PUSH**0.5 * (1.0 + jnp.abs(reference))
-    moved = eqx.tree_at(lambda b: b.reference_push, plain, tried)
-    rise = (-moved.step(moved.init(), start.voltage)[1] - start.voltage) / tried
-    follows = jnp.abs(rise) > VOLTAGE_PUSH
-    needed = jnp.where(follows, 1.0, 0.0) / jnp.where(follows, rise, 1.0)
-    return BrokenLoop(
-        plain.loop,
-        reference,
-        start,
-        voltage_push=jax.lax.stop_gradient(side * VOLTAGE_PUSH * size),
-        reference_push=jax.lax.stop_gradient(side * COMMAND_PUSH * size * needed),
+    tried = jax.tree.map(lambda r: VOLTAGE_PUSH**0.5 * (1.0 + jnp.abs(r)), reference)
+    moved = BrokenLoop(freed, reference, start, reference_push=tried)
+    _, output = moved.step(moved.init(), start.voltage)
+
+    def voltage_push(voltage):
+        return side * VOLTAGE_PUSH * (1.0 + jnp.abs(voltage))
+
+    def reference_push(output, voltage, tried):
+        rise = (-output - voltage) / tried
+        follows = jnp.abs(rise) > VOLTAGE_PUSH
+        needed = jnp.where(follows, 1.0, 0.0) / jnp.where(follows, rise, 1.0)
+        return side * COMMAND_PUSH * (1.0 + jnp.abs(voltage)) * needed
+
+    pushes = (
+        jax.tree.map(voltage_push, start.voltage),
+        jax.tree.map(reference_push, output, start.voltage, tried),
     )
+    return BrokenLoop(freed, reference, start, *jax.lax.stop_gradient(pushes))
 
 
 def _without_limits(loop: Feedback) -> Feedback:
@@ -154,12 +166,12 @@ def _without_limits(loop: Feedback) -> Feedback:
 
 def open_loop(
     loop: Feedback,
-    reference: ScalarLike = 0.0,
+    reference: Any = 0.0,
     branch: str = "ascending",
     state: LoopState | None = None,
     dt: float | None = None,
 ) -> StateSpace:
-    """Return L, one input and one output, of ``loop`` cut at the plant's input.
+    """Return L of ``loop`` cut at the plant's input: an input and an output an axis.
 
     The closed loop is ``A - B C``, since D = 0: a plant answers one sample later.
     ``dt`` in s is looked for in the controller, then in the rest of the loop. Other
@@ -183,13 +195,22 @@ def loop_sample_time(loop: Feedback) -> float:
         return sample_time(loop)
 
 
-def check_operating_point(start: LoopState, reference: float) -> None:
+def check_operating_point(start: LoopState, reference: Any) -> None:
     """Raise ValueError unless ``start`` is finite and rests at ``reference`` (um)."""
-    displacement, voltage = float(start.displacement), float(start.voltage)
-    far = abs(displacement - reference) > 1e-6 * (1.0 + abs(reference))
-    if far or not np.isfinite([displacement, voltage]).all():
-        raise ValueError(
-            f"the loop cannot rest at {reference:g} um: within the actuator's limits "
-            f"the stage rests at {displacement:.6g} um under {voltage:.6g} V; "
-            "choose another reference"
-        )
+    wanted, reached, held = (
+        np.ravel(np.asarray(jax.tree.leaves(signal), float))
+        for signal in (as_signal(reference), start.displacement, start.voltage)
+    )
+    far = np.abs(reached - wanted) > 1e-6 * (1.0 + np.abs(wanted))
+    wrong = far | ~np.isfinite(reached) | ~np.isfinite(held)
+    if not wrong.any():
+        return
+    shown = [
+        ", ".join(f"{number:{form}}" for number in values)
+        for values, form in ((wanted, "g"), (reached, ".6g"), (held, ".6g"))
+    ]
+    raise ValueError(
+        f"the loop cannot rest at {shown[0]} um: within the actuator's limits "
+        f"the stage rests at {shown[1]} um under {shown[2]} V; "
+        "choose another reference"
+    )

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-from .conserved import LinearLoop
+from .conserved import LinearAxes, LinearLoop
 
 PER_DECADE = 400
 """Grid points a decade, before those around the poles."""
@@ -19,7 +19,7 @@ _PEAKS = 8  # highest points of the grid that are refined
 Function = Callable[[np.ndarray], np.ndarray]
 
 
-def angle_grid(loop: LinearLoop) -> np.ndarray:
+def angle_grid(loop: LinearLoop | LinearAxes) -> np.ndarray:
     """Return angles (rad a sample) from far below the slowest pole to pi.
 
     Logarithmic, and denser around each pole of the open and the closed loop, so that no

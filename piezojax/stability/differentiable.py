@@ -1,9 +1,11 @@
 """The same figures as functions that JAX can differentiate and compile."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from .._types import ScalarLike
+from .._types import as_signal
 from ..system import Feedback, LoopState
 from .broken_loop import open_loop
 
@@ -11,40 +13,49 @@ from .broken_loop import open_loop
 def loop_response(
     loop: Feedback,
     frequency: Float[Array, " lines"],
-    reference: ScalarLike = 0.0,
+    reference: Any = 0.0,
     branch: str = "ascending",
     state: LoopState | None = None,
     dt: float | None = None,
-) -> Complex[Array, " lines"]:
+) -> Complex[Array, " lines *axes"]:
     """Return L at ``frequency`` (Hz, above 0 and up to the Nyquist frequency).
+
+    With several axes L is a matrix at each.
 
     Other arguments and errors as for ``open_loop``.
     """
     model = open_loop(loop, reference, branch, state, dt)
-    return model.frequency_response(frequency)[:, 0, 0]
+    response = model.frequency_response(frequency)
+    return response if isinstance(as_signal(reference), tuple) else response[:, 0, 0]
 
 
 def sensitivity_peak(
     loop: Feedback,
     frequency: Float[Array, " lines"],
-    reference: ScalarLike = 0.0,
+    reference: Any = 0.0,
     branch: str = "ascending",
     state: LoopState | None = None,
     dt: float | None = None,
 ) -> Float[Array, ""]:
     """Return the largest |1/(1+L)| at the given frequencies (Hz).
 
+    With several axes the largest singular value, in the units of the commands.
+
     A lower bound of Ms that closes as the grid gets denser, and a bound on it for a
     stable loop only: have an eye on ``closed_loop_poles`` too. Other arguments and
     errors as for ``open_loop``.
     """
-    response = loop_response(loop, frequency, reference, branch, state, dt)
-    return jnp.max(1.0 / jnp.abs(1.0 + response))
+    response = open_loop(loop, reference, branch, state, dt).frequency_response(
+        frequency
+    )
+    returned = jnp.eye(response.shape[-1]) + response
+    smallest = jnp.linalg.svd(returned, compute_uv=False)[:, -1]
+    return jnp.max(1.0 / smallest)
 
 
 def closed_loop_poles(
     loop: Feedback,
-    reference: ScalarLike = 0.0,
+    reference: Any = 0.0,
     branch: str = "ascending",
     state: LoopState | None = None,
     dt: float | None = None,

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
-from .._types import Scalar, ScalarLike, as_array
+from .._types import Scalar, ScalarLike, Signal, as_array, as_signal
 from ..dynamics import StateSpace
 from ..system import Feedback, LoopState
 from .broken_loop import check_operating_point, cut, loop_sample_time, side_of
-from .conserved import LinearLoop, balanced, without_conserved
+from .conserved import LinearAxes, LinearLoop, balanced, without_conserved
 from .crossings import angle_grid, peak, roots
 from .linearise import linearise
 
@@ -72,18 +73,26 @@ class StabilityReport:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON: poles as [real, imaginary], infinity None."""
-        values = dataclasses.asdict(self)
-        values["poles"] = [[pole.real, pole.imag] for pole in self.poles]
-        for name, value in values.items():
-            if isinstance(value, float) and not math.isfinite(value):
-                values[name] = None
-        return values
+        return plain(dataclasses.asdict(self))
+
+
+def plain(value: Any) -> Any:
+    """Return ``value`` for JSON: complex as [real, imaginary], infinity None."""
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    if isinstance(value, dict):
+        return {name: plain(part) for name, part in value.items()}
+    if isinstance(value, tuple):
+        return [plain(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 @eqx.filter_jit
 def _linearised(
     loop: Feedback,
-    reference: Scalar,
+    reference: Signal,
     side: Scalar,
     state: LoopState | None,
     dt: float,
@@ -91,27 +100,6 @@ def _linearised(
     broken = cut(loop, reference, side, state)
     model = linearise(broken, broken.start.voltage, broken.init(), dt)
     return model, broken.start
-
-
-def stability_report(
-    loop: Feedback,
-    reference: ScalarLike = 0.0,
-    branch: str = "ascending",
-    state: LoopState | None = None,
-    dt: float | None = None,
-) -> StabilityReport:
-    """Return the stability of ``loop`` for small motions around ``reference`` (um).
-
-    ``branch`` is "ascending" or "descending": the side from which the slope of a
-    hysteresis is taken, see ``broken_loop``. ``state`` is an operating point other than
-    rest on the virgin curve, such as the last state of a simulation; ``dt`` (s) is
-    needed only if the loop names no sample time.
-
-    Raises ValueError if the loop cannot rest at ``reference``, its derivatives are not
-    finite, the sample time is not known or the branch is none.
-    """
-    model, start = linear_loop(loop, reference, branch, state, dt)
-    return located_report(model, float(reference), start, branch)
 
 
 def located_report(
@@ -135,41 +123,86 @@ def linear_loop(
 ) -> tuple[LinearLoop, LoopState]:
     """Return L in matrices, for ``report_of`` and pictures, and the operating point.
 
+    Arguments and errors as for ``stability_report``; ``linear_axes`` is for several
+    axes.
+    """
+    model, start = _model(loop, as_array(reference), branch, state, dt)
+    return without_conserved(
+        balanced(LinearLoop(model.A, model.B[:, 0], model.C[0], model.dt))
+    ), start
+
+
+def linear_axes(
+    loop: Feedback,
+    reference: Any,
+    branch: str = "ascending",
+    state: LoopState | None = None,
+    dt: float | None = None,
+) -> tuple[LinearAxes, LoopState]:
+    """Return L of a loop of several axes, cut in all, and the operating point.
+
     Arguments and errors as for ``stability_report``.
     """
+    model, start = _model(loop, as_signal(reference), branch, state, dt)
+    return without_conserved(balanced(model)), start
+
+
+def _model(
+    loop: Feedback,
+    reference: Signal,
+    branch: str,
+    state: LoopState | None,
+    dt: float | None,
+) -> tuple[LinearAxes, LoopState]:
     side = as_array(side_of(branch))
     dt = loop_sample_time(loop) if dt is None else dt
-    model, start = _linearised(loop, as_array(reference), side, state, dt)
+    model, start = _linearised(loop, reference, side, state, dt)
     if state is None:
-        check_operating_point(start, float(reference))
+        check_operating_point(start, reference)
     A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
     if not all(np.isfinite(m).all() for m in (A, B, C)):
+        shown = ", ".join(f"{float(r):g}" for r in jax.tree.leaves(reference))
         raise ValueError(
-            f"the loop has no finite derivative at {float(reference):g} um; "
+            f"the loop has no finite derivative at {shown} um; "
             "it cannot be linearised there"
         )
     assert not D.any()  # the plant answers one sample later
-    return without_conserved(*balanced(A, B[:, 0], C[0]), dt), start
+    return LinearAxes(A, B, C, dt), start
 
 
 def report_of(loop: LinearLoop) -> StabilityReport:
     """Return the report on a loop that is linear already."""
+    found = poles_of(loop)
+    figures: dict[str, Any] = dict.fromkeys(_FIGURES)
+    if found["stable"]:
+        figures |= _figures(loop)
+    return StabilityReport(**(figures | found))
+
+
+def poles_of(loop: LinearLoop | LinearAxes) -> dict[str, Any]:
+    """Return what a report says about the poles of the closed loop."""
     poles = np.linalg.eigvals(loop.closed())
     poles = poles[np.argsort(-np.abs(poles), kind="stable")]
     largest = float(np.abs(poles).max(initial=0.0))
     stable = largest < 1.0
-    figures: dict[str, Any] = dict.fromkeys(_FIGURES)
-    if stable:
-        speed = -math.log(largest) if largest > 0.0 else math.inf
-        figures["slowest_time_constant_s"] = loop.dt / speed
-        figures |= _figures(loop)
-    return StabilityReport(
-        stable=stable,
-        dt_s=loop.dt,
-        poles=tuple(complex(pole) for pole in poles),
-        conserved=loop.conserved,
-        **figures,
-    )
+    speed = -math.log(largest) if 0.0 < largest < 1.0 else math.inf
+    return {
+        "stable": stable,
+        "dt_s": loop.dt,
+        "poles": tuple(complex(pole) for pole in poles),
+        "conserved": loop.conserved,
+        "slowest_time_constant_s": loop.dt / speed if stable else None,
+    }
+
+
+def disk_figures(largest: float) -> dict[str, float]:
+    """Return alpha = 1/``largest``, of (S - T)/2, as margins of gain and phase."""
+    alpha = 1.0 / largest
+    return {
+        "disk_margin": alpha,
+        "disk_gain_margin": (2 + alpha) / (2 - alpha) if alpha < 2 else math.inf,
+        "disk_phase_margin_deg": math.degrees(2.0 * math.atan(alpha / 2.0)),
+    }
 
 
 _FIGURES = [
@@ -195,12 +228,9 @@ def _figures(loop: LinearLoop) -> dict[str, float | None]:
     for name in ("sensitivity_peak", "complementary_peak"):
         figures[name] = peaks[name][0]
         figures[f"{name}_Hz"] = _hertz(peaks[name][1], loop.dt)
-    alpha = 1.0 / peaks["disk"][0]
-    figures["disk_margin"] = alpha
-    figures["disk_gain_margin"] = (2 + alpha) / (2 - alpha) if alpha < 2 else math.inf
-    figures["disk_phase_margin_deg"] = math.degrees(2.0 * math.atan(alpha / 2.0))
     return (
         figures
+        | disk_figures(peaks["disk"][0])
         | _gain_margins(loop, grid, response)
         | _phase_margins(loop, grid, response)
     )

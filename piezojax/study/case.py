@@ -1,15 +1,18 @@
 """A study made ready to run: files read, plant fitted, loop and search space built."""
 
+import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from .._types import as_array
-from ..catalog import CONTROLLERS, PLANTS, at_rate
+from ..axes import PerAxis
+from ..catalog import CONTROLLERS, PLANTS, VARIATIONS, at_rate
 from ..control.design import DESIGNS
 from ..hardware import Quantiser, Saturation, Sensor, SlewLimit
 from ..identify import Fit, identify, read_record
@@ -19,6 +22,35 @@ from ..serial import load as load_system
 from ..space import Space, space_of
 from ..system import Feedback, Observation, System, rest_output, series
 from .schema import RecordPlant, Study, load, one_of, validated
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Plants off their nominal values: how they are made, and how far off."""
+
+    make: Callable[..., System]
+    deviations: tuple[str, ...]
+    study: Study
+
+    def plants(self, part: Literal["tune", "holdout"]) -> System | None:
+        """Return the drawn plants of a part, stacked on a leading axis.
+
+        Both parts are drawn from streams of their own. None if there are none.
+        """
+        table = self.study.ensemble
+        assert table is not None
+        count = getattr(table, part)
+        if count == 0:
+            return None
+        stream = {"tune": 2, "holdout": 3}[part]
+        seed = np.random.SeedSequence(self.study.seed, spawn_key=(stream,))
+        shape = (count, len(self.deviations), self.study.axis_count)
+        draws = np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
+        spread = [table.spread.get(name, 0.0) for name in self.deviations]
+        draws = as_array(draws * np.array(spread)[:, None])
+        return jax.vmap(
+            lambda row: self.make(**dict(zip(self.deviations, row, strict=True)))
+        )(draws)
 
 
 @dataclass(frozen=True)
@@ -33,6 +65,7 @@ class Case:
     loop: Feedback
     space: Space
     fit: Fit | None = None
+    ensemble: Ensemble | None = None
 
 
 def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
@@ -53,14 +86,14 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         study.rate,
         design=lambda name: DESIGNS[one_of(name, DESIGNS)](plant, study.dt),
     )
-    zero = as_array(0.0)
+    zero = _per_axis(study, lambda axis: as_array(0.0))
     _check_role(plant, zero, "plant", "a voltage to a displacement")
     seen = Observation(zero, zero, zero, zero)
     _check_role(controller, seen, "controller", "an Observation to a command")
     loop = Feedback(controller, plant, _actuator(study), _sensor(study))
     loop, space = _search_space(study, loop)
     _check_rates(study, loop)
-    return Case(study, path.stem, loop, space, fit)
+    return Case(study, path.stem, loop, space, fit, _ensemble(study))
 
 
 def read(path: str | Path, seed: int | None = None) -> Case:
@@ -87,21 +120,62 @@ def _plant(study: Study, folder: Path) -> tuple[System, Fit | None]:
     return fit.system, fit
 
 
+def _ensemble(study: Study) -> Ensemble | None:
+    if study.ensemble is None:
+        return None
+    name = str(study.plant.get("catalog", ""))
+    if name not in VARIATIONS:
+        raise ValueError(
+            "ensemble: plant.catalog must be one whose variations are known: "
+            f"{', '.join(VARIATIONS)}"
+        )
+    known = inspect.signature(VARIATIONS[name]).parameters
+    for deviation in study.ensemble.spread:
+        if deviation not in known:
+            raise ValueError(
+                f"ensemble.spread.{deviation} is unknown; {name} varies in "
+                f"{', '.join(known)}"
+            )
+    return Ensemble(VARIATIONS[name], tuple(known), study)
+
+
+def _per_axis(study: Study, make: Callable[[int], Any]) -> Any:
+    """Return what ``make`` gives for the one axis, or a tuple with that of each."""
+    if study.axes is None:
+        return make(0)
+    return tuple(make(axis) for axis in range(study.axis_count))
+
+
+def _systems(study: Study, make: Callable[[int], System]) -> System:
+    parts = _per_axis(study, make)
+    return PerAxis(parts, study.axes.names) if study.axes else parts
+
+
 def _actuator(study: Study) -> System:
     table = study.actuator
-    parts: dict[str, System] = {"limits": Saturation(table.lower, table.upper)}
-    if table.slew_rate is not None:
-        parts["slew"] = SlewLimit(table.slew_rate, study.dt)
-    if table.resolution is not None:
-        parts["converter"] = Quantiser(table.resolution)
-    return series(**parts)
+    lower, upper = study.by_axis(table.lower), study.by_axis(table.upper)
+
+    def one(axis: int) -> System:
+        parts: dict[str, System] = {"limits": Saturation(lower[axis], upper[axis])}
+        if table.slew_rate is not None:
+            parts["slew"] = SlewLimit(table.slew_rate, study.dt)
+        if table.resolution is not None:
+            parts["converter"] = Quantiser(table.resolution)
+        return series(**parts)
+
+    return _systems(study, one)
 
 
 def _sensor(study: Study) -> System:
-    parts: dict[str, System] = {"noise": Sensor(study.sensor.noise_rms)}
-    if study.sensor.resolution is not None:
-        parts["converter"] = Quantiser(study.sensor.resolution)
-    return series(**parts)
+    noise = study.by_axis(study.sensor.noise_rms)
+
+    def one(axis: int) -> System:
+        parts: dict[str, System] = {"noise": Sensor(noise[axis])}
+        if study.sensor.resolution is not None:
+            parts["converter"] = Quantiser(study.sensor.resolution)
+        return series(**parts)
+
+    return _systems(study, one)
 
 
 def _search_space(study: Study, loop: Feedback) -> tuple[Feedback, Space]:
@@ -144,7 +218,7 @@ def _check_role(system: System, example: Any, where: str, role: str) -> None:
     """Raise ValueError unless ``system`` can start at and step on ``example``."""
     try:
         eqx.filter_eval_shape(rest_output, system, example)
-    except (AttributeError, TypeError):
+    except (AttributeError, TypeError, ValueError, IndexError):
         raise ValueError(
             f"{where} is a {type(system).__name__}; it must map {role}"
         ) from None

@@ -1,10 +1,12 @@
 """The tables of a study file, validated before anything is built."""
 
 import difflib
+import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
+import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -14,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from .. import signals
+from .. import motions, signals
 from ..identify import chain
 from ..optimisers import METHODS
 from ..space import Transform
@@ -28,6 +30,29 @@ class Table(BaseModel):
     """A table of a study: nothing in it is guessed, nothing unknown is passed over."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Each = TypeVar("Each")
+ByAxis = Each | tuple[Each, ...]
+"""One value for all axes, or a list with one for each."""
+
+
+class AxesTable(Table):
+    """Names and units of the axes of a stage with several."""
+
+    names: tuple[str, ...] = Field(min_length=2)
+    units: tuple[str, ...]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "AxesTable":
+        if len(self.units) != len(self.names) or len(set(self.names)) < len(self.names):
+            raise ValueError("names must differ and have one unit each")
+        for unit in self.units:
+            one_of(unit, ("um", "urad"))
+        for name in self.names:
+            if not name.isidentifier():
+                raise ValueError(f"axis {name!r}: a name is letters, digits and _")
+        return self
 
 
 class RecordPlant(Table):
@@ -53,8 +78,8 @@ class References(Table):
 
     tune: tuple[str, ...] = Field(min_length=1)
     unseen: tuple[str, ...] = ()
-    amplitude: Positive = 5.0
-    offset: Finite = 0.0
+    amplitude: ByAxis[Positive] = 5.0
+    offset: ByAxis[Finite] = 0.0
     duration: Positive = 1.0
     settle: NotNegative = 0.5
 
@@ -62,7 +87,6 @@ class References(Table):
     @classmethod
     def _signals(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         for name in names:
-            signals.parse(name)
             if names.count(name) > 1:
                 raise ValueError(f"{name} is listed twice")
         return names
@@ -92,25 +116,29 @@ class Bounds(Table):
 class Actuator(Table):
     """Limits of the drive, V and V/s; ``resolution`` of its converter, V."""
 
-    lower: Finite
-    upper: Finite
+    lower: ByAxis[Finite]
+    upper: ByAxis[Finite]
     slew_rate: Positive | None = None
     resolution: Positive | None = None
 
     @model_validator(mode="after")
     def _ordered(self) -> "Actuator":
-        if self.lower >= self.upper:
-            raise ValueError(
-                f"lower is {self.lower:g} V and upper {self.upper:g} V; "
-                "lower must be below upper"
-            )
+        if np.ndim(self.lower) != np.ndim(self.upper):
+            raise ValueError("lower and upper must both be lists, or neither")
+        pairs = zip(np.ravel(self.lower), np.ravel(self.upper), strict=False)
+        for lower, upper in pairs:
+            if lower >= upper:
+                raise ValueError(
+                    f"lower is {lower:g} V and upper {upper:g} V; "
+                    "lower must be below upper"
+                )
         return self
 
 
 class SensorTable(Table):
     """Noise and resolution of the sensor, um."""
 
-    noise_rms: NotNegative = 0.0
+    noise_rms: ByAxis[NotNegative] = 0.0
     resolution: Positive | None = None
 
 
@@ -118,9 +146,23 @@ class ObjectiveTable(Table):
     """What is minimised; see piezojax.tune.objective.Objective."""
 
     aggregate: Literal["geometric_mean", "mean_square", "worst"] = "geometric_mean"
+    coupling_weight: NotNegative = 1.0
     effort_weight: NotNegative = 0.0
     slew_weight: NotNegative = 0.0
     noise_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
+
+
+class EnsembleTable(Table):
+    """Plants off their nominal values, drawn evenly within ``spread`` to both sides.
+
+    ``spread`` holds relative deviations by the names that the catalogued plant gives
+    them. ``tune`` draws take part in the objective beside the nominal plant; on
+    ``holdout`` others the gains are judged.
+    """
+
+    spread: dict[str, Positive] = Field(min_length=1)
+    tune: Annotated[int, Field(strict=True, ge=0, le=64)] = 0
+    holdout: Annotated[int, Field(strict=True, ge=1, le=1024)] = 50
 
 
 class OptimiserTable(Table):
@@ -148,6 +190,7 @@ class Study(Table):
     title: str
     rate: Positive
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    axes: AxesTable | None = None
     plant: dict[str, Any]
     actuator: Actuator
     sensor: SensorTable = SensorTable()
@@ -156,6 +199,7 @@ class Study(Table):
     parameters: dict[str, Bounds] = Field(min_length=1)
     objective: ObjectiveTable = ObjectiveTable()
     optimiser: OptimiserTable = OptimiserTable()
+    ensemble: EnsembleTable | None = None
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
 
     @field_validator("parameters", mode="before")
@@ -180,12 +224,18 @@ class Study(Table):
                 "it takes 2 or more"
             )
         for name in (*table.tune, *table.unseen):
-            frequency = signals.parse(name)[1] or 0.0
-            if frequency >= 0.5 * self.rate:
-                raise ValueError(
-                    f"references: {name} is not below half the rate, "
-                    f"{0.5 * self.rate:g} Hz"
-                )
+            try:
+                driven = self.driven(name)
+            except ValueError as error:
+                part = "tune" if name in table.tune else "unseen"
+                raise ValueError(f"references.{part}: {error}") from None
+            for kind in driven.values():
+                frequency = signals.parse(kind)[1] or 0.0
+                if frequency >= 0.5 * self.rate:
+                    raise ValueError(
+                        f"references: {name} is not below half the rate, "
+                        f"{0.5 * self.rate:g} Hz"
+                    )
         if round(table.settle * self.rate) >= samples:
             raise ValueError(
                 f"references.settle is {table.settle:g} s; no sample is left after it"
@@ -203,10 +253,56 @@ class Study(Table):
             )
         return self
 
+    @model_validator(mode="after")
+    def _by_axis(self) -> "Study":
+        lists = {
+            "references.amplitude": self.references.amplitude,
+            "references.offset": self.references.offset,
+            "actuator.lower": self.actuator.lower,
+            "actuator.upper": self.actuator.upper,
+            "sensor.noise_rms": self.sensor.noise_rms,
+        }
+        for key, value in lists.items():
+            if isinstance(value, tuple) and len(value) != self.axis_count:
+                raise ValueError(
+                    f"{key} holds {len(value)} values; the study has {self.axis_count} "
+                    f"{'axis' if self.axis_count == 1 else 'axes'}"
+                )
+        return self
+
     @property
     def dt(self) -> float:
         """Sample time, s."""
         return 1.0 / self.rate
+
+    @property
+    def axis_count(self) -> int:
+        """Number of axes of the stage."""
+        return len(self.axes.names) if self.axes else 1
+
+    @property
+    def highest(self) -> float | tuple[float, ...]:
+        """Offset and amplitude together, of each axis."""
+        table = self.references
+        values = zip(
+            self.by_axis(table.offset), self.by_axis(table.amplitude), strict=True
+        )
+        tops = tuple(offset + amplitude for offset, amplitude in values)
+        return tops if self.axes else tops[0]
+
+    def by_axis(self, value: float | tuple[float, ...]) -> tuple[float, ...]:
+        """Return one value for each axis."""
+        return value if isinstance(value, tuple) else (value,) * self.axis_count
+
+    def driven(self, reference: str) -> dict[str, str]:
+        """Return the signal on each driven axis of a reference, by the axis' name.
+
+        The name is "" on a stage with one axis. Raises ValueError for an unknown one.
+        """
+        if self.axes:
+            return motions.parse(reference, self.axes.names)
+        signals.parse(reference)
+        return {"": reference}
 
 
 def one_of(name: str, allowed: Any) -> str:
@@ -224,9 +320,15 @@ def validated(kind: type[Any], data: Any, where: str) -> Any:
         raise ValueError(_first_line(error, kind, where)) from None
 
 
+_UNION = re.compile(r"(constrained-)?(float|tuple\[.*)$")
+"""What pydantic adds to a place where a field takes one of several kinds."""
+
+
 def _first_line(error: ValidationError, kind: type[BaseModel], where: str) -> str:
-    first = error.errors()[0]
-    key = ".".join([where, *(str(part) for part in first["loc"])]).strip(".")
+    # Of a field that takes a number or a list, the error that fits what was given.
+    first = min(error.errors(), key=lambda found: isinstance(found["input"], list))
+    place = [str(part) for part in first["loc"] if not _UNION.match(str(part))]
+    key = ".".join([where, *place]).strip(".")
     if first["type"] == "extra_forbidden":
         table: Any = kind
         for part in first["loc"][:-1]:

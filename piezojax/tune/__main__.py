@@ -11,7 +11,13 @@ from .. import study as studies
 from ..command import INTERRUPTED, Command, common, results_folder, run
 from ..files import write_text
 from ..report.comparison import comparison_table, write_comparison
-from ..report.console import Bar, gains_table, stability_table, tuning_table
+from ..report.console import (
+    Bar,
+    gains_table,
+    perturbed_text,
+    stability_table,
+    tuning_table,
+)
 from ..report.identification import write_fit
 from ..report.stability import compared, write_stability
 from ..report.tuning import write_numbers, write_results
@@ -57,10 +63,10 @@ def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> N
                 write_fit(case.fit, folder)
             bar.stage("working out margins")
             # At the top of the references the branches differ most.
-            table = case.study.references
             stability = compared(
-                table.offset + table.amplitude,
+                case.study.highest,
                 case.study.dt,
+                case.study.axes.names if case.study.axes else (),
                 before=outcome.before,
                 after=outcome.after,
             )
@@ -69,6 +75,8 @@ def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> N
     console.print(tuning_table(result))
     console.print(gains_table(result))
     console.print(stability_table(stability))
+    if result.perturbed is not None:
+        console.print(perturbed_text(result.perturbed), soft_wrap=True)
     for name, why in stability.problems.items():
         console.print(f"note: no margins {name} tuning: {why}", soft_wrap=True)
     for warning in result.warnings:

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..axes import PerAxisMetric
 from ..metrics import Tracking, TrackingFigures
-from ..rollout import simulate
+from ..rollout import Metric, simulate
 from ..space import Space
-from ..system import Feedback, loop_inputs
+from ..system import Feedback, System, loop_inputs
 
 Aggregate = Literal["geometric_mean", "mean_square", "worst"]
 
@@ -26,11 +27,16 @@ _FLOOR = 1e-9  # um: an error below a femtometre is as good as none
 
 
 class Signals(eqx.Module):
-    """References (um), unit-variance noise draws and a disturbance (um) for a loop."""
+    """References (um), unit-variance noise draws and a disturbance (um) for a loop.
 
-    references: Float[Array, "references samples"]
-    noise: Float[Array, "references draws samples"]
+    With several axes references and noise have a last dimension for them, in the unit
+    of each. ``traces`` then are what is judged: pairs of a reference and an axis.
+    """
+
+    references: Float[Array, "references samples *axes"]
+    noise: Float[Array, "references draws samples *axes"]
     disturbance: Float[Array, " samples"] | None = None
+    traces: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
 
 
 def evaluate(
@@ -38,9 +44,12 @@ def evaluate(
 ) -> TrackingFigures:
     """Return the figures of ``loop_of(parameters)`` for each reference and noise draw.
 
-    Every run starts at rest at its reference; samples before ``start`` do not count.
+    With several axes, for each trace and noise draw. Every run starts at rest at its
+    reference; samples before ``start`` do not count.
     """
-    metric = Tracking(start=start)
+    metric: Metric = Tracking(start=start)
+    if signals.references.ndim > 2:
+        metric = PerAxisMetric(metric, signals.references.shape[2])
 
     def one(parameters, reference, noise):
         loop = loop_of(parameters)
@@ -54,7 +63,16 @@ def evaluate(
         lambda x: jnp.broadcast_to(x, (*runs, *jnp.shape(x))), parameters
     )
     draws = jax.vmap(one, in_axes=(0, None, 0))
-    return jax.vmap(draws)(copies, signals.references, signals.noise)
+    figures = jax.vmap(draws)(copies, signals.references, signals.noise)
+    if not signals.traces:
+        return figures
+    run, axis = (list(indices) for indices in zip(*signals.traces, strict=True))
+    return jax.tree.map(lambda x: x[jnp.array(run), :, jnp.array(axis)], figures)
+
+
+def with_plant(loop: Feedback, plant: System) -> Feedback:
+    """Return ``loop`` around another plant."""
+    return Feedback(loop.controller, plant, loop.actuator, loop.sensor)
 
 
 class Objective(eqx.Module):
@@ -63,8 +81,12 @@ class Objective(eqx.Module):
     Each reference's RMS error, over its noise draws, is divided by ``scale`` (um).
     ``aggregate`` joins them: ``geometric_mean`` (mean of logarithms: a tenfold gain
     counts the same on every reference), ``mean_square``, or ``worst`` (a smooth
-    maximum of the logarithms). ``effort_weight`` and ``slew_weight`` add the mean RMS
-    voltage and RMS voltage change a sample, both as a share of ``voltage_span`` (V).
+    maximum of the logarithms). ``weights`` says how much each counts (alike if left
+    out); what is ``resting``, an axis that should not move, counts only as far as its
+    error exceeds its scale. ``plants``, stacked on a leading axis, take the place of
+    the loop's own, each counting as much. ``effort_weight`` and ``slew_weight`` add the
+    mean RMS voltage and RMS voltage change a sample, both as a share of
+    ``voltage_span``.
     """
 
     loop: Feedback
@@ -73,16 +95,39 @@ class Objective(eqx.Module):
     scale: Float[Array, " references"]
     voltage_span: Float[Array, ""]
     start: int = eqx.field(static=True)
+    weights: Float[Array, " references"] | None = None
+    plants: System | None = None
+    resting: tuple[bool, ...] = eqx.field(static=True, default=())
     aggregate: Aggregate = eqx.field(static=True, default="geometric_mean")
     effort_weight: float = eqx.field(static=True, default=0.0)
     slew_weight: float = eqx.field(static=True, default=0.0)
 
+    def _figures(self, unit: Float[Array, " n"]) -> TrackingFigures:
+        """Return figures of shape [plants, references, draws]."""
+
+        def loop_of(unit):
+            return self.space.put(self.loop, unit)
+
+        if self.plants is None:
+            figures = evaluate(loop_of, unit, self.signals, self.start)
+            return jax.tree.map(lambda x: x[None], figures)
+        return eqx.filter_vmap(
+            lambda plant: evaluate(
+                lambda unit: with_plant(loop_of(unit), plant),
+                unit,
+                self.signals,
+                self.start,
+            )
+        )(self.plants)
+
     def _parts(self, unit: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        figures = evaluate(
-            lambda unit: self.space.put(self.loop, unit), unit, self.signals, self.start
-        )
-        square = jnp.mean(figures.rms_error**2, axis=1)
+        figures = self._figures(unit)
+        square = jnp.mean(figures.rms_error**2, axis=2)
         normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
+        if any(self.resting):
+            # A smooth maximum with 1: no gain in stillness, a price for motion.
+            above = jnp.logaddexp(0.0, _SHARPNESS * jnp.log(normalised)) / _SHARPNESS
+            normalised = jnp.where(jnp.array(self.resting), jnp.exp(above), normalised)
         # Limits turn divergence into a limit cycle between them.
         railed = jnp.any(figures.saturated > RAILED)
         normalised = jnp.where(railed, jnp.inf, normalised)
@@ -90,16 +135,24 @@ class Objective(eqx.Module):
         slew = jnp.mean(figures.rms_slew) / self.voltage_span
         return normalised, effort, slew
 
+    def _shares(self, normalised: Array) -> Array:
+        """Return how much each error counts; the shares sum to 1."""
+        weights = jnp.ones_like(self.scale) if self.weights is None else self.weights
+        weights = jnp.broadcast_to(weights, normalised.shape)
+        return weights / jnp.sum(weights)
+
     def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
         """Return the objective; ``HOPELESS`` where the loop diverges or rails."""
         normalised, effort, slew = self._parts(unit)
+        shares = self._shares(normalised)
         if self.aggregate == "mean_square":
-            joined = jnp.mean(normalised**2)
+            joined = jnp.sum(shares * normalised**2)
         elif self.aggregate == "geometric_mean":
-            joined = jnp.mean(jnp.log(normalised))
+            joined = jnp.sum(shares * jnp.log(normalised))
         else:
             logs = _SHARPNESS * jnp.log(normalised)
-            joined = jax.nn.logsumexp(logs) / _SHARPNESS
+            each = shares * shares.size
+            joined = jax.nn.logsumexp(logs, b=each) / _SHARPNESS
         total = joined + self.effort_weight * effort + self.slew_weight * slew
         return jnp.where(jnp.isfinite(total), total, HOPELESS)
 
@@ -111,7 +164,7 @@ class Objective(eqx.Module):
         if self.aggregate != "mean_square":
             raise ValueError(f"least squares cannot minimise {self.aggregate!r}")
         normalised, effort, slew = self._parts(unit)
-        parts = [normalised / jnp.sqrt(normalised.size)]
+        parts = [(normalised * jnp.sqrt(self._shares(normalised))).ravel()]
         for weight, value in ((self.effort_weight, effort), (self.slew_weight, slew)):
             if weight > 0.0:
                 parts.append(jnp.sqrt(weight * value)[None])
@@ -147,8 +200,11 @@ def with_finite_gradient(loss, *, forward: bool):
     def guarded(unit):
         fixed = jax.lax.stop_gradient(unit)
         if forward:
-            value, push = jax.linearize(loss, fixed)
-            gradient = jax.vmap(push)(jnp.eye(fixed.shape[0]))
+            # Not linearize: that would keep what every sample leaves behind.
+            value, gradient = jax.vmap(
+                lambda direction: jax.jvp(loss, (fixed,), (direction,)),
+                out_axes=(None, 0),
+            )(jnp.eye(fixed.shape[0]))
         else:
             value, gradient = jax.value_and_grad(loss)(fixed)
         usable = jnp.all(jnp.isfinite(gradient)) & (value < HOPELESS)

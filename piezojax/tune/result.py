@@ -32,13 +32,64 @@ class Scores(BaseModel):
         return self.geomean_rms_um is not None and not railed
 
 
+class Perturbed(BaseModel):
+    """The same gains on ``plants`` off their nominal values, drawn for the hold-out.
+
+    ``unstable`` counts plants on which a run diverges or rails. ``median_better`` and
+    ``worst_better`` are how many times smaller the geometric mean of the errors of the
+    driven axes is than before, on the plant in the middle and on the worst one, None
+    where a loop is unstable; ``coupling_better`` is the median of the axes at rest.
+    """
+
+    plants: int
+    unstable_before: int
+    unstable: int
+    geomean_rms_um: float | None
+    worst_rms_um: float | None
+    median_better: float | None
+    worst_better: float | None
+    coupling_better: float | None
+
+    @classmethod
+    def of(
+        cls, before: TrackingFigures, after: TrackingFigures, driven: np.ndarray
+    ) -> "Perturbed":
+        """Return what figures [plant, trace, draw] before and after tuning come to."""
+        means, lost = [], []
+        for figures in (before, after):
+            rms = np.sqrt(np.mean(np.asarray(figures.rms_error) ** 2, axis=2))
+            railed = np.max(np.asarray(figures.saturated), axis=(1, 2)) > RAILED
+            lost.append(railed | ~np.all(np.isfinite(rms), axis=1))
+            with np.errstate(divide="ignore"):
+                means.append(np.log(rms))
+        usable = ~lost[0] & ~lost[1]
+        better = np.exp(np.mean((means[0] - means[1])[usable][:, driven], axis=1))
+        rest = (means[0] - means[1])[usable][:, ~driven]
+        errors = np.exp(np.mean(means[1][~lost[1]][:, driven], axis=1))
+        return cls(
+            plants=len(usable),
+            unstable_before=int(lost[0].sum()),
+            unstable=int(lost[1].sum()),
+            geomean_rms_um=_number(np.median(errors)) if errors.size else None,
+            worst_rms_um=_number(errors.max()) if errors.size else None,
+            median_better=_number(np.median(better)) if better.size else None,
+            worst_better=_number(better.min()) if better.size else None,
+            coupling_better=(
+                _number(np.median(np.exp(np.mean(rest, axis=1)))) if rest.size else None
+            ),
+        )
+
+
 class Result(BaseModel):
     """Everything a tuning run found; ``result.json`` is this as JSON.
 
     ``before`` and ``after`` are the study's own gains and the tuned ones on the tuning
     references and draws; ``holdout_before`` and ``holdout`` are the same two on noise
     the optimiser has not seen, and ``unseen_before`` and ``unseen`` on references it
-    has not seen, with that noise too.
+    has not seen, with that noise too. On a stage with several axes these are the driven
+    ones, each error in its own unit of ``units``; ``coupling_before`` and ``coupling``
+    are the axes that should rest, under all references of the hold-out. ``perturbed``
+    says how the gains do on the plants of the study's ensemble.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -56,6 +107,10 @@ class Result(BaseModel):
     holdout: Scores
     unseen_before: Scores | None
     unseen: Scores | None
+    coupling_before: Scores | None = None
+    coupling: Scores | None = None
+    perturbed: Perturbed | None = None
+    units: dict[str, str] = {}
     warnings: list[str]
     history: list[list[float | None]]
     evaluations: int

@@ -20,8 +20,9 @@ from .result import Status
 STALL_STEPS, STALL_GAIN = 20, 1e-3
 """Stop when the best start gained less than this in so many steps."""
 
-FORWARD_BELOW = 5
-"""Fewer parameters than this are differentiated in forward mode."""
+FORWARD_BELOW, FORWARD_BELOW_WITH_AXES = 5, 64
+"""Fewer parameters than this are differentiated in forward mode: with several axes the
+reverse pass takes minutes to compile, three times as long."""
 
 
 class Clock:
@@ -139,7 +140,8 @@ def _descend(
     progress: Progress,
 ) -> None:
     table = case.study.optimiser
-    forward = len(case.space.paths) < FORWARD_BELOW
+    below = FORWARD_BELOW_WITH_AXES if case.study.axes else FORWARD_BELOW
+    forward = len(case.space.paths) < below
 
     def optimiser(objective):
         # A lambda, because a bound method would be hashed with its arrays.

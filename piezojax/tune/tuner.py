@@ -6,20 +6,22 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import __version__
+from .. import __version__, motions
 from .. import signals as signal_library
 from .._types import as_array
 from ..metrics import TrackingFigures
 from ..progress import Progress, Silent
-from ..study import Case, read, shipped
-from ..system import Feedback
-from .objective import Objective, Signals, evaluate
-from .result import Result, Scores, scores
+from ..study import Case, Study, read, shipped
+from ..system import Feedback, System
+from .objective import RAILED, Objective, Signals, evaluate, with_plant
+from .result import Perturbed, Result, Scores, scores
 from .search import Clock, Search, search_box
+from .traces import Trace, traces_of
 
 
 @dataclass
@@ -44,6 +46,7 @@ class _Judge:
     def __init__(self, clock: Clock, start: int):
         self._clock, self._start = clock, start
         self._programs: dict[tuple[int, ...], Callable] = {}
+        self._plants: Callable | None = None
 
     def figures(self, loop: Feedback, signals: Signals) -> TrackingFigures:
         """Return the figures by reference and draw."""
@@ -56,38 +59,48 @@ class _Judge:
             )
         return self._programs[shape](loop, signals)
 
-    def __call__(
-        self, loop: Feedback, signals: Signals, names: tuple[str, ...]
-    ) -> Scores:
-        """Return the scores by reference."""
-        return scores(self.figures(loop, signals), names)
+    def on_plants(
+        self, loop: Feedback, plants: System, signals: Signals
+    ) -> TrackingFigures:
+        """Return the figures by plant, reference and draw, of ``plants`` stacked."""
+        dynamic, static = eqx.partition(plants, eqx.is_array)
+
+        def all_plants(loop, dynamic, signals):
+            def one(part):
+                other = with_plant(loop, eqx.combine(part, static))
+                return evaluate(lambda x: x, other, signals, self._start)
+
+            return jax.lax.map(one, dynamic)
+
+        if self._plants is None:
+            self._plants = self._clock.compiled(all_plants, loop, dynamic, signals)
+        return self._plants(loop, dynamic, signals)
 
 
 @dataclass
 class _Data:
-    names: tuple[str, ...]
-    tuned: int  # the first so many references are tuned on
+    tuned: int  # the first so many traces are tuned on
+    traces: tuple[Trace, ...]
     tuning: Signals
     holdout: Signals
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(trace.name for trace in self.traces)
 
 
 def _make_data(case: Case) -> _Data:
     study = case.study
     table = study.references
     time_s = signal_library.time_grid(table.duration, study.rate)
-    names = (*table.tune, *table.unseen)
-    references = jnp.stack(
-        [
-            signal_library.signal(name, time_s, table.amplitude, table.offset)
-            for name in names
-        ]
-    )
+    runs = (*table.tune, *table.unseen)
+    references = jnp.stack([_reference(study, name, time_s) for name in runs])
     # Two streams of one seed: the hold-out draws are new for every reference.
     streams = np.random.SeedSequence(study.seed).spawn(2)
     draws = [
         as_array(
             np.random.default_rng(stream).standard_normal(
-                (len(names), count, time_s.size)
+                (len(runs), count, *references.shape[1:])
             )
         )
         for stream, count in zip(
@@ -95,14 +108,30 @@ def _make_data(case: Case) -> _Data:
         )
     ]
     count = len(table.tune)
+    traces = traces_of(study)
+    tuned = sum(trace.run < count for trace in traces)
+    picked = tuple((t.run, t.axis) for t in traces) if study.axes else ()
     return _Data(
-        names,
-        count,
+        tuned,
+        traces,
         tuning=Signals(
-            references[:count], draws[0][:count], _unexplained(case, time_s, "train")
+            references[:count],
+            draws[0][:count],
+            _unexplained(case, time_s, "train"),
+            picked[:tuned],
         ),
-        holdout=Signals(references, draws[1], _unexplained(case, time_s, "validate")),
+        holdout=Signals(
+            references, draws[1], _unexplained(case, time_s, "validate"), picked
+        ),
     )
+
+
+def _reference(study: Study, name: str, time_s: jax.Array) -> jax.Array:
+    table = study.references
+    amplitudes, offsets = study.by_axis(table.amplitude), study.by_axis(table.offset)
+    if study.axes is None:
+        return signal_library.signal(name, time_s, amplitudes[0], offsets[0])
+    return motions.motion(name, time_s, study.axes.names, amplitudes, offsets)
 
 
 def _unexplained(
@@ -151,17 +180,22 @@ def tune(
 
     progress.stage("simulating the start")
     judge = _Judge(clock, first)
-    before = judge(case.loop, data.tuning, data.names[: data.tuned])
+    before = judge.figures(case.loop, data.tuning)
     objective = Objective(
         loop=case.loop,
         space=space,
         signals=data.tuning,
-        scale=_scale(before, data.tuning.references),
-        voltage_span=as_array(table.actuator.upper - table.actuator.lower),
+        scale=_scale(before, data),
+        voltage_span=as_array(
+            np.mean(np.subtract(table.actuator.upper, table.actuator.lower))
+        ),
         start=first,
         aggregate=table.objective.aggregate,
         effort_weight=table.objective.effort_weight,
         slew_weight=table.objective.slew_weight,
+        weights=_weights(case, data),
+        resting=tuple(not trace.driven for trace in data.traces[: data.tuned]),
+        plants=_plants(case),
     )
     search = search_box(objective, case, clock, progress)
 
@@ -176,34 +210,85 @@ def tune(
     return Outcome(result, case.loop, after, case, data.holdout)
 
 
-def _scale(before: Scores, references: jax.Array) -> jax.Array:
+def _scale(before: TrackingFigures, data: _Data) -> jax.Array:
+    """Return what each trace's error is measured against: what it was before."""
+    rms = np.sqrt(np.mean(np.asarray(before.rms_error) ** 2, axis=1))
+    if np.all(np.isfinite(rms)) and np.max(before.saturated) <= RAILED:
+        return as_array(np.where(rms > 0.0, rms, 1e-9))
     # Where the start diverges its error is no measure; the reference's own swing is.
-    swing = jnp.maximum(jnp.std(references, axis=1), 1e-3)
-    if not before.stable:
+    swing = jnp.maximum(jnp.std(data.tuning.references, axis=1), 1e-3)
+    if swing.ndim == 1:
         return swing
-    return as_array([rms or 1e-9 for rms in before.per_reference_rms_um.values()])
+    largest = jnp.max(swing, axis=1)
+    return jnp.stack(
+        [
+            swing[trace.run, trace.axis] if trace.driven else largest[trace.run]
+            for trace in data.traces[: data.tuned]
+        ]
+    )
+
+
+def _weights(case: Case, data: _Data) -> jax.Array | None:
+    """Return how much each trace counts: less where the axis should rest."""
+    if case.study.axes is None:
+        return None
+    coupling = case.study.objective.coupling_weight
+    tuned = data.traces[: data.tuned]
+    return as_array([1.0 if trace.driven else coupling for trace in tuned])
+
+
+def _plants(case: Case) -> System | None:
+    """Return the nominal plant and those of the objective, stacked; None if alone."""
+    others = case.ensemble.plants("tune") if case.ensemble else None
+    if others is None:
+        return None
+    return jax.tree.map(
+        lambda own, drawn: jnp.concatenate([own[None], drawn]), case.loop.plant, others
+    )
+
+
+def _perturbed(
+    case: Case, data: _Data, judge: _Judge, before: Feedback, after: Feedback
+) -> Perturbed | None:
+    plants = case.ensemble.plants("holdout") if case.ensemble else None
+    if plants is None:
+        return None
+    driven = np.array([trace.driven for trace in data.traces])
+    found = [
+        jax.tree.map(np.asarray, judge.on_plants(loop, plants, data.holdout))
+        for loop in (before, after)
+    ]
+    return Perturbed.of(found[0], found[1], driven)
 
 
 def _report(
     case: Case,
     data: _Data,
     judge: _Judge,
-    before: Scores,
+    before: TrackingFigures,
     after: Feedback,
     search: Search,
     clock: Clock,
 ) -> Result:
-    tuned, unseen = data.names[: data.tuned], data.names[data.tuned :]
+    driven = np.array([trace.driven for trace in data.traces])
+    seen = np.arange(len(data.traces)) < data.tuned
 
-    def held(loop: Feedback) -> tuple[Scores, Scores | None]:
-        figures = judge.figures(loop, data.holdout)
-        head = jax.tree.map(lambda x: x[: data.tuned], figures)
-        tail = jax.tree.map(lambda x: x[data.tuned :], figures)
-        return scores(head, tuned), scores(tail, unseen) if unseen else None
+    def held(figures: TrackingFigures, chosen: np.ndarray) -> Scores | None:
+        return _chosen(figures, data.names, chosen) if chosen.any() else None
 
-    holdout_before, unseen_before = held(case.loop)
-    holdout, unseen_after = held(after)
-    after_scores = judge(after, data.tuning, tuned)
+    def both(figures: TrackingFigures) -> tuple[Scores, Scores | None, Scores | None]:
+        return (
+            _chosen(figures, data.names, driven & seen),
+            held(figures, driven & ~seen),
+            held(figures, ~driven),
+        )
+
+    on_holdout = [judge.figures(loop, data.holdout) for loop in (case.loop, after)]
+    holdout_before, unseen_before, coupling_before = both(on_holdout[0])
+    holdout, unseen_after, coupling = both(on_holdout[1])
+    tuned = driven[: data.tuned]
+    names = data.names[: data.tuned]
+    after_scores = _chosen(judge.figures(after, data.tuning), names, tuned)
     unit = np.asarray(search.unit)
     values = case.space.from_unit(as_array(unit))
     at_bound = [
@@ -219,12 +304,16 @@ def _report(
         gains=_named(case, values),
         start=_named(case, case.space.from_unit(case.space.start(case.loop))),
         at_bound=at_bound,
-        before=before,
+        before=_chosen(before, names, tuned),
         after=after_scores,
         holdout_before=holdout_before,
         holdout=holdout,
         unseen_before=unseen_before,
         unseen=unseen_after,
+        coupling_before=coupling_before,
+        coupling=coupling,
+        perturbed=_perturbed(case, data, judge, case.loop, after),
+        units={trace.name: trace.unit for trace in data.traces},
         warnings=[*search.warnings, *_warnings(case, at_bound, after_scores, holdout)],
         history=search.history,
         evaluations=search.evaluations,
@@ -236,6 +325,15 @@ def _report(
 
 
 _VERSIONED = ("jax", "jaxlib", "optimistix", "jaxopt", "equinox", "numpy")
+
+
+def _chosen(
+    figures: TrackingFigures, names: tuple[str, ...], chosen: np.ndarray
+) -> Scores:
+    """Return the scores of the traces that ``chosen`` marks."""
+    where = np.flatnonzero(chosen)
+    part = jax.tree.map(lambda x: np.asarray(x)[where], figures)
+    return scores(part, tuple(names[i] for i in where))
 
 
 def _named(case: Case, values: jax.Array) -> dict[str, float]:

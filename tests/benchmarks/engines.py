@@ -1,6 +1,6 @@
-"""The reference engines of the throughput benchmark, all running one loop.
+"""The reference engines of the throughput benchmark, and the first loop they run.
 
-The loop, "dob_pid_smc", is the disturbance-observer-based PID sliding-mode
+The loop "dob_pid_smc" is the disturbance-observer-based PID sliding-mode
 controller (thesis, chapter 5) on a hysteretic second-order plant, 20 kHz, float64.
 At sample k the measurement z(k) = y(k) + n(k) and the reference r(k+1), r(k), r(k-1)
 are known, and the voltage u(k) acts on y(k+1):
@@ -29,6 +29,10 @@ An engine is used as `engine.prepare(gains, reference, noise)`, then `engine.run
 as often as wanted, with gains [B, 8], reference [B, steps+1], noise [B, steps];
 `run` returns rms [B]. Only `run` is timed: compiling, packing and copying belong
 into `prepare`. `engine(gains, reference, noise)` does both.
+
+`loop_three_dof.py` has another loop; `CEngine(loop)` and `NumpyEngine(loop)` run it.
+Its reference [B, steps+1, 3], noise [B, steps, 3] and rms [B, 3] have axes, its gains
+are [B, 9].
 """
 
 import ctypes
@@ -37,6 +41,8 @@ import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +79,20 @@ def problem(lanes, steps, seed=0):
     noise = rng.standard_normal((lanes, steps))
     noise *= 0.012
     return gains, reference, noise
+
+
+@dataclass(frozen=True)
+class Loop:
+    """What the engines run."""
+
+    name: str  # of the C function, too
+    source: str  # beside this file
+    problem: Callable  # (lanes, steps, seed) -> gains, reference, noise
+    simulate: Callable  # (gains, reference, noise) -> rms, lanes second, time first
+    one_lane: bool  # simulate takes one lane as well, and numba can compile it
+    axes: tuple[int, ...] = ()  # of signals and result
+    design: Callable | None = None  # () -> what else the C function is given
+    few_lanes: tuple[str, ...] = ()  # gcc flags for 4 lanes or fewer
 
 
 class Engine:
@@ -159,18 +179,24 @@ def simulate(gains, reference, noise):
     return np.sqrt(total / (steps - half))
 
 
+DOB_PID_SMC = Loop("dob_pid_smc", "loop.c", problem, simulate, one_lane=True)
+
+
 class NumpyEngine(Engine):
     """All lanes at once in NumPy, a Python loop over time."""
 
     name = "numpy"
     slow = True
 
+    def __init__(self, loop=DOB_PID_SMC):
+        self._loop = loop
+
     def prepare(self, gains, reference, noise):
         arrays = gains, reference, noise
-        self._arrays = [np.ascontiguousarray(array.T) for array in arrays]
+        self._arrays = [np.ascontiguousarray(array.swapaxes(0, 1)) for array in arrays]
 
     def run(self):
-        return simulate(*self._arrays)
+        return self._loop.simulate(*self._arrays)
 
 
 @functools.cache
@@ -195,10 +221,14 @@ def _numba_lanes():
 
 
 class NumbaEngine(Engine):
-    """Lane after lane in serial numba, without fastmath."""
+    """Lane after lane in serial numba, without fastmath; of the first loop only."""
 
     name = "numba"
     slow = True
+
+    def __init__(self, loop=DOB_PID_SMC):
+        if not loop.one_lane:
+            raise UnavailableError(f"{loop.name} is not written for numba")
 
     def prepare(self, gains, reference, noise):
         self._lanes, self.compile_s = _numba_lanes()
@@ -212,26 +242,24 @@ class NumbaEngine(Engine):
 
 
 @functools.cache
-def _c_library():
-    """loop.c as a library, and the seconds to compile it."""
+def _c_library(name, *flags):
+    """A C source beside this file as a library, and the seconds to compile it."""
     gcc = shutil.which("gcc")
     if gcc is None:
         raise UnavailableError("gcc is not on the PATH: no C yardstick")
-    source = Path(__file__).with_name("loop.c")
+    source = Path(__file__).with_name(name)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         target = Path(folder, "loop.so")
         begin = time.perf_counter()
         done = subprocess.run(
-            [gcc, *GCC_FLAGS.split(), "-shared", "-fPIC", source, "-o", target, "-lm"],
+            [gcc, *GCC_FLAGS.split(), *flags]
+            + ["-shared", "-fPIC", source, "-o", target, "-lm"],
             capture_output=True,
             text=True,
         )
         if done.returncode != 0:
-            raise UnavailableError(f"gcc cannot compile loop.c: {done.stderr.strip()}")
+            raise UnavailableError(f"gcc cannot compile {name}: {done.stderr.strip()}")
         library = ctypes.CDLL(str(target))
-    pointer = ctypes.POINTER(ctypes.c_double)
-    library.dob_pid_smc.argtypes = [ctypes.c_int, ctypes.c_int, *[pointer] * 4]
-    library.dob_pid_smc.restype = None
     return library, time.perf_counter() - begin
 
 
@@ -248,33 +276,44 @@ def _aligned(*shape):
 
 
 def _blocks(rows, width):
-    """[lanes, n] as [block, n, width]; the last lane fills up the last block."""
+    """[lanes, ...] as [block, ..., width]; the last lane fills up the last block."""
     count = -(-len(rows) // width)
-    blocks = _aligned(count, rows.shape[1], width)
+    blocks = _aligned(count, *rows.shape[1:], width)
     for index, block in enumerate(blocks):
         lanes = np.arange(index * width, (index + 1) * width)
-        block[:] = rows[np.minimum(lanes, len(rows) - 1)].T
+        block[:] = np.moveaxis(rows[np.minimum(lanes, len(rows) - 1)], 0, -1)
     return blocks
 
 
 class CEngine(Engine):
-    """loop.c, compiled by gcc for this machine: SIMD over blocks of lanes."""
+    """The loop in C, compiled by gcc for this machine: SIMD over blocks of lanes."""
 
     name = "c"
 
+    def __init__(self, loop=DOB_PID_SMC):
+        self._loop = loop
+
     def prepare(self, gains, reference, noise):
-        library, self.compile_s = _c_library()
-        self._call = library.dob_pid_smc
-        self._lanes, self._steps = noise.shape
-        width = library.dob_pid_smc_width(self._lanes)
+        loop = self._loop
+        self._lanes, self._steps = noise.shape[:2]
+        flags = loop.few_lanes if self._lanes <= 4 else ()
+        library, self.compile_s = _c_library(loop.source, *flags)
+        width = getattr(library, loop.name + "_width")(self._lanes)
         data = [_blocks(array, width) for array in (gains, reference, noise)]
-        self._arrays = [*data, _aligned(len(data[0]) * width)]
+        if loop.design is not None:
+            data.insert(0, np.array(loop.design(), dtype=float))
+        self._rms = _aligned(-(-self._lanes // width), *loop.axes, width)
+        self._arrays = [*data, self._rms]
         pointer = ctypes.POINTER(ctypes.c_double)
         self._pointers = [array.ctypes.data_as(pointer) for array in self._arrays]
+        self._call = getattr(library, loop.name)
+        self._call.argtypes = [ctypes.c_int] * 2 + [pointer] * len(self._arrays)
+        self._call.restype = None
 
     def run(self):
         self._call(self._lanes, self._steps, *self._pointers)
-        return self._arrays[-1][: self._lanes].copy()
+        lanes_first = np.moveaxis(self._rms, -1, 1)
+        return lanes_first.reshape(-1, *self._loop.axes)[: self._lanes].copy()
 
 
 c_engine = CEngine()

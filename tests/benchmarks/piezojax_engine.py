@@ -1,15 +1,18 @@
 """piezojax as an engine of the throughput benchmark (see engines.py)."""
 
 import time
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from engines import Engine
+from engines import DOB_PID_SMC, Engine
+from loop_three_dof import THREE_DOF_PID_SMC
 
 import piezojax
-from piezojax.catalog import p753
+from piezojax.axes import PerAxisMetric
+from piezojax.catalog import p558_control, p753
 from piezojax.system import LoopInput
 
 BLOCK = 64  # lanes simulated at a time
@@ -34,37 +37,83 @@ def loop(gains):
     return p753.loop(controller, noise_rms=1.0)
 
 
-def rms(gains, inputs, **options):
-    """RMS error (um) of one lane over the second half of the run."""
-    system = loop(gains)
-    metric = piezojax.Tracking(start=len(inputs.noise) // 2)
+def three_dof(gains, base, stage):
+    """The loop of loop_three_dof.py: P, I, D of each axis in gains [9]."""
+    diagonals = [gains[:3], gains[3:6], gains[6:]]
+    controller = eqx.tree_at(
+        lambda c: [
+            matrix[axis][axis]
+            for matrix in (
+                c.controller.proportional,
+                c.controller.integral,
+                c.controller.derivative,
+            )
+            for axis in range(3)
+        ],
+        base,
+        [gain for values in diagonals for gain in values],
+    )
+    return p558_control.loop(controller, noise_rms=(1.0, 1.0, 1.0), plant=stage)
+
+
+def three_dof_loops():
+    """What makes a loop of gains [9], its parts made once and outside of jit."""
+    base, stage = p558_control.multi_axis("dynamic"), p558_control.stage()
+    return lambda gains: three_dof(gains, base, stage)
+
+
+LOOPS = {DOB_PID_SMC.name: lambda: loop, THREE_DOF_PID_SMC.name: three_dof_loops}
+"""What makes loop_of(gains), by the loop's name."""
+
+
+def rms(loop_of, gains, inputs, **options):
+    """RMS error of one lane over the second half of the run, of each axis."""
+    system = loop_of(gains)
+    samples = jax.tree.leaves(inputs)[0].shape[0]
+    metric = piezojax.Tracking(start=samples // 2)
+    start = 0.0
+    if isinstance(inputs.noise, tuple):
+        metric = PerAxisMetric(metric, len(inputs.noise))
+        start = (0.0,) * len(inputs.noise)
     _, figures = piezojax.simulate(
-        system, inputs, system.init(0.0), metric=metric, **options
+        system, inputs, system.init(start), metric=metric, **options
     )
     return figures.rms_error
 
 
-def block_of_rms(gains, inputs):
-    """RMS errors of a block: gains [width, 8], inputs [steps, width].
+def block_of_rms(loop_of, gains, inputs):
+    """RMS errors of a block: gains [width, n], inputs [steps, width].
 
     One plain loop over signals that lie time first, as it reads them.
     """
-    steps = len(inputs.noise)
-    return jax.vmap(lambda g, u: rms(g, u, segment=steps), in_axes=(0, 1))(
+    steps = jax.tree.leaves(inputs)[0].shape[0]
+    return jax.vmap(lambda g, u: rms(loop_of, g, u, segment=steps), in_axes=(0, 1))(
         gains, inputs
     )
 
 
-def mean_square(gains, inputs):
-    """The loss: gains [8] shared by all lanes, inputs [lanes, steps]."""
-    lanes = len(inputs.noise)
+def mean_square(loop_of, gains, inputs):
+    """The loss: gains [n] shared by all lanes, inputs [lanes, steps]."""
+    lanes = jax.tree.leaves(inputs)[0].shape[0]
     # A copy for each lane: their gradients are then summed once, not in each step.
     each = jnp.broadcast_to(gains, (lanes, len(gains)))
-    return jnp.mean(piezojax.in_blocks(rms, each, inputs) ** 2)
+    blocks = piezojax.in_blocks(lambda g, u: rms(loop_of, g, u), each, inputs)
+    return jnp.mean(blocks**2)
+
+
+def signals(reference, noise):
+    """LoopInput of [lanes, steps+1] and [lanes, steps]; of each axis, if there are."""
+    if noise.ndim == 2:
+        return LoopInput(reference[:, 1:], noise)
+    axes = range(noise.shape[2])
+    return LoopInput(
+        tuple(reference[:, 1:, axis] for axis in axes),
+        tuple(noise[..., axis] for axis in axes),
+    )
 
 
 class PiezojaxEngine(Engine):
-    """The loop "dob_pid_smc" as a user of piezojax would run it.
+    """A loop of the benchmark as a user of piezojax would run it.
 
     `what` is "forward" or "gradient".
 
@@ -79,8 +128,9 @@ class PiezojaxEngine(Engine):
 
     name = "piezojax"
 
-    def __init__(self, what="forward"):
+    def __init__(self, what="forward", loop=DOB_PID_SMC):
         self.what = what
+        self._loop_of = LOOPS[loop.name]()
 
     def prepare(self, gains, reference, noise):
         """Build the loop, put the data on the device and compile for their shapes.
@@ -90,7 +140,7 @@ class PiezojaxEngine(Engine):
         `self.compile_s` to the seconds of tracing and compiling. Called anew for other
         shapes and for other data.
         """
-        inputs = LoopInput(reference[:, 1:], noise)
+        inputs = signals(reference, noise)
         if self.what == "forward":
             self._lanes = len(gains)
             width = min(BLOCK, self._lanes)
@@ -98,10 +148,10 @@ class PiezojaxEngine(Engine):
                 self._block(gains, inputs, np.arange(start, start + width))
                 for start in range(0, self._lanes, width)
             ]
-            function = block_of_rms
+            function = partial(block_of_rms, self._loop_of)
         else:
             self._calls = [jax.tree.map(jnp.array, (gains, inputs))]
-            function = jax.value_and_grad(mean_square)
+            function = jax.value_and_grad(partial(mean_square, self._loop_of))
         begin = time.perf_counter()
         self._compiled = jax.jit(function).lower(*self._calls[0]).compile()
         self.compile_s = time.perf_counter() - begin

@@ -10,6 +10,7 @@ import pytest
 # The benchmark is a script beside its modules, not a package.
 sys.path.insert(0, str(Path(__file__).parent))
 engines = importlib.import_module("engines")
+loop_three_dof = importlib.import_module("loop_three_dof")
 piezojax_engine = importlib.import_module("piezojax_engine")
 
 STEPS = 20_000  # one second
@@ -36,6 +37,23 @@ def test_c_and_numpy_agree():
     problem = engines.problem(20, STEPS)
     c = rms_of(engines.c_engine, *problem)
     np.testing.assert_allclose(engines.numpy_engine(*problem), c, rtol=0, atol=1e-9)
+
+
+# One lane, and more than one block, the last half filled.
+@pytest.mark.parametrize("lanes", [1, 20])
+def test_c_and_numpy_agree_on_three_axes(lanes):
+    loop = loop_three_dof.THREE_DOF_PID_SMC
+    problem = loop.problem(lanes, 2000)
+    c = rms_of(engines.CEngine(loop), *problem)
+    assert c.shape == (lanes, 3)
+    np.testing.assert_allclose(
+        engines.NumpyEngine(loop)(*problem), c, rtol=0, atol=1e-12
+    )
+
+
+def test_numba_has_one_loop():
+    with pytest.raises(engines.UnavailableError, match="not written for numba"):
+        engines.NumbaEngine(loop_three_dof.THREE_DOF_PID_SMC)
 
 
 @pytest.mark.parametrize("lanes", [1, 20])

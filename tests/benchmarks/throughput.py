@@ -1,4 +1,4 @@
-"""Throughput of piezojax beside C, numba and NumPy on one closed loop.
+"""Throughput of piezojax beside C, numba and NumPy on closed loops.
 
     python tests/benchmarks/throughput.py --json throughput.json
 
@@ -38,10 +38,11 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import engines  # noqa: E402
+from loop_three_dof import THREE_DOF_PID_SMC  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-LOOP = "dob_pid_smc"
+LOOPS = {loop.name: loop for loop in (engines.DOB_PID_SMC, THREE_DOF_PID_SMC)}
 ENGINES = ("piezojax", "c", "numba", "numpy")
 SHORTEST_SAMPLE_S = 0.02  # shorter runs are repeated within one sample
 SLOW_BUDGET_S = 1.0  # about the longest run of an engine marked slow
@@ -59,13 +60,16 @@ def int_list(text):
     return sorted({positive_int(part) for part in text.split(",") if part})
 
 
-def engine_list(text):
-    names = [part for part in text.split(",") if part]
-    for name in names:
-        if name not in ENGINES:
-            raise argparse.ArgumentTypeError(
-                f"no engine {name!r}; there are {', '.join(ENGINES)}"
-            )
+def names_among(known, kind):
+    def names(text):
+        found = [part for part in text.split(",") if part]
+        for name in found:
+            if name not in known:
+                raise argparse.ArgumentTypeError(
+                    f"no {kind} {name!r}; there are {', '.join(known)}"
+                )
+        return found
+
     return names
 
 
@@ -78,7 +82,9 @@ def parse(arguments=None):
     parser.add_argument("--gradient-lanes", type=int_list, default=[8, 64])
     parser.add_argument("--steps", type=positive_int, default=20000)
     parser.add_argument("--repeats", type=positive_int, default=5)
+    engine_list, loop_list = names_among(ENGINES, "engine"), names_among(LOOPS, "loop")
     parser.add_argument("--engines", type=engine_list, default=list(ENGINES))
+    parser.add_argument("--loops", type=loop_list, default=list(LOOPS))
     options = parser.parse_args(arguments)
     if options.steps < TRIAL_STEPS:
         parser.error(f"--steps: at least {TRIAL_STEPS}")
@@ -95,22 +101,22 @@ def pin_to_one_core():
     return os.cpu_count()
 
 
-def make_engine(name, what):
+def make_engine(name, what, loop):
     if name == "piezojax":
         from piezojax_engine import PiezojaxEngine
 
-        return PiezojaxEngine(what)
+        return PiezojaxEngine(what, loop)
     return {
         "c": engines.CEngine,
         "numba": engines.NumbaEngine,
         "numpy": engines.NumpyEngine,
-    }[name]()
+    }[name](loop)
 
 
 def part(data, what, steps):
     """What an engine is given: the first steps, and for gradients shared gains."""
     gains, reference, noise = data
-    gains = engines.NOMINAL_GAINS if what == "gradient" else gains
+    gains = gains[0] if what == "gradient" else gains
     return gains, reference[:, : steps + 1], noise[:, :steps]
 
 
@@ -131,15 +137,15 @@ def prepare(engine, data, what, steps):
     return steps
 
 
-def measure(lanes, wanted, options, skip):
+def measure(loop, lanes, wanted, options, skip):
     """Time the wanted (what, engine) pairs on one number of lanes, in turn."""
-    entries, data = [], engines.problem(lanes, options.steps)
+    entries, data = [], loop.problem(lanes, options.steps)
     for what, name in wanted:
         try:
-            engine = make_engine(name, what)
+            engine = make_engine(name, what, loop)
             steps = prepare(engine, data, what, options.steps)
         except (engines.UnavailableError, NotImplementedError) as reason:
-            skip(f"{name}, {what}: {reason}")
+            skip(f"{name}, {what}, {loop.name}: {reason}")
             continue
         warm = seconds_of(engine.run)
         calls = max(1, math.ceil(SHORTEST_SAMPLE_S / warm))
@@ -150,7 +156,7 @@ def measure(lanes, wanted, options, skip):
     return [
         {
             "what": what,
-            "loop": LOOP,
+            "loop": loop.name,
             "engine": name,
             "lanes": lanes,
             "steps": steps,
@@ -168,15 +174,16 @@ def memory_bytes(field):
     raise OSError(f"no {field} in /proc/self/status")
 
 
-def extra_memory_mb(what, name, lanes, steps):
+def extra_memory_mb(loop_name, what, name, lanes, steps):
     """Peak growth of resident memory in one run; for a fresh process.
 
     Not ru_maxrss: a child inherits its parent's high-water mark, and compiling
     raises it above what the run needs. The kernel's mark is reset instead, after a
     warm-up run and after freed memory, which a run would reuse unseen, is returned.
     """
-    engine = make_engine(name, what)
-    engine.prepare(*part(engines.problem(lanes, steps), what, steps))
+    loop = LOOPS[loop_name]
+    engine = make_engine(name, what, loop)
+    engine.prepare(*part(loop.problem(lanes, steps), what, steps))
     engine.run()
     gc.collect()
     try:
@@ -212,7 +219,8 @@ def versions():
 
 
 def table(rows):
-    shown = Table(title=f"{LOOP}, one core")
+    shown = Table(title="one core")
+    shown.add_column("loop")
     shown.add_column("what")
     shown.add_column("engine")
     for column in ("lanes", "ns/lane-step", "x C", "extra MB", "steps"):
@@ -223,6 +231,7 @@ def table(rows):
 
     for row in rows:
         shown.add_row(
+            row["loop"],
             row["what"],
             row["engine"],
             str(row["lanes"]),
@@ -237,8 +246,8 @@ def table(rows):
 def compile_key(row):
     """C and numba compile once, piezojax once a shape."""
     if row["engine"] == "piezojax":
-        return f"piezojax {row['what']} {row['lanes']}"
-    return row["engine"]
+        return f"piezojax {row['loop']} {row['what']} {row['lanes']}"
+    return f"{row['engine']} {row['loop']}"
 
 
 def main(arguments=None):
@@ -256,14 +265,19 @@ def main(arguments=None):
 
     forward = ["c", *(name for name in options.engines if name != "c")]
     rows, compile_s = [], {}
-    for lanes in sorted({*options.lanes, *options.gradient_lanes}):
+    cases = [
+        (LOOPS[name], lanes)
+        for name in options.loops
+        for lanes in sorted({*options.lanes, *options.gradient_lanes})
+    ]
+    for loop, lanes in cases:
         wanted = [("forward", name) for name in forward if lanes in options.lanes]
         if lanes in options.gradient_lanes and "piezojax" in options.engines:
             wanted = [*(wanted or [("forward", "c")]), ("gradient", "piezojax")]
         if not wanted:
             continue
-        console.print(f"{lanes} lanes", style="dim")
-        measured = measure(lanes, wanted, options, skip)
+        console.print(f"{loop.name}, {lanes} lanes", style="dim")
+        measured = measure(loop, lanes, wanted, options, skip)
         gc.collect()
         yardstick = next(
             (row["seconds_median"] for row in measured if row["engine"] == "c"), None
@@ -276,7 +290,12 @@ def main(arguments=None):
             row["lane_steps_per_s"] = lanes * options.steps / seconds
             row["ratio_to_c"] = seconds / yardstick if yardstick else None
             row["extra_memory_mb"] = in_fresh_process(
-                extra_memory_mb, row["what"], row["engine"], lanes, row["steps"]
+                extra_memory_mb,
+                loop.name,
+                row["what"],
+                row["engine"],
+                lanes,
+                row["steps"],
             )
             rows.append(row)
 

@@ -110,6 +110,7 @@ def controller_of(gains, rate=20_000):
         model=ARMA(gains["model_a"], gains["model_b"]),
         reference_model=SecondOrderLag(gains["frequency"], gains["damping"], 1 / rate),
         filter=AlphaBeta(gains["alpha"], gains["beta"], 1 / rate),
+        reference_lead=gains.get("lead", 0.0),
         inversion=gains.get("inversion", "tikhonov"),
     )
 
@@ -119,6 +120,7 @@ THIRD = gains_of(
     (1.2, -0.3, 0.02), (0.006, 0.002, 0.001, 0.0005), (0.2, -0.4), "printed"
 )
 TIKHONOV = THIRD | {"inversion": "tikhonov", "R": 0.01}
+AHEAD = TIKHONOV | {"lead": 2.5}
 UNEVEN = gains_of((1.2, -0.3, 0.02), (0.006, 0.002), (0.2, -0.4), "printed")
 
 BANG_BANG = {
@@ -153,6 +155,7 @@ CASES = {
     "first order": Published(controller_of(FIRST), "model reference", FIRST),
     "third order": Published(controller_of(THIRD), "model reference", THIRD),
     "third, Tikhonov": Published(controller_of(TIKHONOV), "model reference", TIKHONOV),
+    "third, ahead": Published(controller_of(AHEAD), "model reference", AHEAD),
     "orders apart": Published(controller_of(UNEVEN), "model reference", UNEVEN),
     **{
         f"continuous at {rate} Hz": Published(
@@ -342,6 +345,7 @@ def changed(controller, **values):
         (lambda: changed(PRINTED, control_weight=-1.0), "R is -1; .* at least 0"),
         (lambda: changed(PRINTED, surface=(np.nan,)), "surface is nan"),
         (lambda: changed(PRINTED, integral=np.inf), "integral in .* is inf"),
+        (lambda: changed(PRINTED, reference_lead=np.nan), "lead in samples is nan"),
         (lambda: changed(SWITCHED.law, gain=-1.0), "gain K is -1; .* at least 0"),
         (
             lambda: changed(SWITCHED, model=LONGER),

@@ -15,7 +15,7 @@ DRAWS = np.random.default_rng(12).normal(size=SAMPLES)
 QUIET = np.zeros(SAMPLES)
 
 LOOPS = {
-    "pid": p753.loop(PID(0.5, 3000.0, 1e-5, 1e-4, 100.0, dt=p753.DT)),
+    "pid": p753.loop(PID(0.5, 3000.0, 1e-5, 1e-4, 100.0, 3.0, -2.5, dt=p753.DT)),
     "sliding mode": p753.loop(p753.sliding_mode()),
     "inversion": p753.loop(p753.inversion()),
     "observer": p753.loop(p753.disturbance_observer()),

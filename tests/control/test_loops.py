@@ -39,9 +39,19 @@ def pid():
     return PID(*PID_GAINS.values(), dt=p753.DT)
 
 
+def weighted_pid(proportional, derivative):
+    return PID(
+        *PID_GAINS.values(),
+        proportional_weight=proportional,
+        derivative_weight=derivative,
+        dt=p753.DT,
+    )
+
+
 # Name: the package's controller; the oracle's kind and gains.
 CONTROLLERS = {
     "pid": (pid(), "pid", PID_GAINS),
+    "weighted pid": (weighted_pid(3.0, -2.5), "pid", PID_GAINS | {"b": 3.0, "c": -2.5}),
     "sliding mode": (p753.sliding_mode("5-4"), "smc", smc_gains("smc", "5-5")),
     "inversion": (p753.inversion(), "inversion", smc_gains("inversion", "5-3")),
     "observer": (p753.disturbance_observer(), "dob", smc_gains("dob", "5-3")),
@@ -86,6 +96,7 @@ def hard_references():
 
 REFERENCES = {
     "pid": hard_references,
+    "weighted pid": hard_references,
     "sliding mode": hard_references,
     # Where the inverse clips, the oracle goes on from what was asked for, the package
     # from what was applied: see the test below.
@@ -159,6 +170,56 @@ def test_anti_windup_brings_the_stage_back_sooner():
     assert late[1] < 0.1 * late[0]
 
 
+def test_unit_weights_are_the_pid_of_the_error():
+    def plain(state, seen):
+        """What the PID was before it had weights, from its equations."""
+        integral, rate, last, command = state
+        error = seen.reference - seen.measured
+        gains = PID_GAINS
+        integral = integral + p753.DT * (
+            gains["anti_windup"] * (seen.applied - command) + gains["I"] * error
+        )
+        slope = (error - last) / p753.DT
+        smoothing = p753.DT / (p753.DT + gains["derivative_filter"])
+        rate = rate + smoothing * (slope - rate)
+        command = gains["P"] * error + integral + gains["D"] * rate
+        return (integral, rate, error, command), command
+
+    seen = Observation(*np.random.default_rng(4).normal(size=(4, 500)))
+    first = Observation(*(float(values[0]) for values in seen))
+    controller = pid()
+    state, found = controller.init(first), []
+    for sample in zip(*seen, strict=True):
+        state, command = controller.step(state, Observation(*sample))
+        found.append(float(command))
+    error = first.reference - first.measured
+    state = (first.applied - PID_GAINS["P"] * error, 0.0, error, first.applied)
+    expected = []
+    for sample in zip(*seen, strict=True):
+        state, command = plain(state, Observation(*sample))
+        expected.append(command)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12)
+    assert vars(weighted_pid(1.0, 1.0)).keys() == vars(controller).keys()
+    for name, value in vars(controller).items():
+        assert getattr(weighted_pid(1.0, 1.0), name) == value
+
+
+def test_weights_leave_the_answer_to_noise_alone():
+    """At a reference of zero there is nothing to weigh."""
+    references = np.zeros((1, SAMPLES + 1))
+    loops = [around(c, p753.plant()) for c in (pid(), weighted_pid(50.0, -20.0))]
+    one, other = (run(loop, references)[1].displacement for loop in loops)
+    np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("weights", [(50.0, 1.0), (1.0, -20.0), (0.0, 0.0)])
+def test_a_weighted_pid_stays_at_rest(weights):
+    loop = around(weighted_pid(*weights), p753.plant())
+    inputs = LoopInput(jnp.full(200, 5.0), jnp.zeros(200))
+    samples = simulate(loop, inputs, loop.init(5.0))[1]
+    np.testing.assert_allclose(samples.displacement, 5.0, rtol=0.0, atol=1e-9)
+
+
 def observed(observer, measured):
     zero = jnp.zeros(len(measured))
     seen = Observation(zero, zero, jnp.asarray(measured), zero)
@@ -227,6 +288,14 @@ def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
         (
             lambda: PID(1.0, 1.0, anti_windup=-1.0, dt=DT),
             "anti-windup rate in 1/s is -1; it must be finite and at least 0",
+        ),
+        (
+            lambda: weighted_pid(np.inf, 1.0),
+            "proportional weight is inf; it must be finite",
+        ),
+        (
+            lambda: weighted_pid(1.0, np.nan),
+            "derivative weight is nan; it must be finite",
         ),
         (
             lambda: sliding_mode(model=FIRST_ORDER),

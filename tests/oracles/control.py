@@ -97,7 +97,8 @@ def make_observer(gains, period):
 class PID:
     """Our baseline, not of the thesis: filtered D, back-calculation.
 
-    gains: P, I, D, derivative_filter Tf [s], anti_windup K_aw [1/s].
+    gains: P, I, D, derivative_filter Tf [s], anti_windup K_aw [1/s]; b and c weigh
+    the reference in the proportional and the derivative part, 1 if left out.
     """
 
     def __init__(self, gains, rate):
@@ -105,23 +106,23 @@ class PID:
         self.period = 1.0 / rate
         self.integral = 0.0
         self.derivative = 0.0
-        self.e_prev = 0.0
+        self.r_prev = self.z_prev = 0.0
         self.saturation = 0.0  # u_applied(k-1) - u_command(k-1)
         self.command = 0.0
 
     def step(self, z, r_next, r, r_prev):
-        """u(k) = P e + q + D d; see the module docstring for the arguments."""
+        """u(k) = P (b r - z) + q + D d; the arguments as in the module docstring."""
         period = self.period
+        b, c = self.gains.get("b", 1.0), self.gains.get("c", 1.0)
         e = r - z
         self.integral += period * self.gains["anti_windup"] * self.saturation
         self.integral += period * self.gains["I"] * e
         weight = period / (period + self.gains["derivative_filter"])
-        slope = (e - self.e_prev) / period
+        slope = (c * (r - self.r_prev) - (z - self.z_prev)) / period
         self.derivative += weight * (slope - self.derivative)
-        self.e_prev = e
-        self.command = (
-            self.gains["P"] * e + self.integral + self.gains["D"] * self.derivative
-        )
+        self.r_prev, self.z_prev = r, z
+        self.command = self.gains["P"] * (b * r - z) + self.integral
+        self.command += self.gains["D"] * self.derivative
         return self.command
 
     def applied(self, u):
@@ -245,7 +246,8 @@ class ModelReference:
     e(k-n+1), ..., e(k); R, Q, alpha, beta, model_a = (a_1, ..., a_n), model_b =
     (b_0, b_1, ...), frequency and damping (below 1) of the reference model, and
     inversion: "tikhonov" (default) or "printed" (4.21). Histories hold the value of
-    k - i at index i; all start at zero.
+    k - i at index i; all start at zero. lead, in samples, moves the reference ahead
+    along its next step; 0 if left out.
     """
 
     def __init__(self, gains, rate):
@@ -271,8 +273,10 @@ class ModelReference:
         self.s_prev = 0.0
 
     def step(self, z, r_next, r, r_prev):
-        """The command u(k), not yet clipped; neither r(k+1) nor r(k-1) is used."""
+        """The command u(k), not yet clipped; r(k-1) is not used."""
         gains, period = self.gains, self.period
+        lead = gains.get("lead", 0.0)
+        r = (1.0 - lead) * r + lead * r_next
         a, (b0, *b) = gains["model_a"], gains["model_b"]
         order = len(a)
         q, weight = gains["Q"], gains["R"]

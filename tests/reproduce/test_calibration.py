@@ -8,11 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.reproduce import calibration, lanes
-from piezojax.reproduce.calibration import EXPERIMENTS, HALVES, fit, geomean
+from piezojax.catalog import p753
+from piezojax.control import ModelReferencePID
+from piezojax.hardware import Sensor
+from piezojax.reproduce import calibration, chapter4, lanes
+from piezojax.reproduce.calibration import EXPERIMENTS, HALVES, fit
 from piezojax.reproduce.cell import printed
-from piezojax.reproduce.judged import ratio_of
 from piezojax.reproduce.lanes import by_column
+from piezojax.reproduce.stage import stage_of
+from piezojax.reproduce.summary import geomean, ratio_of
+from piezojax.rollout import simulate
+from piezojax.system import Feedback, loop_inputs
 
 ROWS = ("SIN50", "PWSW50")
 """Short references whose errors the loop's speed sets."""
@@ -134,6 +140,77 @@ def test_only_the_doubted_gain_is_replaced():
             assert gains.tolist() == [0.01, 0.005]
 
 
+def test_sw_of_another_amplitude_is_followed_by_all_that_follow_it():
+    cells = [
+        printed(chapter, table)[row, column]
+        for row in ("SW50", "SIN50")
+        for chapter, table, column in (
+            ("ch5", "5-3", "inversion"),
+            ("ch4", "4-5", "model_reference"),
+        )
+    ]
+    for made in lanes.lanes_of(cells, short=True):
+        other = made.with_superposed_amplitude(jnp.asarray(3.0))
+        assert made.superposed.tolist() == [True, False]
+        time = np.arange(made.reference.shape[0]) / 20_000.0 - 0.1
+        by_hand = 0.6 * (
+            5.0
+            + 30.0 / 7.0 * np.sin(2.0 * np.pi * 2.5 * time + np.pi)
+            + 25.0 / 7.0 * np.sin(2.0 * np.pi * 10.0 * time + 0.5 * np.pi)
+            + 5.0 / 7.0 * np.sin(2.0 * np.pi * 25.0 * time + 0.2 * np.pi)
+            + 5.0 / 7.0 * np.sin(2.0 * np.pi * 50.0 * time)
+        )
+        np.testing.assert_allclose(other.reference[:, 0], by_hand, atol=1e-9)
+        np.testing.assert_array_equal(other.reference[:, 1], made.reference[:, 1])
+        np.testing.assert_array_equal(other.target[:, 1], made.target[:, 1])
+        controller = jax.tree.map(lambda leaf: leaf[0], made.controller)
+        follow = (
+            chapter4.COLUMNS["4-5"]["model_reference"].target
+            if isinstance(controller, ModelReferencePID)
+            else lambda _, reference: reference
+        )
+        np.testing.assert_allclose(
+            other.target[:, 0], follow(controller, jnp.asarray(by_hand)), atol=1e-9
+        )
+
+
+def test_the_sensor_shakes_the_stage_and_is_not_in_the_error(problem):
+    values = {n: float(v) for n, v in problem.space.named(problem.start).items()}
+    errors = eqx.filter_jit(problem.errors)
+    quiet, loud = (
+        errors(values | {"noise": noise, "sensor_lag": 1e-7}) for noise in (0.0, 0.03)
+    )
+    made = problem.lanes[0]
+    loop = Feedback(
+        jax.tree.map(lambda leaf: leaf[0], made.controller),
+        stage_of(values, problem.numerator),
+        p753.actuator(),
+        Sensor(0.03),
+    )
+    inputs = loop_inputs(made.reference[:, 0], made.noise)
+    sample = simulate(loop, inputs, loop.init(0.0))[1]
+    off = sample.displacement - made.target[:, 0]
+    counted = np.asarray(made.weight[:, 0]) > 0.0
+    rms = np.sqrt(np.mean(np.asarray(off)[counted] ** 2))
+    assert float(loud[0]) == pytest.approx(rms, rel=1e-9)
+    assert 0.0 < abs(float(loud[0] - quiet[0])) < 0.03
+
+
+def test_what_is_in_doubt_is_not_pulled_towards_print(problem, monkeypatch):
+    name = "chapter 5, P of the observer in doubt"
+    cells = [printed("ch5", "5-3")["SIN50", "dob"]]
+    doubtful = EXPERIMENTS[name].problem(cells, short=True)
+    place = doubtful.space.paths.index("observer_proportional")
+    moved = doubtful.start.at[place].add(-0.2).at[0].add(0.1)
+    monkeypatch.setattr(calibration.Problem, "log_ratios", lambda *_: jnp.zeros(1))
+    pull = np.asarray(doubtful.residuals(moved))[len(cells) :]
+    expected = np.zeros(doubtful.start.size)
+    expected[0] = 0.1
+    np.testing.assert_allclose(pull, expected, atol=1e-12)
+    assert len(calibration.starts(doubtful)) == 3
+    assert len(calibration.starts(problem)) == 2
+
+
 def test_geometric_mean_ratio_counts_both_directions():
     cell = printed("ch5", "5-3")["SIN1", "dob"]
     cells = [
@@ -141,4 +218,4 @@ def test_geometric_mean_ratio_counts_both_directions():
         dataclasses.replace(cell, sim=0.5 * cell.paper),
     ]
     assert ratio_of(cells) == pytest.approx(2.0)
-    assert calibration.geomean(np.log([1.0, 4.0])) == pytest.approx(2.0)
+    assert geomean(np.log([1.0, 4.0])) == pytest.approx(2.0)

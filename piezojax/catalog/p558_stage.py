@@ -1,0 +1,73 @@
+"""The P-558.TCD as the plant of a loop: hysteresis, then the printed dynamics.
+
+No hysteresis of this stage is printed: a play operator of 2 % stands in for what its
+internal loop leaves (an assumption of ours; the driven cells of Table 7-4 ask for about
+as much).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..axes import PerAxis
+from ..dynamics import Channel, Channels, channels_of
+from ..hysteresis import PrandtlIshlinskii
+from ..system import Series, System, series
+from . import p558
+from .p558 import OUTPUTS
+
+HYSTERESIS = 0.02
+"""Share of the stroke that passes through the play operator."""
+
+PLAY = 4.0
+"""Half-width of the play in um, urad, urad."""
+
+
+def plant(chapter: str = "7", hysteresis: float = HYSTERESIS) -> Series:
+    """Return the stage: ``hysteresis`` of each axis, then (7.53) or (6.23)-(6.25).
+
+    Raises ValueError for a chapter that prints no model.
+    """
+    loops = tuple(_play(hysteresis) for _ in OUTPUTS)
+    return series(
+        hysteresis=PerAxis(loops, OUTPUTS),
+        dynamics=channels_of(p558.channels(chapter)),
+    )
+
+
+def varied(
+    gain: Float[Array, " axes"],
+    speed: Float[Array, " axes"],
+    hysteresis: Float[Array, " axes"],
+    coupling: Float[Array, " axes"],
+) -> System:
+    """Return the stage with relative deviations by axis, 0 for none.
+
+    ``gain`` of the axis' channel; ``speed``, the time scale of its poles and zeros
+    (A becomes I + (1 + speed)(A - I), B is scaled alike: same gain at rest);
+    ``hysteresis``, the share of play; ``coupling``, what it adds to the other axes.
+    """
+    channels: list[Channel] = []
+    for axis, part in enumerate(channels_of(p558.channels("7")).parts):
+        faster, gain_of = 1.0 + speed[axis], 1.0 + gain[axis]
+        A = tuple(
+            tuple(
+                float(i == j) + faster * (a - float(i == j)) for j, a in enumerate(row)
+            )
+            for i, row in enumerate(part.A)
+        )
+        C = tuple(
+            tuple((1.0 + coupling[axis] * (output != axis)) * c for c in row)
+            for output, row in enumerate(part.C)
+        )
+        B = tuple(faster * gain_of * b for b in part.B)
+        channels.append(Channel(A, B, C, part.dt))
+    loops = tuple(_play(HYSTERESIS * (1.0 + h)) for h in hysteresis)
+    return series(
+        hysteresis=PerAxis(loops, OUTPUTS), dynamics=Channels(tuple(channels))
+    )
+
+
+def _play(share: float | jax.Array) -> PrandtlIshlinskii:
+    share = jnp.asarray(share, jnp.float64)
+    return PrandtlIshlinskii((1.0 - share,), (PLAY,), (share,))

@@ -1,0 +1,35 @@
+"""A controller that sees its measurements through an observer."""
+
+from typing import Any
+
+import jax
+
+from .._types import State
+from ..system import Observation, System
+from .observer import Motion
+
+
+def _is_motion(node: Any) -> bool:
+    return isinstance(node, Motion)
+
+
+class Filtered(System):
+    """``controller``, which is shown the position that ``filter`` estimates as z(k).
+
+    ``filter`` is an Observer, or one on each axis (``PerAxis``); its velocities are not
+    used. Everything behind it sees the filtered position, a disturbance observer too.
+    Input an Observation, output the controller's.
+    """
+
+    filter: System
+    controller: System
+
+    def init(self, input: Observation) -> State:
+        return self.filter.init(input), self.controller.init(input)
+
+    def step(self, state: State, input: Observation) -> tuple[State, Any]:
+        filter_state, motion = self.filter.step(state[0], input)
+        position = jax.tree.map(lambda m: m.position, motion, is_leaf=_is_motion)
+        seen = input._replace(measured=position)
+        controller, command = self.controller.step(state[1], seen)
+        return (filter_state, controller), command

@@ -1,0 +1,273 @@
+"""PID-based sliding mode control of square multi-axis stages (chapter 7)."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._types import State, as_array
+from ..axes import (
+    Axes,
+    Rows,
+    as_rows,
+    check_square,
+    diagonal,
+    inverse,
+    matrix_product,
+    minus,
+    plus,
+    product,
+)
+from ..dynamics.matrix_arma import MatrixARMA
+from ..system import Designed, Observation, System
+
+
+class MultiAxisState(NamedTuple):
+    """Histories newest first, in the units of the axes; commands likewise.
+
+    ``desired`` holds y_d of the next sample and before; ``forward`` past u1;
+    ``feedback`` the last u2; ``predicted`` the state X2 of (7.27); ``integral`` the I
+    part of the command; ``sliding`` the last s.
+    """
+
+    reference_model: State
+    desired: tuple[Axes, ...]
+    forward: tuple[Axes, ...]
+    feedback: Axes
+    predicted: tuple[Axes, ...]
+    integral: Axes
+    sliding: Axes
+
+
+def _matrices(values) -> tuple[Rows, ...]:
+    return tuple(as_rows(value) for value in values)
+
+
+class MultiAxisSlidingModePID(Designed):
+    """Output-tracking sliding mode control with static decoupling, (7.16)-(7.40).
+
+    For ``model``, q axes with p matrices each, any p. The command is u1 + u2. u1 moves
+    the model along the output y_d of ``reference_model``, which turns r(k) into
+    y_d(k+1): ``u1(k) = F1 R1 - K_s (u1(k-1) + ... + u1(k-p+1))`` with
+    ``R1 = y_d(k+1) - sum_i A_i y_d``, ``decoupling`` K_s [q, q], lower triangular in
+    the thesis, and F1 = (I + (p-1) K_s)(sum B)^-1, so that at rest the axes are
+    decoupled. u2 acts on e = y - y_d: the state X2 = [e(k); e(k+1); ...; e(k+p-1)], the
+    later ones as far as they are known, follows from past e and u2 alone, and
+    ``s = surface[0] e(k) + surface[1] e(k+1) + ...`` (7.28), each [q, q];
+    ``u2 = (S B)^-1 (reaching s - S A X2) - (P s + I int s dt + D ds/dt)`` with
+    ``proportional``, ``integral`` (1/s), ``derivative`` (s) and ``reaching`` PHI, all
+    [q, q], of commands in the unit of the output. PHI enters with the sign of (7.29),
+    (7.31) and (7.40); that of (7.30) and (7.34) is unstable.
+
+    Input an Observation of q axes, output a tuple of q commands. (The thesis filters
+    the measurements: see ``Filtered``.) No parameter is limited in sign: a loop of
+    other gains may be unstable. The integral does not stop at a limit.
+
+    At rest without disturbance the state stays where it is. Where the model's DC gain
+    is not the stage's, s = 0 leaves a small error: the prediction knows of no
+    disturbance, and the start moves there slowly.
+
+    Raises ValueError for matrices that are not [q, q] or a surface that has not p of
+    them.
+    """
+
+    proportional: Rows = eqx.field(converter=as_rows)
+    integral: Rows = eqx.field(converter=as_rows)
+    derivative: Rows = eqx.field(converter=as_rows)
+    reaching: Rows = eqx.field(converter=as_rows)
+    decoupling: Rows = eqx.field(converter=as_rows)
+    surface: tuple[Rows, ...] = eqx.field(converter=_matrices)
+    model: MatrixARMA
+    reference_model: System
+
+    def __check_init__(self):
+        q, p = self.model.axes, len(self.model.moving)
+        for name in (
+            "proportional",
+            "integral",
+            "derivative",
+            "reaching",
+            "decoupling",
+        ):
+            check_square(name, getattr(self, name), q)
+        if len(self.surface) != p:
+            raise ValueError(
+                f"surface holds {len(self.surface)} matrices; it must hold {p}, one "
+                "for each lag of the model"
+            )
+        for index, matrix in enumerate(self.surface):
+            check_square(f"surface[{index}]", matrix, q)
+
+    @property
+    def dt(self) -> float:
+        """Sample time, s."""
+        return self.model.dt
+
+    def law(self) -> "MultiAxisLaw":
+        """Return the controller with its gain matrices worked out."""
+        A, surface = self.model.autoregressive, self.surface
+        q, lags = self.model.axes, len(self.model.moving) - 1
+        unit = diagonal([1.0] * q)
+        shared = plus(unit, jax.tree.map(lambda k: lags * k, self.decoupling))
+        forward = matrix_product(shared, inverse(plus(*self.model.moving)))
+        driven = plus(
+            *(
+                matrix_product(S, h)
+                for S, h in zip(surface, self.model.responses(), strict=True)
+            )
+        )
+        reach = inverse(driven)
+        equivalent = []
+        for j, S in enumerate(surface):
+            # X2 moves up by one block; the model's A make the last.
+            moved = matrix_product(surface[-1], A[-1 - j])
+            if j > 0:
+                moved = plus(moved, surface[j - 1])
+            wanted = minus(matrix_product(self.reaching, S), moved)
+            equivalent.append(matrix_product(reach, wanted))
+        return MultiAxisLaw(
+            self.proportional,
+            self.integral,
+            self.derivative,
+            self.decoupling,
+            surface,
+            self.model,
+            forward=forward,
+            past_desired=tuple(matrix_product(forward, a) for a in A),
+            rest=inverse(shared),
+            equivalent=tuple(equivalent),
+            reference_model=self.reference_model,
+        )
+
+
+class MultiAxisLaw(System):
+    """What MultiAxisSlidingModePID runs: its own matrices, and those worked out.
+
+    ``forward`` F1, ``past_desired`` F1 A_i, ``rest`` (I + (p-1) K_s)^-1 and
+    ``equivalent`` (S B)^-1 (PHI S - S A), a block for each of X2.
+    """
+
+    proportional: Rows
+    integral: Rows
+    derivative: Rows
+    decoupling: Rows
+    surface: tuple[Rows, ...]
+    model: MatrixARMA
+    forward: Rows
+    past_desired: tuple[Rows, ...]
+    rest: Rows
+    equivalent: tuple[Rows, ...]
+    reference_model: System
+
+    def _forward(self, desired: tuple[Axes, ...], past: tuple[Axes, ...]) -> Axes:
+        """Return u1 for y_d(k+1), ..., y_d(k-p+1) and the last p-1 values of u1."""
+        newest, *older = desired
+        wanted = product(self.forward, newest)
+        for matrix, value in zip(self.past_desired, older, strict=True):
+            wanted = minus(wanted, product(matrix, value))
+        if past:
+            wanted = minus(wanted, product(self.decoupling, plus(*past)))
+        return wanted
+
+    def _predicted(
+        self, error: Axes, last: tuple[Axes, ...], feedback: Axes
+    ) -> tuple[Axes, ...]:
+        """Return X2(k) from e(k), X2(k-1) and u2(k-1).
+
+        Each block is written with those before it in X2(k) and X2(k-1): both are
+        carried, so that a compiler computes neither twice.
+        """
+        found = [error]
+        model = self.model
+        A, B = model.autoregressive, model.moving
+        p = len(B)
+        for j in range(1, p):
+            block = product(B[j], feedback)
+            # The last block has no successor in X2(k-1); A_0 e(k-1) is in its place.
+            inner = j + 1 < p
+            older = last[j + 1] if inner else product(A[j], last[0])
+            block = plus(block, older)
+            for i in range(j):
+                known = found[j - 1 - i]
+                known = minus(known, last[j - i]) if inner else known
+                block = plus(block, product(A[i], known))
+            found.append(block)
+        return tuple(found)
+
+    def _sliding(self, predicted: tuple[Axes, ...]) -> Axes:
+        return _summed(self.surface, predicted)
+
+    def init(self, input: Observation) -> MultiAxisState:
+        model = self.model
+        q, p = model.axes, len(model.moving)
+        desired = (tuple(as_array(r) for r in input.reference),) * p
+        zero = (jnp.zeros_like(desired[0][0]),) * q
+        # At rest u1 is its own past: u1 (I + (p-1) K_s) = F1 R1.
+        wanted = self._forward((*desired, desired[0]), (zero,) * (p - 1))
+        forward = product(self.rest, wanted)
+        feedback = minus(tuple(as_array(u) for u in input.applied), forward)
+        error = minus(tuple(as_array(z) for z in input.measured), desired[0])
+        predicted = [error]
+        A, B = model.autoregressive, model.moving
+        for j in range(1, p):
+            terms = [product(A[i], predicted[j - 1 - i]) for i in range(j)]
+            terms += [product(A[i], error) for i in range(j, p)]
+            terms += [product(B[i], feedback) for i in range(j, p)]
+            predicted.append(plus(*terms))
+        sliding = self._sliding(tuple(predicted))
+        proportional = product(self.proportional, sliding)
+        equivalent = _summed(self.equivalent, tuple(predicted))
+        return MultiAxisState(
+            reference_model=self.reference_model.init(desired[0]),
+            desired=desired,
+            forward=(forward,) * (p - 1),
+            feedback=feedback,
+            predicted=tuple(predicted),
+            integral=plus(minus(feedback, equivalent), proportional),
+            sliding=sliding,
+        )
+
+    def step(
+        self, state: MultiAxisState, input: Observation
+    ) -> tuple[MultiAxisState, Axes]:
+        dt = self.model.dt
+        error = minus(input.measured, state.desired[0])
+        reference_model, following = self.reference_model.step(
+            state.reference_model, input.reference
+        )
+        desired = (following, *state.desired)
+        forward = self._forward(desired, state.forward)
+
+        predicted = self._predicted(error, state.predicted, state.feedback)
+        sliding = self._sliding(predicted)
+        summed = product(self.integral, sliding)
+        integral = tuple(
+            i - dt * s for i, s in zip(state.integral, summed, strict=True)
+        )
+        slope = tuple(
+            (s - last) / dt for s, last in zip(sliding, state.sliding, strict=True)
+        )
+        switching = minus(
+            integral,
+            plus(
+                product(self.proportional, sliding),
+                product(self.derivative, slope),
+            ),
+        )
+        feedback = plus(_summed(self.equivalent, predicted), switching)
+        state = MultiAxisState(
+            reference_model=reference_model,
+            desired=desired[:-1],
+            forward=(forward, *state.forward)[: len(state.forward)],
+            feedback=feedback,
+            predicted=predicted,
+            integral=integral,
+            sliding=sliding,
+        )
+        return state, plus(forward, feedback)
+
+
+def _summed(matrices: tuple[Rows, ...], blocks: tuple[Axes, ...]) -> Axes:
+    pairs = zip(matrices, blocks, strict=True)
+    return plus(*(product(matrix, block) for matrix, block in pairs))

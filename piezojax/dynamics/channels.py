@@ -1,0 +1,92 @@
+"""Linear dynamics with several inputs, identified input by input."""
+
+from collections.abc import Sequence
+from functools import reduce
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .._types import Scalar, ScalarLike, as_scalars, check
+from ..axes import Axes, Rows, as_rows, check_square, plus, product
+from ..system import System
+from .state_space import StateSpace
+
+
+class Channel(System):
+    """What one input does to all outputs: ``x(k+1) = A x + B u``, ``y(k) = C x(k)``.
+
+    ``A`` [n, n], ``B`` [n], ``C`` [outputs, n] in the units of the input and outputs;
+    ``dt`` in s. Input the scalar u(k), output y(k+1), one scalar an output. Raises
+    ValueError for sizes that do not fit, numbers that are not finite or ``dt <= 0``.
+    """
+
+    A: Rows = eqx.field(converter=as_rows)
+    B: Axes = eqx.field(converter=as_scalars)
+    C: Rows = eqx.field(converter=as_rows)
+    dt: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        check_square("A", self.A, len(self.B))
+        if len(self.C[0]) != len(self.B):
+            raise ValueError(
+                f"C has {len(self.C[0])} columns; it must have one for each of "
+                f"{len(self.B)} states"
+            )
+        check("B", self.B)
+        check("sample time in s", self.dt, above=0.0)
+
+    def init(self, input: ScalarLike = 0.0) -> Axes:
+        A = jnp.stack([jnp.stack(row) for row in self.A])
+        gain = jnp.linalg.solve(jnp.eye(len(A)) - A, jnp.stack(self.B))
+        return tuple(gain[i] * input for i in range(len(self.B)))
+
+    def step(self, state: Axes, input: Scalar) -> tuple[Axes, Axes]:
+        driven = tuple(b * input for b in self.B)
+        state = plus(product(self.A, state), driven)
+        return state, product(self.C, state)
+
+
+class Channels(System):
+    """The sum of what each input does to all outputs, (6.19)-(6.22).
+
+    Answers u(k) with y(k+1), as a loop expects of its plant. Inputs and outputs are
+    tuples of scalars. Raises ValueError for parts that differ in their outputs or
+    sample time, or for none.
+    """
+
+    parts: tuple[Channel, ...]
+
+    def __check_init__(self):
+        kinds = {(len(part.C), part.dt) for part in self.parts}
+        if len(kinds) != 1:
+            raise ValueError(
+                f"channels differ in (outputs, sample time): {sorted(kinds)}; "
+                "there must be at least one, and all the same"
+            )
+
+    def init(self, input: Axes) -> tuple[Axes, ...]:
+        return tuple(p.init(u) for p, u in zip(self.parts, input, strict=True))
+
+    def step(
+        self, state: tuple[Axes, ...], input: Axes
+    ) -> tuple[tuple[Axes, ...], Axes]:
+        stepped = [
+            part.step(x, u) for part, x, u in zip(self.parts, state, input, strict=True)
+        ]
+        outputs = reduce(plus, (y for _, y in stepped))
+        return tuple(x for x, _ in stepped), outputs
+
+
+def channels_of(models: Sequence[StateSpace]) -> Channels:
+    """Return models of one input each as the plant of a loop.
+
+    Raises ValueError for a model with more inputs, or one whose input reaches its own
+    sample (D not zero).
+    """
+    for model in models:
+        if model.B.shape[1] != 1:
+            raise ValueError(f"a channel has {model.B.shape[1]} inputs; it must have 1")
+        if np.any(np.asarray(model.D)):
+            raise ValueError("D is not zero; an input must not reach its own sample")
+    return Channels(tuple(Channel(m.A, m.B[:, 0], m.C, m.dt) for m in models))

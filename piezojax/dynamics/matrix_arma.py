@@ -1,0 +1,155 @@
+"""Square linear models in observability form: an ARMA model with matrices."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._types import check
+from ..axes import (
+    Axes,
+    Rows,
+    as_matrix_of,
+    as_rows,
+    check_square,
+    matrix_product,
+    plus,
+    product,
+)
+from ..system import System
+from .state_space import StateSpace
+
+
+def _matrices(values) -> tuple[Rows, ...]:
+    return tuple(as_rows(value) for value in values)
+
+
+class MatrixARMA(System):
+    """``y(k+1) = sum_i autoregressive[i] y(k-i) + sum_i moving[i] u(k-i)``.
+
+    p matrices [q, q] each, newest first: of the thesis' (7.5)-(7.6) ``autoregressive``
+    holds A_(p-1), ..., A_0 and ``moving`` B_(p-1), ..., B_0 (the last q rows of B_c1,
+    Gamma_1, Gamma_0). Answers u(k) with y(k+1). Inputs and outputs are tuples of q
+    scalars; the state is what the past adds to the outputs 1, 2, ... samples ahead.
+    ``dt`` in s. Raises ValueError for different numbers of matrices, other sizes or
+    ``dt <= 0``.
+    """
+
+    autoregressive: tuple[Rows, ...] = eqx.field(converter=_matrices)
+    moving: tuple[Rows, ...] = eqx.field(converter=_matrices)
+    dt: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        if not self.moving or len(self.autoregressive) != len(self.moving):
+            raise ValueError(
+                f"{len(self.autoregressive)} autoregressive and {len(self.moving)} "
+                "moving matrices; there must be as many of both, at least 1"
+            )
+        for name in ("autoregressive", "moving"):
+            for index, matrix in enumerate(getattr(self, name)):
+                check_square(f"{name}[{index}]", matrix, self.axes)
+        check("sample time in s", self.dt, above=0.0)
+
+    @property
+    def axes(self) -> int:
+        """Number of inputs and of outputs q."""
+        return len(self.moving[0])
+
+    def responses(self) -> tuple[Rows, ...]:
+        """Return the first p Markov parameters h_0 = C B, h_1 = C A B, ..., (7.6)."""
+        found: list[Rows] = []
+        for j, moved in enumerate(self.moving):
+            fed_back = [
+                matrix_product(self.autoregressive[i], found[j - 1 - i])
+                for i in range(j)
+            ]
+            found.append(plus(moved, *fed_back))
+        return tuple(found)
+
+    def dc_gain(self) -> jax.Array:
+        """Return outputs over inputs at rest [q, q]."""
+        fed_back = as_matrix_of(plus(*self.autoregressive))
+        fed_forward = as_matrix_of(plus(*self.moving))
+        return jnp.linalg.solve(jnp.eye(self.axes) - fed_back, fed_forward)
+
+    def init(self, input: Axes) -> tuple[Axes, ...]:
+        output = self.dc_gain() @ jnp.stack(input)
+        held = tuple(output[i] for i in range(self.axes))
+        memory: list[Axes] = []
+        for j in reversed(range(len(self.moving))):
+            terms = [product(self.autoregressive[j], held), *memory[-1:]]
+            if j + 1 < len(self.moving):
+                terms.append(product(self.moving[j + 1], input))
+            memory.append(plus(*terms))
+        return tuple(reversed(memory))
+
+    def step(
+        self, state: tuple[Axes, ...], input: Axes
+    ) -> tuple[tuple[Axes, ...], Axes]:
+        output = plus(state[0], product(self.moving[0], input))
+        memory = [
+            plus(product(self.autoregressive[j], output), *terms)
+            for j, terms in enumerate(self._older(state, input))
+        ]
+        return tuple(memory), output
+
+    def _older(self, state: tuple[Axes, ...], input: Axes) -> list[list[Axes]]:
+        """What outputs 2, 3, ... samples ahead get besides the next output's part."""
+        kept = zip(state[1:], self.moving[1:], strict=True)
+        return [[memory, product(b, input)] for memory, b in kept] + [[]]
+
+
+def observability_form(model: StateSpace, lags: int | None = None) -> MatrixARMA:
+    """Return a square ``model`` with n states and q outputs as a MatrixARMA.
+
+    p is ``lags``, by default the least with p q >= n. F = [C; CA; ...; CA^(p-1)] (7.4)
+    gives [A_0 ... A_(p-1)] F = C A^p, and B_(p-1-j) = h_j - sum_i A_(p-i) h_(j-i) for
+    the Markov parameters h (7.5). For n = p q the A are those of the thesis, the last
+    rows of F A F^-1. Otherwise F has more rows than columns, the A are the smallest
+    that solve it, and the model is met exactly all the same: p q - n modes are added
+    that no input moves. More lags than needed make F better conditioned.
+
+    Raises ValueError for a model that is not square, D that is not zero, one that
+    cannot be observed in p samples, or added modes outside the unit circle of a stable
+    model, which rounding would set going.
+    """
+    (n, inputs), q = model.B.shape, len(model.C)
+    if inputs != q:
+        raise ValueError(
+            f"the model has {inputs} inputs and {q} outputs; as many it must be"
+        )
+    if np.any(np.asarray(model.D)):
+        raise ValueError("D is not zero; an input must not reach its own sample")
+    p = -(-n // q) if lags is None else lags
+    if p * q < n:
+        raise ValueError(f"lags is {p}; {n} states and {q} outputs need {-(-n // q)}")
+    A, C = np.asarray(model.A), np.asarray(model.C)
+    F = np.vstack([C @ np.linalg.matrix_power(A, i) for i in range(p)])
+    last, _, rank, _ = np.linalg.lstsq(
+        F.T, (C @ np.linalg.matrix_power(A, p)).T, rcond=None
+    )
+    if rank < n:
+        raise ValueError(
+            f"the model cannot be observed in {p} samples: (7.4) is singular"
+        )
+    newest_first = [last.T[:, i * q : (i + 1) * q] for i in reversed(range(p))]
+    _check_added(model, newest_first)
+    h = np.asarray(model.markov(p))
+    moving = [
+        h[j] - sum((newest_first[i] @ h[j - 1 - i] for i in range(j)), np.zeros((q, q)))
+        for j in range(p)
+    ]
+    return MatrixARMA(newest_first, moving, model.dt)
+
+
+def _check_added(model: StateSpace, autoregressive: list[np.ndarray]) -> None:
+    q = len(autoregressive[0])
+    companion = np.eye(q * len(autoregressive), k=-q)
+    companion[:q] = np.hstack(autoregressive)
+    radius = np.abs(np.linalg.eigvals(companion)).max()
+    own = np.abs(model.poles()).max()
+    if own < 1.0 <= radius:
+        raise ValueError(
+            f"a mode added to fill {len(autoregressive)} lags has radius {radius:.6g}; "
+            "it must be below 1: reduce the model, or give other lags"
+        )

@@ -1,0 +1,157 @@
+"""Models of fewer states, and models whose n is no multiple of q."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+import piezojax as pj
+from piezojax.axes import PerAxis, packed
+from piezojax.catalog import p558, p558_control
+from piezojax.dynamics import (
+    SecondOrderLag,
+    StateSpace,
+    balanced_reduction,
+    observability_form,
+)
+from piezojax.stability.margins import linear_axes
+
+WHOLE = p558.model("6")  # 15 states, 3 axes
+
+
+def impulse_response(model, samples):
+    """C A^s B [samples, q, q], by plain multiplication."""
+    A, state, C = (np.asarray(matrix) for matrix in (model.A, model.B, model.C))
+    found = []
+    for _ in range(samples):
+        found.append(C @ state)
+        state = A @ state
+    return np.array(found)
+
+
+def run(system, samples):
+    """The same of a system that runs on tuples, an impulse in each input in turn."""
+    columns = []
+    for axis in range(3):
+        inputs = tuple(
+            jnp.zeros(samples).at[0].set(1.0 if i == axis else 0.0) for i in range(3)
+        )
+        _, outputs = pj.simulate(system, inputs, system.init((jnp.zeros(()),) * 3))
+        columns.append(np.asarray(packed(outputs)))
+    return np.stack(columns, axis=-1)
+
+
+def companion(form):
+    """The block companion matrix of a MatrixARMA."""
+    A = [np.array(matrix) for matrix in form.autoregressive]
+    q, p = len(A[0]), len(A)
+    matrix = np.eye(p * q, k=-q)
+    matrix[:q] = np.hstack(A)
+    return matrix
+
+
+@pytest.fixture(scope="module", params=[7, 8])
+def reduced(request):
+    return balanced_reduction(WHOLE, request.param)
+
+
+def test_hankel_singular_values_are_those_of_the_hankel_matrix():
+    h = impulse_response(WHOLE, 599)
+    hankel = h[np.arange(300)[:, None] + np.arange(300)]
+    whole = hankel.transpose(0, 2, 1, 3).reshape(900, 900)
+    singular = np.linalg.svd(whole, compute_uv=False)[:15]
+    ours = balanced_reduction(WHOLE, 15).hankel_singular_values
+    np.testing.assert_allclose(ours, singular, rtol=1e-6, atol=1e-9)
+
+
+def test_the_difference_is_within_its_bounds(reduced):
+    order = reduced.model.order
+    assert np.abs(reduced.model.poles()).max() < 1.0
+    angles = np.concatenate([[0.0], np.geomspace(1e-4, np.pi, 2_000)])
+    z = np.exp(1j * angles)[:, None, None]
+    whole, less = (
+        model.C @ np.linalg.solve(z * np.eye(model.order) - model.A, model.B + 0j)
+        for model in (WHOLE, reduced.model)
+    )
+    worst = np.linalg.norm(whole - less, 2, axis=(1, 2)).max()
+    left_out = reduced.hankel_singular_values[order:]
+    assert reduced.error_bound == pytest.approx(2.0 * left_out.sum(), rel=1e-12)
+    # No model of this order can do better than the largest value left out.
+    assert left_out[0] < worst < reduced.error_bound
+
+
+def test_every_state_kept_changes_nothing():
+    kept = balanced_reduction(WHOLE, 15)
+    assert kept.error_bound == 0.0
+    np.testing.assert_allclose(
+        impulse_response(kept.model, 200), impulse_response(WHOLE, 200), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("more", [0, 1])
+def test_any_number_of_states_in_observability_form(reduced, more):
+    model = reduced.model
+    form = observability_form(model, 3 + more)
+    np.testing.assert_allclose(run(form, 300), impulse_response(model, 300), atol=1e-9)
+    np.testing.assert_allclose(form.dc_gain(), model.dc_gain(), atol=1e-9)
+    # The model's own poles, and added ones that decay.
+    poles = np.linalg.eigvals(companion(form))
+    for pole in model.poles():
+        nearest = np.argmin(np.abs(poles - pole))
+        assert abs(poles[nearest] - pole) < 1e-6
+        poles = np.delete(poles, nearest)
+    assert len(poles) == 3 * (3 + more) - model.order
+    assert np.abs(poles).max() < 0.8
+
+
+@pytest.mark.parametrize(("chapter", "lags"), [("7", 3), ("6", 5)])
+def test_as_many_states_as_rows_are_the_printed_form(chapter, lags):
+    model = p558.model(chapter)
+    A, C = np.asarray(model.A), np.asarray(model.C)
+    form = observability_form(model)
+    assert len(form.moving) == lags
+    F = np.vstack([C @ np.linalg.matrix_power(A, i) for i in range(lags)])
+    last = (F @ A @ np.linalg.inv(F))[-3:]
+    ours = np.hstack([np.array(x) for x in reversed(form.autoregressive)])
+    # F of (6.23)-(6.25) has a condition number of 2e6.
+    np.testing.assert_allclose(ours, last, atol=1e-9 if chapter == "7" else 1e-6)
+    np.testing.assert_allclose(run(form, 300), impulse_response(model, 300), atol=1e-9)
+
+
+@pytest.mark.parametrize("order", [7, 8])
+def test_a_controller_on_such_a_model_stabilises_it(order):
+    model = observability_form(balanced_reduction(WHOLE, order).model)
+    unit = np.eye(3)
+    controller = pj.MultiAxisSlidingModePID(
+        proportional=0.5 * unit,
+        integral=20.0 * unit,
+        derivative=0.0 * unit,
+        reaching=0.9 * unit,
+        decoupling=-0.3 * unit,
+        surface=(unit, unit, unit),
+        model=model,
+        reference_model=PerAxis((SecondOrderLag(200.0, 0.9, p558.DT),) * 3),
+    )
+    # Of 7 states it holds the whole stage of 15, of 8 its model only.
+    plant = p558_control.stage("6") if order == 7 else model
+    loop = p558_control.loop(controller, plant=plant)
+    linear, _ = linear_axes(loop, (0.0, 0.0, 0.0))
+    assert np.abs(np.linalg.eigvals(linear.closed())).max() < 0.99
+
+
+def test_what_is_refused():
+    with pytest.raises(ValueError, match="order is 16; it must be between 1 and 15"):
+        balanced_reduction(WHOLE, 16)
+    unstable = StateSpace(1.1 * np.eye(3), np.eye(3), np.eye(3), np.zeros((3, 3)), 1e-3)
+    with pytest.raises(ValueError, match=r"a pole at radius 1\.1; only a stable one"):
+        balanced_reduction(unstable, 2)
+    idle = StateSpace(block_diag(0.5, 0.4), [[1.0], [0.0]], [[1.0, 1.0]], [[0.0]], 1e-3)
+    with pytest.raises(ValueError, match="order is 2; only 1 states connect"):
+        balanced_reduction(idle, 2)
+    with pytest.raises(ValueError, match="lags is 4; 15 states and 3 outputs need 5"):
+        observability_form(WHOLE, 4)
+    twice = StateSpace(
+        0.5 * np.eye(4), np.eye(4)[:, :2], np.eye(4)[:2], np.zeros((2, 2)), 1e-3
+    )
+    with pytest.raises(ValueError, match="cannot be observed in 2 samples"):
+        observability_form(twice)

@@ -1,0 +1,32 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from piezojax import motions, signals
+
+AXES = ("Z", "Rx", "Ry")
+TIME = signals.time_grid(1.0, 500.0)
+
+
+def test_named_axes_move_and_the_others_rest_at_their_offset():
+    found = motions.motion(
+        "Z:SIN2 Ry:SW10", TIME, AXES, (5.0, 6.0, 7.0), (1.0, 2.0, 3.0)
+    )
+    np.testing.assert_array_equal(found[:, 0], signals.signal("SIN2", TIME, 5.0, 1.0))
+    np.testing.assert_array_equal(found[:, 1], jnp.full(TIME.size, 2.0))
+    np.testing.assert_array_equal(found[:, 2], signals.signal("SW10", TIME, 7.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("SIN10", r"'SIN10' must be an axis, one of Z, Rx, Ry, and a signal"),
+        ("X:SIN10", r"'X:SIN10' must be an axis, one of Z, Rx, Ry"),
+        ("Z:SIN1 Z:SIN5", r"drives Z twice"),
+        ("  ", r"drives no axis"),
+        ("Z:WAVE3", r"signal 'WAVE3' is unknown"),
+    ],
+)
+def test_what_is_no_motion_is_refused(name, message):
+    with pytest.raises(ValueError, match=message):
+        motions.parse(name, AXES)
