@@ -50,7 +50,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     ),
     "p558_nominal": p558_control.nominal,
     "p558_disturbance_observer": p558_control.disturbance_observer,
-    "mirror_multi_axis": mirror.multi_axis,
+    "mirror_multi_axis": mirror.anticipating_multi_axis,
 }
 """Controllers a study can name, with printed gains except where they say "ours";
 those that take a ``rate`` (Hz) come at the study's."""
