@@ -55,8 +55,14 @@ SCALAR = {
     )
     for scheme in ("trapezoid", "quadratic", "voros", "exact")
 }
-PLANT = {name: make() for name, make in PLANTS.items()}
-CONTROLLER = {name: make() for name, make in CONTROLLERS.items()} | {
+ONE_AXIS = [name for name in (*PLANTS, *CONTROLLERS) if name.startswith("p753")]
+AXES = {
+    name: make()
+    for name, make in (PLANTS | CONTROLLERS).items()
+    if name not in ONE_AXIS
+}
+PLANT = {name: PLANTS[name]() for name in PLANTS if name in ONE_AXIS}
+CONTROLLER = {name: CONTROLLERS[name]() for name in CONTROLLERS if name in ONE_AXIS} | {
     "alpha-beta": pj.AlphaBeta(0.1, 1e-4, 5e-5),
     "kalman": p753.kalman(pj.ARMA((0.9,), (0.1, 0.2))),
     "printed Q-filter": p753.disturbance_observer("5-4", coefficients="printed"),
@@ -69,7 +75,9 @@ RICH = pj.Feedback(
     ),
     pj.series(noise=pj.Sensor(0.012), adc=pj.Quantiser(0.001)),
 )
-LOOP = {name: p753.loop(make()) for name, make in CONTROLLERS.items()} | {"rich": RICH}
+LOOP = {
+    name: p753.loop(CONTROLLERS[name]()) for name in CONTROLLERS if name in ONE_AXIS
+} | {"rich": RICH}
 SENSOR = {
     "sensor": pj.Sensor(0.012),
     "recursive": pj.RecursiveLeastSquares(-0.03, 0.99, 1e4, 0.0, 1, 2, "voros"),
@@ -101,6 +109,11 @@ def outputs(system, inputs):
         state, output = system.step(state, value)
         collected.append(output)
     return jax.tree.map(np.asarray, (state, collected))
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_systems_of_several_axes(there_and_back, name):
+    assert_equal(there_and_back(AXES[name]), AXES[name])
 
 
 @pytest.mark.parametrize("name", SCALAR | PLANT)

@@ -33,6 +33,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_kalman_disturbance_observer": p753.kalman_disturbance_observer,
     "p753_mixed_sensitivity": p753.mixed_sensitivity_inversion,
     "p753_model_reference": p753_chapter4.model_reference,
+    "p753_anticipating_model_reference": p753_chapter4.anticipating_model_reference,
     "p753_traditional": p753_by_rate.traditional,
     "p753_bang_bang": p753_by_rate.bang_bang,
     "p753_continuous": p753_by_rate.continuous,
@@ -50,7 +51,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     ),
     "p558_nominal": p558_control.nominal,
     "p558_disturbance_observer": p558_control.disturbance_observer,
-    "mirror_multi_axis": mirror.multi_axis,
+    "mirror_multi_axis": mirror.anticipating_multi_axis,
 }
 """Controllers a study can name, with printed gains except where they say "ours";
 those that take a ``rate`` (Hz) come at the study's."""

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from ..axes import PerAxis
+from ..control.anticipation import Anticipation
 from ..control.multi_axis import MultiAxisSlidingModePID
 from ..dynamics import MatrixARMA, SecondOrderLag, StateSpace, observability_form
 from ..hardware import Saturation, Sensor
@@ -106,6 +107,11 @@ def multi_axis() -> MultiAxisSlidingModePID:
         model=plant,
         reference_model=PerAxis(tuple(SecondOrderLag(*lags) for _ in range(3))),
     )
+
+
+def anticipating_multi_axis() -> Anticipation:
+    """Return ``multi_axis`` with room for a lead on its reference, 0."""
+    return Anticipation(multi_axis(), (0.0, 0.0, 0.0))
 
 
 def _surface_scale(plant: MatrixARMA) -> np.ndarray:

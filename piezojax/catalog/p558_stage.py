@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ..axes import PerAxis
 from ..dynamics import Channel, Channels, channels_of
 from ..hysteresis import PrandtlIshlinskii
-from ..system import Series, System, series
+from ..system import Delay, Series, System, series
 from . import p558
 from .p558 import OUTPUTS
 
@@ -23,16 +23,17 @@ PLAY = 4.0
 """Half-width of the play in um, urad, urad."""
 
 
-def plant(chapter: str = "7", hysteresis: float = HYSTERESIS) -> Series:
+def plant(chapter: str = "7", hysteresis: float = HYSTERESIS, delay: int = 0) -> Series:
     """Return the stage: ``hysteresis`` of each axis, then (7.53) or (6.23)-(6.25).
 
-    Raises ValueError for a chapter that prints no model.
+    ``delay`` in samples, beyond the one that every model has, lies between. Raises
+    ValueError for a chapter that prints no model, or a negative delay.
     """
     loops = tuple(_play(hysteresis) for _ in OUTPUTS)
-    return series(
-        hysteresis=PerAxis(loops, OUTPUTS),
-        dynamics=channels_of(p558.channels(chapter)),
-    )
+    parts: dict[str, System] = {"hysteresis": PerAxis(loops, OUTPUTS)}
+    if delay:
+        parts["delay"] = PerAxis((Delay(delay),) * len(OUTPUTS), OUTPUTS)
+    return series(**parts, dynamics=channels_of(p558.channels(chapter)))
 
 
 def varied(

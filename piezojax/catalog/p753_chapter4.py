@@ -10,6 +10,7 @@ from typing import Any
 from .._types import ScalarLike
 from ..control import (
     AlphaBeta,
+    Anticipation,
     BangBang,
     ContinuousSlidingModePID,
     ModelReferencePID,
@@ -158,6 +159,11 @@ def model_reference(
         reference_model=SecondOrderLag(**REFERENCE_MODELS[table], dt=1.0 / rate),
         filter=alpha_beta(rate) if filter is None else filter,
     )
+
+
+def anticipating_model_reference(rate: int = 20_000) -> Anticipation:
+    """Return ``model_reference`` of Table 4-4 with room for a lead on r (ours, 0)."""
+    return Anticipation(model_reference(rate), (0.0,))
 
 
 def traditional(rate: int = 20_000) -> SlidingModePID:

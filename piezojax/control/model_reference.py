@@ -37,14 +37,10 @@ class ModelReferencePID(System):
     (4.43) with ``proportional`` in V/um, ``integral`` in V/(um s) and ``derivative``
     in V s/um. Both u1 and u_eq divide by b_0, in the form ``inversion`` of
     ``INVERSIONS`` with the weights ``error_weight`` Q and ``control_weight`` R; du does
-    not.
+    not. ``reference_model`` turns r(k) into y_d(k+1), so that y_d is late by a sample
+    and its own lag: ``Anticipation`` makes up for that.
 
-    ``reference_model`` turns r(k) into y_d(k+1), so that y_d is late by a sample and
-    its own lag. ``reference_lead`` L, in samples and ours, makes up for that: the model
-    is given ``r(k) + L (r(k+1) - r(k))``. The default 0 is the printed design, which
-    does not look at r(k+1); 1 gives r(k+1), and above 1 the line through both goes on.
-
-    Input an Observation, output in V. Raises
+    Input an Observation (the next reference is not looked at), output in V. Raises
     ValueError for a model without a_1, a surface of another length than n - 1, b_0 = 0,
     Q <= 0, R < 0 or an unknown inversion.
     """
@@ -59,7 +55,6 @@ class ModelReferencePID(System):
     reference_model: System
     filter: Observer
     inversion: str = eqx.field(static=True, default="tikhonov")
-    reference_lead: Scalar = eqx.field(converter=as_array, default=0.0)
 
     def __check_init__(self):
         order = len(self.model.autoregressive)
@@ -74,7 +69,6 @@ class ModelReferencePID(System):
         check("integral in V/(um s)", self.integral)
         check("derivative in V s/um", self.derivative)
         check("surface", self.surface)
-        check("reference lead in samples", self.reference_lead)
         check_inversion(
             self.inversion, self.model, self.error_weight, self.control_weight
         )
@@ -121,9 +115,8 @@ class ModelReferencePID(System):
         dt = self.filter.dt
         filter_state, motion = self.filter.step(state.filter, input)
         errors = (motion.position - state.desired[0], *state.errors)
-        ahead = input.next_reference - input.reference
         reference_model, following = self.reference_model.step(
-            state.reference_model, input.reference + self.reference_lead * ahead
+            state.reference_model, input.reference
         )
 
         wanted = following - self._advanced(state.desired)

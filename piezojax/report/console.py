@@ -5,6 +5,7 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from itertools import takewhile
 from typing import Any
 
 from rich.console import Console
@@ -197,12 +198,17 @@ def perturbed_text(found: Perturbed) -> str:
 
 def gains_table(result: Result) -> Table:
     """Return the tuned parameters beside their start."""
-    table = Table(title="gains")
-    table.add_column("parameter", no_wrap=True)
-    table.add_column("before", justify="right")
-    table.add_column("tuned", justify="right")
+    # What all paths share is said once: long ones would squeeze out the numbers.
+    parents = zip(*(path.split(".")[:-1] for path in result.gains), strict=False)
+    alike = takewhile(lambda names: len(set(names)) == 1, parents)
+    shared = ".".join(names[0] for names in alike)
+    table = Table(title=f"gains of {shared}" if shared else "gains")
+    table.add_column("parameter")
+    table.add_column("before", justify="right", no_wrap=True)
+    table.add_column("tuned", justify="right", no_wrap=True)
     for path, value in result.gains.items():
-        table.add_row(path, f"{result.start[path]:.4g}", f"{value:.4g}")
+        name = path.removeprefix(f"{shared}.")
+        table.add_row(name, f"{result.start[path]:.4g}", f"{value:.4g}")
     return table
 
 

@@ -12,12 +12,11 @@ from jaxtyping import Array, Float
 
 from .. import signals
 from .._types import State
-from ..axes import PerAxis, PerAxisMetric
-from ..catalog import p558, p558_control
-from ..hysteresis import PrandtlIshlinskii
+from ..axes import PerAxisMetric
+from ..catalog import p558, p558_control, p558_stage
 from ..metrics import Tracking
 from ..rollout import Metric, simulate
-from ..system import Delay, LoopSample, Series, System, loop_inputs
+from ..system import LoopSample, System, loop_inputs
 from .cell import Cell, printed
 
 AXES = p558.OUTPUTS
@@ -27,10 +26,6 @@ FREQUENCIES = (1, 5, 10)
 
 LENGTH_S = 4.0
 """Length of a run in s; the second half counts. Not printed."""
-
-PLAY, RADIUS = 0.02, 4.0
-"""Share of the command that passes through a backlash, and its half-width in um or
-urad: loops about 1 % wide. No hysteresis of this stage is printed."""
 
 SEED = 7
 """Of the sensor noise."""
@@ -44,15 +39,6 @@ class Column(NamedTuple):
 
     make: Callable[[], System]
     delay: int
-
-
-def stage(delay: int) -> System:
-    """Return the stand-in for the stage: (7.53) behind a slight hysteresis.
-
-    ``delay`` is in samples, beyond the one that every model has.
-    """
-    play = PrandtlIshlinskii((1.0 - PLAY,), (RADIUS,), (PLAY,))
-    return PerAxis((Series((play, Delay(delay))),) * 3, AXES) >> p558_control.stage()
 
 
 def references() -> dict[str, np.ndarray]:
@@ -137,7 +123,7 @@ def rms_errors(column: Column) -> Mapping[str, Mapping[str, float]]:
     """
     wanted = references()
     targets = jnp.asarray(np.stack(list(wanted.values())))
-    loop = p558_control.loop(column.make(), plant=stage(column.delay))
+    loop = p558_control.loop(column.make(), plant=p558_stage.plant(delay=column.delay))
     found = np.asarray(_rms_errors(loop, targets, draws(*targets.shape[:2])))
     return {
         name: dict(zip(AXES, map(float, errors), strict=True))

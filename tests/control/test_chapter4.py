@@ -15,6 +15,7 @@ from oracles.published import HYSTERESIS, plant_t2, unit_dc
 from piezojax import (
     ARMA,
     AlphaBeta,
+    Anticipation,
     Feedback,
     ModelReferencePID,
     SecondOrderLag,
@@ -100,7 +101,7 @@ def gains_of(a, b, m, inversion):
 
 def controller_of(gains, rate=20_000):
     """Return the package's model-reference controller with the oracle's gains."""
-    return ModelReferencePID(
+    controller = ModelReferencePID(
         proportional=gains["P"],
         integral=gains["I"],
         derivative=gains["D"],
@@ -110,9 +111,10 @@ def controller_of(gains, rate=20_000):
         model=ARMA(gains["model_a"], gains["model_b"]),
         reference_model=SecondOrderLag(gains["frequency"], gains["damping"], 1 / rate),
         filter=AlphaBeta(gains["alpha"], gains["beta"], 1 / rate),
-        reference_lead=gains.get("lead", 0.0),
         inversion=gains.get("inversion", "tikhonov"),
     )
+    lead = gains.get("lead")
+    return controller if lead is None else Anticipation(controller, (lead,))
 
 
 FIRST = gains_of((0.97,), (0.004,), (), "printed")
@@ -345,7 +347,6 @@ def changed(controller, **values):
         (lambda: changed(PRINTED, control_weight=-1.0), "R is -1; .* at least 0"),
         (lambda: changed(PRINTED, surface=(np.nan,)), "surface is nan"),
         (lambda: changed(PRINTED, integral=np.inf), "integral in .* is inf"),
-        (lambda: changed(PRINTED, reference_lead=np.nan), "lead in samples is nan"),
         (lambda: changed(SWITCHED.law, gain=-1.0), "gain K is -1; .* at least 0"),
         (
             lambda: changed(SWITCHED, model=LONGER),

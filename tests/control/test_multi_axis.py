@@ -339,10 +339,6 @@ REFUSED = [
     ),
     (lambda: MatrixARMA([EYE], [EYE], -1.0), "sample time in s is -1; .* above 0"),
     (lambda: observability_form(state_space(4, 1, 2)), "1 inputs and 2 outputs"),
-    (
-        lambda: observability_form(state_space(5, 2, 2)),
-        "5 states are no multiple of 2 outputs; reduce or extend the model to 4 or 6",
-    ),
     (lambda: observability_form(state_space(4, 2, 2, 0.1)), "D is not zero"),
     (lambda: observability_form(state_space(4, 2, 2)), r"\(7.4\) is singular"),
     (lambda: changed(MULTI, decoupling=np.eye(2)), "decoupling is 2 x 2; .* 3 x 3"),

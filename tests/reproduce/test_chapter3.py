@@ -27,6 +27,8 @@ def test_every_chapter_has_its_tables():
         *("4-5", "4-6", "figure-4-5", "figure-4-7"),
         *("5-3", "5-5"),
         *("6-7", "6-8"),
+        *("7-4", "figure-7-4"),
+        *("8-2", "8-3", "figure-8-4", "figure-8-5"),
     ]
 
 

@@ -268,7 +268,7 @@ def test_the_shipped_comparison_is_valid():
     assert len(found) == len(comparison.controllers)
     tuned = found["model-reference PID-SMC"].case.loop.controller
     printed = p753_chapter4.MODEL_REFERENCE_GAINS["4-4"][2000]
-    assert float(tuned.integral) == printed["integral"]
+    assert float(tuned.controller.integral) == printed["integral"]
     assert found["model-reference PID-SMC"].start == "printed"
     assert found["traditional PID-SMC"].start == "scaled"
     assert found["PID"].start == "rule"
