@@ -220,10 +220,9 @@ def versions():
 
 def table(rows):
     shown = Table(title="one core")
-    shown.add_column("loop")
-    shown.add_column("what")
-    shown.add_column("engine")
-    for column in ("lanes", "ns/lane-step", "x C", "extra MB", "steps"):
+    for column in ("loop", "what", "engine"):
+        shown.add_column(column, no_wrap=True)
+    for column in ("lanes", "ns a lane-step", "x C", "extra MB", "steps"):
         shown.add_column(column, justify="right")
 
     def number(value, digits):
