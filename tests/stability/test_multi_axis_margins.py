@@ -94,9 +94,14 @@ def largest(matrices):
     return np.linalg.svd(matrices, compute_uv=False)[:, 0]
 
 
+def closed_poles(L, gains):
+    """Poles of python-control's L with gains before it, closed (L.D is zero)."""
+    return np.linalg.eigvals(L.A - L.B @ gains @ L.C)
+
+
 def test_poles(pair):
     report, L = pair
-    theirs = control.feedback(L, np.eye(3)).poles()
+    theirs = closed_poles(L, np.eye(3))
     # Deadbeat states are a multiple pole at 0, which rounding spreads.
     theirs = theirs[np.abs(theirs) > 0.1]
     ours = np.array(report.poles)
@@ -196,8 +201,7 @@ def test_gains_within_the_margin_are_stable(pair):
     limit = math.log(report.disk_gain_margin)
     draws = np.random.default_rng(0).uniform(-limit, limit, (40, 3))
     for gains in np.exp(draws):
-        closed = control.feedback(L * np.diag(gains), np.eye(3))
-        assert np.abs(closed.poles()).max() < 1.0
+        assert np.abs(closed_poles(L, np.diag(gains))).max() < 1.0
 
 
 @pytest.fixture(scope="module")
