@@ -4,24 +4,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import __version__, motions
-from .. import signals as signal_library
+from .. import __version__
 from .._types import as_array
 from ..metrics import TrackingFigures
 from ..progress import Progress, Silent
-from ..study import Case, Study, read, shipped
+from ..study import Case, read, shipped
 from ..system import Feedback, System
+from .data import Data, make_data
 from .objective import RAILED, Objective, Signals, evaluate, with_plant
 from .result import Perturbed, Result, Scores, scores
 from .search import Clock, Search, search_box
-from .traces import Trace, traces_of
 
 
 @dataclass
@@ -77,90 +75,6 @@ class _Judge:
         return self._plants(loop, dynamic, signals)
 
 
-@dataclass
-class _Data:
-    tuned: int  # the first so many traces are tuned on
-    traces: tuple[Trace, ...]
-    tuning: Signals
-    holdout: Signals
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(trace.name for trace in self.traces)
-
-
-def _make_data(case: Case) -> _Data:
-    study = case.study
-    table = study.references
-    time_s = signal_library.time_grid(table.duration, study.rate)
-    runs = (*table.tune, *table.unseen)
-    references = jnp.stack([_reference(study, name, time_s) for name in runs])
-    # Two streams of one seed: the hold-out draws are new for every reference.
-    streams = np.random.SeedSequence(study.seed).spawn(2)
-    draws = [
-        as_array(
-            np.random.default_rng(stream).standard_normal(
-                (len(runs), count, *references.shape[1:])
-            )
-        )
-        for stream, count in zip(
-            streams, (study.objective.noise_draws, study.holdout_draws), strict=True
-        )
-    ]
-    count = len(table.tune)
-    traces = traces_of(study)
-    tuned = sum(trace.run < count for trace in traces)
-    picked = tuple((t.run, t.axis) for t in traces) if study.axes else ()
-    return _Data(
-        tuned,
-        traces,
-        tuning=Signals(
-            references[:count],
-            draws[0][:count],
-            _unexplained(case, time_s, "train"),
-            picked[:tuned],
-        ),
-        holdout=Signals(
-            references, draws[1], _unexplained(case, time_s, "validate"), picked
-        ),
-    )
-
-
-def _reference(study: Study, name: str, time_s: jax.Array) -> jax.Array:
-    table = study.references
-    amplitudes, offsets = study.by_axis(table.amplitude), study.by_axis(table.offset)
-    if study.axes is None:
-        return signal_library.signal(name, time_s, amplitudes[0], offsets[0])
-    return motions.motion(name, time_s, study.axes.names, amplitudes, offsets)
-
-
-def _unexplained(
-    case: Case, time_s: jax.Array, part: Literal["train", "validate"]
-) -> jax.Array | None:
-    """Return what the fitted plant leaves unexplained of its record, as a disturbance.
-
-    A controller that contains the fitted model would otherwise be tuned and judged as
-    if the stage were that model. Run forth and back to last as long as the references.
-    """
-    if case.fit is None:
-        return None
-    fit = case.fit
-    where = getattr(fit, part)
-    # The first half of the training part holds the initial loading, a single event.
-    start = where.start if part == "validate" else (where.start + where.stop) // 2
-    residual = (fit.record.output - fit.simulated)[start : where.stop]
-    there_and_back = np.concatenate([residual, residual[-2:0:-1]])
-    dt = fit.record.dt
-    return as_array(
-        np.interp(
-            np.asarray(time_s),
-            np.arange(there_and_back.size) * dt,
-            there_and_back,
-            period=there_and_back.size * dt,
-        )
-    )
-
-
 def tune(
     study: Case | str | Path | None = None, *, progress: Progress | None = None
 ) -> Outcome:
@@ -175,7 +89,7 @@ def tune(
     clock = Clock()
     case = study if isinstance(study, Case) else read(study or shipped())
     table, space = case.study, case.space
-    data = _make_data(case)
+    data = make_data(case)
     first = round(table.references.settle * table.rate)
 
     progress.stage("simulating the start")
@@ -210,7 +124,7 @@ def tune(
     return Outcome(result, case.loop, after, case, data.holdout)
 
 
-def _scale(before: TrackingFigures, data: _Data) -> jax.Array:
+def _scale(before: TrackingFigures, data: Data) -> jax.Array:
     """Return what each trace's error is measured against: what it was before."""
     rms = np.sqrt(np.mean(np.asarray(before.rms_error) ** 2, axis=1))
     if np.all(np.isfinite(rms)) and np.max(before.saturated) <= RAILED:
@@ -228,7 +142,7 @@ def _scale(before: TrackingFigures, data: _Data) -> jax.Array:
     )
 
 
-def _weights(case: Case, data: _Data) -> jax.Array | None:
+def _weights(case: Case, data: Data) -> jax.Array | None:
     """Return how much each trace counts: less where the axis should rest."""
     if case.study.axes is None:
         return None
@@ -248,7 +162,7 @@ def _plants(case: Case) -> System | None:
 
 
 def _perturbed(
-    case: Case, data: _Data, judge: _Judge, before: Feedback, after: Feedback
+    case: Case, data: Data, judge: _Judge, before: Feedback, after: Feedback
 ) -> Perturbed | None:
     plants = case.ensemble.plants("holdout") if case.ensemble else None
     if plants is None:
@@ -263,7 +177,7 @@ def _perturbed(
 
 def _report(
     case: Case,
-    data: _Data,
+    data: Data,
     judge: _Judge,
     before: TrackingFigures,
     after: Feedback,

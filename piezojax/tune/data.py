@@ -1,0 +1,103 @@
+"""What a case is tuned and judged on: references, noise draws, disturbances."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import motions
+from .. import signals as signal_library
+from .._types import as_array
+from ..study import Case, Study
+from .objective import Signals
+from .traces import Trace, traces_of
+
+
+@dataclass
+class Data:
+    """Signals of a case: what tunes, what judges, and the traces among them."""
+
+    tuned: int  # the first so many traces are tuned on
+    traces: tuple[Trace, ...]
+    tuning: Signals
+    holdout: Signals
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the traces."""
+        return tuple(trace.name for trace in self.traces)
+
+
+def make_data(case: Case) -> Data:
+    """Return references and noise of ``case``: the hold-out's are drawn apart."""
+    study = case.study
+    table = study.references
+    time_s = signal_library.time_grid(table.duration, study.rate)
+    runs = (*table.tune, *table.unseen)
+    references = jnp.stack([_reference(study, name, time_s) for name in runs])
+    # Two streams of one seed: the hold-out draws are new for every reference.
+    streams = np.random.SeedSequence(study.seed).spawn(2)
+    draws = [
+        as_array(
+            np.random.default_rng(stream).standard_normal(
+                (len(runs), count, *references.shape[1:])
+            )
+        )
+        for stream, count in zip(
+            streams, (study.objective.noise_draws, study.holdout_draws), strict=True
+        )
+    ]
+    count = len(table.tune)
+    traces = traces_of(study)
+    tuned = sum(trace.run < count for trace in traces)
+    picked = tuple((t.run, t.axis) for t in traces) if study.axes else ()
+    return Data(
+        tuned,
+        traces,
+        tuning=Signals(
+            references[:count],
+            draws[0][:count],
+            _unexplained(case, time_s, "train"),
+            picked[:tuned],
+        ),
+        holdout=Signals(
+            references, draws[1], _unexplained(case, time_s, "validate"), picked
+        ),
+    )
+
+
+def _reference(study: Study, name: str, time_s: jax.Array) -> jax.Array:
+    table = study.references
+    amplitudes, offsets = study.by_axis(table.amplitude), study.by_axis(table.offset)
+    if study.axes is None:
+        return signal_library.signal(name, time_s, amplitudes[0], offsets[0])
+    return motions.motion(name, time_s, study.axes.names, amplitudes, offsets)
+
+
+def _unexplained(
+    case: Case, time_s: jax.Array, part: Literal["train", "validate"]
+) -> jax.Array | None:
+    """Return what the fitted plant leaves unexplained of its record, as a disturbance.
+
+    A controller that contains the fitted model would otherwise be tuned and judged as
+    if the stage were that model. Run forth and back to last as long as the references.
+    """
+    if case.fit is None:
+        return None
+    fit = case.fit
+    where = getattr(fit, part)
+    # The first half of the training part holds the initial loading, a single event.
+    start = where.start if part == "validate" else (where.start + where.stop) // 2
+    residual = (fit.record.output - fit.simulated)[start : where.stop]
+    there_and_back = np.concatenate([residual, residual[-2:0:-1]])
+    dt = fit.record.dt
+    return as_array(
+        np.interp(
+            np.asarray(time_s),
+            np.arange(there_and_back.size) * dt,
+            there_and_back,
+            period=there_and_back.size * dt,
+        )
+    )
