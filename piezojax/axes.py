@@ -36,6 +36,11 @@ def as_rows(values: Any) -> Rows:
     return rows
 
 
+def as_matrices(values: Iterable[Any]) -> tuple[Rows, ...]:
+    """Return several matrices as rows of scalars."""
+    return tuple(as_rows(value) for value in values)
+
+
 def diagonal(values: Iterable[Any]) -> Rows:
     """Return the diagonal matrix of ``values``."""
     values = as_scalars(values)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._types import Scalar, State
+from .metrics import root
 from .rollout import Metric
 from .system import LoopSample
 
@@ -79,8 +80,8 @@ class ContourError(Metric):
         count = jnp.maximum(total["count"], 1.0)
         counted = jnp.where(total["count"] > 0.0, 0.0, jnp.nan)
         return ContourFigures(
-            rms=_root(total["square"] / count) + counted,
-            peak=_root(total["peak"]) + counted,
+            rms=root(total["square"] / count) + counted,
+            peak=root(total["peak"]) + counted,
         )
 
 
@@ -107,18 +108,12 @@ def _square_distance(error: _Point, there: _Point, on: _Point) -> Scalar:
     whole = error[0] ** 2 + error[1] ** 2
     # |error - centre| - radius, written so that a line is a circle of curvature 0.
     bend = curvature**2 * whole - 2.0 * curvature * across
-    distance = (curvature * whole - 2.0 * across) / (1.0 + _root(1.0 + bend))
+    distance = (curvature * whole - 2.0 * across) / (1.0 + root(1.0 + bend))
     return jnp.where(smooth, distance**2, whole)
 
 
 def _positive(square: Scalar) -> Scalar:
     return jnp.where(square > 0.0, square, 1.0)
-
-
-def _root(square: Scalar) -> Scalar:
-    # Its slope at 0 is infinite; a perfect run must have the gradient 0.
-    positive = square > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
 def nearest_on(

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ._types import Scalar, State
 from .rollout import Metric
@@ -77,16 +77,19 @@ class Tracking(Metric):
         count = jnp.maximum(total["count"], 1.0)
         counted = jnp.where(total["count"] > 0.0, 0.0, jnp.nan)
         return TrackingFigures(
-            rms_error=_root(total["error"] / count) + counted,
+            rms_error=root(total["error"] / count) + counted,
             peak_error=total["peak"] + counted,
-            rms_effort=_root(total["effort"] / count) + counted,
-            rms_slew=_root(total["slew"] / count) + counted,
+            rms_effort=root(total["effort"] / count) + counted,
+            rms_slew=root(total["slew"] / count) + counted,
             saturated=total["saturated"] / jnp.maximum(total["samples"], 1.0),
             peak_voltage=total["voltage"],
         )
 
 
-def _root(square: Scalar) -> Scalar:
-    # The slope of sqrt at 0 is infinite; a perfect run must have the gradient 0.
+def root(square: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the square root with the slope 0 at 0, NaN of NaN.
+
+    The slope of sqrt there is infinite; a perfect run must have the gradient 0.
+    """
     positive = square > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0 * square)

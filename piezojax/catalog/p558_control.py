@@ -7,7 +7,7 @@ outputs are in um, urad, urad.
 import math
 from typing import Any
 
-from ..axes import PerAxis
+from ..axes import PerAxis, diagonal
 from ..control.alpha_beta import AlphaBeta
 from ..control.anticipation import Anticipation
 from ..control.disturbance_observer import DisturbanceObserverControl
@@ -107,12 +107,12 @@ def multi_axis(gains: str = "dynamic", filtered: bool = True) -> System:
     chosen = _one_of(MULTI_AXIS_GAINS, gains)
     scale = (SURFACE**2, 2.0 * SURFACE, 1.0)
     controller = MultiAxisSlidingModePID(
-        proportional=_diagonal(chosen["proportional"]),
-        integral=_diagonal(chosen["integral"]),
-        derivative=_diagonal((0.0, 0.0, 0.0)),
-        reaching=_diagonal(REACHING),
+        proportional=diagonal(chosen["proportional"]),
+        integral=diagonal(chosen["integral"]),
+        derivative=diagonal((0.0, 0.0, 0.0)),
+        reaching=diagonal(REACHING),
         decoupling=DECOUPLING,
-        surface=tuple(_diagonal((s, s, s)) for s in scale),
+        surface=tuple(diagonal((s, s, s)) for s in scale),
         model=observability_form(p558.model("7")),
         reference_model=PerAxis(
             tuple(SecondOrderLag(chosen["frequency"], DAMPING, DT) for _ in OUTPUTS),
@@ -206,13 +206,6 @@ def loop(
     wide = PerAxis(tuple(Saturation(-1e4, 1e4) for _ in OUTPUTS), OUTPUTS)
     sensor = PerAxis(tuple(Sensor(rms) for rms in noise_rms), OUTPUTS)
     return Feedback(controller, plant or stage(), wide, sensor)
-
-
-def _diagonal(values: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
-    return tuple(
-        tuple(value if i == j else 0.0 for j in range(len(values)))
-        for i, value in enumerate(values)
-    )
 
 
 def _one_of(table: dict[str, Any], name: str) -> Any:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Scalar, as_array, as_scalars, check
+from ..metrics import root
 from ..rollout import simulate
 from ..system import Feedback, System, loop_inputs
 
@@ -118,9 +119,7 @@ def learn(
 
     carry = (start, jnp.zeros_like(reference))
     (following, error), squares = jax.lax.scan(step, carry, noise)
-    positive = squares > 0.0  # the slope of the root at 0 is infinite
-    roots = jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1.0)), 0.0)
-    return Trials(following, error, roots)
+    return Trials(following, error, root(squares))
 
 
 Trial = Callable[[System, Signal, Signal, Signal], tuple[Signal, Signal]]

@@ -10,6 +10,7 @@ from .._types import State, as_array
 from ..axes import (
     Axes,
     Rows,
+    as_matrices,
     as_rows,
     check_square,
     diagonal,
@@ -38,10 +39,6 @@ class MultiAxisState(NamedTuple):
     predicted: tuple[Axes, ...]
     integral: Axes
     sliding: Axes
-
-
-def _matrices(values) -> tuple[Rows, ...]:
-    return tuple(as_rows(value) for value in values)
 
 
 class MultiAxisSlidingModePID(Designed):
@@ -77,7 +74,7 @@ class MultiAxisSlidingModePID(Designed):
     derivative: Rows = eqx.field(converter=as_rows)
     reaching: Rows = eqx.field(converter=as_rows)
     decoupling: Rows = eqx.field(converter=as_rows)
-    surface: tuple[Rows, ...] = eqx.field(converter=_matrices)
+    surface: tuple[Rows, ...] = eqx.field(converter=as_matrices)
     model: MatrixARMA
     reference_model: System
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._types import Scalar, ScalarLike, as_scalars, check
-from ..axes import Axes, Rows, as_rows, check_square, plus, product
+from ..axes import Axes, Rows, as_matrix_of, as_rows, check_square, plus, product
 from ..system import System
 from .state_space import StateSpace
 
@@ -37,7 +37,7 @@ class Channel(System):
         check("sample time in s", self.dt, above=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> Axes:
-        A = jnp.stack([jnp.stack(row) for row in self.A])
+        A = as_matrix_of(self.A)
         gain = jnp.linalg.solve(jnp.eye(len(A)) - A, jnp.stack(self.B))
         return tuple(gain[i] * input for i in range(len(self.B)))
 

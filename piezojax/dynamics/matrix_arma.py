@@ -9,8 +9,8 @@ from .._types import check
 from ..axes import (
     Axes,
     Rows,
+    as_matrices,
     as_matrix_of,
-    as_rows,
     check_square,
     matrix_product,
     plus,
@@ -18,10 +18,6 @@ from ..axes import (
 )
 from ..system import System
 from .state_space import StateSpace
-
-
-def _matrices(values) -> tuple[Rows, ...]:
-    return tuple(as_rows(value) for value in values)
 
 
 class MatrixARMA(System):
@@ -35,8 +31,8 @@ class MatrixARMA(System):
     ``dt <= 0``.
     """
 
-    autoregressive: tuple[Rows, ...] = eqx.field(converter=_matrices)
-    moving: tuple[Rows, ...] = eqx.field(converter=_matrices)
+    autoregressive: tuple[Rows, ...] = eqx.field(converter=as_matrices)
+    moving: tuple[Rows, ...] = eqx.field(converter=as_matrices)
     dt: float = eqx.field(static=True)
 
     def __check_init__(self):

@@ -13,9 +13,7 @@ from ..stability.crossings import angle_grid
 from ..stability.margins import linear_axes
 from ..stability.multi_axis import MultiAxisReport, axes_report_of
 from ..system import Feedback
-from .figures import AFTER, BEFORE, REFERENCE, figure
-
-COLOURS = {"before": BEFORE, "after": AFTER}
+from .figures import COLOURS, REFERENCE, figure
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,11 @@ from ..stability.crossings import angle_grid
 from ..stability.margins import StabilityReport, linear_loop, located_report
 from ..system import Feedback
 from .axes_stability import AxesStability, axes_figure, worse_branch
-from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
+from .figures import COLOURS, MEASURED, REFERENCE, figure, styled, write
 
 STABILITY_FILE, STABILITY_PICTURE = "stability.json", "stability.png"
 
 LINES = {"ascending": "-", "descending": "--"}
-COLOURS = {"before": BEFORE, "after": AFTER}
 _DECADES = 4.5  # below the Nyquist frequency
 _REACH = 2.5  # half the side of the Nyquist plot
 

@@ -227,7 +227,7 @@ def _figures(loop: LinearLoop) -> dict[str, float | None]:
     figures: dict[str, float | None] = {}
     for name in ("sensitivity_peak", "complementary_peak"):
         figures[name] = peaks[name][0]
-        figures[f"{name}_Hz"] = _hertz(peaks[name][1], loop.dt)
+        figures[f"{name}_Hz"] = hertz(peaks[name][1], loop.dt)
     return (
         figures
         | disk_figures(peaks["disk"][0])
@@ -257,7 +257,7 @@ def _gain_margins(
     return {
         "gain_margin": margin,
         "gain_margin_dB": 20.0 * math.log10(margin),
-        "phase_crossover_Hz": _hertz(float(places[first]), loop.dt) if found else None,
+        "phase_crossover_Hz": hertz(float(places[first]), loop.dt) if found else None,
         "gain_reduction_margin": float(factors[down].max(initial=0.0)),
     }
 
@@ -282,11 +282,12 @@ def _phase_margins(
     samples = float((lag / places).min())
     return {
         "phase_margin_deg": math.degrees(float(either[worst])),
-        "gain_crossover_Hz": _hertz(float(places[worst]), loop.dt),
+        "gain_crossover_Hz": hertz(float(places[worst]), loop.dt),
         "delay_margin_s": samples * loop.dt,
         "delay_margin_samples": samples,
     }
 
 
-def _hertz(angle: float, dt: float) -> float:
+def hertz(angle: float, dt: float) -> float:
+    """Return an angle in rad a sample as a frequency in Hz."""
     return angle / (2.0 * math.pi * dt)

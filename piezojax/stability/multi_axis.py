@@ -1,7 +1,6 @@
 """Margins of a loop of several axes: one at a time, and all at once."""
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,7 @@ from scipy import optimize
 
 from .conserved import LinearAxes
 from .crossings import angle_grid, peak
-from .margins import StabilityReport, disk_figures, plain, poles_of, report_of
+from .margins import StabilityReport, disk_figures, hertz, plain, poles_of, report_of
 
 _SWEEPS = 12
 """Of the balancing: a start only."""
@@ -91,9 +90,9 @@ def _figures(loop: LinearAxes) -> dict[str, Any]:
 
         values = _largest(of_sensitivity(sampled))
         figures[name], angle = peak(largest, grid, values)
-        figures[f"{name}_Hz"] = _hertz(angle, loop.dt)
+        figures[f"{name}_Hz"] = hertz(angle, loop.dt)
     worst, angle = _structured_peak(loop, grid, sampled - 0.5 * eye)
-    figures["disk_margin_Hz"] = _hertz(angle, loop.dt)
+    figures["disk_margin_Hz"] = hertz(angle, loop.dt)
     return figures | disk_figures(worst)
 
 
@@ -174,7 +173,3 @@ def balancing(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         d /= d[:, -1:]
     d = np.sqrt(d)
     return d, d[:, :, None] * matrices / d[:, None, :]
-
-
-def _hertz(angle: float, dt: float) -> float:
-    return angle / (2.0 * math.pi * dt)
