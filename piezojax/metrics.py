@@ -1,6 +1,6 @@
 """Figures of a loop, accumulated while it runs."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -84,6 +84,67 @@ class Tracking(Metric):
             saturated=total["saturated"] / jnp.maximum(total["samples"], 1.0),
             peak_voltage=total["voltage"],
         )
+
+
+class ExtremeFigures(NamedTuple):
+    """Extremes of a run of a loop: ``peak_slew``, the largest change of the voltage
+    from one sample to the next, V; ``overshoot``, how far the displacement goes beyond
+    the highest reference, as a share of the reference's range (0 where it rests).
+    """
+
+    peak_slew: Scalar
+    overshoot: Scalar
+
+
+class Extremes(Metric):
+    """Largest step of the voltage and overshoot, over the whole run."""
+
+    def init(self) -> State:
+        zero, least = jnp.zeros(()), jnp.asarray(-jnp.inf)
+        return {
+            "slew": zero,
+            "last": jnp.asarray(jnp.nan),
+            "highest": least,
+            "top": least,
+            "bottom": -least,
+        }
+
+    def update(self, total: State, index: Array, output: LoopSample) -> State:
+        first = index == 0
+        change = output.voltage - jnp.where(first, output.voltage, total["last"])
+        return {
+            "slew": jnp.maximum(total["slew"], jnp.abs(change)),
+            "last": output.voltage,
+            "highest": jnp.maximum(total["highest"], output.displacement),
+            "top": jnp.maximum(total["top"], output.reference),
+            "bottom": jnp.minimum(total["bottom"], output.reference),
+        }
+
+    def result(self, total: State) -> ExtremeFigures:
+        swing = total["top"] - total["bottom"]
+        beyond = total["highest"] - total["top"]
+        moves = swing > 0.0
+        overshoot = jnp.maximum(beyond, 0.0) / jnp.where(moves, swing, 1.0)
+        return ExtremeFigures(total["slew"], jnp.where(moves, overshoot, 0.0))
+
+
+class Both(Metric):
+    """Two metrics of one run; their figures in a tuple."""
+
+    first: Metric
+    second: Metric
+
+    def init(self) -> State:
+        return self.first.init(), self.second.init()
+
+    def update(self, total: State, index: Array, output: LoopSample) -> State:
+        return (
+            self.first.update(total[0], index, output),
+            self.second.update(total[1], index, output),
+        )
+
+    def result(self, total: State) -> tuple[Any, Any]:
+        return self.first.result(total[0]), self.second.result(total[1])
 
 
 def root(square: Float[Array, "..."]) -> Float[Array, "..."]:

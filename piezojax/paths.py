@@ -10,9 +10,9 @@ import jax.numpy as jnp
 
 from ._types import as_array
 from .axes import PerAxis
-from .system import Series, System
+from .system import Series
 
-S = TypeVar("S", bound=System)
+S = TypeVar("S", bound=eqx.Module)
 
 
 def _children(node: Any) -> dict[str, Any]:
@@ -54,7 +54,7 @@ def _walk(node: Any, path: str) -> Any:
     return node
 
 
-def get(system: System, path: str) -> Any:
+def get(system: eqx.Module, path: str) -> Any:
     """Return the array leaf at ``path``.
 
     Raises ValueError, with the nearest names, where there is none.
@@ -80,7 +80,7 @@ def replace(system: S, values: Mapping[str, Any]) -> S:
     return eqx.tree_at(lambda tree: [_walk(tree, name) for name in names], system, new)
 
 
-def _unknown(system: System, path: str) -> str:
+def _unknown(system: eqx.Module, path: str) -> str:
     known = list(parameters(system))
     near = difflib.get_close_matches(path, known, n=3, cutoff=0.3) or known[:5]
     return f"no parameter {path!r}; the nearest are {', '.join(near)}"

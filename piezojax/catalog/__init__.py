@@ -10,19 +10,25 @@ from . import p558_stage as p558_stage
 from . import p753 as p753
 from . import p753_by_rate as p753_by_rate
 from . import p753_chapter4 as p753_chapter4
+from . import p753_stage as p753_stage
 from . import p753_survey as p753_survey
 
 PLANTS: dict[str, Callable[..., System]] = {
     "p753": p753_by_rate.plant,
     "p753_chapter4": p753_by_rate.chapter4_plant,
+    "p753_stage": p753_stage.stage,
     "p558": p558_stage.plant,
     "mirror": mirror.stage,
 }
 """Plants a study can name."""
 
-VARIATIONS: dict[str, Callable[..., System]] = {"p558": p558_stage.varied}
-"""Plants off their nominal values, by the name of the nominal one: each argument is a
-relative deviation by axis, 0 for none."""
+VARIATIONS: dict[str, Callable[..., System]] = {
+    "p558": p558_stage.varied,
+    "p753_stage": p753_stage.stage,
+}
+"""Plants off their nominal values, by the name of the nominal one. What an argument
+means, a relative deviation or a value, the function says; on several axes each takes
+one an axis."""
 
 CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_pid": p753.pid,

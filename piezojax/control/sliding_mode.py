@@ -60,6 +60,7 @@ class SlidingModePID(System):
     model: ARMA
     filter: Observer
     inversion: str = eqx.field(static=True, default="printed")
+    correction: Scalar = eqx.field(converter=as_array, default=1.0)
 
     def __check_init__(self):
         check_second_order(self.model)
@@ -113,7 +114,7 @@ class SlidingModePID(System):
         )
         v = (
             feedforward(self.model, input.next_reference, reference, older)
-            + equivalent_control(self.model, self.surface, error, dt)
+            + self.correction * equivalent_control(self.model, self.surface, error, dt)
             + switching
         )
         f = inverted(self.model, self._inversion_gain(), v, state.outputs)

@@ -28,6 +28,7 @@ from .figures import (
     styled,
     write,
 )
+from .robustness import front_figure, perturbed_figure
 
 _SHOWN = 3  # references in the tracking picture
 _BEYOND = 1e9  # um or V
@@ -53,6 +54,12 @@ def write_results(outcome: Outcome, folder: Path) -> None:
             "convergence": convergence_figure(outcome) if result.history else None,
             "coupling": coupling_figure(study, result),
             "contour": contour_figure(study, result.title, runs),
+            "robustness": perturbed_figure(result.perturbed, result.title),
+            "pareto": front_figure(
+                result.front,
+                study.pareto.constraint if study.pareto else None,
+                result.title,
+            ),
         }
         for name, picture in pictures.items():
             if picture:

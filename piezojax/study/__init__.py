@@ -10,6 +10,8 @@ from .comparison import entries_of as entries_of
 from .comparison import is_comparison as is_comparison
 from .comparison import load_comparison as load_comparison
 from .comparison import read_entries as read_entries
+from .ensemble import Ensemble as Ensemble
+from .ensemble import Stage as Stage
 from .schema import Study as Study
 from .schema import load as load
 

@@ -1,18 +1,16 @@
 """A study made ready to run: files read, plant fitted, loop and search space built."""
 
-import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from .._types import as_array
 from ..axes import PerAxis
-from ..catalog import CONTROLLERS, PLANTS, VARIATIONS, at_rate
+from ..catalog import CONTROLLERS, PLANTS, at_rate
 from ..control.design import DESIGNS
 from ..hardware import Quantiser, Saturation, Sensor, SlewLimit
 from ..identify import Fit, identify, read_record
@@ -21,36 +19,9 @@ from ..serial import from_data, to_data
 from ..serial import load as load_system
 from ..space import Space, space_of
 from ..system import Feedback, Observation, System, rest_output, series
-from .schema import RecordPlant, Study, load, one_of, validated
-
-
-@dataclass(frozen=True)
-class Ensemble:
-    """Plants off their nominal values: how they are made, and how far off."""
-
-    make: Callable[..., System]
-    deviations: tuple[str, ...]
-    study: Study
-
-    def plants(self, part: Literal["tune", "holdout"]) -> System | None:
-        """Return the drawn plants of a part, stacked on a leading axis.
-
-        Both parts are drawn from streams of their own. None if there are none.
-        """
-        table = self.study.ensemble
-        assert table is not None
-        count = getattr(table, part)
-        if count == 0:
-            return None
-        stream = {"tune": 2, "holdout": 3}[part]
-        seed = np.random.SeedSequence(self.study.seed, spawn_key=(stream,))
-        shape = (count, len(self.deviations), self.study.axis_count)
-        draws = np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
-        spread = [table.spread.get(name, 0.0) for name in self.deviations]
-        draws = as_array(draws * np.array(spread)[:, None])
-        return jax.vmap(
-            lambda row: self.make(**dict(zip(self.deviations, row, strict=True)))
-        )(draws)
+from .ensemble import Ensemble, Stage, ensemble_of
+from .schema import RecordPlant, Study, load
+from .table import one_of, validated
 
 
 @dataclass(frozen=True)
@@ -93,7 +64,9 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     loop = Feedback(controller, plant, _actuator(study), _sensor(study))
     loop, space = _search_space(study, loop)
     _check_rates(study, loop)
-    return Case(study, path.stem, loop, space, fit, _ensemble(study))
+    stage = Stage(loop.plant, loop.sensor)
+    ensemble = ensemble_of(study, stage, path.parent)
+    return Case(study, path.stem, loop, space, fit, ensemble)
 
 
 def read(path: str | Path, seed: int | None = None) -> Case:
@@ -118,25 +91,6 @@ def _plant(study: Study, folder: Path) -> tuple[System, Fit | None]:
     train = slice(*wanted.train) if wanted.train else None
     fit = identify(record, wanted.model, train=train)
     return fit.system, fit
-
-
-def _ensemble(study: Study) -> Ensemble | None:
-    if study.ensemble is None:
-        return None
-    name = str(study.plant.get("catalog", ""))
-    if name not in VARIATIONS:
-        raise ValueError(
-            "ensemble: plant.catalog must be one whose variations are known: "
-            f"{', '.join(VARIATIONS)}"
-        )
-    known = inspect.signature(VARIATIONS[name]).parameters
-    for deviation in study.ensemble.spread:
-        if deviation not in known:
-            raise ValueError(
-                f"ensemble.spread.{deviation} is unknown; {name} varies in "
-                f"{', '.join(known)}"
-            )
-    return Ensemble(VARIATIONS[name], tuple(known), study)
 
 
 def _per_axis(study: Study, make: Callable[[int], Any]) -> Any:

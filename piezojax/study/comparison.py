@@ -12,18 +12,8 @@ from ..catalog import CONTROLLERS, at_rate
 from ..paths import get
 from ..space import Transform
 from .case import Case, build, read
-from .schema import (
-    Finite,
-    ObjectiveTable,
-    OptimiserTable,
-    Positive,
-    References,
-    SensorTable,
-    Study,
-    Table,
-    one_of,
-    validated,
-)
+from .schema import ObjectiveTable, OptimiserTable, References, SensorTable, Study
+from .table import Finite, Positive, Table, one_of, validated
 
 Start = Literal["printed", "scaled", "rule", "own"]
 """Where the gains before tuning come from: a publication, a publication at another

@@ -1,40 +1,18 @@
 """The tables of a study file, validated before anything is built."""
 
-import difflib
-import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, field_validator, model_validator
 
 from .. import motions, signals
 from ..identify import chain
 from ..optimisers import METHODS
 from ..space import Transform
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-
-
-class Table(BaseModel):
-    """A table of a study: nothing in it is guessed, nothing unknown is passed over."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-Each = TypeVar("Each")
-ByAxis = Each | tuple[Each, ...]
-"""One value for all axes, or a list with one for each."""
+from .ensemble_table import EnsembleTable
+from .table import ByAxis, Finite, NotNegative, Positive, Table, one_of, validated
 
 
 class AxesTable(Table):
@@ -142,6 +120,50 @@ class SensorTable(Table):
     resolution: Positive | None = None
 
 
+class DisturbanceTable(Table):
+    """What moves the stage beside the drive: ``drift_rms``, a random walk, um rms after
+    one second.
+    """
+
+    drift_rms: ByAxis[NotNegative] = 0.0
+
+
+class ConstraintsTable(Table):
+    """What tuned gains must keep, on every plant and reference of the objective.
+
+    Of the loop linearised at the top of the references, on both branches of the
+    hysteresis: ``sensitivity_peak`` at most, ``disk_margin`` and ``delay_margin``
+    (samples) at least. Of the runs: ``peak_voltage`` (V), ``peak_slew`` (V/s),
+    ``effort`` (V rms) and ``overshoot`` (share of the reference's range) at most.
+    """
+
+    sensitivity_peak: Annotated[float, Field(gt=1.0, allow_inf_nan=False)] | None = None
+    disk_margin: Annotated[float, Field(gt=0.0, lt=2.0)] | None = None
+    delay_margin: Positive | None = None
+    peak_voltage: Positive | None = None
+    peak_slew: Positive | None = None
+    effort: Positive | None = None
+    overshoot: Positive | None = None
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """What is set, by name."""
+        return self.model_dump(exclude_none=True)
+
+
+class ParetoTable(Table):
+    """A front: the study solved for each limit in ``limits`` of one constraint."""
+
+    constraint: str
+    limits: tuple[Positive, ...] = Field(min_length=2)
+    steps: Annotated[int, Field(strict=True, ge=1, le=10000)] = 30
+
+    @field_validator("constraint")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        return one_of(name, ConstraintsTable.model_fields)
+
+
 class ObjectiveTable(Table):
     """What is minimised; see piezojax.tune.objective.Objective."""
 
@@ -150,19 +172,6 @@ class ObjectiveTable(Table):
     effort_weight: NotNegative = 0.0
     slew_weight: NotNegative = 0.0
     noise_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
-
-
-class EnsembleTable(Table):
-    """Plants off their nominal values, drawn evenly within ``spread`` to both sides.
-
-    ``spread`` holds relative deviations by the names that the catalogued plant gives
-    them. ``tune`` draws take part in the objective beside the nominal plant; on
-    ``holdout`` others the gains are judged.
-    """
-
-    spread: dict[str, Positive] = Field(min_length=1)
-    tune: Annotated[int, Field(strict=True, ge=0, le=64)] = 0
-    holdout: Annotated[int, Field(strict=True, ge=1, le=1024)] = 50
 
 
 class OptimiserTable(Table):
@@ -199,7 +208,10 @@ class Study(Table):
     parameters: dict[str, Bounds] = Field(min_length=1)
     objective: ObjectiveTable = ObjectiveTable()
     optimiser: OptimiserTable = OptimiserTable()
+    disturbance: DisturbanceTable = DisturbanceTable()
     ensemble: EnsembleTable | None = None
+    constraints: ConstraintsTable = ConstraintsTable()
+    pareto: ParetoTable | None = None
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
 
     @field_validator("parameters", mode="before")
@@ -251,6 +263,27 @@ class Study(Table):
                 f"objective.aggregate is {self.objective.aggregate!r}, "
                 "it must be 'mean_square'"
             )
+        if least_squares and self.ensemble and self.ensemble.aggregate != "mean":
+            raise ValueError(
+                "optimiser.method levenberg_marquardt minimises squares; "
+                f"ensemble.aggregate is {self.ensemble.aggregate!r}, "
+                "it must be 'mean'"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _constrained(self) -> "Study":
+        limits = self.constraints.limits
+        if self.axes and limits:
+            raise ValueError(
+                f"constraints.{next(iter(limits))}: constraints are for one axis; "
+                f"this stage has {self.axis_count}"
+            )
+        if self.pareto and self.pareto.constraint not in limits:
+            raise ValueError(
+                f"pareto.constraint is {self.pareto.constraint!r}; "
+                "it must be one of the study's constraints"
+            )
         return self
 
     @model_validator(mode="after")
@@ -261,6 +294,7 @@ class Study(Table):
             "actuator.lower": self.actuator.lower,
             "actuator.upper": self.actuator.upper,
             "sensor.noise_rms": self.sensor.noise_rms,
+            "disturbance.drift_rms": self.disturbance.drift_rms,
         }
         for key, value in lists.items():
             if isinstance(value, tuple) and len(value) != self.axis_count:
@@ -303,48 +337,6 @@ class Study(Table):
             return motions.parse(reference, self.axes.names)
         signals.parse(reference)
         return {"": reference}
-
-
-def one_of(name: str, allowed: Any) -> str:
-    """Return ``name``; raise ValueError, listing ``allowed``, if it is not in there."""
-    if not isinstance(name, str) or name not in allowed:
-        raise ValueError(f"{name!r} is unknown; there are {', '.join(allowed)}")
-    return name
-
-
-def validated(kind: type[Any], data: Any, where: str) -> Any:
-    """Return ``data`` as ``kind``; one line naming key, value and what is allowed."""
-    try:
-        return kind.model_validate(data)
-    except ValidationError as error:
-        raise ValueError(_first_line(error, kind, where)) from None
-
-
-_UNION = re.compile(r"(constrained-)?(float|tuple\[.*)$")
-"""What pydantic adds to a place where a field takes one of several kinds."""
-
-
-def _first_line(error: ValidationError, kind: type[BaseModel], where: str) -> str:
-    # Of a field that takes a number or a list, the error that fits what was given.
-    first = min(error.errors(), key=lambda found: isinstance(found["input"], list))
-    place = [str(part) for part in first["loc"] if not _UNION.match(str(part))]
-    key = ".".join([where, *place]).strip(".")
-    if first["type"] == "extra_forbidden":
-        table: Any = kind
-        for part in first["loc"][:-1]:
-            field = getattr(table, "model_fields", {}).get(part)
-            inner = get_args(table)[-1] if get_args(table) else Bounds
-            table = field.annotation if field else inner
-        known = list(getattr(table, "model_fields", Bounds.model_fields))
-        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        return f"{key} is unknown; allowed are {', '.join(known)}{hint}"
-    if first["type"] == "missing":
-        return f"{key} is missing"
-    message = first["msg"].removeprefix("Value error, ")
-    value = first["input"]
-    shown = f" is {value!r}" if isinstance(value, str | int | float) else ""
-    return f"{key}{shown}: {message}" if key else message
 
 
 def load(path: str | Path) -> Study:

@@ -19,6 +19,7 @@ from ..report.console import (
     tuning_table,
 )
 from ..report.identification import write_fit
+from ..report.robustness import constraints_table, front_table
 from ..report.stability import compared, write_stability
 from ..report.tuning import write_numbers, write_results
 from .comparison import compare
@@ -75,6 +76,10 @@ def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> N
     console.print(tuning_table(result))
     console.print(gains_table(result))
     console.print(stability_table(stability))
+    if result.constraints:
+        console.print(constraints_table(result))
+    if result.front and case.study.pareto:
+        console.print(front_table(result.front, case.study.pareto.constraint))
     if result.perturbed is not None:
         console.print(perturbed_text(result.perturbed), soft_wrap=True)
     for name, why in stability.problems.items():

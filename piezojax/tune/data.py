@@ -1,5 +1,6 @@
 """What a case is tuned and judged on: references, noise draws, disturbances."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
@@ -39,33 +40,48 @@ def make_data(case: Case) -> Data:
     references = jnp.stack([_reference(study, name, time_s) for name in runs])
     # Two streams of one seed: the hold-out draws are new for every reference.
     streams = np.random.SeedSequence(study.seed).spawn(2)
-    draws = [
-        as_array(
-            np.random.default_rng(stream).standard_normal(
-                (len(runs), count, *references.shape[1:])
-            )
+    counts = study.objective.noise_draws, study.holdout_draws
+    tuning, holdout = (
+        _signals(case, references, time_s, np.random.default_rng(stream), count, part)
+        for stream, count, part in zip(
+            streams, counts, ("train", "validate"), strict=True
         )
-        for stream, count in zip(
-            streams, (study.objective.noise_draws, study.holdout_draws), strict=True
-        )
-    ]
-    count = len(table.tune)
+    )
     traces = traces_of(study)
+    count = len(table.tune)
     tuned = sum(trace.run < count for trace in traces)
     picked = tuple((t.run, t.axis) for t in traces) if study.axes else ()
+    first = jax.tree.map(lambda x: x[:count], tuning)
     return Data(
         tuned,
         traces,
-        tuning=Signals(
-            references[:count],
-            draws[0][:count],
-            _unexplained(case, time_s, "train"),
-            picked[:tuned],
-        ),
-        holdout=Signals(
-            references, draws[1], _unexplained(case, time_s, "validate"), picked
-        ),
+        tuning=dataclasses.replace(first, traces=picked[:tuned]),
+        holdout=dataclasses.replace(holdout, traces=picked),
     )
+
+
+def _signals(
+    case: Case,
+    references: jax.Array,
+    time_s: jax.Array,
+    random: np.random.Generator,
+    draws: int,
+    part: Literal["train", "validate"],
+) -> Signals:
+    count, samples, *axes = references.shape
+    shape = (count, draws, samples, *axes)
+    noise = as_array(random.standard_normal(shape))
+    disturbance = None
+    unexplained = _unexplained(case, time_s, part)
+    if unexplained is not None:
+        disturbance = jnp.broadcast_to(unexplained, shape)
+    drift = np.array(case.study.by_axis(case.study.disturbance.drift_rms))
+    if drift.any():
+        steps = random.standard_normal(shape) * np.sqrt(case.study.dt)
+        # By axis only where there are several.
+        walk = as_array(np.cumsum(steps, axis=2) * (drift if axes else drift[0]))
+        disturbance = walk if disturbance is None else disturbance + walk
+    return Signals(references, noise, disturbance)
 
 
 def _reference(study: Study, name: str, time_s: jax.Array) -> jax.Array:

@@ -1,20 +1,32 @@
 """What tuning minimises: normalised tracking errors over references and noise draws."""
 
-from collections.abc import Callable
-from typing import Any, Literal
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._types import as_array
 from ..axes import PerAxisMetric
-from ..metrics import Tracking, TrackingFigures
+from ..metrics import Both, Extremes, Tracking, TrackingFigures
 from ..rollout import Metric, simulate
 from ..space import Space
-from ..system import Feedback, System, loop_inputs
+from ..stability.impulse import sensitivities
+from ..study import Stage
+from ..system import Feedback, loop_inputs
+from .constraints import Seen, augmented, needs, violations
+
+T = TypeVar("T")
 
 Aggregate = Literal["geometric_mean", "mean_square", "worst"]
+Over = Literal["mean", "worst", "cvar"]
+
+PENALTY = 10.0
+"""First penalty on violated limits, on a scale where a factor e too much is 1."""
 
 HOPELESS = 1e6
 """Objective of a run that diverged: finite, so that a line search can step back."""
@@ -27,33 +39,40 @@ _FLOOR = 1e-9  # um: an error below a femtometre is as good as none
 
 
 class Signals(eqx.Module):
-    """References (um), unit-variance noise draws and a disturbance (um) for a loop.
+    """References (um), unit-variance noise draws and disturbances (um) for a loop.
 
-    With several axes references and noise have a last dimension for them, in the unit
-    of each. ``traces`` then are what is judged: pairs of a reference and an axis.
+    With several axes all have a last dimension for them, in the unit of each.
+    ``traces`` then are what is judged: pairs of a reference and an axis.
     """
 
     references: Float[Array, "references samples *axes"]
     noise: Float[Array, "references draws samples *axes"]
-    disturbance: Float[Array, " samples"] | None = None
+    disturbance: Float[Array, "references draws samples *axes"] | None = None
     traces: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
 
 
 def evaluate(
-    loop_of: Callable[[Any], Feedback], parameters: Any, signals: Signals, start: int
-) -> TrackingFigures:
+    loop_of: Callable[[Any], Feedback],
+    parameters: Any,
+    signals: Signals,
+    start: int,
+    beside: Metric | None = None,
+) -> Any:
     """Return the figures of ``loop_of(parameters)`` for each reference and noise draw.
 
     With several axes, for each trace and noise draw. Every run starts at rest at its
-    reference; samples before ``start`` do not count.
+    reference; samples before ``start`` do not count. With ``beside``, another metric of
+    the same runs, a pair of both figures.
     """
     metric: Metric = Tracking(start=start)
+    if beside is not None:
+        metric = Both(metric, beside)
     if signals.references.ndim > 2:
         metric = PerAxisMetric(metric, signals.references.shape[2])
 
-    def one(parameters, reference, noise):
+    def one(parameters, reference, noise, disturbance):
         loop = loop_of(parameters)
-        inputs = loop_inputs(reference, noise, signals.disturbance)
+        inputs = loop_inputs(reference, noise, disturbance)
         return simulate(loop, inputs, loop.init(reference[0]), metric=metric)[1]
 
     # A copy of the parameters for each run: their gradients are then summed once, at
@@ -62,66 +81,124 @@ def evaluate(
     copies = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*runs, *jnp.shape(x))), parameters
     )
-    draws = jax.vmap(one, in_axes=(0, None, 0))
-    figures = jax.vmap(draws)(copies, signals.references, signals.noise)
+    draws = jax.vmap(one, in_axes=(0, None, 0, 0))
+    figures = jax.vmap(draws)(
+        copies, signals.references, signals.noise, signals.disturbance
+    )
     if not signals.traces:
         return figures
     run, axis = (list(indices) for indices in zip(*signals.traces, strict=True))
     return jax.tree.map(lambda x: x[jnp.array(run), :, jnp.array(axis)], figures)
 
 
-def with_plant(loop: Feedback, plant: System) -> Feedback:
-    """Return ``loop`` around another plant."""
-    return Feedback(loop.controller, plant, loop.actuator, loop.sensor)
+class Verdict(NamedTuple):
+    """What a point comes to: the objective, and by how much it violates what most."""
+
+    loss: Float[Array, ""]
+    violation: Float[Array, ""]
+
+
+def _on_each(function: Callable[[Stage | None], T], stages: Stage | None) -> T:
+    """Return ``function`` of each of the stacked ``stages``, or of None alone."""
+    if stages is None:
+        return jax.tree.map(lambda x: x[None], function(None))
+    return eqx.filter_vmap(function)(stages)
 
 
 class Objective(eqx.Module):
     """The objective over a Space.
 
-    Each reference's RMS error, over its noise draws, is divided by ``scale`` (um).
-    ``aggregate`` joins them: ``geometric_mean`` (mean of logarithms: a tenfold gain
-    counts the same on every reference), ``mean_square``, or ``worst`` (a smooth
-    maximum of the logarithms). ``weights`` says how much each counts (alike if left
-    out); what is ``resting``, an axis that should not move, counts only as far as its
-    error exceeds its scale. ``plants``, stacked on a leading axis, take the place of
-    the loop's own, each counting as much. ``effort_weight`` and ``slew_weight`` add the
-    mean RMS voltage and RMS voltage change a sample, both as a share of
-    ``voltage_span``.
+    Each reference's RMS error, over its noise draws, is divided by ``scale`` (um), one
+    for each stage and reference. ``aggregate`` joins them: ``geometric_mean`` (mean of
+    logarithms: a tenfold gain counts the same on every reference), ``mean_square``, or
+    ``worst`` (a smooth maximum of the logarithms). ``weights`` says how much each
+    counts (alike if left out); what is ``resting``, an axis that should not move,
+    counts only as far as its error exceeds its scale.
+
+    ``stages``, stacked on a leading axis, take the place of the loop's own; ``over``
+    joins them: their mean, the worst, or the mean of the worst ``tail`` of them.
+    ``effort_weight`` and ``slew_weight`` add the mean RMS voltage and RMS voltage
+    change a sample, both as a share of ``voltage_span``.
+
+    ``limits`` are constraints by name (``constraints.CONSTRAINTS``), kept on every
+    stage, margins on every one of ``margin_stages`` at the reference ``highest`` (um).
+    ``multipliers`` and ``penalty``
+    are those of the augmented Lagrangian that ``loss`` is.
     """
 
     loop: Feedback
     space: Space
     signals: Signals
-    scale: Float[Array, " references"]
+    scale: Float[Array, "stages references"]
     voltage_span: Float[Array, ""]
     start: int = eqx.field(static=True)
     weights: Float[Array, " references"] | None = None
-    plants: System | None = None
+    stages: Stage | None = None
+    margin_stages: Stage | None = None
     resting: tuple[bool, ...] = eqx.field(static=True, default=())
     aggregate: Aggregate = eqx.field(static=True, default="geometric_mean")
+    over: Over = eqx.field(static=True, default="mean")
+    tail: float = eqx.field(static=True, default=1.0)
     effort_weight: float = eqx.field(static=True, default=0.0)
     slew_weight: float = eqx.field(static=True, default=0.0)
+    limits: dict[str, Array] = eqx.field(default_factory=dict)
+    highest: Array | None = None
+    dt: float = eqx.field(static=True, default=1.0)
+    multipliers: Float[Array, " constraints"] | None = None
+    penalty: Float[Array, ""] = eqx.field(converter=as_array, default=PENALTY)
 
-    def _figures(self, unit: Float[Array, " n"]) -> TrackingFigures:
-        """Return figures of shape [plants, references, draws]."""
+    @property
+    def lanes(self) -> int:
+        """Runs in one evaluation."""
+        runs = self.signals.noise.shape[0] * self.signals.noise.shape[1]
+        return runs * self.scale.shape[0]
+
+    def with_multipliers(self, multipliers: Array) -> "Objective":
+        """Return the objective with these multipliers of its limits."""
+        return dataclasses.replace(self, multipliers=multipliers)
+
+    def with_penalty(self, penalty: float) -> "Objective":
+        """Return the objective with this penalty on violated limits."""
+        return dataclasses.replace(self, penalty=penalty)
+
+    def with_limits(self, limits: Mapping[str, float]) -> "Objective":
+        """Return the objective with other limits of the same constraints."""
+        arrays = {name: as_array(limit) for name, limit in limits.items()}
+        return dataclasses.replace(self, limits=arrays)
+
+    def seen(self, unit: Float[Array, " n"]) -> Seen:
+        """Return what errors and constraints are read from.
+
+        Figures of shape [stages, references, draws].
+        """
+        beside = Extremes() if needs(self.limits, "extremes") else None
 
         def loop_of(unit):
             return self.space.put(self.loop, unit)
 
-        if self.plants is None:
-            figures = evaluate(loop_of, unit, self.signals, self.start)
-            return jax.tree.map(lambda x: x[None], figures)
-        return eqx.filter_vmap(
-            lambda plant: evaluate(
-                lambda unit: with_plant(loop_of(unit), plant),
+        def run(stage):
+            return evaluate(
+                lambda unit: (
+                    loop_of(unit) if stage is None else stage.around(loop_of(unit))
+                ),
                 unit,
                 self.signals,
                 self.start,
+                beside,
             )
-        )(self.plants)
 
-    def _parts(self, unit: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        figures = self._figures(unit)
+        def margins(stage):
+            loop = loop_of(unit)
+            loop = loop if stage is None else stage.around(loop)
+            return sensitivities(loop, self.highest, self.dt)
+
+        figures = _on_each(run, self.stages)
+        figures, extremes = figures if beside else (figures, None)
+        known = needs(self.limits, "sensitivity")
+        found = _on_each(margins, self.margin_stages) if known else None
+        return Seen(figures, extremes, found, dt=self.dt)
+
+    def _normalised(self, figures: TrackingFigures) -> Array:
         square = jnp.mean(figures.rms_error**2, axis=2)
         normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
         if any(self.resting):
@@ -130,31 +207,67 @@ class Objective(eqx.Module):
             normalised = jnp.where(jnp.array(self.resting), jnp.exp(above), normalised)
         # Limits turn divergence into a limit cycle between them.
         railed = jnp.any(figures.saturated > RAILED)
-        normalised = jnp.where(railed, jnp.inf, normalised)
-        effort = jnp.mean(figures.rms_effort) / self.voltage_span
-        slew = jnp.mean(figures.rms_slew) / self.voltage_span
-        return normalised, effort, slew
+        return jnp.where(railed, jnp.inf, normalised)
 
-    def _shares(self, normalised: Array) -> Array:
-        """Return how much each error counts; the shares sum to 1."""
-        weights = jnp.ones_like(self.scale) if self.weights is None else self.weights
-        weights = jnp.broadcast_to(weights, normalised.shape)
+    def _prices(self, figures: TrackingFigures) -> tuple[tuple[float, Array], ...]:
+        """Return weights and values of effort and slew."""
+        return (
+            (self.effort_weight, jnp.mean(figures.rms_effort) / self.voltage_span),
+            (self.slew_weight, jnp.mean(figures.rms_slew) / self.voltage_span),
+        )
+
+    def _shares(self) -> Array:
+        """Return how much each reference's error counts; the shares sum to 1."""
+        count = self.scale.shape[1]
+        weights = jnp.ones(count) if self.weights is None else self.weights
         return weights / jnp.sum(weights)
 
-    def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
-        """Return the objective; ``HOPELESS`` where the loop diverges or rails."""
-        normalised, effort, slew = self._parts(unit)
-        shares = self._shares(normalised)
+    def _error(self, figures: TrackingFigures) -> Array:
+        """Return the errors, joined over references and then over stages."""
+        normalised, shares = self._normalised(figures), self._shares()
         if self.aggregate == "mean_square":
-            joined = jnp.sum(shares * normalised**2)
+            joined = jnp.sum(shares * normalised**2, axis=1)
         elif self.aggregate == "geometric_mean":
-            joined = jnp.sum(shares * jnp.log(normalised))
+            joined = jnp.sum(shares * jnp.log(normalised), axis=1)
         else:
             logs = _SHARPNESS * jnp.log(normalised)
-            each = shares * shares.size
-            joined = jax.nn.logsumexp(logs, b=each) / _SHARPNESS
-        total = joined + self.effort_weight * effort + self.slew_weight * slew
-        return jnp.where(jnp.isfinite(total), total, HOPELESS)
+            each = jnp.broadcast_to(shares * shares.size, logs.shape)
+            joined = jax.nn.logsumexp(logs, axis=1, b=each) / _SHARPNESS
+        if self.over == "worst":
+            return jnp.max(joined)
+        if self.over == "cvar":
+            worst = max(1, math.ceil(self.tail * joined.size))
+            return jnp.mean(jnp.sort(joined)[-worst:])
+        return jnp.mean(joined)
+
+    def _judged(self, seen: Seen) -> tuple[Array, Array]:
+        prices = [weight * value for weight, value in self._prices(seen.figures)]
+        return self._error(seen.figures) + sum(prices), violations(self.limits, seen)
+
+    def _added(self, violation: Array) -> Array:
+        multipliers = self.multipliers
+        if multipliers is None:
+            multipliers = jnp.zeros_like(violation)
+        return augmented(violation, multipliers, self.penalty)
+
+    def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
+        """Return what is minimised; ``HOPELESS`` where the loop diverges or rails."""
+        return self.both(unit)[0]
+
+    def both(self, unit: Float[Array, " n"]) -> tuple[Float[Array, ""], Verdict]:
+        """Return ``loss`` and ``verdict`` of one simulation."""
+        total, violation = self._judged(self.seen(unit))
+        added = total + jnp.sum(self._added(violation) ** 2)
+        finite = [jnp.where(jnp.isfinite(x), x, HOPELESS) for x in (added, total)]
+        return finite[0], Verdict(finite[1], jnp.max(violation, initial=0.0))
+
+    def verdict(self, unit: Float[Array, " n"]) -> Verdict:
+        """Return the objective without constraints, and the worst violation."""
+        return self.both(unit)[1]
+
+    def violated(self, unit: Float[Array, " n"]) -> Float[Array, " constraints"]:
+        """Return every violation, as ``constraints.violations``."""
+        return self._judged(self.seen(unit))[1]
 
     def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " residuals"]:
         """Return what least squares minimises: the squares sum to a mean-square loss.
@@ -163,11 +276,14 @@ class Objective(eqx.Module):
         """
         if self.aggregate != "mean_square":
             raise ValueError(f"least squares cannot minimise {self.aggregate!r}")
-        normalised, effort, slew = self._parts(unit)
-        parts = [(normalised * jnp.sqrt(self._shares(normalised))).ravel()]
-        for weight, value in ((self.effort_weight, effort), (self.slew_weight, slew)):
+        seen = self.seen(unit)
+        normalised = self._normalised(seen.figures)
+        shares = self._shares() / normalised.shape[0]
+        parts = [(normalised * jnp.sqrt(shares)).ravel()]
+        for weight, value in self._prices(seen.figures):
             if weight > 0.0:
                 parts.append(jnp.sqrt(weight * value)[None])
+        parts.append(self._added(violations(self.limits, seen)))
         every = jnp.concatenate(parts)
         finite = jnp.all(jnp.isfinite(every))
         return jnp.where(finite, every, jnp.sqrt(HOPELESS / every.size))

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,13 +13,17 @@ import numpy as np
 
 from .. import __version__
 from .._types import as_array
-from ..metrics import TrackingFigures
+from ..metrics import Extremes, TrackingFigures
 from ..progress import Progress, Silent
-from ..study import Case, read, shipped
-from ..system import Feedback, System
+from ..stability.impulse import sensitivities
+from ..study import Case, Stage, read, shipped
+from ..study.ensemble import Part
+from ..system import Feedback
+from .constraints import Seen, by_stage, needs
 from .data import Data, make_data
-from .objective import RAILED, Objective, Signals, evaluate, with_plant
-from .result import Perturbed, Result, Scores, scores
+from .front import trace_front
+from .objective import RAILED, Objective, Signals, evaluate
+from .result import FrontPoint, Kept, Perturbed, Result, Scores, scores
 from .search import Clock, Search, search_box
 
 
@@ -39,40 +44,55 @@ class Outcome:
 
 
 class _Judge:
-    """Simulates a loop on signals; compiled once for each shape of them."""
+    """Simulates loops on signals; compiled once for each shape of them."""
 
-    def __init__(self, clock: Clock, start: int):
-        self._clock, self._start = clock, start
-        self._programs: dict[tuple[int, ...], Callable] = {}
-        self._plants: Callable | None = None
+    def __init__(self, clock: Clock, case: Case, start: int):
+        self._clock, self._case, self._start = clock, case, start
+        self._programs: dict[str, Callable] = {}
+
+    def _compiled(self, key: str, function: Callable, *arguments: Any) -> Callable:
+        if key not in self._programs:
+            self._programs[key] = self._clock.compiled(function, *arguments)
+        return self._programs[key]
 
     def figures(self, loop: Feedback, signals: Signals) -> TrackingFigures:
         """Return the figures by reference and draw."""
-        shape = signals.noise.shape
-        if shape not in self._programs:
-            self._programs[shape] = self._clock.compiled(
-                lambda loop, signals: evaluate(lambda x: x, loop, signals, self._start),
-                loop,
-                signals,
-            )
-        return self._programs[shape](loop, signals)
+        program = self._compiled(
+            f"figures {signals.noise.shape}",
+            lambda loop, signals: evaluate(lambda x: x, loop, signals, self._start),
+            loop,
+            signals,
+        )
+        return program(loop, signals)
 
-    def on_plants(
-        self, loop: Feedback, plants: System, signals: Signals
-    ) -> TrackingFigures:
-        """Return the figures by plant, reference and draw, of ``plants`` stacked."""
-        dynamic, static = eqx.partition(plants, eqx.is_array)
+    def on_stages(self, loop: Feedback, stages: Stage, signals: Signals) -> Seen:
+        """Return what is seen of ``loop`` on ``stages``, stacked on a leading axis."""
+        dynamic, static = eqx.partition(stages, eqx.is_array)
+        limits = self._case.study.constraints.limits
+        beside = Extremes() if needs(limits, "extremes") else None
 
-        def all_plants(loop, dynamic, signals):
+        def run(loop, dynamic, signals):
+            def around(part):
+                return eqx.combine(part, static).around(loop)
+
             def one(part):
-                other = with_plant(loop, eqx.combine(part, static))
-                return evaluate(lambda x: x, other, signals, self._start)
+                return evaluate(lambda x: x, around(part), signals, self._start, beside)
 
-            return jax.lax.map(one, dynamic)
+            figures = jax.lax.map(one, dynamic)
+            figures, extremes = figures if beside else (figures, None)
+            margins = None
+            if needs(limits, "sensitivity"):
+                study = self._case.study
+                margins = jax.vmap(
+                    lambda part: sensitivities(around(part), study.highest, study.dt)
+                )(dynamic)
+            return figures, extremes, margins
 
-        if self._plants is None:
-            self._plants = self._clock.compiled(all_plants, loop, dynamic, signals)
-        return self._plants(loop, dynamic, signals)
+        count = jax.tree.leaves(dynamic)[0].shape[0]
+        program = self._compiled(
+            f"{count} stages {signals.noise.shape}", run, loop, dynamic, signals
+        )
+        return Seen(*program(loop, dynamic, signals), dt=self._case.study.dt)
 
 
 def tune(
@@ -93,13 +113,18 @@ def tune(
     first = round(table.references.settle * table.rate)
 
     progress.stage("simulating the start")
-    judge = _Judge(clock, first)
+    judge = _Judge(clock, case, first)
     before = judge.figures(case.loop, data.tuning)
+    stages = _stages(case, "tune")
+    scale = _scale(before, data)[None]
+    if stages is not None:
+        found = judge.on_stages(case.loop, stages, data.tuning).figures
+        scale = jax.vmap(lambda one: _scale(one, data, scale[0]))(found)
     objective = Objective(
         loop=case.loop,
         space=space,
         signals=data.tuning,
-        scale=_scale(before, data),
+        scale=scale,
         voltage_span=as_array(
             np.mean(np.subtract(table.actuator.upper, table.actuator.lower))
         ),
@@ -109,27 +134,44 @@ def tune(
         slew_weight=table.objective.slew_weight,
         weights=_weights(case, data),
         resting=tuple(not trace.driven for trace in data.traces[: data.tuned]),
-        plants=_plants(case),
-    )
+        stages=stages,
+        margin_stages=_stages(case, "margins"),
+        over=table.ensemble.aggregate if table.ensemble else "mean",
+        tail=table.ensemble.tail if table.ensemble else 1.0,
+        highest=as_array(table.highest),
+        dt=table.dt,
+    ).with_limits(table.constraints.limits)
     search = search_box(objective, case, clock, progress)
 
     after = space.put(case.loop, as_array(search.unit))
     try:
+        front, kept = None, _kept(objective, search, clock)
+        if table.pareto is not None and search.status != "interrupted":
+            front = trace_front(objective, case, search, clock, progress)
         progress.stage("judging on held-out noise")
-        result = _report(case, data, judge, before, after, search, clock)
+        result = _report(case, data, judge, before, after, search, clock, kept, front)
     except KeyboardInterrupt:
         # What was found is kept; only a second interrupt ends this too.
         search.status = "interrupted"
-        result = _report(case, data, judge, before, after, search, clock)
+        result = _report(case, data, judge, before, after, search, clock, {}, None)
     return Outcome(result, case.loop, after, case, data.holdout)
 
 
-def _scale(before: TrackingFigures, data: Data) -> jax.Array:
-    """Return what each trace's error is measured against: what it was before."""
-    rms = np.sqrt(np.mean(np.asarray(before.rms_error) ** 2, axis=1))
-    if np.all(np.isfinite(rms)) and np.max(before.saturated) <= RAILED:
-        return as_array(np.where(rms > 0.0, rms, 1e-9))
-    # Where the start diverges its error is no measure; the reference's own swing is.
+def _scale(
+    before: TrackingFigures, data: Data, otherwise: jax.Array | None = None
+) -> jax.Array:
+    """Return what each trace's error is measured against: what it was before.
+
+    Where the start diverges that is no measure: ``otherwise`` is, or, without it, the
+    reference's own swing.
+    """
+    rms = jnp.sqrt(jnp.mean(jnp.asarray(before.rms_error) ** 2, axis=1))
+    usable = jnp.all(jnp.isfinite(rms)) & (jnp.max(before.saturated) <= RAILED)
+    own = jnp.where(rms > 0.0, rms, 1e-9)
+    return jnp.where(usable, own, _swing(data) if otherwise is None else otherwise)
+
+
+def _swing(data: Data) -> jax.Array:
     swing = jnp.maximum(jnp.std(data.tuning.references, axis=1), 1e-3)
     if swing.ndim == 1:
         return swing
@@ -151,28 +193,42 @@ def _weights(case: Case, data: Data) -> jax.Array | None:
     return as_array([1.0 if trace.driven else coupling for trace in tuned])
 
 
-def _plants(case: Case) -> System | None:
-    """Return the nominal plant and those of the objective, stacked; None if alone."""
-    others = case.ensemble.plants("tune") if case.ensemble else None
+def _stages(case: Case, part: Part) -> Stage | None:
+    """Return the nominal stage and the drawn ones of a part, stacked; None if alone."""
+    others = case.ensemble.stages(part) if case.ensemble else None
     if others is None:
         return None
+    own = Stage(case.loop.plant, case.loop.sensor)
     return jax.tree.map(
-        lambda own, drawn: jnp.concatenate([own[None], drawn]), case.loop.plant, others
+        lambda own, drawn: jnp.concatenate([own[None], drawn]), own, others
     )
 
 
 def _perturbed(
     case: Case, data: Data, judge: _Judge, before: Feedback, after: Feedback
 ) -> Perturbed | None:
-    plants = case.ensemble.plants("holdout") if case.ensemble else None
-    if plants is None:
+    stages = case.ensemble.stages("holdout") if case.ensemble else None
+    if stages is None:
         return None
     driven = np.array([trace.driven for trace in data.traces])
-    found = [
-        jax.tree.map(np.asarray, judge.on_plants(loop, plants, data.holdout))
+    seen = [
+        jax.tree.map(np.asarray, judge.on_stages(loop, stages, data.holdout))
         for loop in (before, after)
     ]
-    return Perturbed.of(found[0], found[1], driven)
+    return Perturbed.of(seen[0], seen[1], driven, case.study.constraints.limits)
+
+
+def _kept(objective: Objective, search: Search, clock: Clock) -> dict[str, Kept]:
+    """Return the limits and what became of them, on the plants of the tuning."""
+    if not objective.limits:
+        return {}
+    unit = as_array(search.unit)
+    look = clock.compiled(lambda o, u: by_stage(o.limits, o.seen(u)), objective, unit)
+    values = jax.tree.map(np.asarray, look(objective, unit))
+    return {
+        name: Kept.of_values(name, float(limit), values[name])
+        for name, limit in objective.limits.items()
+    }
 
 
 def _report(
@@ -183,6 +239,8 @@ def _report(
     after: Feedback,
     search: Search,
     clock: Clock,
+    kept: dict[str, Kept],
+    front: list[FrontPoint] | None,
 ) -> Result:
     driven = np.array([trace.driven for trace in data.traces])
     seen = np.arange(len(data.traces)) < data.tuned
@@ -226,6 +284,8 @@ def _report(
         unseen=unseen_after,
         coupling_before=coupling_before,
         coupling=coupling,
+        constraints=kept,
+        front=front,
         perturbed=_perturbed(case, data, judge, case.loop, after),
         units={trace.name: trace.unit for trace in data.traces},
         warnings=[*search.warnings, *_warnings(case, at_bound, after_scores, holdout)],

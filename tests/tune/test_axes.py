@@ -104,7 +104,7 @@ def test_perturbed_plants_are_judged_one_by_one(outcome):
     """Median and worst factor against runs of both loops on each plant."""
     found = outcome.result.perturbed
     assert (found.plants, found.unstable_before, found.unstable) == (5, 0, 0)
-    plants = outcome.case.ensemble.plants("holdout")
+    plants = outcome.case.ensemble.stages("holdout").plant
     signals = outcome.holdout
 
     @eqx.filter_jit
@@ -178,7 +178,7 @@ def test_draws_are_those_of_the_seed_and_differ_by_part(tmp_path):
     first, again, other = (read(path, seed).ensemble for seed in (1, 1, 2))
 
     def gains(ensemble, part):
-        return np.asarray(ensemble.plants(part).parts[1].parts[0].B[0])
+        return np.asarray(ensemble.stages(part).plant.parts[1].parts[0].B[0])
 
     np.testing.assert_array_equal(gains(first, "holdout"), gains(again, "holdout"))
     assert not np.isin(gains(first, "tune"), gains(first, "holdout")).any()
@@ -193,7 +193,7 @@ def test_draws_are_those_of_the_seed_and_differ_by_part(tmp_path):
 def test_shipped_studies_build_and_start_inside_their_bounds(name):
     case = read(shipped(name))
     assert case.loop.controller is not None
-    assert case.ensemble.plants("tune").parts[1].parts[0].B[0].shape == (4,)
+    assert case.ensemble.stages("tune").plant.parts[1].parts[0].B[0].shape == (4,)
     assert tomllib.loads(shipped(name).read_text(encoding="utf-8"))["ensemble"]
 
 
@@ -209,7 +209,7 @@ def test_shipped_studies_build_and_start_inside_their_bounds(name):
         ({"axes": {"names": ["Z", "Z"], "units": ["um", "um"]}}, r"names must differ"),
         ({"axes": {"names": ["Z", "R"], "units": ["um", "mm"]}}, r"'mm' is unknown"),
         ({"ensemble": {"spread": {"mass": 0.1}}}, r"mass is unknown; p558 varies in"),
-        ({"ensemble": {"spread": {}}}, r"ensemble.spread"),
+        ({"ensemble": {"spread": {}}}, r"ensemble: one of spread, range, standard_err"),
         ({"controller": {"catalog": "p753_pid"}}, r"controller is a PID; it must map"),
     ],
 )  # fmt: skip

@@ -1,0 +1,123 @@
+"""Tuned gains off the nominal plant: their limits, and what robustness costs."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from ..tune.constraints import CONSTRAINTS
+from ..tune.result import FrontPoint, Perturbed, Result
+from .figures import AFTER, BEFORE, figure
+
+
+def constraints_table(result: Result) -> Table:
+    """Return the limits, what became of them, and on how many held-out plants."""
+    table = Table(title="limits")
+    table.add_column("limit")
+    for name in ("set", "tuned", "state", "held-out plants"):
+        table.add_column(name, justify="right", no_wrap=True)
+    unseen = result.perturbed.constraints if result.perturbed else {}
+    for name, kept in result.constraints.items():
+        unit = "" if kept.unit == "1" else f" {kept.unit}"
+        state = "missed" if not kept.kept else "active" if kept.active else "kept"
+        there = unseen.get(name)
+        table.add_row(
+            f"{name}, {kept.sense}",
+            f"{kept.limit:.4g}{unit}",
+            _number(kept.value),
+            state,
+            f"{_number(there.value)}, kept on {there.on} of {there.of}"
+            if there
+            else "-",
+        )
+    return table
+
+
+def front_table(front: Sequence[FrontPoint], constraint: str) -> Table:
+    """Return the points of a Pareto front."""
+    table = Table(title="Pareto front")
+    for name in (f"{constraint} limit", "reached", "error, nm", "objective"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for point in front:
+        error = point.geomean_rms_um
+        table.add_row(
+            f"{point.limit:.4g}",
+            _number(point.value) + ("" if point.kept else ", missed"),
+            "-" if error is None else f"{1e3 * error:.2f}",
+            f"{point.loss:.3f}",
+        )
+    return table
+
+
+def perturbed_figure(found: Perturbed | None, title: str) -> Figure | None:
+    """Draw the errors on every held-out plant, and what is limited there."""
+    if found is None or not found.geomeans_um:
+        return None
+    limited = list(found.values)
+    picture = figure(3.6 * (1 + len(limited)), 3.2)
+    panels = picture.subplots(1, 1 + len(limited), squeeze=False)[0]
+    panel = panels[0]
+    for name, values, colour in (
+        ("before", found.geomeans_before_um, BEFORE),
+        ("tuned", found.geomeans_um, AFTER),
+    ):
+        errors = [1e3 * value for value in values if value is not None]
+        lost = len(values) - len(errors)
+        label = f"{name}, unstable on {lost}" if lost else name
+        _distribution(panel, errors, found.plants, color=colour, label=label)
+    panel.set_xscale("log")
+    panel.set_xlabel("rms error, geometric mean over references, nm")
+    panel.set_ylabel(f"share of {found.plants} held-out plants, %")
+    panel.legend()
+    for panel, name in zip(panels[1:], limited, strict=True):
+        values = [value for value in found.values[name] if value is not None]
+        kept = found.constraints[name]
+        _distribution(panel, values, found.plants, color=AFTER, label="tuned")
+        panel.axvline(kept.limit, color="0.3", ls="--", label=f"limit, {kept.sense}")
+        panel.set_xlabel(_named(name))
+        panel.legend()
+    picture.suptitle(title)
+    return picture
+
+
+def _distribution(panel: Any, values: Sequence[float], of: int, **style: Any) -> None:
+    share = 100.0 * np.arange(1, len(values) + 1) / of
+    panel.step(np.sort(values), share, where="post", **style)
+    panel.set_ylim(0.0, 102.0)
+
+
+def front_figure(
+    front: Sequence[FrontPoint] | None, constraint: str | None, title: str
+) -> Figure | None:
+    """Draw error against what is limited, point by point."""
+    if not front or constraint is None:
+        return None
+    picture = figure(4.6, 3.4)
+    panel = picture.subplots()
+    drawn = [
+        (p.value, 1e3 * p.geomean_rms_um, p.kept)
+        for p in front
+        if p.geomean_rms_um is not None and p.value is not None
+    ]
+    for kept, style, label in ((True, "o-", "limit kept"), (False, "x", "missed")):
+        points = [(x, y) for x, y, inside in drawn if inside is kept]
+        if points:
+            colour = AFTER if kept else BEFORE
+            panel.plot(*zip(*points, strict=True), style, color=colour, label=label)
+    panel.set_xlabel(f"{_named(constraint)} on the worst plant tuned on")
+    panel.set_ylabel("rms error on the nominal plant,\ngeometric mean, nm")
+    panel.legend()
+    panel.set_title(title)
+    return picture
+
+
+def _named(constraint: str) -> str:
+    unit = CONSTRAINTS[constraint].unit
+    name = constraint.replace("_", " ")
+    return name if unit == "1" else f"{name}, {unit}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"

@@ -1,0 +1,187 @@
+"""Stages off their nominal values: drawn as a study's ensemble says."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from pydantic import BaseModel, ValidationError
+
+from .._types import as_array
+from ..catalog import VARIATIONS
+from ..paths import get, replace
+from ..system import Feedback, System
+from .schema import Study
+
+Part = Literal["tune", "margins", "holdout"]
+
+
+class Stage(eqx.Module):
+    """What a controller meets and an ensemble varies: the plant and its sensor."""
+
+    plant: System
+    sensor: System
+
+    def around(self, loop: Feedback) -> Feedback:
+        """Return ``loop`` with this stage in the place of its own."""
+        return Feedback(loop.controller, self.plant, loop.actuator, self.sensor)
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Stages off their nominal values: how they are made, and how far off.
+
+    ``arguments`` are those of ``make``, the plant's own variations, and ``paths`` lead
+    into the Stage. ``errors`` holds standard errors by path.
+    """
+
+    study: Study
+    nominal: Stage
+    make: Callable[..., System] | None
+    arguments: tuple[str, ...]
+    paths: tuple[str, ...]
+    errors: Mapping[str, float]
+
+    def stages(self, part: Part) -> Stage | None:
+        """Return the drawn stages of a part, stacked on a leading axis.
+
+        ``margins`` begins with the stages of ``tune``; the hold-out has a stream of its
+        own. None if there are none.
+        """
+        table = self.study.ensemble
+        assert table is not None
+        count = getattr(table, part)
+        if part == "margins":
+            count = max(count, table.tune)
+        if count == 0:
+            return None
+        stream = 3 if part == "holdout" else 2
+        random, normals = (
+            np.random.default_rng(
+                np.random.SeedSequence(self.study.seed, spawn_key=(stream, *more))
+            )
+            for more in ((), (1,))
+        )
+        names = (*self.arguments, *self.paths)
+        draws = random.uniform(-1.0, 1.0, (count, len(names), self.study.axis_count))
+        middles, halves = np.array([self._interval(name) for name in names]).T
+        draws = middles[:, None] + halves[:, None] * draws
+        if self.study.axes is None:
+            draws = draws[..., 0]
+        normal = normals.standard_normal((count, len(self.errors)))
+        return jax.vmap(self._stage)(as_array(draws), as_array(normal))
+
+    def _interval(self, name: str) -> tuple[float, float]:
+        """Return the middle and half the width of what ``name`` is drawn from."""
+        table = self.study.ensemble
+        assert table is not None
+        if name in table.range:
+            low, high = table.range[name]
+            return 0.5 * (low + high), 0.5 * (high - low)
+        return 0.0, table.spread.get(name, 0.0)
+
+    def _stage(self, row: Array, normal: Array) -> Stage:
+        stage = self.nominal
+        if self.make is not None:
+            own = dict(zip(self.arguments, row, strict=False))
+            stage = Stage(self.make(**own), stage.sensor)
+        table = self.study.ensemble
+        assert table is not None
+        values: dict[str, Any] = {}
+        for name, draw in zip(self.paths, row[len(self.arguments) :], strict=True):
+            nominal = get(stage, name)
+            values[name] = draw if name in table.range else nominal * (1.0 + draw)
+        for (name, error), draw in zip(self.errors.items(), normal, strict=True):
+            values[name] = get(stage, name) + error * draw
+        return replace(stage, values)
+
+
+def ensemble_of(study: Study, nominal: Stage, folder: Path) -> Ensemble | None:
+    """Return the ensemble of ``study``, None if it has none; files are in ``folder``.
+
+    Raises ValueError, one line, for a deviation that the plant does not know.
+    """
+    table = study.ensemble
+    if table is None:
+        return None
+    wanted = (*table.spread, *table.range)
+    paths = tuple(name for name in wanted if "." in name)
+    make, arguments = None, ()
+    if len(paths) < len(wanted):
+        name = str(study.plant.get("catalog", ""))
+        if name not in VARIATIONS:
+            raise ValueError(
+                "ensemble: plant.catalog must be one whose variations are known: "
+                f"{', '.join(VARIATIONS)}; for others name paths, as plant.0.a"
+            )
+        make = VARIATIONS[name]
+        known = inspect.signature(make).parameters
+        for deviation in wanted:
+            if "." not in deviation and deviation not in known:
+                key = "spread" if deviation in table.spread else "range"
+                raise ValueError(
+                    f"ensemble.{key}.{deviation} is unknown; {name} varies in "
+                    f"{', '.join(known)}"
+                )
+        arguments = tuple(
+            argument
+            for argument, parameter in known.items()
+            if argument in wanted or parameter.default is inspect.Parameter.empty
+        )
+    for path in paths:
+        key = "spread" if path in table.spread else "range"
+        _check_path(nominal, path, f"ensemble.{key}")
+    errors = (
+        _standard_errors(folder / table.standard_errors, nominal)
+        if (table.standard_errors)
+        else {}
+    )
+    return Ensemble(study, nominal, make, arguments, paths, errors)
+
+
+def _check_path(stage: Stage, path: str, where: str) -> None:
+    try:
+        leaf = get(stage, path)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+    if jnp.ndim(leaf):
+        raise ValueError(f"{where}.{path} has shape {leaf.shape}; it must be a number")
+
+
+class _Estimate(BaseModel):
+    value: float
+    standard_error: float | None
+
+
+class _Estimates(BaseModel):
+    parameters: dict[str, _Estimate]
+
+
+def _standard_errors(path: Path, nominal: Stage) -> dict[str, float]:
+    """Return the standard errors that identification wrote, by path in the Stage."""
+    try:
+        found = _Estimates.model_validate_json(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(
+            f"ensemble.standard_errors: {path}: {error.strerror}"
+        ) from None
+    except ValidationError as error:
+        raise ValueError(
+            f"ensemble.standard_errors: {path} is no fit: {error.errors()[0]['msg']}"
+        ) from None
+    errors = {
+        f"plant.{name}": estimate.standard_error
+        for name, estimate in found.parameters.items()
+        if estimate.standard_error is not None and np.isfinite(estimate.standard_error)
+    }
+    if not errors:
+        raise ValueError(f"ensemble.standard_errors: {path} holds no standard error")
+    for name in errors:
+        _check_path(nominal, name, "ensemble.standard_errors")
+    return errors

@@ -1,0 +1,69 @@
+"""How a table of a file is validated: strictly, and with errors in one line."""
+
+import difflib
+import re
+from typing import Annotated, Any, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+
+
+class Table(BaseModel):
+    """A table of a study: nothing in it is guessed, nothing unknown is passed over."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Each = TypeVar("Each")
+ByAxis = Each | tuple[Each, ...]
+"""One value for all axes, or a list with one for each."""
+
+
+def one_of(name: str, allowed: Any) -> str:
+    """Return ``name``; raise ValueError, listing ``allowed``, if it is not in there."""
+    if not isinstance(name, str) or name not in allowed:
+        raise ValueError(f"{name!r} is unknown; there are {', '.join(allowed)}")
+    return name
+
+
+def validated(kind: type[Any], data: Any, where: str) -> Any:
+    """Return ``data`` as ``kind``; one line naming key, value and what is allowed."""
+    try:
+        return kind.model_validate(data)
+    except ValidationError as error:
+        raise ValueError(_first_line(error, kind, where)) from None
+
+
+def _table_in(annotation: Any) -> Any:
+    """Return the Table in an annotation: itself, an optional one, a dict's values."""
+    inner = [part for part in get_args(annotation) if part is not type(None)]
+    return _table_in(inner[-1]) if inner else annotation
+
+
+_UNION = re.compile(r"(constrained-)?(float|tuple\[.*)$")
+"""What pydantic adds to a place where a field takes one of several kinds."""
+
+
+def _first_line(error: ValidationError, kind: type[BaseModel], where: str) -> str:
+    # Of a field that takes a number or a list, the error that fits what was given.
+    first = min(error.errors(), key=lambda found: isinstance(found["input"], list))
+    place = [str(part) for part in first["loc"] if not _UNION.match(str(part))]
+    key = ".".join([where, *place]).strip(".")
+    if first["type"] == "extra_forbidden":
+        table: Any = kind
+        for part in first["loc"][:-1]:
+            field = getattr(table, "model_fields", {}).get(part)
+            table = _table_in(field.annotation if field else table)
+        known = list(table.model_fields)
+        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        return f"{key} is unknown; allowed are {', '.join(known)}{hint}"
+    if first["type"] == "missing":
+        return f"{key} is missing"
+    message = first["msg"].removeprefix("Value error, ")
+    value = first["input"]
+    shown = f" is {value!r}" if isinstance(value, str | int | float) else ""
+    return f"{key}{shown}: {message}" if key else message
