@@ -1,0 +1,10 @@
+"""How small a tracking error any linear controller could leave."""
+
+from .performance import performance_limit as performance_limit
+from .reached import NEAR as NEAR
+from .reached import LimitReport as LimitReport
+from .reached import Reached as Reached
+from .reached import Shares as Shares
+from .wiener import best_response as best_response
+from .wiener import error_shares as error_shares
+from .wiener import inner_part as inner_part

@@ -1,0 +1,155 @@
+"""The limit of linear control for a loop and its references, and how near it comes.
+
+The plant is the stage linearised (``linear_plant``) with the gain that fits the loop's
+own runs. The disturbance is all that this leaves of those runs, d = y - P u: what
+hysteresis, creep, drift and the study's own disturbance do. It is taken from the runs
+that are judged, noise included, because noise that reaches the voltage shakes a
+hysteresis and makes another disturbance than a quiet run does; for a controller that
+shakes it otherwise it would be another one.
+
+What one linear filter of the reference makes of all references is foretold, and with
+full preview costs nothing; so the gain of P hardly matters: what it leaves wrong is
+foretold. The rest, known by its spectrum at a stated resolution, is what feedback is
+for, and ``wiener`` has the least that it can leave.
+
+Not in the limit: a price on voltage, limits of the actuator, plants other than this
+one. A controller that is no linear one, or that knows the reference's period, may do
+better.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._types import as_array
+from ..stability.broken_loop import loop_sample_time
+from ..system import Feedback
+from .plant import answers, felt_gain, linear_plant
+from .reached import Curves, LimitReport, Reached, Shares
+from .runs import quiet_error, simulated
+from .spectra import Foretelling, grid_size, spectra, windowed
+from .wiener import best_response, common_response, error_shares, inner_part
+
+SEGMENT = 0.1
+"""Length of the windows of the spectra, s: what their resolution is the inverse of."""
+
+
+def performance_limit(
+    loop: Feedback,
+    names: tuple[str, ...],
+    references: Any,
+    noise: Any,
+    disturbance: Any = None,
+    *,
+    start: int = 0,
+    segment: float = SEGMENT,
+    dt: float | None = None,
+) -> LimitReport:
+    """Return the limit for ``loop`` and how near its runs come to it.
+
+    ``references`` [names, samples] in um; ``noise`` [names, draws, samples], draws of
+    unit variance; ``disturbance`` [samples] in um, if any: as the tuner's Signals hold
+    them. Samples before ``start`` do not count. ``segment`` (s) is the window of the
+    spectra, no longer than what counts; ``dt`` (s) is looked for in the loop.
+
+    Raises ValueError for several axes, a sensor without noise, runs that diverge, and
+    a plant that is unstable or does not move as its linear model does.
+    """
+    references, noise = as_array(references), as_array(noise)
+    if references.ndim != 2:
+        raise ValueError("the limit is known for one axis only")
+    dt = loop_sample_time(loop) if dt is None else dt
+    runs, rest = simulated(loop, references, noise, disturbance)
+    error, heard = runs.displacement - runs.reference, runs.measured - runs.displacement
+    if not np.all(np.isfinite(error)):
+        raise ValueError("a run diverges")
+    variance = float(np.var(heard[:, start:]))
+    if variance == 0.0:
+        raise ValueError("without sensor noise the limit of linear control is zero")
+
+    counted = references.shape[1] - start
+    reach = min(round(0.5 * segment / dt), counted // 8)
+    known = Foretelling(np.asarray(references), start, reach)
+    window = min(round(segment / dt), known.count)
+    points = grid_size(window)
+
+    def by_draw(signals: np.ndarray) -> np.ndarray:
+        return signals.reshape(noise.shape)
+
+    def lines(signals: np.ndarray) -> np.ndarray:
+        return windowed(signals, window, points)
+
+    middle = 0.5 * (jnp.min(references) + jnp.max(references))
+    plant = linear_plant(loop, middle, dt)
+    answer = answers(plant, runs.voltage, rest)
+    gain = felt_gain(
+        lines(known.unforeseen(by_draw(answer))),
+        lines(known.unforeseen(by_draw(runs.displacement))),
+        lines(known.cut(by_draw(heard))),
+    )
+    plant = plant.scaled(gain)
+    # At rest where it started the linear plant leaves nothing.
+    left = runs.displacement - runs.displacement[:, :1] - gain * answer
+    disturbed = spectra(lines(known.unforeseen(by_draw(left))))
+    quiet = quiet_error(loop, plant, references, left)
+
+    inner = inner_part(plant.response(points))
+    shared = common_response(disturbed, variance, inner)
+    best = [best_response(spectrum, variance, inner) for spectrum in disturbed]
+
+    def mean_square(signals: np.ndarray) -> np.ndarray:
+        return np.mean(signals**2, axis=(1, 2))
+
+    tuned = mean_square(by_draw(error)[..., start:])
+    noisy = mean_square(by_draw(error - quiet)[..., start:])
+    kept = mean_square(known.unforeseen(by_draw(quiet)))
+    whole = mean_square(known.cut(by_draw(left)))
+    line = 1.0 / (points * dt)
+    rows = {}
+    for i, name in enumerate(names):
+        least = error_shares(best[i], disturbed[i], variance)
+        rows[name] = Reached(
+            tuned=_root(tuned[i]),
+            limit=_root(sum(least)),
+            one_controller=_root(sum(error_shares(shared, disturbed[i], variance))),
+            disturbance=_root(whole[i]),
+            unforeseen=_root(np.mean(disturbed[i])),
+            bandwidth=_last_above(disturbed[i], variance) * line,
+            tuned_shares=Shares(
+                noise=_root(noisy[i]),
+                unforeseen=_root(kept[i]),
+                foreseen=_root(tuned[i] - noisy[i] - kept[i]),
+            ),
+            limit_shares=Shares(noise=_root(least[1]), unforeseen=_root(least[0])),
+        )
+    T, half = np.array(best), slice(1, points // 2)
+    lowest = np.abs(1.0 - T) ** 2 * disturbed + np.abs(T) ** 2 * variance
+    curves = Curves(
+        frequency=line * np.arange(points)[half],
+        unforeseen=disturbed[:, half],
+        noise=variance,
+        tuned=spectra(lines(known.cut(by_draw(error))))[:, half],
+        limit=lowest[:, half],
+    )
+    return LimitReport(
+        references=rows,
+        dt=dt,
+        noise_rms=_root(variance),
+        resolution=1.0 / (window * dt),
+        gain=float(plant.response(2)[0].real),
+        delay=float(-np.angle(inner[1]) * points / (2.0 * np.pi)),
+        sensitivity_peak=float(np.max(np.abs(1.0 - shared))),
+        curves=curves,
+    )
+
+
+def _root(square: float) -> float:
+    # What is missing to the whole may be less than nothing; a share is not.
+    return float(np.sqrt(max(square, 0.0)))
+
+
+def _last_above(spectrum: np.ndarray, level: float) -> int:
+    """Return the highest line at which ``spectrum`` is above ``level``, or 0."""
+    above = np.flatnonzero(spectrum[: len(spectrum) // 2] > level)
+    return int(above[-1]) if above.size else 0
