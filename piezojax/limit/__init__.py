@@ -1,5 +1,7 @@
 """How small a tracking error any linear controller could leave."""
 
+from .attained import Attained as Attained
+from .attained import attained as attained
 from .performance import performance_limit as performance_limit
 from .reached import NEAR as NEAR
 from .reached import LimitReport as LimitReport

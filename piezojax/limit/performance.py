@@ -19,16 +19,15 @@ better.
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from .._types import as_array
 from ..stability.broken_loop import loop_sample_time
 from ..system import Feedback
-from .plant import answers, felt_gain, linear_plant
+from .problem import problem_of
 from .reached import Curves, LimitReport, Reached, Shares
 from .runs import quiet_error, simulated
-from .spectra import Foretelling, grid_size, spectra, windowed
+from .spectra import spectra
 from .wiener import best_response, common_response, error_shares, inner_part
 
 SEGMENT = 0.1
@@ -61,61 +60,30 @@ def performance_limit(
         raise ValueError("the limit is known for one axis only")
     dt = loop_sample_time(loop) if dt is None else dt
     runs, rest = simulated(loop, references, noise, disturbance)
-    error, heard = runs.displacement - runs.reference, runs.measured - runs.displacement
-    if not np.all(np.isfinite(error)):
-        raise ValueError("a run diverges")
-    variance = float(np.var(heard[:, start:]))
-    if variance == 0.0:
-        raise ValueError("without sensor noise the limit of linear control is zero")
+    posed = problem_of(loop, runs, rest, np.asarray(references), start, segment, dt)
+    known, variance, points = posed.known, posed.variance, posed.points
+    inner = inner_part(posed.plant.response(points))
+    shared = common_response(posed.spectra, variance, inner)
+    best = [best_response(spectrum, variance, inner) for spectrum in posed.spectra]
 
-    counted = references.shape[1] - start
-    reach = min(round(0.5 * segment / dt), counted // 8)
-    known = Foretelling(np.asarray(references), start, reach)
-    window = min(round(segment / dt), known.count)
-    points = grid_size(window)
-
-    def by_draw(signals: np.ndarray) -> np.ndarray:
-        return signals.reshape(noise.shape)
-
-    def lines(signals: np.ndarray) -> np.ndarray:
-        return windowed(signals, window, points)
-
-    middle = 0.5 * (jnp.min(references) + jnp.max(references))
-    plant = linear_plant(loop, middle, dt)
-    answer = answers(plant, runs.voltage, rest)
-    gain = felt_gain(
-        lines(known.unforeseen(by_draw(answer))),
-        lines(known.unforeseen(by_draw(runs.displacement))),
-        lines(known.cut(by_draw(heard))),
-    )
-    plant = plant.scaled(gain)
-    # At rest where it started the linear plant leaves nothing.
-    left = runs.displacement - runs.displacement[:, :1] - gain * answer
-    disturbed = spectra(lines(known.unforeseen(by_draw(left))))
-    quiet = quiet_error(loop, plant, references, left)
-
-    inner = inner_part(plant.response(points))
-    shared = common_response(disturbed, variance, inner)
-    best = [best_response(spectrum, variance, inner) for spectrum in disturbed]
-
-    def mean_square(signals: np.ndarray) -> np.ndarray:
-        return np.mean(signals**2, axis=(1, 2))
-
-    tuned = mean_square(by_draw(error)[..., start:])
-    noisy = mean_square(by_draw(error - quiet)[..., start:])
-    kept = mean_square(known.unforeseen(by_draw(quiet)))
-    whole = mean_square(known.cut(by_draw(left)))
+    error = (runs.displacement - runs.reference).reshape(noise.shape)
+    quiet = quiet_error(loop, posed.plant, references, posed.left)
+    tuned = _mean_square(error[..., start:])
+    noisy = _mean_square((error - quiet)[..., start:])
+    kept = _mean_square(known.unforeseen(quiet))
+    whole = _mean_square(known.cut(posed.left))
     line = 1.0 / (points * dt)
     rows = {}
     for i, name in enumerate(names):
-        least = error_shares(best[i], disturbed[i], variance)
+        spectrum = posed.spectra[i]
+        least = error_shares(best[i], spectrum, variance)
         rows[name] = Reached(
             tuned=_root(tuned[i]),
             limit=_root(sum(least)),
-            one_controller=_root(sum(error_shares(shared, disturbed[i], variance))),
+            one_controller=_root(sum(error_shares(shared, spectrum, variance))),
             disturbance=_root(whole[i]),
-            unforeseen=_root(np.mean(disturbed[i])),
-            bandwidth=_last_above(disturbed[i], variance) * line,
+            unforeseen=_root(np.mean(spectrum)),
+            bandwidth=_last_above(spectrum, variance) * line,
             tuned_shares=Shares(
                 noise=_root(noisy[i]),
                 unforeseen=_root(kept[i]),
@@ -124,24 +92,28 @@ def performance_limit(
             limit_shares=Shares(noise=_root(least[1]), unforeseen=_root(least[0])),
         )
     T, half = np.array(best), slice(1, points // 2)
-    lowest = np.abs(1.0 - T) ** 2 * disturbed + np.abs(T) ** 2 * variance
+    lowest = np.abs(1.0 - T) ** 2 * posed.spectra + np.abs(T) ** 2 * variance
     curves = Curves(
         frequency=line * np.arange(points)[half],
-        unforeseen=disturbed[:, half],
+        unforeseen=posed.spectra[:, half],
         noise=variance,
-        tuned=spectra(lines(known.cut(by_draw(error))))[:, half],
+        tuned=spectra(posed.lines(known.cut(error)))[:, half],
         limit=lowest[:, half],
     )
     return LimitReport(
         references=rows,
         dt=dt,
         noise_rms=_root(variance),
-        resolution=1.0 / (window * dt),
-        gain=float(plant.response(2)[0].real),
+        resolution=1.0 / (posed.window * dt),
+        gain=float(posed.plant.response(2)[0].real),
         delay=float(-np.angle(inner[1]) * points / (2.0 * np.pi)),
         sensitivity_peak=float(np.max(np.abs(1.0 - shared))),
         curves=curves,
     )
+
+
+def _mean_square(signals: np.ndarray) -> np.ndarray:
+    return np.mean(signals**2, axis=(1, 2))
 
 
 def _root(square: float) -> float:

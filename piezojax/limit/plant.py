@@ -1,5 +1,7 @@
 """The linear plant of a limit: the stage linearised, with the gain that it shows."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Scalar, ScalarLike, as_array
+from ..dynamics import StateSpace
 from ..rollout import simulate
 from ..stability.conserved import LinearLoop, without_conserved
 from ..stability.linearise import linearise
@@ -69,12 +72,7 @@ def linear_plant(loop: Feedback, reference: ScalarLike, dt: float) -> LinearPlan
     ``dt`` in s. Raises ValueError for several axes and for a plant that is not stable.
     """
 
-    @jax.jit
-    def derivatives(loop, reference):
-        start = loop.init(reference)
-        return linearise(loop.plant, start.voltage, start.plant, dt)
-
-    model = derivatives(loop, as_array(reference))
+    model = _derivatives(loop, as_array(reference), dt)
     A, B, C, D = (np.asarray(matrix) for matrix in (model.A, model.B, model.C, model.D))
     if D.shape != (1, 1):
         raise ValueError("the limit is known for one axis only")
@@ -94,6 +92,12 @@ def linear_plant(loop: Feedback, reference: ScalarLike, dt: float) -> LinearPlan
             "the limit is known for stable plants"
         )
     return LinearPlant(found.A, found.B, found.C, D[0, 0])
+
+
+@partial(jax.jit, static_argnums=2)
+def _derivatives(loop: Feedback, reference: jax.Array, dt: float) -> StateSpace:
+    start = loop.init(reference)
+    return linearise(loop.plant, start.voltage, start.plant, dt)
 
 
 def answers(plant: LinearPlant, voltage: np.ndarray, rest: np.ndarray) -> np.ndarray:

@@ -35,15 +35,15 @@ def _logs(loop: Feedback, references: Any, noise: Any, disturbance: Any) -> Any:
 def quiet_error(
     loop: Feedback, plant: LinearPlant, references: jax.Array, left: np.ndarray
 ) -> np.ndarray:
-    """Return the error [runs, samples] of ``loop`` around ``plant``, without noise.
+    """Return the error of ``loop`` around ``plant``, without noise.
 
-    ``left`` [runs, samples] is what the linear plant leaves of each run, in um; it acts
-    as a disturbance. With the run's noise the error would be that of the run.
+    ``left`` is what the linear plant leaves of each run, in um; it acts as a
+    disturbance. With the run's noise the error would be that of the run. Both are
+    [references, draws, samples].
     """
     # What a loop is given at k moves the displacement at k + 1.
-    ahead = np.concatenate([left[:, 1:], left[:, -1:]], axis=1)
-    ahead = ahead.reshape(references.shape[0], -1, left.shape[1])
-    return _flat(_errors(loop, plant, references, ahead))
+    ahead = np.concatenate([left[..., 1:], left[..., -1:]], axis=-1)
+    return np.asarray(_errors(loop, plant, references, ahead))
 
 
 @jax.jit

@@ -32,7 +32,8 @@ class Foretelling:
         ahead_and_back = np.lib.stride_tricks.sliding_window_view(
             padded, 2 * reach + 1, axis=1
         )
-        self._seen = ahead_and_back[:, start:, :: max(2 * reach // TAPS, 1)]
+        self._whole = ahead_and_back[:, :, :: max(2 * reach // TAPS, 1)]
+        self._seen = self._whole[:, start:]
         self._start, self.count = start, self._seen.shape[1]
         steps = self._steps()
         power, directions = np.linalg.eigh(sum(step.T @ step for step in steps))
@@ -45,21 +46,45 @@ class Foretelling:
 
     def cut(self, signals: np.ndarray) -> np.ndarray:
         """Return ``signals`` [..., samples] where they are told apart, less means."""
-        part = signals[..., self._start : self._start + self.count]
+        part = self.told_apart(signals)
         return part - part.mean(axis=-1, keepdims=True)
+
+    def told_apart(self, signals: np.ndarray) -> np.ndarray:
+        """Return ``signals`` [..., samples] where they are told apart."""
+        return signals[..., self._start : self._start + self.count]
+
+    def weights(self, signals: np.ndarray) -> np.ndarray:
+        """Return the filter's taps, the earliest reference first.
+
+        ``signals`` are [references, draws, samples]. All draws of a reference are
+        foretold alike: their mean says how.
+        """
+        moved = np.diff(self.cut(signals).mean(axis=1), axis=1)
+        product = sum(s.T @ m for s, m in zip(self._steps(), moved, strict=True))
+        return self._directions @ (self._directions.T @ product / self._power)
 
     def unforeseen(self, signals: np.ndarray) -> np.ndarray:
         """Return what is left [references, draws, count] of signals, means removed.
 
         ``signals`` are [references, draws, samples].
         """
-        signals = self.cut(signals)
-        # All draws of a reference are foretold alike: their mean says how.
-        moved = np.diff(signals.mean(axis=1), axis=1)
-        product = sum(s.T @ m for s, m in zip(self._steps(), moved, strict=True))
-        weights = self._directions @ (self._directions.T @ product / self._power)
+        weights = self.weights(signals)
         told = np.stack([seen @ weights for seen in self._seen])
-        return signals - (told - told.mean(axis=1, keepdims=True))[:, None]
+        told -= told.mean(axis=1, keepdims=True)
+        return self.cut(signals) - told[:, None]
+
+    def foretold(self, signals: np.ndarray) -> np.ndarray:
+        """Return the filter's work [references, samples] on whole records.
+
+        With the mean that ``signals`` have; held where the record does not say what
+        comes next.
+        """
+        weights = self.weights(signals)
+        told = np.stack([seen @ weights for seen in self._whole])
+        mean = self.told_apart(signals).mean(axis=(1, 2))
+        told += (mean - self.told_apart(told).mean(axis=1))[:, None]
+        missing = signals.shape[-1] - told.shape[1]
+        return np.pad(told, ((0, 0), (0, missing)), mode="edge")
 
 
 def grid_size(segment: int) -> int:
