@@ -33,6 +33,8 @@ from .wiener import best_response, common_response, error_shares, inner_part
 SEGMENT = 0.1
 """Length of the windows of the spectra, s: what their resolution is the inverse of."""
 
+_LINEAR = 1.2  # the most that shares of a linear loop may come to, over its error
+
 
 def performance_limit(
     loop: Feedback,
@@ -84,11 +86,7 @@ def performance_limit(
             disturbance=_root(whole[i]),
             unforeseen=_root(np.mean(spectrum)),
             bandwidth=_last_above(spectrum, variance) * line,
-            tuned_shares=Shares(
-                noise=_root(noisy[i]),
-                unforeseen=_root(kept[i]),
-                foreseen=_root(tuned[i] - noisy[i] - kept[i]),
-            ),
+            tuned_shares=_shares(tuned[i], noisy[i], kept[i]),
             limit_shares=Shares(noise=_root(least[1]), unforeseen=_root(least[0])),
         )
     T, half = np.array(best), slice(1, points // 2)
@@ -114,6 +112,13 @@ def performance_limit(
 
 def _mean_square(signals: np.ndarray) -> np.ndarray:
     return np.mean(signals**2, axis=(1, 2))
+
+
+def _shares(whole: float, noise: float, unforeseen: float) -> Shares | None:
+    if noise + unforeseen > _LINEAR**2 * whole:
+        return None
+    foreseen = _root(whole - noise - unforeseen)
+    return Shares(_root(noise), _root(unforeseen), foreseen)
 
 
 def _root(square: float) -> float:

@@ -41,7 +41,7 @@ class Reached:
     disturbance: float
     unforeseen: float
     bandwidth: float
-    tuned_shares: Shares
+    tuned_shares: Shares | None
     limit_shares: Shares
 
     @property
@@ -50,8 +50,10 @@ class Reached:
         return self.tuned / self.limit
 
     @property
-    def exceeding(self) -> str:
+    def exceeding(self) -> str | None:
         """Name of the share whose mean square is furthest above the limit's."""
+        if self.tuned_shares is None:
+            return None
         least = asdict(self.limit_shares)
         own = asdict(self.tuned_shares)
         return max(own, key=lambda name: own[name] ** 2 - least[name] ** 2)

@@ -14,10 +14,11 @@ from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
 
 LIMIT_FILE, LIMIT_PICTURE = "limit.json", "limit.png"
 
-CAUSES = {
+CAUSES: dict[str | None, str] = {
     "noise": "lets through more sensor noise than it has to",
     "unforeseen": "cancels too little of what the reference does not foretell",
     "foreseen": "leaves what a linear filter of the reference would cancel",
+    None: "is too far from linear to say why",
 }
 """What a loop does where a share of its error exceeds the limit's."""
 
@@ -67,14 +68,22 @@ def limit_text(found: LimitReport | str) -> str:
         f"best one controller for all: {found.over_one_controller:.2f}x, "
         f"{found.near_one_controller} of {count}"
     ]
-    by_cause: dict[str, list[str]] = {}
+    by_cause: dict[str | None, list[str]] = {}
+    below = []
     for name, one in found.references.items():
-        if one.over > NEAR:
+        if one.over < 1.0:
+            below.append(f"{name} {one.over:.2f}x")
+        elif one.over > NEAR:
             by_cause.setdefault(one.exceeding, []).append(f"{name} {one.over:.2f}x")
     lines += [
         f"note: on {', '.join(names)} the loop {CAUSES[cause]}"
         for cause, names in by_cause.items()
     ]
+    if below:
+        lines.append(
+            f"note: {', '.join(below)}: below the limit, as a controller may be that "
+            "is not linear or knows more of the stage"
+        )
     return "\n".join(lines)
 
 

@@ -9,10 +9,11 @@ from scipy import signal
 
 import piezojax as pj
 from piezojax import signals as references_of
-from piezojax.limit import NEAR, LimitReport, performance_limit
+from piezojax.limit import NEAR, LimitReport, Reached, Shares, performance_limit
 from piezojax.limit.plant import linear_plant
+from piezojax.limit.reached import Curves
 from piezojax.limit.spectra import Foretelling, grid_size, spectra, windowed
-from piezojax.report.limit import limit_of, limit_text, write_limit
+from piezojax.report.limit import limit_text, write_limit
 
 RATE, DT, START, SAMPLES = 5_000.0, 2e-4, 2_500, 25_000
 NOISE, SLOPE, MEMORY, DRIVEN = 0.012, 0.15, 0.99, 0.004
@@ -245,10 +246,36 @@ class Scalar(pj.System):
         return state, output[0]
 
 
+def reached(tuned, limit, shares):
+    least = Shares(noise=0.6 * limit, unforeseen=0.8 * limit)
+    return Reached(tuned, limit, 1.1 * limit, 0.3, 0.02, 200.0, shares, least)
+
+
+def test_the_words_name_what_exceeds():
+    rows = {
+        "A": reached(4.0, 2.0, Shares(3.9, 0.5, 0.7)),
+        "B": reached(4.0, 2.0, Shares(1.2, 3.7, 0.7)),
+        "C": reached(4.0, 2.0, Shares(1.2, 1.6, 3.4)),
+        "D": reached(2.2, 2.0, Shares(1.5, 1.6)),
+        "E": reached(1.0, 2.0, None),
+        "F": reached(4.0, 2.0, None),
+    }
+    nothing = Curves(np.zeros(0), np.zeros((6, 0)), 1.0, *np.zeros((2, 6, 0)))
+    report = LimitReport(rows, DT, NOISE, 10.0, SLOPE, 1.0, 1.1, nothing)
+    assert report.near == 2
+    assert report.over == pytest.approx((2.0**4 * 1.1 * 0.5) ** (1.0 / 6.0))
+    text = limit_text(report)
+    assert "on A 2.00x the loop lets through more sensor noise" in text
+    assert "on B 2.00x the loop cancels too little" in text
+    assert "on C 2.00x the loop leaves what a linear filter" in text
+    assert "on F 2.00x the loop is too far from linear" in text
+    assert "note: E 0.50x: below the limit" in text
+    assert "D" not in text.split("\n", 1)[1]
+
+
 def test_what_went_wrong_is_said(tmp_path):
     write_limit("the stage sleeps", tmp_path)
     data = json.loads((tmp_path / "limit.json").read_text(encoding="utf-8"))
     assert data == {"problem": "the stage sleeps"}
     assert not (tmp_path / "limit.png").exists()
     assert limit_text("the stage sleeps").endswith("linear control: the stage sleeps")
-    assert callable(limit_of)
