@@ -9,4 +9,4 @@ from .reached import Reached as Reached
 from .reached import Shares as Shares
 from .wiener import best_response as best_response
 from .wiener import error_shares as error_shares
-from .wiener import inner_part as inner_part
+from .wiener import inner_response as inner_response

@@ -24,7 +24,7 @@ from .performance import SEGMENT
 from .plant import LinearPlant
 from .problem import Problem, problem_of
 from .runs import simulated
-from .wiener import common_response, error_shares, inner_part
+from .wiener import common_response, error_shares, inner_response
 
 _TAIL = 1e-7  # of the largest tap: where the controller's memory ends
 
@@ -121,7 +121,8 @@ def attained(
     for _ in range(rounds):
         posed = problem_of(loop, runs, rest, known, start, segment, dt)
         plant = posed.plant.response(posed.points)
-        T = common_response(posed.spectra, posed.variance, inner_part(plant))
+        inner = inner_response(*posed.plant.obstacles(), posed.points)
+        T = common_response(posed.spectra, posed.variance, inner)
         predicted = [
             np.sqrt(sum(error_shares(T, spectrum, posed.variance)))
             for spectrum in posed.spectra

@@ -28,7 +28,13 @@ from .problem import problem_of
 from .reached import Curves, LimitReport, Reached, Shares
 from .runs import quiet_error, simulated
 from .spectra import spectra
-from .wiener import best_response, common_response, error_shares, inner_part
+from .wiener import (
+    best_response,
+    common_response,
+    error_shares,
+    inner_response,
+    slow_delay,
+)
 
 SEGMENT = 0.1
 """Length of the windows of the spectra, s: what their resolution is the inverse of."""
@@ -64,7 +70,8 @@ def performance_limit(
     runs, rest = simulated(loop, references, noise, disturbance)
     posed = problem_of(loop, runs, rest, np.asarray(references), start, segment, dt)
     known, variance, points = posed.known, posed.variance, posed.points
-    inner = inner_part(posed.plant.response(points))
+    obstacles = posed.plant.obstacles()
+    inner = inner_response(*obstacles, points)
     shared = common_response(posed.spectra, variance, inner)
     best = [best_response(spectrum, variance, inner) for spectrum in posed.spectra]
 
@@ -104,7 +111,7 @@ def performance_limit(
         noise_rms=_root(variance),
         resolution=1.0 / (posed.window * dt),
         gain=float(posed.plant.response(2)[0].real),
-        delay=float(-np.angle(inner[1]) * points / (2.0 * np.pi)),
+        delay=slow_delay(*obstacles),
         sensitivity_peak=float(np.max(np.abs(1.0 - shared))),
         curves=curves,
     )

@@ -17,6 +17,8 @@ from ..system import Feedback, System
 
 _CHUNK = 2048  # points of the circle at a time: few states, little memory
 _ROUNDS = 8
+_NOTHING = 1e-12
+_ON_CIRCLE = 1e-6
 
 
 class LinearPlant(System):
@@ -63,6 +65,23 @@ class LinearPlant(System):
             for part in np.array_split(z, -(-points // _CHUNK))
         ]
         return (np.concatenate(states) + D) / z
+
+    def obstacles(self) -> tuple[int, np.ndarray]:
+        """Return what no controller gets around: the delay, and the zeros outside.
+
+        The delay is in samples, with the loop's own; the zeros are those in the z plane
+        outside the unit circle. One on the circle costs nothing.
+        """
+        A, B, C, D = (np.asarray(x) for x in (self.A, self.B, self.C, self.D))
+        delay, first = 1, float(D)
+        size = abs(first) + np.linalg.norm(C) * np.linalg.norm(B)
+        # Look ahead until the input shows: the zeros are then those of C, D.
+        while abs(first) <= _NOTHING * size and delay <= len(A):
+            delay, first, C = delay + 1, float(C @ B), C @ A
+        if abs(first) <= _NOTHING * size:
+            raise ValueError("the voltage does not move the linearised plant")
+        zeros = np.linalg.eigvals(A - np.outer(B, C) / first)
+        return delay, zeros[np.abs(zeros) > 1.0 + _ON_CIRCLE]
 
 
 def linear_plant(loop: Feedback, reference: ScalarLike, dt: float) -> LinearPlant:

@@ -27,8 +27,8 @@ Theory, 1970, chapter 6), against which Harris' index judges loops (Can. J. Chem
 67 (1989) 856-861).
 
 All functions work on a grid of N points around the unit circle, z = exp(2 pi i k / N),
-N even, where multiplying by 1/z delays by a sample. Factors come from the cepstrum;
-nothing is fitted, and no Riccati equation has to be solved for a plant whose zeros make
+N even, where multiplying by 1/z delays by a sample. V comes from the cepstrum; nothing
+is fitted, and no Riccati equation has to be solved for a plant whose zeros make
 it ill-conditioned.
 """
 
@@ -53,11 +53,23 @@ def outer_factor(magnitude: np.ndarray) -> np.ndarray:
     return np.exp(np.fft.fft(cepstrum))
 
 
-def inner_part(plant: np.ndarray) -> np.ndarray:
-    """Return P_i [N] of the response ``plant`` [N] of a stable plant, its delay too."""
-    inner = plant / outer_factor(np.abs(plant))
-    size = np.abs(inner)
-    return np.where(size > 0.0, inner / np.where(size > 0.0, size, 1.0), 1.0)
+def inner_response(delay: int, zeros: np.ndarray, points: int) -> np.ndarray:
+    """Return P_i [points] of a stable plant: its ``delay`` and ``zeros`` outside.
+
+    The delay is in samples, the loop's own among them, and the zeros are those in z
+    outside the unit circle. Up to a sign, which is no matter.
+    """
+    w = np.exp(-2j * np.pi * np.arange(points) / points)
+    response = w**delay
+    for place in 1.0 / np.asarray(zeros, complex):
+        response = response * (w - place) / (1.0 - np.conj(place) * w)
+    return response
+
+
+def slow_delay(delay: int, zeros: np.ndarray) -> float:
+    """Return the delay (samples) that P_i amounts to for slow motion."""
+    place = 1.0 / np.asarray(zeros, complex)
+    return delay + float(np.sum((1.0 - np.abs(place) ** 2) / np.abs(1.0 - place) ** 2))
 
 
 def best_response(

@@ -10,7 +10,7 @@ from scipy import signal
 import piezojax as pj
 from piezojax import signals as references_of
 from piezojax.limit import NEAR, LimitReport, Reached, Shares, performance_limit
-from piezojax.limit.plant import linear_plant
+from piezojax.limit.plant import LinearPlant, linear_plant
 from piezojax.limit.reached import Curves
 from piezojax.limit.spectra import Foretelling, grid_size, spectra, windowed
 from piezojax.report.limit import limit_text, write_limit
@@ -173,6 +173,25 @@ def test_what_a_plant_remembers_or_never_moves_is_left_out():
     # Its own input, a pole at 0, and the lag; not where on its branch it is.
     poles = np.linalg.eigvals(linear_plant(loop_of(stage), 5.0, DT).A)
     np.testing.assert_allclose(np.sort(poles), [0.0, np.exp(-0.4)], atol=1e-9)
+
+
+def test_what_stands_in_the_way_of_a_controller():
+    """Delays and zeros of plants written as functions of 1/z, and slow creep."""
+    moving, autoregressive = (0.0050811, -0.0036354, 0.010553), (1.6035, -0.61995)
+    dynamics = pj.ARMA(autoregressive, moving)
+    for plant, delay, zeros in (
+        (dynamics, 1, np.roots(moving)),
+        (dynamics >> pj.Delay(2), 3, np.roots(moving)),
+        (pj.ARMA(autoregressive, (0.0, 0.2, 0.1)), 2, []),
+        (pj.ARMA(autoregressive, (0.1, 0.1)), 1, []),
+        (pj.LogarithmicCreep(0.02, 0.1, 1e3, DT) >> dynamics, 1, np.roots(moving)),
+    ):
+        found = linear_plant(loop_of(plant), 0.0, DT).obstacles()
+        assert found[0] == delay
+        np.testing.assert_allclose(np.sort(found[1]), np.sort(zeros), rtol=1e-6)
+    still = LinearPlant([[0.5]], [0.0], [1.0], 0.0)
+    with pytest.raises(ValueError, match="voltage does not move"):
+        still.obstacles()
 
 
 def test_spectra_hold_the_variance():

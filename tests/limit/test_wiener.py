@@ -8,8 +8,9 @@ from piezojax.limit.wiener import (
     best_response,
     common_response,
     error_shares,
-    inner_part,
+    inner_response,
     outer_factor,
+    slow_delay,
 )
 
 POINTS = 2**14
@@ -21,8 +22,15 @@ def response(numerator, denominator=(1.0,)):
     return np.polyval(numerator[::-1], W) / np.polyval(denominator[::-1], W)
 
 
-def least(spectrum, variance, plant):
-    T = best_response(spectrum, variance, inner_part(plant))
+def inner_of(numerator):
+    """Return the inner part of a plant with a stable denominator."""
+    delay = int(np.flatnonzero(numerator)[0])
+    zeros = np.roots(numerator[delay:])
+    return inner_response(delay, zeros[np.abs(zeros) > 1.0], POINTS)
+
+
+def least(spectrum, variance, inner):
+    T = best_response(spectrum, variance, inner)
     return sum(error_shares(T, spectrum, variance))
 
 
@@ -44,10 +52,18 @@ def test_a_factor_is_stable_with_a_stable_inverse():
 
 def test_the_inner_part_is_delay_and_zeros_outside():
     plant = response((0.0, 0.0, 1.0, -2.0), (1.0, -0.9))
-    expected = response((0.0, 0.0, 1.0, -2.0), (2.0, -1.0))
-    np.testing.assert_allclose(inner_part(plant), expected, atol=1e-9)
-    # One on the circle takes only its sign with it.
-    np.testing.assert_allclose(np.abs(inner_part(response((1.0, 1.0)))), 1.0)
+    found = inner_of((0.0, 0.0, 1.0, -2.0))
+    np.testing.assert_allclose(np.abs(found), 1.0, rtol=1e-12)
+    # What is left is stable with a stable inverse: it is its own outer factor.
+    rest = plant / found
+    np.testing.assert_allclose(rest, -outer_factor(np.abs(plant)), rtol=1e-9)
+    angle = np.unwrap(np.angle(found))
+    slope = -(angle[1] - angle[0]) * POINTS / (2.0 * np.pi)
+    assert slow_delay(2, np.array([2.0])) == pytest.approx(slope, rel=1e-4)
+    pair = np.array([0.5 + 1.2j, 0.5 - 1.2j])
+    angle = np.unwrap(np.angle(inner_response(1, pair, POINTS)))
+    slope = -(angle[1] - angle[0]) * POINTS / (2.0 * np.pi)
+    assert slow_delay(1, pair) == pytest.approx(slope, rel=1e-4)
 
 
 def test_a_white_disturbance_cannot_be_foreseen():
@@ -73,7 +89,7 @@ def test_a_zero_outside_the_circle_raises_it_by_the_known_factor(zero):
     factor = 1.0 + a**2 * (1.0 - b**2) / (1.0 - a * b) ** 2
     delayed = least(ar1(a), 0.0, W)
     assert delayed == pytest.approx(1.0, rel=1e-9)
-    found = least(ar1(a), 0.0, response((0.0, 1.0, -zero)))
+    found = least(ar1(a), 0.0, inner_of((0.0, 1.0, -zero)))
     assert found == pytest.approx(factor, rel=1e-8)
 
 
@@ -129,7 +145,7 @@ PLANTS = {
 def test_it_is_cheap_control_lqg(name, variance):
     model = ((0.0, 1.0, 0.3), (1.0, -1.9, 0.905))
     spectrum = 0.02 * np.abs(response(*model)) ** 2
-    found = least(spectrum, variance, response(*PLANTS[name]))
+    found = least(spectrum, variance, inner_of(PLANTS[name][0]))
     priced = [
         lqg(PLANTS[name], model, 0.02, variance, effort) for effort in (1e-5, 1e-9)
     ]
@@ -138,8 +154,8 @@ def test_it_is_cheap_control_lqg(name, variance):
 
 
 def test_less_noise_less_error():
-    plant = response(*PLANTS["zeros outside"])
-    errors = [least(ar1(0.98), variance, plant) for variance in (10.0, 1.0, 0.1, 0.0)]
+    inner = inner_of(PLANTS["zeros outside"][0])
+    errors = [least(ar1(0.98), variance, inner) for variance in (10.0, 1.0, 0.1, 0.0)]
     assert np.all(np.diff(errors) < 0.0)
 
 
@@ -154,7 +170,7 @@ def drawn():
 def test_the_best_controller_in_a_loop_reaches_it(drawn):
     numerator, denominator = PLANTS["zeros outside"]
     plant = response(numerator, denominator)
-    T = best_response(ar1(0.98), 4.0, inner_part(plant))
+    T = best_response(ar1(0.98), 4.0, inner_of(numerator))
     predicted = sum(error_shares(T, ar1(0.98), 4.0))
     taps = np.fft.ifft(T / plant).real
     assert np.max(np.abs(taps[400:])) < 1e-9 * np.max(np.abs(taps))
@@ -198,7 +214,7 @@ def test_no_other_linear_controller_beats_it(drawn):
 
 def test_one_controller_for_several_disturbances():
     spectra = np.stack([ar1(0.99, 1.0), ar1(0.6, 10.0), ar1(0.9, 0.01)])
-    inner = inner_part(response(*PLANTS["zeros outside"]))
+    inner = inner_of(PLANTS["zeros outside"][0])
 
     def errors(T):
         return np.array([sum(error_shares(T, s, 0.5)) for s in spectra])
