@@ -1,16 +1,19 @@
 """The limit of linear control for a loop and its references, and how near it comes.
 
-The plant is the stage linearised (``linear_plant``) with the gain that fits the loop's
-own runs. The disturbance is all that this leaves of those runs, d = y - P u: what
-hysteresis, creep, drift and the study's own disturbance do. It is taken from the runs
-that are judged, noise included, because noise that reaches the voltage shakes a
-hysteresis and makes another disturbance than a quiet run does; for a controller that
-shakes it otherwise it would be another one.
+The plant is the stage linearised (``linear_plant``) with the gain with which it answers
+what noise makes of the voltage in the loop's own runs (``felt_gain``). The disturbance
+is all that this leaves of those runs, d = y - P u: what hysteresis, creep, drift and
+the study's own disturbance do. It is taken from the runs that are judged, noise
+included, because noise that reaches the voltage shakes a hysteresis and makes another
+disturbance than a quiet run does. A controller that shakes it otherwise meets another
+one; ``attained`` says how much that matters.
 
 What one linear filter of the reference makes of all references is foretold, and with
-full preview costs nothing; so the gain of P hardly matters: what it leaves wrong is
-foretold. The rest, known by its spectrum at a stated resolution, is what feedback is
-for, and ``wiener`` has the least that it can leave.
+full preview costs nothing. The rest, known by its spectrum at a stated resolution, is
+what feedback is for, and ``wiener`` has the least that it can leave: for each reference
+alone, a controller made for it, and for all of them, the one controller with the least
+geometric mean. The first is the limit; the second is no lower bound for one reference,
+but what a loop with one set of gains can be held against.
 
 Not in the limit: a price on voltage, limits of the actuator, plants other than this
 one. A controller that is no linear one, or that knows the reference's period, may do

@@ -27,9 +27,9 @@ Theory, 1970, chapter 6), against which Harris' index judges loops (Can. J. Chem
 67 (1989) 856-861).
 
 All functions work on a grid of N points around the unit circle, z = exp(2 pi i k / N),
-N even, where multiplying by 1/z delays by a sample. V comes from the cepstrum; nothing
-is fitted, and no Riccati equation has to be solved for a plant whose zeros make
-it ill-conditioned.
+N even, where multiplying by 1/z delays by a sample. V comes from the cepstrum: no
+model of the disturbance is fitted and no Riccati equation solved, which vanishing
+effort makes ill-conditioned.
 """
 
 import numpy as np
