@@ -195,7 +195,7 @@ def test_tune_writes_its_results(tuned):
     assert set(names(out)) >= {
         *("result.json", "gains.toml"),
         *("tracking.png", "hysteresis.png", "convergence.png"),
-        *("stability.json", "stability.png"),
+        *("stability.json", "stability.png", "limit.json"),
     }
     assert not [name for name in names(out) if name.startswith(".")]
     assert_pictures(out, "tracking.png", "hysteresis.png", "convergence.png")

@@ -19,8 +19,8 @@ class EnsembleTable(Table):
 
     ``tune`` draws take part in the objective beside the nominal plant; margins are
     kept on these and on as many more as make ``margins``, which is cheap; on
-    ``holdout`` others the gains are judged. ``aggregate`` joins the plants of the objective: their
-    mean, the worst, or the mean of the worst ``tail`` of them (CVaR).
+    ``holdout`` others the gains are judged. ``aggregate`` joins the plants of the
+    objective: their mean, the worst, or the mean of the worst ``tail`` of them (CVaR).
     """
 
     spread: dict[str, Positive] = Field(default_factory=dict)

@@ -19,6 +19,7 @@ from ..report.console import (
     tuning_table,
 )
 from ..report.identification import write_fit
+from ..report.limit import limit_of, limit_text, write_limit
 from ..report.robustness import constraints_table, front_table
 from ..report.stability import compared, write_stability
 from ..report.tuning import write_numbers, write_results
@@ -72,6 +73,9 @@ def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> N
                 after=outcome.after,
             )
             write_stability(stability, folder, outcome.result.title)
+            bar.stage("working out the limit of linear control")
+            limit = limit_of(outcome)
+            write_limit(limit, folder, outcome.result.title)
     result = outcome.result
     console.print(tuning_table(result))
     console.print(gains_table(result))
@@ -80,6 +84,7 @@ def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> N
         console.print(constraints_table(result))
     if result.front and case.study.pareto:
         console.print(front_table(result.front, case.study.pareto.constraint))
+    console.print(limit_text(limit), soft_wrap=True)
     if result.perturbed is not None:
         console.print(perturbed_text(result.perturbed), soft_wrap=True)
     for name, why in stability.problems.items():

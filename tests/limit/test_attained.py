@@ -1,0 +1,54 @@
+"""The controller of the limit on stages: what is predicted is what it leaves."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+import piezojax as pj
+from piezojax import signals as references_of
+from piezojax.limit import attained, performance_limit
+
+RATE, DT, START, SAMPLES = 5_000.0, 2e-4, 2_500, 6_000
+NAMES = ("SIN10", "PWSW10")
+TIME = references_of.time_grid(SAMPLES * DT, RATE)
+REFERENCES = np.stack([references_of.signal(name, TIME) for name in NAMES])
+NOISE = np.random.default_rng(8).standard_normal((2, 1, SAMPLES))
+
+
+def loop_of(plant, integral):
+    controller = pj.PID(0.0, integral, 0.0, 0.0, 50.0, dt=DT)
+    limits = pj.Saturation(-200.0, 200.0)
+    return pj.Feedback(controller, plant, limits, pj.Sensor(0.012))
+
+
+def test_on_a_linear_stage_at_once():
+    draws = np.random.default_rng(3).standard_normal(SAMPLES)
+    disturbance = signal.lfilter([0.004], [1.0, -0.99], draws)
+    stage = pj.series(slope=pj.Affine(0.15), lag=pj.FirstOrderLag(5e-4, DT))
+    loop = loop_of(stage, 4000.0)
+    (found,) = attained(loop, REFERENCES, NOISE, disturbance, start=START, rounds=1)
+    report = performance_limit(loop, NAMES, REFERENCES, NOISE, disturbance, start=START)
+    shared = [one.one_controller for one in report.references.values()]
+    np.testing.assert_allclose(found.predicted, shared, rtol=1e-9)
+    # 0.7 s of noise are one draw of it.
+    np.testing.assert_allclose(found.simulated, found.predicted, rtol=0.1)
+    # The reference is followed by what was known of it: an integral lags 0.1 um.
+    assert report.references["SIN10"].tuned > 10.0 * found.simulated[0]
+
+
+def test_on_a_hysteretic_stage_once_it_has_met_its_own_disturbance():
+    model = pj.ColemanHodgdon(0.0077, 0.1167, -0.0487)
+    stage = pj.series(hysteresis=model, lag=pj.FirstOrderLag(5e-4, DT))
+    first, *_, last = attained(
+        loop_of(stage, 4000.0), REFERENCES, NOISE, start=START, rounds=3
+    )
+    np.testing.assert_allclose(last.simulated, last.predicted, rtol=0.2)
+    worst = [np.max(found.simulated / found.predicted) for found in (first, last)]
+    assert worst[1] < worst[0]
+
+
+def test_what_cannot_be_attained():
+    loop = loop_of(pj.Affine(0.15), 4000.0)
+    quiet = pj.Feedback(loop.controller, loop.plant, loop.actuator, pj.Sensor(0.0))
+    with pytest.raises(ValueError, match="without sensor noise"):
+        attained(quiet, REFERENCES, NOISE, start=START)

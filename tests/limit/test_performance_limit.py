@@ -1,0 +1,300 @@
+"""How near loops come to their limit, against what is known of them beforehand."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import signal
+
+import piezojax as pj
+from piezojax import signals as references_of
+from piezojax.limit import NEAR, LimitReport, Reached, Shares, performance_limit
+from piezojax.limit.plant import LinearPlant, linear_plant
+from piezojax.limit.reached import Curves
+from piezojax.limit.spectra import Foretelling, grid_size, spectra, windowed
+from piezojax.report.limit import limit_text, write_limit
+
+RATE, DT, START, SAMPLES = 5_000.0, 2e-4, 2_500, 15_000
+NOISE, SLOPE, MEMORY, DRIVEN = 0.012, 0.15, 0.99, 0.004
+NAMES = ("SIN10", "PWSW10")
+
+
+def loop_of(plant, integral=8000.0, noise=NOISE):
+    controller = pj.PID(0.0, integral, 0.0, 0.0, 50.0, dt=DT)
+    return pj.Feedback(controller, plant, pj.Saturation(-1e3, 1e3), pj.Sensor(noise))
+
+
+def driving(names=NAMES, draws=1, samples=SAMPLES):
+    time = references_of.time_grid(samples * DT, RATE)
+    references = np.stack([references_of.signal(name, time) for name in names])
+    random = np.random.default_rng(8)
+    return references, random.standard_normal((len(names), draws, samples))
+
+
+@pytest.fixture(scope="module")
+def disturbance():
+    draws = np.random.default_rng(3).standard_normal(SAMPLES)
+    return signal.lfilter([DRIVEN], [1.0, -MEMORY], draws)
+
+
+@pytest.fixture(scope="module")
+def linear(disturbance):
+    """A slope with one sample of delay, an integral controller, a known disturbance."""
+    found = performance_limit(
+        loop_of(pj.Affine(SLOPE)), NAMES, *driving(), disturbance, start=START
+    )
+    return found
+
+
+def riccati(variance):
+    b = variance * (1.0 - MEMORY**2) - DRIVEN**2
+    return 0.5 * (-b + np.sqrt(b**2 + 4.0 * variance * DRIVEN**2))
+
+
+def test_a_linear_loop_is_seen_as_it_is(linear, disturbance):
+    assert isinstance(linear, LimitReport)
+    assert linear.gain == pytest.approx(SLOPE, rel=0.02)
+    assert linear.delay == pytest.approx(1.0, abs=1e-9)
+    assert linear.noise_rms == pytest.approx(NOISE, rel=0.02)
+    assert linear.resolution == pytest.approx(10.0)
+    for found in linear.references.values():
+        whole = disturbance[START:].std()
+        assert found.unforeseen == pytest.approx(whole, rel=0.1)
+        # A gain 1 % wrong adds as much of the stage's own motion, all foretold.
+        assert found.unforeseen <= found.disturbance < whole + 0.02 * 5.0
+
+
+def test_the_limit_is_that_of_the_scalar_riccati_equation(linear):
+    known = np.sqrt(riccati(NOISE**2))
+    for found in linear.references.values():
+        # The drawn disturbance is not its model: 45 segments make a spectrum.
+        assert found.limit == pytest.approx(known, rel=0.06)
+        assert found.limit <= found.one_controller <= 1.03 * known
+
+
+def test_errors_and_their_shares_are_those_of_the_loop(linear, disturbance):
+    references, noise = driving()
+    # The error of y(k + 1) = SLOPE u(k) + d(k), u an integral of r - z.
+    loop = [1.0, 8000.0 * DT * SLOPE - 1.0]
+    for i, found in enumerate(linear.references.values()):
+        heard = signal.lfilter([0.0, 1.0 + loop[1]], loop, NOISE * noise[i, 0])
+        left = signal.lfilter([0.0, 1.0, -1.0], loop, disturbance)
+
+        def rms(error):
+            return np.sqrt(np.mean(error[START:] ** 2))
+
+        shares = found.tuned_shares
+        assert shares.noise == pytest.approx(rms(heard), rel=0.03)
+        assert shares.unforeseen == pytest.approx(rms(left), rel=0.15)
+        parts = shares.noise**2 + shares.unforeseen**2 + shares.foreseen**2
+        assert np.sqrt(parts) == pytest.approx(found.tuned, rel=0.05)
+        # An integral lags behind a sine by its frequency over the loop's bandwidth.
+        if i == 0:
+            lag = 2.0 * np.pi * 10.0 / (8000.0 * SLOPE)
+            swing = references[0].std()
+            expected = swing * lag / np.hypot(1.0, lag)
+            assert shares.foreseen == pytest.approx(expected, rel=0.05)
+            assert found.exceeding == "foreseen"
+        assert found.over > NEAR
+
+
+def test_a_better_controller_comes_nearer(linear, disturbance):
+    # Of a constant reference nothing has to be followed: what is left is feedback.
+    references, noise = driving()
+    flat = np.full_like(references, 5.0)
+    found = {
+        integral: performance_limit(
+            loop_of(pj.Affine(SLOPE), integral),
+            NAMES,
+            flat,
+            noise,
+            disturbance,
+            start=START,
+        )
+        for integral in (8000.0, 40000.0)
+    }
+    good, keen = found[8000.0], found[40000.0]
+    assert 1.0 < good.over < 1.2
+    assert good.near == good.near_one_controller == 2
+    assert good.over_one_controller < good.over
+    assert keen.over > 2.0
+    assert keen.near == 0
+    assert {one.exceeding for one in keen.references.values()} == {"noise"}
+    # The limit is the disturbance's and the noise's, not the loop's.
+    for name in NAMES:
+        limits = [report.references[name].limit for report in (good, keen)]
+        assert limits[1] == pytest.approx(limits[0], rel=0.06)
+
+
+def test_a_hysteretic_stage(tmp_path):
+    model = pj.ColemanHodgdon(0.0077, 0.1167, -0.0487)
+    stage = pj.series(hysteresis=model, lag=pj.FirstOrderLag(5e-4, DT))
+    references, noise = driving(draws=2, samples=5_000)
+    found = performance_limit(
+        loop_of(stage, 3000.0), NAMES, references, noise, start=START, segment=0.1
+    )
+    for one in found.references.values():
+        assert one.limit < one.one_controller < one.tuned
+        # The reference foretells most of what its hysteresis does.
+        assert 0.0 < one.unforeseen < 0.5 * one.disturbance
+        assert one.limit**2 == pytest.approx(
+            one.limit_shares.noise**2 + one.limit_shares.unforeseen**2
+        )
+    write_limit(found, tmp_path, "a stage")
+    data = json.loads((tmp_path / "limit.json").read_text(encoding="utf-8"))
+    assert data["references_within"] == found.near
+    row = data["per_reference"]["SIN10"]
+    assert row["tuned_rms_um"] / row["limit_rms_um"] == row["tuned_over_limit"]
+    assert (tmp_path / "limit.png").read_bytes().startswith(b"\x89PNG")
+    text = limit_text(found)
+    assert f"{found.near} of 2 references within 1.5x" in text
+    assert "note: on SIN10" in text
+
+
+def test_what_a_plant_remembers_or_never_moves_is_left_out():
+    class Counting(pj.System):
+        """A slope and a ramp of its own, which no voltage moves."""
+
+        def init(self, input=0.0):
+            return jnp.zeros(2)
+
+        def step(self, state, input):
+            count, ramp = state
+            return jnp.stack([count + 1.0, ramp + count]), SLOPE * input + 1e-6 * ramp
+
+    plant = linear_plant(loop_of(Counting()), 0.0, DT)
+    assert len(plant.A) == 0
+    np.testing.assert_allclose(
+        plant.response(8), SLOPE / np.exp(0.25j * np.pi * np.arange(8))
+    )
+    model = pj.ColemanHodgdon(0.0077, 0.1167, -0.0487)
+    stage = pj.series(hysteresis=model, lag=pj.FirstOrderLag(5e-4, DT))
+    # Its own input, a pole at 0, and the lag; not where on its branch it is.
+    poles = np.linalg.eigvals(linear_plant(loop_of(stage), 5.0, DT).A)
+    np.testing.assert_allclose(np.sort(poles), [0.0, np.exp(-0.4)], atol=1e-9)
+
+
+def test_what_stands_in_the_way_of_a_controller():
+    """Delays and zeros of plants written as functions of 1/z, and slow creep."""
+    moving, autoregressive = (0.0050811, -0.0036354, 0.010553), (1.6035, -0.61995)
+    dynamics = pj.ARMA(autoregressive, moving)
+    for plant, delay, zeros in (
+        (dynamics, 1, np.roots(moving)),
+        (dynamics >> pj.Delay(2), 3, np.roots(moving)),
+        (pj.ARMA(autoregressive, (0.0, 0.2, 0.1)), 2, []),
+        (pj.ARMA(autoregressive, (0.1, 0.1)), 1, []),
+        (pj.LogarithmicCreep(0.02, 0.1, 1e3, DT) >> dynamics, 1, np.roots(moving)),
+    ):
+        found = linear_plant(loop_of(plant), 0.0, DT).obstacles()
+        assert found[0] == delay
+        np.testing.assert_allclose(np.sort(found[1]), np.sort(zeros), rtol=1e-6)
+    still = LinearPlant([[0.5]], [0.0], [1.0], 0.0)
+    with pytest.raises(ValueError, match="voltage does not move"):
+        still.obstacles()
+
+
+def test_spectra_hold_the_variance():
+    random = np.random.default_rng(1)
+    drawn = random.standard_normal((2, 3, 40_000)) * np.array([[[1.0]], [[3.0]]])
+    coloured = signal.lfilter([1.0], [1.0, -0.6], drawn)
+    points = grid_size(500)
+    found = spectra(windowed(coloured, 500, points))
+    np.testing.assert_allclose(found.mean(axis=1), coloured.var(axis=(1, 2)), rtol=0.02)
+    w = np.exp(-2j * np.pi * np.arange(points) / points)
+    expected = np.abs(1.0 / (1.0 - 0.6 * w)) ** 2
+    shape = found[1] / (9.0 * expected)
+    assert np.abs(shape.reshape(64, -1).mean(axis=1) - 1.0).max() < 0.15
+
+
+def test_a_filter_of_the_reference_is_foretold_and_nothing_else():
+    time = np.arange(10_000) * DT
+    names = ("SIN1", "SIN10", "SW30", "PWSW10")
+    moving = np.stack([references_of.signal(name, jnp.asarray(time)) for name in names])
+    known = Foretelling(moving, 5_000, 250)
+    assert known.count == 10_000 - 5_000 - 250
+    # Lag, lead and slope: what a controller and a linear stage make of a reference.
+    lagging = signal.lfilter([0.05], [1.0, -0.95], moving - moving[:, :1])
+    ahead = np.concatenate([moving[:, 20:], moving[:, -20:]], axis=1)
+    signals = (lagging + 0.3 * ahead + 4.0)[:, None]
+    rest = known.unforeseen(signals)
+    whole = known.cut(signals)
+    assert np.all(rest.std(axis=2) < 1e-3 * whole.std(axis=2))
+    # Harmonics are no linear filter's work, and neither is anything of one's own.
+    other = np.stack([np.sin(2.0 * np.pi * 3.0 * 10.0 * time)] * 4)[:, None]
+    kept = known.unforeseen(
+        signals + np.array([0.0, 1.0, 0.0, 0.0])[:, None, None] * other
+    )
+    assert kept[1].std() == pytest.approx(np.sqrt(0.5), rel=0.2)
+    drawn = np.random.default_rng(4).standard_normal((4, 2, 10_000))
+    left = known.unforeseen(drawn)
+    np.testing.assert_allclose(left.std(axis=2), 1.0, atol=0.05)
+    # A reference that does not move foretells nothing.
+    still = Foretelling(np.full((4, 10_000), 5.0), 5_000, 250)
+    np.testing.assert_array_equal(still.unforeseen(signals), still.cut(signals))
+
+
+def test_what_has_no_limit():
+    references, noise = driving(samples=500)
+    loop = loop_of(pj.Affine(SLOPE))
+    with pytest.raises(ValueError, match="without sensor noise"):
+        performance_limit(
+            loop_of(pj.Affine(SLOPE), noise=0.0), NAMES, references, noise
+        )
+    with pytest.raises(ValueError, match="one axis only"):
+        performance_limit(loop, NAMES, references[..., None], noise)
+    with pytest.raises(ValueError, match="a run diverges"):
+        performance_limit(loop, NAMES, references, np.nan * noise)
+    integrating = pj.StateSpace([[1.0]], [[1.0]], [[1.0]], [[0.0]], DT)
+    with pytest.raises(ValueError, match="known for stable plants"):
+        linear_plant(loop_of(Scalar(integrating)), 0.0, DT)
+    with pytest.raises(ValueError, match="does not move as its linear model"):
+        performance_limit(loop_of(pj.Affine(SLOPE), 0.0), NAMES, references, noise)
+
+
+class Scalar(pj.System):
+    """A model of vectors as a plant of numbers."""
+
+    model: pj.StateSpace
+
+    def init(self, input=0.0):
+        return jnp.zeros(1)
+
+    def step(self, state, input):
+        state, output = self.model.step(state, jnp.stack([input]))
+        return state, output[0]
+
+
+def reached(tuned, limit, shares):
+    least = Shares(noise=0.6 * limit, unforeseen=0.8 * limit)
+    return Reached(tuned, limit, 1.1 * limit, 0.3, 0.02, 200.0, shares, least)
+
+
+def test_the_words_name_what_exceeds():
+    rows = {
+        "A": reached(4.0, 2.0, Shares(3.9, 0.5, 0.7)),
+        "B": reached(4.0, 2.0, Shares(1.2, 3.7, 0.7)),
+        "C": reached(4.0, 2.0, Shares(1.2, 1.6, 3.4)),
+        "D": reached(2.2, 2.0, Shares(1.5, 1.6)),
+        "E": reached(1.0, 2.0, None),
+        "F": reached(4.0, 2.0, None),
+    }
+    nothing = Curves(np.zeros(0), np.zeros((6, 0)), 1.0, *np.zeros((2, 6, 0)))
+    report = LimitReport(rows, DT, NOISE, 10.0, SLOPE, 1.0, 1.1, nothing)
+    assert report.near == 2
+    assert report.over == pytest.approx((2.0**4 * 1.1 * 0.5) ** (1.0 / 6.0))
+    text = limit_text(report)
+    assert "on A 2.00x the loop lets through more sensor noise" in text
+    assert "on B 2.00x the loop cancels too little" in text
+    assert "on C 2.00x the loop leaves what a linear filter" in text
+    assert "on F 2.00x the loop is too far from linear" in text
+    assert "note: E 0.50x: below the limit" in text
+    assert "D" not in text.split("\n", 1)[1]
+
+
+def test_what_went_wrong_is_said(tmp_path):
+    write_limit("the stage sleeps", tmp_path)
+    data = json.loads((tmp_path / "limit.json").read_text(encoding="utf-8"))
+    assert data == {"problem": "the stage sleeps"}
+    assert not (tmp_path / "limit.png").exists()
+    assert limit_text("the stage sleeps").endswith("linear control: the stage sleeps")
