@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -57,7 +57,8 @@ class Ensemble:
 class Case:
     """A study with its files read, its plant fitted, its loop and search space built.
 
-    ``fit`` is there if the plant was fitted to a record.
+    ``fit`` is there if the plant was fitted to a record. ``plants`` are those that a
+    sweep puts in the place of the loop's own, by name.
     """
 
     study: Study
@@ -66,6 +67,7 @@ class Case:
     space: Space
     fit: Fit | None = None
     ensemble: Ensemble | None = None
+    plants: Mapping[str, System] = field(default_factory=dict)
 
 
 def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
@@ -92,8 +94,9 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     _check_role(controller, seen, "controller", "an Observation to a command")
     loop = Feedback(controller, plant, _actuator(study), _sensor(study))
     loop, space = _search_space(study, loop)
-    _check_rates(study, loop)
-    return Case(study, path.stem, loop, space, fit, _ensemble(study))
+    _check_rates(study, loop, "the controller or plant")
+    plants = _swept_plants(study, zero)
+    return Case(study, path.stem, loop, space, fit, _ensemble(study), plants)
 
 
 def read(path: str | Path, seed: int | None = None) -> Case:
@@ -118,6 +121,16 @@ def _plant(study: Study, folder: Path) -> tuple[System, Fit | None]:
     train = slice(*wanted.train) if wanted.train else None
     fit = identify(record, wanted.model, train=train)
     return fit.system, fit
+
+
+def _swept_plants(study: Study, zero: Any) -> dict[str, System]:
+    found = {}
+    for name in study.sweep.plants if study.sweep else ():
+        where = f"sweep.plants.{name}"
+        found[name] = _choice({"catalog": name}, where, Path(), PLANTS, study.rate)
+        _check_role(found[name], zero, where, "a voltage to a displacement")
+        _check_rates(study, found[name], where)
+    return found
 
 
 def _ensemble(study: Study) -> Ensemble | None:
@@ -224,12 +237,11 @@ def _check_role(system: System, example: Any, where: str, role: str) -> None:
         ) from None
 
 
-def _check_rates(study: Study, loop: Feedback) -> None:
-    for dt in static_fields(loop, "dt"):
+def _check_rates(study: Study, system: System, what: str) -> None:
+    for dt in static_fields(system, "dt"):
         if not np.isclose(dt, study.dt, rtol=1e-9, atol=0.0):
             raise ValueError(
-                f"rate is {study.rate:g} Hz, but the controller or plant was made for "
-                f"{1.0 / dt:g} Hz"
+                f"rate is {study.rate:g} Hz, but {what} was made for {1.0 / dt:g} Hz"
             )
 
 

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 import numpy as np
 from pydantic import (
     BaseModel,
-    ConfigDict,
     Field,
     ValidationError,
     field_validator,
@@ -20,17 +19,8 @@ from .. import motions, signals
 from ..identify import chain
 from ..optimisers import METHODS
 from ..space import Transform
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-
-
-class Table(BaseModel):
-    """A table of a study: nothing in it is guessed, nothing unknown is passed over."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+from .sweep_table import SweepTable, quoted
+from .table import Finite, NotNegative, Positive, Table, one_of
 
 Each = TypeVar("Each")
 ByAxis = Each | tuple[Each, ...]
@@ -201,18 +191,12 @@ class Study(Table):
     optimiser: OptimiserTable = OptimiserTable()
     ensemble: EnsembleTable | None = None
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
+    sweep: SweepTable | None = None
 
     @field_validator("parameters", mode="before")
     @classmethod
     def _quoted(cls, tables: Any) -> Any:
-        for key, table in tables.items() if isinstance(tables, dict) else ():
-            if isinstance(table, dict) and any(
-                isinstance(value, dict) for value in table.values()
-            ):
-                raise ValueError(
-                    f'a path must stand in quotes, as in "{key}.{next(iter(table))}"'
-                )
-        return tables
+        return quoted(tables)
 
     @model_validator(mode="after")
     def _sampled(self) -> "Study":
@@ -251,6 +235,17 @@ class Study(Table):
                 f"objective.aggregate is {self.objective.aggregate!r}, "
                 "it must be 'mean_square'"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _swept(self) -> "Study":
+        known = (*self.references.tune, *self.references.unseen)
+        for name in self.sweep.references if self.sweep else ():
+            if name not in known:
+                raise ValueError(
+                    f"sweep.references: {name} is none of the study's references, "
+                    f"{', '.join(known)}"
+                )
         return self
 
     @model_validator(mode="after")
@@ -305,13 +300,6 @@ class Study(Table):
         return {"": reference}
 
 
-def one_of(name: str, allowed: Any) -> str:
-    """Return ``name``; raise ValueError, listing ``allowed``, if it is not in there."""
-    if not isinstance(name, str) or name not in allowed:
-        raise ValueError(f"{name!r} is unknown; there are {', '.join(allowed)}")
-    return name
-
-
 def validated(kind: type[Any], data: Any, where: str) -> Any:
     """Return ``data`` as ``kind``; one line naming key, value and what is allowed."""
     try:
@@ -335,6 +323,9 @@ def _first_line(error: ValidationError, kind: type[BaseModel], where: str) -> st
             field = getattr(table, "model_fields", {}).get(part)
             inner = get_args(table)[-1] if get_args(table) else Bounds
             table = field.annotation if field else inner
+            optional = [t for t in get_args(table) if hasattr(t, "model_fields")]
+            if type(None) in get_args(table) and optional:
+                table = optional[0]
         known = list(getattr(table, "model_fields", Bounds.model_fields))
         near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
