@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from .._runtime import simulate_side_by_side
 from ..study import Case
 from .local import Done
 from .simulator import Simulator
@@ -89,7 +90,8 @@ def cluster_chunks(
                 )
             if not running:
                 return
-            done, running = finished(running, return_when="FIRST_COMPLETED")
+            with client.as_current():
+                done, running = finished(running, return_when="FIRST_COMPLETED")
             for future in done:
                 yield future.result()
 
@@ -111,6 +113,7 @@ def simulate_chunk(case: bytes, chunk: int) -> Done:
     if key not in _simulators:
         import cloudpickle
 
+        simulate_side_by_side()
         _simulators.clear()
         _simulators[key] = Simulator(cloudpickle.loads(case))
     begin = time.perf_counter()
