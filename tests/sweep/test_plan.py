@@ -4,7 +4,7 @@ import copy
 
 import numpy as np
 import pytest
-from sweep.conftest import GRID, PARAMETERS
+from swept_studies import GRID, PARAMETERS
 
 from piezojax.sweep import read_swept
 from piezojax.sweep.dataset import boxes
