@@ -12,8 +12,7 @@ from swept_studies import GRID
 
 import piezojax as pj
 from piezojax.paths import replace
-from piezojax.study import build, load, shipped
-from piezojax.study.sweep_table import SweepTable
+from piezojax.report.sweep import panels
 from piezojax.sweep import run_sweep
 from piezojax.sweep.__main__ import main
 from piezojax.sweep.local import local_chunks
@@ -164,42 +163,39 @@ def test_sensitivity_is_that_of_the_stability_report(case_of):
     assert np.isinf(lost).all()
 
 
+AXES = {
+    "rate": 500.0,
+    "axes": {"names": ["Z", "Rx", "Ry"], "units": ["um", "urad", "urad"]},
+    "plant": {"catalog": "p558"},
+    "actuator": {"lower": [-60.0, -300.0, -300.0], "upper": [60.0, 300.0, 300.0]},
+    "sensor": {"noise_rms": [0.0008, 0.013, 0.013]},
+    "controller": {"catalog": "p558_pid"},
+    "references": {"tune": ["Z:SIN5 Rx:SIN10"], "duration": 0.4, "settle": 0.2},
+    "parameters": {"controller.Z.integral": {"lower": 10.0, "upper": 500.0}},
+}
+
+
 @pytest.mark.slow
-def test_several_axes_have_a_dimension():
-    study = load(shipped("three_dof_sliding_mode"))
-    axes = len(study.axes.names)
-    path = next(iter(study.parameters))
-    table = SweepTable(
-        references=study.references.tune[:1],
-        parameters={path: {"values": [study_value(study, path)]}},
-    )
-    short = study.references.model_copy(update={"duration": 0.02, "settle": 0.01})
-    study = study.model_copy(update={"sweep": table, "references": short})
-    case = build(study, shipped("three_dof_sliding_mode"))
-    found = pj.sweep(case)
+def test_several_axes_have_a_dimension(case_of, tmp_path):
+    table = {"every": 10, "parameters": {"controller.Z.integral": {"values": [100.0]}}}
+    case = case_of(table, **AXES)
+    found = pj.sweep(case, out=tmp_path / "axes")
     assert found is not None
     assert found.rms_error.dims[-2:] == ("reference", "axis")
-    assert found.axis_unit.values.tolist() == list(study.axes.units)
+    assert found.displacement.dims[-2:] == ("axis", "time")
+    assert found.axis_unit.values.tolist() == ["um", "urad", "urad"]
     data = make_data(case).holdout
-    signals = Signals(data.references[:1], data.noise[:1])
-    place = {path: float(found[path][0])}
-    start = round(0.01 * study.rate)
-    judge = jax.jit(lambda loop: evaluate(lambda x: x, loop, signals, start))
-    figures = judge(replace(case.loop, place))
-    assert figures.rms_error.shape[-1] == axes
-    np.testing.assert_allclose(
-        found.rms_error[0, 0], figures.rms_error[:, 0], rtol=1e-12
+    signals = Signals(data.references, data.noise)
+    judge = jax.jit(lambda loop: evaluate(lambda x: x, loop, signals, 100))
+    figures = judge(replace(case.loop, {"controller.Z.integral": 100.0}))
+    np.testing.assert_allclose(found.rms_error[0, 0], figures.rms_error[:, 0], 1e-12)
+    np.testing.assert_array_equal(
+        found.followed[0], np.asarray(data.references)[0, ::10].T
     )
-    bad = study.model_copy(
-        update={"sweep": table.model_copy(update={"metrics": ("sensitivity_peak",)})}
-    )
+    # A picture has a panel for each axis, each in its own unit.
+    assert [panel.unit for panel in panels(found, "rms_error")] == ["nm", *["nrad"] * 2]
     with pytest.raises(ValueError, match="for a stage with one axis"):
-        Simulator(build(bad, shipped("three_dof_sliding_mode")))
-
-
-def study_value(study, path):
-    bound = study.parameters[path]
-    return float(np.sqrt(bound.lower * bound.upper))
+        Simulator(case_of(table | {"metrics": ["sensitivity_peak"]}, **AXES))
 
 
 def test_shards_merge_into_the_whole_bit_for_bit(case_of, tmp_path):
