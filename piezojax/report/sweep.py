@@ -11,7 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm, Normalize, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import FormatStrFormatter, LogLocator
 from rich.table import Table
 
 from ..study.sweep_table import METRICS
@@ -67,7 +67,10 @@ def metric_figure(dataset: "Dataset", name: str) -> Figure:
     """
     shown = panels(dataset, name)[:MOST_PANELS]
     axes = parameters(dataset)
-    title = f"{fill(dataset.attrs['title'], 48)}\n{fill(label_of(dataset, name), 56)}"
+    title = "\n".join(
+        fill(text, 60, break_on_hyphens=False)
+        for text in (dataset.attrs["title"], label_of(dataset, name))
+    )
     if dataset.attrs["method"] != "grid" or len(axes) > 2:
         return _parallel(shown, _flattened(dataset, axes), title)
     columns = min(len(shown), 3)
@@ -83,7 +86,7 @@ def metric_figure(dataset: "Dataset", name: str) -> Figure:
             ax.set_title(panel.title)
     for ax in places[len(shown) :]:
         ax.remove()
-    picture.suptitle(title)
+    picture.suptitle(title, fontsize=10.0)
     return picture
 
 
@@ -170,7 +173,9 @@ def _kept(values: np.ndarray) -> np.ndarray:
     finite = np.where(np.isfinite(values), values, np.nan)
     if not np.isfinite(finite).any():
         return finite
-    return np.where(finite > _BEYOND * np.nanmedian(finite), np.nan, finite)
+    middle = np.nanmedian(finite)
+    far = (finite > _BEYOND * middle) if middle > 0.0 else False
+    return np.where(far, np.nan, finite)
 
 
 def _scale(values: np.ndarray) -> Normalize:
@@ -201,7 +206,7 @@ def _heat_map(picture: Figure, ax: Axes, panel: Panel, axes: list[Parameter]) ->
     ax.set(xlabel=across.label, ylabel=up.label)
     ax.grid(False)
     _bar(picture, ax, mesh, panel.unit)
-    if np.isfinite(values).any() and np.nanmin(values) < np.nanmax(values):
+    if np.sum(values == np.nanmin(values, initial=np.inf)) == 1:
         row, column = np.unravel_index(np.nanargmin(values), values.shape)
         ax.plot(
             across.values[column],
@@ -231,7 +236,8 @@ def _bar(
     bar = picture.colorbar(mapped, ax=ax)
     bar.set_label("; ".join(part for part in (unit, note) if part))
     if isinstance(mapped.norm, LogNorm):
-        bar.set_ticks(LogLocator(subs=(1.0, 2.0, 5.0)), format="%g")
+        bar.ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
         bar.minorticks_off()
 
 
@@ -281,7 +287,7 @@ def _parallel(shown: list[Panel], axes: list[Parameter], title: str) -> Figure:
             fontweight="normal",
             pad=20,
         )
-    picture.suptitle(title)
+    picture.suptitle(title, fontsize=10.0)
     return picture
 
 
@@ -314,7 +320,13 @@ def _dress(ax: Axes, axes: list[Parameter]) -> None:
             (-0.035, axis.values.min(), "top"),
             (1.035, axis.values.max(), "bottom"),
         ):
-            ax.text(place, height, f"{value:.3g}", ha="center", va=where, fontsize=8.0)
+            ax.text(place, height, _number(value), ha="center", va=where, fontsize=8.0)
+
+
+def _number(value: float) -> str:
+    if not 1e-3 <= abs(value) < 1e6:
+        return f"{value:.3g}"
+    return np.format_float_positional(value, precision=3, fractional=False, trim="-")
 
 
 def _broken(label: str) -> str:
@@ -336,7 +348,7 @@ def best_table(path: Path) -> Table:
         for axis in axes:
             table.add_column(axis.label, justify="right")
         table.add_column("least", justify="right")
-        table.add_column("points lost", justify="right")
+        table.add_column("diverged", justify="right")
         for panel in panels(dataset, name):
             values = _kept(panel.values)
             lost = int(np.isnan(values).sum())

@@ -1,10 +1,13 @@
 """Chunks on a cluster of Dask workers: the same program in other processes."""
 
 import hashlib
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
+
+import jax
 
 from .._runtime import simulate_side_by_side
 from ..study import Case
@@ -51,6 +54,7 @@ def client_of(where: str) -> Iterator["Client"]:
             n_workers=int(where),
             threads_per_worker=1,
             processes=True,
+            silence_logs=logging.ERROR,
             dashboard_address=None,  # pyright: ignore[reportArgumentType]
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
@@ -116,6 +120,7 @@ def simulate_chunk(case: bytes, chunk: int) -> Done:
         simulate_side_by_side()
         _simulators.clear()
         _simulators[key] = Simulator(cloudpickle.loads(case))
+        _simulators[key].compile(jax.devices()[0])
     begin = time.perf_counter()
     arrays = _simulators[key].chunk(chunk)
     assert arrays is not None

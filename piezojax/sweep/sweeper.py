@@ -185,7 +185,7 @@ def _simulate(
         running = local_chunks(simulator, todo, devices)
     else:
         running = cluster_chunks(client, simulator, todo)
-    begin = time.perf_counter()
+    begin = first = time.perf_counter()
     with running as chunks:
         for number, (chunk, arrays, seconds) in enumerate(chunks, start=1):
             store.write(chunk, arrays, seconds)
@@ -193,7 +193,12 @@ def _simulate(
             swept.simulated += 1
             swept.lane_steps += (stop - start) * simulator.lane_steps
             swept.core_s += seconds
-            each = (time.perf_counter() - begin) / number
+            now = time.perf_counter()
+            each = (now - begin) / number
+            if number == 1:
+                first = now  # until then workers of a cluster start and compile
+            else:
+                each = (now - first) / (number - 1)
             progress.advance(math.nan, remaining(each * (len(todo) - number)))
 
 
