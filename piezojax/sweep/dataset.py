@@ -10,7 +10,8 @@ import numpy as np
 
 from ..files import written_elsewhere
 from ..study.sweep_table import SENSITIVITY
-from .simulator import TRAJECTORIES, Simulator
+from .plan import TRAJECTORIES
+from .simulator import Simulator
 from .store import RESULT, Store
 
 LONG_NAMES = {

@@ -29,6 +29,9 @@ MOST_CHUNKS = 4096
 FEWEST_CHUNKS = 16
 """Small sweeps, too, keep several cores busy."""
 
+TRAJECTORIES = ("displacement", "voltage")
+"""Signals that are kept at every N-th sample if a study asks for them."""
+
 UNITS = {
     "cutoff": "rad/s",
     "noise_rms": "um",
@@ -71,21 +74,17 @@ class Plan:
             self.shape = (table.samples,)
             self._sampled = _samples(table, self.axes, study.seed)
         self.points = math.prod(self.shape)
-        self.width = min(BLOCK, self.points)
-        self.chunk = self._chunk(study, table)
+        most = max(1, int(CHUNK_BYTES / bytes_of_point(study)))
+        self.width = min(BLOCK, self.points, most)
+        self.chunk = self._chunk(study, table, most)
         self.chunks = -(-self.points // self.chunk)
 
-    def _chunk(self, study: Study, table: SweepTable) -> int:
-        runs = runs_of_point(study)
-        samples = round(study.references.duration * study.rate)
-        kept = len(table.metrics)
-        if table.every:
-            kept += 2 * -(-samples // table.every)
-        most = CHUNK_BYTES / (8 * runs * kept * study.axis_count)
+    def _chunk(self, study: Study, table: SweepTable, most: int) -> int:
         if table.chunk is not None:
             wanted = table.chunk
         else:
-            wanted = max(CHUNK_LANE_STEPS / (runs * samples), self.points / MOST_CHUNKS)
+            lane_steps = runs_of_point(study) * samples_of(study)
+            wanted = max(CHUNK_LANE_STEPS / lane_steps, self.points / MOST_CHUNKS)
             wanted = min(wanted, most, self.points / FEWEST_CHUNKS)
         return max(1, math.ceil(wanted / self.width)) * self.width
 
@@ -147,6 +146,20 @@ def runs_of_point(study: Study) -> int:
     """Return how many simulations a point takes."""
     plants = len(swept(study).plants) or 1
     return plants * len(references_of(study)) * study.holdout_draws
+
+
+def samples_of(study: Study) -> int:
+    """Return the samples of a simulation."""
+    return round(study.references.duration * study.rate)
+
+
+def bytes_of_point(study: Study) -> int:
+    """Return what is kept of a point."""
+    table = swept(study)
+    kept = len(table.metrics)
+    if table.every:
+        kept += len(TRAJECTORIES) * -(-samples_of(study) // table.every)
+    return 8 * runs_of_point(study) * kept * study.axis_count
 
 
 def _axes(study: Study, table: SweepTable) -> list[Axis]:

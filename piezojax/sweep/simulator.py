@@ -21,16 +21,13 @@ from ..study.sweep_table import SENSITIVITY
 from ..system import Feedback, LoopSample, System, loop_inputs
 from ..tune.data import make_data
 from ..tune.objective import with_plant
-from .plan import Plan, plants_of, references_of, swept
+from .plan import TRAJECTORIES, Plan, plants_of, references_of, swept
 
 LINES = 400
 """Frequencies, evenly on a logarithmic scale, at which sensitivity is looked at."""
 
 LOWEST = 1.0  # Hz
 _OUTSIDE = 1e-6  # of the unit circle: hysteresis remembers at 1, to rounding
-
-TRAJECTORIES = ("displacement", "voltage")
-"""Signals that are kept at every N-th sample if a study asks for them."""
 
 
 class Metered(System):
