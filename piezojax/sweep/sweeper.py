@@ -26,6 +26,10 @@ DEFAULT = "sweep_p753"
 """Name of the study that is swept when none is given."""
 
 
+ATTEMPTS = 3
+"""How often damaged chunks are done again."""
+
+
 @dataclass
 class Swept:
     """What a run of a sweep has done.
@@ -147,7 +151,7 @@ def run_sweep(
         return swept
     begin = time.perf_counter()
     todo = store.missing(share)
-    while True:
+    for _ in range(ATTEMPTS):
         _simulate(swept, store, todo, client, progress)
         swept.wall_s = time.perf_counter() - begin
         if not store.there(range(plan.chunks)):
@@ -160,6 +164,7 @@ def run_sweep(
             continue
         swept.finished = True
         return swept
+    raise ValueError(f"{folder}: chunks {todo[:5]} keep being damaged; see to the disk")
 
 
 def _simulate(
