@@ -12,6 +12,8 @@ command does. Figures of the JSON file:
                            after the sweep, half of them each
     predicted_s            lane_steps at that speed, divided by the cores
     simulating_s, ratio    time from the first chunk to the last, over predicted_s
+    cpu_ratio              processor time of a sample, over that of such a block: on a
+                           machine with other work the fairer of the two (Linux)
     wall_s, wall_ratio     the whole command, Python's start and compiling included
     lane_steps_per_s       lane_steps / simulating_s, all cores together
     rss_mb                 resident memory over time, [s since the first chunk was
@@ -73,7 +75,7 @@ def write_study(path, samples, **sweep):
 
 
 def block_seconds(repeats):
-    """Times of single blocks of the throughput benchmark, on the core we are on."""
+    """Times of blocks of the throughput benchmark on one core: wall, processor."""
     from piezojax_engine import PiezojaxEngine
 
     engine = PiezojaxEngine()
@@ -81,34 +83,37 @@ def block_seconds(repeats):
     engine.run()
     found = []
     for _ in range(repeats):
-        begin = time.perf_counter()
+        begin = time.perf_counter(), time.process_time()
         engine.run()
-        found.append(time.perf_counter() - begin)
+        found.append((time.perf_counter() - begin[0], time.process_time() - begin[1]))
     return found
 
 
-def resident_mb(process):
+def state_of(process):
+    """Resident memory in MB and processor time in s, so far, of a process."""
+    folder = Path(f"/proc/{process.pid}")
     try:
-        status = Path(f"/proc/{process.pid}/status").read_text()
-    except OSError:
+        pages = int((folder / "statm").read_text().split()[1])
+        ticks = (folder / "stat").read_text().rpartition(")")[2].split()[11:13]
+    except (OSError, IndexError):
         return None
-    for line in status.splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1]) * 1024 / 1e6
-    return None
+    memory = pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    return memory, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
 
 
 def run_command(study, out, every_s=0.05):
-    """Run the sweep and watch its memory; returns seconds and the memory over time."""
+    """Run the sweep and watch it; returns seconds, and [time, MB, s of processor]."""
     begin = time.perf_counter()
     process = subprocess.Popen([*COMMAND, study, "--out", out, "--quiet"])
-    memory = []
+    watched = []
     while process.poll() is None:
-        memory.append((time.time(), resident_mb(process)))
+        state = state_of(process)
+        if state and state[0] > 0.0:
+            watched.append((time.time(), *state))
         time.sleep(every_s)
     if process.returncode:
         raise SystemExit(f"the sweep ended with status {process.returncode}")
-    return time.perf_counter() - begin, [(t, mb) for t, mb in memory if mb]
+    return time.perf_counter() - begin, watched
 
 
 def chunks_of(out):
@@ -136,16 +141,21 @@ def main_sweep(folder, samples):
     workers, references = cores(), len(signals.THESIS)
     blocks = block_seconds(10)
     study = write_study(folder / "bar.toml", samples)
-    wall, memory = run_command(study, folder / "bar")
+    wall, watched = run_command(study, folder / "bar")
     blocks += block_seconds(10)
-    block = statistics.median(blocks)
+    block, block_cpu = (
+        statistics.median(column) for column in zip(*blocks, strict=True)
+    )
     steps = samples * references * RATE
     predicted = steps / (BLOCK * RATE) * block / workers
     chunks = chunks_of(folder / "bar")
     simulating = simulating_seconds(chunks, workers)
     first, last = chunks[0][0], chunks[-1][0]
-    during = [(t - first, mb) for t, mb in memory if first <= t <= last]
-    half = len(during) // 2
+    during = [row for row in watched if first <= row[0] <= last]
+    memory, half = [row[1] for row in during], len(during) // 2
+    # What the processor did between the first watched moment and the last.
+    share = (during[-1][0] - during[0][0]) / simulating
+    cpu_each = (during[-1][2] - during[0][2]) / (share * steps)
     core_s = sum(seconds for _, seconds in chunks)
     each = core_s / (samples * references)
     return {
@@ -154,17 +164,20 @@ def main_sweep(folder, samples):
         "cores": workers,
         "block_s": block,
         "block_ns_per_lane_step": 1e9 * block / (BLOCK * RATE),
+        "block_cpu_ns_per_lane_step": 1e9 * block_cpu / (BLOCK * RATE),
         "predicted_s": predicted,
         "simulating_s": simulating,
         "ratio": simulating / predicted,
+        "cpu_ns_per_lane_step": 1e9 * cpu_each,
+        "cpu_ratio": cpu_each / (block_cpu / (BLOCK * RATE)),
+        "load_average": os.getloadavg()[0],
         "wall_s": wall,
         "wall_ratio": wall / predicted,
         "lane_steps_per_s": steps / simulating,
         "chunks": len(chunks),
-        "rss_mb": [(round(t, 2), round(mb, 1)) for t, mb in during],
-        "rss_peak_mb": max(mb for _, mb in memory),
-        "rss_growth": max(mb for _, mb in during[half:])
-        / max(mb for _, mb in during[:half]),
+        "rss_mb": [[round(t - first, 2), round(mb, 1)] for t, mb, _ in during],
+        "rss_peak_mb": max(mb for _, mb, _ in watched),
+        "rss_growth": max(memory[half:]) / max(memory[:half]),
         "cost": {
             "core_s_per_simulation": each,
             "core_hours_of_1e9": in_core_hours(1e9 * each),
