@@ -77,6 +77,7 @@ from .serial import save as save
 from .stability import MultiAxisReport as MultiAxisReport
 from .stability import stability_report as stability_report
 from .study import Case as Case
+from .sweep import sweep as sweep
 from .system import Affine as Affine
 from .system import Delay as Delay
 from .system import Feedback as Feedback

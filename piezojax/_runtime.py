@@ -68,6 +68,21 @@ def configure() -> None:
         _use_cache(folder, jaxlib)
 
 
+def simulate_side_by_side() -> bool:
+    """Let threads of this process simulate at the same time; says whether they can.
+
+    Where JAX queues its calls on the CPU, they wait for each other, on one core. Takes
+    effect only before the backend starts, as it does in a command.
+    """
+    if not _backend_is_running():
+        jax.config.update("jax_cpu_enable_async_dispatch", False)
+        _side_by_side.append(True)
+    return bool(_side_by_side)
+
+
+_side_by_side: list[bool] = []
+
+
 def _use_cache(folder: str, jaxlib: tuple[int, ...]) -> None:
     # Compiled code of another version or CPU has crashed when loaded: key the folder.
     import hashlib

@@ -10,8 +10,8 @@ class Progress(Protocol):
     def stage(self, text: str, steps: int = 0) -> None:
         """Announce a stage that takes ``steps`` advances, or an unknown time."""
 
-    def advance(self, best: float) -> None:
-        """Tell that a step is done and how good the best start is."""
+    def advance(self, best: float, note: str = "") -> None:
+        """Tell that a step is done, and how good the best start is or a note."""
 
 
 class Silent:
@@ -20,5 +20,5 @@ class Silent:
     def stage(self, text: str, steps: int = 0) -> None:
         """Say nothing."""
 
-    def advance(self, best: float) -> None:
+    def advance(self, best: float, note: str = "") -> None:
         """Say nothing."""

@@ -142,3 +142,21 @@ def test_flags_are_set_only_where_they_are_known(version, expected, monkeypatch)
     monkeypatch.setattr(_runtime, "_backend_is_running", lambda: False)
     _runtime.configure()
     assert os.environ["XLA_FLAGS"] == expected
+
+
+def test_threads_simulate_side_by_side_if_asked_in_time():
+    done = python(
+        "from piezojax import _runtime\n"
+        "import jax.numpy as jnp\n"
+        "print(_runtime.simulate_side_by_side())\n"
+        "jnp.zeros(3)\n"
+        "print(_runtime.simulate_side_by_side())\n"
+    )
+    assert done.stdout.split() == ["True", "True"], done.stderr
+    late = python(
+        "from piezojax import _runtime\n"
+        "import jax.numpy as jnp\n"
+        "jnp.zeros(3)\n"
+        "print(_runtime.simulate_side_by_side())\n"
+    )
+    assert late.stdout.split() == ["False"], late.stderr

@@ -219,7 +219,7 @@ def test_a_cut_off_just_below_nyquist(study):
             1.0,
             "rat is unknown; allowed are title, rate, seed, axes, plant, actuator, "
             "sensor, controller, references, parameters, objective, optimiser, "
-            "disturbance, ensemble, constraints, pareto, holdout_draws; "
+            "disturbance, ensemble, constraints, pareto, holdout_draws, sweep; "
             "did you mean 'rate'?",
         ),
         ("actuator/uper", 1.0, "actuator.uper is unknown; allowed are lower, upper, "),

@@ -4,6 +4,7 @@ import math
 import signal
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from itertools import takewhile
 from typing import Any
@@ -28,6 +29,9 @@ from ..reproduce.summary import GroupedAgreement, TableAgreement
 from ..stability import StabilityReport
 from ..tune.result import Perturbed, Result, Scores
 from .stability import Comparison
+
+NOTE_EVERY = 30.0
+"""Seconds between two notes where there is no terminal."""
 
 
 class Bar:
@@ -55,6 +59,7 @@ class Bar:
         self._interrupted = False
         self._finishing = False
         self._handler: Any = None
+        self._noted = time.monotonic()
 
     def __enter__(self) -> "Bar":
         # Only the main thread may handle signals.
@@ -96,11 +101,16 @@ class Bar:
             self._progress.update(self._task, total=1, completed=1)
         self._task = self._progress.add_task(text, total=steps or None, note="")
 
-    def advance(self, best: float) -> None:
-        """Move the bar by one step."""
+    def advance(self, best: float, note: str = "") -> None:
+        """Move the bar by one step; where there is none, print a note now and then."""
         self._stop_if_asked()
         if self._task is not None:
-            self._progress.update(self._task, advance=1, note=f"objective {best:.3f}")
+            shown = note or f"objective {best:.3f}"
+            self._progress.update(self._task, advance=1, note=shown)
+        now = time.monotonic()
+        if note and not self._live and now - self._noted > NOTE_EVERY:
+            self._console.print(note)
+            self._noted = now
 
 
 def models_table() -> Table:

@@ -1,7 +1,7 @@
 """A study made ready to run: files read, plant fitted, loop and search space built."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,8 @@ from .table import one_of, validated
 class Case:
     """A study with its files read, its plant fitted, its loop and search space built.
 
-    ``fit`` is there if the plant was fitted to a record.
+    ``fit`` is there if the plant was fitted to a record. ``plants`` are those that a
+    sweep puts in the place of the loop's own, by name.
     """
 
     study: Study
@@ -37,6 +38,7 @@ class Case:
     space: Space
     fit: Fit | None = None
     ensemble: Ensemble | None = None
+    plants: Mapping[str, System] = field(default_factory=dict)
 
 
 def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
@@ -63,10 +65,11 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     _check_role(controller, seen, "controller", "an Observation to a command")
     loop = Feedback(controller, plant, _actuator(study), _sensor(study))
     loop, space = _search_space(study, loop)
-    _check_rates(study, loop)
+    _check_rates(study, loop, "the controller or plant")
     stage = Stage(loop.plant, loop.sensor)
     ensemble = ensemble_of(study, stage, path.parent)
-    return Case(study, path.stem, loop, space, fit, ensemble)
+    plants = _swept_plants(study, zero)
+    return Case(study, path.stem, loop, space, fit, ensemble, plants)
 
 
 def read(path: str | Path, seed: int | None = None) -> Case:
@@ -91,6 +94,16 @@ def _plant(study: Study, folder: Path) -> tuple[System, Fit | None]:
     train = slice(*wanted.train) if wanted.train else None
     fit = identify(record, wanted.model, train=train)
     return fit.system, fit
+
+
+def _swept_plants(study: Study, zero: Any) -> dict[str, System]:
+    found = {}
+    for name in study.sweep.plants if study.sweep else ():
+        where = f"sweep.plants.{name}"
+        found[name] = _choice({"catalog": name}, where, Path(), PLANTS, study.rate)
+        _check_role(found[name], zero, where, "a voltage to a displacement")
+        _check_rates(study, found[name], where)
+    return found
 
 
 def _per_axis(study: Study, make: Callable[[int], Any]) -> Any:
@@ -178,12 +191,11 @@ def _check_role(system: System, example: Any, where: str, role: str) -> None:
         ) from None
 
 
-def _check_rates(study: Study, loop: Feedback) -> None:
-    for dt in static_fields(loop, "dt"):
+def _check_rates(study: Study, system: System, what: str) -> None:
+    for dt in static_fields(system, "dt"):
         if not np.isclose(dt, study.dt, rtol=1e-9, atol=0.0):
             raise ValueError(
-                f"rate is {study.rate:g} Hz, but the controller or plant was made for "
-                f"{1.0 / dt:g} Hz"
+                f"rate is {study.rate:g} Hz, but {what} was made for {1.0 / dt:g} Hz"
             )
 
 

@@ -12,6 +12,7 @@ from ..identify import chain
 from ..optimisers import METHODS
 from ..space import Transform
 from .ensemble_table import EnsembleTable
+from .sweep_table import SweepTable, quoted
 from .table import ByAxis, Finite, NotNegative, Positive, Table, one_of, validated
 
 
@@ -213,18 +214,12 @@ class Study(Table):
     constraints: ConstraintsTable = ConstraintsTable()
     pareto: ParetoTable | None = None
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
+    sweep: SweepTable | None = None
 
     @field_validator("parameters", mode="before")
     @classmethod
     def _quoted(cls, tables: Any) -> Any:
-        for key, table in tables.items() if isinstance(tables, dict) else ():
-            if isinstance(table, dict) and any(
-                isinstance(value, dict) for value in table.values()
-            ):
-                raise ValueError(
-                    f'a path must stand in quotes, as in "{key}.{next(iter(table))}"'
-                )
-        return tables
+        return quoted(tables)
 
     @model_validator(mode="after")
     def _sampled(self) -> "Study":
@@ -284,6 +279,17 @@ class Study(Table):
                 f"pareto.constraint is {self.pareto.constraint!r}; "
                 "it must be one of the study's constraints"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _swept(self) -> "Study":
+        known = (*self.references.tune, *self.references.unseen)
+        for name in self.sweep.references if self.sweep else ():
+            if name not in known:
+                raise ValueError(
+                    f"sweep.references: {name} is none of the study's references, "
+                    f"{', '.join(known)}"
+                )
         return self
 
     @model_validator(mode="after")

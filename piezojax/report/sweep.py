@@ -1,0 +1,226 @@
+"""Pictures and the closing table of a sweep."""
+
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from ..study.sweep_table import METRICS
+from .figures import AFTER, UNITS, figure, styled, write
+from .parallel_coordinates import parallel_coordinates
+from .sweep_scale import COLOUR_MAP, LOST, Panel, Parameter, colour_bar, kept, scale_of
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+MOST_PANELS = 12
+
+
+def write_pictures(path: Path, folder: Path) -> None:
+    """Draw each metric of the data set ``path`` into ``folder``."""
+    with _opened(path) as dataset, styled():
+        for name in (name for name in METRICS if name in dataset):
+            write(metric_figure(dataset, name), folder / f"{name}.png")
+
+
+def _opened(path: Path) -> "Dataset":
+    import xarray as xr
+
+    return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
+
+
+def metric_figure(dataset: "Dataset", name: str) -> Figure:
+    """Return the picture of a metric.
+
+    A heat map of a grid of two parameters, a curve over one, and parallel coordinates
+    of samples and of larger grids.
+    """
+    shown = panels(dataset, name)[:MOST_PANELS]
+    axes = parameters(dataset)
+    title = "\n".join(
+        fill(text, 60, break_on_hyphens=False)
+        for text in (dataset.attrs["title"], label_of(dataset, name))
+    )
+    if dataset.attrs["method"] != "grid" or len(axes) > 2:
+        return parallel_coordinates(shown, _flattened(dataset, axes), title)
+    columns = min(len(shown), 3)
+    rows = -(-len(shown) // columns)
+    picture = figure(0.6 + 4.4 * columns, 0.5 + 3.4 * rows)
+    places = picture.subplots(rows, columns, squeeze=False).ravel()
+    for panel, ax in zip(shown, places, strict=False):
+        if len(axes) == 2:
+            _heat_map(picture, ax, panel, axes)
+        else:
+            _curve(ax, panel, axes[0])
+        if len(shown) > 1:
+            ax.set_title(panel.title)
+    for ax in places[len(shown) :]:
+        ax.remove()
+    picture.suptitle(title, fontsize=10.0)
+    return picture
+
+
+def label_of(dataset: "Dataset", name: str) -> str:
+    """Return what a picture of a metric shows."""
+    label = str(dataset[name].attrs["long_name"])
+    if "reference" not in dataset[name].dims:
+        return label
+    kind = "mean" if name == "saturated" else "geometric mean"
+    return f"{label}, {kind} over {dataset.sizes['reference']} references"
+
+
+def panels(dataset: "Dataset", name: str) -> list[Panel]:
+    """Return a metric, by point, of each plant and axis."""
+    variable = dataset[name]
+    others = [d for d in ("plant", "axis") if d in variable.dims]
+    found = []
+    for place in np.ndindex(*(variable.sizes[d] for d in others)):
+        chosen = dict(zip(others, place, strict=True))
+        unit = str(variable.attrs["units"])
+        if "axis" in chosen:
+            unit = str(dataset["axis_unit"].values[chosen["axis"]])
+        shown, factor = _shown_unit(name, unit)
+        title = ", ".join(str(dataset[d].values[i]) for d, i in chosen.items())
+        found.append(Panel(title, factor * _mean(variable.isel(chosen), name), shown))
+    return found
+
+
+def _shown_unit(name: str, unit: str) -> tuple[str, float]:
+    if name in ("rms_error", "peak_error"):
+        return UNITS[unit][1], 1e3
+    if name == "saturated":
+        return "%", 100.0
+    return ("" if unit == "1" else UNITS[unit][0] if unit in UNITS else unit), 1.0
+
+
+def _mean(variable: Any, name: str) -> np.ndarray:
+    """Return the mean over references and draws: of logarithms, unless of a share."""
+    over = [d for d in ("reference", "draw") if d in variable.dims]
+    if not over:
+        return np.asarray(variable.values)
+    total, count = None, 0
+    # One run after the other: a large data set is not held in memory.
+    for place in np.ndindex(*(variable.sizes[d] for d in over)):
+        values = variable.isel(dict(zip(over, place, strict=True))).values
+        with np.errstate(divide="ignore"):
+            values = values if name == "saturated" else np.log(values)
+        total = values if total is None else total + values
+        count += 1
+    mean = np.asarray(total) / count
+    return mean if name == "saturated" else np.exp(mean)
+
+
+def parameters(dataset: "Dataset") -> list[Parameter]:
+    """Return the swept parameters, in the order of the study."""
+    found = []
+    for name, variable in dataset.coords.items():
+        if "transform" not in variable.attrs:
+            continue
+        parts = str(name).split(".")
+        unit = variable.attrs["units"]
+        # What is left of a long path still tells the parameters apart.
+        label = ".".join(parts[-2:]).replace("_", " ") + (
+            f" ({unit.replace('um', 'µm')})" if unit else ""
+        )
+        found.append(
+            Parameter(label, variable.values, variable.attrs["transform"] == "log")
+        )
+    return found
+
+
+def _flattened(dataset: "Dataset", axes: list[Parameter]) -> list[Parameter]:
+    if dataset.attrs["method"] != "grid":
+        return axes
+    grids = np.meshgrid(*(axis.values for axis in axes), indexing="ij")
+    return [
+        axis._replace(values=grid.ravel())
+        for axis, grid in zip(axes, grids, strict=True)
+    ]
+
+
+def _heat_map(picture: Figure, ax: Axes, panel: Panel, axes: list[Parameter]) -> None:
+    values = kept(panel.values)
+    across, up = axes[1], axes[0]
+    ax.set_facecolor(LOST)  # what is lost
+    mesh = ax.pcolormesh(
+        across.values,
+        up.values,
+        values,
+        shading="nearest",
+        cmap=COLOUR_MAP,
+        norm=scale_of(values),
+        rasterized=True,
+    )
+    for axis, scale in ((across, ax.set_xscale), (up, ax.set_yscale)):
+        if axis.logarithmic:
+            scale("log")
+    ax.set(xlabel=across.label, ylabel=up.label)
+    ax.grid(False)
+    colour_bar(picture, ax, mesh, panel.unit)
+    if np.sum(values == np.nanmin(values, initial=np.inf)) == 1:
+        row, column = np.unravel_index(np.nanargmin(values), values.shape)
+        ax.plot(
+            across.values[column],
+            up.values[row],
+            "o",
+            ms=7,
+            mfc="none",
+            mec="#c9293d",
+            mew=1.6,
+            label=f"least: {values[row, column]:.3g} {panel.unit}".rstrip(),
+        )
+    if np.isnan(values).any():
+        ax.plot([], [], "s", color=LOST, label="unstable or lost")
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.18),
+            ncols=2,
+            borderaxespad=0.0,
+        )
+
+
+def _curve(ax: Axes, panel: Panel, axis: Parameter) -> None:
+    values = kept(panel.values)
+    ax.plot(axis.values, values, "o-", ms=3, color=AFTER)
+    if axis.logarithmic:
+        ax.set_xscale("log")
+    if isinstance(scale_of(values), LogNorm):
+        ax.set_yscale("log")
+    ax.set(xlabel=axis.label, ylabel=panel.unit)
+
+
+def best_table(path: Path) -> Table:
+    """Return where the first metric is least, for each plant and axis."""
+    with _opened(path) as dataset:
+        name = next(name for name in METRICS if name in dataset)
+        axes = parameters(dataset)
+        grid = dataset.attrs["method"] == "grid"
+        table = Table(
+            title=f"{dataset.attrs['title']}\nleast {label_of(dataset, name)}"
+        )
+        table.add_column("plant")
+        for axis in axes:
+            table.add_column(axis.label, justify="right")
+        table.add_column("least", justify="right")
+        table.add_column("diverged", justify="right")
+        for panel in panels(dataset, name):
+            values = kept(panel.values)
+            lost = int(np.isnan(values).sum())
+            share = f"{lost} of {values.size}"
+            if lost == values.size:
+                table.add_row(panel.title, *("-" for _ in axes), "-", share)
+                continue
+            place = np.unravel_index(np.nanargmin(values), values.shape)
+            where = place if grid else place * len(axes)
+            shown = (
+                f"{axis.values[i]:.4g}" for axis, i in zip(axes, where, strict=True)
+            )
+            least = f"{values[place]:.4g} {panel.unit}"
+            table.add_row(panel.title, *shown, least, share)
+    return table

@@ -1,0 +1,127 @@
+"""The table ``[sweep]`` of a study: which parameters are varied, and what is kept."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from ..metrics import TrackingFigures
+from ..space import Transform
+from .table import Finite, Table, one_of
+
+SENSITIVITY = "sensitivity_peak"
+METRICS = (*TrackingFigures._fields, SENSITIVITY)
+"""What can be kept of each run: figures of the simulation, and the peak of |1/(1+L)|
+of the linearised loop."""
+
+PARTS = ("controller", "plant", "actuator", "sensor")
+"""Parts of a loop, with which the path of a parameter starts."""
+
+Count = Annotated[int, Field(strict=True, ge=1)]
+
+
+class SweptParameter(Table):
+    """Where a parameter is tried: ``values``, or ``lower`` to ``upper``.
+
+    ``count`` points of a grid lie evenly on the scale ``transform``; samples need none.
+    ``unit`` is what pictures and the data set say.
+    """
+
+    lower: Finite | None = None
+    upper: Finite | None = None
+    count: Annotated[int, Field(strict=True, ge=2)] | None = None
+    transform: Transform = "linear"
+    values: tuple[Finite, ...] | None = None
+    unit: str | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "SweptParameter":
+        bounds = self.lower is not None and self.upper is not None
+        some = self.lower is not None or self.upper is not None or self.count
+        if bounds == (self.values is not None) or (self.values is not None and some):
+            raise ValueError("it takes either values, or lower and upper")
+        if self.values is not None:
+            if not self.values:
+                raise ValueError("values must hold at least one number")
+            if list(self.values) != sorted(set(self.values)):
+                raise ValueError("values must rise")
+        return self
+
+
+class SweepTable(Table):
+    """What ``python -m piezojax.sweep`` does with a study.
+
+    ``method`` "grid" tries every combination of the parameters; "latin_hypercube" and
+    "sobol" draw ``samples`` points of their box. Without ``parameters`` the box is that
+    of the study's own ``[parameters]``. ``plants`` are of the catalogue, ``references``
+    among the study's; left out: the study's own plant, all its references. ``every``
+    N-th sample of displacement and voltage is kept if given. ``chunk`` points are
+    simulated and kept at a time.
+    """
+
+    method: Literal["grid", "latin_hypercube", "sobol"] = "grid"
+    samples: Count | None = None
+    parameters: dict[str, SweptParameter] = Field(default_factory=dict)
+    plants: tuple[str, ...] = ()
+    references: tuple[str, ...] = ()
+    metrics: tuple[str, ...] = Field(
+        default=("rms_error", "peak_error", "rms_effort", "saturated"), min_length=1
+    )
+    every: Count | None = None
+    chunk: Count | None = None
+
+    @field_validator("metrics")
+    @classmethod
+    def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(one_of(name, METRICS) for name in names)
+
+    @field_validator("metrics", "plants", "references")
+    @classmethod
+    def _once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"{name} is listed twice")
+        return names
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _quoted(cls, tables: Any) -> Any:
+        return quoted(tables)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "SweepTable":
+        for path, parameter in self.parameters.items():
+            if path.split(".")[0] not in PARTS:
+                raise ValueError(
+                    f"parameters.{path}: the path must start with one of "
+                    f"{', '.join(PARTS)}"
+                )
+            if self.method == "grid":
+                if parameter.values is None and parameter.count is None:
+                    raise ValueError(f"parameters.{path}: a grid needs a count")
+            elif parameter.values is not None or parameter.count is not None:
+                raise ValueError(
+                    f"parameters.{path}: {self.method} draws points between lower and "
+                    "upper; leave values and count out"
+                )
+        if self.method == "grid" and not self.parameters:
+            raise ValueError("a grid needs parameters, each with a count or values")
+        if (self.samples is None) != (self.method == "grid"):
+            problem = (
+                "a grid has its counts, and no samples"
+                if self.method == "grid"
+                else f"{self.method} needs samples, the number of points"
+            )
+            raise ValueError(problem)
+        return self
+
+
+def quoted(tables: Any) -> Any:
+    """Return ``tables`` by path; raise ValueError for a path that was not in quotes."""
+    for key, table in tables.items() if isinstance(tables, dict) else ():
+        if isinstance(table, dict) and any(
+            isinstance(value, dict) for value in table.values()
+        ):
+            raise ValueError(
+                f'a path must stand in quotes, as in "{key}.{next(iter(table))}"'
+            )
+    return tables

@@ -1,0 +1,39 @@
+"""A study that is quick to compile and to run, and a grid to sweep it on."""
+
+PARAMETERS = {
+    "controller.proportional": {"lower": 0.1, "upper": 5.0, "transform": "log"},
+    "controller.integral": {"lower": 100.0, "upper": 2e4, "transform": "log"},
+}
+GRID = {
+    "metrics": ["rms_error", "peak_voltage"],
+    "parameters": {
+        "controller.proportional": {"values": [0.1, 0.5, 1.0, 2.0, 4.0]},
+        "plant.time_constant": {
+            "lower": 5e-4,
+            "upper": 2e-3,
+            "count": 3,
+            "transform": "log",
+        },
+    },
+}
+
+
+def study_of(sweep, **changes):
+    """A PID on a lag: quick to compile, and a millisecond a run."""
+    study = {
+        "title": "a PID on a lag",
+        "rate": 20_000.0,
+        "seed": 3,
+        "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
+        "actuator": {"lower": -20.0, "upper": 120.0},
+        "sensor": {"noise_rms": 0.012},
+        "controller": {"catalog": "p753_pid"},
+        "references": {
+            "tune": ["SIN50"],
+            "unseen": ["SW50"],
+            "duration": 0.02,
+            "settle": 0.005,
+        },
+        "parameters": PARAMETERS,
+    } | changes
+    return study | ({} if sweep is None else {"sweep": sweep})
