@@ -132,7 +132,7 @@ def attained(
         control = LinearLimit(loop, posed.plant, taps)
         foretold = posed.known.foretold(posed.left)
         voltage = _ahead(posed, known, foretold) + rest.reshape(noise.shape[:2])[:, :1]
-        still = jnp.zeros(known.shape[1]) if disturbance is None else disturbance
+        still = jnp.zeros_like(noise) if disturbance is None else disturbance
         logs = _logs(control, voltage, foretold, references, noise, still)
         runs = jax.tree.map(lambda x: np.asarray(x).reshape(-1, x.shape[-1]), logs)
         error = posed.known.cut(np.asarray(logs.displacement - logs.reference))
@@ -163,9 +163,9 @@ def _logs(
     noise: Any,
     disturbance: Any,
 ) -> LoopSample:
-    def one(voltage, foretold, reference, noise):
+    def one(voltage, foretold, reference, noise, disturbance):
         inputs = Ahead(voltage, foretold, reference, noise, disturbance)
         return simulate(control, inputs, control.init(reference[0]))[1]
 
-    each = jax.vmap(one, in_axes=(None, None, None, 0))
-    return jax.vmap(each)(voltage, foretold, references, noise)
+    each = jax.vmap(one, in_axes=(None, None, None, 0, 0))
+    return jax.vmap(each)(voltage, foretold, references, noise, disturbance)

@@ -59,7 +59,7 @@ def performance_limit(
     """Return the limit for ``loop`` and how near its runs come to it.
 
     ``references`` [names, samples] in um; ``noise`` [names, draws, samples], draws of
-    unit variance; ``disturbance`` [samples] in um, if any: as the tuner's Signals hold
+    unit variance; ``disturbance`` [references, draws, samples] in um, if any: as the tuner's Signals hold
     them. Samples before ``start`` do not count. ``segment`` (s) is the window of the
     spectra, no longer than what counts; ``dt`` (s) is looked for in the loop.
 

@@ -15,8 +15,8 @@ def simulated(
 ) -> tuple[LoopSample, np.ndarray]:
     """Return the logs [runs, samples] and the voltages [runs] before the first sample.
 
-    ``references`` [references, samples], ``noise`` [references, draws, samples]: a run
-    each draw.
+    ``references`` [references, samples], ``noise`` and ``disturbance``, if there is
+    any, [references, draws, samples]: a run each draw.
     """
     logs, rest = _logs(loop, references, noise, disturbance)
     return jax.tree.map(_flat, logs), np.asarray(rest).reshape(-1)
@@ -24,12 +24,13 @@ def simulated(
 
 @jax.jit
 def _logs(loop: Feedback, references: Any, noise: Any, disturbance: Any) -> Any:
-    def one(reference, noise):
+    def one(reference, noise, disturbance):
         start = loop.init(reference[0])
         inputs = loop_inputs(reference, noise, disturbance)
         return simulate(loop, inputs, start)[1], start.voltage
 
-    return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(references, noise)
+    each = jax.vmap(one, in_axes=(None, 0, 0))
+    return jax.vmap(each)(references, noise, disturbance)
 
 
 def quiet_error(
