@@ -88,7 +88,9 @@ class Result(BaseModel):
     the optimiser has not seen, and ``unseen_before`` and ``unseen`` on references it
     has not seen, with that noise too. On a stage with several axes these are the driven
     ones, each error in its own unit of ``units``; ``coupling_before`` and ``coupling``
-    are the axes that should rest, under all references of the hold-out. ``perturbed``
+    are the axes that should rest, under all references of the hold-out. ``history``
+    holds the lowest loss of each start after each step, ``times_s`` the seconds from
+    the begin of the search to the end of that step. ``perturbed``
     says how the gains do on the plants of the study's ensemble.
     """
 
@@ -113,6 +115,7 @@ class Result(BaseModel):
     units: dict[str, str] = {}
     warnings: list[str]
     history: list[list[float | None]]
+    times_s: list[float] = []
     evaluations: int
     compile_s: float
     wall_s: float

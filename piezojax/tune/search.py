@@ -1,9 +1,6 @@
 """The search: screen the box, then descend from the best starts, all at once."""
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import numpy as np
@@ -14,6 +11,8 @@ from ..optimisers import METHODS
 from ..progress import Progress
 from ..rollout import BLOCK, in_blocks
 from ..study import Case
+from .clock import Clock
+from .course import Course
 from .objective import HOPELESS, Objective, with_finite_gradient
 from .result import Status
 
@@ -25,31 +24,13 @@ FORWARD_BELOW, FORWARD_BELOW_WITH_AXES = 5, 64
 reverse pass takes minutes to compile, three times as long."""
 
 
-class Clock:
-    """Wall time since it was made, and how much of it went into compiling (s)."""
-
-    def __init__(self):
-        self._began = time.perf_counter()
-        self.compile_s = 0.0
-
-    def compiled(self, function: Callable, *arguments: Any) -> Callable:
-        """Return ``function`` compiled for ``arguments``, its time counted."""
-        start = time.perf_counter()
-        program = jax.jit(function).lower(*arguments).compile()
-        self.compile_s += time.perf_counter() - start
-        return program
-
-    def wall_s(self) -> float:
-        """Return the seconds since the start."""
-        return time.perf_counter() - self._began
-
-
 @dataclass
 class Search:
     """The best point found so far, in [0, 1]^n, and how it was found.
 
     ``history`` holds the lowest loss of each start after each step, None while it
-    diverges.
+    diverges; ``course`` the best of all with its time; ``starts`` the points descended
+    from.
     """
 
     unit: np.ndarray
@@ -57,11 +38,19 @@ class Search:
     status: Status = "step limit"
     evaluations: int = 0
     history: list[list[float | None]] = field(default_factory=list)
+    course: Course = field(default_factory=Course)
+    starts: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     warnings: list[str] = field(default_factory=list)
+
+    @property
+    def times_s(self) -> list[float]:
+        """Seconds from the begin of the search to each step of the history."""
+        return self.course.times_s[len(self.course.times_s) - len(self.history) :]
 
     def offer(self, units: np.ndarray, losses: np.ndarray) -> None:
         """Take the best of ``units`` if it beats what is there."""
         leader = int(np.argmin(losses))
+        self.course.add(len(losses), float(losses[leader]))
         if losses[leader] < self.loss:
             self.loss, self.unit = float(losses[leader]), units[leader]
 
@@ -75,25 +64,31 @@ def search_box(
     loop diverges at every point tried.
     """
     own = np.asarray(case.space.start(case.loop))
-    search = Search(own)
+    search = Search(own, starts=own[None])
+    mine = search.course.clock
     try:
-        points = np.concatenate([own[None], _candidates(case)])
-        losses = _screen(objective, points, clock, progress)
+        points = candidates(case)
+        losses = _screen(objective, points, mine, progress)
         search.evaluations += losses.size
         chosen = _starts(losses, case.study.optimiser.starts, search)
         search.offer(points, losses)
-        _descend(objective, points[chosen], search, case, clock, progress)
+        search.starts = points[chosen]
+        _descend(objective, search.starts, search, case, mine, progress)
     except KeyboardInterrupt:
         search.status = "interrupted"
+    clock.compile_s += mine.compile_s
     return search
 
 
-def _candidates(case: Case) -> np.ndarray:
+def candidates(case: Case) -> np.ndarray:
+    """Return the points to be screened: the study's own start, then others."""
+    own = np.asarray(case.space.start(case.loop))
     table, size = case.study.optimiser, len(case.space.paths)
     count = max(table.candidates, table.starts - 1)
     sampler = qmc.Sobol(size, rng=np.random.default_rng(case.study.seed))
     # Sobol points are balanced in powers of two.
-    return sampler.random_base2(int(np.ceil(np.log2(max(count, 1)))))[:count]
+    others = sampler.random_base2(int(np.ceil(np.log2(max(count, 1)))))[:count]
+    return np.concatenate([own[None], others])
 
 
 def _screen(
