@@ -18,7 +18,7 @@ from pydantic import (
 
 from .. import motions, signals
 from ..identify import chain
-from ..optimisers import METHODS
+from ..optimisers import GAUSS_NEWTON, METHODS
 from ..space import Transform
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
@@ -181,7 +181,7 @@ class OptimiserTable(Table):
     @field_validator("method")
     @classmethod
     def _known(cls, name: str) -> str:
-        return one_of(name, METHODS)
+        return one_of(name, (*METHODS, GAUSS_NEWTON))
 
 
 class Study(Table):

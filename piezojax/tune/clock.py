@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any
 
 import jax
@@ -20,6 +21,12 @@ class Clock:
         program = jax.jit(function).lower(*arguments).compile()
         self.compile_s += time.perf_counter() - start
         return program
+
+    def waited(self, program: Future) -> None:
+        """Wait for a program that another thread compiles, and count the waiting."""
+        start = time.perf_counter()
+        program.result()
+        self.compile_s += time.perf_counter() - start
 
     def wall_s(self) -> float:
         """Return the seconds since the start."""

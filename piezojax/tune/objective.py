@@ -47,6 +47,21 @@ def evaluate(
     With several axes, for each trace and noise draw. Every run starts at rest at its
     reference; samples before ``start`` do not count.
     """
+    return sampled(loop_of, parameters, signals, start)[0]
+
+
+def sampled(
+    loop_of: Callable[[Any], Feedback],
+    parameters: Any,
+    signals: Signals,
+    start: int,
+    every: int = 1,
+) -> tuple[TrackingFigures, Array | None]:
+    """Return what ``evaluate`` does, and one of ``every`` errors (um) of each run.
+
+    The errors are those at samples counted, with time last; None unless ``every`` is
+    above 1.
+    """
     metric: Metric = Tracking(start=start)
     if signals.references.ndim > 2:
         metric = PerAxisMetric(metric, signals.references.shape[2])
@@ -54,7 +69,15 @@ def evaluate(
     def one(parameters, reference, noise):
         loop = loop_of(parameters)
         inputs = loop_inputs(reference, noise, signals.disturbance)
-        return simulate(loop, inputs, loop.init(reference[0]), metric=metric)[1]
+        found = simulate(
+            loop, inputs, loop.init(reference[0]), metric=metric, every=every
+        )[1]
+        if every == 1:
+            return found, None
+        figures, log = found
+        error = jax.tree.map(jnp.subtract, log.displacement, log.reference)
+        counted = jax.tree.map(lambda x: x[start // every :], error)
+        return figures, jnp.stack(counted) if isinstance(counted, tuple) else counted
 
     # A copy of the parameters for each run: their gradients are then summed once, at
     # the end, and not in each step.
@@ -63,11 +86,11 @@ def evaluate(
         lambda x: jnp.broadcast_to(x, (*runs, *jnp.shape(x))), parameters
     )
     draws = jax.vmap(one, in_axes=(0, None, 0))
-    figures = jax.vmap(draws)(copies, signals.references, signals.noise)
+    found = jax.vmap(draws)(copies, signals.references, signals.noise)
     if not signals.traces:
-        return figures
+        return found
     run, axis = (list(indices) for indices in zip(*signals.traces, strict=True))
-    return jax.tree.map(lambda x: x[jnp.array(run), :, jnp.array(axis)], figures)
+    return jax.tree.map(lambda x: x[jnp.array(run), :, jnp.array(axis)], found)
 
 
 def with_plant(loop: Feedback, plant: System) -> Feedback:
@@ -105,23 +128,28 @@ class Objective(eqx.Module):
     def _figures(self, unit: Float[Array, " n"]) -> TrackingFigures:
         """Return figures of shape [plants, references, draws]."""
 
+        return self._sampled(unit, 1)[0]
+
+    def _sampled(
+        self, unit: Float[Array, " n"], every: int
+    ) -> tuple[TrackingFigures, Array | None]:
         def loop_of(unit):
             return self.space.put(self.loop, unit)
 
         if self.plants is None:
-            figures = evaluate(loop_of, unit, self.signals, self.start)
-            return jax.tree.map(lambda x: x[None], figures)
+            found = sampled(loop_of, unit, self.signals, self.start, every)
+            return jax.tree.map(lambda x: x[None], found)
         return eqx.filter_vmap(
-            lambda plant: evaluate(
+            lambda plant: sampled(
                 lambda unit: with_plant(loop_of(unit), plant),
                 unit,
                 self.signals,
                 self.start,
+                every,
             )
         )(self.plants)
 
-    def _parts(self, unit: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        figures = self._figures(unit)
+    def _parts(self, figures: TrackingFigures) -> tuple[Array, Array, Array]:
         square = jnp.mean(figures.rms_error**2, axis=2)
         normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
         if any(self.resting):
@@ -143,7 +171,27 @@ class Objective(eqx.Module):
 
     def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
         """Return the objective; ``HOPELESS`` where the loop diverges or rails."""
-        normalised, effort, slew = self._parts(unit)
+        return self._joined(self._figures(unit))
+
+    def errors(
+        self, unit: Float[Array, " n"], every: int
+    ) -> tuple[Array, Float[Array, "runs samples"], Float[Array, " runs"]]:
+        """Return the objective, one of ``every`` errors of each run, and their weights.
+
+        A weight is how much the objective rises with half the mean square of a run's
+        error: weighted so, the errors are the residuals of a least-squares problem
+        with the same gradient, as far as the objective depends on them.
+        """
+        figures, error = self._sampled(unit, every)
+        assert error is not None
+        loss, slope = jax.value_and_grad(
+            lambda rms: self._joined(figures._replace(rms_error=rms))
+        )(figures.rms_error)
+        weights = slope / jnp.maximum(figures.rms_error, _FLOOR)
+        return loss, error.reshape(-1, error.shape[-1]), weights.ravel()
+
+    def _joined(self, figures: TrackingFigures) -> Float[Array, ""]:
+        normalised, effort, slew = self._parts(figures)
         shares = self._shares(normalised)
         if self.aggregate == "mean_square":
             joined = jnp.sum(shares * normalised**2)
@@ -163,7 +211,7 @@ class Objective(eqx.Module):
         """
         if self.aggregate != "mean_square":
             raise ValueError(f"least squares cannot minimise {self.aggregate!r}")
-        normalised, effort, slew = self._parts(unit)
+        normalised, effort, slew = self._parts(self._figures(unit))
         parts = [(normalised * jnp.sqrt(self._shares(normalised))).ravel()]
         for weight, value in ((self.effort_weight, effort), (self.slew_weight, slew)):
             if weight > 0.0:

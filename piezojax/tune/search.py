@@ -7,13 +7,15 @@ import numpy as np
 from scipy.stats import qmc
 
 from .._types import as_array
-from ..optimisers import METHODS
+from ..optimisers import GAUSS_NEWTON, METHODS
 from ..progress import Progress
 from ..rollout import BLOCK, in_blocks
 from ..study import Case
 from .clock import Clock
 from .course import Course
+from .gauss_newton import Descent
 from .objective import HOPELESS, Objective, with_finite_gradient
+from .race import programs_for, race
 from .result import Status
 
 STALL_STEPS, STALL_GAIN = 20, 1e-3
@@ -47,10 +49,16 @@ class Search:
         """Seconds from the begin of the search to each step of the history."""
         return self.course.times_s[len(self.course.times_s) - len(self.history) :]
 
-    def offer(self, units: np.ndarray, losses: np.ndarray) -> None:
-        """Take the best of ``units`` if it beats what is there."""
+    def offer(
+        self, units: np.ndarray, losses: np.ndarray, evaluations: int | None = None
+    ) -> None:
+        """Take the best of ``units`` if it beats what is there.
+
+        It took so many evaluations; one each, if not said.
+        """
         leader = int(np.argmin(losses))
-        self.course.add(len(losses), float(losses[leader]))
+        taken = len(losses) if evaluations is None else evaluations
+        self.course.add(taken, float(losses[leader]))
         if losses[leader] < self.loss:
             self.loss, self.unit = float(losses[leader]), units[leader]
 
@@ -65,19 +73,69 @@ def search_box(
     """
     own = np.asarray(case.space.start(case.loop))
     search = Search(own, starts=own[None])
-    mine = search.course.clock
+    way = _race if case.study.optimiser.method == GAUSS_NEWTON else _together
     try:
-        points = candidates(case)
-        losses = _screen(objective, points, mine, progress)
-        search.evaluations += losses.size
-        chosen = _starts(losses, case.study.optimiser.starts, search)
-        search.offer(points, losses)
-        search.starts = points[chosen]
-        _descend(objective, search.starts, search, case, mine, progress)
+        way(objective, search, case, progress)
     except KeyboardInterrupt:
         search.status = "interrupted"
-    clock.compile_s += mine.compile_s
+    clock.compile_s += search.course.clock.compile_s
     return search
+
+
+def _together(
+    objective: Objective, search: Search, case: Case, progress: Progress
+) -> None:
+    """Screen, then descend from all starts in step, by a method of ``optimisers``."""
+    clock = search.course.clock
+    points = candidates(case)
+    losses = _screen(objective, points, clock, progress)
+    _choose(points, losses, search, case)
+    _descend(objective, search.starts, search, case, clock, progress)
+
+
+def _race(objective: Objective, search: Search, case: Case, progress: Progress) -> None:
+    """Screen, then race descents by Gauss and Newton's method."""
+    clock, table = search.course.clock, case.study.optimiser
+    points = candidates(case)
+    progress.stage(f"screening {len(points)} points of the box")
+    programs = programs_for(objective, points.shape[1], clock)
+    try:
+        losses = programs.losses(points)
+        chosen = _choose(points, losses, search, case)
+        progress.stage("compiling the derivatives")
+    finally:
+        programs.wait()
+    progress.stage(f"tuning from {len(chosen)} starts", table.steps)
+
+    def after(descents: list[Descent], evaluations: int) -> None:
+        search.evaluations += evaluations
+        found = np.array([descent.loss for descent in descents])
+        search.history.append([float(loss) for loss in found])
+        units = np.array([descent.unit for descent in descents])
+        search.offer(units, found, evaluations)
+
+    ended = race(
+        programs,
+        points[chosen],
+        losses[chosen],
+        steps=table.steps,
+        tolerance=table.tolerance,
+        progress=progress,
+        after=after,
+    )
+    if ended:
+        search.status = "converged"
+
+
+def _choose(
+    points: np.ndarray, losses: np.ndarray, search: Search, case: Case
+) -> np.ndarray:
+    """Note what screening found; return which points to descend from."""
+    search.evaluations += losses.size
+    chosen = _starts(losses, case.study.optimiser.starts, search)
+    search.offer(points, losses)
+    search.starts = points[chosen]
+    return chosen
 
 
 def candidates(case: Case) -> np.ndarray:
