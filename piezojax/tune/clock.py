@@ -13,6 +13,7 @@ class Clock:
 
     def __init__(self):
         self._began = time.perf_counter()
+        self._cpu = time.process_time()
         self.compile_s = 0.0
 
     def compiled(self, function: Callable, *arguments: Any) -> Callable:
@@ -27,6 +28,10 @@ class Clock:
         start = time.perf_counter()
         program.result()
         self.compile_s += time.perf_counter() - start
+
+    def cpu_s(self) -> float:
+        """Return the processor seconds since the start, of all threads."""
+        return time.process_time() - self._cpu
 
     def wall_s(self) -> float:
         """Return the seconds since the start."""

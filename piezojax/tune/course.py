@@ -13,13 +13,15 @@ class Course:
     """The best loss after each batch of evaluations of one search.
 
     ``times_s`` are seconds since the search began, waiting for the compiler included;
-    ``compile_s`` is how much of each went into that; ``evaluations`` counts simulations
-    of all references, those that carry derivatives too.
+    ``compile_s`` is how much of each went into that, ``cpu_s`` the processor's seconds
+    till then, of all threads: what a busy machine does not lengthen. ``evaluations``
+    counts simulations of all references, those that carry derivatives too.
     """
 
     clock: Clock = field(default_factory=Clock)
     times_s: list[float] = field(default_factory=list)
     compile_s: list[float] = field(default_factory=list)
+    cpu_s: list[float] = field(default_factory=list)
     evaluations: list[int] = field(default_factory=list)
     losses: list[float] = field(default_factory=list)
 
@@ -28,6 +30,7 @@ class Course:
         before = self.evaluations[-1] if self.evaluations else 0
         self.times_s.append(self.clock.wall_s())
         self.compile_s.append(self.clock.compile_s)
+        self.cpu_s.append(self.clock.cpu_s())
         self.evaluations.append(before + evaluations)
         self.losses.append(min(loss, self.loss))
 

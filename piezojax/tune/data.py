@@ -9,8 +9,9 @@ import numpy as np
 
 from .. import motions
 from .. import signals as signal_library
-from .._types import as_array
+from .._types import as_array, as_signal
 from ..study import Case, Study
+from ..system import holding_input
 from .objective import Signals
 from .traces import Trace, traces_of
 
@@ -53,6 +54,7 @@ def make_data(case: Case) -> Data:
     traces = traces_of(study)
     tuned = sum(trace.run < count for trace in traces)
     picked = tuple((t.run, t.axis) for t in traces) if study.axes else ()
+    holding = _holding(case, references[:, 0])
     return Data(
         tuned,
         traces,
@@ -61,11 +63,28 @@ def make_data(case: Case) -> Data:
             draws[0][:count],
             _unexplained(case, time_s, "train"),
             picked[:tuned],
+            holding[:count],
         ),
         holdout=Signals(
-            references, draws[1], _unexplained(case, time_s, "validate"), picked
+            references,
+            draws[1],
+            _unexplained(case, time_s, "validate"),
+            picked,
+            holding,
         ),
     )
+
+
+def _holding(case: Case, begins: jax.Array) -> jax.Array:
+    """Return the inputs under which the stage rests where the references begin."""
+
+    def one(begin):
+        held = holding_input(case.loop.plant, as_signal(begin))
+        return jnp.stack(held) if isinstance(held, tuple) else held
+
+    # References begin in a few places, most of them in one.
+    places, which = np.unique(np.asarray(begins), axis=0, return_inverse=True)
+    return jax.jit(jax.vmap(one))(as_array(places))[which.ravel()]
 
 
 def _reference(study: Study, name: str, time_s: jax.Array) -> jax.Array:

@@ -1,6 +1,7 @@
 """What tuning minimises: normalised tracking errors over references and noise draws."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal
 
 import equinox as eqx
@@ -31,12 +32,19 @@ class Signals(eqx.Module):
 
     With several axes references and noise have a last dimension for them, in the unit
     of each. ``traces`` then are what is judged: pairs of a reference and an axis.
+    ``holding`` is the input under which the loop's own plant rests at the begin of each
+    reference, worked out if left out.
     """
 
     references: Float[Array, "references samples *axes"]
     noise: Float[Array, "references draws samples *axes"]
     disturbance: Float[Array, " samples"] | None = None
     traces: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
+    holding: Float[Array, "*begins"] | None = None
+
+    def for_another_plant(self) -> "Signals":
+        """Return the same without ``holding``."""
+        return replace(self, holding=None)
 
 
 def evaluate(
@@ -66,12 +74,11 @@ def sampled(
     if signals.references.ndim > 2:
         metric = PerAxisMetric(metric, signals.references.shape[2])
 
-    def one(parameters, reference, noise):
+    def one(parameters, reference, noise, holding):
         loop = loop_of(parameters)
         inputs = loop_inputs(reference, noise, signals.disturbance)
-        found = simulate(
-            loop, inputs, loop.init(reference[0]), metric=metric, every=every
-        )[1]
+        state = loop.init(reference[0], holding)
+        found = simulate(loop, inputs, state, metric=metric, every=every)[1]
         if every == 1:
             return found, None
         figures, log = found
@@ -85,8 +92,8 @@ def sampled(
     copies = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*runs, *jnp.shape(x))), parameters
     )
-    draws = jax.vmap(one, in_axes=(0, None, 0))
-    found = jax.vmap(draws)(copies, signals.references, signals.noise)
+    draws = jax.vmap(one, in_axes=(0, None, 0, None))
+    found = jax.vmap(draws)(copies, signals.references, signals.noise, signals.holding)
     if not signals.traces:
         return found
     run, axis = (list(indices) for indices in zip(*signals.traces, strict=True))
@@ -143,7 +150,7 @@ class Objective(eqx.Module):
             lambda plant: sampled(
                 lambda unit: with_plant(loop_of(unit), plant),
                 unit,
-                self.signals,
+                self.signals.for_another_plant(),
                 self.start,
                 every,
             )

@@ -68,6 +68,7 @@ class _Judge:
     ) -> TrackingFigures:
         """Return the figures by plant, reference and draw, of ``plants`` stacked."""
         dynamic, static = eqx.partition(plants, eqx.is_array)
+        signals = signals.for_another_plant()
 
         def all_plants(loop, dynamic, signals):
             def one(part):

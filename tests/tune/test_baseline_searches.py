@@ -111,7 +111,7 @@ def test_a_course_says_when_a_loss_was_reached():
 def entry(**changes):
     numbers = dict(
         method="m", loss=1.0, holdout_geomean_um=0.1, evaluations=10, wall_s=20.0,
-        compile_s=2.0, best_s=15.0, stop="", gains={},
+        compile_s=2.0, cpu_s=30.0, best_s=15.0, stop="", gains={},
     )  # fmt: skip
     return Contestant(**(numbers | changes))
 
@@ -121,11 +121,13 @@ def test_the_ratio_is_of_the_time_to_the_same_loss():
         losses=[3.0, 1.0, 0.5],
         times_s=[2.0, 4.0, 9.0],
         compiled_s=[1.0, 3.0, 3.0],
+        used_s=[1.0, 6.0, 7.0],
         evaluated=[5, 6, 7],
     )
     found = against(entry(), ours)
     assert (found.reached_s, found.reached_evaluations) == (4.0, 6)
     assert (found.ratio, found.ratio_running, found.ratio_best) == (5.0, 18.0, 3.75)
+    assert found.ratio_cpu == 5.0
     assert against(entry(loss=0.4), ours).ratio is None
     assert against(entry(loss=None), ours).reached_s == 2.0
 

@@ -20,13 +20,15 @@ class Contestant(BaseModel):
     ``loss`` is the objective, ``holdout_geomean_um`` the geometric mean of the rms
     errors on noise that no method has seen, None where the loop diverges. ``wall_s``
     is from the method's begin to its end, ``compile_s`` the part of it spent waiting
-    for the compiler, ``best_s`` when it had come within ``NEAR`` of its ``loss``.
-    ``times_s``, ``compiled_s``, ``evaluated`` and ``losses`` are its course; ``unit``
-    the point in the study's box, None for a rule, whose controller is a PID.
+    for the compiler, ``cpu_s`` the processor's seconds of all threads, ``best_s`` when
+    it had come within ``NEAR`` of its ``loss``. ``times_s``, ``compiled_s``, ``used_s``
+    (of the processor), ``evaluated`` and ``losses`` are its course; ``unit`` is the
+    point in the study's box, None for a rule, whose controller is a PID.
 
     ``reached_s`` is the time at which the search of ``piezojax.tune`` had a loss as
     low, ``ratio`` is ``wall_s`` over it, ``ratio_running`` the same without compiling,
-    ``ratio_best`` with ``best_s`` for ``wall_s``; None if it never had.
+    ``ratio_best`` with ``best_s`` for ``wall_s``, ``ratio_cpu`` the same in processor's
+    seconds; None if it never had.
     """
 
     method: str
@@ -35,12 +37,14 @@ class Contestant(BaseModel):
     evaluations: int
     wall_s: float
     compile_s: float
+    cpu_s: float
     best_s: float
     stop: str
     gains: dict[str, float]
     unit: list[float] | None = None
     times_s: list[float] = []
     compiled_s: list[float] = []
+    used_s: list[float] = []
     evaluated: list[int] = []
     losses: list[float] = []
     reached_s: float | None = None
@@ -48,6 +52,7 @@ class Contestant(BaseModel):
     ratio: float | None = None
     ratio_running: float | None = None
     ratio_best: float | None = None
+    ratio_cpu: float | None = None
 
 
 class Baselines(BaseModel):
@@ -106,12 +111,14 @@ def contestant(
         evaluations=course.evaluations[-1],
         wall_s=course.times_s[-1],
         compile_s=course.compile_s[-1],
+        cpu_s=course.cpu_s[-1],
         best_s=course.times_s[near],
         stop=stop,
         gains=gains,
         unit=None if unit is None else [float(x) for x in unit],
         times_s=course.times_s,
         compiled_s=course.compile_s,
+        used_s=course.cpu_s,
         evaluated=course.evaluations,
         losses=course.losses,
     )
@@ -132,5 +139,6 @@ def against(rival: Contestant, ours: Contestant) -> Contestant:
             "ratio": rival.wall_s / reached,
             "ratio_running": (rival.wall_s - rival.compile_s) / running,
             "ratio_best": rival.best_s / reached,
+            "ratio_cpu": rival.cpu_s / ours.used_s[place],
         }
     )
