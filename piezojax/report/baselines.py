@@ -1,6 +1,7 @@
 """The table, the picture and the file of the baselines beside the search."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -77,39 +78,30 @@ def write_baselines(found: Baselines, folder: Path) -> None:
 def baselines_figure(found: Baselines) -> Figure:
     """Best loss of each method against wall time, compiling included."""
     geometric = found.aggregate == "geometric_mean"
-    picture = figure(7.0, 4.2)
+    picture = figure(7.6, 4.0)
     ax = picture.subplots()
+    colours = [colour for colour in COLOURS if colour != AFTER]
     for i, entry in enumerate(e for e in found.rivals if e.loss is not None):
-        colour = COLOURS[(i + 1) % len(COLOURS)]
+        look: dict[str, Any] = {
+            "color": colours[i % len(colours)],
+            "label": entry.method,
+        }
         if entry.unit is None:
-            place = entry.wall_s, _shown(entry, geometric)[-1]
-            ax.plot(
-                *place,
-                marker=MARKERS[i % len(MARKERS)],
-                ms=5.0,
-                ls="",
-                color=colour,
-                label=entry.method,
-            )
+            look |= {"marker": MARKERS[i % len(MARKERS)], "ms": 5.0, "ls": ""}
+            ax.plot(entry.wall_s, _shown(entry, geometric)[-1], **look)
         else:
-            ax.step(
-                entry.times_s,
-                _shown(entry, geometric),
-                where="post",
-                color=colour,
-                label=entry.method,
-            )
+            ax.step(entry.times_s, _shown(entry, geometric), where="post", **look)
     ours = found.ours
     ax.step(
         ours.times_s,
         _shown(ours, geometric),
         where="post",
         color=AFTER,
-        lw=2.0,
+        lw=2.2,
         label=ours.method,
         zorder=3,
     )
-    ax.set(xscale="log", xlabel="wall time, compiling included (s)")
+    ax.set(xscale="log", xlabel="wall time, compiling included (s)", title=found.title)
     if geometric:
         ax.set(
             yscale="log",
@@ -118,7 +110,6 @@ def baselines_figure(found: Baselines) -> Figure:
     else:
         ax.set(ylabel="objective (-)")
     picture.legend(loc="outside right upper", fontsize=7.5)
-    picture.suptitle(f"{found.title}: one objective")
     return picture
 
 
