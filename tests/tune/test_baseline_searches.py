@@ -145,7 +145,12 @@ STUDY = {
         "controller.proportional": {"lower": 0.1, "upper": 100.0, "transform": "log"},
         "controller.integral": {"lower": 100.0, "upper": 1e6, "transform": "log"},
     },
-    "optimiser": {"starts": 2, "candidates": 4, "steps": 25},
+    "optimiser": {
+        "method": "gauss_newton",
+        "starts": 2,
+        "candidates": 4,
+        "steps": 25,
+    },
 }
 
 
