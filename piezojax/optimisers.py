@@ -158,3 +158,6 @@ METHODS: dict[str, Callable[[Function, Function, float], Optimiser]] = {
     "lbfgsb": lbfgsb,
 }
 """Optimisers by the name a study uses."""
+
+GAUSS_NEWTON = "gauss_newton"
+"""The search of ``tune.gauss_newton``: on the errors of a loop, so only for tuning."""

@@ -54,25 +54,27 @@ def simulate(
     - every ``every``-th output, stacked in time (a dense log costs about twice the run,
       every 20th sample a tenth); or
     - with ``metric``, its result, accumulated on the way: memory does not grow with
-      time.
+      time; or
+    - with both, the pair of the result and the last output of each whole stretch of
+      ``every`` samples, stacked in time: not for reverse mode.
 
     Reverse-mode differentiation stores one state each ``segment`` samples and runs the
     samples between again, so its memory is flat too. A ``segment`` as long as the run
     is one plain loop: for runs that are not differentiated in reverse, and a third
     faster where a batch of inputs lies time first (``in_axes=1``). Batches:
     ``jax.vmap``, or ``in_blocks`` for many lanes. Raises ValueError for empty or
-    ragged inputs, and for ``every`` beside a ``metric``.
+    ragged inputs, and for a stretch longer than the run.
     """
     for name, value in (("every", every), ("segment", segment)):
         if value < 1:
             raise ValueError(f"{name} is {value}; it must be at least 1")
-    if metric is not None and every > 1:
-        raise ValueError(
-            f"every is {every}; with a metric, which counts every sample, it must be 1"
-        )
     samples = _length(inputs)
+    if metric is not None and every > samples:
+        raise ValueError(f"every is {every}; the run has {samples} samples")
     system = worked_out(system)
     state = system.init() if state is None else state
+    if metric is not None and every > 1:
+        return _sampled(system, inputs, state, metric, every, samples)
     if metric is not None:
         return _accumulate(system, inputs, state, metric, segment, samples)
     if every > 1:
@@ -119,6 +121,33 @@ def _accumulate(
         carry = _in_segments(sample, carry, inputs, segment, samples)
     state, total, _ = carry
     return state, metric.result(total)
+
+
+def _sampled(
+    system: System, inputs: Any, state: State, metric: Metric, every: int, samples: int
+) -> tuple[State, Any]:
+    def sample(carry, input):
+        state, total, index, _ = carry
+        state, output = system.step(state, input)
+        return (state, metric.update(total, index, output), index + 1, output), None
+
+    def stretch(carry, inputs):
+        carry, _ = jax.lax.scan(sample, carry, inputs)
+        return carry, carry[-1]
+
+    # The last output goes round with the state: one copy of the step to compile.
+    first = jax.tree.map(lambda x: x[0], inputs)
+    empty = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(lambda s, u: system.step(s, u)[1], state, first),
+    )
+    head, tail = _chunks(inputs, every, samples)
+    carry = (state, metric.init(), jnp.zeros((), jnp.int32), empty)
+    carry, outputs = jax.lax.scan(stretch, carry, head)
+    if samples % every:
+        carry, _ = jax.lax.scan(sample, carry, tail)
+    state, total, _, _ = carry
+    return state, (metric.result(total), outputs)
 
 
 def _in_segments(

@@ -242,13 +242,17 @@ class Feedback(System):
     actuator: System
     sensor: System
 
-    def init(self, input: Any = 0.0) -> LoopState:
+    def init(self, input: Any = 0.0, holding: Any = None) -> LoopState:
         """Return the loop at rest at the reference ``input`` (um): a bumpless start.
 
-        With several axes ``input`` is a vector or a tuple.
+        With several axes ``input`` is a vector or a tuple. ``holding`` is what
+        ``holding_input`` gives for it, if known: solving for it takes longer to compile
+        than the rest.
         """
         reference = as_signal(input)
-        voltage = rest_output(self.actuator, holding_input(self.plant, reference))
+        if holding is None:
+            holding = holding_input(self.plant, reference)
+        voltage = rest_output(self.actuator, as_signal(holding))
         displacement = rest_output(self.plant, voltage)
         quiet = (displacement, jax.tree.map(jnp.zeros_like, displacement))
         measured = rest_output(self.sensor, quiet)

@@ -254,9 +254,21 @@ def test_ragged_and_empty_inputs_are_refused(options):
         simulate(Affine(), jnp.zeros(0), **options)
 
 
-def test_a_metric_counts_every_sample():
-    with pytest.raises(ValueError, match="every is 5; with a metric"):
-        simulate(PLANT, VOLTAGES, every=5, metric=WeightedSum())
+@pytest.mark.parametrize("every", [2, 7, 100, SAMPLES])
+def test_a_metric_counts_every_sample_beside_a_decimated_log(every, dense):
+    run = jax.jit(
+        lambda plant: simulate(plant, VOLTAGES, metric=WeightedSum(), every=every)
+    )
+    state, (found, outputs) = run(PLANT)
+    np.testing.assert_allclose(found, WEIGHTS @ dense[1], rtol=1e-11)
+    expected = dense[1][every - 1 :: every]
+    np.testing.assert_allclose(outputs, expected, rtol=0.0, atol=1e-12)
+    assert_same(state, dense[0])
+
+
+def test_a_metric_and_a_stretch_longer_than_the_run_are_refused():
+    with pytest.raises(ValueError, match=f"every is 2000; the run has {SAMPLES}"):
+        simulate(PLANT, VOLTAGES, every=2000, metric=WeightedSum())
 
 
 @pytest.mark.parametrize(

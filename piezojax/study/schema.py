@@ -9,7 +9,7 @@ from pydantic import Field, field_validator, model_validator
 
 from .. import motions, signals
 from ..identify import chain
-from ..optimisers import METHODS
+from ..optimisers import GAUSS_NEWTON, METHODS
 from ..space import Transform
 from .ensemble_table import EnsembleTable
 from .sweep_table import SweepTable, quoted
@@ -191,7 +191,7 @@ class OptimiserTable(Table):
     @field_validator("method")
     @classmethod
     def _known(cls, name: str) -> str:
-        return one_of(name, METHODS)
+        return one_of(name, (*METHODS, GAUSS_NEWTON))
 
 
 class Study(Table):

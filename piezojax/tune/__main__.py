@@ -10,6 +10,7 @@ from rich.console import Console
 from .. import study as studies
 from ..command import INTERRUPTED, Command, common, results_folder, run
 from ..files import write_text
+from ..report.baselines import baselines_table, baselines_text, write_baselines
 from ..report.comparison import comparison_table, write_comparison
 from ..report.console import (
     Bar,
@@ -23,15 +24,25 @@ from ..report.limit import limit_of, limit_text, write_limit
 from ..report.robustness import constraints_table, front_table
 from ..report.stability import compared, write_stability
 from ..report.tuning import write_numbers, write_results
+from .baselines import Budget
 from .comparison import compare
 from .tuner import Outcome, tune
 
 
 @click.command(cls=Command)
 @click.argument("study", nargs=-1, type=click.Path(path_type=Path))
+@click.option(
+    "--baselines",
+    is_flag=True,
+    help="Also tune by Ziegler-Nichols, a relay, CMA-ES and Nelder-Mead (minutes).",
+)
 @common
 def main(
-    study: tuple[Path, ...], out: Path | None, seed: int | None, quiet: bool
+    study: tuple[Path, ...],
+    baselines: bool,
+    out: Path | None,
+    seed: int | None,
+    quiet: bool,
 ) -> None:
     """Tune the controller that STUDY describes, by gradients through the simulation.
 
@@ -44,22 +55,32 @@ def main(
     def body(console: Console) -> None:
         paths = [_path_of(name) for name in study] or [studies.shipped()]
         if len(paths) > 1 or studies.is_comparison(paths[0]):
+            if baselines:
+                raise ValueError("--baselines takes one study, not a comparison")
             _compare(paths, out, seed, console)
         else:
-            _tune(paths[0], out, seed, console)
+            _tune(paths[0], out, seed, Budget() if baselines else None, console)
 
     run(quiet, body)
 
 
-def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> None:
+def _tune(
+    path: Path,
+    out: Path | None,
+    seed: int | None,
+    baselines: Budget | None,
+    console: Console,
+) -> None:
     with Bar(console) as bar:
         bar.stage(f"reading {path.name}")
         description = studies.load(path)
         with results_folder(out, path.stem) as folder:
             case = studies.build(description, path, seed=seed)
-            outcome = tune(case, progress=bar)
+            outcome = tune(case, baselines=baselines, progress=bar)
             bar.finish()
             bar.stage("drawing")
+            if outcome.baselines is not None:
+                write_baselines(outcome.baselines, folder)
             write_results(outcome, folder)
             if case.fit is not None:
                 write_fit(case.fit, folder)
@@ -87,6 +108,11 @@ def _tune(path: Path, out: Path | None, seed: int | None, console: Console) -> N
     console.print(limit_text(limit), soft_wrap=True)
     if result.perturbed is not None:
         console.print(perturbed_text(result.perturbed), soft_wrap=True)
+    if outcome.baselines is not None:
+        console.print(baselines_table(outcome.baselines))
+        console.print(baselines_text(outcome.baselines), soft_wrap=True)
+        for note in outcome.baselines.notes:
+            console.print(f"note: {note}", soft_wrap=True)
     for name, why in stability.problems.items():
         console.print(f"note: no margins {name} tuning: {why}", soft_wrap=True)
     for warning in result.warnings:

@@ -10,8 +10,9 @@ import numpy as np
 
 from .. import motions
 from .. import signals as signal_library
-from .._types import as_array
+from .._types import as_array, as_signal
 from ..study import Case, Study
+from ..system import holding_input
 from .objective import Signals
 from .traces import Trace, traces_of
 
@@ -41,8 +42,17 @@ def make_data(case: Case) -> Data:
     # Two streams of one seed: the hold-out draws are new for every reference.
     streams = np.random.SeedSequence(study.seed).spawn(2)
     counts = study.objective.noise_draws, study.holdout_draws
+    holding = _holding(case, references[:, 0])
     tuning, holdout = (
-        _signals(case, references, time_s, np.random.default_rng(stream), count, part)
+        _signals(
+            case,
+            references,
+            holding,
+            time_s,
+            np.random.default_rng(stream),
+            count,
+            part,
+        )
         for stream, count, part in zip(
             streams, counts, ("train", "validate"), strict=True
         )
@@ -63,6 +73,7 @@ def make_data(case: Case) -> Data:
 def _signals(
     case: Case,
     references: jax.Array,
+    holding: jax.Array,
     time_s: jax.Array,
     random: np.random.Generator,
     draws: int,
@@ -81,7 +92,19 @@ def _signals(
         # By axis only where there are several.
         walk = as_array(np.cumsum(steps, axis=2) * (drift if axes else drift[0]))
         disturbance = walk if disturbance is None else disturbance + walk
-    return Signals(references, noise, disturbance)
+    return Signals(references, noise, disturbance, (), holding)
+
+
+def _holding(case: Case, begins: jax.Array) -> jax.Array:
+    """Return the inputs under which the stage rests where the references begin."""
+
+    def one(begin):
+        held = holding_input(case.loop.plant, as_signal(begin))
+        return jnp.stack(held) if isinstance(held, tuple) else held
+
+    # References begin in a few places, most of them in one.
+    places, which = np.unique(np.asarray(begins), axis=0, return_inverse=True)
+    return jax.jit(jax.vmap(one))(as_array(places))[which.ravel()]
 
 
 def _reference(study: Study, name: str, time_s: jax.Array) -> jax.Array:

@@ -6,10 +6,12 @@ import numpy as np
 from .._types import as_array
 from ..progress import Progress
 from ..study import Case
+from .clock import Clock
 from .constraints import CONSTRAINTS, TOLERANCE, by_stage
+from .found import Search
 from .objective import Objective
 from .result import FrontPoint
-from .search import Clock, Search, compiled, descend
+from .search import way_of
 
 
 def trace_front(
@@ -34,12 +36,13 @@ def trace_front(
     loosest_first = sorted(
         table.limits, reverse=CONSTRAINTS[table.constraint].sense == "at most"
     )
-    programs = compiled(objective, 1, case, clock, progress)
+    way = way_of(objective, case, clock)
+    way.wait()
     found, unit = [], search.unit
     for limit in loosest_first:
         asked = objective.with_limits(limits | {table.constraint: limit})
-        here = Search(unit)
-        descend(programs, asked, unit[None], here, table.steps, progress)
+        here = Search(unit, starts=unit[None])
+        way.descend(asked, unit[None], here, table.steps, progress)
         unit = here.unit
         seen = jax.tree.map(np.asarray, look(asked, as_array(unit)))
         rms = np.sqrt(np.mean(seen["rms_um"] ** 2, axis=1))

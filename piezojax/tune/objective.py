@@ -42,13 +42,20 @@ class Signals(eqx.Module):
     """References (um), unit-variance noise draws and disturbances (um) for a loop.
 
     With several axes all have a last dimension for them, in the unit of each.
-    ``traces`` then are what is judged: pairs of a reference and an axis.
+    ``traces`` then are what is judged: pairs of a reference and an axis. ``holding`` is
+    the input under which the loop's own plant rests at the begin of each reference,
+    worked out if left out.
     """
 
     references: Float[Array, "references samples *axes"]
     noise: Float[Array, "references draws samples *axes"]
     disturbance: Float[Array, "references draws samples *axes"] | None = None
     traces: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
+    holding: Float[Array, "*begins"] | None = None
+
+    def for_another_plant(self) -> "Signals":
+        """Return the same without ``holding``."""
+        return dataclasses.replace(self, holding=None)
 
 
 def evaluate(
@@ -64,16 +71,39 @@ def evaluate(
     reference; samples before ``start`` do not count. With ``beside``, another metric of
     the same runs, a pair of both figures.
     """
+    return sampled(loop_of, parameters, signals, start, beside)[0]
+
+
+def sampled(
+    loop_of: Callable[[Any], Feedback],
+    parameters: Any,
+    signals: Signals,
+    start: int,
+    beside: Metric | None = None,
+    every: int = 1,
+) -> tuple[Any, Array | None]:
+    """Return what ``evaluate`` does, and one of ``every`` errors (um) of each run.
+
+    The errors are those at samples counted, with time last; None unless ``every`` is
+    above 1.
+    """
     metric: Metric = Tracking(start=start)
     if beside is not None:
         metric = Both(metric, beside)
     if signals.references.ndim > 2:
         metric = PerAxisMetric(metric, signals.references.shape[2])
 
-    def one(parameters, reference, noise, disturbance):
+    def one(parameters, reference, noise, disturbance, holding):
         loop = loop_of(parameters)
         inputs = loop_inputs(reference, noise, disturbance)
-        return simulate(loop, inputs, loop.init(reference[0]), metric=metric)[1]
+        state = loop.init(reference[0], holding)
+        found = simulate(loop, inputs, state, metric=metric, every=every)[1]
+        if every == 1:
+            return found, None
+        figures, log = found
+        error = jax.tree.map(jnp.subtract, log.displacement, log.reference)
+        counted = jax.tree.map(lambda x: x[start // every :], error)
+        return figures, jnp.stack(counted) if isinstance(counted, tuple) else counted
 
     # A copy of the parameters for each run: their gradients are then summed once, at
     # the end, and not in each step.
@@ -81,14 +111,18 @@ def evaluate(
     copies = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*runs, *jnp.shape(x))), parameters
     )
-    draws = jax.vmap(one, in_axes=(0, None, 0, 0))
-    figures = jax.vmap(draws)(
-        copies, signals.references, signals.noise, signals.disturbance
+    draws = jax.vmap(one, in_axes=(0, None, 0, 0, None))
+    found = jax.vmap(draws)(
+        copies,
+        signals.references,
+        signals.noise,
+        signals.disturbance,
+        signals.holding,
     )
     if not signals.traces:
-        return figures
+        return found
     run, axis = (list(indices) for indices in zip(*signals.traces, strict=True))
-    return jax.tree.map(lambda x: x[jnp.array(run), :, jnp.array(axis)], figures)
+    return jax.tree.map(lambda x: x[jnp.array(run), :, jnp.array(axis)], found)
 
 
 class Verdict(NamedTuple):
@@ -96,6 +130,22 @@ class Verdict(NamedTuple):
 
     loss: Float[Array, ""]
     violation: Float[Array, ""]
+
+
+class Errors(NamedTuple):
+    """A point as a problem of least squares.
+
+    ``loss`` is what is minimised, ``errors`` of each run in um, ``added`` what the
+    augmented Lagrangian adds. A weight is how much the loss rises with half the mean
+    square of a run's error: with these weights, and 2 on what is added, they are
+    residuals whose squares have the loss's gradient, as far as it depends on them.
+    """
+
+    loss: Float[Array, ""]
+    verdict: Verdict
+    errors: Float[Array, "runs samples"]
+    added: Float[Array, " constraints"]
+    weights: Float[Array, " runs"]
 
 
 def _on_each(function: Callable[[Stage | None], T], stages: Stage | None) -> T:
@@ -144,7 +194,9 @@ class Objective(eqx.Module):
     limits: dict[str, Array] = eqx.field(default_factory=dict)
     highest: Array | None = None
     dt: float = eqx.field(static=True, default=1.0)
-    multipliers: Float[Array, " constraints"] | None = None
+    multipliers: Float[Array, " constraints"] = eqx.field(
+        default_factory=lambda: jnp.zeros(0)
+    )
     penalty: Float[Array, ""] = eqx.field(converter=as_array, default=PENALTY)
 
     @property
@@ -171,32 +223,38 @@ class Objective(eqx.Module):
 
         Figures of shape [stages, references, draws].
         """
-        beside = Extremes() if needs(self.limits, "extremes") else None
+        return self._sampled(unit)[0]
 
-        def loop_of(unit):
-            return self.space.put(self.loop, unit)
+    def _sampled(
+        self, unit: Float[Array, " n"], every: int = 1
+    ) -> tuple[Seen, Array | None]:
+        beside = Extremes() if needs(self.limits, "extremes") else None
+        signals = self.signals
+        if self.stages is not None:
+            signals = signals.for_another_plant()
+
+        def loop_of(unit, stage):
+            loop = self.space.put(self.loop, unit)
+            return loop if stage is None else stage.around(loop)
 
         def run(stage):
-            return evaluate(
-                lambda unit: (
-                    loop_of(unit) if stage is None else stage.around(loop_of(unit))
-                ),
+            return sampled(
+                lambda unit: loop_of(unit, stage),
                 unit,
-                self.signals,
+                signals,
                 self.start,
                 beside,
+                every,
             )
 
         def margins(stage):
-            loop = loop_of(unit)
-            loop = loop if stage is None else stage.around(loop)
-            return sensitivities(loop, self.highest, self.dt)
+            return sensitivities(loop_of(unit, stage), self.highest, self.dt)
 
-        figures = _on_each(run, self.stages)
+        figures, errors = _on_each(run, self.stages)
         figures, extremes = figures if beside else (figures, None)
         known = needs(self.limits, "sensitivity")
         found = _on_each(margins, self.margin_stages) if known else None
-        return Seen(figures, extremes, found, dt=self.dt)
+        return Seen(figures, extremes, found, dt=self.dt), errors
 
     def _normalised(self, figures: TrackingFigures) -> Array:
         square = jnp.mean(figures.rms_error**2, axis=2)
@@ -246,7 +304,7 @@ class Objective(eqx.Module):
 
     def _added(self, violation: Array) -> Array:
         multipliers = self.multipliers
-        if multipliers is None:
+        if multipliers.size == 0:
             multipliers = jnp.zeros_like(violation)
         return augmented(violation, multipliers, self.penalty)
 
@@ -256,10 +314,29 @@ class Objective(eqx.Module):
 
     def both(self, unit: Float[Array, " n"]) -> tuple[Float[Array, ""], Verdict]:
         """Return ``loss`` and ``verdict`` of one simulation."""
-        total, violation = self._judged(self.seen(unit))
-        added = total + jnp.sum(self._added(violation) ** 2)
-        finite = [jnp.where(jnp.isfinite(x), x, HOPELESS) for x in (added, total)]
-        return finite[0], Verdict(finite[1], jnp.max(violation, initial=0.0))
+        return self._whole(self.seen(unit))[:2]
+
+    def _whole(self, seen: Seen) -> tuple[Array, Verdict, Array]:
+        """Return loss, verdict, and what the augmented Lagrangian adds."""
+        total, violation = self._judged(seen)
+        added = self._added(violation)
+        loss, alone = (
+            jnp.where(jnp.isfinite(x), x, HOPELESS)
+            for x in (total + jnp.sum(added**2), total)
+        )
+        return loss, Verdict(alone, jnp.max(violation, initial=0.0)), added
+
+    def errors(self, unit: Float[Array, " n"], every: int) -> Errors:
+        """Return the objective and one of ``every`` errors of each run."""
+        seen, errors = self._sampled(unit, every)
+        assert errors is not None
+        slope = jax.grad(lambda rms: self._error(seen.figures._replace(rms_error=rms)))(
+            seen.figures.rms_error
+        )
+        weights = slope / jnp.maximum(seen.figures.rms_error, _FLOOR)
+        loss, verdict, added = self._whole(seen)
+        flat = errors.reshape(-1, errors.shape[-1])
+        return Errors(loss, verdict, flat, added, weights.ravel())
 
     def verdict(self, unit: Float[Array, " n"]) -> Verdict:
         """Return the objective without constraints, and the worst violation."""

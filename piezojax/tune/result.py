@@ -168,6 +168,8 @@ class Result(BaseModel):
     are the axes that should rest, under all references of the hold-out.
     ``constraints`` says what became of the study's limits, ``front`` is its Pareto
     front, and ``perturbed`` how the gains do on the held-out plants of its ensemble.
+    ``history`` holds the lowest loss of each start after each step, ``times_s`` the
+    seconds from the begin of the search to the end of that step.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -193,6 +195,7 @@ class Result(BaseModel):
     units: dict[str, str] = {}
     warnings: list[str]
     history: list[list[float | None]]
+    times_s: list[float] = []
     evaluations: int
     compile_s: float
     wall_s: float

@@ -19,23 +19,30 @@ from ..stability.impulse import sensitivities
 from ..study import Case, Stage, read, shipped
 from ..study.ensemble import Part
 from ..system import Feedback
+from .baselines import Baselines, Budget, contest
+from .clock import Clock
 from .constraints import Seen, by_stage, needs
 from .data import Data, make_data
+from .found import Search
 from .front import trace_front
 from .objective import RAILED, Objective, Signals, evaluate
 from .result import FrontPoint, Kept, Perturbed, Result, Scores, scores
-from .search import Clock, Search, search_box
+from .search import search_box
 
 
 @dataclass
 class Outcome:
-    """A Result with the loops and signals behind it, for pictures and further use."""
+    """A Result with the loops and signals behind it, for pictures and further use.
+
+    ``baselines`` are there if they were asked for.
+    """
 
     result: Result
     before: Feedback
     after: Feedback
     case: Case
     holdout: Signals
+    baselines: Baselines | None = None
 
     @property
     def controller(self):
@@ -68,6 +75,7 @@ class _Judge:
     def on_stages(self, loop: Feedback, stages: Stage, signals: Signals) -> Seen:
         """Return what is seen of ``loop`` on ``stages``, stacked on a leading axis."""
         dynamic, static = eqx.partition(stages, eqx.is_array)
+        signals = signals.for_another_plant()
         limits = self._case.study.constraints.limits
         beside = Extremes() if needs(limits, "extremes") else None
 
@@ -96,11 +104,15 @@ class _Judge:
 
 
 def tune(
-    study: Case | str | Path | None = None, *, progress: Progress | None = None
+    study: Case | str | Path | None = None,
+    *,
+    baselines: Budget | None = None,
+    progress: Progress | None = None,
 ) -> Outcome:
     """Tune the controller of a study and judge it on held-out noise and references.
 
     ``study`` is a Case, the path of a study file, or None for the default study.
+    With a budget the ``baselines`` are run on the same objective once that is done.
     ``Ctrl-C`` ends the search and keeps the best gains found so far. A start that
     diverges is replaced by the best of the candidates. Raises ValueError when no point
     of the box, the start included, gives a stable loop.
@@ -154,7 +166,12 @@ def tune(
         # What was found is kept; only a second interrupt ends this too.
         search.status = "interrupted"
         result = _report(case, data, judge, before, after, search, clock, {}, None)
-    return Outcome(result, case.loop, after, case, data.holdout)
+    rivals = (
+        contest(objective, case, data, search, baselines, progress)
+        if baselines and search.status != "interrupted"
+        else None
+    )
+    return Outcome(result, case.loop, after, case, data.holdout, rivals)
 
 
 def _scale(
@@ -290,6 +307,7 @@ def _report(
         units={trace.name: trace.unit for trace in data.traces},
         warnings=[*search.warnings, *_warnings(case, at_bound, after_scores, holdout)],
         history=search.history,
+        times_s=search.times_s,
         evaluations=search.evaluations,
         compile_s=clock.compile_s,
         wall_s=clock.wall_s(),

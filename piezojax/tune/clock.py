@@ -1,0 +1,38 @@
+"""Wall time of a piece of work, and the part of it that went into compiling."""
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+import jax
+
+
+class Clock:
+    """Wall time since it was made, and how much of it went into compiling (s)."""
+
+    def __init__(self):
+        self._began = time.perf_counter()
+        self._cpu = time.process_time()
+        self.compile_s = 0.0
+
+    def compiled(self, function: Callable, *arguments: Any) -> Callable:
+        """Return ``function`` compiled for ``arguments``, its time counted."""
+        start = time.perf_counter()
+        program = jax.jit(function).lower(*arguments).compile()
+        self.compile_s += time.perf_counter() - start
+        return program
+
+    def waited(self, program: Future) -> None:
+        """Wait for a program that another thread compiles, and count the waiting."""
+        start = time.perf_counter()
+        program.result()
+        self.compile_s += time.perf_counter() - start
+
+    def cpu_s(self) -> float:
+        """Return the processor seconds since the start, of all threads."""
+        return time.process_time() - self._cpu
+
+    def wall_s(self) -> float:
+        """Return the seconds since the start."""
+        return time.perf_counter() - self._began
