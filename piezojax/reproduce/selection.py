@@ -30,13 +30,13 @@ MOST = 3
 WORTH = 1.02
 """Least factor by which a doubt must lower the cross-validated ratio."""
 
-GRID = 9
+GRID = 5
 """Values of a candidate tried with the stage held; the middle one is print."""
 
 SCREENING = 3
 """Steps of the optimiser from the best of them, with the stage free."""
 
-FINALISTS = 4
+FINALISTS = 3
 """Candidates, the cheapest after that, that are cross-validated."""
 
 
