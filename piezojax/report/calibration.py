@@ -8,6 +8,7 @@ from rich.table import Table
 
 from ..reproduce.calibration import EXPERIMENTS, Swap
 from ..reproduce.judged import BAR
+from ..reproduce.selection import Round
 from ..reproduce.summary import ratio_of
 from .figures import AFTER, BEFORE, REFERENCE, figure, styled, write
 
@@ -50,7 +51,10 @@ def calibration_figure(found: Mapping[str, Sequence[Swap]]) -> Figure:
 
 
 def calibration_table(name: str, swaps: Sequence[Swap]) -> Table:
-    """Return ratios and fitted values, a column a half."""
+    """Return ratios, fitted values and how the doubts were chosen, a column a half.
+
+    A print that one half alone puts in doubt has no value in the other's column.
+    """
     table = Table(title=f"{name}: fitted to one half of the cells, judged on the other")
     table.add_column("")
     for swap in swaps:
@@ -61,6 +65,8 @@ def calibration_table(name: str, swaps: Sequence[Swap]) -> Table:
     table.add_row(
         "geometric-mean ratio, held out", *(f"{x:.3f}" for x in held_out), style="bold"
     )
+    alone = (f"{ratio_of(swap.alone):.3f}" for swap in swaps)
+    table.add_row("the same, the stage alone, no print in doubt", *alone)
     judged = ("met" if x <= BAR else "missed" for x in held_out)
     table.add_row(f"bar of {BAR:g}", *judged)
     table.add_section()
@@ -73,7 +79,32 @@ def calibration_table(name: str, swaps: Sequence[Swap]) -> Table:
             f"held out, {' '.join(place)}", *(f"{ratio_of(c):.3f}" for c in inside)
         )
     table.add_section()
+    every = [name for swap in swaps for name in swap.values]
     for quantity, about in EXPERIMENTS[name].quantities().items():
-        values = (f"{swap.values[quantity]:.4g}" for swap in swaps)
-        table.add_row(f"{quantity} ({about.unit})", *values)
+        if quantity in every:
+            values = (
+                f"{swap.values[quantity]:.4g}" if quantity in swap.values else "-"
+                for swap in swaps
+            )
+            table.add_row(f"{quantity} ({about.unit})", *values)
+    table.add_row("pull towards print", *(f"{swap.strength:g}" for swap in swaps))
+    table.add_section()
+    for number in range(max(len(swap.rounds) for swap in swaps)):
+        told = (_told(swap.rounds[number : number + 1]) for swap in swaps)
+        table.add_row(f"cross-validated inside the half, doubt {number + 1}", *told)
     return table
+
+
+def _told(rounds: Sequence[Round]) -> str:
+    """Return what the round said, one finalist a line; nothing for no round."""
+    return "\n".join(
+        line
+        for found in rounds
+        for line in (
+            f"without: {found.before:.3f}",
+            *(
+                f"{name}{' (taken)' if name == found.taken else ''}: {ratio:.3f}"
+                for name, ratio in found.after.items()
+            ),
+        )
+    )

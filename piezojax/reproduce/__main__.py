@@ -29,7 +29,7 @@ from .summary import as_csv, summarise
     "--calibrate",
     is_flag=True,
     help="Fit the stage to half of the cells and predict the others, then swap "
-    "(minutes).",
+    "(half an hour or more).",
 )
 @common
 def main(tables, calibrate, out, seed, quiet):

@@ -35,7 +35,10 @@ def as_plain(name: str, swaps: Sequence[Swap]) -> dict[str, Any]:
                 for n, value in swap.values.items()
             },
             "pull_towards_print": swap.strength,
+            "doubts": list(swap.doubts),
+            "selection": [found._asdict() for found in swap.rounds],
             "fitted": _ratios(swap.train),
+            "held_out_without_doubts": _ratios(swap.alone),
             "held_out": _ratios(swap.held_out),
             "bar": BAR,
             "met": ratio_of(swap.held_out) <= BAR,

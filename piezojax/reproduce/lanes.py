@@ -12,11 +12,12 @@ from jaxtyping import Array, Bool, Float
 from .. import signals
 from .._types import State
 from ..catalog import p753
-from ..control import DisturbanceObserverControl
+from ..paths import parameters, replace
 from ..rollout import Metric, simulate
 from ..system import Feedback, LoopInput, System, loop_inputs
 from . import chapter4, chapter5
 from .cell import Cell, window
+from .doubts import DOUBTS, REFERENCE, candidates
 
 WARM_UP = 0.3
 """Of a shortened run, before errors count, s: a jump of SW at its start rings off."""
@@ -27,53 +28,40 @@ SHORT = 1.0
 SEED = 0
 """Of the sensor's noise."""
 
-DOUBTED = ("5-5", "dob")
-"""Table and column whose printed P = 0.05 is suspect (docs/errata.md)."""
-
 
 class Lanes(eqx.Module):
     """Loops of one kind of controller, a lane a cell; time first, in um.
 
     ``weight`` is one over the number of samples counted, or zero outside the window;
-    ``noise``, of unit variance, is the same in all lanes. ``doubted`` marks those of
-    the disturbance observer of Table 5-4, ``superposed`` those that follow SW.
+    ``noise``, of unit variance, is the same in all lanes. ``follow`` turns controller
+    and reference into what the displacement is judged against; ``concerned`` marks,
+    for each of ``doubts.DOUBTS`` that counts here, the lanes that hold it.
     """
 
     controller: System
     reference: Float[Array, "samples lanes"]
-    target: Float[Array, "samples lanes"]
     weight: Float[Array, "samples lanes"]
     noise: Float[Array, " samples"]
-    doubted: Bool[Array, " lanes"]
-    superposed: Bool[Array, " lanes"]
+    concerned: dict[str, Bool[Array, " lanes"]]
+    follow: Callable[[System, Array], Array] = eqx.field(static=True)
 
-    def with_doubts(self, values: Mapping[str, Any]) -> "Lanes":
-        """Return the lanes with those of ``stage.DOUBTS`` that ``values`` holds."""
-        lanes = self
-        if "observer_proportional" in values:
-            lanes = lanes.with_observer_proportional(values["observer_proportional"])
-        if "superposed_amplitude" in values:
-            lanes = lanes.with_superposed_amplitude(values["superposed_amplitude"])
-        return lanes
+    def target(self) -> Float[Array, "samples lanes"]:
+        """Return what the displacement is to be, um."""
+        return jax.vmap(self.follow, (0, 1), 1)(self.controller, self.reference)
 
-    def with_superposed_amplitude(self, value: Array) -> "Lanes":
-        """Return the lanes with SW of another amplitude (um) than the printed 5."""
-        share = jnp.where(self.superposed, value / 5.0, 1.0)
-        # From rest at zero the target is linear in the reference.
+    def with_doubts(self, factors: Mapping[str, Any]) -> "Lanes":
+        """Return the lanes with their prints times ``factors``, by name."""
+        reference, leaves = self.reference, parameters(self.controller)
+        for name, lanes in self.concerned.items():
+            factor, doubt = jnp.where(lanes, factors[name], 1.0), DOUBTS[name]
+            if doubt.leaf == REFERENCE:
+                reference = factor * reference
+            for path in doubt.leaves(leaves):
+                leaves[path] = factor * leaves[path]
         return eqx.tree_at(
-            lambda lanes: (lanes.reference, lanes.target),
+            lambda lanes: (lanes.controller, lanes.reference),
             self,
-            (share * self.reference, share * self.target),
-        )
-
-    def with_observer_proportional(self, value: Array) -> "Lanes":
-        """Return the lanes with another P where Table 5-4 prints 0.05."""
-        if not isinstance(self.controller, DisturbanceObserverControl):
-            return self
-        return eqx.tree_at(
-            lambda lanes: lanes.controller.feedback.proportional,
-            self,
-            replace_fn=lambda printed: jnp.where(self.doubted, value, printed),
+            (replace(self.controller, leaves), reference),
         )
 
 
@@ -85,10 +73,14 @@ def _maker(cell: Cell) -> Callable[[], System]:
     return lambda: make(chapter4.RATES[cell.table])
 
 
-def _target(cell: Cell, controller: System, reference: Array) -> Array:
+def _reference(controller: System, reference: Array) -> Array:
+    return reference
+
+
+def _follow(cell: Cell) -> Callable[[System, Array], Array]:
     if cell.table in chapter5.TABLES:
-        return reference
-    return chapter4.COLUMNS[cell.table][cell.column].target(controller, reference)
+        return _reference
+    return chapter4.COLUMNS[cell.table][cell.column].target
 
 
 def _spans(name: str, short: bool) -> tuple[int, int]:
@@ -119,12 +111,6 @@ def _together(cells: Sequence[Cell], longest: int, short: bool) -> Lanes:
     time = jnp.arange(longest) / p753.RATE
     controllers = [_maker(cell)() for cell in cells]
     references = [signals.signal(cell.row, time) for cell in cells]
-    targets = [
-        _target(cell, controller, reference)
-        for cell, controller, reference in zip(
-            cells, controllers, references, strict=True
-        )
-    ]
     weight = np.zeros((longest, len(cells)))
     for lane, cell in enumerate(cells):
         start, stop = _spans(cell.row, short)
@@ -132,11 +118,13 @@ def _together(cells: Sequence[Cell], longest: int, short: bool) -> Lanes:
     return Lanes(
         jax.tree.map(lambda *leaves: jnp.stack(leaves), *controllers),
         jnp.stack(references, axis=1),
-        jnp.stack(targets, axis=1),
         jnp.asarray(weight),
         jnp.asarray(np.random.default_rng(SEED).standard_normal(longest)),
-        jnp.asarray([(cell.table, cell.column) == DOUBTED for cell in cells]),
-        jnp.asarray([signals.parse(cell.row)[0] == "SW" for cell in cells]),
+        {
+            name: jnp.asarray([doubt.concerns(cell) for cell in cells])
+            for name, doubt in candidates(cells).items()
+        },
+        _follow(cells[0]),
     )
 
 
@@ -182,5 +170,5 @@ def mean_squares(stage: System, sensor: System, lanes: Lanes) -> Float[Array, " 
         )[1]
 
     return jax.vmap(one, in_axes=(0, 1, 1, 1))(
-        lanes.controller, lanes.reference, lanes.target, lanes.weight
+        lanes.controller, lanes.reference, lanes.target(), lanes.weight
     )

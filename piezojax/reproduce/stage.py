@@ -29,14 +29,6 @@ class Quantity:
     scale: Transform = "log"
 
 
-DOUBTS = {
-    "observer_proportional": Quantity(0.05, 5e-4, 0.1, "V s/um"),
-    "superposed_amplitude": Quantity(5.0, 2.0, 8.0, "um"),
-}
-"""What is printed, no property of the stage, and may be fitted all the same: P of the
-disturbance observer in Table 5-4, and the amplitude of SW, 5 um being (4.48)."""
-
-
 def _within(value: float, ratio: float, unit: str) -> Quantity:
     return Quantity(value, value / ratio, value * ratio, unit)
 

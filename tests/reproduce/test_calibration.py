@@ -11,10 +11,13 @@ import pytest
 from piezojax.catalog import p753
 from piezojax.control import ModelReferencePID
 from piezojax.hardware import Sensor
-from piezojax.reproduce import calibration, chapter4, lanes
-from piezojax.reproduce.calibration import EXPERIMENTS, HALVES, fit
+from piezojax.paths import parameters
+from piezojax.reproduce import chapter4, lanes
+from piezojax.reproduce.calibration import EXPERIMENTS, HALVES
 from piezojax.reproduce.cell import printed
-from piezojax.reproduce.lanes import by_column
+from piezojax.reproduce.doubts import DOUBTS, REFERENCE, candidates
+from piezojax.reproduce.problem import STEEPEST, Problem, fit
+from piezojax.reproduce.selection import starts
 from piezojax.reproduce.stage import stage_of
 from piezojax.reproduce.summary import geomean, ratio_of
 from piezojax.rollout import simulate
@@ -52,9 +55,12 @@ def test_a_known_stage_is_found_from_its_own_cells(problem):
     )
     before = geomean(made.log_ratios(made.start))
     assert before > 1.05
-    unit = fit(made, steps=20)
-    found = made.space.named(unit)
-    assert geomean(made.log_ratios(unit)) < 1.005
+    free = range(made.stage)
+    point, least = fit(made, free, starts(made), steps=20)
+    found = made.space.named(point)
+    assert geomean(made.log_ratios(point)) < 1.005
+    assert least == pytest.approx(float(jnp.sum(made.residuals(point) ** 2)))
+    np.testing.assert_array_equal(point[made.stage :], made.start[made.stage :])
     assert float(found["gain"]) == pytest.approx(truth["gain"], rel=0.03)
     assert float(found["slow_pole"]) == pytest.approx(truth["slow_pole"], rel=0.1)
 
@@ -62,14 +68,31 @@ def test_a_known_stage_is_found_from_its_own_cells(problem):
 @pytest.mark.slow
 def test_jacobian_against_finite_differences(problem):
     at = problem.start + 0.013
+    names = ("proportional, Table 5-4, PID-SMC", "size of SIN", "DC gain of (5.34)")
+    doubted = [problem.space.paths.index(name) for name in names]
+    free = [*range(problem.stage), *doubted]
     residuals = eqx.filter_jit(problem.residuals)
-    slope, value = eqx.filter_jit(problem.jacobian)(at)
+    slope, value = eqx.filter_jit(problem.jacobian)(at, jnp.asarray(free))
     np.testing.assert_allclose(value, residuals(at), rtol=1e-12)
-    for i in range(at.size):
+    for column, i in enumerate(free):
         step = jnp.zeros(at.size).at[i].set(1e-6)
         central = (residuals(at + step) - residuals(at - step)) / 2e-6
-        np.testing.assert_allclose(slope[:, i], central, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(slope[:, column], central, rtol=1e-4, atol=1e-6)
     assert np.all(np.abs(np.asarray(slope)).max(axis=0) > 0.0)
+
+
+def test_no_step_follows_a_slope_that_is_not_believed(problem, monkeypatch):
+    def wild(self, point):
+        return jnp.stack([jnp.exp(1e3 * point[0]), jnp.nan * point[1], point[2]])
+
+    monkeypatch.setattr(Problem, "log_ratios", wild)
+    three = eqx.tree_at(lambda p: p.counts, problem, jnp.ones(3))
+    slope, value = three.jacobian(three.start, jnp.arange(3))
+    assert np.all(np.isfinite(slope))
+    assert np.all(np.isfinite(value))
+    assert value[1] == STEEPEST
+    assert not np.any(slope[1])
+    assert slope[2, 2] > 0.0
 
 
 def test_uncounted_cells_do_not_move_the_fit(problem):
@@ -120,27 +143,70 @@ def test_the_first_cells_of_the_even_half():
     ]
 
 
-def test_only_the_doubted_gain_is_replaced():
-    cells = [
-        cell
-        for table in ("5-3", "5-5")
-        for cell in printed("ch5", table).values()
-        if cell.row == "SIN50"
-    ]
-    for group in by_column(cells):
-        made = lanes.lanes_of(group, short=True)[0]
-        other = made.with_observer_proportional(jnp.asarray(0.005))
-        changed = [
-            not np.array_equal(x, y)
-            for x, y in zip(jax.tree.leaves(made), jax.tree.leaves(other), strict=True)
-        ]
-        assert sum(changed) == (1 if group[0].column == "dob" else 0)
-        if group[0].column == "dob":
-            gains = other.controller.feedback.proportional
-            assert gains.tolist() == [0.01, 0.005]
+def every_cell(name):
+    return [cell for half in EXPERIMENTS[name].cells().values() for cell in half]
 
 
-def test_sw_of_another_amplitude_is_followed_by_all_that_follow_it():
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_number_of_every_loop_may_be_doubted(name):
+    free = {"error_weight", "autoregressive", "rest_input", "rest_output"}
+    cells = every_cell(name)
+    for cell in cells:
+        doubts = [doubt for doubt in DOUBTS.values() if doubt.concerns(cell)]
+        paths = parameters(lanes._maker(cell)())
+        for path in paths:
+            held = [doubt for doubt in doubts if path in doubt.leaves(paths)]
+            assert len(held) == (0 if free & set(path.split(".")) else 1), path
+        assert sum(doubt.leaf == REFERENCE for doubt in doubts) == 1
+        for doubt in doubts:
+            assert doubt.leaf == REFERENCE or doubt.leaves(paths)
+    quantities = EXPERIMENTS[name].quantities()
+    for doubt in candidates(cells):
+        assert quantities[doubt].start == 1.0
+
+
+def test_the_number_of_candidates():
+    assert len(candidates(every_cell("chapter 5"))) == 33
+    assert len(candidates(every_cell("chapter 4"))) == 17
+
+
+@pytest.mark.parametrize(
+    ("doubt", "column", "expected"),
+    [
+        ("proportional, Table 5-4, observer", "dob", {"feedback.proportional": 1}),
+        ("proportional, Table 5-2", "pid_smc", {"proportional": 0}),
+        ("K_e", "dob", {"gain": None}),
+        (
+            "DC gain of (5.33)",
+            "dob",
+            {
+                f"{m}moving.{i}": None
+                for m in ("model.", "feedback.model.")
+                for i in "012"
+            },
+        ),
+        ("K_e", "inversion", {}),
+    ],
+)
+def test_only_the_doubted_number_is_replaced(doubt, column, expected):
+    """``expected``: the leaves that change, in the lane of one table or in both."""
+    cells = [printed("ch5", t)["SIN50", column] for t in ("5-3", "5-5")]
+    made = lanes.lanes_of(cells, short=True)[0]
+    factors = dict.fromkeys(DOUBTS, 1.0) | {doubt: 0.1}
+    before = parameters(made.controller)
+    after = parameters(made.with_doubts(factors).controller)
+    changed = {}
+    for path, leaf in before.items():
+        share = np.asarray(after[path]) / np.where(leaf == 0.0, 1.0, leaf)
+        if np.any(leaf != after[path]):
+            changed[path] = [bool(np.isclose(s, 0.1)) for s in share]
+    assert changed == {
+        path: [True, True] if lane is None else [lane == 0, lane == 1]
+        for path, lane in expected.items()
+    }
+
+
+def test_sw_of_another_size_is_followed_by_all_that_follow_it():
     cells = [
         printed(chapter, table)[row, column]
         for row in ("SW50", "SIN50")
@@ -150,8 +216,8 @@ def test_sw_of_another_amplitude_is_followed_by_all_that_follow_it():
         )
     ]
     for made in lanes.lanes_of(cells, short=True):
-        other = made.with_superposed_amplitude(jnp.asarray(3.0))
-        assert made.superposed.tolist() == [True, False]
+        other = made.with_doubts(dict.fromkeys(DOUBTS, 1.0) | {"size of SW": 0.6})
+        assert made.concerned["size of SW"].tolist() == [True, False]
         time = np.arange(made.reference.shape[0]) / 20_000.0 - 0.1
         by_hand = 0.6 * (
             5.0
@@ -162,7 +228,7 @@ def test_sw_of_another_amplitude_is_followed_by_all_that_follow_it():
         )
         np.testing.assert_allclose(other.reference[:, 0], by_hand, atol=1e-9)
         np.testing.assert_array_equal(other.reference[:, 1], made.reference[:, 1])
-        np.testing.assert_array_equal(other.target[:, 1], made.target[:, 1])
+        np.testing.assert_array_equal(other.target()[:, 1], made.target()[:, 1])
         controller = jax.tree.map(lambda leaf: leaf[0], made.controller)
         follow = (
             chapter4.COLUMNS["4-5"]["model_reference"].target
@@ -170,8 +236,20 @@ def test_sw_of_another_amplitude_is_followed_by_all_that_follow_it():
             else lambda _, reference: reference
         )
         np.testing.assert_allclose(
-            other.target[:, 0], follow(controller, jnp.asarray(by_hand)), atol=1e-9
+            other.target()[:, 0], follow(controller, jnp.asarray(by_hand)), atol=1e-9
         )
+
+
+def test_a_doubted_reference_model_is_what_the_error_is_held_against():
+    cell = printed("ch4", "4-5")["SIN50", "model_reference"]
+    made = lanes.lanes_of([cell], short=True)[0]
+    other = made.with_doubts(dict.fromkeys(DOUBTS, 1.0) | {"zeta, 4.5.4.3": 2.0})
+    controller = jax.tree.map(lambda leaf: leaf[0], made.controller)
+    damped = eqx.tree_at(lambda c: c.reference_model.damping, controller, 0.5)
+    follow = chapter4.COLUMNS["4-5"]["model_reference"].target
+    wanted = follow(damped, made.reference[:, 0])
+    np.testing.assert_allclose(other.target()[:, 0], wanted, atol=1e-12)
+    assert not np.allclose(made.target()[:, 0], wanted, atol=1e-3)
 
 
 def test_the_sensor_shakes_the_stage_and_is_not_in_the_error(problem):
@@ -189,7 +267,7 @@ def test_the_sensor_shakes_the_stage_and_is_not_in_the_error(problem):
     )
     inputs = loop_inputs(made.reference[:, 0], made.noise)
     sample = simulate(loop, inputs, loop.init(0.0))[1]
-    off = sample.displacement - made.target[:, 0]
+    off = sample.displacement - made.target()[:, 0]
     counted = np.asarray(made.weight[:, 0]) > 0.0
     rms = np.sqrt(np.mean(np.asarray(off)[counted] ** 2))
     assert float(loud[0]) == pytest.approx(rms, rel=1e-9)
@@ -197,18 +275,12 @@ def test_the_sensor_shakes_the_stage_and_is_not_in_the_error(problem):
 
 
 def test_what_is_in_doubt_is_not_pulled_towards_print(problem, monkeypatch):
-    name = "chapter 5, P of the observer in doubt"
-    cells = [printed("ch5", "5-3")["SIN50", "dob"]]
-    doubtful = EXPERIMENTS[name].problem(cells, short=True)
-    place = doubtful.space.paths.index("observer_proportional")
-    moved = doubtful.start.at[place].add(-0.2).at[0].add(0.1)
-    monkeypatch.setattr(calibration.Problem, "log_ratios", lambda *_: jnp.zeros(1))
-    pull = np.asarray(doubtful.residuals(moved))[len(cells) :]
-    expected = np.zeros(doubtful.start.size)
-    expected[0] = 0.1
-    np.testing.assert_allclose(pull, expected, atol=1e-12)
-    assert len(calibration.starts(doubtful)) == 3
-    assert len(calibration.starts(problem)) == 2
+    one = eqx.tree_at(lambda p: p.counts, problem, jnp.ones(1))
+    moved = one.start.at[one.stage + 2].add(-0.2).at[0].add(0.1)
+    monkeypatch.setattr(Problem, "log_ratios", lambda *_: jnp.zeros(1))
+    expected = np.zeros(one.stage + 1)
+    expected[1] = 0.1
+    np.testing.assert_allclose(one.residuals(moved), expected, atol=1e-12)
 
 
 def test_geometric_mean_ratio_counts_both_directions():
