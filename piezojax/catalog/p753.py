@@ -10,6 +10,7 @@ from .._types import ScalarLike
 from ..control import (
     PID,
     AlphaBeta,
+    Anticipation,
     DisturbanceObserverControl,
     InversionControl,
     KalmanFilter,
@@ -212,6 +213,11 @@ def disturbance_observer(
         dt=DT,
         coefficients=coefficients,
     )
+
+
+def anticipating_disturbance_observer(table: str = "5-2") -> Anticipation:
+    """Return ``disturbance_observer``, shown the reference ahead: a lead of 0, ours."""
+    return Anticipation(disturbance_observer(table), (0.0,))
 
 
 def pid() -> PID:

@@ -40,7 +40,9 @@ class SlidingModePID(System):
     switching term (5.18), and the zeros of the model, which may lie outside the unit
     circle, are inverted in the least-squares sense with the weights ``error_weight`` Q
     and ``control_weight`` R: f = Q/(Q+R) [v - (b1/b0) f' - (b2/b0) f''] (5.23), or in
-    another form ``inversion`` of ``INVERSIONS``.
+    another form ``inversion`` of ``INVERSIONS``. ``correction`` weighs the equivalent
+    control, 1 as printed: with less of it the feedback is weaker, the reference part
+    is not.
 
     Input an Observation; output f in the unit of the model's input: volts if the model
     was identified from voltage (the nominal controller), um behind an inverse
@@ -71,6 +73,7 @@ class SlidingModePID(System):
         check("integral", self.integral)
         check("derivative", self.derivative)
         check("surface in 1/s", self.surface)
+        check("correction", self.correction)
 
     @property
     def dt(self) -> float:

@@ -85,18 +85,20 @@ def _moved(trace: Trace) -> str:
 def _runs(outcome: Outcome, chosen: set[int]) -> dict[int, Both]:
     """Run both loops over the chosen references, as in the hold-out."""
 
+    signals = outcome.holdout
+
     @jax.jit
-    def run(loop, reference, noise):
-        inputs = loop_inputs(reference, noise, outcome.holdout.disturbance)
+    def run(loop, index):
+        reference, noise = signals.references[index], signals.noise[index, 0]
+        moved = signals.disturbance
+        inputs = loop_inputs(
+            reference, noise, None if moved is None else moved[index, 0]
+        )
         return simulate(loop, inputs, loop.init(reference[0]))[1]
 
-    signals = outcome.holdout
     runs = {}
     for index in sorted(chosen):
-        before, after = (
-            run(loop, signals.references[index], signals.noise[index, 0])
-            for loop in (outcome.before, outcome.after)
-        )
+        before, after = (run(loop, index) for loop in (outcome.before, outcome.after))
         runs[index] = jax.tree.map(_drawable, (before, after))
     return runs
 

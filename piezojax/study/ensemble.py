@@ -70,7 +70,7 @@ class Ensemble:
         )
         names = (*self.arguments, *self.paths)
         draws = random.uniform(-1.0, 1.0, (count, len(names), self.study.axis_count))
-        middles, halves = np.array([self._interval(name) for name in names]).T
+        middles, halves = np.reshape([self._interval(n) for n in names], (-1, 2)).T
         draws = middles[:, None] + halves[:, None] * draws
         if self.study.axes is None:
             draws = draws[..., 0]

@@ -228,10 +228,7 @@ def _perturbed(
     if stages is None:
         return None
     driven = np.array([trace.driven for trace in data.traces])
-    seen = [
-        jax.tree.map(np.asarray, judge.on_stages(loop, stages, data.holdout))
-        for loop in (before, after)
-    ]
+    seen = [judge.on_stages(loop, stages, data.holdout) for loop in (before, after)]
     return Perturbed.of(seen[0], seen[1], driven, case.study.constraints.limits)
 
 

@@ -12,6 +12,7 @@ import tomli_w
 
 import piezojax as pj
 from piezojax.catalog import p753, p753_stage
+from piezojax.metrics import TrackingFigures
 from piezojax.paths import replace
 from piezojax.stability import stability_report
 from piezojax.study import Stage, read, shipped
@@ -46,8 +47,13 @@ STUDY = {
         "holdout": 5,
     },
     "constraints": {"sensitivity_peak": 1.3, "delay_margin": 3.0, "overshoot": 0.5},
-    "pareto": {"constraint": "sensitivity_peak", "limits": [1.2, 1.4], "steps": 20},
-    "optimiser": {"starts": 2, "candidates": 8, "steps": 40},
+    "pareto": {"constraint": "sensitivity_peak", "limits": [1.2, 1.4], "steps": 40},
+    "optimiser": {
+        "method": "gauss_newton",
+        "starts": 2,
+        "candidates": 8,
+        "steps": 40,
+    },
 }
 
 
@@ -276,14 +282,17 @@ def test_standard_errors_of_a_fit_are_drawn_from(tmp_path):
     ("over", "tail"), [("mean", 1.0), ("worst", 1.0), ("cvar", 0.4)]
 )
 def test_plants_are_joined_as_named(over, tail, tmp_path):
-    class Figures:
-        saturated = jnp.zeros((5, 2, 1))
-        rms_error = jnp.exp(jnp.arange(10.0).reshape(5, 2, 1) % 7.0)
-        rms_effort = rms_slew = jnp.zeros((5, 2, 1))
-
+    none = jnp.zeros((5, 2, 1))
+    rms = jnp.exp(jnp.arange(10.0).reshape(5, 2, 1) % 7.0)
+    figures = TrackingFigures(rms, none, none, none, none, none)
     case = read(written(tmp_path, STUDY))
     objective = Objective(
-        case.loop, case.space, None, jnp.ones((5, 2)), jnp.asarray(1.0), 0
+        case.loop,
+        case.space,
+        make_data(case).tuning,
+        jnp.ones((5, 2)),
+        jnp.asarray(1.0),
+        0,
     )
     objective = dataclasses.replace(objective, over=over, tail=tail)
     each_plant = np.sort(np.mean(np.arange(10.0).reshape(5, 2) % 7.0, axis=1))
@@ -292,7 +301,7 @@ def test_plants_are_joined_as_named(over, tail, tmp_path):
         "worst": each_plant[-1],
         "cvar": each_plant[-2:].mean(),
     }[over]
-    assert objective._error(Figures) == pytest.approx(expected, abs=1e-6)
+    assert objective._error(figures) == pytest.approx(expected, abs=1e-6)
 
 
 def test_drift_is_a_random_walk_that_moves_the_stage(tmp_path):
