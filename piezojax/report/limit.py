@@ -32,13 +32,14 @@ def limit_of(outcome: Outcome) -> LimitReport | str:
     if study.axes is not None:
         return "the limit is known for one axis only"
     names, signals = study.references.tune, outcome.holdout
+    moved = signals.disturbance
     try:
         return performance_limit(
             outcome.after,
             names,
             signals.references[: len(names)],
             signals.noise[: len(names)],
-            signals.disturbance,
+            None if moved is None else moved[: len(names)],
             start=round(study.references.settle * study.rate),
             dt=study.dt,
         )

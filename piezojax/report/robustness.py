@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from rich.table import Table
 
 from ..tune.constraints import CONSTRAINTS
@@ -68,6 +69,9 @@ def perturbed_figure(found: Perturbed | None, title: str) -> Figure | None:
         label = f"{name}, unstable on {lost}" if lost else name
         _distribution(panel, errors, found.plants, color=colour, label=label)
     panel.set_xscale("log")
+    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    panel.xaxis.set_major_formatter(ScalarFormatter())
+    panel.xaxis.set_minor_formatter(NullFormatter())
     panel.set_xlabel("rms error, geometric mean over references, nm")
     panel.set_ylabel(f"share of {found.plants} held-out plants, %")
     panel.legend()
