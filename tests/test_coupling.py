@@ -12,8 +12,8 @@ from piezojax.report.figures import styled
 from piezojax.study import Study, build
 from piezojax.system import LoopSample
 from piezojax.tune import coupling_matrix
-from piezojax.tune.objective import Signals
 from piezojax.tune.result import Result, Scores
+from piezojax.tune.runs import Signals
 from piezojax.tune.traces import traces_of
 from piezojax.tune.tuner import Outcome
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from piezojax.optimisers import METHODS
-from piezojax.tune.objective import HOPELESS, with_finite_gradient
+from piezojax.tune.gradient import with_finite_gradient
+from piezojax.tune.objective import HOPELESS
 
 STEPS = 160
 TOLERANCE = 1e-8

@@ -20,7 +20,8 @@ from ..serial import load as load_system
 from ..space import Space, space_of
 from ..system import Feedback, Observation, System, rest_output, series
 from .ensemble import Ensemble, Stage, ensemble_of
-from .schema import RecordPlant, Study, load
+from .schema import Study, load
+from .stage_tables import RecordPlant
 from .table import one_of, validated
 
 

@@ -12,7 +12,8 @@ from ..catalog import CONTROLLERS, at_rate
 from ..paths import get
 from ..space import Transform
 from .case import Case, build, read
-from .schema import ObjectiveTable, OptimiserTable, References, SensorTable, Study
+from .schema import ObjectiveTable, OptimiserTable, References, Study
+from .stage_tables import SensorTable
 from .table import Finite, Positive, Table, one_of, validated
 
 Start = Literal["printed", "scaled", "rule", "own"]

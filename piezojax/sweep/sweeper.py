@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from .._runtime import simulate_side_by_side
 from ..progress import Progress, Silent
 from ..study import Case, Study, build, load, shipped
-from ..study.schema import validated
 from ..study.sweep_table import SweepTable
+from ..study.table import validated
 from .cluster import cluster_chunks
 from .dataset import DamagedError, Merger, merged
 from .local import local_chunks, workers

@@ -13,7 +13,7 @@ from .. import signals as signal_library
 from .._types import as_array, as_signal
 from ..study import Case, Study
 from ..system import holding_input
-from .objective import Signals
+from .runs import Signals
 from .traces import Trace, traces_of
 
 

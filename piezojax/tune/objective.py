@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,14 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import as_array
-from ..axes import PerAxisMetric
-from ..metrics import Both, Extremes, Tracking, TrackingFigures
-from ..rollout import Metric, simulate
+from ..metrics import Extremes, TrackingFigures
 from ..space import Space
 from ..stability.impulse import sensitivities
 from ..study import Stage
-from ..system import Feedback, loop_inputs
+from ..system import Feedback
 from .constraints import Seen, augmented, needs, violations
+from .runs import Signals, sampled
 
 T = TypeVar("T")
 
@@ -36,93 +35,6 @@ RAILED = 0.9
 
 _SHARPNESS = 20.0  # of the smooth maximum in "worst"
 _FLOOR = 1e-9  # um: an error below a femtometre is as good as none
-
-
-class Signals(eqx.Module):
-    """References (um), unit-variance noise draws and disturbances (um) for a loop.
-
-    With several axes all have a last dimension for them, in the unit of each.
-    ``traces`` then are what is judged: pairs of a reference and an axis. ``holding`` is
-    the input under which the loop's own plant rests at the begin of each reference,
-    worked out if left out.
-    """
-
-    references: Float[Array, "references samples *axes"]
-    noise: Float[Array, "references draws samples *axes"]
-    disturbance: Float[Array, "references draws samples *axes"] | None = None
-    traces: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
-    holding: Float[Array, "*begins"] | None = None
-
-    def for_another_plant(self) -> "Signals":
-        """Return the same without ``holding``."""
-        return dataclasses.replace(self, holding=None)
-
-
-def evaluate(
-    loop_of: Callable[[Any], Feedback],
-    parameters: Any,
-    signals: Signals,
-    start: int,
-    beside: Metric | None = None,
-) -> Any:
-    """Return the figures of ``loop_of(parameters)`` for each reference and noise draw.
-
-    With several axes, for each trace and noise draw. Every run starts at rest at its
-    reference; samples before ``start`` do not count. With ``beside``, another metric of
-    the same runs, a pair of both figures.
-    """
-    return sampled(loop_of, parameters, signals, start, beside)[0]
-
-
-def sampled(
-    loop_of: Callable[[Any], Feedback],
-    parameters: Any,
-    signals: Signals,
-    start: int,
-    beside: Metric | None = None,
-    every: int = 1,
-) -> tuple[Any, Array | None]:
-    """Return what ``evaluate`` does, and one of ``every`` errors (um) of each run.
-
-    The errors are those at samples counted, with time last; None unless ``every`` is
-    above 1.
-    """
-    metric: Metric = Tracking(start=start)
-    if beside is not None:
-        metric = Both(metric, beside)
-    if signals.references.ndim > 2:
-        metric = PerAxisMetric(metric, signals.references.shape[2])
-
-    def one(parameters, reference, noise, disturbance, holding):
-        loop = loop_of(parameters)
-        inputs = loop_inputs(reference, noise, disturbance)
-        state = loop.init(reference[0], holding)
-        found = simulate(loop, inputs, state, metric=metric, every=every)[1]
-        if every == 1:
-            return found, None
-        figures, log = found
-        error = jax.tree.map(jnp.subtract, log.displacement, log.reference)
-        counted = jax.tree.map(lambda x: x[start // every :], error)
-        return figures, jnp.stack(counted) if isinstance(counted, tuple) else counted
-
-    # A copy of the parameters for each run: their gradients are then summed once, at
-    # the end, and not in each step.
-    runs = signals.noise.shape[:2]
-    copies = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (*runs, *jnp.shape(x))), parameters
-    )
-    draws = jax.vmap(one, in_axes=(0, None, 0, 0, None))
-    found = jax.vmap(draws)(
-        copies,
-        signals.references,
-        signals.noise,
-        signals.disturbance,
-        signals.holding,
-    )
-    if not signals.traces:
-        return found
-    run, axis = (list(indices) for indices in zip(*signals.traces, strict=True))
-    return jax.tree.map(lambda x: x[jnp.array(run), :, jnp.array(axis)], found)
 
 
 class Verdict(NamedTuple):
@@ -364,44 +276,3 @@ class Objective(eqx.Module):
         every = jnp.concatenate(parts)
         finite = jnp.all(jnp.isfinite(every))
         return jnp.where(finite, every, jnp.sqrt(HOPELESS / every.size))
-
-
-@jax.custom_vjp
-def _guarded(value: Array, gradient: Array, unit: Array) -> Array:
-    return value
-
-
-def _guarded_forward(value, gradient, unit):
-    return value, gradient
-
-
-def _guarded_backward(gradient, cotangent):
-    return jnp.zeros_like(cotangent), jnp.zeros_like(gradient), cotangent * gradient
-
-
-_guarded.defvjp(_guarded_forward, _guarded_backward)
-
-
-def with_finite_gradient(loss, *, forward: bool):
-    """Return ``loss`` of a vector with its gradient made finite and computed at once.
-
-    The derivative of a diverged run is NaN and would spoil the optimiser's memory; it
-    becomes zero. ``forward`` picks forward mode, which wins for few parameters and few
-    lanes; reverse mode wins beyond.
-    """
-
-    def guarded(unit):
-        fixed = jax.lax.stop_gradient(unit)
-        if forward:
-            # Not linearize: that would keep what every sample leaves behind.
-            value, gradient = jax.vmap(
-                lambda direction: jax.jvp(loss, (fixed,), (direction,)),
-                out_axes=(None, 0),
-            )(jnp.eye(fixed.shape[0]))
-        else:
-            value, gradient = jax.value_and_grad(loss)(fixed)
-        usable = jnp.all(jnp.isfinite(gradient)) & (value < HOPELESS)
-        gradient = jnp.where(usable, jnp.nan_to_num(gradient), 0.0)
-        return _guarded(value, gradient, unit)
-
-    return guarded

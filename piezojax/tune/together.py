@@ -14,8 +14,9 @@ from ..study import Case
 from .clock import Clock
 from .constraints import updated
 from .found import Search
+from .gradient import with_finite_gradient
 from .lagrangian import prepared, rounds
-from .objective import Objective, Verdict, with_finite_gradient
+from .objective import Objective, Verdict
 
 STALL_STEPS, STALL_GAIN = 20, 1e-3
 """Stop when the best start gained less than this in so many steps."""

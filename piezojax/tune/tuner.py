@@ -1,32 +1,30 @@
 """Tuning: screen the box, descend from the best starts, judge on what was held out."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .. import __version__
 from .._types import as_array
-from ..metrics import Extremes, TrackingFigures
+from ..metrics import TrackingFigures
 from ..progress import Progress, Silent
-from ..stability.impulse import sensitivities
 from ..study import Case, Stage, read, shipped
 from ..study.ensemble import Part
 from ..system import Feedback
 from .baselines import Baselines, Budget, contest
 from .clock import Clock
-from .constraints import Seen, by_stage, needs
+from .constraints import by_stage
 from .data import Data, make_data
 from .found import Search
 from .front import trace_front
-from .objective import RAILED, Objective, Signals, evaluate
+from .judge import Judge
+from .objective import RAILED, Objective
 from .result import FrontPoint, Kept, Perturbed, Result, Scores, scores
+from .runs import Signals
 from .search import search_box
 
 
@@ -48,59 +46,6 @@ class Outcome:
     def controller(self):
         """The tuned controller."""
         return self.after.controller
-
-
-class _Judge:
-    """Simulates loops on signals; compiled once for each shape of them."""
-
-    def __init__(self, clock: Clock, case: Case, start: int):
-        self._clock, self._case, self._start = clock, case, start
-        self._programs: dict[str, Callable] = {}
-
-    def _compiled(self, key: str, function: Callable, *arguments: Any) -> Callable:
-        if key not in self._programs:
-            self._programs[key] = self._clock.compiled(function, *arguments)
-        return self._programs[key]
-
-    def figures(self, loop: Feedback, signals: Signals) -> TrackingFigures:
-        """Return the figures by reference and draw."""
-        program = self._compiled(
-            f"figures {signals.noise.shape}",
-            lambda loop, signals: evaluate(lambda x: x, loop, signals, self._start),
-            loop,
-            signals,
-        )
-        return program(loop, signals)
-
-    def on_stages(self, loop: Feedback, stages: Stage, signals: Signals) -> Seen:
-        """Return what is seen of ``loop`` on ``stages``, stacked on a leading axis."""
-        dynamic, static = eqx.partition(stages, eqx.is_array)
-        signals = signals.for_another_plant()
-        limits = self._case.study.constraints.limits
-        beside = Extremes() if needs(limits, "extremes") else None
-
-        def run(loop, dynamic, signals):
-            def around(part):
-                return eqx.combine(part, static).around(loop)
-
-            def one(part):
-                return evaluate(lambda x: x, around(part), signals, self._start, beside)
-
-            figures = jax.lax.map(one, dynamic)
-            figures, extremes = figures if beside else (figures, None)
-            margins = None
-            if needs(limits, "sensitivity"):
-                study = self._case.study
-                margins = jax.vmap(
-                    lambda part: sensitivities(around(part), study.highest, study.dt)
-                )(dynamic)
-            return figures, extremes, margins
-
-        count = jax.tree.leaves(dynamic)[0].shape[0]
-        program = self._compiled(
-            f"{count} stages {signals.noise.shape}", run, loop, dynamic, signals
-        )
-        return Seen(*program(loop, dynamic, signals), dt=self._case.study.dt)
 
 
 def tune(
@@ -125,7 +70,7 @@ def tune(
     first = round(table.references.settle * table.rate)
 
     progress.stage("simulating the start")
-    judge = _Judge(clock, case, first)
+    judge = Judge(clock, case, first)
     before = judge.figures(case.loop, data.tuning)
     stages = _stages(case, "tune")
     scale = _scale(before, data)[None]
@@ -222,7 +167,7 @@ def _stages(case: Case, part: Part) -> Stage | None:
 
 
 def _perturbed(
-    case: Case, data: Data, judge: _Judge, before: Feedback, after: Feedback
+    case: Case, data: Data, judge: Judge, before: Feedback, after: Feedback
 ) -> Perturbed | None:
     stages = case.ensemble.stages("holdout") if case.ensemble else None
     if stages is None:
@@ -248,7 +193,7 @@ def _kept(objective: Objective, search: Search, clock: Clock) -> dict[str, Kept]
 def _report(
     case: Case,
     data: Data,
-    judge: _Judge,
+    judge: Judge,
     before: TrackingFigures,
     after: Feedback,
     search: Search,

@@ -19,7 +19,7 @@ from piezojax.sweep.local import local_chunks
 from piezojax.sweep.simulator import Simulator
 from piezojax.system import loop_inputs
 from piezojax.tune.data import make_data
-from piezojax.tune.objective import Signals, evaluate
+from piezojax.tune.runs import Signals, evaluate
 
 pytestmark = pytest.mark.usefixtures("kept_programs")
 

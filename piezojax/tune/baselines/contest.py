@@ -8,8 +8,9 @@ from ...progress import Progress
 from ...study import Case
 from ...system import Feedback
 from ..data import Data
-from ..objective import Objective, evaluate
+from ..objective import Objective
 from ..result import scores
+from ..runs import evaluate
 from ..search import Search
 from .entries import Baselines, Contestant, against, contestant
 from .pids import by_rules

@@ -1,0 +1,48 @@
+"""Gradients that an optimiser can live with: finite, and computed at once."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .objective import HOPELESS
+
+
+@jax.custom_vjp
+def _guarded(value: Array, gradient: Array, unit: Array) -> Array:
+    return value
+
+
+def _guarded_forward(value, gradient, unit):
+    return value, gradient
+
+
+def _guarded_backward(gradient, cotangent):
+    return jnp.zeros_like(cotangent), jnp.zeros_like(gradient), cotangent * gradient
+
+
+_guarded.defvjp(_guarded_forward, _guarded_backward)
+
+
+def with_finite_gradient(loss, *, forward: bool):
+    """Return ``loss`` of a vector with its gradient made finite and computed at once.
+
+    The derivative of a diverged run is NaN and would spoil the optimiser's memory; it
+    becomes zero. ``forward`` picks forward mode, which wins for few parameters and few
+    lanes; reverse mode wins beyond.
+    """
+
+    def guarded(unit):
+        fixed = jax.lax.stop_gradient(unit)
+        if forward:
+            # Not linearize: that would keep what every sample leaves behind.
+            value, gradient = jax.vmap(
+                lambda direction: jax.jvp(loss, (fixed,), (direction,)),
+                out_axes=(None, 0),
+            )(jnp.eye(fixed.shape[0]))
+        else:
+            value, gradient = jax.value_and_grad(loss)(fixed)
+        usable = jnp.all(jnp.isfinite(gradient)) & (value < HOPELESS)
+        gradient = jnp.where(usable, jnp.nan_to_num(gradient), 0.0)
+        return _guarded(value, gradient, unit)
+
+    return guarded
