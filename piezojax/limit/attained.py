@@ -132,7 +132,8 @@ def attained(
         control = LinearLimit(loop, posed.plant, taps)
         foretold = posed.known.foretold(posed.left)
         voltage = _ahead(posed, known, foretold) + rest.reshape(noise.shape[:2])[:, :1]
-        still = jnp.zeros_like(noise) if disturbance is None else disturbance
+        moved = 0.0 if disturbance is None else disturbance
+        still = jnp.broadcast_to(moved, noise.shape)
         logs = _logs(control, voltage, foretold, references, noise, still)
         runs = jax.tree.map(lambda x: np.asarray(x).reshape(-1, x.shape[-1]), logs)
         error = posed.known.cut(np.asarray(logs.displacement - logs.reference))

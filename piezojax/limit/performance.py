@@ -59,10 +59,10 @@ def performance_limit(
     """Return the limit for ``loop`` and how near its runs come to it.
 
     ``references`` [names, samples] in um; ``noise`` [names, draws, samples], draws of
-    unit variance; ``disturbance`` in um, if any, of the same shape: as the tuner's
-    Signals hold them. Samples before ``start`` do not count. ``segment`` (s) is the
-    window of the spectra, no longer than what counts; ``dt`` (s) is looked for in the
-    loop.
+    unit variance; ``disturbance`` in um, if any, of a shape that goes with that: as the
+    tuner's Signals hold them. Samples before ``start`` do not count. ``segment`` (s) is
+    the window of the spectra, no longer than what counts; ``dt`` (s) is looked for in
+    the loop.
 
     Raises ValueError for several axes, a sensor without noise, runs that diverge, and
     a plant that is unstable or does not move as its linear model does.

@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..rollout import simulate
@@ -15,9 +16,11 @@ def simulated(
 ) -> tuple[LoopSample, np.ndarray]:
     """Return the logs [runs, samples] and the voltages [runs] before the first sample.
 
-    ``references`` [references, samples], ``noise`` and ``disturbance``, if there is
-    any, [references, draws, samples]: a run each draw.
+    ``references`` [references, samples], ``noise`` [references, draws, samples]: a run
+    each draw. ``disturbance``, if there is any, goes with the shape of the noise.
     """
+    if disturbance is not None:
+        disturbance = jnp.broadcast_to(disturbance, noise.shape)
     logs, rest = _logs(loop, references, noise, disturbance)
     return jax.tree.map(_flat, logs), np.asarray(rest).reshape(-1)
 

@@ -47,9 +47,14 @@ class Race:
 
     def losses(self, points: np.ndarray) -> tuple[np.ndarray, Verdict]:
         """Return loss and verdict of any number of points."""
+        return self._looked(self.objective, points)
+
+    def _looked(
+        self, objective: Objective, points: np.ndarray
+    ) -> tuple[np.ndarray, Verdict]:
         filler = np.repeat(points[-1:], -len(points) % LANES, axis=0)
         batches = np.concatenate([points, filler]).reshape(-1, LANES, points.shape[1])
-        found = [self._lanes(self.objective, as_array(batch))[:2] for batch in batches]
+        found = [self._lanes(objective, as_array(batch))[:2] for batch in batches]
         return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(points)], *found)
 
     def wait(self) -> None:
@@ -76,6 +81,7 @@ class Race:
         for _, penalty, share, last in rounds(objective, steps):
             objective = objective.with_penalty(penalty).with_multipliers(multipliers)
             descents = self._descents(objective, units)
+            search.evaluations += len(descents)
             ended = self._run(descents, places, search, share, progress)
             if ended and last:
                 search.status = "converged"
@@ -92,14 +98,18 @@ class Race:
         def lanes(units):
             return self._lanes(objective, as_array(units))
 
-        found = []
-        for unit in units:
-            here = lanes(np.repeat(unit[None], LANES, axis=0))
-            loss, verdict = jax.tree.map(lambda x: np.asarray(x)[0], here[:2])
-            found.append(
-                Descent(unit, float(loss), verdict, slopes, lanes, self._tolerance)
+        losses, verdicts = self._looked(objective, units)
+        return [
+            Descent(
+                unit,
+                float(losses[i]),
+                jax.tree.map(lambda x, i=i: x[i], verdicts),
+                slopes,
+                lanes,
+                self._tolerance,
             )
-        return found
+            for i, unit in enumerate(units)
+        ]
 
     def _run(
         self,

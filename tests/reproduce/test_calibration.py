@@ -149,7 +149,7 @@ def every_cell(name):
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_number_of_every_loop_may_be_doubted(name):
-    free = {"error_weight", "autoregressive", "rest_input", "rest_output"}
+    free = {"error_weight", "autoregressive", "rest_input", "rest_output", "correction"}
     cells = every_cell(name)
     for cell in cells:
         doubts = [doubt for doubt in DOUBTS.values() if doubt.concerns(cell)]

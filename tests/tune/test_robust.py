@@ -104,14 +104,15 @@ def test_multipliers_of_a_known_problem():
         added = augmented(jnp.log(x / 2.0)[None], multipliers, penalty)
         return (x - 3.0) ** 2 + jnp.sum(added**2)
 
+    @jax.jit
+    def newton(x, multipliers):
+        slope = jax.grad(total)(x, multipliers, penalty)
+        return x - slope / jax.hessian(total)(x, multipliers, penalty)
+
     x, multipliers, penalty = jnp.asarray(3.0), jnp.zeros(1), jnp.asarray(5.0)
     for _ in range(30):
-        for _ in range(50):
-            slope, curve = (
-                jax.grad(total)(x, multipliers, penalty),
-                jax.hessian(total)(x, multipliers, penalty),
-            )
-            x = x - slope / curve
+        for _ in range(10):
+            x = newton(x, multipliers)
         multipliers = updated(jnp.log(x / 2.0)[None], multipliers, penalty)
     assert x == pytest.approx(2.0, abs=1e-6)
     assert multipliers[0] == pytest.approx(4.0, rel=1e-4)
