@@ -205,7 +205,7 @@ def test_weighted_errors_have_the_gradient_of_the_objective():
 
         def one(reference, noise):
             inputs = loop_inputs(reference, noise)
-            log = simulate(loop, inputs, loop.init(0.0, 0.0))[1]
+            log = simulate(loop, inputs, loop.init(reference[0]))[1]
             return (log.displacement - log.reference)[400:]
 
         signals = objective.signals
