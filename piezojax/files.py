@@ -5,6 +5,11 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -66,6 +71,19 @@ def _keep_names(folder: Path) -> None:
         pass  # nor do some network file systems sync them
     finally:
         os.close(handle)
+
+
+def read_model(kind: type[Model], path: Path, wrong: str) -> Model:
+    """Read a JSON file as ``kind``.
+
+    Raises ValueError, with ``wrong`` said of a file that holds something else.
+    """
+    try:
+        return kind.model_validate_json(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from None
+    except ValidationError as error:
+        raise ValueError(f"{path} {wrong}: {error.errors()[0]['msg']}") from None
 
 
 def fresh_folder(path: Path) -> Path:

@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from .._types import as_array
 from ..catalog import VARIATIONS
+from ..files import read_model
 from ..paths import get, replace
 from ..system import Feedback, System
 from .schema import Study
@@ -166,15 +167,9 @@ class _Estimates(BaseModel):
 def _standard_errors(path: Path, nominal: Stage) -> dict[str, float]:
     """Return the standard errors that identification wrote, by path in the Stage."""
     try:
-        found = _Estimates.model_validate_json(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(
-            f"ensemble.standard_errors: {path}: {error.strerror}"
-        ) from None
-    except ValidationError as error:
-        raise ValueError(
-            f"ensemble.standard_errors: {path} is no fit: {error.errors()[0]['msg']}"
-        ) from None
+        found = read_model(_Estimates, path, "is no fit")
+    except ValueError as error:
+        raise ValueError(f"ensemble.standard_errors: {error}") from None
     errors = {
         f"plant.{name}": estimate.standard_error
         for name, estimate in found.parameters.items()

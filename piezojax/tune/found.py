@@ -75,5 +75,5 @@ def ranked(loss: Any, violation: Any) -> np.ndarray:
     """Return the loss where limits are kept, else a number above every such loss."""
     loss, violation = np.asarray(loss), np.asarray(violation)
     loss = np.where(np.isfinite(loss), loss, np.inf)
-    missed = MISSED + np.minimum(violation, 1.0 * MISSED - 1.0)
+    missed = MISSED + np.minimum(violation, MISSED - 1.0)
     return np.where((violation <= TOLERANCE) | (loss >= HOPELESS), loss, missed)

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+from jax import Array
 
 from .._types import as_array
 from ..progress import Progress
@@ -10,7 +11,7 @@ from .clock import Clock
 from .constraints import CONSTRAINTS, TOLERANCE, by_stage
 from .found import Search
 from .objective import Objective
-from .result import FrontPoint
+from .result import FrontPoint, Kept
 from .search import way_of
 
 
@@ -25,14 +26,12 @@ def trace_front(
     table = case.study.pareto
     assert table is not None
     limits = case.study.constraints.limits
-    look = clock.compiled(
-        lambda objective, unit: (
-            by_stage(objective.limits, objective.seen(unit))
-            | {"rms_um": objective.seen(unit).figures.rms_error[0]}
-        ),
-        objective,
-        as_array(search.unit),
-    )
+
+    def look(objective: Objective, unit: Array) -> tuple[dict[str, Array], Array]:
+        seen = objective.seen(unit)
+        return by_stage(objective.limits, seen), seen.figures.rms_error[0]
+
+    program = clock.compiled(look, objective, as_array(search.unit))
     loosest_first = sorted(
         table.limits, reverse=CONSTRAINTS[table.constraint].sense == "at most"
     )
@@ -44,14 +43,13 @@ def trace_front(
         here = Search(unit, starts=unit[None])
         way.descend(asked, unit[None], here, table.steps, progress)
         unit = here.unit
-        seen = jax.tree.map(np.asarray, look(asked, as_array(unit)))
-        rms = np.sqrt(np.mean(seen["rms_um"] ** 2, axis=1))
-        kind = CONSTRAINTS[table.constraint].sense
-        values = seen[table.constraint]
+        values, rms = jax.tree.map(np.asarray, program(asked, as_array(unit)))
+        rms = np.sqrt(np.mean(rms**2, axis=1))
+        reached = Kept.of_values(table.constraint, limit, values[table.constraint])
         found.append(
             FrontPoint(
                 limit=limit,
-                value=float(values.max() if kind == "at most" else values.min()),
+                value=reached.value,
                 loss=here.loss,
                 kept=here.violation <= TOLERANCE,
                 geomean_rms_um=float(np.exp(np.mean(np.log(rms)))),

@@ -16,16 +16,18 @@ GROWTH = 3.0
 
 def prepared(objective: Objective) -> Objective:
     """Return ``objective`` with multipliers of its limits, all 0."""
+    if not objective.limits:
+        return objective
     some = jnp.full(len(objective.space.paths), 0.5)
     count = jax.eval_shape(lambda o: o.violated(some), objective).shape[0]
     return objective.with_multipliers(jnp.zeros(count))
 
 
-def rounds(objective: Objective, steps: int) -> Iterator[tuple[int, float, int, bool]]:
-    """Yield the number, the penalty and the steps of each round, and if it is the last.
+def rounds(objective: Objective, steps: int) -> Iterator[tuple[float, int, bool]]:
+    """Yield the penalty and the steps of each round, and whether it is the last.
 
     An objective without limits takes one.
     """
     count = ROUNDS if objective.limits else 1
     for number in range(count):
-        yield number, PENALTY * GROWTH**number, -(-steps // count), number + 1 == count
+        yield PENALTY * GROWTH**number, -(-steps // count), number + 1 == count

@@ -84,8 +84,8 @@ class Objective(eqx.Module):
 
     ``limits`` are constraints by name (``constraints.CONSTRAINTS``), kept on every
     stage, margins on every one of ``margin_stages`` at the reference ``highest`` (um).
-    ``multipliers`` and ``penalty``
-    are those of the augmented Lagrangian that ``loss`` is.
+    ``multipliers`` and ``penalty`` are those of the augmented Lagrangian that ``loss``
+    is.
     """
 
     loop: Feedback

@@ -1,6 +1,7 @@
 """Descents raced against each other: all set out, the better half goes on."""
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -41,8 +42,11 @@ class Race:
         self._lanes = clock.compiled(
             lambda o, units: lanes_of(o, units, every), objective, points
         )
-        self._violated = clock.compiled(
-            lambda o, unit: o.violated(unit), objective, points[0]
+        # Without limits there is one round, and nothing is asked.
+        self._violated: Callable = (
+            clock.compiled(lambda o, unit: o.violated(unit), objective, points[0])
+            if objective.limits
+            else objective.violated
         )
 
     def losses(self, points: np.ndarray) -> tuple[np.ndarray, Verdict]:
@@ -78,7 +82,7 @@ class Race:
         progress.stage(f"tuning from {len(starts)} starts", steps)
         multipliers = self.objective.multipliers
         units, places = starts, np.arange(len(starts))
-        for _, penalty, share, last in rounds(objective, steps):
+        for penalty, share, last in rounds(objective, steps):
             objective = objective.with_penalty(penalty).with_multipliers(multipliers)
             descents = self._descents(objective, units)
             search.evaluations += len(descents)

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
+from ..files import read_model
 from ..metrics import TrackingFigures
 from .constraints import CONSTRAINTS, TOLERANCE, Seen, by_stage
 from .objective import RAILED
@@ -238,11 +239,4 @@ def load_result(path: str | Path) -> Result:
     """
     path = Path(path)
     path = path / RESULT_FILE if path.is_dir() else path
-    try:
-        return Result.model_validate_json(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}") from None
-    except ValidationError as error:
-        raise ValueError(
-            f"{path} is no result of tuning: {error.errors()[0]['msg']}"
-        ) from None
+    return read_model(Result, path, "is no result of tuning")

@@ -67,7 +67,7 @@ class Together:
         objective = objective.with_multipliers(self.objective.multipliers)
         units, places = as_array(starts), np.arange(len(starts))
         multipliers = jnp.zeros((len(starts), objective.multipliers.size))
-        for _, penalty, share, last in rounds(objective, steps):
+        for penalty, share, last in rounds(objective, steps):
             objective = objective.with_penalty(penalty)
             carry = begin(objective, units, multipliers)
             bests: list[float] = []

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
+from ...files import read_model
 from ..course import Course
 from ..objective import HOPELESS
 
@@ -83,14 +84,7 @@ def load_baselines(path: str | Path) -> Baselines:
     """
     path = Path(path)
     path = path / BASELINES_FILE if path.is_dir() else path
-    try:
-        return Baselines.model_validate_json(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}") from None
-    except ValidationError as error:
-        raise ValueError(
-            f"{path} holds no baselines: {error.errors()[0]['msg']}"
-        ) from None
+    return read_model(Baselines, path, "holds no baselines")
 
 
 def contestant(
