@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from ..reproduce.calibration import EXPERIMENTS, Swap
-from ..reproduce.judged import BAR
+from ..reproduce.judged import BAR, together
 from ..reproduce.selection import Round
 from ..reproduce.summary import ratio_of
 from .figures import AFTER, BEFORE, REFERENCE, figure, styled, write
@@ -92,6 +92,23 @@ def calibration_table(name: str, swaps: Sequence[Swap]) -> Table:
     for number in range(max(len(swap.rounds) for swap in swaps)):
         told = (_told(swap.rounds[number : number + 1]) for swap in swaps)
         table.add_row(f"cross-validated inside the half, doubt {number + 1}", *told)
+    return table
+
+
+def together_table(found: Mapping[str, Sequence[Swap]]) -> Table:
+    """Return the ratio of all held-out cells, a column a half."""
+    halves = together(found)
+    table = Table(title="all held-out cells of Tables 5-3, 5-5 and 4-5")
+    table.add_column("")
+    for half in halves:
+        table.add_column(f"fitted: {half}", justify="right")
+    ratios = [half["held_out"]["geomean_ratio"] for half in halves.values()]
+    table.add_row(
+        "cells", *(str(half["held_out"]["cells"]) for half in halves.values())
+    )
+    table.add_row("geometric-mean ratio", *(f"{x:.3f}" for x in ratios), style="bold")
+    judged = ("met" if half["met"] else "missed" for half in halves.values())
+    table.add_row(f"bar of {BAR:g}", *judged)
     return table
 
 

@@ -6,13 +6,13 @@ import click
 
 from ..command import Command, common, results_folder, run
 from ..files import write_text
-from ..report.calibration import calibration_table, write_calibration
+from ..report.calibration import calibration_table, together_table, write_calibration
 from ..report.console import Bar, reproduction_table
 from ..report.reproduction import write_picture, write_rates
 from . import TABLES, reproduce
 from .calibration import EXPERIMENTS
 from .calibration import calibrate as calibrated
-from .judged import as_plain
+from .judged import as_plain, together
 from .rates import FIGURE, errors_by_rate, rates_as_csv
 from .summary import as_csv, summarise
 
@@ -79,10 +79,12 @@ def main(tables, calibrate, out, seed, quiet):
             with Bar(console) as bar:
                 found = {n: calibrated(n, progress=bar) for n in EXPERIMENTS}
             plain = {n: as_plain(n, swaps) for n, swaps in found.items()}
+            plain |= {"together": together(found)}
             write_text(folder / "calibration.json", json.dumps(plain, indent=2) + "\n")
             write_calibration(found, folder)
         for name, swaps in found.items():
             console.print(calibration_table(name, swaps))
+        console.print(together_table(found))
         console.print(f"results in {folder}", soft_wrap=True)
 
     run(quiet, calibration if calibrate else body)

@@ -1,6 +1,6 @@
 """A calibration as plain numbers: ratios of fitted and held-out cells, and values."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .calibration import EXPERIMENTS, Swap
@@ -22,6 +22,18 @@ def _ratios(cells: Sequence[Cell]) -> dict[str, Any]:
             )
             for table, column in places
         },
+    }
+
+
+def together(found: Mapping[str, Sequence[Swap]]) -> dict[str, Any]:
+    """Return the ratios of all held-out cells, whatever their experiment, by half."""
+    halves: dict[str, list[Cell]] = {}
+    for swaps in found.values():
+        for swap in swaps:
+            halves.setdefault(swap.half, []).extend(swap.held_out)
+    return {
+        half: {"held_out": _ratios(cells), "bar": BAR, "met": ratio_of(cells) <= BAR}
+        for half, cells in halves.items()
     }
 
 

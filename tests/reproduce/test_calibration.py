@@ -13,9 +13,10 @@ from piezojax.control import ModelReferencePID
 from piezojax.hardware import Sensor
 from piezojax.paths import parameters
 from piezojax.reproduce import chapter4, lanes
-from piezojax.reproduce.calibration import EXPERIMENTS, HALVES
-from piezojax.reproduce.cell import printed
+from piezojax.reproduce.calibration import EXPERIMENTS, HALVES, Swap
+from piezojax.reproduce.cell import Cell, printed
 from piezojax.reproduce.doubts import DOUBTS, REFERENCE, candidates
+from piezojax.reproduce.judged import together
 from piezojax.reproduce.problem import STEEPEST, Problem, fit
 from piezojax.reproduce.selection import starts
 from piezojax.reproduce.stage import stage_of
@@ -291,3 +292,20 @@ def test_geometric_mean_ratio_counts_both_directions():
     ]
     assert ratio_of(cells) == pytest.approx(2.0)
     assert geomean(np.log([1.0, 4.0])) == pytest.approx(2.0)
+
+
+def test_all_held_out_cells_of_a_half_are_judged_together():
+    def swap(half, ratios):
+        cells = [Cell("5-3", f"row {i}", "pid", "um", 2.0, 2.0 * r) for i, r in ratios]
+        return Swap(half, 1.0, {}, (), (), [], cells, [])
+
+    found = {
+        "one": [swap("even", [(0, 1.5), (1, 1.5), (2, 1.5)]), swap("odd", [(3, 1.0)])],
+        "other": [swap("even", [(4, 1.0)]), swap("odd", [(5, 2.0)])],
+    }
+    halves = together(found)
+    assert halves["even"]["held_out"]["cells"] == 4
+    # Cells count alike, not experiments.
+    assert halves["even"]["held_out"]["geomean_ratio"] == pytest.approx(1.5**0.75)
+    assert not halves["even"]["met"]
+    assert halves["odd"]["held_out"]["geomean_ratio"] == pytest.approx(2.0**0.5)
