@@ -14,6 +14,7 @@ from .axes import PerAxis as PerAxis
 from .charge_drive import ChargeDrive as ChargeDrive
 from .contour_error import ContourError as ContourError
 from .control import PID as PID
+from .control import AdaptiveInverse as AdaptiveInverse
 from .control import Allocation as Allocation
 from .control import AlphaBeta as AlphaBeta
 from .control import Anticipation as Anticipation

@@ -35,6 +35,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_sliding_mode": p753.sliding_mode,
     "p753_inversion": p753_by_rate.inversion,
     "p753_disturbance_observer": p753_by_rate.disturbance_observer,
+    "p753_adaptive_disturbance_observer": p753.adaptive_disturbance_observer,
     "p753_anticipating_disturbance_observer": p753.anticipating_disturbance_observer,
     "p753_kalman_sliding_mode": p753.kalman_sliding_mode,
     "p753_kalman_disturbance_observer": p753.kalman_disturbance_observer,

@@ -6,9 +6,12 @@ Every number carries its equation or table in Y. Cao's thesis (2013). All sets h
 
 from typing import Any
 
+import numpy as np
+
 from .._types import ScalarLike
 from ..control import (
     PID,
+    AdaptiveInverse,
     AlphaBeta,
     Anticipation,
     DisturbanceObserverControl,
@@ -218,6 +221,38 @@ def disturbance_observer(
 def anticipating_disturbance_observer(table: str = "5-2") -> Anticipation:
     """Return ``disturbance_observer``, shown the reference ahead: a lead of 0, ours."""
     return Anticipation(disturbance_observer(table), (0.0,))
+
+
+ADAPTIVE_INVERSE = {
+    "thresholds": (0.3, 1.0, 2.5),
+    "cutoff": 2000.0,
+    "equation_error": 10.0,
+    "memory": 0.5,
+}
+"""Ours: um, rad/s, V, s. Stops for motions of some um; slower than half a second the
+feedback is enough."""
+
+
+def adaptive_disturbance_observer(table: str = "5-2") -> AdaptiveInverse:
+    """Return ``disturbance_observer`` beside an inverse that is learned: ours.
+
+    With a share of 0 this is ``disturbance_observer``. The weights begin with the
+    printed gain and poles, and with stops of a hysteresis of the usual size.
+    """
+    slow, fast = (
+        -DT / float(np.log(pole))
+        for pole in np.real(ARMA(**DYNAMICS_BEHIND_HYSTERESIS).poles())
+    )
+    gains = (1.0 / GAIN, (slow + fast) / GAIN, slow * fast / GAIN)
+    stops = len(ADAPTIVE_INVERSE["thresholds"])
+    return AdaptiveInverse(
+        disturbance_observer(table),
+        weights=(*gains, *(0.1 * gains[0],) * stops),
+        deviations=(*(0.5 * gain for gain in gains), *(0.3 * gains[0],) * stops),
+        **ADAPTIVE_INVERSE,
+        dt=DT,
+        share=0.0,
+    )
 
 
 def pid() -> PID:

@@ -136,7 +136,7 @@ class PIDSMC:
     gains: P, I, D (K for "bang-bang"), m, R, Q, alpha, beta, model_a = (a1, a2),
     model_b = (b0, b1, b2); Ke and cutoff for "dob"; hysteresis = (a, b, c) for
     "inversion". Optional q_corrected (default True) chooses the form of the
-    Q filter. All stored values start at zero.
+    Q filter, correction (default 1) weighs veq. All stored values start at zero.
     """
 
     def __init__(self, variant, gains, rate):
@@ -183,7 +183,7 @@ class PIDSMC:
 
         v1 = (r_next - a1 * r - a2 * r_prev) / b0
         veq = -(m * (a11 * e1 + a12 * e2) + a21 * e1 + a22 * e2)
-        veq = veq / (m * b0 + b0 / period)
+        veq = self.gains.get("correction", 1.0) * veq / (m * b0 + b0 / period)
         self.s_sum += s
         if self.variant == "bang-bang":
             dv = -self.gains["K"] * ((s > 0.0) - (s < 0.0))

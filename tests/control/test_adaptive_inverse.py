@@ -1,0 +1,195 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles.adaptive_inverse import AdaptiveInverse as Oracle
+from oracles.control import make_controller
+from oracles.loop import closed_loop
+from oracles.published import plant_t2, smc_gains
+
+import piezojax as pj
+from piezojax.catalog import p753, p753_stage
+from piezojax.control.recursive_weights import RecursiveWeights
+from piezojax.stability.impulse import peak_of, sensitivity
+from piezojax.system import LoopInput, Observation
+
+SAMPLES = 10_000
+NOISE_RMS = 0.012
+DRAWS = np.random.default_rng(5).normal(size=SAMPLES)
+NEVER = 1e15  # s: nothing is forgotten
+
+NUMBERS = {
+    "weights": (7.0, 8e-3, 8e-7, 0.7, 0.5),
+    "deviations": (3.0, 4e-3, 4e-7, 2.0, 2.0),
+    "thresholds": (0.4, 1.5),
+    "cutoff": 1500.0,
+    "equation_error": 5.0,
+    "share": 0.8,
+    "offset_deviation": 4.0,
+    "dt": p753.DT,
+}
+PID = {"P": 0.5, "I": 3e3, "D": 1e-5, "derivative_filter": 1e-4, "anti_windup": 100.0}
+CONTROLLERS = {
+    "pid": (pj.PID(*PID.values(), dt=p753.DT), "pid", PID),
+    "weak equivalent control": (
+        eqx.tree_at(
+            lambda c: c.feedback.correction,
+            p753.disturbance_observer(),
+            jnp.asarray(0.4),
+        ),
+        "dob",
+        {**smc_gains("dob", "5-3"), "correction": 0.4},
+    ),
+}
+
+
+def adaptive(controller, **changes):
+    return pj.AdaptiveInverse(controller, **{"memory": NEVER, **NUMBERS, **changes})
+
+
+def reference(samples=SAMPLES + 1):
+    time = np.arange(samples) * p753.DT
+    return 2.5 * (1.0 - np.cos(2.0 * np.pi * 25.0 * time)) + np.sin(300.0 * time) ** 3
+
+
+def around(controller, plant=None):
+    plant = p753.plant() if plant is None else plant
+    return pj.Feedback(controller, plant, p753.actuator(), pj.Sensor(NOISE_RMS))
+
+
+@jax.jit
+def run(loop, wanted, draws):
+    return pj.simulate(loop, LoopInput(wanted[1:], draws), loop.init(wanted[0]))
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_loop_is_least_squares_over_all_it_has_seen(name):
+    controller, kind, gains = CONTROLLERS[name]
+    inner = make_controller(kind, gains, p753.RATE)
+    expected = closed_loop(
+        Oracle(inner, **NUMBERS),
+        reference(),
+        plant_t2("trapezoid"),
+        None,
+        noise=NOISE_RMS * DRAWS,
+    )
+    _, found = run(around(adaptive(controller)), reference(), DRAWS)
+    for column in ("displacement", "voltage"):
+        np.testing.assert_allclose(
+            getattr(found, column), expected[column], rtol=0.0, atol=1e-8
+        )
+    # It is not the controller alone that follows.
+    _, alone = run(around(controller), reference(), DRAWS)
+    assert np.abs(alone.displacement - found.displacement).max() > 0.05
+
+
+def test_without_a_share_it_is_the_controller():
+    printed = p753.disturbance_observer()
+    adaptive = p753.adaptive_disturbance_observer()
+    _, expected = run(around(printed), reference(), DRAWS)
+    _, found = run(around(adaptive), reference(), DRAWS)
+    np.testing.assert_allclose(
+        found.displacement, expected.displacement, rtol=0.0, atol=1e-9
+    )
+
+
+def test_gain_poles_and_hysteresis_that_are_off_are_learned():
+    stage = p753_stage.stage(gain=0.2, poles=-0.2, hysteresis=0.2)
+    controller = p753.adaptive_disturbance_observer()
+    errors = []
+    for share in (0.0, 1.0):
+        one = eqx.tree_at(lambda c: c.share, controller, jnp.asarray(share))
+        _, found = run(around(one, stage), reference(), 0.0 * DRAWS)
+        error = (found.displacement - found.reference)[SAMPLES // 2 :]
+        errors.append(float(jnp.sqrt(jnp.mean(error**2))))
+    assert errors[1] < errors[0] / 4.0
+
+
+def test_at_rest_nothing_moves_and_margins_are_those_of_the_controller():
+    inner = CONTROLLERS["pid"][0]
+    whole = adaptive(inner, memory=0.1, share=1.0)
+    loop = around(whole)
+    _, found = run(loop, jnp.full(SAMPLES + 1, 3.0), 0.0 * DRAWS)
+    np.testing.assert_allclose(found.displacement, 3.0, atol=1e-9)
+    np.testing.assert_allclose(found.voltage, found.voltage[0], atol=1e-9)
+    peaks = [
+        float(peak_of(sensitivity(around(one), 3.0, duration=0.02)))
+        for one in (inner, whole)
+    ]
+    assert peaks[0] > 1.05
+    np.testing.assert_allclose(peaks[1], peaks[0], rtol=1e-9)
+
+
+def test_slopes_are_those_of_differences_and_jit_is_eager():
+    wanted, draws = reference(801), DRAWS[:800]
+
+    def error(scale):
+        values = jnp.asarray([0.8, 1500.0, 5.0, 0.02]) * scale
+        whole = eqx.tree_at(
+            lambda c: (c.share, c.cutoff, c.equation_error, c.memory),
+            adaptive(CONTROLLERS["pid"][0]),
+            tuple(values),
+        )
+        _, found = run(around(whole), wanted, draws)
+        return jnp.mean((found.displacement - found.reference) ** 2)
+
+    slope = jax.jit(jax.jacfwd(error))(jnp.ones(4))
+    once = jax.jit(error)
+    step = 1e-5
+    for i, along in enumerate(np.eye(4)):
+        ends = [float(once(jnp.ones(4) + s * step * along)) for s in (1.0, -1.0)]
+        assert slope[i] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-4)
+    whole = adaptive(CONTROLLERS["pid"][0])
+    zero, seen = jnp.zeros(()), Observation(*jnp.asarray([1.0, 1.1, 0.9, 8.0]))
+    state = whole.init(Observation(zero, zero, zero, zero))
+    for left, right in zip(
+        jax.tree.leaves(whole.step(state, seen)),
+        jax.tree.leaves(jax.jit(type(whole).step)(whole, state, seen)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(left, right, rtol=1e-12, atol=1e-12)
+
+
+def test_what_was_learned_is_forgotten_and_a_certain_weight_is_held():
+    """With the row at zero the covariance goes back to its start."""
+    learner = RecursiveWeights((1.0, 2.0), (0.5, 0.0), 0.1, 0.01, 1e-3)
+    rows = np.random.default_rng(1).normal(size=(100, 2))
+    state = learner.init()
+
+    @jax.jit
+    def step(state, row, target):
+        return learner.step(state, (tuple(row), jnp.asarray(target)))
+
+    for row in rows:
+        state, weights = step(state, row, 3.0 * row[0] + 2.0 * row[1])
+    np.testing.assert_allclose(weights, (3.0, 2.0), atol=0.02)
+    assert weights[1] == 2.0
+    assert state.covariance[0, 0] < 0.25 * 0.25
+    for _ in range(200):
+        state, weights = step(state, np.zeros(2), 0.0)
+    np.testing.assert_allclose(state.covariance, np.diag([0.25, 0.0]), atol=1e-8)
+    np.testing.assert_allclose(weights, (3.0, 2.0), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"weights": (1.0, 2.0)}, "3 weights and 6 deviations"),
+        (
+            {"weights": (1.0,) * 6, "deviations": (1.0,) * 6},
+            "6 weights for 2 thresholds; it must be three and one for each",
+        ),
+        ({"thresholds": (0.4, 0.0)}, "thresholds in um is 0; it must be finite and ab"),
+        ({"deviations": (-1.0,) + (1.0,) * 4}, "deviations is -1; .* at least 0"),
+        ({"cutoff": 7e4}, "cut-off in rad/s is 70000; .* above 0 and below 62831.9"),
+        ({"equation_error": 0.0}, "equation error is 0; it must be finite and above 0"),
+        ({"memory": -1.0}, "memory in s is -1; it must be finite and above 0"),
+        ({"offset_deviation": 0.0}, "offset deviation in V is 0"),
+        ({"share": np.nan}, "share is nan; it must be finite"),
+        ({"dt": 0.0}, "sample time in s is 0"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        adaptive(CONTROLLERS["pid"][0], **changes)

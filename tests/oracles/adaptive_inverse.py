@@ -1,0 +1,59 @@
+"""The learned inverse as a plain loop: least squares over everything seen so far."""
+
+import numpy as np
+
+
+class AdaptiveInverse:
+    """Beside ``feedback``, a controller of ``control``; forgets nothing.
+
+    Every sample the weights are found anew, from all rows so far and the prior as one
+    more row for each weight: no recursion is shared with what is tested.
+    """
+
+    def __init__(self, feedback, weights, deviations, thresholds, **numbers):
+        self.feedback = feedback
+        self.thresholds = thresholds
+        self.share, self.dt = numbers["share"], numbers["dt"]
+        self.pole = np.exp(-numbers["cutoff"] * self.dt)
+        self.equation_error = numbers["equation_error"]
+        self.start = np.array([0.0, *weights])
+        prior = np.array([numbers["offset_deviation"], *deviations])
+        self.normal = np.diag(self.equation_error**2 / prior**2)
+        self.right = self.normal @ self.start
+        count = 3 + len(thresholds)
+        self.lags = np.zeros((2, 1 + count))
+        self.seen = [0.0, 0.0], np.zeros(len(thresholds))
+        self.wanted = [0.0, 0.0], np.zeros(len(thresholds))
+        self.terms = np.zeros(count)
+        self.fed = self.voltage = 0.0
+
+    def _terms(self, memory, y):
+        past, stops = memory
+        for i, r in enumerate(self.thresholds):
+            stops[i] = min(max(stops[i] + y - past[0], -r), r)
+        velocity = (y - past[0]) / self.dt
+        acceleration = (y - 2.0 * past[0] + past[1]) / self.dt**2
+        past[:] = y, past[0]
+        return np.array([y, velocity, acceleration, *stops])
+
+    def step(self, z, r_next, r, r_prev):
+        signals = np.array([self.voltage, *self._terms(self.seen, z)])
+        for lag in self.lags:
+            lag += (1.0 - self.pole) * (signals - lag)
+            signals = lag.copy()
+        row = np.array([1.0, *signals[1:]])
+        self.normal += np.outer(row, row)
+        self.right += row * signals[0]
+        weights = np.linalg.solve(self.normal, self.right)[1:]
+        rest = 1.0 - self.share
+        left = self.feedback.step(
+            z - self.share * r, rest * r_next, rest * r, rest * r_prev
+        )
+        terms = self._terms(self.wanted, r_next)
+        self.fed += weights @ (terms - self.terms)
+        self.terms = terms
+        return left + self.share * self.fed
+
+    def applied(self, u):
+        self.voltage = u
+        self.feedback.applied(u - self.share * self.fed)
