@@ -1,3 +1,6 @@
+import os
+import tempfile
+
 import jax
 import pytest
 from hypothesis import settings
@@ -6,6 +9,18 @@ from jax.experimental.compilation_cache import compilation_cache
 # The same examples in every run: a red run can be repeated, a green one is no luck.
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
+
+
+def pytest_configure(config):
+    """Let all workers and commands of a run share what they compile.
+
+    Most of the time goes into compiling, and many files compile the same loops.
+    """
+    if hasattr(config, "workerinput") or "PIEZOJAX_COMPILATION_CACHE" in os.environ:
+        return
+    folder = tempfile.TemporaryDirectory(prefix="piezojax-programs-")
+    os.environ["PIEZOJAX_COMPILATION_CACHE"] = folder.name
+    config.add_cleanup(folder.cleanup)
 
 
 @pytest.fixture(scope="module")

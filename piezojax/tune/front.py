@@ -12,16 +12,21 @@ from .constraints import CONSTRAINTS, TOLERANCE, by_stage
 from .found import Search
 from .objective import Objective
 from .result import FrontPoint, Kept
-from .search import way_of
+from .search import Way
 
 
 def trace_front(
-    objective: Objective, case: Case, search: Search, clock: Clock, progress: Progress
+    objective: Objective,
+    case: Case,
+    search: Search,
+    way: Way,
+    clock: Clock,
+    progress: Progress,
 ) -> list[FrontPoint]:
     """Return the best gains found for each limit of the study's front.
 
     Each limit starts from the gains of the one before, the limits from the loosest to
-    the tightest; what ``search`` found is where the first starts.
+    the tightest; what ``search`` found by ``way`` is where the first starts.
     """
     table = case.study.pareto
     assert table is not None
@@ -35,8 +40,6 @@ def trace_front(
     loosest_first = sorted(
         table.limits, reverse=CONSTRAINTS[table.constraint].sense == "at most"
     )
-    way = way_of(objective, case, clock)
-    way.wait()
     found, unit = [], search.unit
     for limit in loosest_first:
         asked = objective.with_limits(limits | {table.constraint: limit})

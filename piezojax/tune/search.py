@@ -23,15 +23,15 @@ def way_of(objective: Objective, case: Case, clock: Clock) -> Way:
 
 def search_box(
     objective: Objective, case: Case, clock: Clock, progress: Progress
-) -> Search:
-    """Return the best point of the case's box.
+) -> tuple[Search, Way | None]:
+    """Return the best point of the case's box, and the way, with all it compiled.
 
-    ``Ctrl-C`` ends the search with the best point so far. Raises ValueError when the
-    loop diverges at every point tried.
+    ``Ctrl-C`` ends the search with the best point so far; there is no way if it came
+    before there was one. Raises ValueError when the loop diverges at every point tried.
     """
     own, table = np.asarray(case.space.start(case.loop)), case.study.optimiser
     search = Search(own, starts=own[None])
-    inner = search.course.clock
+    inner, way = search.course.clock, None
     try:
         points = candidates(case)
         progress.stage(f"screening {len(points)} points of the box")
@@ -47,7 +47,7 @@ def search_box(
     except KeyboardInterrupt:
         search.status = "interrupted"
     clock.compile_s += inner.compile_s
-    return search
+    return search, way
 
 
 def candidates(case: Case) -> np.ndarray:

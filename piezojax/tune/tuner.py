@@ -98,13 +98,13 @@ def tune(
         highest=as_array(table.highest),
         dt=table.dt,
     ).with_limits(table.constraints.limits)
-    search = search_box(objective, case, clock, progress)
+    search, way = search_box(objective, case, clock, progress)
 
     after = space.put(case.loop, as_array(search.unit))
     try:
         front, kept = None, _kept(objective, search, clock)
-        if table.pareto is not None and search.status != "interrupted":
-            front = trace_front(objective, case, search, clock, progress)
+        if table.pareto is not None and way and search.status != "interrupted":
+            front = trace_front(objective, case, search, way, clock, progress)
         progress.stage("judging on held-out noise")
         result = _report(case, data, judge, before, after, search, clock, kept, front)
     except KeyboardInterrupt:

@@ -66,8 +66,12 @@ def cores():
 
 
 def write_study(path, samples, **sweep):
-    """The shipped study of this controller, with its eight gains drawn by Sobol."""
+    """The shipped study of this controller, with its eight gains drawn by Sobol.
+
+    On the stage of throughput.py, which has neither creep nor a mode.
+    """
     study = load(shipped("p753_dob")).model_dump(mode="json", exclude_none=True)
+    study["plant"], study["disturbance"] = {"catalog": "p753"}, {}
     study["references"] |= {"tune": list(signals.THESIS), "unseen": []}
     study["sweep"] = {"method": "sobol", "samples": samples, **sweep}
     path.write_text(tomli_w.dumps(study))
