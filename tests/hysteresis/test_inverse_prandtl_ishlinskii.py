@@ -145,6 +145,15 @@ def test_inverse_rests_where_it_starts(model, wanted):
     np.testing.assert_allclose(rest_output(model, voltage), wanted, atol=1e-10)
 
 
+def test_eager_is_jitted(model):
+    inverse = inverse_of(model)
+    state = model.step(model.init(30.0), 55.0)[0]
+    jitted = jax.jit(lambda s, f: inverse.solve(s, f))
+    for wanted in (9.0, 1.0):
+        eager = inverse.solve(state, wanted)
+        np.testing.assert_allclose(jitted(state, wanted), eager, rtol=1e-12)
+
+
 def test_gradient_of_the_inverse_is_the_reciprocal_slope(model):
     state = model.step(model.init(30.0), 55.0)[0]
     inverse = inverse_of(model)

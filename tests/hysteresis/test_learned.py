@@ -55,6 +55,12 @@ def test_at_rest_nothing_moves():
     np.testing.assert_allclose(jax.tree.leaves(after), jax.tree.leaves(state))
 
 
+def test_eager_is_jitted():
+    x = drive(20)[:20]
+    eager = simulate(MODEL, jnp.asarray(x), MODEL.init(x[0]))[1]
+    np.testing.assert_allclose(response(MODEL, x), eager, atol=1e-13)
+
+
 def test_gradients_are_central_differences():
     leaves, tree = jax.tree.flatten(MODEL)
     x = jnp.asarray(drive(80))

@@ -60,6 +60,12 @@ def test_at_rest_nothing_moves():
     assert MODEL.step(state, 40.0)[0] == state
 
 
+def test_eager_is_jitted():
+    x = sine(7.0)[:20]
+    eager = simulate(MODEL, jnp.asarray(x), MODEL.init(x[0]))[1]
+    np.testing.assert_allclose(response(MODEL, x), eager, atol=1e-13)
+
+
 def test_gradients_are_central_differences():
     leaves, tree = jax.tree.flatten(MODEL)
     x = jnp.asarray(sine(7.0)[:200])
