@@ -44,7 +44,8 @@ class Duhem(System):
     ``substeps`` parts a step, Runge-Kutta of fourth order except where x changes its
     sign under a modulus. Rate-independent in the same order; what else holds is the
     shape functions' doing. In general, as in the two special cases, the extrema are
-    not remembered: no return-point memory, no wiping-out, no congruency.
+    not remembered: no return-point memory, no wiping-out, no congruency. Source: Oh and
+    Bernstein 2005, IEEE Trans. Automat. Contr. 50(5).
 
     Inverse: InverseHysteresis, where y rises with u on every branch.
 

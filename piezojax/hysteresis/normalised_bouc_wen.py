@@ -21,14 +21,14 @@ class NormalisedBoucWenState(NamedTuple):
 
 
 class NormalisedBoucWen(System):
-    """``y = k_x x + k_w w``, ``w' = rho (x' - sigma |x'| |w|^(n-1) w + (sigma - 1) x'
-    |w|^n)``.
+    """``y = k_x x + k_w w``: a straight line and a bounded part with hysteresis.
 
-    (2.5), with its symbols set right: as printed w is called the input and the second
-    line is headed by x'. Here x is the input in V, w the internal state without unit,
-    which stays within -1 and 1, and y the output Phi in um. ``k_x`` in um/V, ``k_w`` in
-    um, ``rho`` in 1/V, above 0; ``sigma`` above 0.5; ``n``, at least 1 and not only
-    whole, is how sharply the loop bends. w is the force of a classical Bouc-Wen model,
+    ``w' = rho (x' - sigma |x'| |w|^(n-1) w + (sigma - 1) x' |w|^n)``, (2.5) with its
+    symbols set right: as printed w is called the input and the second line is headed by
+    x'. Here x is the input in V, w the internal state without unit, which stays within
+    -1 and 1, and y the output Phi in um. ``k_x`` in um/V, ``k_w`` in um, ``rho`` in
+    1/V, above 0; ``sigma`` above 0.5; ``n``, at least 1 and not only whole, is how
+    sharply the loop bends. w is the force of a classical Bouc-Wen model,
     ``classical()``. Source: Ikhouane and Rodellar, Systems with Hysteresis, 2007.
 
     With ``k_w > 0``, which (2.5) asks for, loops run clockwise, as a force over a

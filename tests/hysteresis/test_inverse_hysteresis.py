@@ -10,6 +10,7 @@ from piezojax import (
     ARMA,
     PID,
     BashashJalili,
+    BoucWen,
     ColemanHodgdon,
     Duhem,
     Feedback,
@@ -33,7 +34,7 @@ A, B, C = HYSTERESIS
 
 MODELS = {
     "trapezoid": ColemanHodgdon(A, B, C),
-    "exact": ColemanHodgdon(A, B, C, scheme="exact"),
+    "force": BoucWen(0.12, 8e-4, 4e-4),  # its state has no field `input`
     "shaped": ShapedColemanHodgdon(
         (0.02, 0.006, -2e-5, 1e-7), (0.11, -3e-4, 2e-6), -0.05
     ),
@@ -108,7 +109,7 @@ def weighted(inverse_and_wanted):
     return jnp.sin(1.0 + jnp.arange(voltages.size)) @ voltages
 
 
-DIFFERENTIATED = ["shaped", "bouc_wen_exact", "extrema"]
+DIFFERENTIATED = ["shaped", "extrema"]
 
 
 @pytest.mark.parametrize("name", DIFFERENTIATED)
@@ -118,8 +119,6 @@ def test_gradients_are_those_of_differences(name):
     leaves, tree = jax.tree.flatten(arguments)
     found = jax.tree.leaves(weighted(arguments)[1])
     for i, leaf in enumerate(leaves):
-        if name == "bouc_wen_exact" and i == 4:
-            continue  # n is 1 there, and no parameter
         for unit in np.eye(leaf.size).reshape(-1, *leaf.shape):
             step = 1e-5 * (np.max(np.abs(leaf)) or 1.0)
             above, below = (
