@@ -67,6 +67,7 @@ from .hysteresis import ShapedColemanHodgdon as ShapedColemanHodgdon
 from .identify import Record as Record
 from .identify import RecursiveLeastSquares as RecursiveLeastSquares
 from .identify import identify as identify
+from .identify import identify_all as identify_all
 from .identify import read_record as read_record
 from .metrics import Tracking as Tracking
 from .rollout import Metric as Metric
