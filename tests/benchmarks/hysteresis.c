@@ -7,7 +7,7 @@
      name           mean square of y over a run, [lane]
      name_gradient  its gradient by one-sided differences, N + 1 runs, [N][lane]
 
-   params [block][N][W], steps_of [block][N][W] (of the differences),
+   params [block][N][W], steps_of [block][N][W] (of the differences; 0 for no parameter),
    input [block][steps][W]; the last block is filled up with copies of a lane. */
 
 #include <math.h>
@@ -43,7 +43,7 @@ int width(void) { return W; }
                                                                                     \
             memcpy(p, params, sizeof p);                                            \
             NAME##_run(steps, p, input, result);                                    \
-            params += N * W;                                                        \
+            params += (N) * W;                                                      \
             input += (size_t)steps * W;                                             \
             result += W;                                                            \
         }                                                                           \
@@ -57,7 +57,11 @@ int width(void) { return W; }
             row p[N], here, there;                                                  \
                                                                                     \
             memcpy(p, params, sizeof p);                                            \
-            for (int i = -1; i < N; i++) {                                          \
+            for (int i = -1; i < (N); i++) {                                        \
+                if (i >= 0 && steps_of[i * W] == 0.0) { /* no parameter */          \
+                    LANES result[i * W + l] = 0.0;                                  \
+                    continue;                                                       \
+                }                                                                   \
                 if (i >= 0)                                                         \
                     LANES p[i][l] += steps_of[i * W + l];                           \
                 NAME##_run(steps, p, input, i < 0 ? here : there);                  \
@@ -66,10 +70,10 @@ int width(void) { return W; }
                 LANES result[i * W + l] = (there[l] - here[l]) / steps_of[i * W + l]; \
                 LANES p[i][l] = params[i * W + l];                                  \
             }                                                                       \
-            params += N * W;                                                        \
-            steps_of += N * W;                                                      \
+            params += (N) * W;                                                      \
+            steps_of += (N) * W;                                                    \
             input += (size_t)steps * W;                                             \
-            result += N * W;                                                        \
+            result += (N) * W;                                                      \
         }                                                                           \
     }
 

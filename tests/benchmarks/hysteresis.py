@@ -75,18 +75,20 @@ class MeanSquare(piezojax.Metric):
 
 
 class Problem:
-    """A model, parameters [lanes, n] of its usual sizes [n], inputs [lanes, steps]."""
+    """A model, parameters [lanes, n] of its usual sizes [n], inputs [lanes, steps].
+
+    A size of 0 stands for a number that is no parameter: it has no gradient.
+    """
 
     def __init__(self, name, lanes, steps, seed=0):
         rng = np.random.default_rng(seed)
         part = PARTS[name][1](EXTENT)
         self.system, self.name = part.system, name
-        self.paths = list(parameters(part.system))
-        nominal = np.array([float(v) for v in parameters(part.system).values()])
-        reach = np.array(
-            [np.ptp(part.bounds.get(path, (0.0, 1.0))[:2]) for path in self.paths]
-        )
-        self.sizes = np.where(nominal != 0.0, np.abs(nominal), 0.01 * reach)
+        leaves = {path: np.asarray(v) for path, v in parameters(part.system).items()}
+        self.shapes = {path: leaf.shape for path, leaf in leaves.items()}
+        nominal = np.concatenate([leaf.ravel() for leaf in leaves.values()])
+        sizes = [self._size(part, path, leaf) for path, leaf in leaves.items()]
+        self.sizes = np.concatenate(sizes)
         spread = rng.uniform(-0.1, 0.1, (lanes, len(nominal)))
         self.parameters = nominal + spread * self.sizes
         time_s = EXTENT.dt * np.arange(steps)
@@ -94,9 +96,27 @@ class Problem:
         fade = np.linspace(1.0, 0.3, steps)
         self.inputs = 50.0 * (1.0 - fade * np.cos(2 * np.pi * hertz * time_s))
 
+    @staticmethod
+    def _size(part, path, leaf):
+        """Usual size of each number in a leaf; by its bounds, where it starts at 0."""
+        if leaf.ndim:
+            return np.abs(leaf).ravel()
+        reach = np.ptp(part.bounds.get(path, (0.0, 1.0))[:2])
+        return np.array([abs(leaf) if leaf else 0.01 * reach], dtype=float)
+
     def lane(self, values, input, segment):
         """Mean square of the output of one lane."""
-        system = replace(self.system, dict(zip(self.paths, values, strict=True)))
+        ends = np.cumsum([math.prod(shape) for shape in self.shapes.values()])
+        pieces = jnp.split(values, ends[:-1])
+        system = replace(
+            self.system,
+            {
+                path: piece.reshape(shape)
+                for (path, shape), piece in zip(
+                    self.shapes.items(), pieces, strict=True
+                )
+            },
+        )
         before = getattr(system, "rest_input", 0.0)
         metric = MeanSquare(len(input))
         return piezojax.simulate(
@@ -134,13 +154,21 @@ class PiezojaxEngine:
         return np.asarray(self._compiled(*self._arguments))
 
 
+def _library():
+    """The C functions, with vectors as wide as XLA's where gcc knows of them."""
+    try:
+        return engines.c_library("hysteresis.c", "-mprefer-vector-width=512")
+    except engines.UnavailableError:
+        return engines.c_library("hysteresis.c")
+
+
 class CEngine:
     """The model's functions in hysteresis.c; UnavailableError without gcc or them."""
 
     name = "c"
 
     def __init__(self, problem, what):
-        library, self.compile_s = engines.c_library("hysteresis.c")
+        library, self.compile_s = _library()
         function = problem.name + ("_gradient" if what == "gradient" else "")
         if not hasattr(library, function):
             raise engines.UnavailableError(f"hysteresis.c has no {function}")

@@ -26,12 +26,18 @@ def c_engine(problem, what):
 
 
 @pytest.mark.parametrize("name", hysteresis.MODELS)
-def test_each_model_and_its_gradient(name):
+def test_each_model(name):
     problem = hysteresis.Problem(name, LANES, STEPS)
     c = c_engine(problem, "forward").run()
     run = hysteresis.PiezojaxEngine(problem, "run").run()
     assert np.all(c > 0.0)
     np.testing.assert_allclose(run, c, rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", hysteresis.MODELS)
+def test_each_gradient(name):
+    problem = hysteresis.Problem(name, LANES, STEPS)
     differences = c_engine(problem, "gradient").run()
     mode = hysteresis.modes("gradient", len(problem.sizes))[0]
     gradient = hysteresis.PiezojaxEngine(problem, mode).run()
