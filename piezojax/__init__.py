@@ -50,7 +50,9 @@ from .dynamics import LogarithmicCreep as LogarithmicCreep
 from .dynamics import MatrixARMA as MatrixARMA
 from .dynamics import NeuralStateSpace as NeuralStateSpace
 from .dynamics import SecondOrderLag as SecondOrderLag
+from .dynamics import SpringDamperCreep as SpringDamperCreep
 from .dynamics import StateSpace as StateSpace
+from .dynamics import ThermalDrift as ThermalDrift
 from .hardware import Quantiser as Quantiser
 from .hardware import Saturation as Saturation
 from .hardware import Sensor as Sensor
@@ -62,8 +64,17 @@ from .hysteresis import BoucWen as BoucWen
 from .hysteresis import ColemanHodgdon as ColemanHodgdon
 from .hysteresis import HystereticARMA as HystereticARMA
 from .hysteresis import InverseColemanHodgdon as InverseColemanHodgdon
+from .hysteresis import InversePrandtlIshlinskii as InversePrandtlIshlinskii
+from .hysteresis import (
+    InverseRateDependentPrandtlIshlinskii as InverseRateDependentPrandtlIshlinskii,
+)
+from .hysteresis import LearnedOperator as LearnedOperator
 from .hysteresis import PrandtlIshlinskii as PrandtlIshlinskii
+from .hysteresis import (
+    RateDependentPrandtlIshlinskii as RateDependentPrandtlIshlinskii,
+)
 from .hysteresis import ShapedColemanHodgdon as ShapedColemanHodgdon
+from .hysteresis import StopPrandtlIshlinskii as StopPrandtlIshlinskii
 from .identify import Record as Record
 from .identify import RecursiveLeastSquares as RecursiveLeastSquares
 from .identify import identify as identify
@@ -73,6 +84,7 @@ from .metrics import Tracking as Tracking
 from .rollout import Metric as Metric
 from .rollout import in_blocks as in_blocks
 from .rollout import simulate as simulate
+from .select import Select as Select
 from .serial import load as load
 from .serial import save as save
 from .stability import MultiAxisReport as MultiAxisReport

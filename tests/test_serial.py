@@ -45,6 +45,27 @@ SCALAR = {
         -0.03, (1.6, -0.6), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0), 0.5, -2.0, "quadratic"
     ),
     "inverse": pj.InverseColemanHodgdon(p753.hysteresis()),
+    "inverse of plays": pj.InversePrandtlIshlinskii(
+        pj.PrandtlIshlinskii((0.1, 1e-4), (2.0, 5.0), (0.01, 0.02))
+    ),
+    "stops": pj.StopPrandtlIshlinskii((0.1, 1e-4), (2.0, 5.0), (0.01, 0.02), 3.0),
+    "plays and their rate": pj.InverseRateDependentPrandtlIshlinskii(
+        pj.RateDependentPrandtlIshlinskii((0.1,), (2.0,), (0.01,), 1e-3, 5e-5)
+    ),
+    "learned": pj.LearnedOperator(
+        (0.5,),
+        (1.0, 0.2, 0.1),
+        [[0.1, 0.2, 0.3]],
+        (0.0,),
+        (2.0,),
+        (0.3,),
+        5.0,
+        2.0,
+        1.0,
+    ),
+    "creep beside": pj.LogarithmicCreep(0.01, 1.0, 10.0, 0.1, direct=0.0),
+    "damped springs": pj.SpringDamperCreep((3.0,), (9.0,), float("inf"), 2.0, 0.1),
+    "drift": pj.ThermalDrift(0.1, 30.0, 22.0, 0.1),
     "named series": pj.series(gain=pj.Affine(3.0), lag=pj.FirstOrderLag(1e-3, 5e-5)),
     "series": pj.Affine(3.0) >> pj.Delay(1) >> pj.Quantiser(0.1),
     "parallel": pj.Affine(3.0) + pj.Delay(2) + pj.FirstOrderLag(1e-3, 5e-5),

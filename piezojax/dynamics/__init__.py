@@ -7,7 +7,9 @@ from .channels import Channels as Channels
 from .channels import channels_of as channels_of
 from .creep import ExponentialCreep as ExponentialCreep
 from .creep import LogarithmicCreep as LogarithmicCreep
+from .creep import SpringDamperCreep as SpringDamperCreep
 from .delay import FractionalDelay as FractionalDelay
+from .drift import ThermalDrift as ThermalDrift
 from .held import Held as Held
 from .hysteretic_oscillator import HystereticOscillator as HystereticOscillator
 from .lag import FirstOrderLag as FirstOrderLag

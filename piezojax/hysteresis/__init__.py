@@ -4,8 +4,19 @@ from .bouc_wen import BoucWen as BoucWen
 from .coleman_hodgdon import ColemanHodgdon as ColemanHodgdon
 from .coleman_hodgdon import InverseColemanHodgdon as InverseColemanHodgdon
 from .hysteretic_arma import HystereticARMA as HystereticARMA
+from .inverse_prandtl_ishlinskii import (
+    InversePrandtlIshlinskii as InversePrandtlIshlinskii,
+)
+from .learned import LearnedOperator as LearnedOperator
 from .prandtl_ishlinskii import (
     AsymmetricPrandtlIshlinskii as AsymmetricPrandtlIshlinskii,
 )
 from .prandtl_ishlinskii import PrandtlIshlinskii as PrandtlIshlinskii
+from .rate_dependent_prandtl_ishlinskii import (
+    InverseRateDependentPrandtlIshlinskii as InverseRateDependentPrandtlIshlinskii,
+)
+from .rate_dependent_prandtl_ishlinskii import (
+    RateDependentPrandtlIshlinskii as RateDependentPrandtlIshlinskii,
+)
 from .shaped import ShapedColemanHodgdon as ShapedColemanHodgdon
+from .stop_prandtl_ishlinskii import StopPrandtlIshlinskii as StopPrandtlIshlinskii

@@ -5,29 +5,7 @@ import jax.numpy as jnp
 
 from .._types import Scalar, ScalarLike, as_array, as_scalars, check
 from ..system import System
-
-Memory = tuple[Scalar, ...]
-
-
-def _played(input: Scalar, memory: Memory, thresholds: Memory) -> Memory:
-    """Advance play operators (backlashes) of half-width ``thresholds`` by one sample.
-
-    w <- max(x - r, min(x + r, w)), Kuhnen 2003, eq. (3).
-    """
-    return tuple(
-        jnp.maximum(input - r, jnp.minimum(input + r, w))
-        for r, w in zip(thresholds, memory, strict=True)
-    )
-
-
-def _check_plays(thresholds: Memory, weights: Memory, name: str = "weights") -> None:
-    check("thresholds", thresholds, above=0.0)
-    check(name, weights)
-    if len(thresholds) != len(weights):
-        raise ValueError(
-            f"{len(thresholds)} thresholds and {len(weights)} {name}; "
-            "each play operator needs one of both"
-        )
+from .plays import Memory, check_plays, memoryless, played, weighted
 
 
 class PrandtlIshlinskii(System):
@@ -51,16 +29,16 @@ class PrandtlIshlinskii(System):
 
     def __check_init__(self):
         check("polynomial", self.polynomial)
-        _check_plays(self.thresholds, self.weights)
+        check_plays(self.thresholds, self.weights)
 
     def init(self, input: ScalarLike = 0.0) -> Memory:
         virgin = (self.rest_input,) * len(self.thresholds)
-        return _played(as_array(input), virgin, self.thresholds)
+        return played(as_array(input), virgin, self.thresholds)
 
     def step(self, state: Memory, input: ScalarLike) -> tuple[Memory, Scalar]:
         input = as_array(input)
-        state = _played(input, state, self.thresholds)
-        return state, _memoryless(self.polynomial, input) + _sum(self.weights, state)
+        state = played(input, state, self.thresholds)
+        return state, memoryless(self.polynomial, input) + weighted(self.weights, state)
 
 
 class AsymmetricPrandtlIshlinskii(System):
@@ -86,8 +64,8 @@ class AsymmetricPrandtlIshlinskii(System):
 
     def __check_init__(self):
         check("polynomial", self.polynomial)
-        _check_plays(self.thresholds, self.weights)
-        _check_plays(self.thresholds, self.skew, "skew weights")
+        check_plays(self.thresholds, self.weights)
+        check_plays(self.thresholds, self.skew, "skew weights")
         check("scale in V", self.scale, above=0.0)
 
     def _square(self, x: Scalar) -> Scalar:
@@ -97,8 +75,8 @@ class AsymmetricPrandtlIshlinskii(System):
         input, virgin = as_array(input), self.rest_input
         count = len(self.thresholds)
         return (
-            _played(input, (virgin,) * count, self.thresholds),
-            _played(
+            played(input, (virgin,) * count, self.thresholds),
+            played(
                 self._square(input), (self._square(virgin),) * count, self.thresholds
             ),
         )
@@ -107,19 +85,8 @@ class AsymmetricPrandtlIshlinskii(System):
         self, state: tuple[Memory, Memory], input: ScalarLike
     ) -> tuple[tuple[Memory, Memory], Scalar]:
         input = as_array(input)
-        plain = _played(input, state[0], self.thresholds)
-        skewed = _played(self._square(input), state[1], self.thresholds)
-        output = _memoryless(self.polynomial, input)
-        output = output + _sum(self.weights, plain) + _sum(self.skew, skewed)
+        plain = played(input, state[0], self.thresholds)
+        skewed = played(self._square(input), state[1], self.thresholds)
+        output = memoryless(self.polynomial, input)
+        output = output + weighted(self.weights, plain) + weighted(self.skew, skewed)
         return (plain, skewed), output
-
-
-def _memoryless(polynomial: Memory, x: Scalar) -> Scalar:
-    total = jnp.zeros_like(x)
-    for coefficient in reversed(polynomial):
-        total = (total + coefficient) * x
-    return total
-
-
-def _sum(weights: Memory, plays: Memory) -> Scalar:
-    return sum((w * p for w, p in zip(weights, plays, strict=True)), as_array(0.0))

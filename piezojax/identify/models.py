@@ -9,7 +9,7 @@ from .._types import as_array
 from ..paths import get, replace
 from ..space import INSIDE, Space, space_of
 from ..system import Affine, Series, series
-from .parts import PARTS, Part, extent_of
+from .parts import OWN_DYNAMICS, PARTS, Part, extent_of
 from .record import Record
 from .structure import Structure
 
@@ -23,8 +23,8 @@ DEFAULT = "shaped_coleman_hodgdon+exponential_creep+lag"
 def chain(name: str) -> list[str]:
     """Return the parts of a model such as ``"coleman_hodgdon+logarithmic_creep+lag"``.
 
-    A hysteresis by itself is followed by a lag. Raises ValueError for a part that is
-    not in PARTS, or for two in one place.
+    A hysteresis by itself is followed by a lag, unless it has past outputs. Raises
+    ValueError for a part that is not in PARTS, or for two in one place.
     """
     parts = [part.strip() for part in name.split("+")]
     for part in parts:
@@ -37,7 +37,8 @@ def chain(name: str) -> list[str]:
     for place in places:
         if places.count(place) > 1:
             raise ValueError(f"model {name!r} has two parts for its {place}")
-    return [*parts, "lag"] if places == ["hysteresis"] else parts
+    lagged = places == ["hysteresis"] and parts[0] not in OWN_DYNAMICS
+    return [*parts, "lag"] if lagged else parts
 
 
 def structure(name: str, record: Record) -> Structure:

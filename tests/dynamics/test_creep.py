@@ -2,7 +2,14 @@ import jax
 import numpy as np
 import pytest
 
-from piezojax import ExponentialCreep, LogarithmicCreep, simulate
+from piezojax import (
+    ColemanHodgdon,
+    ExponentialCreep,
+    FirstOrderLag,
+    LogarithmicCreep,
+    SpringDamperCreep,
+    simulate,
+)
 
 DT = 0.01
 
@@ -41,10 +48,77 @@ def test_creep_that_has_ended_is_at_rest():
     for system in (
         ExponentialCreep((0.1,), (0.5,), DT),
         LogarithmicCreep(0.1, 0.1, 10.0, DT),
+        SpringDamperCreep((20.0,), (5.0,), 10.0, 11.0, DT),
     ):
         y = response(system, np.full(50, 3.0), 3.0)
         np.testing.assert_allclose(y, y[0], atol=1e-13)
         assert y[0] > 3.0
+
+
+def test_a_held_force_stretches_damped_springs_exactly():
+    stiffness, damping, spring, force = (40.0, 90.0), (8.0, 300.0), 6.0, 2.5
+    levels = np.array([0.0, 30.0, -10.0, 55.0])
+    u = np.repeat(levels, 250)
+    y, total = np.zeros(2), []
+    for volts in u:  # each element's own equation, solved over one held sample
+        for i, (k, c) in enumerate(zip(stiffness, damping, strict=True)):
+            end = force * volts / k
+            y[i] = end - (end - y[i]) * np.exp(-k / c * DT)
+        total.append(force * volts / spring + y.sum())
+    system = SpringDamperCreep(stiffness, damping, spring, force, DT)
+    np.testing.assert_allclose(response(system, u, 0.0), total, atol=1e-12)
+
+
+def test_damped_springs_are_a_sum_of_exponentials():
+    cascade = SpringDamperCreep((40.0, 90.0), (8.0, 300.0), 6.0, 6.0, DT)
+    exponentials = ExponentialCreep((6.0 / 40.0, 6.0 / 90.0), (0.2, 10.0 / 3.0), DT)
+    u = np.random.default_rng(1).normal(size=300).cumsum()
+    np.testing.assert_allclose(
+        response(cascade, u, 1.0), response(exponentials, u, 1.0), atol=1e-12
+    )
+
+
+U = 40.0 + 30.0 * np.sin(np.linspace(0.0, 12.0, 400))
+PARALLEL = {
+    "exponential": (
+        ExponentialCreep((0.01,), (0.5,), DT, direct=0.0),
+        ExponentialCreep((0.01,), (0.5,), DT),
+    ),
+    "logarithmic": (
+        LogarithmicCreep(0.01, 0.1, 1.0, DT, direct=0.0),
+        LogarithmicCreep(0.01, 0.1, 1.0, DT),
+    ),
+    "cascade": (
+        SpringDamperCreep((200.0,), (100.0,), np.inf, 2.0, DT),
+        SpringDamperCreep((200.0,), (100.0,), 2.0, 2.0, DT),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PARALLEL)
+def test_hysteresis_plus_creep_in_front_of_dynamics(name):
+    # The creep of the voltage itself: what a creep in series gives beyond its input.
+    only, whole = PARALLEL[name]
+    hysteresis = ColemanHodgdon(0.0077, 0.1167, -0.0487)
+    lag = FirstOrderLag(0.05, DT)
+    plant = hysteresis + only >> lag
+    force = response(hysteresis, U, 0.0) + response(whole, U, 0.0) - U
+    expected, held = [], 0.0
+    for f in np.asarray(force):
+        held = f + (held - f) * np.exp(-DT / 0.05)
+        expected.append(held)
+    np.testing.assert_allclose(response(plant, U, 0.0), expected, atol=1e-11)
+
+
+def test_creep_in_series_follows_the_hysteresis():
+    hysteresis = ColemanHodgdon(0.0077, 0.1167, -0.0487)
+    creep = ExponentialCreep((0.05,), (0.5,), DT)
+    force = response(hysteresis, U, 0.0)
+    np.testing.assert_allclose(
+        response(hysteresis >> creep >> FirstOrderLag(0.05, DT), U, 0.0),
+        response(creep >> FirstOrderLag(0.05, DT), force, 0.0),
+        atol=1e-12,
+    )
 
 
 @pytest.mark.parametrize(
@@ -53,6 +127,26 @@ def test_creep_that_has_ended_is_at_rest():
         (lambda: ExponentialCreep((0.1,), (0.0,), DT), "time constants in s is 0"),
         (lambda: ExponentialCreep((0.1,), (1.0, 2.0), DT), "1 gains and 2 time"),
         (lambda: ExponentialCreep((0.1,), (1.0,), 0.0), "sample time in s is 0"),
+        (
+            lambda: ExponentialCreep((0.1,), (1.0,), DT, direct=np.nan),
+            "share that passes at once is nan",
+        ),
+        (
+            lambda: SpringDamperCreep((1.0,), (0.0,), 1.0, 1.0, DT),
+            "damping in N s/um is 0; it must be finite and above 0",
+        ),
+        (
+            lambda: SpringDamperCreep((-1.0,), (1.0,), 1.0, 1.0, DT),
+            "stiffness in N/um is -1; it must be finite and above 0",
+        ),
+        (
+            lambda: SpringDamperCreep((1.0,), (1.0, 2.0), 1.0, 1.0, DT),
+            "1 springs and 2 dampers",
+        ),
+        (
+            lambda: SpringDamperCreep((1.0,), (1.0,), 0.0, 1.0, DT),
+            "compliance of the spring in um/N is inf",
+        ),
         (lambda: LogarithmicCreep(0.1, 1.0, 1.0, DT), "shortest must be below longest"),
         (lambda: LogarithmicCreep(0.1, 0.0, 1.0, DT), "shortest time in s is 0"),
     ],

@@ -183,3 +183,44 @@ def shaped_trapezoid(x, pull, slope, c, y_init):
         force = s * (big_p(x1) - big_p(x0)) + big_g(x1) - big_g(x0)
         y.append((force + (1.0 + h) * y[-1]) / (1.0 - h))
     return np.array(y)
+
+
+def stop(x, threshold, start):
+    """A spring with a slider that yields at +-`threshold`, unloaded at `start`."""
+    held, before, out = 0.0, start, []
+    for value in x:
+        held += value - before
+        if abs(held) > threshold:
+            held = math.copysign(threshold, held)
+        before = value
+        out.append(held)
+    return np.array(out)
+
+
+def inverse_prandtl_ishlinskii(f, slope, thresholds, weights, rest):
+    """Inverse of slope x + sum w play(x) as Krejci and Kuhnen (2001) write it.
+
+    Plays of f with the thresholds sum_{j<=i} w_j (r_i - r_j), where r_0 = 0 and w_0 is
+    the slope, and the weights 1/w_0 and -w_i / (W_i W_{i-1}), W_i = sum_{j<=i} w_j.
+    """
+    r, w = [0.0, *thresholds], [slope, *weights]
+    x = np.asarray(f) / slope
+    for i in range(1, len(r)):
+        reach = sum(w[j] * (r[i] - r[j]) for j in range(i + 1))
+        total = sum(w[: i + 1])
+        x = x - w[i] / (total * sum(w[:i])) * play(f, reach, sum(w) * rest)
+    return x
+
+
+def rate_dependent_plays(x, thresholds, growth, dt, start):
+    """Backlashes whose half-width grows with the rate of the sample before."""
+    columns = [[start] * len(thresholds)]
+    rate, before = 0.0, x[0]
+    for value in x:
+        row = []
+        for r, w in zip(thresholds, columns[-1], strict=True):
+            width = r + growth * abs(rate)
+            row.append(clip(w, value - width, value + width))
+        columns.append(row)
+        rate, before = (value - before) / dt, value
+    return np.array(columns[1:])

@@ -1,0 +1,63 @@
+"""Prandtl-Ishlinskii hysteresis by stop operators, the dual of plays."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._types import Scalar, ScalarLike, as_array, as_scalars, check
+from ..system import System
+from .plays import Memory, check_plays, memoryless, stopped, weighted
+from .prandtl_ishlinskii import PrandtlIshlinskii
+
+
+class StopState(NamedTuple):
+    """Last input (V) and what each stop holds of it (V)."""
+
+    input: Scalar
+    stops: Memory
+
+
+class StopPrandtlIshlinskii(System):
+    """``y = P(x) - sum_i weights[i] stop_i(x)``: what the stops hold back.
+
+    Input x in V, output y in um. A stop of half-width ``thresholds[i]`` (V) follows x
+    until it yields; ``weights[i]`` in um/V. ``polynomial`` and ``rest_input`` as in
+    ``PrandtlIshlinskii``: P is the slope of the loop's axis, where with plays it is the
+    slope right after a turning point. Since play and stop add up to x the same model
+    can be had of plays, ``as_plays``, and with it the inverse. Source: Brokate and
+    Sprekels, Hysteresis and Phase Transitions, 1996, section 2.1.
+
+    Raises ValueError for thresholds that are not positive, numbers that are not finite,
+    or a different count of thresholds and weights.
+    """
+
+    polynomial: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
+    thresholds: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
+    weights: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
+    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+
+    def __check_init__(self):
+        check("polynomial", self.polynomial)
+        check_plays(self.thresholds, self.weights)
+
+    def init(self, input: ScalarLike = 0.0) -> StopState:
+        input = as_array(input)
+        virgin = (jnp.zeros_like(input),) * len(self.thresholds)
+        return StopState(
+            input, stopped(input - self.rest_input, virgin, self.thresholds)
+        )
+
+    def step(self, state: StopState, input: ScalarLike) -> tuple[StopState, Scalar]:
+        input = as_array(input)
+        stops = stopped(input - state.input, state.stops, self.thresholds)
+        output = memoryless(self.polynomial, input) - weighted(self.weights, stops)
+        return StopState(input, stops), output
+
+    def as_plays(self) -> PrandtlIshlinskii:
+        """Return the same model as a sum of plays: -w stop = w play - w x."""
+        first, *others = self.polynomial or (as_array(0.0),)
+        first = first - sum(self.weights, as_array(0.0))
+        return PrandtlIshlinskii(
+            (first, *others), self.thresholds, self.weights, self.rest_input
+        )
