@@ -1,17 +1,17 @@
 """Which models a record can support: what ``--model all`` tries, and what it does not.
 
 Every hysteresis is first fitted with the richest creep and dynamics that the records
-can show; only the best few then with each simpler choice. All combinations would take
-many times as long and tell no more.
+can show; only the best few then with other creeps or none, and the best of those with
+simpler dynamics. All combinations would take many times as long and tell no more.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from .checks import lines
 from .estimate import Options
 from .methods import METHODS
-from .parts import PARTS, extent_of
+from .parts import OWN_DYNAMICS, PARTS, extent_of
 from .record import Record
 
 CREEP_SECONDS = 1.0
@@ -98,8 +98,9 @@ def _seen(record: Record, train: slice) -> float:
     return (min(train.stop, record.samples) - train.start) * record.dt
 
 
-def chained(*parts: str) -> str:
-    """Return the chain of ``parts``, of which some may be empty."""
+def chained(hysteresis: str, creep: str, dynamics: str) -> str:
+    """Return the chain of the parts, of which some may be empty."""
+    parts = [hysteresis, creep, "" if hysteresis in OWN_DYNAMICS else dynamics]
     return "+".join(part for part in parts if part)
 
 
@@ -127,25 +128,50 @@ def first_round(
     if several:
         return whole, [*(Untried(name, several) for name in names), *untried]
     found, missing = companions(records, train)
-    behind = (found.creeps[0], found.dynamics[0])
-    chains = [Candidate(chained(name, *behind)) for name in ("", *names)]
+    creep, dynamics = found.creeps[0], found.dynamics[0]
+    chains = [Candidate(chained(name, creep, dynamics)) for name in ("", *names)]
     return [*chains, *whole], [*missing, *untried]
 
 
-def second_round(
-    best: Sequence[str], records: Sequence[Record], train: slice
-) -> list[Candidate]:
-    """Return the chains ``best`` with every other choice of creep and dynamics."""
+def later_rounds(
+    records: Sequence[Record], train: slice
+) -> list[Callable[[Sequence[str]], list[Candidate]]]:
+    """Return what makes further rounds of the best chains so far.
+
+    Each with the other creeps, or none; then each with the simpler dynamics.
+    """
     if _several(records):
         return []
     found, _ = companions(records, train)
+
+    def creeps(best: Sequence[str]) -> list[Candidate]:
+        return _new(best, found.creeps[1:], found.dynamics[:1])
+
+    def dynamics(best: Sequence[str]) -> list[Candidate]:
+        return [
+            candidate
+            for model in best
+            for candidate in _new([model], [_creep_of(model)], found.dynamics[1:])
+        ]
+
+    return [creeps, dynamics]
+
+
+def _new(
+    best: Sequence[str], creeps: Sequence[str], dynamics: Sequence[str]
+) -> list[Candidate]:
     return [
-        Candidate(chained(model.split("+")[0], creep, dynamics))
-        for model in best
-        for dynamics in found.dynamics
-        for creep in found.creeps
-        if (creep, dynamics) != (found.creeps[0], found.dynamics[0])
+        Candidate(model)
+        for name in dict.fromkeys(model.split("+")[0] for model in best)
+        for model in dict.fromkeys(
+            chained(name, creep, behind) for behind in dynamics for creep in creeps
+        )
+        if model not in best
     ]
+
+
+def _creep_of(model: str) -> str:
+    return next((part for part in model.split("+") if part in at("creep")), "")
 
 
 def _several(records: Sequence[Record]) -> str | None:

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..progress import Progress, Silent
-from .candidates import Candidate, Untried, at, first_round, second_round
+from .candidates import Candidate, Untried, at, first_round, later_rounds
 from .comparison import RULE, Comparison, ComparisonReport, Row, file_name
 from .criteria import Criteria, criteria, effective_samples, ranking
 from .estimate import Options
 from .fit import Fit, check_together, identify, parts_of
 from .record import Record
 
-KEPT = 3
-"""Hysteresis models that go on to the second round."""
+KEPT = 2
+"""Chains with a hysteresis that go on to each further round."""
 
 
 def identify_all(
@@ -31,8 +31,9 @@ def identify_all(
 
     First each hysteresis (of those named, if any) with the richest creep and dynamics
     that the records can show, a linear model and the models that are no chain; then the
-    best few hysteresis models with each simpler choice. A model that fails is a row of
-    the report, as is one that the records cannot support. Parts as in ``identify``;
+    best few with other creeps or none, and with simpler dynamics. A model that fails is
+    a row of the report, as is one that the records cannot support. Parts as in
+    ``identify``;
     without ``train`` and ``validate`` they are the halves of what comes before
     ``test``. Ctrl-C ends the search and keeps what is fitted.
 
@@ -47,14 +48,16 @@ def identify_all(
     options = options or Options()
     first, untried = first_round(records, train, options, hysteresis)
     search = _Search(records, train, validate, options, progress or Silent())
-    chosen = [c.model for c in first if c.model.split("+")[0] in at("hysteresis")]
-    later = len(second_round(chosen[:KEPT], records, train))
+    rounds = later_rounds(records, train)
+    total = len(first) + sum(len(later(_chains(first)[:KEPT])) for later in rounds)
     interrupted = False
     try:
-        search.fit(first, len(first) + later)
-        best = [model for model in search.ranked() if model in chosen][:KEPT]
-        second = second_round(best, records, train)
-        search.fit(second, len(first) + len(second))
+        search.fit(first, total)
+        for later in rounds:
+            chains = _chains([Candidate(model) for model in search.ranked()])
+            search.fit(
+                [c for c in later(chains[:KEPT]) if c.model not in search.fits], total
+            )
     except KeyboardInterrupt:
         if not search.fits:
             raise
@@ -66,6 +69,12 @@ def identify_all(
         )
         raise ValueError(f"no model could be fitted ({why})")
     return _judged(search, untried, test, interrupted, time.perf_counter() - began)
+
+
+def _chains(candidates: Sequence[Candidate]) -> list[str]:
+    """Return the models that are chains with a hysteresis."""
+    names = at("hysteresis")
+    return [c.model for c in candidates if c.model.split("+")[0] in names]
 
 
 def _split(
@@ -125,7 +134,7 @@ class _Search:
         self.waiting = list(candidates)
         for candidate in candidates:
             number = len(self.fits) + len(self.failed) + 1
-            label = f"{number} of {total}, {candidate.model}"
+            label = f"{number} of about {total}, {candidate.model}"
             began = time.perf_counter()
             try:
                 fit = identify(

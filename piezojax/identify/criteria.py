@@ -101,5 +101,6 @@ def ranking(
     squares = [float(np.mean(np.concatenate(errors) ** 2)) for errors in validation]
     best = validation[int(np.argmin(squares))]
     well = [as_good(errors, best) for errors in validation]
-    order = sorted(range(len(bics)), key=lambda i: (not well[i], bics[i]))
+    # Rounded, so that of two ways to write one model the first is taken.
+    order = sorted(range(len(bics)), key=lambda i: (not well[i], round(bics[i], 2)))
     return order, well

@@ -9,6 +9,7 @@ from .._types import as_array
 from ..paths import get, replace
 from ..space import INSIDE, Space, space_of
 from ..system import Affine, Series, series
+from .part import around
 from .parts import OWN_DYNAMICS, PARTS, Part, extent_of
 from .record import Record
 from .structure import Structure
@@ -55,7 +56,7 @@ def structure(name: str, record: Record) -> Structure:
     parts["calibration"] = Part(
         Affine(slope, extent.centre),
         {
-            **({} if scaled else {"gain": (*sorted((0.0, 3.0 * slope)), "linear")}),
+            **({} if scaled else {"gain": around(slope, 0.0, 3.0)}),
             "offset": (extent.centre - reach, extent.centre + reach, "linear"),
         },
     )

@@ -4,8 +4,9 @@ import numpy as np
 
 from piezojax import Record
 from piezojax.identify import METHODS, PARTS
-from piezojax.identify.candidates import at, companions, first_round, second_round
+from piezojax.identify.candidates import at, companions, first_round, later_rounds
 from piezojax.identify.estimate import Options
+from piezojax.identify.parts import OWN_DYNAMICS
 
 HYSTERESIS = at("hysteresis")
 OPTIONS = Options()
@@ -31,7 +32,10 @@ def reasons(untried):
 
 def test_every_hysteresis_is_tried_with_what_the_record_shows():
     found, untried = first_round([RICH], HALF, OPTIONS)
-    chains = [f"{name}+exponential_creep+arma" for name in HYSTERESIS]
+    chains = [
+        f"{name}+exponential_creep{'' if name in OWN_DYNAMICS else '+arma'}"
+        for name in HYSTERESIS
+    ]
     assert models(found)[: len(chains) + 1] == ["exponential_creep+arma", *chains]
     assert {"hysteretic_arma", "state_space"} <= set(models(found))
     assert set(reasons(untried)) >= {"bouc_wen", "neural_state_space"}
@@ -51,7 +55,10 @@ def test_one_frequency_carries_no_second_order_dynamics():
     assert "1 frequency in the training part" in reasons(untried)["arma"]
     assert "state_space" in reasons(untried)
     assert "hysteretic_arma" in reasons(untried)
-    assert all(model.endswith("+lag") for model in models(found))
+    assert all(
+        model.endswith("+lag") or model.split("+")[0] in OWN_DYNAMICS
+        for model in models(found)
+    )
 
 
 def test_a_short_record_shows_no_creep():
@@ -60,15 +67,26 @@ def test_a_short_record_shows_no_creep():
     assert "lasts 0.9 s" in reasons(untried)["exponential_creep"]
 
 
-def test_the_second_round_has_every_simpler_choice():
+def test_later_rounds_try_other_creeps_and_simpler_dynamics():
     best = ["coleman_hodgdon+exponential_creep+arma"]
-    names = models(second_round(best, [RICH], HALF))
     behind, _ = companions([RICH], HALF)
     assert set(behind.creeps) == {*at("creep"), ""}
-    assert len(names) == len(behind.creeps) * len(behind.dynamics) - 1
-    assert "coleman_hodgdon+lag" in names
-    assert best[0] not in names
-    assert second_round(best, [RICH], slice(0, 900)) == [("coleman_hodgdon+lag", None)]
+    creeps, dynamics = later_rounds([RICH], HALF)
+    others = [name for name in behind.creeps if name != "exponential_creep"]
+    chains = ["+".join(p for p in ("coleman_hodgdon", c, "arma") if p) for c in others]
+    assert models(creeps(best)) == chains
+    assert models(dynamics(best)) == ["coleman_hodgdon+exponential_creep+lag"]
+    assert models(dynamics(["coleman_hodgdon+arma"])) == ["coleman_hodgdon+lag"]
+    for later in later_rounds([ONE], slice(0, 900)):
+        assert later(["coleman_hodgdon+lag"]) == []
+
+
+def test_a_model_with_past_outputs_stands_without_dynamics():
+    for name in OWN_DYNAMICS:
+        found, _ = first_round([RICH], HALF, OPTIONS, [name])
+        assert f"{name}+exponential_creep" in models(found)
+        _, dynamics = later_rounds([RICH], HALF)
+        assert dynamics([f"{name}+exponential_creep"]) == []
 
 
 def test_several_inputs_leave_the_linear_model():
@@ -78,7 +96,7 @@ def test_several_inputs_leave_the_linear_model():
     found, untried = first_round([record], HALF, OPTIONS)
     assert ("state_space", "frequency_response") in found
     assert all("2 inputs and 2 outputs" in reasons(untried)[h] for h in HYSTERESIS)
-    assert second_round([], [record], HALF) == []
+    assert later_rounds([record], HALF) == []
 
 
 def test_several_records_of_one_stage_are_fitted_together():

@@ -139,8 +139,10 @@ def test_progress_counts_the_models(made):
     made()
     told = Told()
     fits = identify_all(RICH, progress=told).fits
-    assert told.stages[0] == f"1 of {len(fits)}, exponential_creep+arma: fitting"
-    assert told.stages[-1].startswith(f"{len(fits)} of {len(fits)}, ")
+    assert len(told.stages) == len(fits)
+    assert told.stages[0].startswith("1 of about ")
+    assert told.stages[0].endswith(", exponential_creep+arma: fitting")
+    assert told.stages[-1].startswith(f"{len(fits)} of about ")
 
 
 # A part that the choice does not see
