@@ -60,15 +60,19 @@ from .hardware import SlewLimit as SlewLimit
 from .hysteresis import (
     AsymmetricPrandtlIshlinskii as AsymmetricPrandtlIshlinskii,
 )
+from .hysteresis import BashashJalili as BashashJalili
 from .hysteresis import BoucWen as BoucWen
 from .hysteresis import ColemanHodgdon as ColemanHodgdon
+from .hysteresis import Duhem as Duhem
 from .hysteresis import HystereticARMA as HystereticARMA
 from .hysteresis import InverseColemanHodgdon as InverseColemanHodgdon
+from .hysteresis import InverseHysteresis as InverseHysteresis
 from .hysteresis import InversePrandtlIshlinskii as InversePrandtlIshlinskii
 from .hysteresis import (
     InverseRateDependentPrandtlIshlinskii as InverseRateDependentPrandtlIshlinskii,
 )
 from .hysteresis import LearnedOperator as LearnedOperator
+from .hysteresis import NormalisedBoucWen as NormalisedBoucWen
 from .hysteresis import PrandtlIshlinskii as PrandtlIshlinskii
 from .hysteresis import (
     RateDependentPrandtlIshlinskii as RateDependentPrandtlIshlinskii,

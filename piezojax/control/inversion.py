@@ -3,31 +3,33 @@
 from typing import NamedTuple
 
 from .._types import Scalar, State
-from ..hysteresis.coleman_hodgdon import HysteresisState, InverseColemanHodgdon
-from ..system import Observation, System
+from ..hysteresis.inverse import Inverse
+from ..system import Observation, System, rest_output
 
 
 class InversionState(NamedTuple):
     """State of the controller, and of the hysteresis model up to the last voltage."""
 
     feedback: State
-    hysteresis: HysteresisState
+    hysteresis: State
 
 
 class InversionControl(System):
     """``feedback`` asks for a hysteresis output f, the inverse turns it into volts.
 
-    Figure 5.1, (5.24)-(5.25). The model is advanced with the voltage that the actuator
+    Figure 5.1, (5.24)-(5.25). ``inverse`` is an InverseColemanHodgdon, or any other
+    ``Inverse``. The model is advanced with the voltage that the actuator
     really applied, and ``feedback`` sees the model output for it in place of the
     voltage, so limits and anti-windup stay right. Input an Observation, output in V.
     """
 
     feedback: System
-    inverse: InverseColemanHodgdon
+    inverse: Inverse
 
     def init(self, input: Observation) -> InversionState:
         hysteresis = self.inverse.model.init(input.applied)
-        seen = input._replace(applied=hysteresis.output)
+        force = rest_output(self.inverse.model, input.applied)
+        seen = input._replace(applied=force)
         return InversionState(self.feedback.init(seen), hysteresis)
 
     def step(

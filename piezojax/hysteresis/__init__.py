@@ -1,13 +1,18 @@
 """Hysteresis models, one file each, with their inverses beside them."""
 
+from .bashash_jalili import BashashJalili as BashashJalili
 from .bouc_wen import BoucWen as BoucWen
 from .coleman_hodgdon import ColemanHodgdon as ColemanHodgdon
 from .coleman_hodgdon import InverseColemanHodgdon as InverseColemanHodgdon
+from .duhem import Duhem as Duhem
 from .hysteretic_arma import HystereticARMA as HystereticARMA
+from .inverse import Inverse as Inverse
+from .inverse import InverseHysteresis as InverseHysteresis
 from .inverse_prandtl_ishlinskii import (
     InversePrandtlIshlinskii as InversePrandtlIshlinskii,
 )
 from .learned import LearnedOperator as LearnedOperator
+from .normalised_bouc_wen import NormalisedBoucWen as NormalisedBoucWen
 from .prandtl_ishlinskii import (
     AsymmetricPrandtlIshlinskii as AsymmetricPrandtlIshlinskii,
 )

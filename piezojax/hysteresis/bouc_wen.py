@@ -29,6 +29,12 @@ class BoucWen(System):
     is followed as long as ``nu (|beta_gamma| + |beta_delta|) |z|^(nu - 1)`` times the
     displacement in a part stays well below 1. Sources: Bouc 1967, Wen 1976.
 
+    Loops close in the limit of many cycles only: there is no return-point memory, no
+    wiping-out and no congruency, and the force drifts when a partial unloading is
+    repeated. As a dissipating force over a displacement its loops run clockwise, not
+    counter-clockwise as a piezo's displacement over its voltage. Inverse:
+    InverseHysteresis, below the force where z' = 0, which no displacement exceeds.
+
     Raises ValueError for non-finite parameters, ``nu <= 0`` or ``substeps < 1``.
     """
 

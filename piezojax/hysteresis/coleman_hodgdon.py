@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, State, as_array, check
-from ..system import System, holding_input
+from .._types import Scalar, ScalarLike, as_array, check
+from ..system import System
+from .inverse import Inverse
 
 
 class HysteresisState(NamedTuple):
@@ -32,6 +33,11 @@ class ColemanHodgdon(System):
       the trapezoid step is taken right after a turning point or a pause;
     - ``"voros"`` (2.11), explicit, first order: the earlier model the thesis compares;
     - ``"exact"``, the closed form on each monotone branch.
+
+    What was fades with the path of the input, and is not wiped out: no return-point
+    memory, no wiping-out and no congruency; a loop closes after many cycles only. It
+    runs counter-clockwise, as a piezo's, if a > |c| b. Speed does not matter, exactly
+    in the scheme "exact", else to the order of the scheme.
 
     Raises ValueError for non-finite parameters, ``c >= 0`` or an unknown scheme.
     """
@@ -127,7 +133,7 @@ SCHEMES: dict[str, Callable[[ColemanHodgdon, HysteresisState, Scalar], Scalar]] 
 }
 
 
-class InverseColemanHodgdon(System):
+class InverseColemanHodgdon(Inverse):
     """Voltage that moves a trapezoid Coleman-Hodgdon model to a wanted output.
 
     Input f(k) in um, output u(k) in V. Source: (5.24)-(5.25) with
@@ -147,14 +153,7 @@ class InverseColemanHodgdon(System):
                 "it must be 'trapezoid'"
             )
 
-    def init(self, input: ScalarLike = 0.0) -> HysteresisState:
-        return self.model.init(holding_input(self.model, input))
-
-    def step(self, state: HysteresisState, input: Any) -> tuple[State, Scalar]:
-        voltage = self.solve(state, input)
-        return self.model.step(state, voltage)[0], voltage
-
-    def solve(self, state: HysteresisState, wanted: ScalarLike) -> Scalar:
+    def solve(self, state: Any, wanted: ScalarLike) -> Scalar:
         """Return the voltage (V) for which the model's next output is ``wanted``."""
         model, wanted = self.model, as_array(wanted)
         rise = wanted - state.output

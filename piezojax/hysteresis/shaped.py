@@ -27,6 +27,9 @@ class ShapedColemanHodgdon(System):
     x + ... (um/V, ...), ``c`` in 1/V is negative. Trapezoid step: the polynomials are
     integrated exactly, y by the trapezoid rule. ``pull = (0, a)``, ``slope = (b,)`` is
     ColemanHodgdon. The virgin curve starts at ``rest_input`` (V), ``rest_output`` (um).
+    As there no return-point memory, no wiping-out and no congruency. Inverse:
+    InverseHysteresis, where y rises on every branch. Loops run
+    counter-clockwise, as a piezo's, where p'(x) > |c| g(x), and clockwise below that.
 
     Raises ValueError for numbers that are not finite, empty polynomials or ``c >= 0``.
     """

@@ -1,0 +1,177 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import extrema as oracle
+
+from piezojax import BashashJalili, simulate
+
+LOWER, UPPER = (0.0, 0.0), (100.0, 12.0)
+SHAPES = ((-0.45, 0.03), (-0.35, 0.05))
+SAMPLES = 64
+
+
+def model(depth=4, shapes=SHAPES):
+    return BashashJalili(*LOWER, *UPPER, *shapes[0], *shapes[1], depth=depth)
+
+
+@jax.jit
+def padded(system, path):
+    return simulate(system, path, system.init(path[0]))[1]
+
+
+def response(system, path):
+    """One program for every path that is short enough."""
+    samples = SAMPLES * -(-path.size // SAMPLES)
+    longer = np.pad(path, (0, samples - path.size), "edge")
+    return np.asarray(padded(system, longer))[: path.size]
+
+
+def expected(path, depth=4):
+    return oracle.follow(list(map(float, path)), LOWER, UPPER, SHAPES, depth)
+
+
+def rounded(low, high):
+    return st.floats(low, high).map(lambda value: round(value, 2))
+
+
+@settings(max_examples=60)
+@given(st.lists(rounded(-30.0, 140.0), min_size=SAMPLES, max_size=SAMPLES))
+def test_any_path_is_that_of_the_list_of_branches(path):
+    np.testing.assert_allclose(
+        response(model(), np.array(path)), expected(path), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("depth", [1, 2, 4])
+def test_nested_deeper_than_remembered(depth):
+    # Ever smaller loops, three times as many as fit, and out again past all of them.
+    turns = 50.0 + 45.0 * (-0.8) ** np.arange(SAMPLES // 2)
+    path = np.concatenate([turns, turns[::-1]])
+    found = response(model(depth), path)
+    np.testing.assert_allclose(found, expected(path, depth), atol=1e-9)
+    deep = np.array(expected(path, SAMPLES))
+    assert np.max(np.abs(found - deep)) > 1e-3  # what was forgotten is missed
+    # Out of the nest, at the outermost turns, nothing of it is left.
+    np.testing.assert_allclose(found[-2:], deep[-2:], atol=1e-9)
+
+
+def test_a_loop_beyond_the_memory_has_no_width_and_no_jump():
+    system = model(depth=1)
+    fine = np.interp(
+        np.arange(0, 5, 0.01), range(6), [0.0, 80.0, 40.0, 60.0, 20.0, 70.0]
+    )
+    found = np.asarray(response(system, fine))
+    step = np.max(np.abs(np.diff(fine)))
+    assert np.max(np.abs(np.diff(found))) < 0.25 * step  # the steepest slope is 0.23
+    # 80 to 40 is stored; 40 to 60 and back to 40 is run on the branch from 80.
+    np.testing.assert_allclose(found[300:351], found[200:301:2][::-1], atol=1e-9)
+
+
+def test_the_branch_passes_through_both_extrema():
+    path = np.array([0.0, 50.0, 100.0, 50.0, 0.0])
+    found = response(model(), path)
+    np.testing.assert_allclose(found[0::2], [0.0, 12.0, 0.0], atol=1e-12)
+    assert found[1] < 6.0 < found[3]  # counter-clockwise
+
+
+def test_straight_branches_have_no_hysteresis():
+    path = np.random.default_rng(0).uniform(-20.0, 120.0, SAMPLES)
+    flat = model(shapes=((0.0, 0.03), (0.0, 0.05)))
+    np.testing.assert_allclose(response(flat, path), 0.12 * path, atol=1e-12)
+
+
+@pytest.mark.parametrize("input", [-10.0, 0.0, 30.0, 100.0, 120.0])
+def test_rest_is_rest_and_every_way_from_it_is_continuous(input):
+    system = model()
+    state = system.init(input)
+    step = jax.jit(lambda state, v: system.step(state, v))
+    after, output = step(state, input)
+    np.testing.assert_allclose(output, expected([input])[0], atol=1e-12)
+    np.testing.assert_allclose(
+        jax.tree.leaves(after), jax.tree.leaves(state), rtol=0.0, atol=1e-14
+    )
+    for by in (-1e-7, 1e-7):
+        assert abs(step(state, input + by)[1] - output) < 1e-7
+
+
+@jax.jit
+@jax.value_and_grad
+def weighted(system_and_path):
+    system, path = system_and_path
+    outputs = simulate(system, path, system.init(path[0]))[1]
+    return jnp.sin(jnp.arange(outputs.size)) @ outputs
+
+
+def test_gradients_are_those_of_differences():
+    # Turns, pauses, wiped loops, both ends passed.
+    path = np.repeat([10.0, 60.0, 30.0, 45.0, 20.0, 110.0, 70.0, 90.0, -5.0, 40.0], 2)
+    leaves, tree = jax.tree.flatten((model(), path))
+    found = jax.tree.leaves(weighted((model(), path))[1])
+    for i, leaf in enumerate(leaves[:-1]):
+        step = 1e-5 * max(1.0, abs(float(leaf)))
+        above, below = (
+            float(
+                weighted(
+                    jax.tree.unflatten(tree, [*leaves[:i], leaf + by, *leaves[i + 1 :]])
+                )[0]
+            )
+            for by in (step, -step)
+        )
+        slope = (above - below) / (2.0 * step)
+        np.testing.assert_allclose(found[i], slope, rtol=1e-5, atol=1e-7)
+    for k in range(1, path.size, 2):  # the pause moves with its turn
+        step = np.zeros(path.size)
+        step[k - 1 : k + 1] = 1e-5
+        above, below = (
+            float(weighted((model(), path + by * step))[0]) for by in (1, -1)
+        )
+        slope = (above - below) / 2e-5
+        np.testing.assert_allclose(found[-1][k - 1 : k + 1].sum(), slope, rtol=1e-5)
+
+
+@pytest.mark.parametrize("start", [0.0, 30.0, 100.0])
+def test_gradient_at_rest_is_finite(start):
+    found = weighted((model(), np.full(20, start)))[1]
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
+
+
+def test_eager_is_jitted_is_a_lane_of_a_batch():
+    paths = np.random.default_rng(1).uniform(-10.0, 110.0, (2, SAMPLES))
+    state, eager = model().init(paths[0, 0]), []
+    for v in paths[0, :8]:
+        state, output = model().step(state, v)
+        eager.append(output)
+    alone = response(model(), paths[0])
+    np.testing.assert_allclose(alone[:8], eager, atol=1e-12)
+    batch = jax.vmap(padded, in_axes=(None, 0))(model(), paths)
+    np.testing.assert_allclose(batch[0], alone, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"lower_input": np.nan}, "lower_input in V is nan; it must be finite"),
+        ({"upper_input": -1.0}, "lower_input must be below upper_input"),
+        ({"upper_output": 0.0}, "lower_output must be below upper_output"),
+        ({"rising_alpha": -1.0}, "rising_alpha is -1; it must be finite and above -1"),
+        ({"falling_alpha": 8.0}, "falling_alpha is 8; .* below 7.38906"),
+        ({"rising_tau": -0.1}, "rising_tau in 1/V is -0.1; .* at least 0"),
+        ({"depth": 0}, "depth is 0; it must be finite and at least 1"),
+    ],
+)
+def test_bad_parameters_are_refused(changed, message):
+    good = {
+        "lower_input": 0.0,
+        "lower_output": 0.0,
+        "upper_input": 100.0,
+        "upper_output": 12.0,
+        "rising_alpha": -0.4,
+        "rising_tau": 0.03,
+        "falling_alpha": -0.4,
+        "falling_tau": 0.03,
+    }
+    with pytest.raises(ValueError, match=message):
+        BashashJalili(**{**good, **changed})

@@ -1,0 +1,220 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import duhem as oracle
+
+from piezojax import (
+    BoucWen,
+    ColemanHodgdon,
+    Duhem,
+    ShapedColemanHodgdon,
+    load,
+    save,
+    simulate,
+)
+from piezojax.hysteresis.duhem import DuhemState
+
+A, B, C = 0.0077, 0.1167, -0.0487
+PULL, SLOPE = (0.02, 0.006, -2e-5, 1e-7), (0.11, -3e-4, 2e-6)
+ALPHA, GAMMA, DELTA = 0.05, 0.03, -0.01  # 1/V
+
+
+def coleman_hodgdon(**options):
+    return Duhem(((B,),), ((0.0, A), (C,)), **options)
+
+
+def bouc_wen(nu=1, **options):
+    if nu == 1:
+        parts = {
+            "irreversible": ((), (-GAMMA,)),
+            "reversible_modulus": ((-DELTA,),),
+        }
+        return Duhem(((ALPHA,),), **parts, **options)
+    # |z|^2 is a polynomial, |z| z is one times the modulus.
+    parts = {"irreversible": (), "irreversible_modulus": ((), (-GAMMA,))}
+    return Duhem(((ALPHA,), (), (-DELTA,)), **parts, **options)
+
+
+def curved(**options):
+    """Nothing special: all four surfaces, output of both."""
+    return Duhem(
+        reversible=((0.1, 1e-3), (-0.002,)),
+        irreversible=((0.01, 2e-3), (-0.02, -1e-4)),
+        reversible_modulus=((-0.003,),),
+        irreversible_modulus=((0.0, 1e-5), (-0.001,)),
+        output=((0.2, 0.05, 1e-4), (0.8, 1e-3), (0.01,)),
+        rest_input=3.0,
+        rest_memory=0.5,
+        **options,
+    )
+
+
+@jax.jit
+def padded(system, path, start):
+    return simulate(system, path, system.init(start))[1]
+
+
+def response(system, path, start):
+    """One program for every path of up to 256 samples."""
+    longer = np.pad(path, (0, 256 - path.size), "edge")
+    return np.asarray(padded(system, longer, start))[: path.size]
+
+
+def drive(samples=200):
+    time = np.linspace(0.0, 3.0, samples)
+    return 40.0 + 30.0 * np.sin(2 * np.pi * time) * np.exp(-0.3 * time)
+
+
+def walk(samples, span):
+    return np.repeat(np.random.default_rng(0).uniform(-span, span, samples), 2)
+
+
+def shares(x, u):
+    """The two slopes of `curved`, written out."""
+    f = 0.1 + 1e-3 * u - 0.002 * x - 0.003 * abs(x)
+    g = 0.01 + 2e-3 * u + (-0.02 - 1e-4 * u) * x + abs(x) * (1e-5 * u - 0.001 * x)
+    return f, g
+
+
+def rising(x, u):
+    f, g = shares(x, u)
+    return f + g
+
+
+def falling(x, u):
+    f, g = shares(x, u)
+    return f - g
+
+
+def test_the_step_is_the_rule_of_kutta():
+    path = walk(40, 20.0)
+    path[0] = 3.0
+    found = response(curved(), path, path[0])
+    x = oracle.kutta(
+        path, 0.5, lambda x, u: shares(x, u)[0], lambda x, u: shares(x, u)[1]
+    )
+    h = 0.2 + 0.05 * path + 1e-4 * path**2 + (0.8 + 1e-3 * path) * x + 0.01 * x**2
+    np.testing.assert_allclose(found, h, rtol=0.0, atol=1e-12)
+
+
+def test_it_solves_the_differential_equation_in_fourth_order():
+    corners = [3.0, 60.0, 20.0, 50.0, 10.0]
+    x = oracle.along(corners, 0.5, rising, falling)
+    assert np.all(x > 0.0)  # no branch crosses the kink
+    u = np.array(corners)
+    h = 0.2 + 0.05 * u + 1e-4 * u**2 + (0.8 + 1e-3 * u) * x + 0.01 * x**2
+    errors = []
+    for parts in (16, 32):
+        path = np.interp(np.arange(0, 4 + 1e-9, 1 / parts), range(5), corners)
+        found = response(curved(), path, 3.0)[parts : 4 * parts + 1 : parts]
+        errors.append(np.max(np.abs(found - h[1:])))
+    assert errors[1] < 1e-6
+    assert 11.0 < errors[0] / errors[1] < 22.0
+
+
+def test_linear_surfaces_are_coleman_hodgdon():
+    path = drive()
+    exact = ColemanHodgdon(A, B, C, 4.0, 1.0, scheme="exact")
+    found = response(coleman_hodgdon(rest_input=4.0, rest_memory=1.0), path, path[0])
+    np.testing.assert_allclose(found, response(exact, path, path[0]), atol=1e-7)
+
+
+def test_surfaces_of_the_input_are_shaped_coleman_hodgdon():
+    path = np.linspace(40.0, 70.0, 128)  # its step is of second order only
+    path = np.concatenate([path, path[::-1]])
+    shaped = ShapedColemanHodgdon(PULL, SLOPE, C, 4.0, 1.0)
+    duhem = Duhem((SLOPE,), (PULL, (C,)), rest_input=4.0, rest_memory=1.0)
+    found, expected = (response(system, path, 40.0) for system in (duhem, shaped))
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+@pytest.mark.parametrize("nu", [1, 2])
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_a_modulus_is_bouc_wen(nu, substeps):
+    path = walk(60, 30.0)
+    path[0] = 0.0
+    classical = BoucWen(ALPHA, GAMMA, DELTA, nu, substeps=substeps)
+    found = response(bouc_wen(nu, substeps=substeps), path, 0.0)
+    np.testing.assert_allclose(found, response(classical, path, 0.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("input", [-30.0, 3.0, 80.0])
+def test_rest_is_on_the_virgin_curve(input):
+    system = curved()
+    x = oracle.along([3.0, input], 0.5, rising, falling)[-1]
+    state = system.init(input)
+    np.testing.assert_allclose(state.memory, x, atol=1e-5)
+    after, _ = system.step(state, input)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(a == b), state, after))
+
+
+@jax.jit
+@jax.value_and_grad
+def weighted(system_and_path):
+    system, path = system_and_path
+    outputs = simulate(system, path, system.init(5.0))[1]
+    return jnp.sin(jnp.arange(outputs.size)) @ outputs
+
+
+def test_gradients_are_those_of_differences():
+    arguments = (curved(), walk(8, 20.0))
+    leaves, tree = jax.tree.flatten(arguments)
+    found = jax.tree.leaves(weighted(arguments)[1])
+
+    def value(i, change):
+        changed = [*leaves[:i], leaves[i] + change, *leaves[i + 1 :]]
+        return float(weighted(jax.tree.unflatten(tree, changed))[0])
+
+    for i, leaf in enumerate(leaves[:-1]):
+        step = 1e-5 * max(1e-2, abs(float(leaf)))
+        slope = (value(i, step) - value(i, -step)) / (2.0 * step)
+        np.testing.assert_allclose(found[i], slope, rtol=1e-5, atol=1e-7)
+    for k in range(1, leaves[-1].size, 2):  # a pause moves with its turn
+        unit = np.zeros(leaves[-1].size)
+        unit[k - 1 : k + 1] = 1e-5
+        last = len(leaves) - 1
+        slope = (value(last, unit) - value(last, -unit)) / 2e-5
+        np.testing.assert_allclose(found[-1][k - 1 : k + 1].sum(), slope, rtol=1e-5)
+
+
+def test_slope_at_rest_is_that_of_the_rising_branch():
+    system = coleman_hodgdon()
+    state = system.init(40.0)
+    found = jax.grad(lambda u: system.step(state, u)[1])(40.0)
+    np.testing.assert_allclose(found, A * 40.0 + B + C * state.memory, rtol=1e-12)
+
+
+def test_eager_is_jitted_is_a_lane_of_a_batch():
+    paths = np.random.default_rng(1).uniform(-20.0, 20.0, (2, 256))
+    alone = response(curved(), paths[0], 3.0)
+    state, eager = DuhemState(jnp.array(3.0), jnp.array(0.5)), []
+    for u in paths[0, :4]:
+        state, output = curved().step(state, u)
+        eager.append(output)
+    np.testing.assert_allclose(alone[:4], eager, atol=1e-13)
+    batch = jax.vmap(padded, in_axes=(None, 0, None))(curved(), paths, 3.0)
+    np.testing.assert_allclose(batch[0], alone, atol=1e-13)
+
+
+def test_it_can_be_saved(tmp_path):
+    save(curved(substeps=2), tmp_path / "model.toml")
+    back = load(tmp_path / "model.toml")
+    assert jax.tree.structure(back) == jax.tree.structure(curved(substeps=2))
+    assert jax.tree.leaves(back) == jax.tree.leaves(curved(substeps=2))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"reversible": ((0.1,), (np.nan,))}, r"reversible\[1\] is nan"),
+        ({"irreversible_modulus": ((np.inf,),)}, r"irreversible_modulus\[0\] is inf"),
+        ({"output": ()}, "output is empty; it must hold a coefficient"),
+        ({"rest_input": np.nan}, "rest_input in V is nan"),
+        ({"substeps": 0}, "substeps is 0; it must be finite and at least 1"),
+    ],
+)
+def test_bad_parameters_are_refused(changed, message):
+    good = {"reversible": ((0.1,),), "irreversible": ((),)}
+    with pytest.raises(ValueError, match=message):
+        Duhem(**{**good, **changed})

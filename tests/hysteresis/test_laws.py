@@ -1,0 +1,248 @@
+"""Which law of hysteresis each model keeps, and which it breaks: a row a model.
+
+A law is a function from a model and an example to a defect, 0 where it is kept. Laws in
+a row's `keeps` hold within the tolerance there on every drawn example; laws in `breaks`
+fail by at least the number there on the stated example, and the model's docstring says
+so. A new model is one more row.
+"""
+
+import inspect
+import itertools
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import piezojax.hysteresis
+from piezojax import (
+    AsymmetricPrandtlIshlinskii,
+    BashashJalili,
+    BoucWen,
+    ColemanHodgdon,
+    Duhem,
+    HystereticARMA,
+    NormalisedBoucWen,
+    PrandtlIshlinskii,
+    ShapedColemanHodgdon,
+    System,
+    simulate,
+)
+from piezojax.hysteresis import Inverse
+
+SPAN = (0.0, 100.0)  # V
+SHARES = 6  # numbers in 0 .. 1 that make an example
+SEGMENTS, PARTS = 12, 16  # of every path, and samples a segment
+LENGTH = SEGMENTS * PARTS + 1
+
+
+@jax.jit
+def _outputs(system, paths):
+    return jax.vmap(lambda p: simulate(system, p, system.init(p[0]))[1])(paths)
+
+
+def outputs(system, *paths):
+    """One program a model: two paths of one length, whatever the law."""
+    stacked = np.stack([np.pad(p, (0, LENGTH - p.size), "edge") for p in paths])
+    return np.asarray(_outputs(system, stacked))
+
+
+def through(shares, parts=PARTS):
+    """Inputs (V) along straight segments between corners given in 0 .. 1."""
+    corners = SPAN[0] + (SPAN[1] - SPAN[0]) * np.asarray(shares)
+    at = np.arange((corners.size - 1) * parts + 1) / parts
+    return np.interp(at, np.arange(corners.size), corners)
+
+
+def return_point_memory(system, example):
+    """A minor loop closes where it was left: um that it misses by."""
+    low, q, p, high = sorted(example[:4])
+    start = example[4]
+    up = [start, high, low, p, q, p]
+    down = [start, low, high, q, p, q]
+    y = outputs(system, through(up), through(down))
+    return np.max(np.abs(y[:, 5 * PARTS] - y[:, 3 * PARTS]))
+
+
+def wiping_out(system, example):
+    """What lies between two larger extrema is forgotten: um that are left of it."""
+    low, high = min(example), max(example)
+    start, *inner, end = example
+    plain = [start] * (len(inner) + 1) + [low, high, end]
+    rich = [start, *inner, low, high, end]
+    y = outputs(system, through(plain), through(rich))
+    return abs(y[0, -1] - y[1, -1])
+
+
+def congruency(system, example):
+    """Minor loops between the same two inputs are one shape: um that they differ by."""
+    low, q, p, high = sorted(example[:4])
+    start = example[4]
+    y = outputs(system, through([start, low, p, q]), through([start, high, q, p, q]))
+    # Both fall from p to q, one from the main branch and one inside a loop.
+    first = y[0, 2 * PARTS : 3 * PARTS + 1]
+    second = y[1, 3 * PARTS : 4 * PARTS + 1]
+    return np.max(np.abs((first - first[0]) - (second - second[0])))
+
+
+def rate_independence(system, example):
+    """Only the path matters, not its speed: um at the corners between two speeds."""
+    even = through(example)
+    corners = even[::PARTS]
+    # Slow out of every corner, fast into the next one.
+    shares = (np.arange(PARTS) / PARTS) ** 2
+    uneven = [a + (b - a) * shares for a, b in itertools.pairwise(corners)]
+    y = outputs(system, even, np.append(np.concatenate(uneven), corners[-1]))
+    at = slice(0, even.size, PARTS)
+    return np.max(np.abs(y[0, at] - y[1, at]))
+
+
+def pauses(system, example):
+    """A pause changes nothing: um at the corners."""
+    path = through(example)
+    y = outputs(system, path, np.repeat(path, 2))
+    return np.max(np.abs(y[0, : path.size] - y[1, 1 : 2 * path.size : 2]))
+
+
+def thermodynamic_sign(system, example):
+    """A closed cycle dissipates, counter-clockwise in (V, um): V um that it gives.
+
+    The third round of a cycle of four corners: what fades has nearly faded, and in the
+    sum over the samples a kink between two of them costs some 0.1 V um.
+    """
+    path = through([*example[:4]] * 3 + [example[0]])
+    last = slice(-4 * PARTS - 1, None)
+    v, y = path[last], outputs(system, path, path)[0, last]
+    return -np.sum((0.5 * (v[1:] + v[:-1]) - v[0]) * np.diff(y))
+
+
+LAWS = {
+    "return-point memory": return_point_memory,
+    "wiping-out": wiping_out,
+    "congruency": congruency,
+    "rate independence": rate_independence,
+    "pauses": pauses,
+    "counter-clockwise": thermodynamic_sign,
+}
+EXACT = 1e-9
+LOOP = (0.05, 0.35, 0.6, 0.95, 0.5, 0.2)
+SHORT = (0.4, 0.55, 0.4, 0.55, 0.42, 0.5)  # so short that little of it fades
+CYCLE = (0.0, 1.0, 0.2, 0.8, 0.0, 1.0)
+
+
+class Row(NamedTuple):
+    """A model, the um (or V um) that laws hold to, and what breaks laws how far."""
+
+    system: System
+    keeps: dict
+    breaks: dict
+
+
+def fading(system, rate, **breaks):
+    """A differential model: what it remembers fades, and is not wiped out.
+
+    `rate`: at 16 samples a branch; the order of each scheme is tested in its own file.
+    """
+    memory = {
+        "return-point memory": (LOOP, 0.02),
+        "wiping-out": (SHORT, 0.005),
+        "congruency": (LOOP, 0.01),
+    }
+    kept = {"rate independence": rate, "pauses": EXACT, "counter-clockwise": 0.5}
+    return row(system, kept, memory | breaks)
+
+
+def remembering(system, **breaks):
+    """A model of extrema: everything holds to rounding."""
+    return row(system, dict.fromkeys(LAWS, EXACT) | {"counter-clockwise": 0.5}, breaks)
+
+
+def row(system, kept, breaks):
+    breaks = {law.replace("_", "-"): example for law, example in breaks.items()}
+    return Row(system, {k: v for k, v in kept.items() if k not in breaks}, breaks)
+
+
+A, B, C = 0.0077, 0.1167, -0.0487
+THRESHOLDS, WEIGHTS = (2.0, 7.0, 15.0), (0.02, 0.015, 0.01)
+BRANCHES = (-0.45, 0.03, -0.35, 0.05)
+ROWS = {
+    "ColemanHodgdon, exact": fading(ColemanHodgdon(A, B, C, scheme="exact"), EXACT),
+    "ColemanHodgdon": fading(ColemanHodgdon(A, B, C), 2e-3),
+    "ShapedColemanHodgdon": fading(
+        ShapedColemanHodgdon((0.0, 0.0077, 3e-6), (0.11, 5e-5), C), 2e-3
+    ),
+    "ShapedColemanHodgdon, weak pull": fading(
+        ShapedColemanHodgdon((0.02, 0.006, -2e-5, 1e-7), (0.11, -3e-4, 2e-6), -0.05),
+        5e-3,
+        counter_clockwise=(CYCLE, 5.0),
+    ),
+    "Duhem": fading(Duhem(((B,),), ((0.0, A), (C,))), 1e-4),
+    "BoucWen": fading(
+        BoucWen(0.04, 0.024, 0.016), 1e-3, counter_clockwise=(CYCLE, 50.0)
+    ),
+    "NormalisedBoucWen": fading(NormalisedBoucWen(0.12, -1.0, 0.04, 0.6, 2.0), 1e-3),
+    "NormalisedBoucWen, exact": fading(
+        NormalisedBoucWen(0.12, -1.0, 0.04, 0.6, scheme="exact"), EXACT
+    ),
+    "NormalisedBoucWen, k_w > 0": fading(
+        NormalisedBoucWen(0.12, 1.0, 0.04, 0.6, scheme="exact"),
+        EXACT,
+        counter_clockwise=(CYCLE, 50.0),
+    ),
+    "PrandtlIshlinskii": remembering(
+        PrandtlIshlinskii((0.08, 2e-4), THRESHOLDS, WEIGHTS)
+    ),
+    "AsymmetricPrandtlIshlinskii": remembering(
+        AsymmetricPrandtlIshlinskii(
+            (0.05,), THRESHOLDS, WEIGHTS, (0.01, 0.004, 0.02), -20.0, 120.0
+        )
+    ),
+    "BashashJalili": remembering(
+        BashashJalili(0.0, 0.0, 100.0, 12.0, *BRANCHES, depth=6),
+        congruency=(LOOP, 0.03),
+    ),
+    "BashashJalili, alpha > 0": remembering(
+        BashashJalili(0.0, 0.0, 100.0, 12.0, 0.45, 0.03, 0.35, 0.05, depth=6),
+        congruency=(LOOP, 0.03),
+        counter_clockwise=(CYCLE, 20.0),
+    ),
+}
+KEPT = [(name, law) for name, row in ROWS.items() for law in row.keeps]
+BROKEN = [(name, law) for name, row in ROWS.items() for law in row.breaks]
+
+shares = st.floats(0.0, 1.0).map(lambda share: round(share, 3))
+
+
+@pytest.mark.parametrize(("name", "law"), KEPT)
+@settings(max_examples=10)
+@given(example=st.lists(shares, min_size=SHARES, max_size=SHARES))
+def test_the_law_holds(name, law, example):
+    assert LAWS[law](ROWS[name].system, example) <= ROWS[name].keeps[law]
+
+
+@pytest.mark.parametrize(("name", "law"), BROKEN)
+def test_the_law_is_broken_and_the_docs_say_so(name, law):
+    row = ROWS[name]
+    example, least = row.breaks[law]
+    assert LAWS[law](row.system, example) >= least
+    assert law in " ".join(inspect.getdoc(type(row.system)).lower().split())
+
+
+def test_every_law_of_every_model_is_in_the_table():
+    for name, row in ROWS.items():
+        assert sorted([*row.keeps, *row.breaks]) == sorted(LAWS), name
+
+
+def test_every_model_has_a_row():
+    exported = {
+        kind
+        for kind in vars(piezojax.hysteresis).values()
+        if isinstance(kind, type) and issubclass(kind, System)
+    }
+    # A model with dynamics depends on the rate; an inverse obeys the inverted laws.
+    models = {
+        kind for kind in exported - {HystereticARMA} if not issubclass(kind, Inverse)
+    }
+    assert models == {type(row.system) for row in ROWS.values()}
