@@ -195,3 +195,264 @@ INLINE void asymmetric_prandtl_ishlinskii_step(const row *p, row *s, const doubl
 }
 
 MODEL(asymmetric_prandtl_ishlinskii, 6 + 3 * PLAYS, 2 * PLAYS)
+
+/* Stop operators: as plays. What they hold, and the last x. */
+
+INLINE void stop_prandtl_ishlinskii_start(const row *p, row *s)
+{
+    for (int i = 0; i < PLAYS; i++)
+        LANES s[i][l] = 0.0;
+    LANES s[PLAYS][l] = p[3 + 2 * PLAYS][l];
+}
+
+INLINE void stop_prandtl_ishlinskii_step(const row *p, row *s, const double *x,
+                                         double *y)
+{
+    row dx;
+
+    LANES dx[l] = x[l] - s[PLAYS][l];
+    LANES y[l] = x[l] * (p[0][l] + x[l] * (p[1][l] + x[l] * p[2][l]));
+    for (int i = 0; i < PLAYS; i++)
+        LANES {
+            s[i][l] = played(0.0, p[3 + i][l], s[i][l] + dx[l]);
+            y[l] -= p[3 + PLAYS + i][l] * s[i][l];
+        }
+    LANES s[PLAYS][l] = x[l];
+}
+
+MODEL(stop_prandtl_ishlinskii, 4 + 2 * PLAYS, PLAYS + 1)
+
+/* Plays with growth |x'| more than their thresholds; growth before rest x. The last x
+   and the rate that led there, V/s. */
+
+static const double DT = 5e-5; /* that of hysteresis.py */
+
+INLINE void rate_dependent_prandtl_ishlinskii_start(const row *p, row *s)
+{
+    for (int i = 0; i <= PLAYS; i++)
+        LANES s[i][l] = p[4 + 2 * PLAYS][l];
+    LANES s[PLAYS + 1][l] = 0.0;
+}
+
+INLINE void rate_dependent_prandtl_ishlinskii_step(const row *p, row *s,
+                                                   const double *x, double *y)
+{
+    row wider;
+
+    LANES wider[l] = p[3 + 2 * PLAYS][l] * fabs(s[PLAYS + 1][l]);
+    LANES y[l] = x[l] * (p[0][l] + x[l] * (p[1][l] + x[l] * p[2][l]));
+    for (int i = 0; i < PLAYS; i++)
+        LANES {
+            s[i][l] = played(x[l], p[3 + i][l] + wider[l], s[i][l]);
+            y[l] += p[3 + PLAYS + i][l] * s[i][l];
+        }
+    LANES {
+        s[PLAYS + 1][l] = (x[l] - s[PLAYS][l]) / DT;
+        s[PLAYS][l] = x[l];
+    }
+}
+
+MODEL(rate_dependent_prandtl_ishlinskii, 5 + 2 * PLAYS, PLAYS + 2)
+
+/* Neurons over plays and past outputs: 2 past outputs, R linear, NEURONS x R mixing,
+   bias, output, thresholds of R - 2 plays, centre, scale, pace, rest x. The state holds
+   the plays, 2 past outputs, the last x. */
+
+#define R 7
+#define NEURONS 4
+#define MIXING (2 + R)
+#define BIAS (MIXING + NEURONS * R)
+#define OUTPUT (BIAS + NEURONS)
+#define THRESHOLDS (OUTPUT + NEURONS)
+#define CENTRE (THRESHOLDS + R - 2)
+
+INLINE void driven(const row *p, const row *r, double *y)
+{
+    LANES y[l] = 0.0;
+    for (int j = 0; j < R; j++)
+        LANES y[l] += p[2 + j][l] * r[j][l];
+    for (int i = 0; i < NEURONS; i++) {
+        row a;
+
+        LANES a[l] = p[BIAS + i][l];
+        for (int j = 0; j < R; j++)
+            LANES a[l] += p[MIXING + i * R + j][l] * r[j][l];
+        LANES y[l] += p[OUTPUT + i][l] * tanh(a[l]);
+    }
+}
+
+INLINE void learned_operator_start(const row *p, row *s)
+{
+    row r[R], y;
+
+    for (int j = 0; j < R; j++)
+        LANES r[j][l] = j == R - 1 ? 0.0
+                                   : (p[CENTRE + 3][l] - p[CENTRE][l])
+                                         / p[CENTRE + 1][l];
+    for (int i = 0; i < R - 2; i++)
+        LANES s[i][l] = r[0][l];
+    driven(p, r, y);
+    LANES s[R - 2][l] = s[R - 1][l] = y[l] / (1.0 - p[0][l] - p[1][l]);
+    LANES s[R][l] = p[CENTRE + 3][l];
+}
+
+INLINE void learned_operator_step(const row *p, row *s, const double *x, double *y)
+{
+    row r[R];
+
+    LANES {
+        r[0][l] = (x[l] - p[CENTRE][l]) / p[CENTRE + 1][l];
+        r[R - 1][l] = (x[l] - s[R][l]) / p[CENTRE + 2][l];
+        s[R][l] = x[l];
+    }
+    for (int i = 0; i < R - 2; i++)
+        LANES r[1 + i][l] = s[i][l] = played(r[0][l], p[THRESHOLDS + i][l], s[i][l]);
+    driven(p, r, y);
+    LANES {
+        y[l] += p[0][l] * s[R - 2][l] + p[1][l] * s[R - 1][l];
+        s[R - 1][l] = s[R - 2][l];
+        s[R - 2][l] = y[l];
+    }
+}
+
+MODEL(learned_operator, CENTRE + 4, R + 1)
+
+/* w' = rho (x' - sigma |x'| |w|^(n-1) w + (sigma - 1) x' |w|^n), y = k_x x + k_w w, a
+   Runge-Kutta step along x: k_x, k_w, rho, sigma, n, rest x. */
+
+INLINE double bouc_wen_rate(double rho, double sigma, double n, double dx, double w)
+{
+    const double power = n == 1.0 ? fabs(w) : pow(fabs(w), n);
+
+    return rho * (dx - (sigma * fabs(dx) * copysign(1.0, w) + (1.0 - sigma) * dx) * power);
+}
+
+INLINE void normalised_bouc_wen_start(const row *p, row *s)
+{
+    LANES s[0][l] = p[5][l];
+    LANES s[1][l] = 0.0;
+}
+
+INLINE void normalised_bouc_wen_step(const row *p, row *s, const double *x, double *y)
+{
+    LANES {
+        const double dx = x[l] - s[0][l], w = s[1][l];
+        const double rho = p[2][l], sigma = p[3][l], n = p[4][l];
+        const double a = bouc_wen_rate(rho, sigma, n, dx, w);
+        const double b = bouc_wen_rate(rho, sigma, n, dx, w + 0.5 * a);
+        const double c = bouc_wen_rate(rho, sigma, n, dx, w + 0.5 * b);
+        const double d = bouc_wen_rate(rho, sigma, n, dx, w + c);
+
+        s[1][l] = w + (a + 2.0 * (b + c) + d) / 6.0;
+        s[0][l] = x[l];
+        y[l] = p[0][l] * x[l] + p[1][l] * s[1][l];
+    }
+}
+
+MODEL(normalised_bouc_wen, 6, 2)
+
+/* x' = F u' + G |u'| with F = g0 + g1 u + g2 u^2, G = p0 + ... + p3 u^3 + c x and
+   y = h0 + h1 x, a Runge-Kutta step along u: g, p, c, h, rest u, rest x. */
+
+INLINE double duhem_rate(const row *p, int l, double x, double u, double du)
+{
+    const double rising = p[0][l] + u * (p[1][l] + u * p[2][l]);
+    const double pull = p[3][l] + u * (p[4][l] + u * (p[5][l] + u * p[6][l]));
+
+    return rising * du + (pull + p[7][l] * x) * fabs(du);
+}
+
+INLINE void duhem_start(const row *p, row *s)
+{
+    LANES s[0][l] = p[10][l];
+    LANES s[1][l] = p[11][l];
+}
+
+INLINE void duhem_step(const row *p, row *s, const double *input, double *y)
+{
+    LANES {
+        const double u = s[0][l], du = input[l] - u, x = s[1][l];
+        const double a = duhem_rate(p, l, x, u, du);
+        const double b = duhem_rate(p, l, x + 0.5 * a, u + 0.5 * du, du);
+        const double c = duhem_rate(p, l, x + 0.5 * b, u + 0.5 * du, du);
+        const double d = duhem_rate(p, l, x + c, u + du, du);
+
+        s[1][l] = x + (a + 2.0 * (b + c) + d) / 6.0;
+        s[0][l] = input[l];
+        y[l] = p[8][l] + p[9][l] * s[1][l];
+    }
+}
+
+MODEL(duhem, 12, 2)
+
+/* Exponential curves between remembered turning points, a stack of them: lower x, y,
+   upper x, y, rising alpha, tau, falling alpha, tau. The last x and y, the count, the
+   direction, the points; it starts rising from the lower end, at x = 0. */
+
+#define POINTS 10
+
+INLINE double bent(double alpha, double tau, double distance)
+{
+    return (1.0 + alpha * exp(-tau * fabs(distance))) * distance;
+}
+
+INLINE double curve(const row *p, int l, const row *s, double x)
+{
+    const int count = (int)s[2][l], side = s[3][l] > 0.0 ? 4 : 6;
+    const double alpha = p[side][l], tau = p[side + 1][l];
+    const double x1 = s[3 + count][l], y1 = s[3 + POINTS + count][l];
+    const double x2 = s[2 + count][l], y2 = s[2 + POINTS + count][l];
+
+    return y1 + (y2 - y1) * bent(alpha, tau, x - x1) / bent(alpha, tau, x2 - x1);
+}
+
+INLINE void bashash_jalili_start(const row *p, row *s)
+{
+    LANES {
+        s[0][l] = 0.0;
+        s[2][l] = 2.0;
+        s[3][l] = 1.0;
+        s[4][l] = p[2][l];
+        s[5][l] = p[0][l];
+        s[4 + POINTS][l] = p[3][l];
+        s[5 + POINTS][l] = p[1][l];
+        s[1][l] = curve(p, l, s, 0.0);
+    }
+}
+
+INLINE void bashash_jalili_step(const row *p, row *s, const double *x, double *y)
+{
+    LANES {
+        const double moved = x[l] - s[0][l];
+        const double way = moved > 0.0 ? 1.0 : moved < 0.0 ? -1.0 : s[3][l];
+        int count = (int)s[2][l], follows = 1;
+
+        if (way != s[3][l] && count < POINTS) {
+            s[4 + count][l] = s[0][l];
+            s[4 + POINTS + count][l] = s[1][l];
+            count++;
+        } else if (way != s[3][l]) {
+            follows = way * (x[l] - s[3 + POINTS][l]) >= 0.0;
+            count -= follows;
+        }
+        if (follows) {
+            s[3][l] = way;
+            while (count > 2 && way * (x[l] - s[2 + count][l]) >= 0.0)
+                count -= 2;
+        }
+        if (count < 2) {
+            for (int i = 4; i <= 4 + POINTS; i += POINTS) {
+                const double first = s[i][l];
+
+                s[i][l] = s[i + 1][l];
+                s[i + 1][l] = first;
+            }
+            count = 2;
+        }
+        s[2][l] = count;
+        s[1][l] = y[l] = curve(p, l, s, x[l]);
+        s[0][l] = x[l];
+    }
+}
+
+MODEL(bashash_jalili, 8, 4 + 2 * POINTS)

@@ -8,8 +8,8 @@ each lane. The gradient is exact here (in reverse, or in forward mode where that
 faster: `mode` in the rows), in C that of one-sided differences, a run for each
 parameter and one more. A bar is the most that `ratio_to_c` may be.
 
-A model takes part by its name in piezojax.identify.PARTS and a C function of that name
-in hysteresis.c.
+A model takes part by its name in piezojax.identify.PARTS, or OTHERS here, and a C
+function of that name in hysteresis.c.
 """
 
 import argparse
@@ -56,7 +56,29 @@ DIFFERENCE = 1e-6
 FEW = 6
 """Up to so many parameters forward mode is the faster one."""
 
+OTHERS = {
+    "duhem": lambda: piezojax.Duhem(
+        reversible=[[0.08, 1e-4, -1e-6]],
+        irreversible=[[1e-3, 7.7e-3, 1e-5, -1e-7], [-0.0487]],
+    ),
+    "normalised_bouc_wen": lambda: piezojax.NormalisedBoucWen(
+        k_x=0.14, k_w=-1.5, rho=0.03, sigma=0.8, n=1.5
+    ),
+    "bashash_jalili": lambda: piezojax.BashashJalili(
+        lower_input=-10.0,
+        lower_output=-1.0,
+        upper_input=120.0,
+        upper_output=12.0,
+        rising_alpha=-0.4,
+        rising_tau=0.02,
+        falling_alpha=-0.3,
+        falling_tau=0.03,
+    ),
+}
+"""Models that are no part of a chain to fit."""
+
 MODELS = [name for name, (place, _) in PARTS.items() if place == "hysteresis"]
+MODELS += [name for name in OTHERS if name not in MODELS]
 
 
 class MeanSquare(piezojax.Metric):
@@ -82,12 +104,16 @@ class Problem:
 
     def __init__(self, name, lanes, steps, seed=0):
         rng = np.random.default_rng(seed)
-        part = PARTS[name][1](EXTENT)
-        self.system, self.name = part.system, name
-        leaves = {path: np.asarray(v) for path, v in parameters(part.system).items()}
+        bounds = {}
+        if name in OTHERS:
+            self.system = OTHERS[name]()
+        else:
+            self.system, bounds, *_ = PARTS[name][1](EXTENT)
+        self.name = name
+        leaves = {path: np.asarray(v) for path, v in parameters(self.system).items()}
         self.shapes = {path: leaf.shape for path, leaf in leaves.items()}
         nominal = np.concatenate([leaf.ravel() for leaf in leaves.values()])
-        sizes = [self._size(part, path, leaf) for path, leaf in leaves.items()]
+        sizes = [_size(bounds.get(path), leaf) for path, leaf in leaves.items()]
         self.sizes = np.concatenate(sizes)
         spread = rng.uniform(-0.1, 0.1, (lanes, len(nominal)))
         self.parameters = nominal + spread * self.sizes
@@ -95,14 +121,6 @@ class Problem:
         hertz = np.linspace(5.0, 50.0, lanes)[:, None]
         fade = np.linspace(1.0, 0.3, steps)
         self.inputs = 50.0 * (1.0 - fade * np.cos(2 * np.pi * hertz * time_s))
-
-    @staticmethod
-    def _size(part, path, leaf):
-        """Usual size of each number in a leaf; by its bounds, where it starts at 0."""
-        if leaf.ndim:
-            return np.abs(leaf).ravel()
-        reach = np.ptp(part.bounds.get(path, (0.0, 1.0))[:2])
-        return np.array([abs(leaf) if leaf else 0.01 * reach], dtype=float)
 
     def lane(self, values, input, segment):
         """Mean square of the output of one lane."""
@@ -122,6 +140,14 @@ class Problem:
         return piezojax.simulate(
             system, input, system.init(before), metric=metric, segment=segment
         )[1]
+
+
+def _size(bounds, leaf):
+    """Usual size of each number in a leaf; by its bounds, where it starts at 0."""
+    if leaf.ndim:
+        return np.abs(leaf).ravel()
+    reach = 1.0 if bounds is None else bounds[1] - bounds[0]
+    return np.array([abs(leaf) if leaf else 0.01 * reach], dtype=float)
 
 
 def modes(what, count):
