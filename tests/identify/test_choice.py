@@ -98,9 +98,9 @@ def check_recovered(found, plant, clean):
 
 
 def test_the_model_that_made_a_record_is_chosen():
-    # Among a linear one and one with as many parameters more.
+    # Among a linear one and one that holds it and has four parameters more.
     record, plant, clean = made_by("coleman_hodgdon", ONE_TONE)
-    among = ["coleman_hodgdon", "prandtl_ishlinskii"]
+    among = ["coleman_hodgdon", "shaped_coleman_hodgdon"]
     found = identify_all(
         record, hysteresis=among, train=TRAIN, options=Options(steps=40)
     )
