@@ -53,8 +53,8 @@ EXTENT = Extent(
 DIFFERENCE = 1e-6
 """Step of the differences in C, as a share of a parameter's usual size."""
 
-FEW = 6
-"""Up to so many parameters forward mode is the faster one."""
+FEW = 12
+"""Up to so many parameters forward mode may be the faster one: both are timed."""
 
 OTHERS = {
     "duhem": lambda: piezojax.Duhem(
