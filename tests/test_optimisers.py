@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.optimisers import METHODS
+from piezojax.optimisers import METHODS, damped_gauss_newton
 from piezojax.tune.gradient import with_finite_gradient
 from piezojax.tune.objective import HOPELESS
 
@@ -239,3 +239,33 @@ def test_an_infinite_slope_is_no_slope(forward):
     value, slope = jax.value_and_grad(guarded)(jnp.array([0.0, 2.0]))
     assert value == 2.0
     np.testing.assert_array_equal(slope, 0.0)
+
+
+def _course(optimiser, unit, steps):
+    step = jax.jit(optimiser.step)
+    carry, found = optimiser.start(jnp.array(unit)), []
+    for _ in range(steps):
+        carry = step(carry)
+        view = optimiser.view(carry)
+        found.append([*np.asarray(view.unit), float(view.loss)])
+    return np.array(found), bool(view.done)
+
+
+@pytest.mark.parametrize(
+    ("residuals", "unit"), [(_rosenbrock, (0.2, 0.8)), (_quadratic, (0.9, 0.1, 0.2))]
+)
+def test_damped_gauss_newton_takes_the_steps_of_optimistix(residuals, unit):
+    ours, done = _course(damped_gauss_newton(residuals, TOLERANCE), unit, 60)
+    optimistix = METHODS["levenberg_marquardt"](residuals, residuals, TOLERANCE)
+    theirs, _ = _course(optimistix, unit, 60)
+    np.testing.assert_allclose(ours[:25], theirs[:25], rtol=1e-6, atol=1e-12)
+    assert done
+    np.testing.assert_array_equal(ours[-1], ours[-2])
+    assert ours[-1, -1] < 1e-10
+
+
+def test_a_parameter_that_does_nothing_stays_where_it_is():
+    blind = lambda unit: _quadratic(unit.at[0].set(0.3))  # noqa: E731
+    course, done = _course(damped_gauss_newton(blind, TOLERANCE), (0.9, 0.1, 0.2), 80)
+    assert done
+    np.testing.assert_allclose(course[-1], [0.9, 0.7, 0.55, 0.0], atol=1e-6)

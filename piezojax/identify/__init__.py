@@ -1,5 +1,7 @@
 """From a lab's records to a plant model."""
 
+from .compare import identify_all as identify_all
+from .comparison import Comparison as Comparison
 from .estimate import Options as Options
 from .fit import Fit as Fit
 from .fit import FitReport as FitReport

@@ -7,10 +7,15 @@ import click
 from ..command import Command, common, results_folder, run
 from ..report.console import Bar, fit_table, models_table
 from ..report.identification import write_fit
+from ..report.models import comparison_notes, comparison_table, write_comparison
+from .compare import identify_all
 from .estimate import Options
 from .fit import identify
 from .models import DEFAULT
 from .record import read_record
+
+ALL = "all"
+"""The model that stands for every one that the records support."""
 
 
 class _Part(click.ParamType):
@@ -32,8 +37,9 @@ class _Part(click.ParamType):
     "--model",
     default=DEFAULT,
     show_default=True,
-    help="Model to fit, parts joined by '+'; 'help' lists them.",
+    help="Model to fit, parts joined by '+'; 'help' lists them, 'all' tries all.",
 )
+@click.option("--among", help="With 'all': only these hysteresis parts, by commas.")
 @click.option("--time", help="Time column, by name or number from zero.")
 @click.option("--input", default="0", show_default=True, help="Input column.")
 @click.option("--output", default="1", show_default=True, help="Output column.")
@@ -71,10 +77,12 @@ class _Part(click.ParamType):
 )
 @click.option("--train", type=_Part(), help="Samples to fit (default: first half).")
 @click.option("--validate", type=_Part(), help="Samples to judge on (default: rest).")
+@click.option("--test", type=_Part(), help="With 'all': samples kept from the choice.")
 @common
 def main(
     records,
     model,
+    among,
     method,
     order,
     window,
@@ -82,6 +90,7 @@ def main(
     steps,
     train,
     validate,
+    test,
     out,
     seed,
     quiet,
@@ -100,7 +109,15 @@ def main(
             return
         if not records:
             raise ValueError("name the RECORD to fit a model to")
+        if model == ALL and method is not None:
+            raise ValueError("--method goes with one model; 'all' takes each one's own")
+        if model != ALL and (among or test):
+            raise ValueError("--among and --test go with --model all")
         loaded = [read_record(record, **columns) for record in records]
+        options = Options(order, window, oversample, steps)
+        if model == ALL:
+            compare(console, loaded, options)
+            return
         with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
             fit = identify(
                 loaded,
@@ -108,7 +125,7 @@ def main(
                 method=method,
                 train=train,
                 validate=validate,
-                options=Options(order, window, oversample, steps),
+                options=options,
                 progress=bar,
             )
             bar.stage("drawing")
@@ -117,6 +134,30 @@ def main(
         for warning in fit.report.warnings:
             console.print(f"note: {warning}", soft_wrap=True)
         console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
+
+    def compare(console, loaded, options):
+        with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
+            comparison = identify_all(
+                loaded,
+                hysteresis=among.split(",") if among else None,
+                train=train,
+                validate=validate,
+                test=test,
+                options=options,
+                progress=bar,
+            )
+            bar.finish()
+            bar.stage("drawing")
+            write_comparison(comparison, folder)
+        report = comparison.report
+        console.print(comparison_table(report))
+        notes = comparison_notes(report)
+        for note in [
+            *notes,
+            *(f"note: {text}" for text in comparison.best.report.warnings),
+        ]:
+            console.print(note, soft_wrap=True)
+        console.print(f"{report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
 
     run(quiet, body)
 

@@ -152,7 +152,7 @@ def _excitation(
     record: Record, train: slice, order: int, hysteresis: bool
 ) -> Iterator[str]:
     for name, input in _named("input", record.inputs[train]):
-        count = _lines(input)
+        count = lines(input)
         if 2 * count < order:
             yield (
                 f"{name} is not exciting enough: its {count} "
@@ -168,7 +168,7 @@ def _excitation(
             )
 
 
-def _lines(input: np.ndarray) -> int:
+def lines(input: np.ndarray) -> int:
     """Return how many sines the spectrum of ``input`` [samples] amounts to."""
     window = blackmanharris(input.size)
     spectrum = np.abs(np.fft.rfft((input - np.mean(input)) * window))

@@ -50,7 +50,8 @@ class Estimate(NamedTuple):
     """A fitted system, its free run over every record [samples, p], what to say.
 
     ``order`` counts the parameters of linear dynamics that the records had to excite,
-    ``hysteresis`` tells whether they also had to show full cycles.
+    ``hysteresis`` tells whether they also had to show full cycles. ``count``: how many
+    parameters were fitted, where ``parameters`` does not name them all.
     """
 
     system: System
@@ -60,3 +61,8 @@ class Estimate(NamedTuple):
     order: int = 0
     hysteresis: bool = False
     linear: LinearDetail | None = None
+    count: int | None = None
+
+    def counted(self) -> int:
+        """Return how many parameters were fitted."""
+        return len(self.parameters) if self.count is None else self.count

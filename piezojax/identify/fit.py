@@ -49,7 +49,8 @@ class FitReport(BaseModel):
 class Fit:
     """A fitted plant, its report, the records and the simulated outputs (their unit).
 
-    ``system`` holds what was in force before the first record.
+    ``system`` holds what was in force before the first record. ``count``: how many
+    parameters were fitted.
     """
 
     system: System
@@ -59,6 +60,18 @@ class Fit:
     train: slice
     validate: slice
     linear: LinearDetail | None = None
+    count: int = 0
+
+    def errors(self, part: slice) -> list[np.ndarray]:
+        """Return the errors over ``part``, [samples, p] for each record."""
+        return [
+            (run - record.outputs)[part]
+            for record, run in zip(self.records, self.simulations, strict=True)
+        ]
+
+    def error_over(self, part: slice) -> FitError:
+        """Return the RMS of the errors over ``part``."""
+        return _fit_error(self.records, self.simulations, part)
 
     @property
     def record(self) -> Record:
@@ -97,8 +110,8 @@ def identify(
     began = time.perf_counter()
     chosen = method_for(model, method)
     records = (records,) if isinstance(records, Record) else tuple(records)
-    _check_together(records)
-    train, validate = _parts(min(r.samples for r in records), train, validate)
+    check_together(records)
+    train, validate = parts_of(min(r.samples for r in records), train, validate)
     estimate = chosen.estimate(
         model, records, train, options or Options(), progress or Silent()
     )
@@ -126,10 +139,20 @@ def identify(
         ],
         wall_s=time.perf_counter() - began,
     )
-    return Fit(estimate.system, report, records, runs, train, validate, estimate.linear)
+    return Fit(
+        estimate.system,
+        report,
+        records,
+        runs,
+        train,
+        validate,
+        estimate.linear,
+        estimate.counted(),
+    )
 
 
-def _check_together(records: tuple[Record, ...]) -> None:
+def check_together(records: tuple[Record, ...]) -> None:
+    """Raise ValueError unless there are records, of one sample time and units."""
     if not records:
         raise ValueError("no record to fit a model to")
     for record in records[1:]:
@@ -147,9 +170,13 @@ def _check_together(records: tuple[Record, ...]) -> None:
                 )
 
 
-def _parts(
+def parts_of(
     samples: int, train: slice | None, validate: slice | None
 ) -> tuple[slice, slice]:
+    """Return the parts to fit and to judge on: halves where they are left out.
+
+    Raises ValueError for a part that is empty or outside of the ``samples``.
+    """
     train = _closed(train or slice(0, samples // 2), samples)
     validate = _closed(validate or slice(min(train.stop, samples), samples), samples)
     for name, part in (("train", train), ("validate", validate)):

@@ -176,7 +176,12 @@ def _linear(
     else:
         system = plant
         warnings = [*warnings, "inputs and outputs are deviations from their means"]
-    return Estimate(system, runs, named, warnings, 2 * stage.order, linear=detail)
+    # What a similarity of the states cannot change, and the means of the outputs.
+    outputs, inputs = stage.D.shape
+    count = stage.order * (inputs + outputs) + np.count_nonzero(stage.D) + outputs
+    return Estimate(
+        system, runs, named, warnings, 2 * stage.order, linear=detail, count=int(count)
+    )
 
 
 def _as_arma(model: StateSpace) -> ARMA:

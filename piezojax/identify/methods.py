@@ -140,7 +140,8 @@ def _by_steady_state(
     warnings = [
         f"the model runs at {1.0 / fine.dt:g} Hz on input means: see identify.resample"
     ]
-    return Estimate(system, (response[phase],), named, warnings)
+    count = sum(int(np.size(value)) for value in parameters(system).values())
+    return Estimate(system, (response[phase],), named, warnings, count=count)
 
 
 def _single(records: Records) -> Record:

@@ -9,6 +9,7 @@ from .._types import as_array
 from ..paths import get, replace
 from ..space import INSIDE, Space, space_of
 from ..system import Affine, Series, series
+from .part import around
 from .parts import OWN_DYNAMICS, PARTS, Part, extent_of
 from .record import Record
 from .structure import Structure
@@ -49,10 +50,15 @@ def structure(name: str, record: Record) -> Structure:
     extent = extent_of(record)
     parts = {PARTS[part][0]: PARTS[part][1](extent) for part in chain(name)}
     reach = 2.0 * extent.span
+    # Without a hysteresis nothing else turns volts into the output's unit.
+    slope = 1.0 if "hysteresis" in parts else extent.slope
+    scaled = "hysteresis" in parts or any(part.gain for part in parts.values())
     parts["calibration"] = Part(
-        # Without a hysteresis nothing else turns volts into the output's unit.
-        Affine(1.0 if "hysteresis" in parts else extent.slope, extent.centre),
-        {"offset": (extent.centre - reach, extent.centre + reach, "linear")},
+        Affine(slope, extent.centre),
+        {
+            **({} if scaled else {"gain": around(slope, 0.0, 3.0)}),
+            "offset": (extent.centre - reach, extent.centre + reach, "linear"),
+        },
     )
     system = series(**{place: part.system for place, part in parts.items()})
     gains = [f"{place}.{part.gain}" for place, part in parts.items() if part.gain]

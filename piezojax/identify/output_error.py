@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._types import ScalarLike, as_array
-from ..optimisers import Optimiser, levenberg_marquardt
+from ..optimisers import Optimiser, damped_gauss_newton
 from ..paths import parameters
 from ..progress import Progress, Silent
 from ..rollout import simulate
@@ -191,7 +191,7 @@ def _for_every_record(structure: Structure, problem: Problem) -> np.ndarray:
 def _optimiser(problem: Problem) -> Optimiser:
     # A lambda, because a bound method would be hashed with its arrays.
     residuals = lambda unknown: problem.residuals(unknown)  # noqa: E731
-    return levenberg_marquardt(residuals, residuals, TOLERANCE)
+    return damped_gauss_newton(residuals, TOLERANCE)
 
 
 @eqx.filter_jit
@@ -224,10 +224,11 @@ def _stalled(bests: Sequence[float]) -> bool:
 
 
 @eqx.filter_jit
-def _sensitivity(problem: Problem, unit: Array) -> tuple[Array, Array]:
-    """Return the unknowns' values and the weighted Jacobian of the residuals."""
+def _sensitivity(problem: Problem, unit: Array) -> tuple[Array, Array, Array]:
+    """Return the unknowns' values, their slopes, the residuals' weighted Jacobian."""
     jacobian = jax.jacfwd(lambda unknown: problem.residuals(unknown))(unit)
-    return _values(problem, unit), jacobian
+    slopes = jax.jacfwd(lambda u: _values(problem, u))(unit).diagonal()
+    return _values(problem, unit), slopes, jacobian
 
 
 def _values(problem: Problem, unit: Array) -> Array:
@@ -246,8 +247,7 @@ def _with_errors(
     The covariance is s^2 (J'J)^-1; a parameter in a direction that the record says
     nothing about has no standard error.
     """
-    values, jacobian = map(np.asarray, _sensitivity(problem, unit))
-    slopes = np.asarray(jax.jacfwd(lambda u: _values(problem, u))(unit)).diagonal()
+    values, slopes, jacobian = map(np.asarray, _sensitivity(problem, unit))
     jacobian = jacobian / np.where(slopes == 0.0, 1.0, slopes)
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)

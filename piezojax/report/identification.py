@@ -21,15 +21,20 @@ MODEL_FILE, FIT_FILE, PICTURE_FILE = "model.json", "fit.json", "fit.png"
 
 def write_fit(fit: Fit, folder: Path) -> None:
     """Write model.json, fit.json and the pictures into ``folder``."""
-    save(fit.system, folder / MODEL_FILE)
-    text = fit.report.model_dump_json(indent=2, by_alias=True)
-    write_text(folder / FIT_FILE, text + "\n")
+    write_model(fit, folder)
     with styled():
         single = fit.simulations[0].shape[1] == 1
         picture = fit_figure(fit) if single else outputs_figure(fit)
         write(picture, folder / PICTURE_FILE)
         if fit.linear is not None:
             _write_linear(fit.linear, fit.record, folder)
+
+
+def write_model(fit: Fit, folder: Path) -> None:
+    """Write model.json and fit.json into ``folder``."""
+    save(fit.system, folder / MODEL_FILE)
+    text = fit.report.model_dump_json(indent=2, by_alias=True)
+    write_text(folder / FIT_FILE, text + "\n")
 
 
 def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> None:
@@ -59,7 +64,7 @@ def outputs_figure(fit: Fit) -> Figure:
     picture = figure(9.0, 2.4 * run.shape[1] + 0.8)
     panels = picture.subplots(run.shape[1], 2, squeeze=False)
     for i, (course, spectrum) in enumerate(panels):
-        unit = _shown(record.output_units[i])
+        unit = shown_unit(record.output_units[i])
         time = record.time[shown]
         course.plot(time, record.outputs[shown, i], color=MEASURED, label="measured")
         course.plot(time, run[shown, i], color=AFTER, lw=0.9, label="simulated")
@@ -90,7 +95,7 @@ def fit_figure(fit: Fit) -> Figure:
     """Loop, time course and residual with its spectrum."""
     record, report = fit.record, fit.report
     time, error = record.time, fit.simulated - record.output
-    unit = _shown(record.output_unit)
+    unit = shown_unit(record.output_unit)
     picture = figure(9.0, 5.6)
     (loop, course), (residual, spectrum) = picture.subplots(2, 2)
     part = fit.validate
@@ -133,5 +138,6 @@ def fit_figure(fit: Fit) -> Figure:
     return picture
 
 
-def _shown(unit: str) -> str:
+def shown_unit(unit: str) -> str:
+    """Return ``unit`` as it is written in a picture."""
     return unit.replace("um", "µm") if unit in ("um", "um/s") else unit

@@ -242,7 +242,7 @@ class NumbaEngine(Engine):
 
 
 @functools.cache
-def _c_library(name, *flags):
+def c_library(name, *flags):
     """A C source beside this file as a library, and the seconds to compile it."""
     gcc = shutil.which("gcc")
     if gcc is None:
@@ -268,21 +268,21 @@ def c_flags():
     return GCC_FLAGS
 
 
-def _aligned(*shape):
+def aligned(*shape):
     """An empty array that starts on a cache line."""
     memory = np.empty(int(np.prod(shape)) + 8)
     skip = -memory.ctypes.data % 64 // 8
     return memory[skip : skip + memory.size - 8].reshape(shape)
 
 
-def _blocks(rows, width):
+def blocks(rows, width):
     """[lanes, ...] as [block, ..., width]; the last lane fills up the last block."""
     count = -(-len(rows) // width)
-    blocks = _aligned(count, *rows.shape[1:], width)
-    for index, block in enumerate(blocks):
+    found = aligned(count, *rows.shape[1:], width)
+    for index, block in enumerate(found):
         lanes = np.arange(index * width, (index + 1) * width)
         block[:] = np.moveaxis(rows[np.minimum(lanes, len(rows) - 1)], 0, -1)
-    return blocks
+    return found
 
 
 class CEngine(Engine):
@@ -297,12 +297,12 @@ class CEngine(Engine):
         loop = self._loop
         self._lanes, self._steps = noise.shape[:2]
         flags = loop.few_lanes if self._lanes <= 4 else ()
-        library, self.compile_s = _c_library(loop.source, *flags)
+        library, self.compile_s = c_library(loop.source, *flags)
         width = getattr(library, loop.name + "_width")(self._lanes)
-        data = [_blocks(array, width) for array in (gains, reference, noise)]
+        data = [blocks(array, width) for array in (gains, reference, noise)]
         if loop.design is not None:
             data.insert(0, np.array(loop.design(), dtype=float))
-        self._rms = _aligned(-(-self._lanes // width), *loop.axes, width)
+        self._rms = aligned(-(-self._lanes // width), *loop.axes, width)
         self._arrays = [*data, self._rms]
         pointer = ctypes.POINTER(ctypes.c_double)
         self._pointers = [array.ctypes.data_as(pointer) for array in self._arrays]

@@ -1,0 +1,78 @@
+"""What a comparison of models found."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import BaseModel
+
+from .criteria import MARGIN
+from .fit import Fit, FitError
+
+RULE = (
+    "lowest BIC among the models whose validation error is not above the smallest by "
+    f"more than {MARGIN:g} standard errors of the difference; BIC from the training "
+    "part, with the effective number of samples"
+)
+"""How the best model is chosen."""
+
+
+class Row(BaseModel):
+    """A model of the comparison: what it reached, or why it is not there.
+
+    ``parameters`` counts what was fitted; ``as_good``: validates as well as the best;
+    ``folder``: where its model.json and fit.json are.
+    """
+
+    model: str
+    status: Literal["fitted", "failed", "not tried"]
+    note: str = ""
+    parameters: int | None = None
+    train_rmse: float | None = None
+    validation_rmse: float | None = None
+    validation_rmse_percent_of_span: float | None = None
+    aic: float | None = None
+    bic: float | None = None
+    as_good: bool | None = None
+    wall_s: float | None = None
+    warnings: list[str] = []
+    folder: str | None = None
+
+
+class ComparisonReport(BaseModel):
+    """The content of ``comparison.json``; ``rows`` best first, then what failed.
+
+    ``test`` is the error of the best model on samples that neither a fit nor the choice
+    has seen, None if no such part was named. ``effective_samples`` (of ``samples``, for
+    each output) is what AIC and BIC count.
+    """
+
+    best: str
+    rule: str
+    unit: str
+    train: tuple[int, int]
+    validation: tuple[int, int]
+    test_part: tuple[int, int] | None
+    test: FitError | None
+    samples: int
+    effective_samples: list[float]
+    interrupted: bool
+    rows: list[Row]
+    wall_s: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Fits by model, best first, and the report on them."""
+
+    fits: dict[str, Fit]
+    report: ComparisonReport
+
+    @property
+    def best(self) -> Fit:
+        """The fit that was chosen."""
+        return self.fits[self.report.best]
+
+
+def file_name(model: str) -> str:
+    """Return ``model`` as the name of a folder."""
+    return model.replace("+", "-")

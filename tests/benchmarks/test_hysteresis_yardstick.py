@@ -1,0 +1,72 @@
+"""The hysteresis models in C and in piezojax compute the same thing."""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+# The benchmark is a script beside its modules, not a package.
+sys.path.insert(0, str(Path(__file__).parent))
+engines = importlib.import_module("engines")
+hysteresis = importlib.import_module("hysteresis")
+
+LANES, STEPS = 20, 2000  # more than one block, the last half filled
+
+
+def c_engine(problem, what):
+    try:
+        return hysteresis.CEngine(problem, what)
+    except engines.UnavailableError as reason:
+        if "gcc is not" in str(reason):
+            pytest.skip(str(reason))
+        raise
+
+
+@pytest.mark.parametrize("name", hysteresis.MODELS)
+def test_each_model(name):
+    problem = hysteresis.Problem(name, LANES, STEPS)
+    c = c_engine(problem, "forward").run()
+    run = hysteresis.PiezojaxEngine(problem, "run").run()
+    assert np.all(c > 0.0)
+    np.testing.assert_allclose(run, c, rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", hysteresis.MODELS)
+def test_each_gradient(name):
+    problem = hysteresis.Problem(name, LANES, STEPS)
+    differences = c_engine(problem, "gradient").run()
+    mode = hysteresis.modes("gradient", len(problem.sizes))[0]
+    gradient = hysteresis.PiezojaxEngine(problem, mode).run()
+    # By the usual change of a parameter: one-sided differences are that good.
+    scale = np.max(np.abs(gradient * problem.sizes), axis=1, keepdims=True)
+    np.testing.assert_allclose(
+        gradient * problem.sizes / scale, differences * problem.sizes / scale, atol=1e-4
+    )
+
+
+def test_the_command(tmp_path, monkeypatch):
+    monkeypatch.setattr(hysteresis.throughput, "pin_to_one_core", lambda: 1)
+    file = tmp_path / "out.json"
+    name = "coleman_hodgdon"
+    arguments = ["--models", name, "--lanes", "16", "--steps", "300", "--repeats", "1"]
+    assert hysteresis.main(["--json", str(file), *arguments]) == 0
+    rows = json.loads(file.read_text())["rows"]
+    found = [(row["what"], row["engine"], row["mode"]) for row in rows]
+    if ("forward", "c", "run") not in found:
+        pytest.skip("no C yardstick here")
+    assert ("forward", "piezojax", "run") in found
+    assert ("gradient", "piezojax", "reverse") in found
+    assert ("gradient", "c", "differences") in found
+    assert {row["bar"] for row in rows} == {2.0}
+    assert set(hysteresis.within(rows)) == {(name, "forward"), (name, "gradient")}
+
+
+def test_models_without_a_function_in_c_are_said(monkeypatch):
+    problem = hysteresis.Problem("coleman_hodgdon", 2, 10)
+    problem.name = "unwritten"
+    with pytest.raises(engines.UnavailableError, match="has no unwritten"):
+        c_engine(problem, "forward")
