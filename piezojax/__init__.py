@@ -62,7 +62,10 @@ from .hysteresis import BoucWen as BoucWen
 from .hysteresis import ColemanHodgdon as ColemanHodgdon
 from .hysteresis import HystereticARMA as HystereticARMA
 from .hysteresis import InverseColemanHodgdon as InverseColemanHodgdon
+from .hysteresis import InversePreisach as InversePreisach
 from .hysteresis import PrandtlIshlinskii as PrandtlIshlinskii
+from .hysteresis import Preisach as Preisach
+from .hysteresis import RateDependentPreisach as RateDependentPreisach
 from .hysteresis import ShapedColemanHodgdon as ShapedColemanHodgdon
 from .identify import Record as Record
 from .identify import RecursiveLeastSquares as RecursiveLeastSquares

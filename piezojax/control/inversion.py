@@ -3,15 +3,15 @@
 from typing import NamedTuple
 
 from .._types import Scalar, State
-from ..hysteresis.coleman_hodgdon import HysteresisState, InverseColemanHodgdon
-from ..system import Observation, System
+from ..hysteresis.inverse import InverseHysteresis
+from ..system import Observation, System, rest_output
 
 
 class InversionState(NamedTuple):
     """State of the controller, and of the hysteresis model up to the last voltage."""
 
     feedback: State
-    hysteresis: HysteresisState
+    hysteresis: State
 
 
 class InversionControl(System):
@@ -23,11 +23,12 @@ class InversionControl(System):
     """
 
     feedback: System
-    inverse: InverseColemanHodgdon
+    inverse: InverseHysteresis
 
     def init(self, input: Observation) -> InversionState:
-        hysteresis = self.inverse.model.init(input.applied)
-        seen = input._replace(applied=hysteresis.output)
+        model = self.inverse.model
+        seen = input._replace(applied=rest_output(model, input.applied))
+        hysteresis = model.init(input.applied)
         return InversionState(self.feedback.init(seen), hysteresis)
 
     def step(

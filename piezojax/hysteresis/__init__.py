@@ -8,4 +8,7 @@ from .prandtl_ishlinskii import (
     AsymmetricPrandtlIshlinskii as AsymmetricPrandtlIshlinskii,
 )
 from .prandtl_ishlinskii import PrandtlIshlinskii as PrandtlIshlinskii
+from .preisach import InversePreisach as InversePreisach
+from .preisach import Preisach as Preisach
+from .rate_dependent_preisach import RateDependentPreisach as RateDependentPreisach
 from .shaped import ShapedColemanHodgdon as ShapedColemanHodgdon

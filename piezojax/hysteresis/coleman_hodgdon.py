@@ -1,13 +1,14 @@
 """Coleman-Hodgdon (ferromagnetic) hysteresis, four discretisations, and its inverse."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, State, as_array, check
+from .._types import Scalar, ScalarLike, as_array, check
 from ..system import System, holding_input
+from .inverse import InverseHysteresis
 
 
 class HysteresisState(NamedTuple):
@@ -127,7 +128,7 @@ SCHEMES: dict[str, Callable[[ColemanHodgdon, HysteresisState, Scalar], Scalar]] 
 }
 
 
-class InverseColemanHodgdon(System):
+class InverseColemanHodgdon(InverseHysteresis):
     """Voltage that moves a trapezoid Coleman-Hodgdon model to a wanted output.
 
     Input f(k) in um, output u(k) in V. Source: (5.24)-(5.25) with
@@ -150,12 +151,7 @@ class InverseColemanHodgdon(System):
     def init(self, input: ScalarLike = 0.0) -> HysteresisState:
         return self.model.init(holding_input(self.model, input))
 
-    def step(self, state: HysteresisState, input: Any) -> tuple[State, Scalar]:
-        voltage = self.solve(state, input)
-        return self.model.step(state, voltage)[0], voltage
-
     def solve(self, state: HysteresisState, wanted: ScalarLike) -> Scalar:
-        """Return the voltage (V) for which the model's next output is ``wanted``."""
         model, wanted = self.model, as_array(wanted)
         rise = wanted - state.output
         sign = _direction(rise)
