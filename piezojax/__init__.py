@@ -69,15 +69,18 @@ from .hysteresis import HystereticARMA as HystereticARMA
 from .hysteresis import InverseColemanHodgdon as InverseColemanHodgdon
 from .hysteresis import InverseHysteresis as InverseHysteresis
 from .hysteresis import InversePrandtlIshlinskii as InversePrandtlIshlinskii
+from .hysteresis import InversePreisach as InversePreisach
 from .hysteresis import (
     InverseRateDependentPrandtlIshlinskii as InverseRateDependentPrandtlIshlinskii,
 )
 from .hysteresis import LearnedOperator as LearnedOperator
 from .hysteresis import NormalisedBoucWen as NormalisedBoucWen
 from .hysteresis import PrandtlIshlinskii as PrandtlIshlinskii
+from .hysteresis import Preisach as Preisach
 from .hysteresis import (
     RateDependentPrandtlIshlinskii as RateDependentPrandtlIshlinskii,
 )
+from .hysteresis import RateDependentPreisach as RateDependentPreisach
 from .hysteresis import ShapedColemanHodgdon as ShapedColemanHodgdon
 from .hysteresis import StopPrandtlIshlinskii as StopPrandtlIshlinskii
 from .identify import Record as Record

@@ -17,11 +17,14 @@ from .prandtl_ishlinskii import (
     AsymmetricPrandtlIshlinskii as AsymmetricPrandtlIshlinskii,
 )
 from .prandtl_ishlinskii import PrandtlIshlinskii as PrandtlIshlinskii
+from .preisach import InversePreisach as InversePreisach
+from .preisach import Preisach as Preisach
 from .rate_dependent_prandtl_ishlinskii import (
     InverseRateDependentPrandtlIshlinskii as InverseRateDependentPrandtlIshlinskii,
 )
 from .rate_dependent_prandtl_ishlinskii import (
     RateDependentPrandtlIshlinskii as RateDependentPrandtlIshlinskii,
 )
+from .rate_dependent_preisach import RateDependentPreisach as RateDependentPreisach
 from .shaped import ShapedColemanHodgdon as ShapedColemanHodgdon
 from .stop_prandtl_ishlinskii import StopPrandtlIshlinskii as StopPrandtlIshlinskii

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Scalar, ScalarLike, as_array, check
-from ..system import System
+from ..system import System, holding_input
 from .inverse import Inverse
 
 
@@ -152,6 +152,9 @@ class InverseColemanHodgdon(Inverse):
                 f"the inverse of scheme {self.model.scheme!r} is not available; "
                 "it must be 'trapezoid'"
             )
+
+    def init(self, input: ScalarLike = 0.0) -> HysteresisState:
+        return self.model.init(holding_input(self.model, input))
 
     def solve(self, state: Any, wanted: ScalarLike) -> Scalar:
         """Return the voltage (V) for which the model's next output is ``wanted``."""

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from .._types import Scalar, ScalarLike, as_array, check, check_order
-from ..system import System
+from .inverse import Inverse
 from .plays import Memory, memoryless, weighted
 from .prandtl_ishlinskii import PrandtlIshlinskii
 
@@ -14,7 +14,7 @@ ITERATIONS = 8
 """Newton steps, halving where one leaves the bracket, for a polynomial P."""
 
 
-class InversePrandtlIshlinskii(System):
+class InversePrandtlIshlinskii(Inverse):
     """Voltage that moves a Prandtl-Ishlinskii model to a wanted output.
 
     Input f(k) in um, output u(k) in V. From a given memory the model's next output
@@ -43,10 +43,6 @@ class InversePrandtlIshlinskii(System):
     def init(self, input: ScalarLike = 0.0) -> Memory:
         virgin = (self.model.rest_input,) * len(self.model.thresholds)
         return self.model.init(self.solve(virgin, input))
-
-    def step(self, state: Memory, input: ScalarLike) -> tuple[Memory, Scalar]:
-        voltage = self.solve(state, input)
-        return self.model.step(state, voltage)[0], voltage
 
     def solve(self, state: Memory, wanted: ScalarLike) -> Scalar:
         """Return the voltage (V) for which the model's next output is ``wanted``."""

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from .._types import Scalar, ScalarLike, as_array, as_scalars, check
 from ..system import System
+from .inverse import Inverse
 from .inverse_prandtl_ishlinskii import check_invertible, solved
 from .plays import Memory, check_plays, memoryless, played, weighted
 
@@ -66,7 +67,7 @@ class RateDependentPrandtlIshlinskii(System):
         return tuple(r + wider for r in self.thresholds)
 
 
-class InverseRateDependentPrandtlIshlinskii(System):
+class InverseRateDependentPrandtlIshlinskii(Inverse):
     """Voltage that moves a rate-dependent model to a wanted output.
 
     Input f(k) in um, output u(k) in V. The thresholds of the step to come are known, so
@@ -84,10 +85,6 @@ class InverseRateDependentPrandtlIshlinskii(System):
     def init(self, input: ScalarLike = 0.0) -> RateState:
         virgin = self.model.init(self.model.rest_input)
         return self.model.init(self.solve(virgin, input))
-
-    def step(self, state: RateState, input: ScalarLike) -> tuple[RateState, Scalar]:
-        voltage = self.solve(state, input)
-        return self.model.step(state, voltage)[0], voltage
 
     def solve(self, state: RateState, wanted: ScalarLike) -> Scalar:
         """Return the voltage (V) for which the model's next output is ``wanted``."""

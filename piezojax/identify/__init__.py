@@ -13,6 +13,7 @@ from .neural import fit_neural_state_space as fit_neural_state_space
 from .neural import neural_start as neural_start
 from .output_error import free_run as free_run
 from .parts import PARTS as PARTS
+from .preisach import fit_preisach as fit_preisach
 from .record import Record as Record
 from .record import read_record as read_record
 from .recursive import Measured as Measured

@@ -1,0 +1,67 @@
+"""Preisach hysteresis whose density depends on how fast the input moves."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._types import Matrix, Scalar, ScalarLike, as_array, as_matrix, check
+from ..system import Designed, System
+from .preisach import (
+    Levels,
+    PlayLines,
+    Preisach,
+    Rows,
+    check_weights,
+    outputs,
+    rows_of,
+)
+
+
+class RateDependentPreisach(Designed):
+    """``y = integral of mu(alpha, beta, du/dt) relay(u)``, (2.10), of a Preisach model.
+
+    mu goes from the density of ``slow`` to that of ``fast_weights`` (um, n x n as in
+    Preisach), cell by cell, with the share r^2 / (1 + r^2), r = (du/dt) / ``rate``:
+    half way at ``rate`` (V/s), smooth where the input turns. du/dt is that over the
+    last sample, ``dt`` in s. The relays themselves, and what they remember, are those
+    of ``slow``. Input in V, output in um. The thesis leaves mu to a neural network;
+    this form of it is ours.
+
+    Raises ValueError for weights that Preisach refuses, another number of cells than
+    ``slow`` has, ``rate <= 0`` or ``dt <= 0``.
+    """
+
+    slow: Preisach
+    fast_weights: Matrix = eqx.field(converter=as_matrix)
+    rate: Scalar = eqx.field(converter=as_array)
+    dt: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        check_weights("fast weights in um", self.fast_weights)
+        if self.fast_weights.shape[0] != self.slow.cells:
+            raise ValueError(
+                f"fast weights have {self.fast_weights.shape[0]} cells a side; "
+                f"the slow ones have {self.slow.cells}"
+            )
+        check("rate in V/s", self.rate, above=0.0)
+        check("sample time in s", self.dt, above=0.0)
+
+    def law(self) -> System:
+        slow = self.slow.law()
+        half_way = self.rate * self.dt / slow.size
+        return _Blend(slow, rows_of(self.fast_weights), half_way)
+
+
+class _Blend(System):
+    slow: PlayLines
+    fast: Rows
+    half_way: Scalar  # cells a sample at which both densities count alike
+
+    def init(self, input: ScalarLike = 0.0) -> Levels:
+        return self.slow.init(input)
+
+    def step(self, state: Levels, input: ScalarLike) -> tuple[Levels, Scalar]:
+        levels, slow = self.slow.step(state, input)
+        fast = self.slow.lowest + jnp.sum(outputs(self.fast, levels))
+        # Of both, element 0 is the input.
+        square = ((levels[0] - state[0]) / self.half_way) ** 2
+        return levels, slow + square / (1.0 + square) * (fast - slow)

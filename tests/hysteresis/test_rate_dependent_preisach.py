@@ -1,0 +1,94 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import preisach as oracle
+
+from piezojax import Preisach, RateDependentPreisach, simulate
+
+LOW, HIGH, LOWEST, REST = 0.0, 80.0, 0.4, 20.0
+DT, RATE = 1e-3, 5e3
+SLOW = np.tril([[0.3] * 4, [0.2] * 4, [0.5] * 4, [0.1] * 4])
+FAST = np.tril([[0.1] * 4, [0.4] * 4, [0.2] * 4, [0.3] * 4])
+
+
+def model(rate=RATE, rest=REST):
+    return RateDependentPreisach(
+        Preisach(SLOW, LOW, HIGH, LOWEST, rest), FAST, rate, DT
+    )
+
+
+@jax.jit
+def response(system, inputs):
+    return simulate(system, inputs, system.init(inputs[0]))[1]
+
+
+def test_against_relays_whose_weights_go_with_the_rate():
+    # Multiples of 5 V, between which the relays lie.
+    x = 5.0 * np.random.default_rng(1).integers(-2, 19, 100)
+    rate = np.diff(x, prepend=x[0]) / DT / RATE
+    share = rate**2 / (1.0 + rate**2)
+    assert share.min() == 0.0
+    assert share.max() > 0.8
+    slow, fast = (oracle.along(w, LOW, HIGH, 4, x, REST) for w in (SLOW, FAST))
+    expected = LOWEST + (1.0 - share) * slow + share * fast
+    np.testing.assert_allclose(response(model(), x), expected, rtol=0, atol=1e-12)
+
+
+def test_slow_and_fast_are_the_two_densities():
+    x = np.random.default_rng(2).uniform(LOW, HIGH, 100)
+    for rate, weights in ((1e12, SLOW), (1e-6, FAST)):
+        plain = response(Preisach(weights, LOW, HIGH, LOWEST, REST), x)
+        found = response(model(rate), x)
+        moving = np.diff(x, prepend=x[0]) != 0.0
+        np.testing.assert_allclose(found[moving], plain[moving], rtol=0, atol=1e-9)
+
+
+def test_at_rest_it_is_the_slow_one_and_stays():
+    system = model()
+    state = system.init(33.0)
+    after, output = system.step(state, 33.0)
+    np.testing.assert_array_equal(after, state)
+    np.testing.assert_allclose(output, system.slow.step(state, 33.0)[1], rtol=0)
+
+
+def test_gradients_are_central_differences():
+    path = jnp.array([10.0, 24.0, 61.0, 35.0, 47.0])
+
+    @jax.jit
+    def loss(system):
+        outputs = simulate(system, path, system.init(path[0]))[1]
+        return jnp.sum(jnp.cos(jnp.arange(path.size)) * outputs)
+
+    values, tree = jax.tree.flatten(model(rest=21.3))
+    found = jax.tree.leaves(jax.jit(jax.grad(loss))(model(rest=21.3)))
+    for at, (leaf, gradient) in enumerate(zip(values, found, strict=True)):
+        for index in np.ndindex(leaf.shape):
+            ends = []
+            size = 1e-6 * max(1.0, abs(float(leaf[index])))
+            for by in (size, -size):
+                moved = list(values)
+                moved[at] = leaf.at[index].add(by)
+                ends.append(float(loss(jax.tree.unflatten(tree, moved))))
+            slope = (ends[0] - ends[1]) / (2.0 * size)
+            np.testing.assert_allclose(gradient[index], slope, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fast_weights": np.eye(3)}, "fast weights have 3 cells a side; .* have 4"),
+        ({"fast_weights": -np.eye(4)}, "fast weights in um is"),
+        ({"rate": 0.0}, "rate in V/s is 0; it must be finite and above 0"),
+        ({"dt": 0.0}, "sample time in s is 0"),
+    ],
+)
+def test_bad_parameters(changes, message):
+    good = {
+        "slow": Preisach(SLOW, LOW, HIGH),
+        "fast_weights": FAST,
+        "rate": RATE,
+        "dt": DT,
+    }
+    with pytest.raises(ValueError, match=message):
+        RateDependentPreisach(**(good | changes))
