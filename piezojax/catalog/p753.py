@@ -226,7 +226,7 @@ def anticipating_disturbance_observer(table: str = "5-2") -> Anticipation:
 ADAPTIVE_INVERSE = {
     "thresholds": (0.3, 1.0, 2.5),
     "cutoff": 2000.0,
-    "equation_error": 10.0,
+    "equation_error": 3.0,
     "memory": 0.5,
 }
 """Ours: um, rad/s, V, s. Stops for motions of some um; slower than half a second the

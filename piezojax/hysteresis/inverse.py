@@ -107,7 +107,7 @@ class InverseHysteresis(Inverse):
             return low, high, jnp.where(rises & inside, newton, middle)
 
         # The bracket starts outside the range, so that either end is tried once. A
-        # loop: unrolled it runs a fifth faster, and compiles two to a hundred times longer.
+        # loop: unrolled it is a fifth faster, but compiles up to 100 times longer.
         first = getattr(still_state, "input", 0.5 * (lower + upper))
         start = (2.0 * lower - upper, 2.0 * upper - lower, first)
         voltage = jax.lax.fori_loop(0, self.iterations, nearer, start)[2]

@@ -24,9 +24,14 @@ from piezojax import (
     ColemanHodgdon,
     Duhem,
     HystereticARMA,
+    LearnedOperator,
     NormalisedBoucWen,
     PrandtlIshlinskii,
+    Preisach,
+    RateDependentPrandtlIshlinskii,
+    RateDependentPreisach,
     ShapedColemanHodgdon,
+    StopPrandtlIshlinskii,
     System,
     simulate,
 )
@@ -199,6 +204,10 @@ ROWS = {
             (0.05,), THRESHOLDS, WEIGHTS, (0.01, 0.004, 0.02), -20.0, 120.0
         )
     ),
+    "StopPrandtlIshlinskii": remembering(
+        StopPrandtlIshlinskii((0.15, 2e-4), THRESHOLDS, WEIGHTS)
+    ),
+    "Preisach": remembering(Preisach(np.tril(np.full((7, 7), 0.4)), *SPAN)),
     "BashashJalili": remembering(
         BashashJalili(0.0, 0.0, 100.0, 12.0, *BRANCHES, depth=6),
         congruency=(LOOP, 0.03),
@@ -241,8 +250,13 @@ def test_every_model_has_a_row():
         for kind in vars(piezojax.hysteresis).values()
         if isinstance(kind, type) and issubclass(kind, System)
     }
-    # A model with dynamics depends on the rate; an inverse obeys the inverted laws.
-    models = {
-        kind for kind in exported - {HystereticARMA} if not issubclass(kind, Inverse)
+    # These depend on the rate, and say so by their name or their past outputs; an
+    # inverse obeys the inverted laws.
+    by_rate = {
+        HystereticARMA,
+        LearnedOperator,
+        RateDependentPrandtlIshlinskii,
+        RateDependentPreisach,
     }
+    models = {kind for kind in exported - by_rate if not issubclass(kind, Inverse)}
     assert models == {type(row.system) for row in ROWS.values()}
