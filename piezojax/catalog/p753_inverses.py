@@ -10,7 +10,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
 from ..control import InversionControl
@@ -82,7 +82,9 @@ def _dynamics() -> ARMA:
 
 
 @eqx.filter_jit
-def response(system: System, inputs: np.ndarray) -> Array:
+def response(
+    system: System, inputs: Float[Array | np.ndarray, " samples"]
+) -> Float[Array, " samples"]:
     """Return the output of ``system``, um, along ``inputs``, V, from rest."""
     return simulate(system, jnp.asarray(inputs), system.init(inputs[0]))[1]
 
