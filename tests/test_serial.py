@@ -255,18 +255,20 @@ EXECUTABLE = [
 @pytest.mark.parametrize("kind", EXECUTABLE)
 def test_only_systems_are_built(kind):
     message = message_for({"type": kind})
-    assert message.startswith(f"system.type is {kind!r}; it must be one of ARMA, Aff")
+    assert message.startswith(f"system.type is {kind!r}; it must be one of ARMA, Ada")
 
 
 @pytest.mark.parametrize("kind", [3, None, True])
 def test_type_must_be_a_name(kind):
     message = message_for({"type": kind})
-    assert message.startswith(f"system.type is {kind!r}; it must be one of ARMA, Aff")
+    assert message.startswith(f"system.type is {kind!r}; it must be one of ARMA, Ada")
 
 
 def test_no_type():
     message = message_for({"gain": 2.0})
-    assert message.startswith("system needs a key 'type'; one of ARMA, Affine, ")
+    assert message.startswith(
+        "system needs a key 'type'; one of ARMA, AdaptiveInverse, Affine, "
+    )
 
 
 def test_unknown_key():

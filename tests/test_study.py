@@ -323,12 +323,12 @@ def test_unknown_keys(refusal, place, value, message):
         (
             "plant",
             {"type": "Lag", "time_constant": 1e-3},
-            "plant.type is 'Lag'; it must be one of ARMA, Affine, Allocation, Alph",
+            "plant.type is 'Lag'; it must be one of ARMA, AdaptiveInverse, Affi",
         ),
         (
             "plant",
             {"type": "os.system"},
-            "plant.type is 'os.system'; it must be one of ARMA, Affine, Allocation, ",
+            "plant.type is 'os.system'; it must be one of ARMA, AdaptiveInverse, Affi",
         ),
         (
             "parameters/controller.integral/transform",
