@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..files import write_text
@@ -91,6 +92,26 @@ def outputs_figure(fit: Fit) -> Figure:
     return picture
 
 
+def loop_panel(ax: Axes, fit: Fit, label: str) -> None:
+    """Output against input over the validation part, the model under ``label``."""
+    record, part = fit.record, fit.validate
+    ax.plot(
+        record.input[part],
+        record.output[part],
+        ".",
+        ms=2,
+        color=MEASURED,
+        label="measured",
+    )
+    ax.plot(record.input[part], fit.simulated[part], color=AFTER, label=label)
+    ax.set(
+        xlabel=f"input ({record.input_unit})",
+        ylabel=f"output ({shown_unit(record.output_unit)})",
+        title="Hysteresis loop, validation part",
+    )
+    ax.legend()
+
+
 def fit_figure(fit: Fit) -> Figure:
     """Loop, time course and residual with its spectrum."""
     record, report = fit.record, fit.report
@@ -99,21 +120,7 @@ def fit_figure(fit: Fit) -> Figure:
     picture = figure(9.0, 5.6)
     (loop, course), (residual, spectrum) = picture.subplots(2, 2)
     part = fit.validate
-    loop.plot(
-        record.input[part],
-        record.output[part],
-        ".",
-        ms=2,
-        color=MEASURED,
-        label="measured",
-    )
-    loop.plot(record.input[part], fit.simulated[part], color=AFTER, label="simulated")
-    loop.set(
-        xlabel=f"input ({record.input_unit})",
-        ylabel=f"output ({unit})",
-        title="Hysteresis loop, validation part",
-    )
-    loop.legend()
+    loop_panel(loop, fit, "simulated")
     course.plot(time, record.output, color=MEASURED, label="measured")
     course.plot(time, fit.simulated, color=AFTER, lw=0.9, label="free-run simulation")
     course.set(xlabel="time (s)", ylabel=f"output ({unit})", title="Whole record\n")

@@ -14,7 +14,7 @@ from ..files import write_text
 from ..identify.comparison import Comparison, ComparisonReport, Row
 from ..identify.fit import Fit
 from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
-from .identification import shown_unit, write_fit, write_model
+from .identification import loop_panel, shown_unit, write_fit, write_model
 
 COMPARISON_FILE, TABLE_FILE = "comparison.json", "comparison.csv"
 COMPARISON_PICTURE = "comparison.png"
@@ -126,7 +126,7 @@ def comparison_figure(comparison: Comparison) -> Figure:
     record, outputs = best[0].record, best[0].simulations[0].shape[1]
     single = (record.inputs.shape[1], outputs) == (1, 1)
     if single:
-        _loop_panel(picture.add_subplot(grid[0, 1]), best[0])
+        loop_panel(picture.add_subplot(grid[0, 1]), best[0], "chosen")
     _residual_panel(picture.add_subplot(grid[1 if single else slice(None), 1]), best)
     picture.suptitle(f"Models fitted to {record.source}")
     return picture
@@ -158,25 +158,6 @@ def _errors_panel(ax: Axes, report: ComparisonReport) -> None:
         xlabel=f"validation error ({shown_unit(report.unit)} rms)",
         title="Error and number of parameters; chosen in blue",
     )
-
-
-def _loop_panel(ax: Axes, fit: Fit) -> None:
-    record, part = fit.record, fit.validate
-    ax.plot(
-        record.input[part],
-        record.output[part],
-        ".",
-        ms=2,
-        color=MEASURED,
-        label="measured",
-    )
-    ax.plot(record.input[part], fit.simulated[part], color=AFTER, label="chosen")
-    ax.set(
-        xlabel=f"input ({record.input_unit})",
-        ylabel=f"output ({shown_unit(record.output_unit)})",
-        title="Hysteresis loop, validation part",
-    )
-    ax.legend()
 
 
 def _residual_panel(ax: Axes, fits: list[Fit]) -> None:
