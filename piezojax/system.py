@@ -74,6 +74,11 @@ def worked_out(system: Any) -> Any:
     )
 
 
+class Learned(eqx.Module):
+    """State that is learned while a system runs: a loop taken for small motions holds
+    it, because what it has learned changes slowly and acts only on larger ones."""
+
+
 def rest_output(system: System, input: Any) -> Any:
     """Return what ``system`` puts out at rest under the constant ``input``."""
     return system.step(system.init(input), input)[1]

@@ -1,17 +1,17 @@
 """Weights of a linear relation, learned sample by sample."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from .._types import Matrix, Scalar, as_array, as_scalars, check
-from ..system import System
+from ..system import Learned, System
 
 Row = tuple[Scalar, ...]
 
 
-class RecursiveWeightsState(NamedTuple):
+class RecursiveWeightsState(Learned):
     """Weights and their covariance.
 
     The one matrix in a loop: as scalars it takes four times as long to compile, because

@@ -17,6 +17,7 @@ from .._types import Scalar, ScalarLike, State, as_array
 from ..rollout import simulate
 from ..system import Feedback, LoopState, System
 from .broken_loop import BRANCHES, BrokenLoop, cut, loop_sample_time, side_of
+from .linearise import parted
 
 DURATION = 0.2
 """Length of the impulse response, s: what is slower than that rings on unseen, and
@@ -52,12 +53,11 @@ class SmallMotion(System):
 
 
 def _tangent(broken: BrokenLoop, state: State, input: Scalar) -> tuple[State, Scalar]:
-    # A counter in the state has no derivative and is held.
-    moving, held = eqx.partition(broken.init(), eqx.is_inexact_array)
+    moving, held = parted(broken.init())
 
     def step(moving: State, voltage: Scalar) -> tuple[State, Scalar]:
         state, output = broken.step(eqx.combine(moving, held), voltage)
-        return eqx.filter(state, eqx.is_inexact_array), output
+        return parted(state)[0], output
 
     return jax.jvp(step, (moving, broken.start.voltage), (state, input))[1]
 
@@ -102,7 +102,7 @@ def _sensitivity(
     duration: float,
 ) -> Sensitivity:
     broken = cut(loop, reference, side, state)
-    rest = jax.tree.map(jnp.zeros_like, eqx.filter(broken.init(), eqx.is_inexact_array))
+    rest = jax.tree.map(jnp.zeros_like, parted(broken.init())[0])
     push, _ = _tangent(broken, rest, jnp.ones(()))
     impulse = jnp.zeros(round(duration / dt)).at[0].set(1.0)
     _, response = simulate(SmallMotion(broken, push), impulse)

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from .._types import State
 from ..dynamics import StateSpace
 from ..paths import static_fields
-from ..system import System
+from ..system import Learned, System
 
 
 def linearise(
@@ -26,7 +26,8 @@ def linearise(
     The matrices are the exact derivatives of one step: A [n, n], B [n, m], C [p, n],
     D [p, m] for the n numbers of the raveled state, the m of the input and the p of the
     output, in the order in which ``jax.tree.leaves`` lists them and in the units of the
-    system; they map deviations from the operating point to deviations.
+    system; they map deviations from the operating point to deviations. Counters and
+    what is ``Learned`` are held and no states of the model.
 
     ``state`` is that at rest under ``input`` if left out. ``dt`` in s is looked for in
     the parts of the system. Where a step has a kink, as hysteresis has at rest, the
@@ -40,19 +41,32 @@ def linearise(
     dt = sample_time(system) if dt is None else dt
     input = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), input)
     state = system.init(input) if state is None else state
-    # A counter in the state has no derivative and is held.
-    moving, held = eqx.partition(state, eqx.is_inexact_array)
+    moving, held = parted(state)
     x, unravel_state = ravel_pytree(moving)
     u, unravel_input = ravel_pytree(input)
 
     def step(x: Array, u: Array) -> tuple[Array, Array]:
         state = eqx.combine(unravel_state(x), held)
         state, output = system.step(state, unravel_input(u))
-        following = eqx.filter(state, eqx.is_inexact_array)
-        return ravel_pytree(following)[0], ravel_pytree(output)[0]
+        return ravel_pytree(parted(state)[0])[0], ravel_pytree(output)[0]
 
     (A, B), (C, D) = jax.jacfwd(step, argnums=(0, 1))(x, u)
     return StateSpace(A, B, C, D, dt)
+
+
+def parted(state: State) -> tuple[State, State]:
+    """Return what small motions move of ``state``, and what they leave where it is.
+
+    A counter has no derivative, and what is ``Learned`` is held.
+    """
+
+    def is_learned(part: Any) -> bool:
+        return isinstance(part, Learned)
+
+    def moves(part: Any) -> bool:
+        return not is_learned(part) and eqx.is_inexact_array(part)
+
+    return eqx.partition(state, moves, is_leaf=is_learned)
 
 
 def sample_time(system: System) -> float:
