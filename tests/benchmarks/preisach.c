@@ -7,10 +7,12 @@
      preisach_ramps   the output of a line as a sum of clipped ramps, one a cell
      preisach_table   the same from a table of running sums: less arithmetic, but loads
                       that differ from lane to lane
+     preisach_gradient  the same sum by ramps, and its gradient by all weights
 
    weights  [cells (cells + 1) / 2]  um, line by line
    input    [groups][steps][GROUP]   cells from the lowest input
-   square   [groups][GROUP]          sum over the steps of output^2, um^2 */
+   square   [groups][GROUP]          sum over the steps of output^2, um^2
+   gradient [groups][weights][GROUP] of square, um */
 
 #include <math.h>
 
@@ -73,6 +75,42 @@ void preisach_table(int cells, int groups, int steps, const double *weights,
                     y[l] += table[k][j][1] + table[k][j][0] * (v - j);
                 }
             LANES sum[l] += y[l] * y[l];
+        }
+        LANES square[g * GROUP + l] = sum[l];
+    }
+}
+
+void preisach_gradient(int cells, int groups, int steps, const double *weights,
+                       const double *input, double *square, double *gradient)
+{
+    const int count = cells * (cells + 1) / 2;
+    static double up[MOST * (MOST + 1) / 2][GROUP];
+    for (int g = 0; g < groups; g++) {
+        double level[MOST][GROUP] = {{0.0}}, sum[GROUP] = {0.0};
+        double *slope = gradient + (long)g * count * GROUP;
+        for (int i = 0; i < count * GROUP; i++)
+            slope[i] = 0.0;
+        for (int t = 0; t < steps; t++) {
+            const double *x = input + ((long)g * steps + t) * GROUP;
+            double y[GROUP] = {0.0}, twice[GROUP];
+            for (int k = 0, i = 0; k < cells; k++) {
+                double v[GROUP];
+                LANES {
+                    v[l] = most(x[l] - k, least(x[l], level[k][l]));
+                    level[k][l] = v[l];
+                }
+                for (int j = 0; j < cells - k; j++, i++)
+                    LANES {
+                        up[i][l] = least(most(v[l] - j, 0.0), 1.0);
+                        y[l] += weights[i] * up[i][l];
+                    }
+            }
+            LANES {
+                sum[l] += y[l] * y[l];
+                twice[l] = 2.0 * y[l];
+            }
+            for (int i = 0; i < count; i++)
+                LANES slope[i * GROUP + l] += twice[l] * up[i][l];
         }
         LANES square[g * GROUP + l] = sum[l];
     }
