@@ -12,7 +12,7 @@ from ..files import write_text
 from ..tune.baselines import Baselines, Contestant
 from ..tune.baselines.entries import BASELINES_FILE
 from .comparison import COLOURS, MARKERS
-from .figures import AFTER, figure, styled, write
+from .figures import AFTER, figure, styled, ticks_in_full, write
 
 
 def baselines_table(found: Baselines) -> Table:
@@ -102,11 +102,13 @@ def baselines_figure(found: Baselines) -> Figure:
         zorder=3,
     )
     ax.set(xscale="log", xlabel="wall time, compiling included (s)", title=found.title)
+    ticks_in_full(ax.xaxis)
     if geometric:
         ax.set(
             yscale="log",
             ylabel="error, geometric mean of all\nreferences, relative to before (-)",
         )
+        ticks_in_full(ax.yaxis)
     else:
         ax.set(ylabel="objective (-)")
     picture.legend(loc="outside right upper", fontsize=7.5)

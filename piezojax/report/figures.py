@@ -6,7 +6,9 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from ..files import write_bytes
 
@@ -52,6 +54,13 @@ def legend_above(ax: Axes) -> None:
         columnspacing=1.2,
         handlelength=1.4,
     )
+
+
+def ticks_in_full(axis: Axis) -> None:
+    """Write numbers, not powers, at 1, 2 and 5 of a short logarithmic ``axis``."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FormatStrFormatter("%g"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def styled():

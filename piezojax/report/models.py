@@ -13,7 +13,16 @@ from rich.table import Table
 from ..files import write_text
 from ..identify.comparison import Comparison, ComparisonReport, Row
 from ..identify.fit import Fit
-from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
+from .figures import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    REFERENCE,
+    figure,
+    styled,
+    ticks_in_full,
+    write,
+)
 from .identification import loop_panel, shown_unit, write_fit, write_model
 
 COMPARISON_FILE, TABLE_FILE = "comparison.json", "comparison.csv"
@@ -154,6 +163,7 @@ def _errors_panel(ax: Axes, report: ComparisonReport) -> None:
     ax.margins(x=0.12)
     if errors.max() > 5.0 * errors.min():
         ax.set_xscale("log")
+        ticks_in_full(ax.xaxis)
     ax.set(
         xlabel=f"validation error ({shown_unit(report.unit)} rms)",
         title="Error and number of parameters; chosen in blue",

@@ -5,12 +5,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from rich.table import Table
 
 from ..tune.constraints import CONSTRAINTS
 from ..tune.result import FrontPoint, Perturbed, Result
-from .figures import AFTER, BEFORE, figure
+from .figures import AFTER, BEFORE, figure, ticks_in_full
 
 
 def constraints_table(result: Result) -> Table:
@@ -69,9 +68,7 @@ def perturbed_figure(found: Perturbed | None, title: str) -> Figure | None:
         label = f"{name}, unstable on {lost}" if lost else name
         _distribution(panel, errors, found.plants, color=colour, label=label)
     panel.set_xscale("log")
-    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    panel.xaxis.set_major_formatter(ScalarFormatter())
-    panel.xaxis.set_minor_formatter(NullFormatter())
+    ticks_in_full(panel.xaxis)
     panel.set_xlabel("rms error, geometric mean over references, nm")
     panel.set_ylabel(f"share of {found.plants} held-out plants, %")
     panel.legend()

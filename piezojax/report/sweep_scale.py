@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter, LogLocator
+
+from .figures import ticks_in_full
 
 LOST = "#d9d9d9"  # the colour of points that are lost
 COLOUR_MAP = "viridis_r"  # dark is large: what is bad stands out
@@ -58,6 +59,5 @@ def colour_bar(
     bar = picture.colorbar(mapped, ax=ax)
     bar.set_label("; ".join(part for part in (unit, note) if part))
     if isinstance(mapped.norm, LogNorm):
-        bar.ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        bar.ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        ticks_in_full(bar.ax.yaxis)
         bar.minorticks_off()
