@@ -1,9 +1,11 @@
 """The generalised Duhem model: hysteresis as a differential equation of the input."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from .._types import Scalar, ScalarLike, as_array, as_scalars, check
@@ -82,17 +84,20 @@ class Duhem(System):
         """Return dx along a ``change`` (V) of the input, at x and u."""
         # +1 at rest, as in ColemanHodgdon: |u'| then has the slope of the rising side.
         magnitude = jnp.where(change >= 0.0, change, -change)
-        modulus = jnp.abs(memory)
         reversible = _value(self.reversible, memory, input)
-        reversible += modulus * _value(self.reversible_modulus, memory, input)
         irreversible = _value(self.irreversible, memory, input)
-        irreversible += modulus * _value(self.irreversible_modulus, memory, input)
+        if any(self.reversible_modulus + self.irreversible_modulus):
+            modulus = jnp.abs(memory)
+            reversible += modulus * _value(self.reversible_modulus, memory, input)
+            irreversible += modulus * _value(self.irreversible_modulus, memory, input)
         return reversible * change + irreversible * magnitude
 
     def init(self, input: ScalarLike = 0.0) -> DuhemState:
         virgin = DuhemState(self.rest_input, self.rest_memory)
         return loaded(self, virgin, as_array(input))
 
+    # In reverse mode a step is worked out again: its stages take longer to store.
+    @partial(jax.checkpoint, prevent_cse=False)
     def step(self, state: DuhemState, input: ScalarLike) -> tuple[DuhemState, Scalar]:
         input = as_array(input)
         change = input - state.input
@@ -107,10 +112,14 @@ class Duhem(System):
 
 def _value(surface: Surface, x: Scalar, u: Scalar) -> Scalar:
     """Return sum_ij surface[i][j] x^i u^j by Horner's rule in both."""
-    total = jnp.zeros_like(x)
-    for row in reversed(surface):
-        inner = jnp.zeros_like(x)
-        for coefficient in reversed(row):
-            inner = inner * u + coefficient
-        total = total * x + inner
+    return _polynomial([_polynomial(row, u) for row in surface], x)
+
+
+def _polynomial(coefficients: Sequence[Scalar], at: Scalar) -> Scalar:
+    if not coefficients:
+        return jnp.zeros_like(at)
+    # From the highest one: a product with a zero in front of it would be worked out.
+    *lower, total = coefficients
+    for coefficient in reversed(lower):
+        total = total * at + coefficient
     return total
