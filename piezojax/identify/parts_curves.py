@@ -7,6 +7,7 @@ from ..hysteresis import (
     NormalisedBoucWen,
     ShapedColemanHodgdon,
 )
+from ..space import Transform
 from .part import Extent, Part, around, rest_bounds, rests
 
 
@@ -158,15 +159,13 @@ def bashash_jalili(extent: Extent) -> Part:
     # The reference loop is that over the record's range; beside an offset of the
     # output only one of its two ends is free.
     lower, upper = slope * extent.low, slope * extent.high
-    least, most = lower + 0.3 * extent.span, lower + 3.0 * extent.span
-    shape = {
-        f"{branch}_{name}": bound
-        for branch in ("rising", "falling")
-        for name, bound in (
-            ("alpha", (-0.99, 3.0, "linear")),
-            ("tau", (0.2 / width, 100.0 / width, "log")),
-        )
+    steepness = (0.2 / width, 100.0 / width)
+    bounds: dict[str, tuple[float, float, Transform]] = {
+        "upper_output": (lower + 0.3 * extent.span, lower + 3.0 * extent.span, "linear")
     }
+    for branch in ("rising", "falling"):
+        bounds[f"{branch}_alpha"] = (-0.99, 3.0, "linear")
+        bounds[f"{branch}_tau"] = (*steepness, "log")
     return Part(
         BashashJalili(
             lower_input=extent.low,
@@ -178,10 +177,7 @@ def bashash_jalili(extent: Extent) -> Part:
             falling_alpha=-0.4,
             falling_tau=4.0 / width,
         ),
-        {
-            "upper_output": (least, most, "linear"),
-            **shape,
-        },
+        bounds,
         [
             {"rising_tau": steep / width, "falling_tau": steep / width}
             for steep in (1.5, 4.0, 12.0)
