@@ -1,6 +1,6 @@
 """Is the hysteresis that made a record the one that is chosen, its parameters found?
 
-    python tests/benchmarks/choice.py --json choice.json [--models NAME,...]
+    python tests/benchmarks/choice.py --json choice.json [--draws N] [--models NAME,...]
 
 Each hysteresis that can be fitted makes a record behind a lag, with white sensor noise
 and parameters inside what a laboratory sees; ``identify_all`` fits every model to it
@@ -21,6 +21,7 @@ operator may change places and signs. ``--tone`` makes records with one sine ins
 """
 
 import argparse
+import itertools
 import json
 import sys
 import time
@@ -109,20 +110,21 @@ class Lines:
         del best, note
 
 
-def study(name, drive=choice_records.LOOPS, among=None):
+def study(name, seed=1, drive=choice_records.LOOPS, among=None):
     """One record, all models, and what was chosen."""
-    record, clean = choice_records.made(name, drive)
+    record, clean = choice_records.made(name, drive, seed)
     model, values = choice_records.expected(name, drive)
     began = time.perf_counter()
     found = identify_all(
         record,
         hysteresis=among,
         train=slice(0, drive.trained),
-        progress=Lines(name),
+        progress=Lines(f"{name}, noise {seed}"),
     )
     report = found.report
     row = {
         "truth": name,
+        "seed": seed,
         "expected": model,
         "chosen": report.best,
         "validation_rmse_um": report.rows[0].validation_rmse,
@@ -139,34 +141,30 @@ def study(name, drive=choice_records.LOOPS, among=None):
 
 
 def table(rows, drive):
-    """What was found, a line a truth."""
-    shown = Table(
-        title=f"records of {drive.input.size} samples, {1e3 * NOISE:g} nm of noise"
-    )
-    for column in (
-        "made by",
-        "chosen",
-        "validation nm",
-        "parameters: furthest off",
-    ):
+    """What was found, a line a truth: the worst of all draws of the noise."""
+    title = f"records of {drive.input.size} samples, {1e3 * NOISE:g} nm of noise"
+    shown = Table(title=title)
+    for column in ("made by", "chosen", "furthest parameter, s.e."):
         shown.add_column(column)
-    for column in ("output off, noise", "recovered", "s"):
+    for column in ("validation nm", "output off, noise", "right", "recovered", "s"):
         shown.add_column(column, justify="right")
-    for row in rows:
-        if row.get("worst") is None:
-            off = "not fitted"
-        else:
-            off = f"{row['worst_in_standard_errors']:.1f} s.e. ({row['worst']})"
-            if row["undetermined"]:
-                off += f", {len(row['undetermined'])} not determined"
+    for name in dict.fromkeys(row["truth"] for row in rows):
+        own = [row for row in rows if row["truth"] == name]
+        fitted = [row for row in own if row.get("worst")]
+        worst = max(fitted, key=lambda row: row["worst_in_standard_errors"], default={})
+        off = f"{worst.get('worst_in_standard_errors', np.nan):.1f}"
+        off += f" {str(worst.get('worst')).removeprefix('hysteresis.')}"
+        lost = max((len(row["undetermined"]) for row in fitted), default=0)
+        both = [row["chosen_right"] and row.get("recovered", False) for row in own]
         shown.add_row(
-            row["truth"],
-            ("" if row["chosen_right"] else "NOT: ") + row["chosen"],
-            f"{1e3 * row['validation_rmse_um']:.2f}",
-            off,
-            f"{row.get('clean_error_in_noise', np.nan):.2f}",
-            "yes" if row["chosen_right"] and row.get("recovered") else "no",
-            f"{row['seconds']:.0f}",
+            name,
+            "\n".join(dict.fromkeys(row["chosen"] for row in own)),
+            off + (f", {lost} not determined" if lost else ""),
+            f"{1e3 * max(row['validation_rmse_um'] for row in own):.2f}",
+            f"{max((r['clean_error_in_noise'] for r in fitted), default=np.nan):.2f}",
+            f"{sum(row['chosen_right'] for row in own)} of {len(own)}",
+            f"{sum(both)} of {len(own)}",
+            f"{np.mean([row['seconds'] for row in own]):.0f}",
         )
     return shown
 
@@ -176,6 +174,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--models", help="only records of these, by commas")
+    parser.add_argument("--draws", type=int, default=1, help="of the noise, a model")
     parser.add_argument("--tone", action="store_true", help="one sine as the input")
     parser.add_argument("--among", help="only these hysteresis parts fitted, by commas")
     options = parser.parse_args()
@@ -187,8 +186,9 @@ def main():
     among = options.among.split(",") if options.among else None
     drive = choice_records.TONE if options.tone else choice_records.LOOPS
     rows = []
-    for name in names:
-        rows.append(study(name, drive, among))
+    draws = range(1, options.draws + 1)
+    for seed, name in itertools.product(draws, names):
+        rows.append(study(name, seed, drive, among))
         if options.json:  # as far as it got
             options.json.write_text(
                 json.dumps({"rows": rows}, indent=2) + "\n", encoding="utf-8"
