@@ -22,8 +22,8 @@ LEARNED_PLAYS, NEURONS = 5, 4
 SEEDS = 16
 """Draws of a learned operator's first weights, the same in every run.
 
-Of four, all ended in a worse place than its own weights on one of two records that a
-learned operator made (tests/benchmarks/choice.py); of sixteen some never did."""
+A learned operator's own record, tests/benchmarks/choice.py: of twelve draws all ended
+in a worse place than its weights for two of three draws of the noise, of sixteen never."""
 
 
 def _plays(extent: Extent) -> tuple[dict[str, Any], Bounds]:
