@@ -22,8 +22,9 @@ LEARNED_PLAYS, NEURONS = 5, 4
 SEEDS = 16
 """Draws of a learned operator's first weights, the same in every run.
 
-A learned operator's own record, tests/benchmarks/choice.py: of twelve draws all ended
-in a worse place than its weights for two of three draws of the noise, of sixteen never."""
+On records that a learned operator made (tests/benchmarks/choice.py) all of twelve ended
+in a worse place than the true one for two of three draws of the noise, of sixteen not.
+"""
 
 
 def _plays(extent: Extent) -> tuple[dict[str, Any], Bounds]:
