@@ -11,6 +11,7 @@ from typing import NamedTuple
 from .checks import lines
 from .estimate import Options
 from .methods import METHODS
+from .model_preisach import TOO_FEW, cells_told_apart
 from .parts import OWN_DYNAMICS, PARTS, extent_of
 from .record import Record
 
@@ -239,6 +240,16 @@ def _against_periods(
     return _against_several_records(records)
 
 
+def _against_preisach(
+    records: Sequence[Record], train: slice, options: Options
+) -> str | None:
+    del options
+    against = _against_several_records(records) or _several(records)
+    if against:
+        return against
+    return None if cells_told_apart(records[0], train) else TOO_FEW
+
+
 def _against_several_records(records: Sequence[Record]) -> str | None:
     return f"{len(records)} records; it takes one" if len(records) > 1 else None
 
@@ -248,5 +259,6 @@ _AGAINST = {
     "state_space": _against_state_space,
     "bouc_wen": lambda *of: _against_periods(*of) or _several(of[0]),
     "neural_state_space": _against_periods,
+    "preisach": _against_preisach,
 }
 """What speaks against a model; one that is not here is tried on any record."""

@@ -8,7 +8,7 @@ import numpy as np
 from ..progress import Progress, Silent
 from .candidates import Candidate, Untried, at, first_round, later_rounds
 from .comparison import RULE, Comparison, ComparisonReport, Row, file_name
-from .criteria import Criteria, criteria, effective_samples, ranking
+from .criteria import Criteria, criteria, effective_samples, first_alike, ranking
 from .estimate import Options
 from .fit import Fit, check_together, identify, parts_of
 from .record import Record
@@ -54,7 +54,10 @@ def identify_all(
     try:
         search.fit(first, total)
         for later in rounds:
-            chains = _chains([Candidate(model) for model in search.ranked()])
+            twins = search.twins()
+            chains = _chains(
+                [Candidate(model) for model in search.ranked() if model not in twins]
+            )
             search.fit(
                 [c for c in later(chains[:KEPT]) if c.model not in search.fits], total
             )
@@ -182,15 +185,44 @@ class _Search:
             for model, fit in self.fits.items()
         }
 
+    def twins(self) -> dict[str, str]:
+        """Return the models that are another way to write one, and that one.
+
+        In the order in which hysteresis parts are listed, not in that of the fits.
+        """
+        if not self.fits:
+            return {}
+        models = self._listed()
+        worth = self.criteria()
+        alike = first_alike(
+            [worth[model].bic for model in models],
+            [self.fits[model].count for model in models],
+            [self.fits[model].errors(slice(None)) for model in models],
+        )
+        return {
+            models[i]: models[j] for i, j in enumerate(alike) if models[i] != models[j]
+        }
+
     def ranked(self) -> dict[str, bool]:
         """Return whether each model validates as well as the best; best model first."""
         if not self.fits:
             return {}
-        bics = [found.bic for found in self.criteria().values()]
-        errors = [fit.errors(self.validate) for fit in self.fits.values()]
+        models, worth, twins = self._listed(), self.criteria(), self.twins()
+        # One model has one BIC, so that of its ways to be written the first is taken.
+        bics = [
+            min(worth[m].bic for m in models if twins.get(m, m) == twins.get(own, own))
+            for own in models
+        ]
+        errors = [self.fits[model].errors(self.validate) for model in models]
         order, well = ranking(bics, errors)
-        models = list(self.fits)
         return {models[i]: well[i] for i in order}
+
+    def _listed(self) -> list[str]:
+        names = at("hysteresis")
+        places = {name: place for place, name in enumerate(names)}
+        return sorted(
+            self.fits, key=lambda model: places.get(model.split("+")[0], len(names))
+        )
 
 
 def _judged(
@@ -202,11 +234,12 @@ def _judged(
 ) -> Comparison:
     ranked, worth = search.ranked(), search.criteria()
     fits = {model: search.fits[model] for model in ranked}
-    best = next(iter(ranked))
+    best, twins = next(iter(ranked)), search.twins()
     rows = [
         Row(
             model=model,
             status="fitted",
+            note=f"another way to write {twins[model]}" if model in twins else "",
             parameters=fit.count,
             train_rmse=fit.report.train.rmse,
             validation_rmse=fit.report.validation.rmse,

@@ -15,6 +15,12 @@ import numpy as np
 MARGIN = 2.0
 """Standard errors by which a validation error must differ to count as worse."""
 
+BARE_MENTION = 2.0
+"""Difference of BIC that is not worth more (Kass and Raftery 1995, JASA 90(430))."""
+
+SAME_RUN = 0.1
+"""Share of the rms error by which the free runs of one model may differ."""
+
 Errors = Sequence[np.ndarray]
 """Errors of a free run, [samples, p] for each record."""
 
@@ -101,6 +107,32 @@ def ranking(
     squares = [float(np.mean(np.concatenate(errors) ** 2)) for errors in validation]
     best = validation[int(np.argmin(squares))]
     well = [as_good(errors, best) for errors in validation]
-    # Rounded, so that of two ways to write one model the first is taken.
-    order = sorted(range(len(bics)), key=lambda i: (not well[i], round(bics[i], 2)))
+    order = sorted(range(len(bics)), key=lambda i: (not well[i], bics[i]))
     return order, well
+
+
+def first_alike(
+    bics: Sequence[float], counts: Sequence[int], errors: Sequence[Errors]
+) -> list[int]:
+    """Return, for each fit, the first of the fits that is the same model.
+
+    Two ways to write one model, stops and plays say, have as many parameters and the
+    same free run, up to where their descents ended: runs less than SAME_RUN of the
+    smaller rms error apart, BIC less than BARE_MENTION. No record tells them apart, so
+    which one it is must not hang on rounding.
+    """
+    joined = [np.concatenate(one) for one in errors]
+    found: list[int] = []
+    for i, own in enumerate(joined):
+        alike = i
+        for j in dict.fromkeys(found):
+            least = min(np.mean(own**2), np.mean(joined[j] ** 2))
+            if (
+                counts[i] == counts[j]
+                and abs(bics[i] - bics[j]) < BARE_MENTION
+                and np.mean((own - joined[j]) ** 2) < SAME_RUN**2 * least
+            ):
+                alike = j
+                break
+        found.append(alike)
+    return found

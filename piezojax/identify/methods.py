@@ -13,6 +13,7 @@ from ..system import System
 from .estimate import Estimate, FittedParameter, Options
 from .linear import by_frequency_response, by_subspace
 from .model_bouc_wen import bouc_wen
+from .model_preisach import preisach_with_lag
 from .models import structure
 from .neural import fit_neural_state_space
 from .output_error import Optimum, from_rest, output_error
@@ -144,6 +145,23 @@ def _by_steady_state(
     return Estimate(system, (response[phase],), named, warnings, count=count)
 
 
+def _by_nonnegative_least_squares(
+    model: str, records: Records, train: slice, options: Options, progress: Progress
+) -> Estimate:
+    del options
+    record = _single(records)
+    progress.stage(f"searching for the lag behind the {model} model")
+    found = preisach_with_lag(record, train)
+    named = {
+        name: FittedParameter(value=value, standard_error=deviation)
+        for (name, value), deviation in zip(
+            found.values.items(), found.deviations, strict=True
+        )
+    }
+    runs = _free_runs([found.system], [record])
+    return Estimate(found.system, runs, named, [], 1, True)
+
+
 def _single(records: Records) -> Record:
     if len(records) != 1:
         raise ValueError(f"{len(records)} records; this method takes one")
@@ -171,6 +189,11 @@ METHODS: dict[str, Method] = {
         "(3.32) by (3.35); sensor noise biases it",
         ("hysteretic_arma",),
         _by_regression(least_squares),
+    ),
+    "nonnegative_least_squares": Method(
+        "weights of a Preisach triangle behind the lag that fits best",
+        ("preisach",),
+        _by_nonnegative_least_squares,
     ),
     "subspace": Method(
         "Hankel-Toeplitz regression with a prior (MAP); a record an input channel",

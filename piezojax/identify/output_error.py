@@ -249,13 +249,20 @@ def _with_errors(
     """
     values, slopes, jacobian = map(np.asarray, _sensitivity(problem, unit))
     jacobian = jacobian / np.where(slopes == 0.0, 1.0, slopes)
+    counted = int(np.sum(np.asarray(problem.weights) > 0))
+    return values, standard_errors(jacobian, loss / max(counted - unit.size, 1))
+
+
+def standard_errors(jacobian: np.ndarray, variance: float) -> list[float | None]:
+    """Return the square roots of the diagonal of ``variance`` (J'J)^-1.
+
+    None for a parameter in a direction that the ``jacobian`` says nothing about.
+    """
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
     _, strength, directions = np.linalg.svd(jacobian / scale, full_matrices=False)
     weak = strength < UNDETERMINED * strength[0]
     known = np.sum(directions[weak] ** 2, axis=0) < 1e-6
-    counted = int(np.sum(np.asarray(problem.weights) > 0))
-    variance = loss / max(counted - unit.size, 1)
     inverse = np.where(weak, 0.0, 1.0 / np.where(weak, 1.0, strength))
     spread = np.sqrt(variance * np.sum((directions.T * inverse) ** 2, axis=1)) / scale
-    return values, [float(d) if k else None for d, k in zip(spread, known, strict=True)]
+    return [float(d) if k else None for d, k in zip(spread, known, strict=True)]

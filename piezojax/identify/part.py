@@ -64,3 +64,14 @@ def around(value: float, below: float, above: float) -> tuple[float, float, Tran
     """Bounds at multiples of ``value``, which may be negative."""
     low, high = sorted((below * value, above * value))
     return low, high, "linear"
+
+
+def rest_bounds(extent: Extent) -> Bounds:
+    """Bounds of the input in force before the record."""
+    margin = 0.5 * extent.width
+    return {"rest_input": (extent.low - margin, extent.high + margin, "linear")}
+
+
+def rests(extent: Extent) -> list[dict[str, float]]:
+    """Where the input may have been before the record: where it begins, at its low."""
+    return [{"rest_input": extent.first[0]}, {"rest_input": extent.low}]

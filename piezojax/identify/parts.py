@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 from ..dynamics import ARMA, FirstOrderLag, FractionalDelay
 from . import parts_creep as creep
-from . import parts_hysteresis as hysteresis
+from . import parts_curves as curves
+from . import parts_plays as plays
 from .part import Extent as Extent
 from .part import Part as Part
 from .part import extent_of as extent_of
@@ -44,19 +45,22 @@ def delay(extent: Extent) -> Part:
 
 
 PARTS: dict[str, tuple[str, Callable[[Extent], Part]]] = {
-    "coleman_hodgdon": ("hysteresis", hysteresis.coleman_hodgdon),
-    "shaped_coleman_hodgdon": ("hysteresis", hysteresis.shaped_coleman_hodgdon),
-    "prandtl_ishlinskii": ("hysteresis", hysteresis.prandtl_ishlinskii),
+    "coleman_hodgdon": ("hysteresis", curves.coleman_hodgdon),
+    "shaped_coleman_hodgdon": ("hysteresis", curves.shaped_coleman_hodgdon),
+    "prandtl_ishlinskii": ("hysteresis", plays.prandtl_ishlinskii),
     "asymmetric_prandtl_ishlinskii": (
         "hysteresis",
-        hysteresis.asymmetric_prandtl_ishlinskii,
+        plays.asymmetric_prandtl_ishlinskii,
     ),
-    "stop_prandtl_ishlinskii": ("hysteresis", hysteresis.stop_prandtl_ishlinskii),
+    "stop_prandtl_ishlinskii": ("hysteresis", plays.stop_prandtl_ishlinskii),
     "rate_dependent_prandtl_ishlinskii": (
         "hysteresis",
-        hysteresis.rate_dependent_prandtl_ishlinskii,
+        plays.rate_dependent_prandtl_ishlinskii,
     ),
-    "learned_operator": ("hysteresis", hysteresis.learned_operator),
+    "duhem": ("hysteresis", curves.duhem),
+    "normalised_bouc_wen": ("hysteresis", curves.normalised_bouc_wen),
+    "bashash_jalili": ("hysteresis", curves.bashash_jalili),
+    "learned_operator": ("hysteresis", plays.learned_operator),
     "exponential_creep": ("creep", creep.exponential_creep),
     "logarithmic_creep": ("creep", creep.logarithmic_creep),
     "spring_damper_creep": ("creep", creep.spring_damper_creep),

@@ -75,7 +75,7 @@ def fit_preisach(
         )
     shape = Preisach(np.zeros((cells, cells)), low, high, 0.0, input[0], start)
     places = [(j + k, j) for k in range(cells) for j in range(cells - k)]
-    rows = _rows(shape, input, dynamics, part)
+    rows = responses(shape, input, dynamics, part)
     least = np.zeros(len(places))
     least[:cells] = LEAST_SLOPE * slope * (high - low) / cells
     centre = rows.mean(axis=0)
@@ -112,7 +112,7 @@ def _levels(shape: Preisach, input: Any) -> Any:
     return simulate(memory, input, memory.init(input[0]))[1]
 
 
-def _rows(
+def responses(
     shape: Preisach, input: np.ndarray, dynamics: ARMA | None, part: slice
 ) -> np.ndarray:
     """Return what a weight of 1 um in each cell puts out over ``part``, a column each.

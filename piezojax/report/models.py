@@ -99,6 +99,9 @@ def comparison_notes(report: ComparisonReport) -> list[str]:
     found = [f"{row.model} failed: {row.note}" for row in _with(report, "failed")]
     for reason, rows in groupby(_with(report, "not tried"), key=lambda row: row.note):
         found.append(f"not tried: {', '.join(row.model for row in rows)}: {reason}")
+    found += [
+        f"{row.model} is {row.note}" for row in _with(report, "fitted") if row.note
+    ]
     share = sum(report.effective_samples) / len(report.effective_samples)
     found.append(
         f"{report.samples} training samples count as {share:.0f} in BIC: errors of a "

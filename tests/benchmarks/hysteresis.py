@@ -75,7 +75,7 @@ OTHERS = {
         falling_tau=0.03,
     ),
 }
-"""Models that are no part of a chain to fit."""
+"""Models timed with other numbers than those a fit starts from: no term is zero."""
 
 MODELS = [name for name, (place, _) in PARTS.items() if place == "hysteresis"]
 MODELS += [name for name in OTHERS if name not in MODELS]

@@ -12,6 +12,7 @@ from piezojax.identify.estimate import Options
 from piezojax.identify.models import structure
 from piezojax.paths import get, replace
 from piezojax.study import shipped
+from piezojax.system import Series
 
 DT = 1e-3
 SAMPLES = 900
@@ -36,7 +37,7 @@ def made_by_coleman_hodgdon():
 
 
 def check_recovered(found, plant, clean):
-    """Every parameter within its standard error, as a plant within the noise."""
+    """Every parameter within 4 standard errors, as a plant within the noise."""
     for path, parameter in found.report.parameters.items():
         if parameter.standard_error is None or "rest_" in path:
             continue
@@ -55,6 +56,64 @@ def test_the_model_that_made_a_record_is_chosen():
     )
     assert set(found.fits) == {"lag", *(f"{name}+lag" for name in among)}
     assert found.report.best == "coleman_hodgdon+lag"
+    check_recovered(found.best, plant, clean)
+
+
+PLAYS = {
+    **{f"polynomial.{i}": v for i, v in enumerate((0.071, 1.3e-4, -7e-7))},
+    **{f"weights.{i}": 0.011 * 0.82**i for i in range(10)},
+}
+
+
+def made_by_plays(name, **more):
+    """A record of 10 Hz at several amplitudes, the plant, its clean output.
+
+    One amplitude alone would leave the weights of the plays to its one loop.
+    """
+    level = np.select(
+        [np.arange(SAMPLES) < stop for stop in (300, 400, 500, 600, 700, 800)],
+        [1.0, 0.8, 0.6, 0.35, 0.9, 0.5],
+        0.7,
+    )
+    input = level * 5.0 / 3.0 * ONE_TONE
+    seen = Record(input, 0.12 * input, DT).until(TRAIN.stop)
+    truth = {f"hysteresis.{path}": value for path, value in (PLAYS | more).items()}
+    truth |= {"hysteresis.rest_input": 0.0, "calibration.offset": -3.0}
+    truth |= {"lag.time_constant": 1.1e-3}
+    plant = replace(structure(f"{name}+lag", seen).system, truth)
+    clean = np.asarray(free_run(plant, jnp.asarray(input), 0.0))
+    noise = NOISE * np.random.default_rng(1).standard_normal(SAMPLES)
+    return Record(input, clean + noise, DT, source="made up"), plant, clean
+
+
+def chosen_of_plays(record, among):
+    found = identify_all(
+        record, hysteresis=among, train=TRAIN, options=Options(steps=60)
+    )
+    assert {f"{name}+lag" for name in among} < set(found.fits)
+    return found
+
+
+def test_stops_are_chosen_as_the_plays_that_they_are():
+    record, plant, clean = made_by_plays(
+        "stop_prandtl_ishlinskii", **{"polynomial.0": 0.152}
+    )
+    found = chosen_of_plays(record, ["prandtl_ishlinskii", "stop_prandtl_ishlinskii"])
+    assert found.report.best == "prandtl_ishlinskii+lag"
+    rows = {row.model: row for row in found.report.rows}
+    note = rows["stop_prandtl_ishlinskii+lag"].note
+    assert note == "another way to write prandtl_ishlinskii+lag"
+    stops, *others = plant.parts
+    same = Series((stops.as_plays(), *others), plant.names)
+    check_recovered(found.best, same, clean)
+
+
+@pytest.mark.slow
+def test_plays_that_widen_with_the_rate_are_told_from_those_that_do_not():
+    name = "rate_dependent_prandtl_ishlinskii"
+    record, plant, clean = made_by_plays(name, growth=1e-3)
+    found = chosen_of_plays(record, ["prandtl_ishlinskii", name])
+    assert found.report.best == f"{name}+lag"
     check_recovered(found.best, plant, clean)
 
 

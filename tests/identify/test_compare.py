@@ -64,6 +64,25 @@ def made(monkeypatch):
     return install
 
 
+def test_of_two_ways_to_write_one_model_the_first_is_chosen(made, monkeypatch):
+    made()
+    monkeypatch.setitem(BIAS, "prandtl_ishlinskii", 1e-4)
+    monkeypatch.setitem(BIAS, "stop_prandtl_ishlinskii", 2e-4)
+    monkeypatch.delitem(BIAS, "coleman_hodgdon")
+    found = identify_all(RICH)
+    rows = {row.model: row for row in found.report.rows}
+    stop = rows["stop_prandtl_ishlinskii+exponential_creep+arma"]
+    plays = "prandtl_ishlinskii+exponential_creep+arma"
+    assert stop.bic < rows[plays].bic
+    assert found.report.best.split("+")[0] == "prandtl_ishlinskii"
+    assert stop.note == f"another way to write {plays}"
+    assert f"{stop.model} is {stop.note}" in comparison_notes(found.report)
+    # Another model has its place in the further rounds.
+    assert not any(
+        "stop_" in model and "exponential" not in model for model in found.fits
+    )
+
+
 def test_the_best_is_chosen_and_the_others_are_there(made):
     made()
     found = identify_all(RICH)

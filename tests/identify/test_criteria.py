@@ -8,6 +8,7 @@ from piezojax.identify.criteria import (
     correlation_time,
     criteria,
     effective_samples,
+    first_alike,
     ranking,
 )
 
@@ -106,3 +107,22 @@ def test_more_parameters_do_not_win_by_themselves():
     assert int(np.argmin(bics)) == 2
     assert order == [0, 1, 2]
     assert well == [True, True, False]
+
+
+def test_two_ways_to_write_one_model_are_one():
+    rng = np.random.default_rng(7)
+    noise = rng.standard_normal((500, 1))
+    near = noise + 0.05 * rng.standard_normal((500, 1))
+    other = noise + 0.2 * rng.standard_normal((500, 1))
+    errors = [[noise], [near], [other], [near], [near], [noise[:200], near[200:]]]
+    bics = [-10.0, -10.9, -10.0, -10.0, -12.1, -10.0]
+    counts = [5, 5, 5, 6, 5, 5]
+    # Beside the second, one has another run, one another count, one another BIC.
+    assert first_alike(bics, counts, errors) == [0, 0, 2, 3, 4, 0]
+
+
+def test_alike_is_said_of_the_first_not_of_a_neighbour():
+    # Each comes close to the one before, but the last not to the first.
+    noise = np.random.default_rng(8).standard_normal((500, 1))
+    errors = [[noise * (1.0 + share)] for share in (0.0, 0.08, 0.16)]
+    assert first_alike([0.0, 0.0, 0.0], [5, 5, 5], errors) == [0, 0, 2]

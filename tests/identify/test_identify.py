@@ -232,7 +232,9 @@ def record():
     return record_of(INPUT, 0.1 * INPUT)
 
 
-@pytest.mark.parametrize("name", ["preisach", "", "ColemanHodgdon", "lag+preisach"])
+@pytest.mark.parametrize(
+    "name", ["krasnoselskii", "", "ColemanHodgdon", "lag+preisach"]
+)
 def test_unknown_model(record, name):
     part = name.split("+")[-1]
     message = f"a model has no part {part!r}; there are "

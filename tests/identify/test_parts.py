@@ -28,6 +28,9 @@ INPUT = excitation()
 
 
 NAMES = [
+    "bashash_jalili",
+    "duhem",
+    "normalised_bouc_wen",
     "stop_prandtl_ishlinskii",
     "rate_dependent_prandtl_ishlinskii",
     "learned_operator",

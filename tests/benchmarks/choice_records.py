@@ -1,0 +1,185 @@
+"""Records that each hysteresis makes, with its parameters: what choice.py fits."""
+
+import itertools
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from piezojax import FirstOrderLag, Preisach, Record, series
+from piezojax.identify import free_run
+from piezojax.identify.models import structure
+from piezojax.paths import parameters, replace
+
+NOISE = 0.01  # um
+LAG = 1.1e-3  # s
+OFFSET = -2.0  # um
+SLOW, FAST = 0.7, 0.15  # samples a volt
+SHORTEST = 5  # samples of a stroke
+
+FIRST = (
+    (0, 100, 0, 92, 6, 84, 14, 76, 24, 66, 34, 57, 42, 100, 30, 95, 12, 48, 20, 38, 26)
+    + (88, 0, 55, 5, 30, 10, 22, 100, 55, 90, 62, 82, 70, 100, 0, 70, 18, 60, 0, 45, 0)
+    + (20, 0, 100, 85, 98, 75, 100, 0)
+)
+AGAIN = (0, 100, 20, 80, 35, 65, 45, 90, 10, 50, 0, 75, 40, 95, 60, 85, 5, 100, 0)
+"""Turning points of the training part, V: slow ones, then fast ones."""
+
+LAST = (0, 97, 15, 62, 28, 89, 51, 73, 3, 41, 9, 100, 37, 81, 22, 0)
+LAST_AGAIN = (0, 93, 33, 68, 12, 87, 47, 99, 58, 77, 0, 52, 16)
+"""Those of the validation part."""
+
+
+def strokes(corners, samples_a_volt):
+    """The way from corner to corner, at rest in each; without the first sample."""
+    pieces = []
+    for start, stop in itertools.pairwise(corners):
+        samples = max(SHORTEST, round(samples_a_volt * abs(stop - start)))
+        share = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, samples + 1) / samples)
+        pieces.append(start + (stop - start) * share)
+    return np.concatenate(pieces)
+
+
+class Drive(NamedTuple):
+    """An input from rest at 0 V, its sample time, how many samples are to be fitted."""
+
+    input: np.ndarray
+    dt: float
+    trained: int
+
+    @property
+    def seen(self):
+        """What the fit sees, as a record of a stage without hysteresis."""
+        return Record(
+            self.input[: self.trained], 0.12 * self.input[: self.trained], self.dt
+        )
+
+
+SEEN = np.concatenate([[0.0], strokes(FIRST, SLOW), strokes(AGAIN, FAST)])
+LOOPS = Drive(
+    np.concatenate([SEEN, strokes(LAST, SLOW), strokes(LAST_AGAIN, FAST)]),
+    4e-4,
+    SEEN.size,
+)
+TONE = Drive(50.0 - 50.0 * np.cos(2.0 * np.pi * 0.01 * np.arange(900)), 1e-3, 600)
+REST = 0.0
+
+FADING = tuple(0.011 * 0.82**i for i in range(10))
+PLAYS = {
+    **{f"polynomial.{i}": v for i, v in enumerate((0.071, 1.3e-4, -7e-7))},
+    **{f"weights.{i}": v for i, v in enumerate(FADING)},
+}
+
+
+def learned():
+    """Weights of a learned operator: drawn, but not as the fit's starts are."""
+    draw = np.random.default_rng(2026).uniform
+    signs = np.array([[1, -1], [-1, 1]])
+    return {
+        "autoregressive.0": 0.35,
+        "autoregressive.1": -0.06,
+        "linear.0": 2.6,
+        **{f"linear.{j}": v for j, v in enumerate((0.5, 0.4, 0.35, 0.3, 0.25), 1)},
+        "linear.6": 0.15,
+        **{
+            f"mixing.{i}.{j}": float(signs[i % 2, j % 2] * draw(0.3, 1.5))
+            for i in range(4)
+            for j in range(7)
+        },
+        **{f"bias.{i}": float(v) for i, v in enumerate((-0.8, 0.5, 0.9, -0.3))},
+        **{f"output.{i}": v for i, v in enumerate((0.5, -0.4, 0.6, 0.45))},
+    }
+
+
+TRUTHS = {
+    "coleman_hodgdon": {"a": 0.0077, "b": 0.1167, "c": -0.0487},
+    "shaped_coleman_hodgdon": {
+        "pull.1": 0.0065,
+        "pull.2": 2.2e-5,
+        "pull.3": -1.7e-7,
+        "slope.0": 0.088,
+        "slope.1": 5.5e-4,
+        "slope.2": -4.5e-6,
+        "c": -0.052,
+    },
+    "prandtl_ishlinskii": PLAYS,
+    "asymmetric_prandtl_ishlinskii": {
+        **PLAYS,
+        **{f"skew.{i}": 0.02 * 0.75**i for i in range(10)},
+    },
+    "stop_prandtl_ishlinskii": {**PLAYS, "polynomial.0": 0.152},
+    "rate_dependent_prandtl_ishlinskii": {**PLAYS, "growth": 2.3e-4},
+    "duhem": {
+        "reversible.0.0": 0.085,
+        "reversible.0.1": 2.4e-4,
+        "reversible.1.0": 0.007,
+        "irreversible.0.1": 0.0046,
+        "irreversible.1.0": -0.034,
+    },
+    "normalised_bouc_wen": {
+        "k_x": 0.141,
+        "k_w": -1.37,
+        "rho": 0.047,
+        "sigma": 0.86,
+        "n": 1.65,
+    },
+    "bashash_jalili": {
+        "upper_output": 12.6,
+        "rising_alpha": -0.34,
+        "rising_tau": 0.052,
+        "falling_alpha": -0.47,
+        "falling_tau": 0.033,
+    },
+    "learned_operator": learned(),
+    "preisach": {},
+}
+"""Parameters of each hysteresis by their paths in it; V, um, s."""
+
+
+def density():
+    """Weights of a Preisach model on which its lines differ from place to place."""
+    i, j = np.mgrid[0:10, 0:10]
+    hump = 0.25 * np.exp(-((i - 6.2) ** 2 + (j - 3.4) ** 2) / 8.0)
+    weights = 0.03 + hump + np.where(i == j, 0.45 + 0.03 * j, 0.0)
+    return np.tril(weights)
+
+
+def truth(name, drive=LOOPS):
+    """The plant that makes the record, and its parameters by their names in a fit."""
+    if name == "preisach":
+        hysteresis = Preisach(density(), 0.0, 100.0, OFFSET, REST)
+        plant = series(hysteresis=hysteresis, lag=FirstOrderLag(LAG, drive.dt))
+        named = {
+            f"hysteresis.weights.{i}.{j}": float(hysteresis.weights[i, j])
+            for i in range(10)
+            for j in range(i + 1)
+        }
+        return plant, named | {"hysteresis.lowest": OFFSET, "lag.time_constant": LAG}
+    lagged = name != "learned_operator"
+    shape = structure(name, drive.seen)
+    values = {f"hysteresis.{path}": value for path, value in TRUTHS[name].items()}
+    values |= {"calibration.offset": OFFSET}
+    values |= {"lag.time_constant": LAG} if lagged else {}
+    missing = {p for p in shape.space.paths if "rest_" not in p} - set(values)
+    if missing:
+        raise ValueError(f"{name}: no truth for {', '.join(sorted(missing))}")
+    rest = {path: REST for path in shape.space.paths if "rest_" in path}
+    return replace(shape.system, {**rest, **values}), values
+
+
+def expected(name, drive=LOOPS):
+    """What is to be chosen for a record of ``name``, and its parameters."""
+    plant, values = truth(name, drive)
+    if name == "stop_prandtl_ishlinskii":
+        plays = parameters(plant.parts[0].as_plays(), "hysteresis.")
+        values |= {path: float(v) for path, v in plays.items() if path in values}
+        name = "prandtl_ishlinskii"
+    return name if name in ("preisach", "learned_operator") else f"{name}+lag", values
+
+
+def made(name, drive=LOOPS, seed=1):
+    """The record, and the output without noise."""
+    plant, _ = truth(name, drive)
+    clean = np.asarray(free_run(plant, jnp.asarray(drive.input), REST))
+    noise = NOISE * np.random.default_rng(seed).standard_normal(clean.size)
+    return Record(drive.input, clean + noise, drive.dt, source=f"made by {name}"), clean

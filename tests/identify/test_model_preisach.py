@@ -1,0 +1,110 @@
+"""A Preisach model behind a lag from a record, and records that support none."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import preisach as oracle
+
+from piezojax import Record, identify, load
+from piezojax.identify import free_run
+from piezojax.identify.candidates import whole_models
+from piezojax.identify.estimate import Options
+from piezojax.identify.model_preisach import cells_told_apart
+from piezojax.report.identification import write_fit
+
+DT, LAG, LOWEST, NOISE = 1e-3, 2.2e-3, -1.5, 2e-3
+CELLS = 10
+WEIGHTS = np.tril(np.random.default_rng(3).uniform(0.05, 0.3, (CELLS, CELLS)))
+CORNERS = (
+    [0, 100, 0, 92, 6, 84, 14, 76, 24, 66, 34, 57, 42, 100, 30, 95, 12, 48, 20, 38, 26]
+    + [88, 0, 55, 5, 30, 10, 22, 100, 55, 90, 62, 82, 70, 100, 0, 70, 18, 60, 0, 45, 0]
+    + [20, 0, 100, 85, 98, 75, 100, 0, 97, 15, 62, 28, 89, 51, 73, 3, 41, 9, 99, 0]
+)
+
+
+def drive():
+    """From corner to corner in steps of two volts."""
+    ways = [
+        np.linspace(a, b, abs(b - a) // 2 + 2)[1:]
+        for a, b in itertools.pairwise(CORNERS)
+    ]
+    return np.concatenate([[0.0], *ways])
+
+
+def record_of(weights, input):
+    """Relays one by one, u(k) moving y(k+1); the lag; the noise."""
+    moved = oracle.along(weights, 0.0, 100.0, 50, input, rest=0.0)
+    pole, output, y = np.exp(-DT / LAG), [moved[0]], moved[0]
+    for f in moved[:-1]:
+        y = f + pole * (y - f)
+        output.append(y)
+    noise = NOISE * np.random.default_rng(1).standard_normal(len(input))
+    return Record(input, LOWEST + np.array(output) + noise, DT, source="made up")
+
+
+INPUT = drive()
+TRAIN = slice(0, 1200)
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return identify(record_of(WEIGHTS, INPUT), "preisach", train=TRAIN)
+
+
+def test_weights_and_lag_are_found_again(fit):
+    found = fit.report.parameters
+    assert fit.count == len(found) == CELLS * (CELLS + 1) // 2 + 2
+    truth = {
+        f"hysteresis.weights.{i}.{j}": WEIGHTS[i, j]
+        for i in range(CELLS)
+        for j in range(i + 1)
+    }
+    truth |= {"hysteresis.lowest": LOWEST, "lag.time_constant": LAG}
+    far = [(found[n].value - v) / found[n].standard_error for n, v in truth.items()]
+    assert np.max(np.abs(far)) < 4.0
+    assert 0.7 < np.std(far) < 1.4
+    # The relays of the record switch one by one, by up to 6 nm.
+    assert fit.report.validation.rmse < 2.0 * NOISE
+
+
+def test_what_is_written_is_the_plant(fit, tmp_path):
+    write_fit(fit, tmp_path)
+    again = load(tmp_path / "model.json")
+    run = free_run(again, jnp.asarray(INPUT), INPUT[0])
+    np.testing.assert_allclose(run, fit.simulated, rtol=0, atol=1e-12)
+
+
+def test_cells_are_as_fine_as_the_turning_points_tell():
+    # Of one loop, of one loop in another, and of all of them.
+    once = 50.0 - 50.0 * np.cos(np.linspace(0.0, 6.0 * np.pi, 600))
+    twice = np.concatenate([once, np.interp(once, [0.0, 100.0], [0.0, 55.0])])
+    found = [
+        cells_told_apart(Record(u, 0.1 * u, DT), slice(0, u.size))
+        for u in (once, twice, INPUT)
+    ]
+    assert found[0] == 0
+    assert found[0] <= found[1] < found[2] == CELLS
+
+
+def test_a_record_of_one_loop_supports_none():
+    once = 50.0 - 50.0 * np.cos(np.linspace(0.0, 6.0 * np.pi, 600))
+    record = Record(once, 0.1 * once, DT, source="one tone")
+    half = slice(0, 300)
+    _, untried = whole_models([record], half, Options())
+    reasons = {one.model: one.reason for one in untried}
+    assert "do not tell even the cells" in reasons["preisach"]
+    with pytest.raises(ValueError, match="a Preisach triangle with 3 a side apart"):
+        identify(record, "preisach", train=half)
+
+
+def test_it_takes_one_record_of_one_input():
+    record = Record(INPUT, 0.1 * INPUT, DT)
+    both = np.stack([INPUT, INPUT[::-1]], axis=1)
+    for records, reason in (
+        ([record, record], "2 records; it takes one"),
+        ([Record(both, both, DT)], "2 inputs and 2 outputs"),
+    ):
+        _, untried = whole_models(records, TRAIN, Options())
+        assert any(u.model == "preisach" and reason in u.reason for u in untried)
