@@ -1,5 +1,7 @@
 """A Pareto front by continuation: the study solved for one limit after the other."""
 
+from collections.abc import Callable, Sequence
+
 import jax
 import numpy as np
 from jax import Array
@@ -14,6 +16,9 @@ from .objective import Objective
 from .result import FrontPoint, Kept
 from .search import Way
 
+Place = tuple[np.ndarray, FrontPoint]
+"""A point of the unit box, and what it is on the front."""
+
 
 def trace_front(
     objective: Objective,
@@ -26,7 +31,9 @@ def trace_front(
     """Return the best gains found for each limit of the study's front.
 
     Each limit starts from the gains of the one before, the limits from the loosest to
-    the tightest; what ``search`` found by ``way`` is where the first starts.
+    the tightest; what ``search`` found by ``way`` is where the first starts. Where a
+    tighter limit came out better than a looser one, that is done again from its gains,
+    which keep both.
     """
     table = case.study.pareto
     assert table is not None
@@ -40,8 +47,8 @@ def trace_front(
     loosest_first = sorted(
         table.limits, reverse=CONSTRAINTS[table.constraint].sense == "at most"
     )
-    found, unit = [], search.unit
-    for limit in loosest_first:
+
+    def solved(limit: float, unit: np.ndarray) -> Place:
         asked = objective.with_limits(limits | {table.constraint: limit})
         here = Search(unit, starts=unit[None])
         way.descend(asked, unit[None], here, table.steps, progress)
@@ -49,17 +56,35 @@ def trace_front(
         values, rms = jax.tree.map(np.asarray, program(asked, as_array(unit)))
         rms = np.sqrt(np.mean(rms**2, axis=1))
         reached = Kept.of_values(table.constraint, limit, values[table.constraint])
-        found.append(
-            FrontPoint(
-                limit=limit,
-                value=reached.value,
-                loss=here.loss,
-                kept=here.violation <= TOLERANCE,
-                geomean_rms_um=float(np.exp(np.mean(np.log(rms)))),
-                gains={
-                    path: float(value)
-                    for path, value in case.space.named(as_array(unit)).items()
-                },
-            )
+        return unit, FrontPoint(
+            limit=limit,
+            value=reached.value,
+            loss=here.loss,
+            kept=here.violation <= TOLERANCE,
+            geomean_rms_um=float(np.exp(np.mean(np.log(rms)))),
+            gains={
+                path: float(value)
+                for path, value in case.space.named(as_array(unit)).items()
+            },
         )
+
+    found, unit = [], search.unit
+    for limit in loosest_first:
+        unit, point = solved(limit, unit)
+        found.append((unit, point))
+    return [point for _, point in undominated(found, solved)]
+
+
+def undominated(
+    found: Sequence[Place], solved: Callable[[float, np.ndarray], Place]
+) -> list[Place]:
+    """Return the front, from its tightest limit back to the loosest.
+
+    A looser limit that came out worse than a tighter one is ``solved`` from it again.
+    """
+    found = list(found)
+    for i in reversed(range(len(found) - 1)):
+        (_, looser), (unit, tighter) = found[i : i + 2]
+        if tighter.kept and not (looser.kept and looser.loss <= tighter.loss):
+            found[i] = solved(looser.limit, unit)
     return found
