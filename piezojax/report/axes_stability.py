@@ -13,7 +13,7 @@ from ..stability.crossings import angle_grid
 from ..stability.margins import linear_axes
 from ..stability.multi_axis import MultiAxisReport, axes_report_of
 from ..system import Feedback
-from .figures import COLOURS, REFERENCE, figure
+from .figures import COLOURS, REFERENCE, figure, headed
 
 
 @dataclass(frozen=True)
@@ -87,5 +87,5 @@ def axes_figure(
         ax.set_ylim(bottom=1e-3)
         if ax.get_legend_handles_labels()[1]:
             ax.legend(fontsize=7.5, loc="lower right")
-    picture.suptitle(title)
+    headed(picture, title)
     return picture

@@ -12,7 +12,7 @@ from ..files import write_text
 from ..tune.baselines import Baselines, Contestant
 from ..tune.baselines.entries import BASELINES_FILE
 from .comparison import COLOURS, MARKERS
-from .figures import AFTER, figure, styled, ticks_in_full, write
+from .figures import AFTER, figure, headed, styled, ticks_in_full, write
 
 
 def baselines_table(found: Baselines) -> Table:
@@ -101,7 +101,8 @@ def baselines_figure(found: Baselines) -> Figure:
         label=ours.method,
         zorder=3,
     )
-    ax.set(xscale="log", xlabel="wall time, compiling included (s)", title=found.title)
+    ax.set(xscale="log", xlabel="wall time, compiling included (s)")
+    headed(picture, found.title)
     ticks_in_full(ax.xaxis)
     if geometric:
         ax.set(

@@ -10,7 +10,7 @@ from .. import motions
 from ..contour_error import nearest_on
 from ..study import Study
 from ..system import LoopSample
-from .figures import AFTER, BEFORE, REFERENCE, UNITS, figure, legend_above
+from .figures import AFTER, BEFORE, REFERENCE, UNITS, figure, headed, legend_above
 
 _MOST = 2  # contours in the picture
 _POINTS = 1500  # of each path
@@ -86,7 +86,7 @@ def contour_figure(
         right.set(xlabel="time (s)", ylabel=f"distance from the contour ({small})")
         legend_above(left)
         legend_above(right)
-    picture.suptitle(f"{title}: contours, hold-out runs")
+    headed(picture, f"{title}: contours, hold-out runs")
     return picture
 
 

@@ -9,7 +9,7 @@ from matplotlib.image import AxesImage
 from ..study import Study
 from ..tune.coupling import Coupling, coupling_matrix
 from ..tune.result import Result, Scores
-from .figures import UNITS, figure
+from .figures import UNITS, figure, headed
 
 _LEAST = 1e-6  # %; a smaller share has no colour of its own
 
@@ -48,7 +48,7 @@ def coupling_figure(study: Study, result: Result) -> Figure | None:
         label="rms error, % of the driven amplitude\n"
         "(of unlike units: µm per 100 µrad, µrad per 100 µm)",
     )
-    picture.suptitle(f"{result.title}: rms errors with one axis driven, hold-out")
+    headed(picture, f"{result.title}: rms errors with one axis driven, hold-out")
     return picture
 
 

@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
@@ -42,6 +43,11 @@ def figure(width: float, height: float) -> Figure:
     Made without pyplot: nothing global, no window, no backend to choose.
     """
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def headed(picture: Figure, title: str) -> None:
+    """Put ``title`` above all panels, in as many lines as the width needs."""
+    picture.suptitle(fill(title, int(11.0 * picture.get_figwidth())))
 
 
 def legend_above(ax: Axes) -> None:

@@ -11,7 +11,16 @@ from ..identify.estimate import LinearDetail
 from ..identify.fit import Fit
 from ..identify.record import Record
 from ..serial import save
-from .figures import AFTER, BEFORE, MEASURED, figure, legend_above, styled, write
+from .figures import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    figure,
+    headed,
+    legend_above,
+    styled,
+    write,
+)
 from .response import response_figure, singular_values_figure
 
 SHOWN = 400
@@ -88,7 +97,7 @@ def outputs_figure(fit: Fit) -> Figure:
             spectrum.legend()
     panels[-1, 0].set(xlabel="time (s)")
     panels[-1, 1].set(xlabel="frequency (Hz)")
-    picture.suptitle(f"{fit.report.model} fitted to {record.source}")
+    headed(picture, f"{fit.report.model} fitted to {record.source}")
     return picture
 
 
@@ -141,7 +150,7 @@ def fit_figure(fit: Fit) -> Figure:
         ylabel=f"amplitude ({unit})",
         title="Spectrum of the validation residual",
     )
-    picture.suptitle(f"{report.model} fitted to {record.source}")
+    headed(picture, f"{report.model} fitted to {record.source}")
     return picture
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from ..files import write_text
 from ..limit import NEAR, LimitReport, performance_limit
 from ..tune.tuner import Outcome
-from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
+from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, headed, styled, write
 
 LIMIT_FILE, LIMIT_PICTURE = "limit.json", "limit.png"
 
@@ -95,7 +95,7 @@ def limit_figure(found: LimitReport, title: str = "") -> Figure:
     _errors(left, found)
     _spectra(right, found)
     if title:
-        picture.suptitle(title)
+        headed(picture, title)
     return picture
 
 

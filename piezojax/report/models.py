@@ -19,6 +19,7 @@ from .figures import (
     MEASURED,
     REFERENCE,
     figure,
+    headed,
     styled,
     ticks_in_full,
     write,
@@ -140,7 +141,7 @@ def comparison_figure(comparison: Comparison) -> Figure:
     if single:
         loop_panel(picture.add_subplot(grid[0, 1]), best[0], "chosen")
     _residual_panel(picture.add_subplot(grid[1 if single else slice(None), 1]), best)
-    picture.suptitle(f"Models fitted to {record.source}")
+    headed(picture, f"Models fitted to {record.source}")
     return picture
 
 

@@ -8,7 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from .figures import figure
+from .figures import figure, headed
 from .sweep_scale import COLOUR_MAP, LOST, Panel, Parameter, colour_bar, kept, scale_of
 
 MOST_LINES = 1500
@@ -55,7 +55,7 @@ def parallel_coordinates(
             fontweight="normal",
             pad=20,
         )
-    picture.suptitle(title, fontsize=10.0)
+    headed(picture, title)
     return picture
 
 

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from ..tune.constraints import CONSTRAINTS
 from ..tune.result import FrontPoint, Perturbed, Result
-from .figures import AFTER, BEFORE, figure, ticks_in_full
+from .figures import AFTER, BEFORE, figure, headed, ticks_in_full
 
 
 def constraints_table(result: Result) -> Table:
@@ -79,7 +79,7 @@ def perturbed_figure(found: Perturbed | None, title: str) -> Figure | None:
         panel.axvline(kept.limit, color="0.3", ls="--", label=f"limit, {kept.sense}")
         panel.set_xlabel(_named(name))
         panel.legend()
-    picture.suptitle(title)
+    headed(picture, title)
     return picture
 
 
@@ -110,7 +110,7 @@ def front_figure(
     panel.set_xlabel(f"{_named(constraint)} on the worst plant tuned on")
     panel.set_ylabel("rms error on the nominal plant,\ngeometric mean, nm")
     panel.legend()
-    panel.set_title(title)
+    headed(picture, title)
     return picture
 
 

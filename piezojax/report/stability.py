@@ -17,7 +17,7 @@ from ..stability.crossings import angle_grid
 from ..stability.margins import StabilityReport, linear_loop, located_report
 from ..system import Feedback
 from .axes_stability import AxesStability, axes_figure, worse_branch
-from .figures import COLOURS, MEASURED, REFERENCE, figure, styled, write
+from .figures import COLOURS, MEASURED, REFERENCE, figure, headed, styled, write
 
 STABILITY_FILE, STABILITY_PICTURE = "stability.json", "stability.png"
 
@@ -143,7 +143,7 @@ def stability_figure(comparison: Comparison, title: str = "") -> Figure:
     if sensitivity.get_legend_handles_labels()[1]:
         sensitivity.legend(fontsize=7.5, loc="upper left")
     if title:
-        picture.suptitle(title)
+        headed(picture, title)
     return picture
 
 

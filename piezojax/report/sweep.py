@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from ..study.sweep_table import METRICS
-from .figures import AFTER, UNITS, figure, styled, write
+from .figures import AFTER, UNITS, figure, headed, styled, write
 from .parallel_coordinates import parallel_coordinates
 from .sweep_scale import COLOUR_MAP, LOST, Panel, Parameter, colour_bar, kept, scale_of
 
@@ -61,7 +61,7 @@ def metric_figure(dataset: "Dataset", name: str) -> Figure:
             ax.set_title(panel.title)
     for ax in places[len(shown) :]:
         ax.remove()
-    picture.suptitle(title, fontsize=10.0)
+    headed(picture, title)
     return picture
 
 

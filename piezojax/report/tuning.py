@@ -24,6 +24,7 @@ from .figures import (
     REFERENCE,
     UNITS,
     figure,
+    headed,
     legend_above,
     styled,
     write,
@@ -183,7 +184,7 @@ def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
         legend_above(right)
     for ax in axes[-1]:
         ax.set_xlabel("time (s)")
-    picture.suptitle(f"{outcome.result.title}: hold-out runs")
+    headed(picture, f"{outcome.result.title}: hold-out runs")
     return picture
 
 
