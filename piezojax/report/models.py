@@ -71,8 +71,8 @@ def comparison_table(report: ComparisonReport) -> Table:
     """Return the fitted models, best first, and those that failed."""
     table = Table(title=f"free-run rms error on the validation part, {report.unit}")
     table.add_column("model", no_wrap=True)
-    for title in ("error", "parameters", "BIC", "time, s", "notes"):
-        table.add_column(title, justify="right")
+    for title in ("error  ", "para-\nmeters", "BIC", "time,\ns", "notes"):
+        table.add_column(title, justify="right", no_wrap=True)
     least = min(row.bic for row in report.rows if row.bic is not None)
     for row in report.rows:
         if row.status == "not tried":
@@ -82,9 +82,9 @@ def comparison_table(report: ComparisonReport) -> Table:
             continue
         table.add_row(
             _broken(row.model),
-            f"{row.validation_rmse:.4g}{'' if row.as_good else ' *'}",
+            f"{row.validation_rmse:.3g} {' ' if row.as_good else '*'}",
             str(row.parameters),
-            f"+{row.bic - least:.1f}",
+            f"+{row.bic - least:.0f}",
             f"{row.wall_s:.1f}",
             str(len(row.warnings)),
             style="bold" if row.model == report.best else None,

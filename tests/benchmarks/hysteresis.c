@@ -351,6 +351,39 @@ INLINE void normalised_bouc_wen_step(const row *p, row *s, const double *x, doub
 
 MODEL(normalised_bouc_wen, 6, 2)
 
+/* z' = alpha y' - beta_gamma |y'| |z|^(nu-1) z - beta_delta y' |z|^nu, a Runge-Kutta step
+   along y, the input: alpha, beta_gamma, beta_delta, nu. Without force at y = 0. */
+
+INLINE double force_rate(const row *p, int l, double dy, double z)
+{
+    const double power = p[3][l] == 1.0 ? fabs(z) : pow(fabs(z), p[3][l]);
+    const double bend = p[1][l] * fabs(dy) * copysign(1.0, z) + p[2][l] * dy;
+
+    return p[0][l] * dy - bend * power;
+}
+
+INLINE void bouc_wen_start(const row *p, row *s)
+{
+    (void)p;
+    LANES s[0][l] = s[1][l] = 0.0;
+}
+
+INLINE void bouc_wen_step(const row *p, row *s, const double *x, double *y)
+{
+    LANES {
+        const double dy = x[l] - s[0][l], z = s[1][l];
+        const double a = force_rate(p, l, dy, z);
+        const double b = force_rate(p, l, dy, z + 0.5 * a);
+        const double c = force_rate(p, l, dy, z + 0.5 * b);
+        const double d = force_rate(p, l, dy, z + c);
+
+        s[1][l] = y[l] = z + (a + 2.0 * (b + c) + d) / 6.0;
+        s[0][l] = x[l];
+    }
+}
+
+MODEL(bouc_wen, 4, 2)
+
 /* x' = F u' + G |u'| with F = g0 + g1 u + g2 u^2, G = p0 + ... + p3 u^3 + c x and
    y = h0 + h1 x, a Runge-Kutta step along u: g, p, c, h, rest u, rest x. */
 

@@ -57,6 +57,10 @@ FEW = 12
 """Up to so many parameters forward mode may be the faster one: both are timed."""
 
 OTHERS = {
+    # A force over a displacement: the numbers are those of volts and um all the same.
+    "bouc_wen": lambda: piezojax.BoucWen(
+        alpha=0.12, beta_gamma=0.012, beta_delta=-0.008, nu=1.3
+    ),
     "duhem": lambda: piezojax.Duhem(
         reversible=[[0.08, 1e-4, -1e-6]],
         irreversible=[[1e-3, 7.7e-3, 1e-5, -1e-7], [-0.0487]],
@@ -75,7 +79,8 @@ OTHERS = {
         falling_tau=0.03,
     ),
 }
-"""Models timed with other numbers than those a fit starts from: no term is zero."""
+"""Models timed with other numbers than those a fit starts from, if one does: no term is
+zero."""
 
 MODELS = [name for name, (place, _) in PARTS.items() if place == "hysteresis"]
 MODELS += [name for name in OTHERS if name not in MODELS]
