@@ -20,6 +20,7 @@ from piezojax.identify import PARTS
 from piezojax.report.console import Bar, console, tuning_table
 from piezojax.reproduce import TABLES
 from piezojax.reproduce.cell import Cell
+from piezojax.reproduce.rates import FIGURE, RateError
 from piezojax.study import read
 
 COMMANDS = {
@@ -512,6 +513,8 @@ def made_up(monkeypatch):
 
     module = sys.modules["piezojax.reproduce.__main__"]
     monkeypatch.setattr(module, "reproduce", reproduce)
+    errors = [RateError(20_000, "continuous", row, 0.1) for row in ("SIN1", "SW10")]
+    monkeypatch.setattr(module, "errors_by_rate", lambda: errors)
     return asked
 
 
@@ -535,6 +538,8 @@ def test_reproduce_writes_its_results(made_up, tmp_path):
 def test_reproduce_all_tables_or_each_once(made_up, tmp_path):
     succeeded(call("reproduce", "--out", tmp_path / "a", "--quiet"))
     assert made_up == list(TABLES)
+    rates = (tmp_path / "a" / f"{FIGURE}.csv").read_text().splitlines()
+    assert rates[1:] == ["20000,continuous,SIN1,0.1", "20000,continuous,SW10,0.1"]
     made_up.clear()
     twice = ("--table", "5-5", "--table", "5-3", "--table", "5-5")
     succeeded(call("reproduce", *twice, "--out", tmp_path / "b"))
