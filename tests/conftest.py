@@ -5,7 +5,6 @@ import tempfile
 import jax
 import pytest
 from hypothesis import settings
-from jax.experimental.compilation_cache import compilation_cache
 
 # The same examples in every run: a red run can be repeated, a green one is no luck.
 settings.register_profile("repeatable", derandomize=True, deadline=None)
@@ -31,19 +30,10 @@ def pytest_sessionfinish():
 
 
 @pytest.fixture(scope="module")
-def kept_programs(tmp_path_factory):
-    """A folder of compiled programs: loops of one structure are compiled once."""
-    folder = str(tmp_path_factory.mktemp("programs"))
-    options = {
-        "jax_compilation_cache_dir": folder,
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-        "jax_persistent_cache_min_entry_size_bytes": -1,
-    }
-    before = {name: getattr(jax.config, name) for name in options}
-    for name, value in options.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
-    yield folder
-    for name, value in before.items():
-        jax.config.update(name, value)
-    compilation_cache.reset_cache()
+def kept_programs():
+    """Small compiled programs are shared too: a loop made again costs its tracing."""
+    name = "jax_persistent_cache_min_compile_time_secs"
+    before = getattr(jax.config, name)
+    jax.config.update(name, 0.0)
+    yield
+    jax.config.update(name, before)

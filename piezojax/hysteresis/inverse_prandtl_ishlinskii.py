@@ -10,7 +10,7 @@ from .inverse import Inverse
 from .plays import Memory, memoryless, weighted
 from .prandtl_ishlinskii import PrandtlIshlinskii
 
-ITERATIONS = 8
+ITERATIONS = 20
 """Newton steps, halving where one leaves the bracket, for a polynomial P."""
 
 

@@ -67,14 +67,15 @@ def cases(draw):
     """Models that rise with any input, or, a fifth of them, within 150 V."""
     slope = draw(st.floats(0.02, 0.5))
     gaps = draw(st.lists(st.floats(0.1, 20.0), min_size=4, max_size=4))
-    weights, total = [], slope
+    weights, total, least = [], slope, slope
     for share in draw(st.lists(st.floats(-0.4, 1.0), min_size=4, max_size=4)):
         weights.append(share * total)
         total += weights[-1]
+        least = min(least, total)  # the flattest, of any plays moving
     bend = draw(unit)
     if draw(st.integers(0, 4)):
         cubic = draw(st.floats(1e-9, 1e-5))
-        curve = (0.9 * bend * np.sqrt(3.0 * slope * cubic), cubic)
+        curve = (0.9 * bend * np.sqrt(3.0 * least * cubic), cubic)
     else:
         curve = (0.15 * bend * slope / 150.0, -0.1 * slope / 150.0**2)
         weights = [abs(w) for w in weights]

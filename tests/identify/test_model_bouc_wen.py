@@ -57,10 +57,16 @@ def made(seed, truth=TRUTH):
     return record_of(force, displacement)
 
 
+def of_two_starts(record):
+    """The structure with fewer of its starts: what two find, all of them find."""
+    structure = bouc_wen(record)
+    return structure._replace(starts=structure.starts[:2])
+
+
 def test_all_parameters_are_recovered_from_a_made_record():
     factor = 16
     fine = resample(made(1), factor)
-    system, errors = fit_structure(bouc_wen(fine), fine, steps=60)
+    system, errors = fit_structure(of_two_starts(fine), fine, steps=60)
     found = {
         "mass": system.mass,
         "damping": system.damping,
@@ -137,7 +143,7 @@ def test_truth_reproduces_the_shared_record_to_its_noise(benchmark):
 def test_white_box_on_the_shared_record(benchmark):
     mean, fresh = benchmark
     fine = resample(mean, 8)
-    system, _ = fit_structure(bouc_wen(fine), fine, settle=8 * 1000, steps=60)
+    system, _ = fit_structure(of_two_starts(fine), fine, settle=8 * 1000, steps=60)
     assert rms(predicted(system, fresh, 8) - fresh.output) < 6e-7  # m; bar 3e-6
 
 
