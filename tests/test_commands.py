@@ -478,8 +478,8 @@ def test_identify_bad_input(record, tmp_path):
         "input column 'volts' is missing; there are time_s, drive_V, sensor_um",
     )
     failed(
-        call("identify", record, *out, *COLUMNS, "--model", "preisach"),
-        "a model has no part 'preisach'; there are coleman_hodgdon",
+        call("identify", record, *out, *COLUMNS, "--model", "maxwell"),
+        "a model has no part 'maxwell'; there are coleman_hodgdon",
     )
     failed(
         call("identify", record, *out, *COLUMNS, "--train", "100:50"),
