@@ -109,15 +109,6 @@ def test_stops_are_chosen_as_the_plays_that_they_are():
 
 
 @pytest.mark.slow
-def test_plays_that_widen_with_the_rate_are_told_from_those_that_do_not():
-    name = "rate_dependent_prandtl_ishlinskii"
-    record, plant, clean = made_by_plays(name, growth=1e-3)
-    found = chosen_of_plays(record, ["prandtl_ishlinskii", name])
-    assert found.report.best == f"{name}+lag"
-    check_recovered(found.best, plant, clean)
-
-
-@pytest.mark.slow
 def test_the_micromanipulator():
     # Its sensor's noise is 0.067 um, cycles differ by as much.
     if MICROMANIPULATOR.is_file():
