@@ -10,9 +10,6 @@ from hypothesis import settings
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
-# Tracing makes millions of objects that stay: looking through them takes time.
-gc.set_threshold(100_000, 20, 100)
-
 
 def pytest_configure(config):
     """Let all workers and commands of a run share what they compile.
