@@ -208,8 +208,7 @@ def _against_regression(
     records: Sequence[Record], train: slice, options: Options
 ) -> str | None:
     del options
-    against = _against_several_records(records) or _several(records)
-    if against:
+    if against := _against_all_but_one(records):
         return against
     found = excitation(records, train)
     needed = len(PARTS["arma"][1](extent_of(records[0])).bounds)
@@ -244,10 +243,14 @@ def _against_preisach(
     records: Sequence[Record], train: slice, options: Options
 ) -> str | None:
     del options
-    against = _against_several_records(records) or _several(records)
-    if against:
+    if against := _against_all_but_one(records):
         return against
     return None if cells_told_apart(records[0], train) else TOO_FEW
+
+
+def _against_all_but_one(records: Sequence[Record]) -> str | None:
+    """Return what speaks against all but one record of one input and one output."""
+    return _against_several_records(records) or _several(records)
 
 
 def _against_several_records(records: Sequence[Record]) -> str | None:

@@ -21,12 +21,9 @@ from scipy.signal import lfilter
 
 from .._types import as_array, check
 from ..hysteresis import HystereticARMA
-from .output_error import free_run
+from .output_error import HOPELESS, free_run
 from .record import Record
 from .regressors import Orders, operated, row_matrix, rows
-
-DIVERGED = 1e100
-"""Mean square of a run that is not finite; the search for c does sums with it."""
 
 GRID = 9
 """Values of c on the coarse grid, in equal ratios between its bounds."""
@@ -287,7 +284,8 @@ def _search(
 
     def loss(c: float, theta: np.ndarray) -> float:
         mean_square = float(np.mean(problem.error(c, theta) ** 2))
-        return mean_square if np.isfinite(mean_square) else DIVERGED
+        # Finite, because the search does sums with it.
+        return mean_square if mean_square < HOPELESS else HOPELESS
 
     grid = -np.geomspace(-lowest, -highest, GRID)
     fits, theta = [], None
@@ -296,7 +294,7 @@ def _search(
         fits.append(theta)
     losses = [loss(value, theta) for value, theta in zip(grid, fits, strict=True)]
     best = int(np.argmin(losses))
-    if losses[best] >= DIVERGED:
+    if losses[best] >= HOPELESS:
         raise ValueError("no c in its bounds led to a finite simulation of the record")
     found = minimize_scalar(
         lambda value: loss(value, fit(value, fits[best])),

@@ -86,19 +86,15 @@ def made_by_plays(name, **more):
     return Record(input, clean + noise, DT, source="made up"), plant, clean
 
 
-def chosen_of_plays(record, among):
-    found = identify_all(
-        record, hysteresis=among, train=TRAIN, options=Options(steps=60)
-    )
-    assert {f"{name}+lag" for name in among} < set(found.fits)
-    return found
-
-
 def test_stops_are_chosen_as_the_plays_that_they_are():
     record, plant, clean = made_by_plays(
         "stop_prandtl_ishlinskii", **{"polynomial.0": 0.152}
     )
-    found = chosen_of_plays(record, ["prandtl_ishlinskii", "stop_prandtl_ishlinskii"])
+    among = ["prandtl_ishlinskii", "stop_prandtl_ishlinskii"]
+    found = identify_all(
+        record, hysteresis=among, train=TRAIN, options=Options(steps=60)
+    )
+    assert {f"{name}+lag" for name in among} < set(found.fits)
     assert found.report.best == "prandtl_ishlinskii+lag"
     rows = {row.model: row for row in found.report.rows}
     note = rows["stop_prandtl_ishlinskii+lag"].note
