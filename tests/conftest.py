@@ -11,8 +11,11 @@ settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
 
+ONE_THREAD = "--xla_cpu_parallel_codegen_split_count=1"
+
+
 def pytest_configure(config):
-    """Let all workers and commands of a run share what they compile.
+    """Let all workers and commands of a run share what they compile, each on a core.
 
     Most of the time goes into compiling, and many files compile the same loops.
     """
@@ -21,6 +24,9 @@ def pytest_configure(config):
     folder = tempfile.TemporaryDirectory(prefix="piezojax-programs-")
     os.environ["PIEZOJAX_COMPILATION_CACHE"] = folder.name
     config.add_cleanup(folder.cleanup)
+    # There is a worker for each core: a compiler of several threads gains nothing.
+    flags = [os.environ.get("XLA_FLAGS", ""), ONE_THREAD]
+    os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 
 
 def pytest_sessionfinish():

@@ -144,18 +144,18 @@ def _downwards(rows: Rows) -> Way:
 
 
 @partial(jax.checkpoint, prevent_cse=False)
-def outputs(rows: Rows, levels: Levels) -> Float[Array, " cells"]:
-    """Return what each line of relays puts out, um.
+def outputs(levels: Levels, *densities: Rows) -> tuple[Levels, ...]:
+    """Return, for each density, what each line of its relays puts out, um.
 
     In reverse mode it is worked out again: that is four times faster than storing it.
     """
-    total = jnp.zeros_like(levels)
-    for beta, weights in enumerate(rows):
+    totals = [jnp.zeros_like(levels) for _ in densities]
+    for beta, weights in enumerate(zip(*densities, strict=True)):
         along = levels - beta
         # Not jnp.clip: at an edge this has the slope of the cell above it.
         up = jnp.where(along < 0.0, 0.0, jnp.where(along < 1.0, along, 1.0))
-        total = total + weights * up
-    return total
+        totals = [t + own * up for t, own in zip(totals, weights, strict=True)]
+    return tuple(totals)
 
 
 class PlayLines(System):
@@ -209,7 +209,8 @@ class PlayLines(System):
 
     def step(self, state: Levels, input: ScalarLike) -> tuple[Levels, Scalar]:
         state = self.played(state, input)
-        return state, self.lowest + jnp.sum(outputs(self.rows, state))
+        (lines,) = outputs(state, self.rows)
+        return state, self.lowest + jnp.sum(lines)
 
     def solve(self, state: Levels, wanted: ScalarLike) -> Scalar:
         """Return the input (V) for which the next output is ``wanted`` (um).
@@ -221,7 +222,7 @@ class PlayLines(System):
         smallest of their n solutions is the solution. Downwards everything is
         reflected: what remains of a line is counted from the top.
         """
-        held = outputs(self.rows, state)
+        (held,) = outputs(state, self.rows)
         rise = as_array(wanted) - self.lowest - jnp.sum(held)
         up = rise >= 0.0
         sign = jnp.where(up, 1.0, -1.0)

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from .._types import Matrix, Scalar, ScalarLike, as_array, as_matrix, check
 from ..system import Designed, System
@@ -60,8 +61,14 @@ class _Blend(System):
         return self.slow.init(input)
 
     def step(self, state: Levels, input: ScalarLike) -> tuple[Levels, Scalar]:
-        levels, slow = self.slow.step(state, input)
-        fast = self.slow.lowest + jnp.sum(outputs(self.fast, levels))
+        levels = self.slow.played(state, input)
+        slow, fast = outputs(levels, self.slow.rows, self.fast)
         # Of both, element 0 is the input.
-        square = ((levels[0] - state[0]) / self.half_way) ** 2
-        return levels, slow + square / (1.0 + square) * (fast - slow)
+        share = fast_share((levels[0] - state[0]) / self.half_way)
+        return levels, self.slow.lowest + jnp.sum(slow + share * (fast - slow))
+
+
+def fast_share(rate: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return how far the density is the fast one, at a rate over that half way."""
+    square = rate**2
+    return square / (1.0 + square)

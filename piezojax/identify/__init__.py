@@ -14,6 +14,7 @@ from .neural import neural_start as neural_start
 from .output_error import free_run as free_run
 from .parts import PARTS as PARTS
 from .preisach import fit_preisach as fit_preisach
+from .preisach import fit_rate_dependent_preisach as fit_rate_dependent_preisach
 from .record import Record as Record
 from .record import read_record as read_record
 from .recursive import Measured as Measured

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from .checks import lines
 from .estimate import Options
 from .methods import METHODS
-from .model_preisach import TOO_FEW, cells_told_apart
+from .model_preisach import PLAIN, RATE_DEPENDENT, TOO_FEW, cells_told_apart
 from .parts import OWN_DYNAMICS, PARTS, extent_of
 from .record import Record
 
@@ -240,12 +240,11 @@ def _against_periods(
 
 
 def _against_preisach(
-    records: Sequence[Record], train: slice, options: Options
+    model: str, records: Sequence[Record], train: slice
 ) -> str | None:
-    del options
     if against := _against_all_but_one(records):
         return against
-    return None if cells_told_apart(records[0], train) else TOO_FEW
+    return None if cells_told_apart(records[0], train, model) else TOO_FEW[model]
 
 
 def _against_all_but_one(records: Sequence[Record]) -> str | None:
@@ -262,6 +261,9 @@ _AGAINST = {
     "state_space": _against_state_space,
     "bouc_wen": lambda *of: _against_periods(*of) or _several(of[0]),
     "neural_state_space": _against_periods,
-    "preisach": _against_preisach,
+    PLAIN: lambda records, train, _: _against_preisach(PLAIN, records, train),
+    RATE_DEPENDENT: lambda records, train, _: _against_preisach(
+        RATE_DEPENDENT, records, train
+    ),
 }
 """What speaks against a model; one that is not here is tried on any record."""

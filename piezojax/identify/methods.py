@@ -13,7 +13,7 @@ from ..system import System
 from .estimate import Estimate, FittedParameter, Options
 from .linear import by_frequency_response, by_subspace
 from .model_bouc_wen import bouc_wen
-from .model_preisach import preisach_with_lag
+from .model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
 from .models import structure
 from .neural import fit_neural_state_space
 from .output_error import Optimum, from_rest, output_error
@@ -151,7 +151,7 @@ def _by_nonnegative_least_squares(
     del options
     record = _single(records)
     progress.stage(f"searching for the lag behind the {model} model")
-    found = preisach_with_lag(record, train)
+    found = preisach_with_lag(record, train, model)
     named = {
         name: FittedParameter(value=value, standard_error=deviation)
         for (name, value), deviation in zip(
@@ -159,7 +159,7 @@ def _by_nonnegative_least_squares(
         )
     }
     runs = _free_runs([found.system], [record])
-    return Estimate(found.system, runs, named, [], 1, True)
+    return Estimate(found.system, runs, named, found.warnings, 1, True)
 
 
 def _single(records: Records) -> Record:
@@ -191,8 +191,8 @@ METHODS: dict[str, Method] = {
         _by_regression(least_squares),
     ),
     "nonnegative_least_squares": Method(
-        "weights of a Preisach triangle behind the lag that fits best",
-        ("preisach",),
+        "weights of Preisach triangles behind the lag that fits best",
+        (PLAIN, RATE_DEPENDENT),
         _by_nonnegative_least_squares,
     ),
     "subspace": Method(

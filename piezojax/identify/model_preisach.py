@@ -1,19 +1,32 @@
-"""A Preisach model behind a lag, as fine as the record can tell its cells apart."""
+"""Preisach models behind a lag, as fine as the record can tell their cells apart."""
 
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import OptimizeResult, least_squares
 
 from .._types import as_array
 from ..dynamics import FirstOrderLag
-from ..hysteresis import Preisach
+from ..hysteresis import Preisach, RateDependentPreisach
 from ..hysteresis.preisach import STARTS
+from ..paths import parameters, replace
 from ..system import Series, series
 from .output_error import from_rest, standard_errors
-from .preisach import fit_preisach, responses
+from .preisach import (
+    empty,
+    fit_preisach,
+    fit_rate_dependent_preisach,
+    line_by_line,
+    responses,
+)
 from .record import Record
+
+Model = Preisach | RateDependentPreisach
+
+PLAIN, RATE_DEPENDENT = "preisach", "rate_dependent_preisach"
+"""The models' names; the second one has two densities, blended by the rate."""
 
 CELLS = range(3, 11)
 """Cells a side that a fit may have."""
@@ -22,38 +35,80 @@ TOLD_APART = 1e-3
 """Least rms that the output changes by with weights moved by 1 um in all, shared out in
 whatever way shows least: below that, nanometres decide about tenths of a micrometre."""
 
-TOO_FEW = (
-    "the turning points of the training part do not tell even the cells of a Preisach "
-    f"triangle with {CELLS[0]} a side apart"
-)
-"""Why a record supports no Preisach model."""
+TOO_FEW = {
+    PLAIN: "the turning points of the training part do not tell even the cells of a "
+    f"Preisach triangle with {CELLS[0]} a side apart",
+    RATE_DEPENDENT: "turning points and paces of the training part do not tell even "
+    f"the cells of two Preisach triangles with {CELLS[0]} a side apart",
+}
+"""Why a record supports no such model."""
 
 LAGS = (0.05, 50.0)
 """Bounds of the lag, samples."""
 
-STEP = 1e-4
-"""Share by which the lag is changed for the slope of the output by it."""
+LAG = 1.5
+"""Where the search for the lag begins, samples."""
 
-OPTIONS = {"xatol": 1e-3}
-"""Accuracy of the lag's logarithm: far below its standard error."""
+RATES = (0.1, 10.0)
+"""Bounds of the rate at which both densities count alike, over the input's own: how
+fast it moves in the root mean square."""
+
+FIRST_RATES = (0.3, 1.0, 3.0)
+"""The best of these is where the search for that rate begins, in the same way."""
+
+STEP = 1e-4
+"""Share by which a lag or a rate is changed for the slope of the output by it."""
+
+ENDED = 1e-5
+"""Change of the logarithms at which their search ends: far below standard errors."""
+
+
+STEPS = 20
+"""Most steps of that search."""
+
+EDGE = 1e-3
+"""How close to a bound, as a share of a logarithm's range, an unknown lies at it."""
+
+
+class Chain(NamedTuple):
+    """A model and what follows it."""
+
+    hysteresis: Model
+    lag: FirstOrderLag
+
+    def system(self) -> Series:
+        """Return both as one plant."""
+        return series(hysteresis=self.hysteresis, lag=self.lag)
+
+
+class Unknown(NamedTuple):
+    """What is searched for, above 0: its bounds, and of which the best is the start."""
+
+    name: str
+    least: float
+    most: float
+    firsts: tuple[float, ...]
 
 
 class PreisachFit(NamedTuple):
-    """The plant, and values and standard errors of its parameters by name."""
+    """The plant, values and standard errors of its parameters by name, what to say."""
 
     system: Series
     values: dict[str, float]
     deviations: list[float | None]
+    warnings: list[str]
 
 
-def cells_told_apart(record: Record, train: slice) -> int:
+def cells_told_apart(record: Record, train: slice, model: str = PLAIN) -> int:
     """Return how many cells a side the samples ``train`` can tell apart, 0 for none."""
-    seen = record.until(train.stop)
-    input = _a_sample_later(seen.input)
-    limits = float(seen.input.min()), float(seen.input.max())
+    seen = _a_sample_later(record.until(train.stop))
     for cells in reversed(CELLS):
-        shape = Preisach(np.zeros((cells, cells)), *limits, 0.0, input[0])
-        rows = responses(shape, input, None, train)
+        shape = empty(seen, cells, None, "virgin")
+        if model == RATE_DEPENDENT:
+            if not _pace(seen):
+                return 0
+            shape = RateDependentPreisach(shape, shape.weights, _pace(seen), seen.dt)
+        rows = responses(shape, seen.input, None, train)
         strength = np.linalg.svd(rows - rows.mean(axis=0), compute_uv=False)
         if len(rows) >= rows.shape[1] and (
             strength[-1] >= TOLD_APART * np.sqrt(len(rows))
@@ -62,78 +117,134 @@ def cells_told_apart(record: Record, train: slice) -> int:
     return 0
 
 
-def preisach_with_lag(record: Record, train: slice) -> PreisachFit:
+def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:
     """Return the Preisach model and lag whose free run fits ``record`` best.
 
-    For each lag the weights are those of ``fit_preisach``, and the best lag is searched
-    for; of both histories before the record, virgin and saturated, the better is taken.
-    Raises ValueError as ``fit_preisach``, and where the record tells too few cells
-    apart.
+    For each lag (and rate) the weights are those of ``fit_preisach`` (or
+    ``fit_rate_dependent_preisach``), so only these are searched for; of both histories
+    before the record, virgin and saturated, the better is taken. Raises ValueError as
+    those functions, and where the record tells too few cells apart.
     """
-    cells = cells_told_apart(record, train)
+    cells = cells_told_apart(record, train, model)
     if not cells:
-        raise ValueError(TOO_FEW)
+        raise ValueError(TOO_FEW[model])
     seen = record.until(train.stop)
-    shifted = Record(_a_sample_later(seen.input), seen.output, seen.dt)
-    limits = float(seen.input.min()), float(seen.input.max())
+    shifted = _a_sample_later(seen)
+    unknowns = _unknowns(shifted, model)
     run = eqx.filter_jit(from_rest)
 
-    def fitted(log_lag: float, start: str) -> tuple[Preisach, FirstOrderLag]:
-        lag = FirstOrderLag(float(np.exp(log_lag)), record.dt)
-        hysteresis = fit_preisach(
+    def fitted(logs: np.ndarray, start: str) -> Chain:
+        lag, *rate = (float(value) for value in np.exp(logs))
+        dynamics = FirstOrderLag(lag, seen.dt)
+        fit = fit_rate_dependent_preisach if rate else fit_preisach
+        hysteresis = fit(
             shifted,
-            cells,
+            *rate,
+            cells=cells,
             train=train,
-            limits=limits,
-            dynamics=lag.as_arma(),
+            dynamics=dynamics.as_arma(),
             start=start,
         )
-        return hysteresis, lag
+        return Chain(hysteresis, dynamics)
 
-    def errors(hysteresis: Preisach, lag: FirstOrderLag) -> np.ndarray:
-        system = series(hysteresis=hysteresis, lag=lag)
+    def errors(system: Series) -> np.ndarray:
         return (np.asarray(run(system, as_array(seen.input))) - seen.output)[train]
 
-    def misfit(log_lag: float, start: str) -> float:
-        return float(np.mean(errors(*fitted(log_lag, start)) ** 2))
+    def reduced(logs: np.ndarray, start: str) -> np.ndarray:
+        return errors(fitted(logs, start).system())
 
-    bounds = tuple(np.log(np.array(LAGS) * record.dt))
-    found = {
-        start: minimize_scalar(
-            misfit, args=(start,), bounds=bounds, method="bounded", options=OPTIONS
-        )
-        for start in STARTS
-    }
-    start = min(found, key=lambda name: found[name].fun)
-    best = float(found[start].x)
-    hysteresis, lag = fitted(best, start)
-    left = errors(hysteresis, lag)
-    tau = float(np.exp(best))
-    slower = FirstOrderLag(tau * (1.0 + STEP), record.dt)
+    def slopes(logs: np.ndarray, start: str) -> np.ndarray:
+        steps = STEP * np.eye(logs.size)
+        here = reduced(logs, start)
+        return np.column_stack([reduced(logs + s, start) - here for s in steps]) / STEP
+
+    def end(start: str) -> OptimizeResult:
+        firsts = map(np.log, itertools.product(*(u.firsts for u in unknowns)))
+        first = min(firsts, key=lambda logs: float(np.sum(reduced(logs, start) ** 2)))
+        options = {"jac": slopes, "bounds": bounds, "args": (start,)}
+        ending = {"xtol": ENDED, "max_nfev": STEPS}
+        return least_squares(reduced, first, **options, **ending)
+
+    bounds = np.log([[u.least, u.most] for u in unknowns]).T
+    ends = {start: end(start) for start in STARTS}
+    start = min(STARTS, key=lambda start: ends[start].cost)
+    logs, warnings = ends[start].x, _at_edges(unknowns, ends[start].x)
+    if not ends[start].status:
+        warnings.append(f"lag and rate were still moving after {STEPS} steps")
+    hysteresis, lag = fitted(logs, start)
+    found = Chain(hysteresis, lag).system()
+    left = errors(found)
+    values = {u.name: float(v) for u, v in zip(unknowns, np.exp(logs), strict=True)}
+    moved = [
+        (errors(replace(found, {name: value * (1.0 + STEP)})) - left) / (value * STEP)
+        for name, value in values.items()
+    ]
     jacobian = np.column_stack(
         [
             responses(hysteresis, shifted.input, lag.as_arma(), train),
             np.ones(left.size),
-            (errors(hysteresis, slower) - left) / (tau * STEP),
+            *moved,
         ]
     )
     variance = float(np.sum(left**2)) / max(left.size - jacobian.shape[1], 1)
-    weights = np.asarray(hysteresis.weights)
-    values = {
-        # Line by line, as the columns of the responses are.
-        f"hysteresis.weights.{j + k}.{j}": float(weights[j + k, j])
-        for k in range(cells)
-        for j in range(cells - k)
-    }
-    values["hysteresis.lowest"] = float(hysteresis.lowest)
-    values["lag.time_constant"] = tau
     return PreisachFit(
-        series(hysteresis=hysteresis, lag=lag),
-        values,
+        found,
+        _named(hysteresis, cells) | values,
         standard_errors(jacobian, variance),
+        warnings,
     )
 
 
-def _a_sample_later(input: np.ndarray) -> np.ndarray:
-    # A plant maps u(k) to y(k+1).
-    return np.concatenate([input[:1], input[:-1]])
+def _unknowns(record: Record, model: str) -> list[Unknown]:
+    """Return what the weights do not follow from, in the order of ``fitted``."""
+    found = [
+        Unknown(
+            "lag.time_constant",
+            LAGS[0] * record.dt,
+            LAGS[1] * record.dt,
+            (LAG * record.dt,),
+        )
+    ]
+    if model == RATE_DEPENDENT:
+        pace = _pace(record)
+        firsts = tuple(pace * first for first in FIRST_RATES)
+        found.append(
+            Unknown("hysteresis.rate", RATES[0] * pace, RATES[1] * pace, firsts)
+        )
+    return found
+
+
+def _named(hysteresis: Model, cells: int) -> dict[str, float]:
+    """Return the weights and the lowest output, in the order of the responses."""
+    known = parameters(hysteresis, "hysteresis.")
+    values = {
+        f"{name}.{i}.{j}": float(leaf[i, j])
+        for name, leaf in known.items()
+        if leaf.ndim == 2
+        for i, j in line_by_line(cells)
+    }
+    return values | {
+        name: float(leaf) for name, leaf in known.items() if name.endswith(".lowest")
+    }
+
+
+def _at_edges(unknowns: list[Unknown], logs: np.ndarray) -> list[str]:
+    return [
+        f"{u.name} lies at the edge of its bounds"
+        for u, log in zip(unknowns, logs, strict=True)
+        if not EDGE < (log - np.log(u.least)) / np.log(u.most / u.least) < 1.0 - EDGE
+    ]
+
+
+def _pace(record: Record) -> float:
+    """Return how fast the input moves in the root mean square, V/s."""
+    return float(np.sqrt(np.mean(np.diff(record.input) ** 2))) / record.dt
+
+
+def _a_sample_later(record: Record) -> Record:
+    """Return ``record`` with the input that a model has at each output.
+
+    A plant maps u(k) to y(k+1).
+    """
+    input = np.concatenate([record.input[:1], record.input[:-1]])
+    return Record(input, record.output, record.dt)

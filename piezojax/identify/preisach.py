@@ -1,4 +1,4 @@
-"""The density of a Preisach model from a record, by non-negative least squares."""
+"""Densities of Preisach models from a record, by non-negative least squares."""
 
 from typing import Any
 
@@ -8,10 +8,11 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.signal import lfilter
 
-from .._types import State
+from .._types import State, as_array
 from ..dynamics import ARMA
-from ..hysteresis import Preisach
+from ..hysteresis import Preisach, RateDependentPreisach
 from ..hysteresis.preisach import Levels, PlayLines
+from ..hysteresis.rate_dependent_preisach import fast_share
 from ..rollout import simulate
 from ..system import System
 from .record import Record
@@ -49,48 +50,110 @@ def fit_preisach(
     input, ``cells`` or ``smoothing`` out of range, or an output that falls while the
     input rises.
     """
+    shape = empty(record, cells, limits, start)
+    (weights,), lowest = _densities(record, shape, train, dynamics, smoothing)
+    return Preisach(weights, shape.low, shape.high, lowest, shape.rest_input, start)
+
+
+def fit_rate_dependent_preisach(
+    record: Record,
+    rate: float,
+    cells: int = 20,
+    *,
+    train: slice | None = None,
+    limits: tuple[float, float] | None = None,
+    dynamics: ARMA | None = None,
+    smoothing: float = 0.0,
+    start: str = "virgin",
+) -> RateDependentPreisach:
+    """Return the two densities, half way at ``rate`` (V/s), that fit ``record`` best.
+
+    For a given rate the output is linear in both, (2.10): all is as in fit_preisach,
+    for each of the two. A record that knows one speed only does not tell them apart.
+    Raises ValueError as fit_preisach, and for ``rate <= 0``.
+    """
+    slow = empty(record, cells, limits, start)
+    shape = RateDependentPreisach(slow, slow.weights, rate, record.dt)
+    found, lowest = _densities(record, shape, train, dynamics, smoothing)
+    weights, fast = found
+    slow = Preisach(weights, slow.low, slow.high, lowest, slow.rest_input, start)
+    return RateDependentPreisach(slow, fast, rate, record.dt)
+
+
+def empty(
+    record: Record, cells: int, limits: tuple[float, float] | None, start: str
+) -> Preisach:
+    """Return a model with no weights for the input of ``record``, and its limits.
+
+    Raises ValueError for less than one cell or limits that do not hold the input.
+    """
     if cells < 1:
         raise ValueError(f"cells is {cells}; it must be at least 1")
-    if not smoothing >= 0.0:
-        raise ValueError(f"smoothing is {smoothing:g}; it must be at least 0")
-    input, output = record.input, record.output
-    extremes = float(input.min()), float(input.max())
+    extremes = float(record.input.min()), float(record.input.max())
     low, high = limits or extremes
     if not (low <= extremes[0] and extremes[1] <= high):
         raise ValueError(
             f"limits are {low:g} to {high:g} V; the input runs from {extremes[0]:g} "
             f"to {extremes[1]:g} V"
         )
+    return Preisach(np.zeros((cells, cells)), low, high, 0.0, record.input[0], start)
+
+
+def _densities(
+    record: Record,
+    shape: Preisach | RateDependentPreisach,
+    train: slice | None,
+    dynamics: ARMA | None,
+    smoothing: float,
+) -> tuple[list[np.ndarray], float]:
+    """Return the weights of each density of ``shape``, and the lowest output, um."""
+    if not smoothing >= 0.0:
+        raise ValueError(f"smoothing is {smoothing:g}; it must be at least 0")
     part = train or slice(None)
-    wanted = output[part]
+    wanted = record.output[part]
     if not wanted.size:
         raise ValueError(
             f"train is {part.start}:{part.stop}; it must hold some of "
             f"{record.samples} samples"
         )
-    slope = float(np.cov(input, output)[0, 1] / np.var(input))
+    slope = float(np.cov(record.input, record.output)[0, 1] / np.var(record.input))
     if slope <= 0.0:
         raise ValueError(
             "the output falls while the input rises; give one with the other sign"
         )
-    shape = Preisach(np.zeros((cells, cells)), low, high, 0.0, input[0], start)
-    places = [(j + k, j) for k in range(cells) for j in range(cells - k)]
-    rows = responses(shape, input, dynamics, part)
+    slow = _slow(shape)
+    cells = slow.cells
+    places = line_by_line(cells)
+    rows = responses(shape, record.input, dynamics, part)
+    count = rows.shape[1] // len(places)
     least = np.zeros(len(places))
-    least[:cells] = LEAST_SLOPE * slope * (high - low) / cells
+    least[:cells] = LEAST_SLOPE * slope * float(slow.high - slow.low) / cells
+    least = np.tile(least, count)
     centre = rows.mean(axis=0)
     rough = smoothing * np.sqrt(wanted.size) * _differences(places)
+    rough = np.kron(np.eye(count), rough)
     matrix = np.vstack([rows - centre, rough])
     right = np.append(wanted - wanted.mean(), np.zeros(len(rough))) - matrix @ least
     # The triangle of the factorisation holds all that the search needs.
     both = np.column_stack([matrix, right])
     small = np.asarray(np.linalg.qr(both, mode="r"))
-    found = least + nnls(small[:, :-1], small[:, -1], maxiter=100 * len(places))[0]
-    weights = np.zeros((cells, cells))
-    weights[tuple(np.transpose(places))] = found
+    found = least + nnls(small[:, :-1], small[:, -1], maxiter=100 * least.size)[0]
+    densities = []
+    for own in np.split(found, count):
+        weights = np.zeros((cells, cells))
+        weights[tuple(np.transpose(places))] = own
+        densities.append(weights)
     gain = 1.0 if dynamics is None else float(dynamics.dc_gain())
-    lowest = float(wanted.mean() - centre @ found) / gain
-    return Preisach(weights, low, high, lowest, input[0], start)
+    return densities, float(wanted.mean() - centre @ found) / gain
+
+
+def _slow(shape: Preisach | RateDependentPreisach) -> Preisach:
+    return shape.slow if isinstance(shape, RateDependentPreisach) else shape
+
+
+def line_by_line(cells: int) -> list[tuple[int, int]]:
+    """Return the cells in the order of ``responses``: that of PlayLines."""
+    return [(j + k, j) for k in range(cells) for j in range(cells - k)]
 
 
 class _Memory(System):
@@ -113,18 +176,28 @@ def _levels(shape: Preisach, input: Any) -> Any:
 
 
 def responses(
-    shape: Preisach, input: np.ndarray, dynamics: ARMA | None, part: slice
+    shape: Preisach | RateDependentPreisach,
+    input: np.ndarray,
+    dynamics: ARMA | None,
+    part: slice,
 ) -> np.ndarray:
     """Return what a weight of 1 um in each cell puts out over ``part``, a column each.
 
-    Cells line by line, as ``PlayLines`` has them.
+    Cells ``line_by_line``, first those of the slow density, then of a fast one.
     """
-    columns = []
-    for k, level in enumerate(np.asarray(_levels(shape, jnp.asarray(input))).T):
-        steps = np.arange(shape.cells - k)
-        share = np.clip(level[:, None] - steps, 0.0, 1.0)
-        columns.append(_passed(share, dynamics)[part])
-    return np.hstack(columns)
+    slow = _slow(shape)
+    levels = np.asarray(_levels(slow, jnp.asarray(input)))
+    up = np.hstack(
+        [
+            np.clip(levels[:, [k]] - np.arange(slow.cells - k), 0.0, 1.0)
+            for k in range(slow.cells)
+        ]
+    )
+    if isinstance(shape, RateDependentPreisach):
+        rate = np.diff(input, prepend=input[0]) / shape.dt
+        fast = np.asarray(fast_share(as_array(rate) / shape.rate))[:, None]
+        up = np.hstack([(1.0 - fast) * up, fast * up])
+    return _passed(up, dynamics)[part]
 
 
 def _passed(signals: np.ndarray, dynamics: ARMA | None) -> np.ndarray:

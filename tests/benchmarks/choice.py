@@ -178,10 +178,10 @@ def main():
     parser.add_argument("--tone", action="store_true", help="one sine as the input")
     parser.add_argument("--among", help="only these hysteresis parts fitted, by commas")
     options = parser.parse_args()
-    names = options.models.split(",") if options.models else list(choice_records.TRUTHS)
+    names = options.models.split(",") if options.models else list(choice_records.NAMES)
     for name in names:
-        if name not in choice_records.TRUTHS:
-            known = ", ".join(choice_records.TRUTHS)
+        if name not in choice_records.NAMES:
+            known = ", ".join(choice_records.NAMES)
             parser.error(f"{name!r} makes no record; there are {known}")
     among = options.among.split(",") if options.among else None
     drive = choice_records.TONE if options.tone else choice_records.LOOPS

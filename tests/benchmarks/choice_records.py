@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from piezojax import FirstOrderLag, Preisach, Record, series
+from piezojax import FirstOrderLag, Preisach, RateDependentPreisach, Record, series
 from piezojax.identify import free_run
 from piezojax.identify.models import structure
 from piezojax.paths import parameters, replace
@@ -131,30 +131,54 @@ TRUTHS = {
         "falling_tau": 0.033,
     },
     "learned_operator": learned(),
-    "preisach": {},
 }
 """Parameters of each hysteresis by their paths in it; V, um, s."""
 
+CELLS = 10
+HALF_WAY = 7e3  # V/s
 
-def density():
+
+def density(alpha=6.2, beta=3.4, along=0.03):
     """Weights of a Preisach model on which its lines differ from place to place."""
-    i, j = np.mgrid[0:10, 0:10]
-    hump = 0.25 * np.exp(-((i - 6.2) ** 2 + (j - 3.4) ** 2) / 8.0)
-    weights = 0.03 + hump + np.where(i == j, 0.45 + 0.03 * j, 0.0)
+    i, j = np.mgrid[0:CELLS, 0:CELLS]
+    hump = 0.25 * np.exp(-((i - alpha) ** 2 + (j - beta) ** 2) / 8.0)
+    weights = 0.03 + hump + np.where(i == j, 0.45 + along * j, 0.0)
     return np.tril(weights)
+
+
+def preisach(drive):
+    """One density."""
+    del drive
+    return Preisach(density(), 0.0, 100.0, OFFSET, REST)
+
+
+def rate_dependent_preisach(drive):
+    """Two of them, the fast one with its hump elsewhere."""
+    fast = density(alpha=4.1, beta=2.2, along=0.01)
+    return RateDependentPreisach(preisach(drive), fast, HALF_WAY, drive.dt)
+
+
+WHOLE = {"preisach": preisach, "rate_dependent_preisach": rate_dependent_preisach}
+"""Models that are no part of a chain."""
+
+NAMES = (*TRUTHS, *WHOLE)
 
 
 def truth(name, drive=LOOPS):
     """The plant that makes the record, and its parameters by their names in a fit."""
-    if name == "preisach":
-        hysteresis = Preisach(density(), 0.0, 100.0, OFFSET, REST)
+    if name in WHOLE:
+        hysteresis = WHOLE[name](drive)
         plant = series(hysteresis=hysteresis, lag=FirstOrderLag(LAG, drive.dt))
+        known = parameters(plant)
         named = {
-            f"hysteresis.weights.{i}.{j}": float(hysteresis.weights[i, j])
-            for i in range(10)
-            for j in range(i + 1)
+            f"{path}.{i}.{j}": float(known[path][i, j])
+            for path in known
+            if path.endswith("weights")
+            for i, j in zip(*np.tril_indices(CELLS), strict=True)
         }
-        return plant, named | {"hysteresis.lowest": OFFSET, "lag.time_constant": LAG}
+        fitted = ("lowest", "hysteresis.rate", "time_constant")
+        others = {p: float(v) for p, v in known.items() if p.endswith(fitted)}
+        return plant, named | others
     lagged = name != "learned_operator"
     shape = structure(name, drive.seen)
     values = {f"hysteresis.{path}": value for path, value in TRUTHS[name].items()}
@@ -174,7 +198,7 @@ def expected(name, drive=LOOPS):
         plays = parameters(plant.parts[0].as_plays(), "hysteresis.")
         values |= {path: float(v) for path, v in plays.items() if path in values}
         name = "prandtl_ishlinskii"
-    return name if name in ("preisach", "learned_operator") else f"{name}+lag", values
+    return name if name in (*WHOLE, "learned_operator") else f"{name}+lag", values
 
 
 def made(name, drive=LOOPS, seed=1):

@@ -1,12 +1,13 @@
-"""Speed of the Preisach model beside C.
+"""Speed of the Preisach models beside C.
 
     python tests/benchmarks/preisach.py --json preisach.json
 
-The model by itself, float64, one core: 64 lanes, each with its own input, over 2000
-steps; the mean square of the output, and its gradient by all weights in reverse mode.
-C (preisach.c) is the faster of two ways to write it, and its gradient in closed form:
-the output is linear in the weights. Runs take turns, so that a busy machine disturbs
-all alike; medians. ratio_to_c is over C for the same figures.
+The plain model and the rate-dependent one, each by itself, float64, one core: 64 lanes,
+each with its own input, over 2000 steps; the mean square of the output, and its
+gradient by all weights (and the rate) in reverse mode. C (preisach.c) is the faster of
+two ways to write it, and its gradient in closed form: the output is linear in the
+weights. Runs take turns, so that a busy machine disturbs all alike; medians. ratio_to_c
+is over C for the same figures.
 """
 
 import argparse
@@ -25,10 +26,12 @@ from rich.console import Console
 from rich.table import Table
 
 import piezojax
+from piezojax.paths import parameters, replace
 from piezojax.rollout import Metric
 
 GROUP = 8  # as in preisach.c
 LOW, HIGH = -20.0, 120.0  # V
+DT, PACE = 1e-4, 4e3  # s; V/s: half of the samples are faster
 
 
 class MeanSquare(Metric):
@@ -44,19 +47,24 @@ class MeanSquare(Metric):
         return total[0] / total[1]
 
 
-def problem(cells, lanes, steps, seed=0):
-    """Weights [cells, cells], um, and inputs [lanes, steps], V: sines that grow."""
+def problem(model, cells, lanes, steps, seed=0):
+    """The model, and inputs [lanes, steps], V: sines that grow."""
     rng = np.random.default_rng(seed)
-    weights = np.tril(rng.uniform(0.0, 0.2, (cells, cells)))
+    weights = [np.tril(rng.uniform(0.0, 0.2, (cells, cells))) for _ in range(2)]
     time = np.arange(steps) / steps
     rates = rng.uniform(3.0, 12.0, (lanes, 1))
-    return weights, 50.0 + 68.0 * time * np.sin(2.0 * np.pi * rates * time)
+    slow = piezojax.Preisach(weights[0], LOW, HIGH, start="saturated")
+    models = {
+        "preisach": slow,
+        "rate_dependent": piezojax.RateDependentPreisach(slow, weights[1], PACE, DT),
+    }
+    return models[model], 50.0 + 68.0 * time * np.sin(2.0 * np.pi * rates * time)
 
 
-def by_c(name, weights, inputs):
+def by_c(name, model, inputs):
     """What runs the C function ``name`` and returns the mean squares.
 
-    Of a gradient: their sum, and its gradient [cells, cells].
+    Of a gradient: their sum, and its gradient by the parameters, by their paths.
     """
     source = Path(__file__).with_name("preisach.c")
     with tempfile.TemporaryDirectory() as folder:
@@ -64,40 +72,54 @@ def by_c(name, weights, inputs):
         flags = ["-O3", "-march=native", "-shared", "-fPIC"]
         subprocess.run(["gcc", *flags, source, "-o", target, "-lm"], check=True)
         function = getattr(ctypes.CDLL(str(target)), name)
-    cells, (lanes, steps) = len(weights), inputs.shape
-    lines = np.concatenate([np.diag(weights, -k) for k in range(cells)])
-    x = (inputs - LOW) / (HIGH - LOW) * cells
+    known = parameters(model)
+    densities = [path for path in known if path.endswith("weights")]
+    cells, (lanes, steps) = len(known[densities[0]]), inputs.shape
+    volts = (HIGH - LOW) / cells
+    half_way = float(known.get("rate", PACE)) * DT / volts
+    ends = np.cumsum(np.arange(cells, 0, -1))
+    lines = [np.diag(known[path], -k) for path in densities for k in range(cells)]
+    weights = np.concatenate(lines)
     groups = -(-lanes // GROUP)
-    padded = np.resize(x, (groups * GROUP, steps)).reshape(groups, GROUP, steps)
-    data = np.ascontiguousarray(padded.swapaxes(1, 2))
+    padded = np.resize((inputs - LOW) / volts, (groups * GROUP, steps))
+    data = np.ascontiguousarray(padded.reshape(groups, GROUP, steps).swapaxes(1, 2))
     square = np.empty(groups * GROUP)
+    slopes = np.empty((groups, weights.size + len(densities) - 1, GROUP))
     pointer = ctypes.POINTER(ctypes.c_double)
-    pointers = [array.ctypes.data_as(pointer) for array in (lines, data, square)]
-    slopes = np.empty((groups, len(lines), GROUP))
+    at = [array.ctypes.data_as(pointer) for array in (weights, data, square, slopes)]
+    before = (cells, groups, steps, at[0], ctypes.c_double(half_way))
 
-    def run(_kept=(lines, data)):
-        function(cells, groups, steps, *pointers)
+    def run(_kept=(weights, data)):
+        function(*before, *at[1:3])
         return square[:lanes] / steps
 
-    def run_gradient(_kept=(lines, data)):
-        function(cells, groups, steps, *pointers, slopes.ctypes.data_as(pointer))
-        every = slopes.swapaxes(1, 2).reshape(-1, len(lines))[:lanes]
+    def run_gradient(_kept=(weights, data)):
+        function(*before, *at[1:])
+        every = slopes.swapaxes(1, 2).reshape(-1, slopes.shape[1])[:lanes]
         total = every.sum(axis=0) / steps
-        gradient = np.zeros((cells, cells))
-        ends = np.cumsum(np.arange(cells, 0, -1))
-        for k, line in enumerate(np.split(total, ends[:-1])):
-            gradient += np.diag(line, -k)
-        return square[:lanes].sum() / steps, gradient
+        found = {}
+        for i, path in enumerate(densities):
+            own = np.split(total[i * ends[-1] : (i + 1) * ends[-1]], ends[:-1])
+            found[path] = sum(np.diag(line, -k) for k, line in enumerate(own))
+        if "rate" in known:
+            found["rate"] = total[-1] * DT / volts
+        return square[:lanes].sum() / steps, found
 
     return run_gradient if name.endswith("gradient") else run
 
 
-def by_piezojax(weights, inputs, *, gradient):
+def by_piezojax(model, inputs, *, gradient):
     """What runs the model, and the seconds of compiling."""
     signals = jnp.asarray(inputs)
+    known = parameters(model)
+    values = {
+        path: value
+        for path, value in known.items()
+        if path.endswith(("weights", "rate"))
+    }
 
-    def squares(weights, signals):
-        model = piezojax.Preisach(weights, LOW, HIGH, start="saturated")
+    def squares(values, signals):
+        with_values = replace(model, values)
 
         def lane(model, signal):
             options = {} if gradient else {"segment": signal.size}
@@ -106,19 +128,58 @@ def by_piezojax(weights, inputs, *, gradient):
             )[1]
 
         if not gradient:
-            return jax.vmap(lane, (None, 1))(model, signals.T)
+            return jax.vmap(lane, (None, 1))(with_values, signals.T)
         # A copy for each lane: their gradients are then summed once, not in each step.
         many = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (len(signals), *x.shape)), model
+            lambda x: jnp.broadcast_to(x, (len(signals), *x.shape)), with_values
         )
         return jnp.sum(jax.vmap(lane)(many, signals))
 
     function = jax.value_and_grad(squares) if gradient else squares
     begin = time.perf_counter()
-    compiled = jax.jit(function).lower(jnp.asarray(weights), signals).compile()
+    compiled = jax.jit(function).lower(values, signals).compile()
     compile_s = time.perf_counter() - begin
-    weights = jnp.asarray(weights)
-    return lambda: jax.block_until_ready(compiled(weights, signals)), compile_s
+    return lambda: jax.block_until_ready(compiled(values, signals)), compile_s
+
+
+def timed(name, options):
+    """Rows of one model, and the seconds of compiling."""
+    model, inputs = problem(name, options.cells, options.lanes, options.steps)
+    forward, forward_s = by_piezojax(model, inputs, gradient=False)
+    gradient, gradient_s = by_piezojax(model, inputs, gradient=True)
+    runs = {
+        "C, ramps": by_c(f"{name}_ramps", model, inputs),
+        "C, table": by_c(f"{name}_table", model, inputs),
+        "C, gradient": by_c(f"{name}_gradient", model, inputs),
+        "piezojax, forward": forward,
+        "piezojax, gradient": gradient,
+    }
+    expected = runs["C, ramps"]()
+    for engine in ("C, table", "piezojax, forward"):
+        np.testing.assert_allclose(runs[engine](), expected, rtol=1e-9, err_msg=engine)
+    (ours, slopes), (theirs, expected) = gradient(), runs["C, gradient"]()
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    for path, slope in expected.items():
+        np.testing.assert_allclose(slopes[path], slope, rtol=1e-9, err_msg=path)
+    seconds = {engine: [] for engine in runs}
+    for _ in range(options.repeats):
+        for engine, run in runs.items():
+            begin = time.perf_counter()
+            run()
+            seconds[engine].append(time.perf_counter() - begin)
+    medians = {engine: statistics.median(all) for engine, all in seconds.items()}
+    forward_c = min(medians["C, ramps"], medians["C, table"])
+    rows = [
+        {
+            "model": name,
+            "engine": engine,
+            "seconds_median": median,
+            "ratio_to_c": median
+            / (medians["C, gradient"] if engine.endswith("gradient") else forward_c),
+        }
+        for engine, median in medians.items()
+    ]
+    return rows, {"forward": forward_s, "gradient": gradient_s}
 
 
 def main():
@@ -129,59 +190,34 @@ def main():
     parser.add_argument("--lanes", type=int, default=64)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--repeats", type=int, default=7)
-    chosen = parser.parse_args()
-    weights, inputs = problem(chosen.cells, chosen.lanes, chosen.steps)
-    forward, forward_s = by_piezojax(weights, inputs, gradient=False)
-    gradient, gradient_s = by_piezojax(weights, inputs, gradient=True)
-    runs = {
-        "C, ramps": by_c("preisach_ramps", weights, inputs),
-        "C, table": by_c("preisach_table", weights, inputs),
-        "C, gradient": by_c("preisach_gradient", weights, inputs),
-        "piezojax, forward": forward,
-        "piezojax, gradient": gradient,
-    }
-    expected = runs["C, ramps"]()
-    for name in ("C, table", "piezojax, forward"):
-        np.testing.assert_allclose(runs[name](), expected, rtol=1e-9, err_msg=name)
-    for ours, theirs in zip(gradient(), runs["C, gradient"](), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-9)
-    seconds = {name: [] for name in runs}
-    for _ in range(chosen.repeats):
-        for name, run in runs.items():
-            begin = time.perf_counter()
-            run()
-            seconds[name].append(time.perf_counter() - begin)
-    medians = {name: statistics.median(all) for name, all in seconds.items()}
-    forward_c = min(medians["C, ramps"], medians["C, table"])
-    yardstick = {
-        name: medians["C, gradient"] if name.endswith("gradient") else forward_c
-        for name in runs
-    }
+    options = parser.parse_args()
     table = Table(
-        title=f"{chosen.cells} x {chosen.cells} cells, {chosen.lanes} lanes, "
-        f"{chosen.steps} steps"
+        title=f"{options.cells} x {options.cells} cells, {options.lanes} lanes, "
+        f"{options.steps} steps"
     )
-    for column in ("engine", "seconds", "ns a lane and step", "x C"):
+    for column in ("model", "engine", "seconds", "ns a lane and step", "x C"):
         table.add_column(column)
-    rows = []
-    for name, median in medians.items():
-        each = 1e9 * median / chosen.lanes / chosen.steps
-        rows.append(
-            {
-                "engine": name,
-                "seconds_median": median,
-                "ratio_to_c": median / yardstick[name],
-            }
-        )
-        ratio = f"{median / yardstick[name]:.2f}"
-        table.add_row(name, f"{median:.4f}", f"{each:.1f}", ratio)
+    all_rows, compiling = [], {}
+    for name in ("preisach", "rate_dependent"):
+        rows, compiling[name] = timed(name, options)
+        all_rows += rows
+        for row in rows:
+            each = 1e9 * row["seconds_median"] / options.lanes / options.steps
+            table.add_row(
+                name,
+                row["engine"],
+                f"{row['seconds_median']:.4f}",
+                f"{each:.1f}",
+                f"{row['ratio_to_c']:.2f}",
+            )
     Console().print(table)
-    compiling = {"forward": forward_s, "gradient": gradient_s}
-    Console().print(
-        f"compiling: {forward_s:.1f} s forward, {gradient_s:.1f} s gradient"
-    )
-    found = {"rows": rows, "compile_s": compiling}
-    chosen.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    for name, seconds in compiling.items():
+        Console().print(
+            f"compiling {name}: {seconds['forward']:.1f} s forward, "
+            f"{seconds['gradient']:.1f} s gradient"
+        )
+    found = {"rows": all_rows, "compile_s": compiling}
+    options.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
