@@ -39,7 +39,7 @@ class _Part(click.ParamType):
     show_default=True,
     help="Model to fit, parts joined by '+'; 'help' lists them, 'all' tries all.",
 )
-@click.option("--among", help="With 'all': only these hysteresis parts, by commas.")
+@click.option("--among", help="With 'all': only these hysteresis models, by commas.")
 @click.option("--time", help="Time column, by name or number from zero.")
 @click.option("--input", default="0", show_default=True, help="Input column.")
 @click.option("--output", default="1", show_default=True, help="Output column.")

@@ -29,6 +29,10 @@ DYNAMICS = ("arma", "lag")
 """Dynamics of a chain, richest first; the last one is tried on any record."""
 
 
+LINEAR = "state_space"
+"""The whole model without hysteresis."""
+
+
 class Candidate(NamedTuple):
     """A model to try, and the method that fits it (None: the first that can)."""
 
@@ -113,24 +117,25 @@ def first_round(
 ) -> tuple[list[Candidate], list[Untried]]:
     """Return what to fit first: a linear model, each hysteresis, the whole models.
 
-    ``hysteresis`` names the parts to try (all if left out). Raises ValueError for a
-    name that is no hysteresis.
+    ``hysteresis`` names the parts and whole models to try (all if left out), beside
+    linear ones. Raises ValueError for a name that is no hysteresis.
     """
-    names = at("hysteresis") if hysteresis is None else list(hysteresis)
+    parts = at("hysteresis")
+    known = [*parts, *(name for name in whole_names() if name != LINEAR)]
+    names = known if hysteresis is None else list(hysteresis)
     for name in names:
-        if name not in at("hysteresis"):
-            raise ValueError(
-                f"{name!r} is no hysteresis; there are {', '.join(at('hysteresis'))}"
-            )
+        if name not in known:
+            raise ValueError(f"{name!r} is no hysteresis; there are {', '.join(known)}")
+    parts = [name for name in names if name in parts]
     whole, untried = whole_models(records, train, options)
-    if hysteresis is not None:
-        whole = [one for one in whole if one.model == "state_space"]
+    whole = [one for one in whole if one.model in (LINEAR, *names)]
+    untried = [one for one in untried if one.model in (LINEAR, *names)]
     several = _several(records)
     if several:
-        return whole, [*(Untried(name, several) for name in names), *untried]
+        return whole, [*(Untried(name, several) for name in parts), *untried]
     found, missing = companions(records, train)
     creep, dynamics = found.creeps[0], found.dynamics[0]
-    chains = [Candidate(chained(name, creep, dynamics)) for name in ("", *names)]
+    chains = [Candidate(chained(name, creep, dynamics)) for name in ("", *parts)]
     return [*chains, *whole], [*missing, *untried]
 
 
@@ -187,14 +192,19 @@ def _several(records: Sequence[Record]) -> str | None:
     return None
 
 
+def whole_names() -> list[str]:
+    """Return the models that are no chain of parts."""
+    return list(dict.fromkeys(m for way in METHODS.values() for m in way.models))
+
+
 def whole_models(
     records: Sequence[Record], train: slice, options: Options
 ) -> tuple[list[Candidate], list[Untried]]:
     """Return the models that are no chain of parts, those of METHODS, sorted out."""
     found, untried = [], []
-    for model in dict.fromkeys(m for method in METHODS.values() for m in method.models):
+    for model in whole_names():
         method = None
-        if model == "state_space" and all(r.period for r in records):
+        if model == LINEAR and all(r.period for r in records):
             method = "frequency_response"
         against = _AGAINST.get(model, lambda *_: None)(records, train, options)
         if against is None:
@@ -258,7 +268,7 @@ def _against_several_records(records: Sequence[Record]) -> str | None:
 
 _AGAINST = {
     "hysteretic_arma": _against_regression,
-    "state_space": _against_state_space,
+    LINEAR: _against_state_space,
     "bouc_wen": lambda *of: _against_periods(*of) or _several(of[0]),
     "neural_state_space": _against_periods,
     PLAIN: lambda records, train, _: _against_preisach(PLAIN, records, train),

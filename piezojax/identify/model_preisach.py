@@ -105,8 +105,6 @@ def cells_told_apart(record: Record, train: slice, model: str = PLAIN) -> int:
     for cells in reversed(CELLS):
         shape = empty(seen, cells, None, "virgin")
         if model == RATE_DEPENDENT:
-            if not _pace(seen):
-                return 0
             shape = RateDependentPreisach(shape, shape.weights, _pace(seen), seen.dt)
         rows = responses(shape, seen.input, None, train)
         strength = np.linalg.svd(rows - rows.mean(axis=0), compute_uv=False)

@@ -41,6 +41,18 @@ def test_every_hysteresis_is_tried_with_what_the_record_shows():
     assert set(reasons(untried)) >= {"bouc_wen", "neural_state_space"}
 
 
+def test_named_ones_are_tried_beside_linear_models():
+    names = ["hysteretic_arma", "prandtl_ishlinskii", "bouc_wen"]
+    found, untried = first_round([RICH], HALF, OPTIONS, names)
+    assert set(models(found)) == {
+        "exponential_creep+arma",
+        "prandtl_ishlinskii+exponential_creep+arma",
+        "hysteretic_arma",
+        "state_space",
+    }
+    assert set(reasons(untried)) == {"bouc_wen"}
+
+
 def test_nothing_is_dropped_in_silence():
     for record in (RICH, ONE, sines((2.0,), period=500), sines((3.0,), 200)):
         found, untried = first_round([record], slice(0, record.samples // 2), OPTIONS)

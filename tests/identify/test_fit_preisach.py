@@ -3,20 +3,24 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from piezojax import ARMA, Preisach, Record, simulate
-from piezojax.identify import fit_preisach
+from piezojax import ARMA, Preisach, RateDependentPreisach, Record, simulate
+from piezojax.identify import fit_preisach, fit_rate_dependent_preisach
 
 CELLS, LOW, HIGH, LOWEST, REST = 6, -20.0, 100.0, -0.7, 10.0
-WEIGHTS = np.tril(np.random.default_rng(7).uniform(0.02, 0.5, (CELLS, CELLS)))
+WEIGHTS, FAST = np.tril(np.random.default_rng(7).uniform(0.02, 0.5, (2, CELLS, CELLS)))
+DT, RATE = 1e-3, 4e3
 DYNAMICS = ARMA((1.2, -0.35), (0.1, 0.08))
 
 
-def drive():
-    """Swings that shrink, from rest: corners in every cell of the triangle."""
+def drive(samples=20):
+    """Swings that shrink, from rest: corners in every cell of the triangle.
+
+    ``samples`` from corner to corner.
+    """
     tops = 40.0 + np.linspace(60.0, 0.0, 25)
     bottoms = 40.0 - np.linspace(60.0, 0.0, 25) * 0.98
     corners = [REST, *np.stack([tops, bottoms], axis=1).ravel()]
-    at = np.arange(0.0, len(corners) - 1 + 1e-9, 1 / 20)
+    at = np.arange(0.0, len(corners) - 1 + 1e-9, 1 / samples)
     return np.interp(at, range(len(corners)), corners)
 
 
@@ -39,7 +43,7 @@ def record(start="virgin", noise=0.0, dynamics=False):
         gain = b.sum() / (1.0 - a.sum())
         output = gain * output[0] + lfilter(b, [1.0, *-a], output - output[0])
     draws = np.random.default_rng(5).normal(size=output.size)
-    return Record(INPUT, output + noise * draws, 1e-3)
+    return Record(INPUT, output + noise * draws, DT)
 
 
 @pytest.mark.parametrize("start", ["virgin", "saturated"])
@@ -56,6 +60,19 @@ def test_behind_known_dynamics_too():
     )
     np.testing.assert_allclose(found.weights, WEIGHTS, rtol=0, atol=1e-8)
     np.testing.assert_allclose(found.lowest, LOWEST, rtol=0, atol=1e-8)
+
+
+def test_two_densities_are_told_apart_by_the_pace():
+    input = np.concatenate([INPUT, drive(6)])
+    plant = RateDependentPreisach(material(), FAST, RATE, DT)
+    paces = Record(input, np.asarray(response(plant, input)), DT)
+    found = fit_rate_dependent_preisach(paces, RATE, CELLS, limits=(LOW, HIGH))
+    np.testing.assert_allclose(found.slow.weights, WEIGHTS, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(found.fast_weights, FAST, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(found.slow.lowest, LOWEST, rtol=0, atol=1e-8)
+    assert (found.rate, found.dt) == (RATE, DT)
+    with pytest.raises(ValueError, match="rate in V/s is 0"):
+        fit_rate_dependent_preisach(paces, 0.0, CELLS)
 
 
 def test_from_a_part_of_the_record():

@@ -11,12 +11,13 @@ from piezojax import Record, identify, load
 from piezojax.identify import free_run
 from piezojax.identify.candidates import whole_models
 from piezojax.identify.estimate import Options
-from piezojax.identify.model_preisach import cells_told_apart
+from piezojax.identify.model_preisach import RATE_DEPENDENT, cells_told_apart
 from piezojax.report.identification import write_fit
 
 DT, LAG, LOWEST, NOISE = 1e-3, 2.2e-3, -1.5, 2e-3
 CELLS = 10
-WEIGHTS = np.tril(np.random.default_rng(3).uniform(0.05, 0.3, (CELLS, CELLS)))
+WEIGHTS, FAST = np.tril(np.random.default_rng(3).uniform(0.05, 0.3, (2, CELLS, CELLS)))
+RATE = 7e3
 CORNERS = (
     [0, 100, 0, 92, 6, 84, 14, 76, 24, 66, 34, 57, 42, 100, 30, 95, 12, 48, 20, 38, 26]
     + [88, 0, 55, 5, 30, 10, 22, 100, 55, 90, 62, 82, 70, 100, 0, 70, 18, 60, 0, 45, 0]
@@ -24,18 +25,22 @@ CORNERS = (
 )
 
 
-def drive():
-    """From corner to corner in steps of two volts."""
+def drive(volts=2):
+    """From corner to corner in steps of ``volts``."""
     ways = [
-        np.linspace(a, b, abs(b - a) // 2 + 2)[1:]
+        np.linspace(a, b, abs(b - a) // volts + 2)[1:]
         for a, b in itertools.pairwise(CORNERS)
     ]
     return np.concatenate([[0.0], *ways])
 
 
-def record_of(weights, input):
+def record_of(input, weights=WEIGHTS, fast=None):
     """Relays one by one, u(k) moving y(k+1); the lag; the noise."""
     moved = oracle.along(weights, 0.0, 100.0, 50, input, rest=0.0)
+    if fast is not None:
+        square = (np.diff(input, prepend=input[0]) / DT / RATE) ** 2
+        quick = oracle.along(fast, 0.0, 100.0, 50, input, rest=0.0)
+        moved = (moved + square * quick) / (1.0 + square)
     pole, output, y = np.exp(-DT / LAG), [moved[0]], moved[0]
     for f in moved[:-1]:
         y = f + pole * (y - f)
@@ -50,7 +55,7 @@ TRAIN = slice(0, 1200)
 
 @pytest.fixture(scope="module")
 def fit():
-    return identify(record_of(WEIGHTS, INPUT), "preisach", train=TRAIN)
+    return identify(record_of(INPUT), "preisach", train=TRAIN)
 
 
 def test_weights_and_lag_are_found_again(fit):
@@ -67,6 +72,39 @@ def test_weights_and_lag_are_found_again(fit):
     assert 0.7 < np.std(far) < 1.4
     # The relays of the record switch one by one, by up to 6 nm.
     assert fit.report.validation.rmse < 2.0 * NOISE
+
+
+@pytest.fixture(scope="module")
+def paces():
+    input = np.concatenate([INPUT, drive(9)])
+    return identify(
+        record_of(input, fast=FAST),
+        "rate_dependent_preisach",
+        train=slice(0, input.size - 50),
+    )
+
+
+def test_both_densities_the_rate_and_the_lag_are_found_again(paces):
+    found = paces.report.parameters
+    assert paces.count == len(found) == CELLS * (CELLS + 1) + 3
+    truth = {
+        f"hysteresis.{name}.{i}.{j}": weights[i, j]
+        for name, weights in (("slow.weights", WEIGHTS), ("fast_weights", FAST))
+        for i in range(CELLS)
+        for j in range(i + 1)
+    }
+    truth |= {"hysteresis.slow.lowest": LOWEST, "hysteresis.rate": RATE}
+    truth |= {"lag.time_constant": LAG}
+    far = [(found[n].value - v) / found[n].standard_error for n, v in truth.items()]
+    assert np.max(np.abs(far)) < 4.0
+    assert 0.7 < np.std(far) < 1.4
+
+
+def test_one_pace_does_not_tell_two_densities_apart():
+    steps = np.where(np.arange(1200) // 50 % 2, -2.0, 2.0)
+    input = np.concatenate([[0.0], np.cumsum(steps)])
+    record = Record(input, 0.1 * input, DT)
+    assert cells_told_apart(record, slice(0, 900), RATE_DEPENDENT) == 0
 
 
 def test_what_is_written_is_the_plant(fit, tmp_path):
@@ -95,6 +133,7 @@ def test_a_record_of_one_loop_supports_none():
     _, untried = whole_models([record], half, Options())
     reasons = {one.model: one.reason for one in untried}
     assert "do not tell even the cells" in reasons["preisach"]
+    assert "of two Preisach triangles" in reasons["rate_dependent_preisach"]
     with pytest.raises(ValueError, match="a Preisach triangle with 3 a side apart"):
         identify(record, "preisach", train=half)
 
