@@ -35,11 +35,7 @@ def pytest_sessionfinish():
     gc.freeze()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session", autouse=True)
 def kept_programs():
     """Small compiled programs are shared too: a loop made again costs its tracing."""
-    name = "jax_persistent_cache_min_compile_time_secs"
-    before = getattr(jax.config, name)
-    jax.config.update(name, 0.0)
-    yield
-    jax.config.update(name, before)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

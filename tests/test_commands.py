@@ -44,9 +44,6 @@ STUDY = {
 }
 
 
-pytestmark = pytest.mark.usefixtures("kept_programs")
-
-
 def call(command, *arguments):
     return CliRunner().invoke(COMMANDS[command], [str(a) for a in arguments])
 

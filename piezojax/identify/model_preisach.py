@@ -23,6 +23,8 @@ from .preisach import (
 )
 from .record import Record
 
+_free_run = eqx.filter_jit(from_rest)
+
 Model = Preisach | RateDependentPreisach
 
 PLAIN, RATE_DEPENDENT = "preisach", "rate_dependent_preisach"
@@ -127,70 +129,91 @@ def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:
     if not cells:
         raise ValueError(TOO_FEW[model])
     seen = record.until(train.stop)
-    shifted = _a_sample_later(seen)
-    unknowns = _unknowns(shifted, model)
-    run = eqx.filter_jit(from_rest)
+    problem = _Problem(seen, _a_sample_later(seen), train, cells)
+    unknowns = _unknowns(problem.shifted, model)
+    ends = {start: problem.end(unknowns, start) for start in STARTS}
+    start = min(STARTS, key=lambda start: ends[start].cost)
+    logs, warnings = ends[start].x, _at_edges(unknowns, ends[start].x)
+    if not ends[start].status:
+        warnings.append(f"lag and rate were still moving after {STEPS} steps")
+    chain = problem.fitted(logs, start)
+    searched = {u.name: float(v) for u, v in zip(unknowns, np.exp(logs), strict=True)}
+    return PreisachFit(
+        chain.system(),
+        _named(chain.hysteresis, cells) | searched,
+        problem.deviations(chain, searched),
+        warnings,
+    )
 
-    def fitted(logs: np.ndarray, start: str) -> Chain:
+
+class _Problem(NamedTuple):
+    """A record up to the end of the part to fit, and with its input a sample later."""
+
+    seen: Record
+    shifted: Record
+    train: slice
+    cells: int
+
+    def fitted(self, logs: np.ndarray, start: str) -> Chain:
+        """Return the model with the best weights at logarithms of the unknowns."""
         lag, *rate = (float(value) for value in np.exp(logs))
-        dynamics = FirstOrderLag(lag, seen.dt)
+        dynamics = FirstOrderLag(lag, self.seen.dt)
         fit = fit_rate_dependent_preisach if rate else fit_preisach
         hysteresis = fit(
-            shifted,
+            self.shifted,
             *rate,
-            cells=cells,
-            train=train,
+            cells=self.cells,
+            train=self.train,
             dynamics=dynamics.as_arma(),
             start=start,
         )
         return Chain(hysteresis, dynamics)
 
-    def errors(system: Series) -> np.ndarray:
-        return (np.asarray(run(system, as_array(seen.input))) - seen.output)[train]
+    def errors(self, system: Series) -> np.ndarray:
+        """Return the errors of the free run over the part, um."""
+        run = np.asarray(_free_run(system, as_array(self.seen.input)))
+        return (run - self.seen.output)[self.train]
 
-    def reduced(logs: np.ndarray, start: str) -> np.ndarray:
-        return errors(fitted(logs, start).system())
+    def reduced(self, logs: np.ndarray, start: str) -> np.ndarray:
+        """Return the errors with the best weights."""
+        return self.errors(self.fitted(logs, start).system())
 
-    def slopes(logs: np.ndarray, start: str) -> np.ndarray:
-        steps = STEP * np.eye(logs.size)
-        here = reduced(logs, start)
-        return np.column_stack([reduced(logs + s, start) - here for s in steps]) / STEP
+    def slopes(self, logs: np.ndarray, start: str) -> np.ndarray:
+        """Return the slopes of those errors, a column an unknown."""
+        here = self.reduced(logs, start)
+        moved = [self.reduced(logs + s, start) for s in STEP * np.eye(logs.size)]
+        return (np.column_stack(moved) - here[:, None]) / STEP
 
-    def end(start: str) -> OptimizeResult:
+    def end(self, unknowns: list[Unknown], start: str) -> OptimizeResult:
+        """Return where the search ends, with one of the histories."""
+
+        def loss(logs: np.ndarray) -> float:
+            return float(np.sum(self.reduced(logs, start) ** 2))
+
         firsts = map(np.log, itertools.product(*(u.firsts for u in unknowns)))
-        first = min(firsts, key=lambda logs: float(np.sum(reduced(logs, start) ** 2)))
-        options = {"jac": slopes, "bounds": bounds, "args": (start,)}
+        bounds = np.log([[u.least, u.most] for u in unknowns]).T
+        options = {"jac": self.slopes, "bounds": bounds, "args": (start,)}
         ending = {"xtol": ENDED, "max_nfev": STEPS}
-        return least_squares(reduced, first, **options, **ending)
+        first = min(firsts, key=loss)
+        return least_squares(self.reduced, first, **options, **ending)
 
-    bounds = np.log([[u.least, u.most] for u in unknowns]).T
-    ends = {start: end(start) for start in STARTS}
-    start = min(STARTS, key=lambda start: ends[start].cost)
-    logs, warnings = ends[start].x, _at_edges(unknowns, ends[start].x)
-    if not ends[start].status:
-        warnings.append(f"lag and rate were still moving after {STEPS} steps")
-    hysteresis, lag = fitted(logs, start)
-    found = Chain(hysteresis, lag).system()
-    left = errors(found)
-    values = {u.name: float(v) for u, v in zip(unknowns, np.exp(logs), strict=True)}
-    moved = [
-        (errors(replace(found, {name: value * (1.0 + STEP)})) - left) / (value * STEP)
-        for name, value in values.items()
-    ]
-    jacobian = np.column_stack(
-        [
-            responses(hysteresis, shifted.input, lag.as_arma(), train),
-            np.ones(left.size),
-            *moved,
+    def deviations(
+        self, chain: Chain, searched: dict[str, float]
+    ) -> list[float | None]:
+        """Return the standard errors of weights, lowest output and what is searched."""
+        system = chain.system()
+        left = self.errors(system)
+        moved = [
+            (self.errors(replace(system, {name: value * (1.0 + STEP)})) - left)
+            / (value * STEP)
+            for name, value in searched.items()
         ]
-    )
-    variance = float(np.sum(left**2)) / max(left.size - jacobian.shape[1], 1)
-    return PreisachFit(
-        found,
-        _named(hysteresis, cells) | values,
-        standard_errors(jacobian, variance),
-        warnings,
-    )
+        rows = responses(
+            chain.hysteresis, self.shifted.input, chain.lag.as_arma(), self.train
+        )
+        jacobian = np.column_stack([rows, np.ones(left.size), *moved])
+        freedom = max(left.size - jacobian.shape[1], 1)
+        return standard_errors(jacobian, float(np.sum(left**2)) / freedom)
 
 
 def _unknowns(record: Record, model: str) -> list[Unknown]:

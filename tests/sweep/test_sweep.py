@@ -21,8 +21,6 @@ from piezojax.system import loop_inputs
 from piezojax.tune.data import make_data
 from piezojax.tune.runs import Signals, evaluate
 
-pytestmark = pytest.mark.usefixtures("kept_programs")
-
 ALL = ["rms_error", "peak_error", "rms_effort", "rms_slew", "saturated", "peak_voltage"]
 CHUNKED = GRID | {"chunk": 15}
 SAMPLED = {"method": "sobol", "samples": 150, "metrics": ["rms_error", "saturated"]}

@@ -24,8 +24,6 @@ from piezojax.tune.clock import Clock
 from piezojax.tune.course import Course
 from piezojax.tune.data import make_data
 
-pytestmark = pytest.mark.usefixtures("kept_programs")
-
 METHODS = {
     "CMA-ES": cma_es(seed=2),
     "CMA-ES, larger": cma_es(14, seed=2),
@@ -159,7 +157,7 @@ def case_of(**changes):
 
 
 @pytest.fixture(scope="module")
-def outcome(kept_programs):
+def outcome():
     return pj.tune(case_of(), baselines=Budget(evaluations=150))
 
 

@@ -19,8 +19,6 @@ from piezojax.tune import comparison as comparing
 from piezojax.tune.__main__ import main
 from piezojax.tune.comparison import Comparison
 
-pytestmark = pytest.mark.usefixtures("kept_programs")
-
 # The lag is given no sample time of its own (an ARMA has none), so any rate fits it.
 LAG = {"type": "ARMA", "autoregressive": [0.5], "moving": [0.0, 0.067]}
 FILE = {
@@ -77,7 +75,7 @@ def with_controller(**changes):
 
 
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory, kept_programs):
+def compared(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compared")
     path = folder / "both.toml"
     path.write_text(tomli_w.dumps(FILE | {"rates": [5000.0]}), encoding="utf-8")

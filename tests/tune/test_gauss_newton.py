@@ -29,8 +29,6 @@ from piezojax.tune.gauss_newton import (
 from piezojax.tune.objective import Errors, Objective, Verdict
 from piezojax.tune.race import Race, halved
 
-pytestmark = pytest.mark.usefixtures("kept_programs")
-
 
 class Problem(eqx.Module):
     """Residuals as one run's errors; the loss is half their mean square."""
@@ -233,7 +231,7 @@ def test_weighted_errors_have_the_gradient_of_the_objective():
 
 
 @pytest.fixture(scope="module")
-def objective(kept_programs):
+def objective():
     return objective_of(case_of())
 
 
@@ -255,7 +253,7 @@ def test_screening_any_number_of_points(objective, programs):
 
 
 @pytest.fixture(scope="module")
-def outcome(kept_programs):
+def outcome():
     return pj.tune(case_of())
 
 

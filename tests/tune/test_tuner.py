@@ -46,9 +46,6 @@ RESULT_KEYS = {
 SCORE_KEYS = {"per_reference_rms_um", "geomean_rms_um", "worst_rms_um"}
 
 
-pytestmark = pytest.mark.usefixtures("kept_programs")
-
-
 def case_of(changes, seed=None):
     data = copy.deepcopy(BASE)
     for place, value in changes.items():
@@ -84,7 +81,7 @@ def progress():
 
 
 @pytest.fixture(scope="module")
-def outcome(progress, kept_programs):
+def outcome(progress):
     """The P-753 with its hysteresis, a reference kept unseen."""
     changes = {
         "plant": {"catalog": "p753"},
@@ -96,7 +93,7 @@ def outcome(progress, kept_programs):
 
 
 @pytest.fixture(scope="module")
-def plain(kept_programs):
+def plain():
     return pj.tune(case_of({}))
 
 
@@ -146,7 +143,7 @@ def test_the_summary_figures_follow_from_the_references(outcome):
             assert part.peak_error_um[name] >= error
 
 
-def test_scores_are_those_of_a_plain_simulation(kept_programs):
+def test_scores_are_those_of_a_plain_simulation():
     # No noise: nothing is drawn, so the error can be found again from outside.
     found = pj.tune(case_of({"sensor/noise_rms": 0.0, "optimiser/steps": 1}))
     for loop, part in (
@@ -210,7 +207,7 @@ def test_tuning_and_holdout_noise_are_different(outcome):
             assert error == pytest.approx(held, rel=0.2)
 
 
-def test_noise_differs_between_references(kept_programs):
+def test_noise_differs_between_references():
     found = pj.tune(
         case_of({"references/tune": ["CONST1", "CONST2"], "optimiser/steps": 1})
     )
@@ -286,7 +283,7 @@ def test_another_seed_draws_other_noise(plain):
 # Starts that diverge, and boxes in which everything does
 
 
-def test_a_diverging_start_is_replaced_and_said(kept_programs):
+def test_a_diverging_start_is_replaced_and_said():
     changes = {
         "actuator": WIDE,
         f"parameters/{INTEGRAL}/upper": 1e7,
@@ -308,7 +305,7 @@ def test_a_diverging_start_is_replaced_and_said(kept_programs):
     json.loads(result.model_dump_json())  # no NaN, no Infinity
 
 
-def test_a_box_in_which_everything_diverges(kept_programs):
+def test_a_box_in_which_everything_diverges():
     changes = {
         "actuator": WIDE,
         f"parameters/{INTEGRAL}": {"lower": 3e6, "upper": 1e7, "start": 5e6},
@@ -360,7 +357,7 @@ def test_ctrl_c_before_the_first_step(stage):
 # Saturation
 
 
-def test_saturation_is_reported(kept_programs):
+def test_saturation_is_reported():
     changes = {
         "plant": {"catalog": "p753"},
         "references/unseen": ["TRI50"],
@@ -399,7 +396,7 @@ def effort_and_slew(loop):
 
 
 @pytest.fixture(scope="module")
-def light(kept_programs):
+def light():
     return pj.tune(case_of(WEIGHTED | {"objective/effort_weight": 1e5}))
 
 
@@ -414,7 +411,7 @@ def test_gains_at_the_edge_are_said(light):
     assert result.gains[INTEGRAL] == pytest.approx(1.0, rel=0.2)
 
 
-def test_a_weight_on_slew_lowers_the_slew(kept_programs):
+def test_a_weight_on_slew_lowers_the_slew():
     found = pj.tune(case_of(WEIGHTED | {"objective/slew_weight": 1e5}))
     assert effort_and_slew(found.after)[1] < 0.5 * effort_and_slew(found.before)[1]
 
@@ -423,7 +420,7 @@ def test_a_weight_on_slew_lowers_the_slew(kept_programs):
     ("method", "aggregate"),
     [("lbfgsb", "worst"), ("levenberg_marquardt", "mean_square")],
 )
-def test_the_other_methods_and_objectives(kept_programs, method, aggregate):
+def test_the_other_methods_and_objectives(method, aggregate):
     changes = {"optimiser/method": method, "objective/aggregate": aggregate}
     result = pj.tune(case_of(changes)).result
     assert method in METHODS
@@ -434,7 +431,7 @@ def test_the_other_methods_and_objectives(kept_programs, method, aggregate):
     assert np.all(np.diff(history, axis=0) <= 0.0)
 
 
-def test_one_start_no_candidates(kept_programs):
+def test_one_start_no_candidates():
     changes = {"starts": 1, "candidates": 0, "steps": 3}
     result = pj.tune(case_of({"optimiser": changes})).result
     assert result.evaluations == 1 + 3
@@ -446,7 +443,7 @@ def test_a_study_that_is_not_there(tmp_path):
         pj.tune(tmp_path / "no.toml")
 
 
-def test_a_box_in_which_every_loop_rails_is_refused_or_called_unstable(kept_programs):
+def test_a_box_in_which_every_loop_rails_is_refused_or_called_unstable():
     bounds = {"lower": 3e6, "upper": 1e7, "start": 5e6}
     try:
         result = pj.tune(case_of({f"parameters/{INTEGRAL}": bounds})).result
@@ -455,7 +452,7 @@ def test_a_box_in_which_every_loop_rails_is_refused_or_called_unstable(kept_prog
     assert not result.before.stable
 
 
-def test_a_start_that_rails_is_said(kept_programs):
+def test_a_start_that_rails_is_said():
     changes = {
         f"parameters/{INTEGRAL}/upper": 1e7,
         f"parameters/{INTEGRAL}/start": 5e6,
@@ -465,7 +462,7 @@ def test_a_start_that_rails_is_said(kept_programs):
     assert any("start" in text or "before" in text for text in result.warnings)
 
 
-def test_ctrl_c_while_judging_keeps_the_gains(kept_programs):
+def test_ctrl_c_while_judging_keeps_the_gains():
     recorder = Recorder(stop_stage="judging")
     try:
         found = pj.tune(case_of({}), progress=recorder)
