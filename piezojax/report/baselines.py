@@ -55,8 +55,8 @@ def baselines_text(found: Baselines) -> str:
     return (
         f"as good as {rival.method}, the best baseline, after {rival.reached_s:.1f} s "
         f"instead of {rival.wall_s:.1f} s: {_times(rival.ratio)} sooner, {running} "
-        f"without compiling, {_times(rival.ratio_cpu)} in processor time, {near} than "
-        "it came within 0.001 of its end"
+        f"without compiling, {_times(rival.ratio_cpu)} in processor time, {near} "
+        "sooner than it came within 0.001 of its end"
     )
 
 

@@ -22,7 +22,20 @@ FIRST = (
     + (88, 0, 55, 5, 30, 10, 22, 100, 55, 90, 62, 82, 70, 100, 0, 70, 18, 60, 0, 45, 0)
     + (20, 0, 100, 85, 98, 75, 100, 0)
 )
-AGAIN = (0, 100, 20, 80, 35, 65, 45, 90, 10, 50, 0, 75, 40, 95, 60, 85, 5, 100, 0)
+
+
+def walk(height, step=10):
+    """Up from 0 to 100 V and back in loops of ``height``, a step further each time."""
+    ways = range(0, 100 - height, step)
+    up = [corner for k in ways for corner in (k + height, k + step)]
+    return (*up, 100, *(100 - corner for corner in up), 0)
+
+
+AGAIN = (
+    (0, 100, 20, 80, 35, 65, 45, 90, 10, 50, 0, 75, 40, 95, 60, 85, 5, 100, 0)
+    + (*walk(30), *walk(50))
+    + (*np.random.default_rng(0).integers(0, 101, 40), 0)
+)
 """Turning points of the training part, V: slow ones, then fast ones."""
 
 LAST = (0, 97, 15, 62, 28, 89, 51, 73, 3, 41, 9, 100, 37, 81, 22, 0)
