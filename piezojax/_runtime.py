@@ -22,7 +22,7 @@ _CPU_FLAGS = {
         "--xla_cpu_copy_insertion_use_region_analysis=true",
         (0, 9, 2),
     ),
-    # The newer code generator compiles loops half as fast, and they run no faster.
+    # The newer code generator takes up to twice as long, and loops run no faster.
     "xla_cpu_use_fusion_emitters": ("--xla_cpu_use_fusion_emitters=false", (0, 10)),
 }
 _BEFORE = (0, 13)
