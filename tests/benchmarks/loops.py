@@ -4,7 +4,7 @@
 
 Each, with the parameters of choice_records.py, is driven slowly from 0 to 100 V and
 back, then up with the same small loop four times on the way; those that depend on the
-rate once more, forty times as fast. Without a lag, an offset or noise.
+rate once more, forty times as fast. Without a lag or noise.
 """
 
 import argparse
@@ -25,14 +25,8 @@ OTHERS = {
     "bouc_wen": lambda: piezojax.BoucWen(
         alpha=0.14, beta_gamma=0.012, beta_delta=-0.004, nu=1.3
     ),
-    "rate_dependent_preisach": lambda: piezojax.RateDependentPreisach(
-        piezojax.Preisach(choice_records.density(), 0.0, 100.0, 0.0, 0.0),
-        0.75 * choice_records.density(),
-        rate=1e4,
-        dt=choice_records.LOOPS.dt,
-    ),
 }
-"""Models that --model all has no record of."""
+"""Models that make no record for choice.py."""
 
 RATED = (
     "rate_dependent_prandtl_ishlinskii",
@@ -59,7 +53,7 @@ def followed(system, samples_a_volt):
 
 def picture():
     """A panel a model."""
-    names = [*choice_records.TRUTHS, *OTHERS]
+    names = [*choice_records.NAMES, *OTHERS]
     down = -(-len(names) // ACROSS)
     drawn = figure(2.3 * ACROSS, 2.2 * down)
     panels = drawn.subplots(down, ACROSS, sharex=True)
