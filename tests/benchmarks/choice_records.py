@@ -25,18 +25,17 @@ FIRST = (
 
 
 def walk(height, step=10):
-    """Up from 0 to 100 V and back in loops of ``height``, a step further each time."""
+    """Up to 100 V and back to 0 in loops of ``height``, a step further each time."""
     ways = range(0, 100 - height, step)
     up = [corner for k in ways for corner in (k + height, k + step)]
     return (*up, 100, *(100 - corner for corner in up), 0)
 
 
-AGAIN = (
-    (0, 100, 20, 80, 35, 65, 45, 90, 10, 50, 0, 75, 40, 95, 60, 85, 5, 100, 0)
-    + (*walk(30), *walk(50))
-    + (*np.random.default_rng(0).integers(0, 101, 40), 0)
-)
+AGAIN = (0, 100, 20, 80, 35, 65, 45, 90, 10, 50, 0, 75, 40, 95, 60, 85, 5, 100, 0)
 """Turning points of the training part, V: slow ones, then fast ones."""
+
+MORE = (*walk(30), *walk(50), *np.random.default_rng(0).integers(0, 101, 40), 0)
+"""Fast ones after these, for what has a memory of its own at that pace."""
 
 LAST = (0, 97, 15, 62, 28, 89, 51, 73, 3, 41, 9, 100, 37, 81, 22, 0)
 LAST_AGAIN = (0, 93, 33, 68, 12, 87, 47, 99, 58, 77, 0, 52, 16)
@@ -68,12 +67,14 @@ class Drive(NamedTuple):
         )
 
 
-SEEN = np.concatenate([[0.0], strokes(FIRST, SLOW), strokes(AGAIN, FAST)])
-LOOPS = Drive(
-    np.concatenate([SEEN, strokes(LAST, SLOW), strokes(LAST_AGAIN, FAST)]),
-    4e-4,
-    SEEN.size,
-)
+def loops(again):
+    """The corners of FIRST and LAST slowly, ``again`` and LAST_AGAIN fast."""
+    seen = np.concatenate([[0.0], strokes(FIRST, SLOW), strokes(again, FAST)])
+    judged = [strokes(LAST, SLOW), strokes(LAST_AGAIN, FAST)]
+    return Drive(np.concatenate([seen, *judged]), 4e-4, seen.size)
+
+
+LOOPS = loops(AGAIN)
 TONE = Drive(50.0 - 50.0 * np.cos(2.0 * np.pi * 0.01 * np.arange(900)), 1e-3, 600)
 REST = 0.0
 
@@ -170,6 +171,9 @@ def rate_dependent_preisach(drive):
     fast = density(alpha=4.1, beta=2.2, along=0.01)
     return RateDependentPreisach(preisach(drive), fast, HALF_WAY, drive.dt)
 
+
+DRIVES = {"rate_dependent_preisach": loops((*AGAIN, *MORE))}
+"""Inputs of those for which LOOPS does not do."""
 
 WHOLE = {"preisach": preisach, "rate_dependent_preisach": rate_dependent_preisach}
 """Models that are no part of a chain."""
