@@ -39,7 +39,7 @@ class _Part(click.ParamType):
     show_default=True,
     help="Model to fit, parts joined by '+'; 'help' lists them, 'all' tries all.",
 )
-@click.option("--among", help="With 'all': only these hysteresis models, by commas.")
+@click.option("--among", help="With 'all': these and linear models only, by commas.")
 @click.option("--time", help="Time column, by name or number from zero.")
 @click.option("--input", default="0", show_default=True, help="Input column.")
 @click.option("--output", default="1", show_default=True, help="Output column.")
@@ -111,7 +111,7 @@ def main(
             raise ValueError("name the RECORD to fit a model to")
         if model == ALL and method is not None:
             raise ValueError("--method goes with one model; 'all' takes each one's own")
-        if model != ALL and (among or test):
+        if model != ALL and (among is not None or test):
             raise ValueError("--among and --test go with --model all")
         loaded = [read_record(record, **columns) for record in records]
         options = Options(order, window, oversample, steps)
@@ -139,7 +139,7 @@ def main(
         with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
             comparison = identify_all(
                 loaded,
-                hysteresis=among.split(",") if among else None,
+                hysteresis=None if among is None else among.split(","),
                 train=train,
                 validate=validate,
                 test=test,

@@ -118,7 +118,8 @@ def first_round(
     """Return what to fit first: a linear model, each hysteresis, the whole models.
 
     ``hysteresis`` names the parts and whole models to try (all if left out), beside
-    linear ones. Raises ValueError for a name that is no hysteresis.
+    linear ones. Raises ValueError for a name that is no hysteresis, or if none of those
+    named can be tried.
     """
     parts = at("hysteresis")
     known = [*parts, *(name for name in whole_names() if name != LINEAR)]
@@ -130,6 +131,9 @@ def first_round(
     whole, untried = whole_models(records, train, options)
     whole = [one for one in whole if one.model in (LINEAR, *names)]
     untried = [one for one in untried if one.model in (LINEAR, *names)]
+    if hysteresis is not None and {one.model for one in untried} >= set(names):
+        reasons = "; ".join(f"{one.model}: {one.reason}" for one in untried)
+        raise ValueError(f"none of them can be tried: {reasons}")
     several = _several(records)
     if several:
         return whole, [*(Untried(name, several) for name in parts), *untried]

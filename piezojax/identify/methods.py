@@ -25,6 +25,8 @@ from .structure import REST_INPUT
 
 AS_GOOD = 1e-3
 """Starts whose mean square comes this close (as a share) to the best fit as well."""
+AMBIGUOUS = 0.01
+"""Share of its range over which a parameter of fits as good must differ to be said."""
 
 
 Records = Sequence[Record]
@@ -81,7 +83,7 @@ def _optimum_warnings(optimum: Optimum, steps: int) -> list[str]:
             found.append(f"{name} lies at the edge of its bounds")
         if optimum.deviations[i] is None:
             found.append(f"{name} is not determined by this record")
-        elif spread[i] > AS_GOOD:
+        elif spread[i] > AMBIGUOUS:
             found.append(
                 f"{name} is ambiguous: other values fit equally well, over "
                 f"{100.0 * spread[i]:.2g} % of its range"

@@ -102,19 +102,31 @@ class PreisachFit(NamedTuple):
 
 
 def cells_told_apart(record: Record, train: slice, model: str = PLAIN) -> int:
-    """Return how many cells a side the samples ``train`` can tell apart, 0 for none."""
+    """Return how many cells a side the samples ``train`` can tell apart, 0 for none.
+
+    Whatever the material remembers before the record.
+    """
     seen = _a_sample_later(record.until(train.stop))
-    for cells in reversed(CELLS):
-        shape = empty(seen, cells, None, "virgin")
-        if model == RATE_DEPENDENT:
-            shape = RateDependentPreisach(shape, shape.weights, _pace(seen), seen.dt)
-        rows = responses(shape, seen.input, None, train)
-        strength = np.linalg.svd(rows - rows.mean(axis=0), compute_uv=False)
-        if len(rows) >= rows.shape[1] and (
-            strength[-1] >= TOLD_APART * np.sqrt(len(rows))
-        ):
-            return cells
-    return 0
+    return next(
+        (
+            cells
+            for cells in reversed(CELLS)
+            if all(_told_apart(seen, train, model, cells, start) for start in STARTS)
+        ),
+        0,
+    )
+
+
+def _told_apart(
+    record: Record, train: slice, model: str, cells: int, start: str
+) -> bool:
+    shape = empty(record, cells, None, start)
+    if model == RATE_DEPENDENT:
+        shape = RateDependentPreisach(shape, shape.weights, _pace(record), record.dt)
+    rows = responses(shape, record.input, None, train)
+    strength = np.linalg.svd(rows - rows.mean(axis=0), compute_uv=False)
+    least = TOLD_APART * np.sqrt(len(rows))
+    return len(rows) >= rows.shape[1] and bool(strength[-1] >= least)
 
 
 def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:

@@ -32,7 +32,7 @@ def chain(name: str) -> list[str]:
         if part not in PARTS:
             raise ValueError(
                 f"a model has no part {part!r}; there are {', '.join(PARTS)}, "
-                "joined by '+'"
+                "joined by '+'; whole models stand by themselves (--model help)"
             )
     places = [PARTS[part][0] for part in parts]
     for place in places:

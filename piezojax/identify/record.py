@@ -1,6 +1,7 @@
 """A lab's record: time, input, output, read from a file and checked."""
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -190,6 +191,8 @@ def read_record(
             step = _time_step(instants, even=resample is None)
             steps = {f"column {name!r}": step} | steps
         dt = _agreed(steps)
+        for role, names in (("input", inputs), ("output", outputs)):
+            _check_signals(names, role)
         if resample is not None:
             if instants is None:
                 instants = dt * np.arange(values[inputs[0]].size)
@@ -205,6 +208,18 @@ def read_record(
         source=path.name,
         period=period,
     )
+
+
+def _check_signals(names: list[str], role: str) -> None:
+    for name in names:
+        if IS_TIME.match(name):
+            raise ContentError(
+                f"the {role} column is {name!r}; name the columns of input and output"
+            )
+
+
+IS_TIME = re.compile(r"time\b|time_", re.IGNORECASE)
+"""Names of columns that are no signal."""
 
 
 def _named(columns: Columns, wanted: Key | Sequence[Key], role: str) -> list[str]:

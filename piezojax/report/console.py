@@ -117,7 +117,7 @@ def models_table() -> Table:
     """Return what can be identified: whole models, and parts to be joined by '+'."""
     table = Table(title="models; parts are joined by '+', as in coleman_hodgdon+lag")
     for column in ("model", "kind", "what it is, or how it is fitted"):
-        table.add_column(column, no_wrap=column == "model")
+        table.add_column(column, no_wrap=column == "model", overflow="fold")
     for name, (place, build) in PARTS.items():
         table.add_row(name, f"part: {place}", (build.__doc__ or "").strip())
     for name, method in METHODS.items():

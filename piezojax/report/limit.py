@@ -64,9 +64,10 @@ def limit_text(found: LimitReport | str) -> str:
         return f"note: no limit of linear control: {found}"
     count = len(found.references)
     lines = [
-        f"limit of linear control with full preview ({found.resolution:.3g} Hz): tuned "
-        f"{found.over:.2f}x, {found.near} of {count} references within {NEAR:g}x; "
-        f"best one controller for all: {found.over_one_controller:.2f}x, "
+        "limit of linear control with full preview (resolved to "
+        f"{found.resolution:.3g} Hz): tuned is {found.over:.2f}x that, {found.near} of "
+        f"{count} references within {NEAR:g}x; it is {found.over_one_controller:.2f}x "
+        "what one such controller for all of them leaves, "
         f"{found.near_one_controller} of {count}"
     ]
     by_cause: dict[str | None, list[str]] = {}

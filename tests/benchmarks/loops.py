@@ -71,11 +71,8 @@ def picture():
         ax.set_title(name, fontsize=7.0)
         force = name in FORCES
         ax.set_ylabel("force (N)" if force else "displacement (µm)", fontsize=7.0)
-    for ax in panels[-1]:
-        ax.set_xlabel("input (V; bouc_wen: µm)", fontsize=7.0)
-    for ax in panels[-2, len(names) % ACROSS or ACROSS :]:
+        ax.set_xlabel("displacement (µm)" if force else "input (V)", fontsize=7.0)
         ax.tick_params(labelbottom=True)
-        ax.set_xlabel("input (V)", fontsize=7.0)
     headed(drawn, "Loops of the hysteresis models, a small loop four times on the way")
     return drawn
 

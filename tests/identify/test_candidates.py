@@ -1,6 +1,7 @@
 """Which models a record can support."""
 
 import numpy as np
+import pytest
 
 from piezojax import Record
 from piezojax.identify import METHODS, PARTS
@@ -51,6 +52,11 @@ def test_named_ones_are_tried_beside_linear_models():
         "state_space",
     }
     assert set(reasons(untried)) == {"bouc_wen"}
+
+
+def test_named_ones_of_which_none_can_be_tried():
+    with pytest.raises(ValueError, match="none of them can be tried: bouc_wen: it nee"):
+        first_round([RICH], HALF, OPTIONS, ["bouc_wen"])
 
 
 def test_nothing_is_dropped_in_silence():

@@ -272,6 +272,7 @@ def test_the_command(made, file, tmp_path):
         (("--model", "all", "--method", "subspace"), "--method goes with one model"),
         (("--test", "0:5"), "--among and --test go with --model all"),
         (("--among", "coleman_hodgdon"), "--among and --test go with --model all"),
+        (("--among", ""), "--among and --test go with --model all"),
     ],
 )
 def test_options_that_do_not_go_together(file, arguments, message):

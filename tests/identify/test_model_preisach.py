@@ -1,18 +1,20 @@
 """A Preisach model behind a lag from a record, and records that support none."""
 
 import itertools
+import sys
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import preisach as oracle
 
-from piezojax import Record, identify, load
+from piezojax import Record, identify, load, read_record
 from piezojax.identify import free_run
 from piezojax.identify.candidates import whole_models
 from piezojax.identify.estimate import Options
 from piezojax.identify.model_preisach import RATE_DEPENDENT, cells_told_apart
 from piezojax.report.identification import write_fit
+from piezojax.study import shipped
 
 DT, LAG, LOWEST, NOISE = 1e-3, 2.2e-3, -1.5, 2e-3
 CELLS = 10
@@ -124,6 +126,20 @@ def test_cells_are_as_fine_as_the_turning_points_tell():
     ]
     assert found[0] == 0
     assert found[0] <= found[1] < found[2] == CELLS
+
+
+def test_the_way_from_a_virgin_start_is_not_relied_upon(monkeypatch):
+    # One amplitude: a virgin material passes more cells on the way to the first corner.
+    record = read_record(
+        shipped().parent / "data" / "micromanipulator.csv",
+        time="time_s",
+        input="input_V",
+        output="displacement_um",
+    )
+    assert cells_told_apart(record, slice(0, 1200)) == 0
+    module = sys.modules[cells_told_apart.__module__]
+    monkeypatch.setattr(module, "STARTS", ("virgin",))
+    assert cells_told_apart(record, slice(0, 1200)) == 4
 
 
 def test_a_record_of_one_loop_supports_none():

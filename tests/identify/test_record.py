@@ -590,3 +590,12 @@ def test_resampling_does_not_sort_time(write):
         **COLUMNS,
         resample=1000.0,
     )
+
+
+def test_a_column_of_time_is_no_signal(tmp_path):
+    path = tmp_path / "clock.csv"
+    rows = [f"{0.1 * k:.1f},{k % 7},{k % 5}" for k in range(60)]
+    for header in ("time_s,u,y", "Time (s),u,y", "time,u,y"):
+        path.write_text("\n".join([header, *rows]), encoding="utf-8")
+        with pytest.raises(ValueError, match=r"the input column is '[Tt]ime"):
+            read_record(path, rate=10.0)
