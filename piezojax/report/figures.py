@@ -46,8 +46,9 @@ def figure(width: float, height: float) -> Figure:
 
 
 def headed(picture: Figure, title: str) -> None:
-    """Put ``title`` above all panels, in as many lines as the width needs."""
-    picture.suptitle(fill(title, int(11.0 * picture.get_figwidth())))
+    """Put ``title`` above all panels, its lines in as many as the width needs."""
+    width = int(11.0 * picture.get_figwidth())
+    picture.suptitle("\n".join(fill(line, width) for line in title.splitlines()))
 
 
 def legend_above(ax: Axes) -> None:

@@ -104,8 +104,8 @@ def _report(
         rate = swept.lane_steps / swept.core_s
         console.print(
             f"{swept.lane_steps:.3g} samples in {swept.wall_s:.1f} s, "
-            f"{swept.core_s / 3600.0:.3g} hours of cores: {rate:.3g} samples a second "
-            "and core",
+            f"{swept.core_s:.3g} core-seconds of simulating: {rate:.3g} samples a "
+            "second and core",
             soft_wrap=True,
         )
     if swept.finished:
