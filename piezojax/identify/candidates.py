@@ -131,8 +131,10 @@ def first_round(
     whole, untried = whole_models(records, train, options)
     whole = [one for one in whole if one.model in (LINEAR, *names)]
     untried = [one for one in untried if one.model in (LINEAR, *names)]
-    if hysteresis is not None and {one.model for one in untried} >= set(names):
-        reasons = "; ".join(f"{one.model}: {one.reason}" for one in untried)
+    if names and {one.model for one in untried} >= set(names):
+        reasons = "; ".join(
+            f"{one.model}: {one.reason}" for one in untried if one.model in names
+        )
         raise ValueError(f"none of them can be tried: {reasons}")
     several = _several(records)
     if several:

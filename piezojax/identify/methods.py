@@ -25,9 +25,9 @@ from .structure import REST_INPUT
 
 AS_GOOD = 1e-3
 """Starts whose mean square comes this close (as a share) to the best fit as well."""
+
 AMBIGUOUS = 0.01
 """Share of its range over which a parameter of fits as good must differ to be said."""
-
 
 Records = Sequence[Record]
 
