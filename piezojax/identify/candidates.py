@@ -6,6 +6,7 @@ simpler dynamics. All combinations would take many times as long and tell no mor
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from .checks import lines
@@ -256,8 +257,9 @@ def _against_periods(
 
 
 def _against_preisach(
-    model: str, records: Sequence[Record], train: slice
+    model: str, records: Sequence[Record], train: slice, options: Options
 ) -> str | None:
+    del options
     if against := _against_all_but_one(records):
         return against
     return None if cells_told_apart(records[0], train, model) else TOO_FEW[model]
@@ -277,9 +279,7 @@ _AGAINST = {
     LINEAR: _against_state_space,
     "bouc_wen": lambda *of: _against_periods(*of) or _several(of[0]),
     "neural_state_space": _against_periods,
-    PLAIN: lambda records, train, _: _against_preisach(PLAIN, records, train),
-    RATE_DEPENDENT: lambda records, train, _: _against_preisach(
-        RATE_DEPENDENT, records, train
-    ),
+    PLAIN: partial(_against_preisach, PLAIN),
+    RATE_DEPENDENT: partial(_against_preisach, RATE_DEPENDENT),
 }
 """What speaks against a model; one that is not here is tried on any record."""

@@ -18,6 +18,16 @@ class FittedParameter(BaseModel):
     standard_error: float | None
 
 
+EDGE = 1e-3
+"""How close to a bound, as a share of the range, a parameter lies at it."""
+
+
+def at_edge(name: str, place: float) -> list[str]:
+    """Return what to say of a parameter at ``place``, 0 to 1, in its range."""
+    inside = EDGE <= place <= 1.0 - EDGE
+    return [] if inside else [f"{name} lies at the edge of its bounds"]
+
+
 @dataclass(frozen=True)
 class Options:
     """What the methods may be told; each uses what it needs.

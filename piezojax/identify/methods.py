@@ -10,7 +10,7 @@ from .._types import as_array
 from ..paths import parameters
 from ..progress import Progress
 from ..system import System
-from .estimate import Estimate, FittedParameter, Options
+from .estimate import Estimate, FittedParameter, Options, at_edge
 from .linear import by_frequency_response, by_subspace
 from .model_bouc_wen import bouc_wen
 from .model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
@@ -78,9 +78,7 @@ def _optimum_warnings(optimum: Optimum, steps: int) -> list[str]:
     as_good = optimum.units[optimum.losses <= optimum.losses[0] * (1.0 + AS_GOOD)]
     spread = np.ptp(as_good, axis=0)
     for i, name in enumerate(optimum.names):
-        place = optimum.units[0, i]
-        if place < 1e-3 or place > 1.0 - 1e-3:
-            found.append(f"{name} lies at the edge of its bounds")
+        found += at_edge(name, optimum.units[0, i])
         if optimum.deviations[i] is None:
             found.append(f"{name} is not determined by this record")
         elif spread[i] > AMBIGUOUS:

@@ -13,6 +13,7 @@ from ..hysteresis import Preisach, RateDependentPreisach
 from ..hysteresis.preisach import STARTS
 from ..paths import parameters, replace
 from ..system import Series, series
+from .estimate import at_edge
 from .output_error import from_rest, standard_errors
 from .preisach import (
     empty,
@@ -64,12 +65,8 @@ STEP = 1e-4
 ENDED = 1e-5
 """Change of the logarithms at which their search ends: far below standard errors."""
 
-
 STEPS = 20
 """Most steps of that search."""
-
-EDGE = 1e-3
-"""How close to a bound, as a share of a logarithm's range, an unknown lies at it."""
 
 
 class Chain(NamedTuple):
@@ -263,9 +260,9 @@ def _named(hysteresis: Model, cells: int) -> dict[str, float]:
 
 def _at_edges(unknowns: list[Unknown], logs: np.ndarray) -> list[str]:
     return [
-        f"{u.name} lies at the edge of its bounds"
+        text
         for u, log in zip(unknowns, logs, strict=True)
-        if not EDGE < (log - np.log(u.least)) / np.log(u.most / u.least) < 1.0 - EDGE
+        for text in at_edge(u.name, (log - np.log(u.least)) / np.log(u.most / u.least))
     ]
 
 

@@ -52,7 +52,7 @@ def fit_preisach(
     """
     shape = empty(record, cells, limits, start)
     (weights,), lowest = _densities(record, shape, train, dynamics, smoothing)
-    return Preisach(weights, shape.low, shape.high, lowest, shape.rest_input, start)
+    return _filled(shape, weights, lowest)
 
 
 def fit_rate_dependent_preisach(
@@ -74,10 +74,15 @@ def fit_rate_dependent_preisach(
     """
     slow = empty(record, cells, limits, start)
     shape = RateDependentPreisach(slow, slow.weights, rate, record.dt)
-    found, lowest = _densities(record, shape, train, dynamics, smoothing)
-    weights, fast = found
-    slow = Preisach(weights, slow.low, slow.high, lowest, slow.rest_input, start)
+    (weights, fast), lowest = _densities(record, shape, train, dynamics, smoothing)
+    slow = _filled(slow, weights, lowest)
     return RateDependentPreisach(slow, fast, rate, record.dt)
+
+
+def _filled(shape: Preisach, weights: np.ndarray, lowest: float) -> Preisach:
+    return Preisach(
+        weights, shape.low, shape.high, lowest, shape.rest_input, shape.start
+    )
 
 
 def empty(

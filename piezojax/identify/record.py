@@ -18,6 +18,9 @@ Key = str | int
 SHORTEST = 50
 """Fewest samples a record may have."""
 
+IS_TIME = re.compile(r"time\b|time_", re.IGNORECASE)
+"""Names of columns that are no signal."""
+
 UNIFORM = 1e-3
 """How far, as a share, time steps may lie from each other to be one sample time."""
 
@@ -216,10 +219,6 @@ def _check_signals(names: list[str], role: str) -> None:
             raise ContentError(
                 f"the {role} column is {name!r}; name the columns of input and output"
             )
-
-
-IS_TIME = re.compile(r"time\b|time_", re.IGNORECASE)
-"""Names of columns that are no signal."""
 
 
 def _named(columns: Columns, wanted: Key | Sequence[Key], role: str) -> list[str]:
