@@ -10,15 +10,19 @@ from oracles.hysteresis import inverse_trapezoid_step
 from oracles.published import HYSTERESIS, KE
 
 from piezojax import (
-    Affine,
-    ChargeDrive,
     Feedback,
-    Sensor,
     loop_inputs,
-    signals,
     simulate,
 )
 from piezojax.catalog import p753, p753_survey
+from piezojax.core.system import (
+    Affine,
+)
+from piezojax.hardware import (
+    ChargeDrive,
+    Sensor,
+)
+from piezojax.signals import waveforms as signals
 
 DT = 5e-5
 LOAD = p753_survey.charge_drive().load

@@ -15,15 +15,15 @@ from click.testing import CliRunner
 from rich.console import Console
 
 import piezojax as pj
-from piezojax.identify import PARTS
+from piezojax.identification import PARTS
 from piezojax.report.console import Bar, console, tuning_table
-from piezojax.reproduce import TABLES
-from piezojax.reproduce.cell import Cell
-from piezojax.reproduce.rates import FIGURE, RateError
+from piezojax.reproduction import TABLES
+from piezojax.reproduction.cell import Cell
+from piezojax.reproduction.rates import FIGURE, RateError
 from piezojax.study import read
 
 COMMANDS = {
-    name: importlib.import_module(f"piezojax.{name}.__main__").main
+    name: importlib.import_module(f"piezojax.cli.{name}").main
     for name in ("tune", "identify", "reproduce")
 }
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -203,8 +203,11 @@ def test_tune_reports_margins_before_and_after(tuned):
     printed, out = tuned
     found = json.loads((out / "stability.json").read_text(encoding="utf-8"))
     assert set(found) == {"before", "after"}
-    lag, drive = pj.FirstOrderLag(1e-3, 5e-5), pj.Saturation(-20.0, 120.0)
-    loop = pj.Feedback(pj.load(out / "gains.toml"), lag, drive, pj.Sensor(0.0))
+    lag, drive = (
+        pj.dynamics.FirstOrderLag(1e-3, 5e-5),
+        pj.hardware.Saturation(-20.0, 120.0),
+    )
+    loop = pj.Feedback(pj.load(out / "gains.toml"), lag, drive, pj.hardware.Sensor(0.0))
     for branch in ("ascending", "descending"):
         report = found["after"][branch]
         assert report["stable"]
@@ -219,7 +222,7 @@ def test_tune_result_and_gains_load(tuned):
     assert result.status in ("converged", "step limit")
     assert result.study == "small"
     controller = pj.load(out / "gains.toml")
-    assert isinstance(controller, pj.PID)
+    assert isinstance(controller, pj.control.PID)
     assert float(controller.integral) == result.gains["controller.integral"]
     assert float(controller.proportional) == result.gains["controller.proportional"]
     raw = json.loads((out / "result.json").read_text(encoding="utf-8"))
@@ -359,7 +362,7 @@ def test_ctrl_c_while_drawing_loses_no_result(study, tmp_path, monkeypatch):
     def press(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("piezojax.report.tuning.tracking_figure", press)
+    monkeypatch.setattr("piezojax.report.tuning_pictures.tracking_figure", press)
     result = call("tune", study, "--out", tmp_path / "out")
     assert result.exit_code == 130
     assert "Traceback" not in result.output
@@ -507,7 +510,7 @@ def made_up(monkeypatch):
             for column in ("pid_smc", "dob")
         ]
 
-    module = sys.modules["piezojax.reproduce.__main__"]
+    module = sys.modules["piezojax.cli.reproduce"]
     monkeypatch.setattr(module, "reproduce", reproduce)
     errors = [RateError(20_000, "continuous", row, 0.1) for row in ("SIN1", "SW10")]
     monkeypatch.setattr(module, "errors_by_rate", lambda: errors)
@@ -622,7 +625,7 @@ def test_a_full_disk_is_said_in_one_line(study, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("piezojax.report.tuning.write_text", full)
+    monkeypatch.setattr("piezojax.report.tuning_pictures.write_text", full)
     result = call("tune", study, "--out", tmp_path / "out")
     failed(result, "No space left on device")
 

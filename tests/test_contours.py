@@ -5,9 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import ContourError, contours, motions, signals
-from piezojax.contour_error import distance_to
-from piezojax.system import LoopSample
+from piezojax.core.system import LoopSample
+from piezojax.signals import (
+    ContourError,
+    contours,
+    motions,
+)
+from piezojax.signals import waveforms as signals
+from piezojax.signals.contour_error import distance_to
 
 TIME = signals.time_grid(1.0, 2000.0)
 AXES = ("Z", "Rx", "Ry")

@@ -4,18 +4,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import signals
-from piezojax.report import tuning
-from piezojax.report.contour import contour_figure, contours_in
-from piezojax.report.coupling import coupling_figure
+from piezojax.core.system import LoopSample
+from piezojax.report import tuning_pictures as tuning
+from piezojax.report.contour_path import contour_figure, contours_in
+from piezojax.report.coupling_map import coupling_figure
 from piezojax.report.figures import styled
+from piezojax.signals import waveforms as signals
 from piezojax.study import Study, build
-from piezojax.system import LoopSample
-from piezojax.tune import coupling_matrix
-from piezojax.tune.result import Result, Scores
-from piezojax.tune.runs import Signals
-from piezojax.tune.traces import traces_of
-from piezojax.tune.tuner import Outcome
+from piezojax.tuning import coupling_matrix
+from piezojax.tuning.result import Result, Scores
+from piezojax.tuning.runs import Signals
+from piezojax.tuning.traces import traces_of
+from piezojax.tuning.tuner import Outcome
 
 TUNE = ["Z:SIN5", "Rx:SIN5", "Ry:SIN5", "Ry:SIN10", "Z+Rx:CIRCLE5"]
 BASE = {

@@ -5,8 +5,8 @@ import stat
 
 import pytest
 
-from piezojax import files
-from piezojax.files import fresh_folder, numbered_folder, write_bytes, write_text
+from piezojax.core import files
+from piezojax.core.files import fresh_folder, numbered_folder, write_bytes, write_text
 
 
 def names(folder):

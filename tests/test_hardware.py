@@ -3,7 +3,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import Quantiser, Saturation, Sensor, SlewLimit, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.hardware import (
+    Quantiser,
+    Saturation,
+    Sensor,
+    SlewLimit,
+)
 
 DT = 5e-5
 

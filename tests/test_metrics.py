@@ -3,8 +3,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import Tracking
-from piezojax.system import LoopSample
+from piezojax.core.metrics import (
+    Tracking,
+)
+from piezojax.core.system import LoopSample
 
 SAMPLES = 300
 

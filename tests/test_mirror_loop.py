@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import piezojax as pj
-from piezojax.axes import packed
 from piezojax.catalog import mirror
-from piezojax.system import loop_inputs
+from piezojax.core.axes import packed
+from piezojax.core.system import loop_inputs
 
 REST = (0.0, 0.0, 0.0)
 

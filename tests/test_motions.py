@@ -2,7 +2,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import motions, signals
+from piezojax.signals import motions
+from piezojax.signals import waveforms as signals
 
 AXES = ("Z", "Rx", "Ry")
 TIME = signals.time_grid(1.0, 500.0)

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.optimisers import METHODS, damped_gauss_newton
-from piezojax.tune.gradient import with_finite_gradient
-from piezojax.tune.objective import HOPELESS
+from piezojax.solve.optimisers import METHODS, damped_gauss_newton
+from piezojax.tuning.gradient import with_finite_gradient
+from piezojax.tuning.objective import HOPELESS
 
 STEPS = 160
 TOLERANCE = 1e-8

@@ -6,11 +6,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import Feedback, Sensor, Tracking, loop_inputs, signals
+from piezojax import (
+    Feedback,
+    loop_inputs,
+)
 from piezojax.catalog import CONTROLLERS, PLANTS, at_rate, p753, p753_by_rate
 from piezojax.catalog import p753_chapter4 as printed
-from piezojax.paths import get, parameters, replace
-from piezojax.rollout import simulate
+from piezojax.core.metrics import (
+    Tracking,
+)
+from piezojax.core.paths import get, parameters, replace
+from piezojax.core.rollout import simulate
+from piezojax.hardware import (
+    Sensor,
+)
+from piezojax.signals import waveforms as signals
 
 RATES = tuple(p753.DYNAMICS_BY_RATE)
 SAME = {

@@ -1,8 +1,14 @@
 import numpy as np
 import pytest
 
-from piezojax import InverseColemanHodgdon, InversePreisach, InversionControl
 from piezojax.catalog import p753, p753_inverses
+from piezojax.control import (
+    InversionControl,
+)
+from piezojax.hysteresis import (
+    InverseColemanHodgdon,
+    InversePreisach,
+)
 
 INPUT = p753_inverses.excitation()[::40]  # 100 Hz in 2000 samples: coarse, but rich
 

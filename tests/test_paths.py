@@ -5,9 +5,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import Affine, Delay, Feedback, FirstOrderLag, series
+from piezojax import (
+    Feedback,
+    series,
+)
 from piezojax.catalog import CONTROLLERS, PLANTS, p753
-from piezojax.paths import get, parameters, replace, static_fields
+from piezojax.core.paths import get, parameters, replace, static_fields
+from piezojax.core.system import (
+    Affine,
+    Delay,
+)
+from piezojax.dynamics import (
+    FirstOrderLag,
+)
 
 
 @pytest.fixture(params=sorted(CONTROLLERS))

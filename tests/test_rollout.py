@@ -5,18 +5,26 @@ import numpy as np
 import pytest
 
 from piezojax import (
-    Affine,
-    ColemanHodgdon,
     Metric,
-    Tracking,
-    in_blocks,
     loop_inputs,
-    paths,
-    signals,
     simulate,
 )
 from piezojax.catalog import p753
-from piezojax.system import LoopInput
+from piezojax.core import paths
+from piezojax.core.metrics import (
+    Tracking,
+)
+from piezojax.core.rollout import (
+    in_blocks,
+)
+from piezojax.core.system import (
+    Affine,
+    LoopInput,
+)
+from piezojax.hysteresis import (
+    ColemanHodgdon,
+)
+from piezojax.signals import waveforms as signals
 
 SAMPLES = 1050  # no multiple of the 100 samples of a segment
 PLANT = p753.plant()

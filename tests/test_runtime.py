@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from piezojax import _runtime
+from piezojax.core import runtime as _runtime
 
 THRESHOLD = (
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
@@ -148,7 +148,7 @@ def test_flags_are_set_only_where_they_are_known(version, expected, monkeypatch)
 
 def test_threads_simulate_side_by_side_if_asked_in_time():
     done = python(
-        "from piezojax import _runtime\n"
+        "from piezojax.core import runtime as _runtime\n"
         "import jax.numpy as jnp\n"
         "print(_runtime.simulate_side_by_side())\n"
         "jnp.zeros(3)\n"
@@ -156,7 +156,7 @@ def test_threads_simulate_side_by_side_if_asked_in_time():
     )
     assert done.stdout.split() == ["True", "True"], done.stderr
     late = python(
-        "from piezojax import _runtime\n"
+        "from piezojax.core import runtime as _runtime\n"
         "import jax.numpy as jnp\n"
         "jnp.zeros(3)\n"
         "print(_runtime.simulate_side_by_side())\n"

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import signals as oracle
 
-from piezojax import signals
+from piezojax.signals import waveforms as signals
 
 RATE = 20_000.0
 

@@ -9,9 +9,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from piezojax import PID, Affine
-from piezojax.paths import replace
-from piezojax.space import INSIDE, TRANSFORMS, space_of, squash, unsquash
+from piezojax.control import (
+    PID,
+)
+from piezojax.core.paths import replace
+from piezojax.core.space import INSIDE, TRANSFORMS, space_of, squash, unsquash
+from piezojax.core.system import (
+    Affine,
+)
 
 UNIT = st.floats(0.0, 1.0)
 SIDES = {

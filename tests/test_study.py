@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 import tomli_w
 
-from piezojax import FirstOrderLag, save
+from piezojax import (
+    save,
+)
 from piezojax.catalog import CONTROLLERS, p753
-from piezojax.paths import get, parameters
+from piezojax.core.paths import get, parameters
+from piezojax.dynamics import (
+    FirstOrderLag,
+)
 from piezojax.study import DEFAULT, build, load, read, shipped
 
 SHIPPED = sorted(path.stem for path in shipped().parent.glob("*.toml"))

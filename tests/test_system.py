@@ -9,28 +9,39 @@ from oracles import hysteresis
 from oracles.published import HYSTERESIS, MODEL_533_A, MODEL_533_B, T2_G, T2_P
 
 from piezojax import (
-    ARMA,
-    PID,
-    Affine,
-    ColemanHodgdon,
-    Delay,
-    DisturbanceObserverControl,
     Feedback,
-    FirstOrderLag,
-    InverseColemanHodgdon,
-    InversionControl,
-    Parallel,
-    Quantiser,
-    Saturation,
-    Sensor,
-    Series,
-    SlewLimit,
     loop_inputs,
     series,
     simulate,
 )
 from piezojax.catalog import p753
-from piezojax.system import holding_input, rest_output
+from piezojax.control import (
+    PID,
+    DisturbanceObserverControl,
+    InversionControl,
+)
+from piezojax.core.system import (
+    Affine,
+    Delay,
+    Parallel,
+    Series,
+    holding_input,
+    rest_output,
+)
+from piezojax.dynamics import (
+    ARMA,
+    FirstOrderLag,
+)
+from piezojax.hardware import (
+    Quantiser,
+    Saturation,
+    Sensor,
+    SlewLimit,
+)
+from piezojax.hysteresis import (
+    ColemanHodgdon,
+    InverseColemanHodgdon,
+)
 
 DT = 5e-5
 GAIN, SHIFT, DOUBLE = Affine(3.0), Affine(1.0, 0.5), Affine(2.0)

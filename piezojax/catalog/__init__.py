@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable, Mapping
 
-from ..system import System
+from ..core.system import System
 from . import mirror as mirror
 from . import p558_control as p558_control
 from . import p558_stage as p558_stage

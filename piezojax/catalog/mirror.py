@@ -24,12 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from ..axes import PerAxis
 from ..control.anticipation import Anticipation
 from ..control.multi_axis import MultiAxisSlidingModePID
+from ..core.axes import PerAxis
+from ..core.system import Feedback, System
 from ..dynamics import MatrixARMA, SecondOrderLag, StateSpace, observability_form
 from ..hardware import Saturation, Sensor
-from ..system import Feedback, System
 
 DT = 1.0 / 6400.0
 """Sample time of the records, s."""

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..axes import Packed, PerAxis
 from ..control.allocation import Allocation
+from ..core.axes import Packed, PerAxis
+from ..core.system import Series, System, series
 from ..dynamics import LinearMap, StateSpace
-from ..system import Series, System, series
 
 POSITIONS = ((50.0, 50.0), (-50.0, 50.0), (-50.0, -50.0), (50.0, -50.0))
 """(x, y) of each actuator, mm; counterclockwise."""

@@ -7,7 +7,6 @@ outputs are in um, urad, urad.
 import math
 from typing import Any
 
-from ..axes import PerAxis, diagonal
 from ..control.alpha_beta import AlphaBeta
 from ..control.anticipation import Anticipation
 from ..control.disturbance_observer import DisturbanceObserverControl
@@ -15,9 +14,10 @@ from ..control.filtered import Filtered
 from ..control.multi_axis import MultiAxisSlidingModePID
 from ..control.nominal import NominalSlidingModePID
 from ..control.pid import PID
+from ..core.axes import PerAxis, diagonal
+from ..core.system import Feedback, System
 from ..dynamics import ARMA, Channels, SecondOrderLag, channels_of, observability_form
 from ..hardware import Saturation, Sensor
-from ..system import Feedback, System
 from . import p558
 from .p558 import DT, NOISE_RMS, OUTPUTS
 

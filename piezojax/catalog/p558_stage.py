@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..axes import PerAxis
+from ..core.axes import PerAxis
+from ..core.system import Delay, Series, System, series
 from ..dynamics import Channel, Channels, channels_of
 from ..hysteresis import PrandtlIshlinskii
-from ..system import Delay, Series, System, series
 from . import p558
 from .p558 import OUTPUTS
 

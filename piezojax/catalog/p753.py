@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from .._types import ScalarLike
 from ..control import (
     PID,
     AdaptiveInverse,
@@ -23,10 +22,11 @@ from ..control import (
     mixed_sensitivity,
 )
 from ..control.kalman import model_kalman
+from ..core.arrays import ScalarLike
+from ..core.system import Feedback, Series, System, series
 from ..dynamics import ARMA, scaled_to_dc
 from ..hardware import Saturation, Sensor
 from ..hysteresis import ColemanHodgdon, InverseColemanHodgdon
-from ..system import Feedback, Series, System, series
 
 RATE = 20_000.0
 """Sampling rate of chapters 3 and 5, Hz."""

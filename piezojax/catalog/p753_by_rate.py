@@ -25,9 +25,9 @@ from ..control import (
     SlidingModePID,
     SwitchedSlidingMode,
 )
+from ..core.system import Series, System, series
 from ..dynamics import ARMA, scaled_to_dc
 from ..hysteresis import InverseColemanHodgdon
-from ..system import Series, System, series
 from . import p753, p753_chapter4
 
 ULTIMATE = {

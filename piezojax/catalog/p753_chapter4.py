@@ -7,7 +7,6 @@ Every number carries its table or section in Y. Cao's thesis (2013); the models 
 from collections.abc import Mapping
 from typing import Any
 
-from .._types import ScalarLike
 from ..control import (
     AlphaBeta,
     Anticipation,
@@ -18,9 +17,10 @@ from ..control import (
     SlidingModePID,
     SwitchedSlidingMode,
 )
+from ..core.arrays import ScalarLike
+from ..core.system import Feedback, Series, System, series
 from ..dynamics import ARMA, Held, SecondOrderLag, scaled_to_dc
 from ..hardware import Sensor
-from ..system import Feedback, Series, System, series
 from . import p753
 
 TRADITIONAL_GAINS = {

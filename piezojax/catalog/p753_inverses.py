@@ -6,6 +6,7 @@ ours; gains and dynamics are the printed ones of ``p753``.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,6 +15,8 @@ from jaxtyping import Array, Float
 from scipy.optimize import minimize_scalar
 
 from ..control import InversionControl
+from ..core.rollout import simulate
+from ..core.system import Series, System, series
 from ..dynamics import ARMA, scaled_to_dc
 from ..hysteresis import (
     ColemanHodgdon,
@@ -21,9 +24,7 @@ from ..hysteresis import (
     InversePreisach,
     Preisach,
 )
-from ..identify import Record, fit_preisach
-from ..rollout import simulate
-from ..system import Series, System, series
+from ..identification import Record, fit_preisach
 from . import p753
 
 CELLS = 20
@@ -140,7 +141,7 @@ def fitted_coleman_hodgdon(record: Record) -> ColemanHodgdon:
         found = np.linalg.lstsq(matrix, output, rcond=None)[0]
         return found, float(np.sum((matrix @ found - output) ** 2))
 
-    best = minimize_scalar(
+    best: Any = minimize_scalar(
         lambda log: solved(-float(np.exp(log)))[1],
         bounds=np.log(-printed["c"] * np.array([0.1, 10.0])),
         method="bounded",

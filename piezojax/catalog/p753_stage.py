@@ -8,10 +8,10 @@ Neither is printed for this stage: both are assumptions of ours.
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Scalar, ScalarLike, as_array
+from ..core.arrays import Scalar, ScalarLike, as_array
+from ..core.system import Affine, Series, series
 from ..dynamics import ARMA, ExponentialCreep, FractionalDelay, SecondOrderLag
 from ..hysteresis import ColemanHodgdon
-from ..system import Affine, Series, series
 from . import p753
 
 CREEP = {"gains": (0.01, 0.01, 0.01), "time_constants": (0.03, 0.3, 3.0)}

@@ -5,7 +5,6 @@ that hold SIN10 of 5 um with the printed noise, to be tuned. Models, filter and 
 are the printed ones of ``p753``.
 """
 
-from ..charge_drive import ChargeDrive
 from ..control import (
     AlphaBeta,
     BoundaryLayer,
@@ -16,9 +15,10 @@ from ..control import (
     SuperTwisting,
     SwitchedSlidingMode,
 )
+from ..core.system import Affine, System
 from ..dynamics import ARMA, FirstOrderLag
+from ..hardware import ChargeDrive
 from ..hysteresis import InverseColemanHodgdon
-from ..system import Affine, System
 from . import p753
 
 BOUNDARY_LAYER = {"gain": 1e4, "width": 4e4}

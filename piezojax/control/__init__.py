@@ -19,7 +19,6 @@ from .iterative_learning import LearningLaw as LearningLaw
 from .iterative_learning import Trials as Trials
 from .iterative_learning import learn as learn
 from .kalman import KalmanFilter as KalmanFilter
-from .linear import StateSpaceController as StateSpaceController
 from .mixed_sensitivity import first_order_weight as first_order_weight
 from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
 from .model_reference import ModelReferencePID as ModelReferencePID
@@ -34,5 +33,6 @@ from .preview import stable_inverse as stable_inverse
 from .preview import zero_phase_inverse as zero_phase_inverse
 from .repetitive import RepetitiveControl as RepetitiveControl
 from .sliding_mode import SlidingModePID as SlidingModePID
+from .state_space_controller import StateSpaceController as StateSpaceController
 from .super_twisting import SuperTwisting as SuperTwisting
 from .switched import SwitchedSlidingMode as SwitchedSlidingMode

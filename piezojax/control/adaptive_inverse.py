@@ -6,9 +6,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, State, as_array, as_scalars, check
+from ..core.arrays import Scalar, ScalarLike, State, as_array, as_scalars, check
+from ..core.system import Observation, Series, System
 from ..dynamics.lag import FirstOrderLag
-from ..system import Observation, Series, System
 from .recursive_weights import RecursiveWeights
 
 Row = tuple[Scalar, ...]

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._types import ScalarLike, State, as_array, check, check_order
-from ..system import System
+from ..core.arrays import ScalarLike, State, as_array, check, check_order
+from ..core.system import System
 from .box import MOST_ACTUATORS, Numbers, Problem, clipped, null_space, within
 
 METHODS = {"minimum_norm": clipped, "weighted": clipped, "bounded": within}

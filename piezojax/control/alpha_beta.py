@@ -3,8 +3,8 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, as_array, check
-from ..system import Observation
+from ..core.arrays import Scalar, as_array, check
+from ..core.system import Observation
 from .observer import Motion, Observer
 
 

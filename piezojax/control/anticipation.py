@@ -4,9 +4,9 @@ from typing import Any
 
 import equinox as eqx
 
-from .._types import Scalar, State, as_scalars, check
-from ..axes import Axes
-from ..system import Observation, System
+from ..core.arrays import Scalar, State, as_scalars, check
+from ..core.axes import Axes
+from ..core.system import Observation, System
 
 
 class Anticipation(System):

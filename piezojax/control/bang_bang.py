@@ -3,8 +3,8 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, State, as_array, check
-from ..system import System
+from ..core.arrays import Scalar, ScalarLike, State, as_array, check
+from ..core.system import System
 
 
 class BangBang(System):

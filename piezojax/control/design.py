@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
+from ..core.system import Series, System
 from ..dynamics import ARMA, FirstOrderLag
 from ..hysteresis import ColemanHodgdon, InverseColemanHodgdon
-from ..system import Series, System
 from .alpha_beta import AlphaBeta
 from .disturbance_observer import DisturbanceObserverControl
 from .inversion import InversionControl

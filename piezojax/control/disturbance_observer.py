@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import equinox as eqx
 
-from .._types import Scalar, State, as_array, check, check_not_zero
+from ..core.arrays import Scalar, State, as_array, check, check_not_zero
+from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
-from ..system import Observation, System
 
 COEFFICIENTS = ("corrected", "printed")
 

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-from .._types import Scalar, State, as_array
-from ..system import Observation, System, rest_output
+from ..core.arrays import Scalar, State, as_array
+from ..core.system import Observation, System, rest_output
 
 
 class FeedforwardState(NamedTuple):

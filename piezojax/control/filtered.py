@@ -4,8 +4,8 @@ from typing import Any
 
 import jax
 
-from .._types import State
-from ..system import Observation, System
+from ..core.arrays import State
+from ..core.system import Observation, System
 from .observer import Motion
 
 

@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-from .._types import Scalar, State
+from ..core.arrays import Scalar, State
+from ..core.system import Observation, System, rest_output
 from ..hysteresis.inverse import Inverse
-from ..system import Observation, System, rest_output
 
 
 class InversionState(NamedTuple):

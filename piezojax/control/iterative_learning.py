@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Scalar, as_array, as_scalars, check
-from ..metrics import root
-from ..rollout import simulate
-from ..system import Feedback, System, loop_inputs
+from ..core.arrays import Scalar, as_array, as_scalars, check
+from ..core.metrics import root
+from ..core.rollout import simulate
+from ..core.system import Feedback, System, loop_inputs
 
 Signal = Float[Array, " samples"]
 

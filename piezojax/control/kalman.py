@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy import linalg
 
-from .._types import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.system import Observation
 from ..dynamics.arma import ARMA
-from ..system import Observation
 from .observer import Motion, Observer
 
 DOUBLINGS = 40

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg
 
-from .._types import check
+from ..core.arrays import check
 from ..dynamics.arma import ARMA
 from ..dynamics.state_space import StateSpace
-from .linear import StateSpaceController
+from .state_space_controller import StateSpaceController
 
 GAMMA_TOLERANCE = 1e-3
 """How close to its least gamma is brought, relative."""

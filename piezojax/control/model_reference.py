@@ -6,9 +6,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, State, as_array, as_scalars, check
+from ..core.arrays import Scalar, State, as_array, as_scalars, check
+from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
-from ..system import Observation, System
 from .observer import Observer
 from .output_tracking import INVERSIONS, check_inversion
 

@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._types import State, as_array
-from ..axes import (
+from ..core.arrays import State, as_array
+from ..core.axes import (
     Axes,
     Rows,
     as_matrices,
@@ -20,8 +20,8 @@ from ..axes import (
     plus,
     product,
 )
+from ..core.system import Designed, Observation, System
 from ..dynamics.matrix_arma import MatrixARMA
-from ..system import Designed, Observation, System
 
 
 class MultiAxisState(NamedTuple):

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 
-from .._types import Scalar
-from ..system import System
+from ..core.arrays import Scalar
+from ..core.system import System
 
 
 class Motion(NamedTuple):

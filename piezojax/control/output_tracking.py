@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from .._types import Scalar, check, check_not_zero
+from ..core.arrays import Scalar, check, check_not_zero
 from ..dynamics.arma import ARMA
 from .observer import Motion
 

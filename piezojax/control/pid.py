@@ -2,11 +2,11 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, as_array, check
-from ..system import Observation, System
+from ..core.arrays import Scalar
+from ..core.parameter import parameter, sample_time
+from ..core.system import Observation, System
 
 
 class PIDState(NamedTuple):
@@ -22,40 +22,51 @@ class PIDState(NamedTuple):
 class PID(System):
     """``u = P (b r - z) + I int (r - z) dt + D d(c r - z)/dt``, r to be followed by z.
 
-    ``proportional`` in V/um, ``integral`` in V/(um s), ``derivative`` in V s/um,
-    ``derivative_filter``, the time constant of the first-order filter on the rate, in
-    s, ``anti_windup`` in 1/s: the rate at which the integral gives back what the
-    actuator could not deliver (0 switches it off), ``dt`` in s. The integral is
-    rectangular and holds volts, so that a new gain does not jump.
+    The derivative acts through a first-order filter. With ``anti_windup`` the integral
+    gives back what the actuator could not deliver. The integral is rectangular and
+    holds volts, so that a new gain causes no jump.
 
-    ``proportional_weight`` b and ``derivative_weight`` c, without unit, are the
-    set-point weights of Astrom and Hagglund (Advanced PID Control, 2006): 1 is the PID
+    ``proportional_weight`` b and ``derivative_weight`` c are the set-point weights of Astrom and Hagglund (Advanced PID Control, 2006): 1 is the PID
     of the error alone, below it a jump of r is softened, and above it P (b - 1) r and
     D (c - 1) dr/dt feed the reference and its rate forward, while what feeds back, and
     with it the noise and the stability, stays as it is. The rate is that up to r(k);
     r(k+1) is not looked at.
 
-    Raises ValueError for a negative filter or anti-windup rate and for ``dt <= 0``.
+    Raises ValueError for a parameter outside its limits.
     """
 
-    proportional: Scalar = eqx.field(converter=as_array)
-    integral: Scalar = eqx.field(converter=as_array)
-    derivative: Scalar = eqx.field(converter=as_array, default=0.0)
-    derivative_filter: Scalar = eqx.field(converter=as_array, default=0.0)
-    anti_windup: Scalar = eqx.field(converter=as_array, default=0.0)
-    proportional_weight: Scalar = eqx.field(converter=as_array, default=1.0)
-    derivative_weight: Scalar = eqx.field(converter=as_array, default=1.0)
-    dt: float = eqx.field(static=True, kw_only=True)
-
-    def __check_init__(self):
-        check("sample time in s", self.dt, above=0.0)
-        check("proportional in V/um", self.proportional)
-        check("integral in V/(um s)", self.integral)
-        check("derivative in V s/um", self.derivative)
-        check("derivative filter in s", self.derivative_filter, least=0.0)
-        check("anti-windup rate in 1/s", self.anti_windup, least=0.0)
-        check("proportional weight", self.proportional_weight)
-        check("derivative weight", self.derivative_weight)
+    proportional: Scalar = parameter(
+        "V/um", "proportional gain P", scale="log", typical=(1e-3, 1e2)
+    )
+    integral: Scalar = parameter(
+        "V/(um s)", "integral gain I", scale="log", typical=(1e-1, 1e5)
+    )
+    derivative: Scalar = parameter(
+        "V s/um", "derivative gain D", scale="log", typical=(1e-8, 1e-1), default=0.0
+    )
+    derivative_filter: Scalar = parameter(
+        "s",
+        "time constant of the derivative's filter",
+        least=0.0,
+        scale="log",
+        typical=(1e-6, 1e-1),
+        default=0.0,
+    )
+    anti_windup: Scalar = parameter(
+        "1/s",
+        "rate of anti-windup; 0 switches it off",
+        least=0.0,
+        scale="log",
+        typical=(1e-1, 1e4),
+        default=0.0,
+    )
+    proportional_weight: Scalar = parameter(
+        "1", "set-point weight b of P", typical=(0.0, 2.0), default=1.0
+    )
+    derivative_weight: Scalar = parameter(
+        "1", "set-point weight c of D", typical=(0.0, 2.0), default=1.0
+    )
+    dt: float = sample_time(kw_only=True)
 
     def _weighted(self, input: Observation) -> tuple[Scalar, Scalar]:
         """Return the errors of the proportional and the derivative part, um."""

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import as_array, check
+from ..core.arrays import as_array, check
+from ..core.rollout import simulate
 from ..dynamics.arma import ARMA
-from ..rollout import simulate
 
 
 class PreviewInverse(eqx.Module):

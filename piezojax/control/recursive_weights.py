@@ -5,8 +5,8 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Matrix, Scalar, as_array, as_scalars, check
-from ..system import Learned, System
+from ..core.arrays import Matrix, Scalar, as_array, as_scalars, check
+from ..core.system import Learned, System
 
 Row = tuple[Scalar, ...]
 

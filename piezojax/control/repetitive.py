@@ -6,8 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._types import Scalar, State, as_array, check
-from ..system import Observation, System
+from ..core.arrays import Scalar, State, as_array, check
+from ..core.system import Observation, System
 
 
 class RepetitiveState(NamedTuple):

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import equinox as eqx
 
-from .._types import Scalar, State, as_array, check
+from ..core.arrays import Scalar, State, as_array, check
+from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
-from ..system import Observation, System
 from .observer import Observer
 from .output_tracking import (
     INVERSIONS,

@@ -11,7 +11,6 @@ from .creep import SpringDamperCreep as SpringDamperCreep
 from .delay import FractionalDelay as FractionalDelay
 from .drift import ThermalDrift as ThermalDrift
 from .held import Held as Held
-from .hysteretic_oscillator import HystereticOscillator as HystereticOscillator
 from .lag import FirstOrderLag as FirstOrderLag
 from .lag import SecondOrderLag as SecondOrderLag
 from .linear_map import LinearMap as LinearMap

@@ -5,8 +5,8 @@ import itertools
 import equinox as eqx
 import numpy as np
 
-from .._types import Scalar, ScalarLike, as_array, as_scalars, check
-from ..system import System
+from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.system import System
 
 
 class ARMA(System):

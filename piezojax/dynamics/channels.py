@@ -7,9 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Scalar, ScalarLike, as_scalars, check
-from ..axes import Axes, Rows, as_matrix_of, as_rows, check_square, plus, product
-from ..system import System
+from ..core.arrays import Scalar, ScalarLike, as_scalars, check
+from ..core.axes import Axes, Rows, as_matrix_of, as_rows, check_square, plus, product
+from ..core.system import System
 from .state_space import StateSpace
 
 

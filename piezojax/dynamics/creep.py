@@ -4,8 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Scalar, ScalarLike, as_array, as_scalars, check, check_order
-from ..system import System
+from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check, check_order
+from ..core.system import System
 
 Lags = tuple[Scalar, ...]
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import equinox as eqx
 
-from .._types import State, check
-from ..system import System
+from ..core.arrays import State, check
+from ..core.system import System
 
 
 class Held(System):

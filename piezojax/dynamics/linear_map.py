@@ -3,8 +3,8 @@
 import equinox as eqx
 from jaxtyping import Array, ArrayLike, Float
 
-from .._types import Matrix, State, as_array, as_matrix, check
-from ..system import System
+from ..core.arrays import Matrix, State, as_array, as_matrix, check
+from ..core.system import System
 
 
 class LinearMap(System):

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import check
-from ..axes import (
+from ..core.arrays import check
+from ..core.axes import (
     Axes,
     Rows,
     as_matrices,
@@ -16,7 +16,7 @@ from ..axes import (
     plus,
     product,
 )
-from ..system import System
+from ..core.system import System
 from .state_space import StateSpace
 
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .._types import as_array, check
-from ..system import System
+from ..core.arrays import as_array, check
+from ..core.system import System
 
 
 class NeuralStateSpace(System):

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .._types import Scalar, as_array, as_scalars, check, check_order
-from ..system import System
+from ..core.arrays import Scalar, as_array, as_scalars, check, check_order
+from ..core.system import System
 from .state_space import StateSpace
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 from scipy import linalg
 
-from .._types import Matrix, as_array, as_matrix, check
-from ..system import System
+from ..core.arrays import Matrix, as_array, as_matrix, check
+from ..core.system import System
 
 INNERMOST = 1.0 - 1e-6
 """Largest modulus that ``stabilised`` gives to a pole it has moved."""

@@ -6,6 +6,7 @@ from .coleman_hodgdon import ColemanHodgdon as ColemanHodgdon
 from .coleman_hodgdon import InverseColemanHodgdon as InverseColemanHodgdon
 from .duhem import Duhem as Duhem
 from .hysteretic_arma import HystereticARMA as HystereticARMA
+from .hysteretic_oscillator import HystereticOscillator as HystereticOscillator
 from .inverse import Inverse as Inverse
 from .inverse import InverseHysteresis as InverseHysteresis
 from .inverse_prandtl_ishlinskii import (

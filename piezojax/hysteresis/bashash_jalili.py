@@ -5,8 +5,8 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, check, check_order
-from ..system import System
+from ..core.arrays import Scalar, ScalarLike, as_array, check, check_order
+from ..core.system import System
 
 Points = tuple[Scalar, ...]
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, check
-from ..runge_kutta import runge_kutta
-from ..system import System
+from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.runge_kutta import runge_kutta
+from ..core.system import System
 
 
 class BoucWenState(NamedTuple):

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, check
-from ..system import System, holding_input
+from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.system import System, holding_input
 from .inverse import Inverse
 
 

@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, as_scalars, check
-from ..runge_kutta import runge_kutta
-from ..system import System
+from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.runge_kutta import runge_kutta
+from ..core.system import System
 from .loading import loaded
 
 Surface: TypeAlias = tuple[tuple[Scalar, ...], ...]

@@ -4,9 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._types import Scalar, ScalarLike, State, as_array, as_scalars
+from ..core.arrays import Scalar, ScalarLike, State, as_array, as_scalars
+from ..core.system import Affine, Series, System, series
 from ..dynamics import ARMA
-from ..system import Affine, Series, System, series
 from .coleman_hodgdon import ColemanHodgdon
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._types import Scalar, ScalarLike, State, as_array, check, check_order
-from ..rollout import simulate
-from ..system import System, holding_input
+from ..core.arrays import Scalar, ScalarLike, State, as_array, check, check_order
+from ..core.rollout import simulate
+from ..core.system import System, holding_input
 
 
 class Inverse(System):

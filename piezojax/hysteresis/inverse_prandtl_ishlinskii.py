@@ -5,7 +5,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, check, check_order
+from ..core.arrays import Scalar, ScalarLike, as_array, check, check_order
 from .inverse import Inverse
 from .plays import Memory, memoryless, weighted
 from .prandtl_ishlinskii import PrandtlIshlinskii

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, as_scalars, check
-from ..axes import Rows, as_rows
-from ..system import System
+from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.axes import Rows, as_rows
+from ..core.system import System
 from .plays import Memory, played
 
 

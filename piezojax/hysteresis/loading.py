@@ -5,8 +5,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .._types import Scalar, State
-from ..system import System
+from ..core.arrays import Scalar, State
+from ..core.system import System
 
 PARTS = 64
 

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from .._types import Scalar, as_array, check
+from ..core.arrays import Scalar, as_array, check
 
 Memory = tuple[Scalar, ...]
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import (
+from ..core.arrays import (
     Matrix,
     Scalar,
     ScalarLike,
@@ -18,7 +18,7 @@ from .._types import (
     check,
     check_order,
 )
-from ..system import Designed, System
+from ..core.system import Designed, System
 from .inverse import Inverse
 
 Levels = Float[Array, " cells"]

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, as_scalars, check
-from ..system import System
+from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.system import System
 from .inverse import Inverse
 from .inverse_prandtl_ishlinskii import check_invertible, solved
 from .plays import Memory, check_plays, memoryless, played, weighted

@@ -4,17 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Matrix, Scalar, ScalarLike, as_array, as_matrix, check
-from ..system import Designed, System
-from .preisach import (
-    Levels,
-    PlayLines,
-    Preisach,
-    Rows,
-    check_weights,
-    outputs,
-    rows_of,
-)
+from ..core.arrays import Matrix, Scalar, ScalarLike, as_array, as_matrix, check
+from ..core.system import Designed, System
+from .preisach import Levels, PlayLines, Preisach, Rows, check_weights, outputs, rows_of
 
 
 class RateDependentPreisach(Designed):

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._types import Scalar, ScalarLike, as_array, as_scalars, check
-from ..system import System
+from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.system import System
 
 
 class LastPoint(NamedTuple):

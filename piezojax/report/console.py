@@ -21,14 +21,14 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from ..identify.fit import FitReport
-from ..identify.methods import METHODS
-from ..identify.parts import PARTS
-from ..reproduce.cell import Cell, title_of
-from ..reproduce.summary import GroupedAgreement, TableAgreement
-from ..stability import StabilityReport
-from ..tune.result import Perturbed, Result, Scores
-from .stability import Comparison
+from ..analysis.stability import StabilityReport
+from ..identification.fit import FitReport
+from ..identification.methods import METHODS
+from ..identification.parts import PARTS
+from ..reproduction.cell import Cell, title_of
+from ..reproduction.summary import GroupedAgreement, TableAgreement
+from ..tuning.result import Perturbed, Result, Scores
+from .bode import Comparison
 
 NOTE_EVERY = 30.0
 """Seconds between two notes where there is no terminal."""

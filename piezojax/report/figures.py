@@ -11,7 +11,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-from ..files import write_bytes
+from ..core.files import write_bytes
 
 REFERENCE, BEFORE, AFTER, MEASURED = "#222222", "#c9753d", "#1f6f8b", "#8a8a8a"
 """Colours with one meaning in every picture."""

@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ..tune.constraints import CONSTRAINTS
-from ..tune.result import FrontPoint, Perturbed, Result
+from ..tuning.constraints import CONSTRAINTS
+from ..tuning.result import FrontPoint, Perturbed, Result
 from .figures import AFTER, BEFORE, figure, headed, ticks_in_full
 
 

@@ -5,11 +5,11 @@ from pathlib import Path
 from .case import Case as Case
 from .case import build as build
 from .case import read as read
-from .comparison import Entry as Entry
-from .comparison import entries_of as entries_of
-from .comparison import is_comparison as is_comparison
-from .comparison import load_comparison as load_comparison
-from .comparison import read_entries as read_entries
+from .contenders import Entry as Entry
+from .contenders import entries_of as entries_of
+from .contenders import is_comparison as is_comparison
+from .contenders import load_comparison as load_comparison
+from .contenders import read_entries as read_entries
 from .ensemble import Ensemble as Ensemble
 from .ensemble import Stage as Stage
 from .schema import Study as Study

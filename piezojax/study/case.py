@@ -8,21 +8,21 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from .._types import as_array
-from ..axes import PerAxis
 from ..catalog import CONTROLLERS, PLANTS, at_rate
 from ..control.design import DESIGNS
+from ..core.arrays import as_array
+from ..core.axes import PerAxis
+from ..core.paths import replace, static_fields
+from ..core.serial import from_data, to_data
+from ..core.serial import load as load_system
+from ..core.space import Space, space_of
+from ..core.system import Feedback, Observation, System, rest_output, series
 from ..hardware import Quantiser, Saturation, Sensor, SlewLimit
-from ..identify import Fit, identify, read_record
-from ..paths import replace, static_fields
-from ..serial import from_data, to_data
-from ..serial import load as load_system
-from ..space import Space, space_of
-from ..system import Feedback, Observation, System, rest_output, series
+from ..identification import Fit, identify, read_record
 from .ensemble import Ensemble, Stage, ensemble_of
 from .schema import Study, load
 from .stage_tables import RecordPlant
-from .table import one_of, validated
+from .tables import one_of, validated
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array
 from pydantic import BaseModel
 
-from .._types import as_array
 from ..catalog import VARIATIONS
-from ..files import read_model
-from ..paths import get, replace
-from ..system import Feedback, System
+from ..core.arrays import as_array
+from ..core.files import read_model
+from ..core.paths import get, replace
+from ..core.system import Feedback, System
 from .schema import Study
 
 Part = Literal["tune", "margins", "holdout"]

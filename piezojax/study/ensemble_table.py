@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from .table import Finite, Positive, Table
+from .tables import Finite, Positive, Table
 
 
 class EnsembleTable(Table):

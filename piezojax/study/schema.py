@@ -6,13 +6,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from .. import motions, signals
-from ..optimisers import GAUSS_NEWTON, METHODS
-from ..space import Transform
+from ..core.space import Transform
+from ..signals import motions
+from ..signals import waveforms as signals
+from ..solve.optimisers import GAUSS_NEWTON, METHODS
 from .ensemble_table import EnsembleTable
 from .stage_tables import Actuator, DisturbanceTable, SensorTable
 from .sweep_table import SweepTable, quoted
-from .table import ByAxis, Finite, NotNegative, Positive, Table, one_of, validated
+from .tables import ByAxis, Finite, NotNegative, Positive, Table, one_of, validated
 
 
 class AxesTable(Table):
@@ -110,7 +111,7 @@ class ParetoTable(Table):
 
 
 class ObjectiveTable(Table):
-    """What is minimised; see piezojax.tune.objective.Objective."""
+    """What is minimised; see piezojax.tuning.objective.Objective."""
 
     aggregate: Literal["geometric_mean", "mean_square", "worst"] = "geometric_mean"
     coupling_weight: NotNegative = 1.0

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import field_validator, model_validator
 
-from ..identify import chain
-from .table import ByAxis, Finite, NotNegative, Positive, Table
+from ..identification import chain
+from .tables import ByAxis, Finite, NotNegative, Positive, Table
 
 
 class RecordPlant(Table):

@@ -4,9 +4,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from ..metrics import TrackingFigures
-from ..space import Transform
-from .table import Finite, Table, one_of
+from ..core.metrics import TrackingFigures
+from ..core.space import Transform
+from .tables import Finite, Table, one_of
 
 SENSITIVITY = "sensitivity_peak"
 METRICS = (*TrackingFigures._fields, SENSITIVITY)

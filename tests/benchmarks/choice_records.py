@@ -6,10 +6,20 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from piezojax import FirstOrderLag, Preisach, RateDependentPreisach, Record, series
-from piezojax.identify import free_run
-from piezojax.identify.models import structure
-from piezojax.paths import parameters, replace
+from piezojax import (
+    Record,
+    series,
+)
+from piezojax.core.paths import parameters, replace
+from piezojax.dynamics import (
+    FirstOrderLag,
+)
+from piezojax.hysteresis import (
+    Preisach,
+    RateDependentPreisach,
+)
+from piezojax.identification import free_run
+from piezojax.identification.chain import structure
 
 NOISE = 0.01  # um
 LAG = 1.1e-3  # s

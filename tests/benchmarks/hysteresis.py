@@ -30,9 +30,9 @@ from rich.console import Console
 from rich.table import Table
 
 import piezojax
-from piezojax.identify import PARTS
-from piezojax.identify.parts import Extent
-from piezojax.paths import parameters, replace
+from piezojax.core.paths import parameters, replace
+from piezojax.identification import PARTS
+from piezojax.identification.parts import Extent
 
 BAR = 2.0
 BARS = {"preisach": 5.0}
@@ -58,17 +58,17 @@ FEW = 12
 
 OTHERS = {
     # A force over a displacement: the numbers are those of volts and um all the same.
-    "bouc_wen": lambda: piezojax.BoucWen(
+    "bouc_wen": lambda: piezojax.hysteresis.BoucWen(
         alpha=0.12, beta_gamma=0.012, beta_delta=-0.008, nu=1.3
     ),
-    "duhem": lambda: piezojax.Duhem(
+    "duhem": lambda: piezojax.hysteresis.Duhem(
         reversible=[[0.08, 1e-4, -1e-6]],
         irreversible=[[1e-3, 7.7e-3, 1e-5, -1e-7], [-0.0487]],
     ),
-    "normalised_bouc_wen": lambda: piezojax.NormalisedBoucWen(
+    "normalised_bouc_wen": lambda: piezojax.hysteresis.NormalisedBoucWen(
         k_x=0.14, k_w=-1.5, rho=0.03, sigma=0.8, n=1.5
     ),
-    "bashash_jalili": lambda: piezojax.BashashJalili(
+    "bashash_jalili": lambda: piezojax.hysteresis.BashashJalili(
         lower_input=-10.0,
         lower_output=-1.0,
         upper_input=120.0,
@@ -169,7 +169,7 @@ class PiezojaxEngine:
 
     def __init__(self, problem, mode):
         steps = problem.inputs.shape[1]
-        segment = steps if mode != "reverse" else piezojax.rollout.SEGMENT
+        segment = steps if mode != "reverse" else piezojax.core.rollout.SEGMENT
         lane = lambda values, input: problem.lane(values, input, segment)  # noqa: E731
         function = {"run": lane, "forward": jax.jacfwd(lane), "reverse": jax.grad(lane)}
         # A plain loop reads inputs that lie time first, segments whole lanes.

@@ -21,10 +21,15 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import least_squares
 
-from piezojax import Record, identify
+from piezojax import (
+    Record,
+)
+from piezojax import (
+    identification as identify,
+)
 from piezojax.catalog import p753
-from piezojax.identify import free_run
-from piezojax.identify.models import structure
+from piezojax.identification import free_run
+from piezojax.identification.chain import structure
 
 SAMPLES = 20_000
 MODEL = "coleman_hodgdon+arma"

@@ -29,11 +29,18 @@ from rich.console import Console
 from rich.table import Table
 
 import piezojax
-from piezojax import Feedback, Sensor, signals, simulate
+from piezojax import (
+    Feedback,
+    simulate,
+)
 from piezojax.catalog import p753, p753_inverses
-from piezojax.reproduce.cell import window
-from piezojax.rollout import Metric
-from piezojax.system import loop_inputs
+from piezojax.core.rollout import Metric
+from piezojax.core.system import loop_inputs
+from piezojax.hardware import (
+    Sensor,
+)
+from piezojax.reproduction.cell import window
+from piezojax.signals import waveforms as signals
 
 GAINS = ("5-2", "5-4")  # tables
 NAMES = ("nominal", "Coleman-Hodgdon inverse", "Preisach inverse", "observer")
@@ -115,7 +122,7 @@ def study(truth, progress):
     records = record_errors(plant, record, inverses)
     progress(f"{truth}: fitted")
     followed = references()
-    alone = {"constant gain": piezojax.Affine(1.0 / p753.GAIN), **inverses}
+    alone = {"constant gain": piezojax.core.system.Affine(1.0 / p753.GAIN), **inverses}
     left = {
         name: by_reference(left_over(inverse, plant.parts[0], *followed))
         for name, inverse in alone.items()
@@ -126,7 +133,10 @@ def study(truth, progress):
         feedback = p753.inversion(table).feedback
         controllers = (
             p753.sliding_mode(table),
-            *(piezojax.InversionControl(feedback, i) for i in inverses.values()),
+            *(
+                piezojax.control.InversionControl(feedback, i)
+                for i in inverses.values()
+            ),
             p753.disturbance_observer(table),
         )
         for name, controller in zip(NAMES, controllers, strict=True):
@@ -141,7 +151,7 @@ def left_over(inverse, hysteresis, references, starts, stops):
     """Mean square of what the hysteresis makes of the references, less these, um^2."""
 
     def one(reference, start, stop):
-        system = piezojax.Series((inverse, hysteresis))
+        system = piezojax.core.system.Series((inverse, hysteresis))
         error = simulate(system, reference, system.init(0.0))[1] - reference
         index = jnp.arange(reference.size)
         inside = (index >= start) & (index < stop)

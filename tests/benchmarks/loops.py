@@ -22,7 +22,7 @@ SLOW, FAST = 4.0, 0.1  # samples a volt
 ACROSS = 5
 
 OTHERS = {
-    "bouc_wen": lambda: piezojax.BoucWen(
+    "bouc_wen": lambda: piezojax.hysteresis.BoucWen(
         alpha=0.14, beta_gamma=0.012, beta_delta=-0.004, nu=1.3
     ),
 }

@@ -11,9 +11,9 @@ from engines import DOB_PID_SMC, Engine
 from loop_three_dof import THREE_DOF_PID_SMC
 
 import piezojax
-from piezojax.axes import PerAxisMetric
 from piezojax.catalog import p558_control, p753
-from piezojax.system import LoopInput
+from piezojax.core.axes import PerAxisMetric
+from piezojax.core.system import LoopInput
 
 BLOCK = 64  # lanes simulated at a time
 
@@ -70,7 +70,7 @@ def rms(loop_of, gains, inputs, **options):
     """RMS error of one lane over the second half of the run, of each axis."""
     system = loop_of(gains)
     samples = jax.tree.leaves(inputs)[0].shape[0]
-    metric = piezojax.Tracking(start=samples // 2)
+    metric = piezojax.core.metrics.Tracking(start=samples // 2)
     start = 0.0
     if isinstance(inputs.noise, tuple):
         metric = PerAxisMetric(metric, len(inputs.noise))
@@ -97,7 +97,9 @@ def mean_square(loop_of, gains, inputs):
     lanes = jax.tree.leaves(inputs)[0].shape[0]
     # A copy for each lane: their gradients are then summed once, not in each step.
     each = jnp.broadcast_to(gains, (lanes, len(gains)))
-    blocks = piezojax.in_blocks(lambda g, u: rms(loop_of, g, u), each, inputs)
+    blocks = piezojax.core.rollout.in_blocks(
+        lambda g, u: rms(loop_of, g, u), each, inputs
+    )
     return jnp.mean(blocks**2)
 
 

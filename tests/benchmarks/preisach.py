@@ -26,8 +26,8 @@ from rich.console import Console
 from rich.table import Table
 
 import piezojax
-from piezojax.paths import parameters, replace
-from piezojax.rollout import Metric
+from piezojax.core.paths import parameters, replace
+from piezojax.core.rollout import Metric
 
 GROUP = 8  # as in preisach.c
 LOW, HIGH = -20.0, 120.0  # V
@@ -53,10 +53,12 @@ def problem(model, cells, lanes, steps, seed=0):
     weights = [np.tril(rng.uniform(0.0, 0.2, (cells, cells))) for _ in range(2)]
     time = np.arange(steps) / steps
     rates = rng.uniform(3.0, 12.0, (lanes, 1))
-    slow = piezojax.Preisach(weights[0], LOW, HIGH, start="saturated")
+    slow = piezojax.hysteresis.Preisach(weights[0], LOW, HIGH, start="saturated")
     models = {
         "preisach": slow,
-        "rate_dependent": piezojax.RateDependentPreisach(slow, weights[1], PACE, DT),
+        "rate_dependent": piezojax.hysteresis.RateDependentPreisach(
+            slow, weights[1], PACE, DT
+        ),
     }
     return models[model], 50.0 + 68.0 * time * np.sin(2.0 * np.pi * rates * time)
 

@@ -41,7 +41,7 @@ import engines
 import numpy as np
 import tomli_w
 
-from piezojax import signals
+from piezojax.signals import waveforms as signals
 from piezojax.study import load, shipped
 
 RATE, BLOCK = 20_000, 64

@@ -9,10 +9,10 @@ from oracles.loop import closed_loop
 from oracles.published import plant_t2, smc_gains
 
 import piezojax as pj
+from piezojax.analysis.stability.impulse import peak_of, sensitivity
 from piezojax.catalog import p753, p753_stage
 from piezojax.control.recursive_weights import RecursiveWeights
-from piezojax.stability.impulse import peak_of, sensitivity
-from piezojax.system import LoopInput, Observation
+from piezojax.core.system import LoopInput, Observation
 
 SAMPLES = 10_000
 NOISE_RMS = 0.012
@@ -31,7 +31,7 @@ NUMBERS = {
 }
 PID = {"P": 0.5, "I": 3e3, "D": 1e-5, "derivative_filter": 1e-4, "anti_windup": 100.0}
 CONTROLLERS = {
-    "pid": (pj.PID(*PID.values(), dt=p753.DT), "pid", PID),
+    "pid": (pj.control.PID(*PID.values(), dt=p753.DT), "pid", PID),
     "weak equivalent control": (
         eqx.tree_at(
             lambda c: c.feedback.correction,
@@ -45,7 +45,9 @@ CONTROLLERS = {
 
 
 def adaptive(controller, **changes):
-    return pj.AdaptiveInverse(controller, **{"memory": NEVER, **NUMBERS, **changes})
+    return pj.control.AdaptiveInverse(
+        controller, **{"memory": NEVER, **NUMBERS, **changes}
+    )
 
 
 def reference(samples=SAMPLES + 1):
@@ -55,7 +57,9 @@ def reference(samples=SAMPLES + 1):
 
 def around(controller, plant=None):
     plant = p753.plant() if plant is None else plant
-    return pj.Feedback(controller, plant, p753.actuator(), pj.Sensor(NOISE_RMS))
+    return pj.Feedback(
+        controller, plant, p753.actuator(), pj.hardware.Sensor(NOISE_RMS)
+    )
 
 
 @jax.jit

@@ -6,12 +6,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import PerAxis, loop_inputs, motions, signals, simulate
-from piezojax.axes import Packed, packed
+from piezojax import (
+    loop_inputs,
+    simulate,
+)
 from piezojax.catalog import p558, p558_actuators, p558_control
+from piezojax.core.axes import (
+    Packed,
+    PerAxis,
+    packed,
+)
+from piezojax.core.system import holding_input, rest_output, series
 from piezojax.dynamics import ARMA, LinearMap
 from piezojax.hysteresis import PrandtlIshlinskii
-from piezojax.system import holding_input, rest_output, series
+from piezojax.signals import motions
+from piezojax.signals import waveforms as signals
 
 SAMPLES, SETTLE = 400, 150
 STUCK = 20.0  # um, of the actuator that is locked

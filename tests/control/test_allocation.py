@@ -10,9 +10,19 @@ from hypothesis import strategies as st
 from oracles import allocation as oracle
 from oracles import state_space
 
-from piezojax import Allocation, StateSpace, load, save, simulate
+from piezojax import (
+    load,
+    save,
+    simulate,
+)
 from piezojax.catalog import p558, p558_actuators
-from piezojax.system import rest_output
+from piezojax.control import (
+    Allocation,
+)
+from piezojax.core.system import rest_output
+from piezojax.dynamics import (
+    StateSpace,
+)
 
 PLATE = p558_actuators.allocation()
 METHODS = ("minimum_norm", "weighted", "bounded")

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 import piezojax as pj
-from piezojax.system import Observation
+from piezojax.core.system import Observation
 
 
 class Echo(pj.System):
@@ -25,13 +25,13 @@ def test_a_straight_line_is_shown_ahead_by_the_lead(lead):
     def line(k):
         return jnp.asarray(3.0 + 0.5 * k)
 
-    anticipating = pj.Anticipation(Echo(), (lead,))
+    anticipating = pj.control.Anticipation(Echo(), (lead,))
     _, shown = anticipating.step((), seen(line(7.0), line(8.0)))
     np.testing.assert_allclose(shown, (line(7.0 + lead), line(8.0 + lead)), rtol=1e-15)
 
 
 def test_each_axis_has_its_own_lead():
-    anticipating = pj.Anticipation(Echo(), (1.0, 0.0))
+    anticipating = pj.control.Anticipation(Echo(), (1.0, 0.0))
     axes = seen(
         (jnp.asarray(1.0), jnp.asarray(5.0)), (jnp.asarray(2.0), jnp.asarray(7.0))
     )
@@ -55,10 +55,10 @@ def test_a_lead_takes_the_delay_off_a_follower():
     errors = {}
     for lead in (0.0, 2.0):
         loop = pj.Feedback(
-            pj.Anticipation(Follower(), (lead,)),
-            pj.Affine(),
-            pj.Saturation(-9.0, 9.0),
-            pj.Sensor(0.0),
+            pj.control.Anticipation(Follower(), (lead,)),
+            pj.core.system.Affine(),
+            pj.hardware.Saturation(-9.0, 9.0),
+            pj.hardware.Sensor(0.0),
         )
         _, log = pj.simulate(loop, pj.loop_inputs(reference), loop.init(reference[0]))
         errors[lead] = float(jnp.max(jnp.abs(log.displacement - reference)))
@@ -68,4 +68,4 @@ def test_a_lead_takes_the_delay_off_a_follower():
 
 def test_what_is_no_lead_is_refused():
     with pytest.raises(ValueError, match="lead in samples is inf; it must be finite"):
-        pj.Anticipation(Echo(), (np.inf,))
+        pj.control.Anticipation(Echo(), (np.inf,))

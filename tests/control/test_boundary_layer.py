@@ -6,9 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import ARMA, BoundaryLayer, loop_inputs, simulate
+from piezojax import (
+    loop_inputs,
+    simulate,
+)
 from piezojax.catalog import p753, p753_survey
 from piezojax.catalog import p753_chapter4 as chapter4
+from piezojax.control import (
+    BoundaryLayer,
+)
+from piezojax.dynamics import (
+    ARMA,
+)
 
 LAW = BoundaryLayer(3.0, 200.0)
 

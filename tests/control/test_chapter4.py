@@ -13,22 +13,30 @@ from oracles.loop import closed_loop
 from oracles.published import HYSTERESIS, plant_t2, unit_dc
 
 from piezojax import (
-    ARMA,
-    AlphaBeta,
-    Anticipation,
     Feedback,
-    ModelReferencePID,
-    SecondOrderLag,
-    Sensor,
-    Tracking,
     loop_inputs,
     series,
     simulate,
 )
 from piezojax.catalog import p753
 from piezojax.catalog import p753_chapter4 as catalog
+from piezojax.control import (
+    AlphaBeta,
+    Anticipation,
+    ModelReferencePID,
+)
 from piezojax.control.output_tracking import INVERSIONS
-from piezojax.system import LoopInput, Observation
+from piezojax.core.metrics import (
+    Tracking,
+)
+from piezojax.core.system import LoopInput, Observation
+from piezojax.dynamics import (
+    ARMA,
+    SecondOrderLag,
+)
+from piezojax.hardware import (
+    Sensor,
+)
 
 NOISE_RMS = 0.012
 DRAWS = np.random.default_rng(21).normal(size=20_000)

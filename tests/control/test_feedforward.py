@@ -6,20 +6,28 @@ import numpy as np
 import pytest
 
 from piezojax import (
-    PID,
-    Affine,
     Feedback,
-    FeedforwardFeedback,
-    InverseColemanHodgdon,
-    InverseFeedforward,
-    Saturation,
-    Sensor,
     loop_inputs,
-    signals,
     simulate,
 )
 from piezojax.catalog import p753
-from piezojax.system import Observation
+from piezojax.control import (
+    PID,
+    FeedforwardFeedback,
+    InverseFeedforward,
+)
+from piezojax.core.system import (
+    Affine,
+    Observation,
+)
+from piezojax.hardware import (
+    Saturation,
+    Sensor,
+)
+from piezojax.hysteresis import (
+    InverseColemanHodgdon,
+)
+from piezojax.signals import waveforms as signals
 
 TIME = signals.time_grid(0.2, p753.RATE)
 REFERENCE = signals.signal("SIN10", TIME)

@@ -6,8 +6,19 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from piezojax import PID, Tracking, loop_inputs, paths, signals, simulate
+from piezojax import (
+    loop_inputs,
+    simulate,
+)
 from piezojax.catalog import p753, p753_chapter4
+from piezojax.control import (
+    PID,
+)
+from piezojax.core import paths
+from piezojax.core.metrics import (
+    Tracking,
+)
+from piezojax.signals import waveforms as signals
 
 SAMPLES = 1000
 TIME = signals.time_grid(SAMPLES / p753.RATE, p753.RATE)

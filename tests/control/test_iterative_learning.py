@@ -5,8 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import ARMA, LearningLaw, learn, signals
 from piezojax.catalog import p753, p753_survey
+from piezojax.control import (
+    LearningLaw,
+    learn,
+)
+from piezojax.dynamics import (
+    ARMA,
+)
+from piezojax.signals import waveforms as signals
 
 SAMPLES, TRIALS = 80, 12
 A, B = (1.2, -0.4), (0.05, 0.1, 0.05)

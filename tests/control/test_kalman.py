@@ -11,11 +11,24 @@ from oracles.loop import closed_loop
 from oracles.published import plant_t2, smc_gains
 from scipy import linalg
 
-from piezojax import ARMA, AlphaBeta, KalmanFilter, Tracking, loop_inputs, simulate
+from piezojax import (
+    loop_inputs,
+    simulate,
+)
 from piezojax.catalog import p753, p753_chapter4
+from piezojax.control import (
+    AlphaBeta,
+    KalmanFilter,
+)
 from piezojax.control.kalman import kinematic_kalman, model_kalman, steady_gain
+from piezojax.core.metrics import (
+    Tracking,
+)
+from piezojax.core.system import LoopInput, Observation
+from piezojax.dynamics import (
+    ARMA,
+)
 from piezojax.study import read, shipped
-from piezojax.system import LoopInput, Observation
 
 DT = p753.DT
 SAMPLES = 20_000  # 1 s

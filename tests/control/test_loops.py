@@ -8,19 +8,28 @@ from oracles.loop import closed_loop
 from oracles.published import plant_t2, smc_gains
 
 from piezojax import (
-    ARMA,
-    PID,
-    AlphaBeta,
-    Delay,
-    DisturbanceObserverControl,
     Feedback,
-    Sensor,
-    SlidingModePID,
     series,
     simulate,
 )
 from piezojax.catalog import p753
-from piezojax.system import LoopInput, Observation
+from piezojax.control import (
+    PID,
+    AlphaBeta,
+    DisturbanceObserverControl,
+    SlidingModePID,
+)
+from piezojax.core.system import (
+    Delay,
+    LoopInput,
+    Observation,
+)
+from piezojax.dynamics import (
+    ARMA,
+)
+from piezojax.hardware import (
+    Sensor,
+)
 
 SAMPLES = 20_000  # 1 s
 NOISE_RMS = 0.012

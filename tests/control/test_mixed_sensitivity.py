@@ -10,17 +10,24 @@ from oracles import signals
 from oracles.hysteresis import clip
 
 from piezojax import (
-    ARMA,
     Feedback,
-    Sensor,
-    StateSpace,
-    StateSpaceController,
     loop_inputs,
     simulate,
 )
 from piezojax.catalog import p753
-from piezojax.control import first_order_weight, mixed_sensitivity
-from piezojax.system import Observation
+from piezojax.control import (
+    StateSpaceController,
+    first_order_weight,
+    mixed_sensitivity,
+)
+from piezojax.core.system import Observation
+from piezojax.dynamics import (
+    ARMA,
+    StateSpace,
+)
+from piezojax.hardware import (
+    Sensor,
+)
 
 DT = p753.DT
 MODEL = (1.6035, -0.61995), (0.0050811, -0.0036354, 0.010553)  # (5.33)

@@ -11,20 +11,16 @@ import pytest
 from oracles import three_dof
 
 from piezojax import (
-    ARMA,
-    Channel,
-    Channels,
-    MatrixARMA,
-    PerAxis,
-    StateSpace,
-    Tracking,
     load,
     loop_inputs,
-    paths,
     save,
     simulate,
 )
-from piezojax.axes import (
+from piezojax.catalog import p558
+from piezojax.catalog import p558_control as catalog
+from piezojax.core import paths
+from piezojax.core.axes import (
+    PerAxis,
     PerAxisMetric,
     as_rows,
     check_square,
@@ -32,10 +28,19 @@ from piezojax.axes import (
     packed,
     product,
 )
-from piezojax.catalog import p558
-from piezojax.catalog import p558_control as catalog
-from piezojax.dynamics import channels_of, observability_form
-from piezojax.system import LoopInput, Observation
+from piezojax.core.metrics import (
+    Tracking,
+)
+from piezojax.core.system import LoopInput, Observation
+from piezojax.dynamics import (
+    ARMA,
+    Channel,
+    Channels,
+    MatrixARMA,
+    StateSpace,
+    channels_of,
+    observability_form,
+)
 
 SAMPLES = 500
 TIME = three_dof.T * np.arange(SAMPLES + 1)

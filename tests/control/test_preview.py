@@ -7,8 +7,10 @@ import pytest
 from oracles.published import MODEL_533_A, MODEL_533_B
 from scipy.signal import lfilter
 
-from piezojax import ARMA
 from piezojax.control.preview import INVERSES
+from piezojax.dynamics import (
+    ARMA,
+)
 
 SAMPLES = 2_000
 MODELS = {  # a, b

@@ -6,15 +6,23 @@ import numpy as np
 import pytest
 
 from piezojax import (
-    ARMA,
-    PID,
-    Affine,
     Feedback,
-    FirstOrderLag,
-    RepetitiveControl,
-    Sensor,
     loop_inputs,
     simulate,
+)
+from piezojax.control import (
+    PID,
+    RepetitiveControl,
+)
+from piezojax.core.system import (
+    Affine,
+)
+from piezojax.dynamics import (
+    ARMA,
+    FirstOrderLag,
+)
+from piezojax.hardware import (
+    Sensor,
 )
 
 DT, PERIOD, PERIODS = 1e-3, 50, 40

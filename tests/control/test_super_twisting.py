@@ -7,7 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import SuperTwisting, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.control import (
+    SuperTwisting,
+)
 
 DT = 1e-4
 

@@ -14,15 +14,19 @@ from oracles.loop import closed_loop
 from oracles.published import HYSTERESIS, RATE, plant_t2, smc_gains
 
 from piezojax import (
-    FirstOrderLag,
-    RepetitiveControl,
-    paths,
     simulate,
     study,
 )
 from piezojax.catalog import CONTROLLERS, p753
 from piezojax.catalog import p753_survey as catalog
-from piezojax.system import LoopInput
+from piezojax.control import (
+    RepetitiveControl,
+)
+from piezojax.core import paths
+from piezojax.core.system import LoopInput
+from piezojax.dynamics import (
+    FirstOrderLag,
+)
 
 DT = 1.0 / RATE
 NOISE_RMS = 0.012

@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from piezojax import Tracking, loop_inputs, signals, simulate
+from piezojax import (
+    loop_inputs,
+    simulate,
+)
 from piezojax.catalog import p753
 from piezojax.catalog import p753_survey as catalog
-from piezojax.system import Observation
+from piezojax.core.metrics import (
+    Tracking,
+)
+from piezojax.core.system import Observation
+from piezojax.signals import waveforms as signals
 
 DRAWS = np.random.default_rng(31).normal(size=200)
 CONTROLLERS = {

@@ -8,8 +8,13 @@ from oracles import dynamics as oracle
 from oracles.published import MODEL_533_A, MODEL_533_B, T2_G
 from scipy import signal
 
-from piezojax import ARMA, simulate
-from piezojax.dynamics import scaled_to_dc
+from piezojax import (
+    simulate,
+)
+from piezojax.dynamics import (
+    ARMA,
+    scaled_to_dc,
+)
 
 # a_1, ... with poles inside the unit circle, and b_0, ...
 ORDERS = {

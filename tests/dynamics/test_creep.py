@@ -3,12 +3,16 @@ import numpy as np
 import pytest
 
 from piezojax import (
-    ColemanHodgdon,
+    simulate,
+)
+from piezojax.dynamics import (
     ExponentialCreep,
     FirstOrderLag,
     LogarithmicCreep,
     SpringDamperCreep,
-    simulate,
+)
+from piezojax.hysteresis import (
+    ColemanHodgdon,
 )
 
 DT = 0.01

@@ -5,8 +5,13 @@ import numpy as np
 import pytest
 from oracles import hysteresis as oracle
 
-from piezojax import Record, identify
-from piezojax.identify import free_run
+from piezojax import (
+    Record,
+)
+from piezojax import (
+    identification as identify,
+)
+from piezojax.identification import free_run
 
 DT = 0.2
 HYSTERESIS = (0.0077, 0.1167, -0.0487)

@@ -3,7 +3,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import FractionalDelay, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.dynamics import (
+    FractionalDelay,
+)
 
 DT = 1e-3
 INPUT = np.random.default_rng(0).normal(size=40)

@@ -3,12 +3,18 @@ import numpy as np
 import pytest
 
 from piezojax import (
-    ColemanHodgdon,
+    simulate,
+)
+from piezojax.core.select import (
+    Select,
+)
+from piezojax.dynamics import (
     ExponentialCreep,
     FirstOrderLag,
-    Select,
     ThermalDrift,
-    simulate,
+)
+from piezojax.hysteresis import (
+    ColemanHodgdon,
 )
 
 DT = 0.5

@@ -2,8 +2,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import Held, simulate
+from piezojax import (
+    simulate,
+)
 from piezojax.catalog import p753
+from piezojax.dynamics import (
+    Held,
+)
 
 STAGE = p753.plant()
 

@@ -6,7 +6,13 @@ from oracles import bouc_wen as oracle
 from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete
 
-from piezojax import BoucWen, HystereticOscillator, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.hysteresis import (
+    BoucWen,
+    HystereticOscillator,
+)
 
 DT = 1e-3
 TRUE = oracle.BENCHMARK

@@ -5,7 +5,13 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piezojax import FirstOrderLag, SecondOrderLag, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.dynamics import (
+    FirstOrderLag,
+    SecondOrderLag,
+)
 
 DT = 5e-5
 

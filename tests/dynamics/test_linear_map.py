@@ -3,8 +3,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import LinearMap, StateSpace, simulate
-from piezojax.system import rest_output
+from piezojax import (
+    simulate,
+)
+from piezojax.core.system import rest_output
+from piezojax.dynamics import (
+    LinearMap,
+    StateSpace,
+)
 
 DRAW = np.random.default_rng(2)
 MATRIX = DRAW.normal(size=(2, 3))

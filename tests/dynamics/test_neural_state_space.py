@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy.signal import dlsim
 
-from piezojax import NeuralStateSpace, load, save, simulate
+from piezojax import (
+    load,
+    save,
+    simulate,
+)
+from piezojax.dynamics import (
+    NeuralStateSpace,
+)
 
 SHAPES = {
     "state_matrix": "nn",

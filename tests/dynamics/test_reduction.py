@@ -6,15 +6,15 @@ import pytest
 from scipy.linalg import block_diag
 
 import piezojax as pj
-from piezojax.axes import PerAxis, packed
+from piezojax.analysis.stability.margins import linear_axes
 from piezojax.catalog import p558, p558_control
+from piezojax.core.axes import PerAxis, packed
 from piezojax.dynamics import (
     SecondOrderLag,
     StateSpace,
     balanced_reduction,
     observability_form,
 )
-from piezojax.stability.margins import linear_axes
 
 WHOLE = p558.model("6")  # 15 states, 3 axes
 
@@ -122,7 +122,7 @@ def test_as_many_states_as_rows_are_the_printed_form(chapter, lags):
 def test_a_controller_on_such_a_model_stabilises_it(order):
     model = observability_form(balanced_reduction(WHOLE, order).model)
     unit = np.eye(3)
-    controller = pj.MultiAxisSlidingModePID(
+    controller = pj.control.MultiAxisSlidingModePID(
         proportional=0.5 * unit,
         integral=20.0 * unit,
         derivative=0.0 * unit,

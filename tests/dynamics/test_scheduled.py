@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from oracles import state_space as oracle
 
-from piezojax import AmplitudeScheduled, StateSpace, load, save, simulate
+from piezojax import (
+    load,
+    save,
+    simulate,
+)
+from piezojax.dynamics import (
+    AmplitudeScheduled,
+    StateSpace,
+)
 
 DT = 1e-3
 LEVELS = (0.5, 1.0, 3.0)

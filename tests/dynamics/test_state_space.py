@@ -9,11 +9,19 @@ from hypothesis import strategies as st
 from oracles import state_space as oracle
 from scipy import signal
 
-from piezojax import StateSpace, load, save, simulate
+from piezojax import (
+    load,
+    save,
+    simulate,
+)
 from piezojax.catalog import p558
-from piezojax.dynamics import stabilised, stacked
-from piezojax.serial import from_data, to_data
-from piezojax.system import rest_output
+from piezojax.core.serial import from_data, to_data
+from piezojax.core.system import rest_output
+from piezojax.dynamics import (
+    StateSpace,
+    stabilised,
+    stacked,
+)
 
 DT = 2e-3
 SIZES = {"one": (1, 1, 1), "wide": (5, 2, 3), "tall": (4, 3, 1), "large": (12, 3, 3)}

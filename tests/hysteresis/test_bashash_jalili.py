@@ -6,7 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import extrema as oracle
 
-from piezojax import BashashJalili, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.hysteresis import (
+    BashashJalili,
+)
 
 LOWER, UPPER = (0.0, 0.0), (100.0, 12.0)
 SHAPES = ((-0.45, 0.03), (-0.35, 0.05))

@@ -6,7 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import bouc_wen as oracle
 
-from piezojax import BoucWen, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.hysteresis import (
+    BoucWen,
+)
 
 ALPHA = 5e4  # N/m
 SHAPES = {  # beta_gamma, beta_delta, nu

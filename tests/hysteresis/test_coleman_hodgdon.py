@@ -10,7 +10,16 @@ from oracles import hysteresis as oracle
 from oracles.published import HYSTERESIS
 from scipy.integrate import solve_ivp
 
-from piezojax import ColemanHodgdon, InverseColemanHodgdon, Series, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.core.system import (
+    Series,
+)
+from piezojax.hysteresis import (
+    ColemanHodgdon,
+    InverseColemanHodgdon,
+)
 
 SCHEMES = ("trapezoid", "quadratic", "voros", "exact")
 SECOND = 20_000  # samples of 1 s at 20 kHz

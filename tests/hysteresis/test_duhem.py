@@ -5,13 +5,15 @@ import pytest
 from oracles import duhem as oracle
 
 from piezojax import (
+    load,
+    save,
+    simulate,
+)
+from piezojax.hysteresis import (
     BoucWen,
     ColemanHodgdon,
     Duhem,
     ShapedColemanHodgdon,
-    load,
-    save,
-    simulate,
 )
 from piezojax.hysteresis.duhem import DuhemState
 

@@ -8,7 +8,20 @@ import numpy as np
 import pytest
 from oracles import regression
 
-from piezojax import ARMA, Affine, ColemanHodgdon, HystereticARMA, series, simulate
+from piezojax import (
+    series,
+    simulate,
+)
+from piezojax.core.system import (
+    Affine,
+)
+from piezojax.dynamics import (
+    ARMA,
+)
+from piezojax.hysteresis import (
+    ColemanHodgdon,
+    HystereticARMA,
+)
 
 POLES = (1.6, -0.62)
 FIRST = (0.0003, -0.0002, 0.0006)

@@ -7,26 +7,34 @@ from hypothesis import strategies as st
 from oracles.published import HYSTERESIS
 
 from piezojax import (
-    ARMA,
-    PID,
-    BashashJalili,
-    BoucWen,
-    ColemanHodgdon,
-    Duhem,
     Feedback,
-    InverseColemanHodgdon,
-    InverseHysteresis,
-    InversionControl,
-    NormalisedBoucWen,
-    PrandtlIshlinskii,
-    Saturation,
-    Sensor,
-    ShapedColemanHodgdon,
     load,
     loop_inputs,
     save,
     series,
     simulate,
+)
+from piezojax.control import (
+    PID,
+    InversionControl,
+)
+from piezojax.dynamics import (
+    ARMA,
+)
+from piezojax.hardware import (
+    Saturation,
+    Sensor,
+)
+from piezojax.hysteresis import (
+    BashashJalili,
+    BoucWen,
+    ColemanHodgdon,
+    Duhem,
+    InverseColemanHodgdon,
+    InverseHysteresis,
+    NormalisedBoucWen,
+    PrandtlIshlinskii,
+    ShapedColemanHodgdon,
 )
 
 LOWER, UPPER = -20.0, 120.0

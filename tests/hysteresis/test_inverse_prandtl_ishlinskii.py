@@ -7,15 +7,22 @@ from hypothesis import strategies as st
 from oracles import hysteresis as oracle
 
 from piezojax import (
+    simulate,
+)
+from piezojax.control import (
     InverseFeedforward,
+)
+from piezojax.core.system import (
+    Observation,
+    Series,
+    rest_output,
+)
+from piezojax.hysteresis import (
     InversePrandtlIshlinskii,
     InverseRateDependentPrandtlIshlinskii,
     PrandtlIshlinskii,
     RateDependentPrandtlIshlinskii,
-    Series,
-    simulate,
 )
-from piezojax.system import Observation, rest_output
 
 DT = 1e-3
 THRESHOLDS = (2.0, 7.0, 15.0)

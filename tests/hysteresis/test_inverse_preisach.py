@@ -11,15 +11,23 @@ from oracles.published import plant_t2, smc_gains
 
 from piezojax import (
     Feedback,
-    InversePreisach,
-    InversionControl,
-    Preisach,
-    Sensor,
-    Series,
     simulate,
 )
 from piezojax.catalog import p753
-from piezojax.system import LoopInput
+from piezojax.control import (
+    InversionControl,
+)
+from piezojax.core.system import (
+    LoopInput,
+    Series,
+)
+from piezojax.hardware import (
+    Sensor,
+)
+from piezojax.hysteresis import (
+    InversePreisach,
+    Preisach,
+)
 
 LOW, HIGH, LOWEST = -20.0, 120.0, -1.2
 LENGTH = 32

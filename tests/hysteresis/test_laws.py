@@ -18,12 +18,17 @@ from hypothesis import strategies as st
 
 import piezojax.hysteresis
 from piezojax import (
+    System,
+    simulate,
+)
+from piezojax.hysteresis import (
     AsymmetricPrandtlIshlinskii,
     BashashJalili,
     BoucWen,
     ColemanHodgdon,
     Duhem,
     HystereticARMA,
+    Inverse,
     LearnedOperator,
     NormalisedBoucWen,
     PrandtlIshlinskii,
@@ -32,10 +37,7 @@ from piezojax import (
     RateDependentPreisach,
     ShapedColemanHodgdon,
     StopPrandtlIshlinskii,
-    System,
-    simulate,
 )
-from piezojax.hysteresis import Inverse
 
 SPAN = (0.0, 100.0)  # V
 SHARES = 6  # numbers in 0 .. 1 that make an example

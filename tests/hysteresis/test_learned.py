@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 from oracles import hysteresis as oracle
 
-from piezojax import LearnedOperator, Record, identify, simulate
-from piezojax.identify.models import chain
+from piezojax import (
+    Record,
+    simulate,
+)
+from piezojax import (
+    identification as identify,
+)
+from piezojax.hysteresis import (
+    LearnedOperator,
+)
+from piezojax.identification.chain import chain
 
 DT = 0.01
 A = (0.5, -0.1)

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from oracles import duhem as oracle
 
-from piezojax import BoucWen, NormalisedBoucWen, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.hysteresis import (
+    BoucWen,
+    NormalisedBoucWen,
+)
 from piezojax.hysteresis.normalised_bouc_wen import NormalisedBoucWenState
 
 K_X, K_W, RHO = 0.12, -1.0, 0.04  # um/V, um, 1/V

@@ -6,7 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles import hysteresis as oracle
 
-from piezojax import AsymmetricPrandtlIshlinskii, PrandtlIshlinskii, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.hysteresis import (
+    AsymmetricPrandtlIshlinskii,
+    PrandtlIshlinskii,
+)
 
 POLYNOMIAL = (0.1, 2e-4, -1e-6)
 THRESHOLDS = (2.0, 7.0, 15.0)

@@ -6,8 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import preisach as oracle
 
-from piezojax import InversePreisach, Preisach, simulate
-from piezojax.serial import from_data, to_data
+from piezojax import (
+    simulate,
+)
+from piezojax.core.serial import from_data, to_data
+from piezojax.hysteresis import (
+    InversePreisach,
+    Preisach,
+)
 
 CELLS, LOW, HIGH, LOWEST = 10, 0.0, 100.0, -1.5
 SIZE = (HIGH - LOW) / CELLS

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from oracles import hysteresis as oracle
 
-from piezojax import PrandtlIshlinskii, RateDependentPrandtlIshlinskii, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.hysteresis import (
+    PrandtlIshlinskii,
+    RateDependentPrandtlIshlinskii,
+)
 
 DT = 1e-3
 POLYNOMIAL = (0.1, 2e-4)

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from oracles import preisach as oracle
 
-from piezojax import Preisach, RateDependentPreisach, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.hysteresis import (
+    Preisach,
+    RateDependentPreisach,
+)
 
 LOW, HIGH, LOWEST, REST = 0.0, 80.0, 0.4, 20.0
 DT, RATE = 1e-3, 5e3

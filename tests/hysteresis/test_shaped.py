@@ -5,7 +5,13 @@ import pytest
 from oracles import hysteresis as oracle
 from scipy.integrate import solve_ivp
 
-from piezojax import ColemanHodgdon, ShapedColemanHodgdon, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.hysteresis import (
+    ColemanHodgdon,
+    ShapedColemanHodgdon,
+)
 
 PULL = (0.02, 0.006, -2e-5, 1e-7)
 SLOPE = (0.11, -3e-4, 2e-6)

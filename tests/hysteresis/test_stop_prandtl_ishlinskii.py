@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from oracles import hysteresis as oracle
 
-from piezojax import InversePrandtlIshlinskii, StopPrandtlIshlinskii, simulate
+from piezojax import (
+    simulate,
+)
+from piezojax.hysteresis import (
+    InversePrandtlIshlinskii,
+    StopPrandtlIshlinskii,
+)
 
 POLYNOMIAL = (0.2, 2e-4, -1e-6)
 THRESHOLDS = (2.0, 7.0, 15.0)

@@ -5,8 +5,8 @@ import pytest
 from scipy import signal
 
 import piezojax as pj
-from piezojax import signals as references_of
-from piezojax.limit import attained, performance_limit
+from piezojax.analysis.limit import attained, performance_limit
+from piezojax.signals import waveforms as references_of
 
 RATE, DT, START, SAMPLES = 5_000.0, 2e-4, 2_500, 6_000
 NAMES = ("SIN10", "PWSW10")
@@ -16,15 +16,17 @@ NOISE = np.random.default_rng(8).standard_normal((2, 1, SAMPLES))
 
 
 def loop_of(plant, integral):
-    controller = pj.PID(0.0, integral, 0.0, 0.0, 50.0, dt=DT)
-    limits = pj.Saturation(-200.0, 200.0)
-    return pj.Feedback(controller, plant, limits, pj.Sensor(0.012))
+    controller = pj.control.PID(0.0, integral, 0.0, 0.0, 50.0, dt=DT)
+    limits = pj.hardware.Saturation(-200.0, 200.0)
+    return pj.Feedback(controller, plant, limits, pj.hardware.Sensor(0.012))
 
 
 def test_on_a_linear_stage_at_once():
     draws = np.random.default_rng(3).standard_normal(SAMPLES)
     disturbance = signal.lfilter([0.004], [1.0, -0.99], draws)
-    stage = pj.series(slope=pj.Affine(0.15), lag=pj.FirstOrderLag(5e-4, DT))
+    stage = pj.series(
+        slope=pj.core.system.Affine(0.15), lag=pj.dynamics.FirstOrderLag(5e-4, DT)
+    )
     loop = loop_of(stage, 4000.0)
     (found,) = attained(loop, REFERENCES, NOISE, disturbance, start=START, rounds=1)
     report = performance_limit(loop, NAMES, REFERENCES, NOISE, disturbance, start=START)
@@ -37,8 +39,8 @@ def test_on_a_linear_stage_at_once():
 
 
 def test_on_a_hysteretic_stage_once_it_has_met_its_own_disturbance():
-    model = pj.ColemanHodgdon(0.0077, 0.1167, -0.0487)
-    stage = pj.series(hysteresis=model, lag=pj.FirstOrderLag(5e-4, DT))
+    model = pj.hysteresis.ColemanHodgdon(0.0077, 0.1167, -0.0487)
+    stage = pj.series(hysteresis=model, lag=pj.dynamics.FirstOrderLag(5e-4, DT))
     first, *_, last = attained(
         loop_of(stage, 4000.0), REFERENCES, NOISE, start=START, rounds=3
     )
@@ -48,7 +50,9 @@ def test_on_a_hysteretic_stage_once_it_has_met_its_own_disturbance():
 
 
 def test_what_cannot_be_attained():
-    loop = loop_of(pj.Affine(0.15), 4000.0)
-    quiet = pj.Feedback(loop.controller, loop.plant, loop.actuator, pj.Sensor(0.0))
+    loop = loop_of(pj.core.system.Affine(0.15), 4000.0)
+    quiet = pj.Feedback(
+        loop.controller, loop.plant, loop.actuator, pj.hardware.Sensor(0.0)
+    )
     with pytest.raises(ValueError, match="without sensor noise"):
         attained(quiet, REFERENCES, NOISE, start=START)

@@ -8,12 +8,18 @@ import pytest
 from scipy import signal
 
 import piezojax as pj
-from piezojax import signals as references_of
-from piezojax.limit import NEAR, LimitReport, Reached, Shares, performance_limit
-from piezojax.limit.plant import LinearPlant, linear_plant
-from piezojax.limit.reached import Curves
-from piezojax.limit.spectra import Foretelling, grid_size, spectra, windowed
-from piezojax.report.limit import limit_text, write_limit
+from piezojax.analysis.limit import (
+    NEAR,
+    LimitReport,
+    Reached,
+    Shares,
+    performance_limit,
+)
+from piezojax.analysis.limit.linear_plant import LinearPlant, linear_plant
+from piezojax.analysis.limit.reached import Curves
+from piezojax.analysis.limit.spectra import Foretelling, grid_size, spectra, windowed
+from piezojax.report.limit_bars import limit_text, write_limit
+from piezojax.signals import waveforms as references_of
 
 RATE, DT, START, SAMPLES = 5_000.0, 2e-4, 2_500, 15_000
 NOISE, SLOPE, MEMORY, DRIVEN = 0.012, 0.15, 0.99, 0.004
@@ -21,8 +27,10 @@ NAMES = ("SIN10", "PWSW10")
 
 
 def loop_of(plant, integral=8000.0, noise=NOISE):
-    controller = pj.PID(0.0, integral, 0.0, 0.0, 50.0, dt=DT)
-    return pj.Feedback(controller, plant, pj.Saturation(-1e3, 1e3), pj.Sensor(noise))
+    controller = pj.control.PID(0.0, integral, 0.0, 0.0, 50.0, dt=DT)
+    return pj.Feedback(
+        controller, plant, pj.hardware.Saturation(-1e3, 1e3), pj.hardware.Sensor(noise)
+    )
 
 
 def driving(names=NAMES, draws=1, samples=SAMPLES):
@@ -42,7 +50,11 @@ def disturbance():
 def linear(disturbance):
     """A slope with one sample of delay, an integral controller, a known disturbance."""
     found = performance_limit(
-        loop_of(pj.Affine(SLOPE)), NAMES, *driving(), disturbance, start=START
+        loop_of(pj.core.system.Affine(SLOPE)),
+        NAMES,
+        *driving(),
+        disturbance,
+        start=START,
     )
     return found
 
@@ -105,7 +117,7 @@ def test_a_better_controller_comes_nearer(linear, disturbance):
     flat = np.full_like(references, 5.0)
     found = {
         integral: performance_limit(
-            loop_of(pj.Affine(SLOPE), integral),
+            loop_of(pj.core.system.Affine(SLOPE), integral),
             NAMES,
             flat,
             noise,
@@ -128,8 +140,8 @@ def test_a_better_controller_comes_nearer(linear, disturbance):
 
 
 def test_a_hysteretic_stage(tmp_path):
-    model = pj.ColemanHodgdon(0.0077, 0.1167, -0.0487)
-    stage = pj.series(hysteresis=model, lag=pj.FirstOrderLag(5e-4, DT))
+    model = pj.hysteresis.ColemanHodgdon(0.0077, 0.1167, -0.0487)
+    stage = pj.series(hysteresis=model, lag=pj.dynamics.FirstOrderLag(5e-4, DT))
     references, noise = driving(draws=2, samples=5_000)
     found = performance_limit(
         loop_of(stage, 3000.0), NAMES, references, noise, start=START, segment=0.1
@@ -168,8 +180,8 @@ def test_what_a_plant_remembers_or_never_moves_is_left_out():
     np.testing.assert_allclose(
         plant.response(8), SLOPE / np.exp(0.25j * np.pi * np.arange(8))
     )
-    model = pj.ColemanHodgdon(0.0077, 0.1167, -0.0487)
-    stage = pj.series(hysteresis=model, lag=pj.FirstOrderLag(5e-4, DT))
+    model = pj.hysteresis.ColemanHodgdon(0.0077, 0.1167, -0.0487)
+    stage = pj.series(hysteresis=model, lag=pj.dynamics.FirstOrderLag(5e-4, DT))
     # Its own input, a pole at 0, and the lag; not where on its branch it is.
     poles = np.linalg.eigvals(linear_plant(loop_of(stage), 5.0, DT).A)
     np.testing.assert_allclose(np.sort(poles), [0.0, np.exp(-0.4)], atol=1e-9)
@@ -178,13 +190,17 @@ def test_what_a_plant_remembers_or_never_moves_is_left_out():
 def test_what_stands_in_the_way_of_a_controller():
     """Delays and zeros of plants written as functions of 1/z, and slow creep."""
     moving, autoregressive = (0.0050811, -0.0036354, 0.010553), (1.6035, -0.61995)
-    dynamics = pj.ARMA(autoregressive, moving)
+    dynamics = pj.dynamics.ARMA(autoregressive, moving)
     for plant, delay, zeros in (
         (dynamics, 1, np.roots(moving)),
-        (dynamics >> pj.Delay(2), 3, np.roots(moving)),
-        (pj.ARMA(autoregressive, (0.0, 0.2, 0.1)), 2, []),
-        (pj.ARMA(autoregressive, (0.1, 0.1)), 1, []),
-        (pj.LogarithmicCreep(0.02, 0.1, 1e3, DT) >> dynamics, 1, np.roots(moving)),
+        (dynamics >> pj.core.system.Delay(2), 3, np.roots(moving)),
+        (pj.dynamics.ARMA(autoregressive, (0.0, 0.2, 0.1)), 2, []),
+        (pj.dynamics.ARMA(autoregressive, (0.1, 0.1)), 1, []),
+        (
+            pj.dynamics.LogarithmicCreep(0.02, 0.1, 1e3, DT) >> dynamics,
+            1,
+            np.roots(moving),
+        ),
     ):
         found = linear_plant(loop_of(plant), 0.0, DT).obstacles()
         assert found[0] == delay
@@ -236,26 +252,28 @@ def test_a_filter_of_the_reference_is_foretold_and_nothing_else():
 
 def test_what_has_no_limit():
     references, noise = driving(samples=500)
-    loop = loop_of(pj.Affine(SLOPE))
+    loop = loop_of(pj.core.system.Affine(SLOPE))
     with pytest.raises(ValueError, match="without sensor noise"):
         performance_limit(
-            loop_of(pj.Affine(SLOPE), noise=0.0), NAMES, references, noise
+            loop_of(pj.core.system.Affine(SLOPE), noise=0.0), NAMES, references, noise
         )
     with pytest.raises(ValueError, match="one axis only"):
         performance_limit(loop, NAMES, references[..., None], noise)
     with pytest.raises(ValueError, match="a run diverges"):
         performance_limit(loop, NAMES, references, np.nan * noise)
-    integrating = pj.StateSpace([[1.0]], [[1.0]], [[1.0]], [[0.0]], DT)
+    integrating = pj.dynamics.StateSpace([[1.0]], [[1.0]], [[1.0]], [[0.0]], DT)
     with pytest.raises(ValueError, match="known for stable plants"):
         linear_plant(loop_of(Scalar(integrating)), 0.0, DT)
     with pytest.raises(ValueError, match="does not move as its linear model"):
-        performance_limit(loop_of(pj.Affine(SLOPE), 0.0), NAMES, references, noise)
+        performance_limit(
+            loop_of(pj.core.system.Affine(SLOPE), 0.0), NAMES, references, noise
+        )
 
 
 class Scalar(pj.System):
     """A model of vectors as a plant of numbers."""
 
-    model: pj.StateSpace
+    model: pj.dynamics.StateSpace
 
     def init(self, input=0.0):
         return jnp.zeros(1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import linalg, signal
 
-from piezojax.limit.wiener import (
+from piezojax.analysis.limit.wiener import (
     best_response,
     common_response,
     error_shares,

@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 
 import piezojax as pj
-from piezojax.catalog import p753, p753_stage
-from piezojax.paths import replace
-from piezojax.stability import sensitivity, stability_report
-from piezojax.stability.impulse import (
+from piezojax.analysis.stability import sensitivity, stability_report
+from piezojax.analysis.stability.impulse import (
     UNREACHED,
     delay_margin_of,
     disk_margin_of,
     peak_of,
 )
+from piezojax.catalog import p753, p753_stage
+from piezojax.core.paths import replace
 
 INTEGRAL = "controller.integral"
 
 
 def pid_loop(integral=3000.0):
-    return p753.loop(pj.PID(0.5, integral, 0.0, 1e-4, 100.0, dt=p753.DT))
+    return p753.loop(pj.control.PID(0.5, integral, 0.0, 1e-4, 100.0, dt=p753.DT))
 
 
 LOOPS = {
@@ -30,10 +30,10 @@ LOOPS = {
         p753.loop(p753.disturbance_observer()), {"controller.feedback.integral": 10.0}
     ),
     "stage with a mode": lambda: pj.Feedback(
-        pj.PID(0.3, 1500.0, dt=p753.DT),
+        pj.control.PID(0.3, 1500.0, dt=p753.DT),
         p753_stage.stage(delay=0.4),
         p753.actuator(),
-        pj.Sensor(0.0),
+        pj.hardware.Sensor(0.0),
     ),
 }
 
@@ -51,9 +51,9 @@ def test_figures_are_those_of_the_exact_report(name, branch):
 
 
 def test_a_loop_that_is_never_as_strong_as_1_has_no_delay_margin():
-    found = sensitivity(pj.Feedback(
-        pj.PID(0.01, 0.0, dt=p753.DT), p753.plant(), p753.actuator(), pj.Sensor(0.0)
-    ), 0.0)  # fmt: skip
+    weak = pj.control.PID(0.01, 0.0, dt=p753.DT)
+    loop = pj.Feedback(weak, p753.plant(), p753.actuator(), pj.Sensor(0.0))
+    found = sensitivity(loop, 0.0)
     assert delay_margin_of(found) == UNREACHED
 
 

@@ -10,10 +10,10 @@ import pytest
 from oracles import published, transfer
 
 import piezojax as pj
+from piezojax.analysis.stability.conserved import LinearLoop
+from piezojax.analysis.stability.margins import linear_loop, report_of
 from piezojax.catalog import p753
-from piezojax.stability.conserved import LinearLoop
-from piezojax.stability.margins import linear_loop, report_of
-from piezojax.system import LoopInput
+from piezojax.core.system import LoopInput
 
 DT = 5e-5
 A, B = published.T2_P, published.T2_G
@@ -27,15 +27,18 @@ PIDS = {
 
 
 def around(controller, gain=1.0, delay=0):
-    parts = {"slope": pj.Affine(gain * SLOPE), "dynamics": pj.ARMA(A, B)}
+    parts = {
+        "slope": pj.core.system.Affine(gain * SLOPE),
+        "dynamics": pj.dynamics.ARMA(A, B),
+    }
     if delay:
-        parts["delay"] = pj.Delay(delay)
-    limits = pj.Saturation(-1e300, 1e300)
-    return pj.Feedback(controller, pj.series(**parts), limits, pj.Sensor(0.0))
+        parts["delay"] = pj.core.system.Delay(delay)
+    limits = pj.hardware.Saturation(-1e300, 1e300)
+    return pj.Feedback(controller, pj.series(**parts), limits, pj.hardware.Sensor(0.0))
 
 
 def pid(name):
-    return pj.PID(*PIDS[name], 50.0, dt=DT)
+    return pj.control.PID(*PIDS[name], 50.0, dt=DT)
 
 
 def dob():

@@ -20,13 +20,13 @@ from scipy.linalg import block_diag
 from scipy.optimize import linear_sum_assignment, minimize
 
 import piezojax as pj
-from piezojax._types import as_signal
+from piezojax.analysis.stability import axes_report_of, broken_loop, report_of
+from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
+from piezojax.analysis.stability.margins import _model, linear_axes
+from piezojax.analysis.stability.multi_axis import structured_bound
 from piezojax.catalog import p558_control
-from piezojax.stability import axes_report_of, broken_loop, report_of
-from piezojax.stability.conserved import LinearAxes, LinearLoop
-from piezojax.stability.margins import _model, linear_axes
-from piezojax.stability.multi_axis import structured_bound
-from piezojax.system import LoopInput
+from piezojax.core.arrays import as_signal
+from piezojax.core.system import LoopInput
 
 REST = (0.0, 0.0, 0.0)
 STATE = {
@@ -263,9 +263,9 @@ def test_the_printed_sign_of_phi_is_unstable(loop):
 def test_limits_of_every_axis_are_taken_out(loop):
     def limits(loop):
         leaves = jax.tree.leaves(
-            loop.actuator, is_leaf=lambda x: isinstance(x, pj.Saturation)
+            loop.actuator, is_leaf=lambda x: isinstance(x, pj.hardware.Saturation)
         )
-        return [x for x in leaves if isinstance(x, pj.Saturation)]
+        return [x for x in leaves if isinstance(x, pj.hardware.Saturation)]
 
     assert len(limits(loop)) == 3
     assert limits(broken_loop(loop, REST).loop) == []

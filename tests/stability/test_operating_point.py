@@ -8,9 +8,7 @@ import pytest
 from oracles import published
 
 import piezojax as pj
-from piezojax.catalog import p753
-from piezojax.report.stability import compared, write_stability
-from piezojax.stability import (
+from piezojax.analysis.stability import (
     broken_loop,
     closed_loop_poles,
     linearise,
@@ -18,30 +16,32 @@ from piezojax.stability import (
     open_loop,
     sensitivity_peak,
 )
-from piezojax.system import LoopInput
+from piezojax.catalog import p753
+from piezojax.core.system import LoopInput
+from piezojax.report.bode import compared, write_stability
 
 a, b, c = published.HYSTERESIS
 SIDES = {"ascending": 1.0, "descending": -1.0}
 
 
 def pid():
-    return pj.PID(0.5, 3000.0, 1e-4, 1e-4, 50.0, dt=5e-5)
+    return pj.control.PID(0.5, 3000.0, 1e-4, 1e-4, 50.0, dt=5e-5)
 
 
 def loop_of(plant, controller=None):
-    limits = pj.Saturation(-20.0, 120.0)
-    return pj.Feedback(controller or pid(), plant, limits, pj.Sensor(0.0))
+    limits = pj.hardware.Saturation(-20.0, 120.0)
+    return pj.Feedback(controller or pid(), plant, limits, pj.hardware.Sensor(0.0))
 
 
 def linear(slope):
-    dynamics = pj.ARMA(published.T2_P, published.T2_G)
-    return pj.series(slope=pj.Affine(slope), dynamics=dynamics)
+    dynamics = pj.dynamics.ARMA(published.T2_P, published.T2_G)
+    return pj.series(slope=pj.core.system.Affine(slope), dynamics=dynamics)
 
 
 def test_linearising_a_linear_system_returns_it():
     rng = np.random.default_rng(3)
     A, B, C, D = (rng.normal(size=s) for s in ((3, 3), (3, 2), (2, 3), (2, 2)))
-    system = pj.StateSpace(A, B, C, D, 1e-3)
+    system = pj.dynamics.StateSpace(A, B, C, D, 1e-3)
     found = linearise(system, jnp.ones(2))
     for name in "ABCD":
         np.testing.assert_allclose(getattr(found, name), getattr(system, name))
@@ -49,8 +49,8 @@ def test_linearising_a_linear_system_returns_it():
 
 
 def test_derivatives_of_a_nonlinear_system_are_differences():
-    oscillator = pj.HystereticOscillator(
-        2.0, 10.0, 5e4, pj.BoucWen(5e4, 1e3, 0.8e3), 1.0 / 750.0
+    oscillator = pj.hysteresis.HystereticOscillator(
+        2.0, 10.0, 5e4, pj.hysteresis.BoucWen(5e4, 1e3, 0.8e3), 1.0 / 750.0
     )
     state, _ = pj.simulate(oscillator, 100.0 * jnp.sin(jnp.arange(50) * 0.3))
     found = linearise(oscillator, 40.0, state)
@@ -100,8 +100,8 @@ def test_an_inverse_hysteresis_takes_the_branch_of_the_plant():
 
 
 def test_plays_engage_on_the_way_up_and_rest_on_the_way_down():
-    plant = pj.PrandtlIshlinskii((0.1,), (2.0, 5.0), (0.02, 0.03))
-    loop = loop_of(plant >> pj.ARMA(published.T2_P, published.T2_G))
+    plant = pj.hysteresis.PrandtlIshlinskii((0.1,), (2.0, 5.0), (0.02, 0.03))
+    loop = loop_of(plant >> pj.dynamics.ARMA(published.T2_P, published.T2_G))
     for branch, slope in (("ascending", 0.15), ("descending", 0.1)):
         twin = pj.stability_report(loop_of(linear(slope)), 3.0)
         report = pj.stability_report(loop, 3.0, branch)
@@ -146,9 +146,13 @@ def test_what_is_injected_is_hidden_from_the_observer():
 
 def test_limits_and_converters_do_not_count_for_small_motions():
     plain = pj.stability_report(loop_of(linear(0.15)), 0.0)
-    parts = (pj.Saturation(0.0, 100.0), pj.SlewLimit(1e5, 5e-5), pj.Quantiser(1e-3))
+    parts = (
+        pj.hardware.Saturation(0.0, 100.0),
+        pj.hardware.SlewLimit(1e5, 5e-5),
+        pj.hardware.Quantiser(1e-3),
+    )
     hard = pj.Feedback(
-        pid(), linear(0.15), parts[0] >> parts[1] >> parts[2], pj.Sensor(0.0)
+        pid(), linear(0.15), parts[0] >> parts[1] >> parts[2], pj.hardware.Sensor(0.0)
     )
     report = pj.stability_report(hard, 0.0)  # on the lower limit itself
     assert report.sensitivity_peak == pytest.approx(plain.sensitivity_peak, rel=1e-9)
@@ -220,8 +224,8 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="branch 'up'; it must be one of"):
         open_loop(loop, branch="up")
     with pytest.raises(ValueError, match=r"Affine name none; give dt"):
-        linearise(pj.Affine(2.0))
-    two = pj.FirstOrderLag(1.0, 1e-3) >> pj.FirstOrderLag(1.0, 2e-3)
+        linearise(pj.core.system.Affine(2.0))
+    two = pj.dynamics.FirstOrderLag(1.0, 1e-3) >> pj.dynamics.FirstOrderLag(1.0, 2e-3)
     with pytest.raises(ValueError, match=r"name 0\.001 s, 0\.002 s; give dt"):
         linearise(two)
     assert linearise(two, dt=1e-3).A.shape == (2, 2)

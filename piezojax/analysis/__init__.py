@@ -1,0 +1,1 @@
+"""Stability of a loop, and the limit of linear control."""

@@ -1,0 +1,84 @@
+"""Any System as a linear model around an operating point, by differentiation."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from ...core.arrays import State
+from ...core.paths import static_fields
+from ...core.system import Learned, System
+from ...dynamics import StateSpace
+
+
+def linearise(
+    system: System,
+    input: Any = 0.0,
+    state: State | None = None,
+    dt: float | None = None,
+) -> StateSpace:
+    """Return ``system`` linearised around ``state`` and ``input``.
+
+    The matrices are the exact derivatives of one step: A [n, n], B [n, m], C [p, n],
+    D [p, m] for the n numbers of the raveled state, the m of the input and the p of the
+    output, in the order in which ``jax.tree.leaves`` lists them and in the units of the
+    system; they map deviations from the operating point to deviations. Counters and
+    what is ``Learned`` are held and no states of the model.
+
+    ``state`` is that at rest under ``input`` if left out. ``dt`` in s is looked for in
+    the parts of the system. Where a step has a kink, as hysteresis has at rest, the
+    derivative is the one JAX takes at that very point: that of the ascending branch for
+    Coleman-Hodgdon models, the mean of both for a play operator. An ``input`` a little
+    to one side of the point picks the branch; ``broken_loop`` does that.
+
+    Usable inside ``jax.jit`` and differentiable. Raises ValueError where the parts of
+    the system name no sample time or several, and ``dt`` is not given.
+    """
+    dt = sample_time(system) if dt is None else dt
+    input = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), input)
+    state = system.init(input) if state is None else state
+    moving, held = parted(state)
+    x, unravel_state = ravel_pytree(moving)
+    u, unravel_input = ravel_pytree(input)
+
+    def step(x: Array, u: Array) -> tuple[Array, Array]:
+        state = eqx.combine(unravel_state(x), held)
+        state, output = system.step(state, unravel_input(u))
+        return ravel_pytree(parted(state)[0])[0], ravel_pytree(output)[0]
+
+    (A, B), (C, D) = jax.jacfwd(step, argnums=(0, 1))(x, u)
+    return StateSpace(A, B, C, D, dt)
+
+
+def parted(state: State) -> tuple[State, State]:
+    """Return what small motions move of ``state``, and what they leave where it is.
+
+    A counter has no derivative, and what is ``Learned`` is held.
+    """
+
+    def is_learned(part: Any) -> bool:
+        return isinstance(part, Learned)
+
+    def moves(part: Any) -> bool:
+        return not is_learned(part) and eqx.is_inexact_array(part)
+
+    return eqx.partition(state, moves, is_leaf=is_learned)
+
+
+def sample_time(system: System) -> float:
+    """Return the one sample time (s) that the parts of ``system`` name.
+
+    Raises ValueError if they name none, or several.
+    """
+    found = [float(dt) for dt in static_fields(system, "dt")]
+    if found and np.allclose(found, found[0], rtol=1e-9, atol=0.0):
+        return found[0]
+    named = ", ".join(f"{dt:g} s" for dt in sorted(set(found))) or "none"
+    raise ValueError(
+        f"the sample time is not known: the parts of the {type(system).__name__} "
+        f"name {named}; give dt"
+    )

@@ -1,0 +1,293 @@
+"""Poles, margins and sensitivity peaks of a discrete loop."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from ...core.arrays import Scalar, ScalarLike, Signal, as_array, as_signal
+from ...core.system import Feedback, LoopState
+from ...dynamics import StateSpace
+from .broken_loop import check_operating_point, cut, loop_sample_time, side_of
+from .conserved import LinearAxes, LinearLoop, balanced, without_conserved
+from .crossings import angle_grid, peak, roots
+from .linearise import linearise
+
+
+@dataclass(frozen=True)
+class StabilityReport:
+    """How far a discrete loop, cut at the plant's input, is from instability.
+
+    L is its loop transfer function (see ``BrokenLoop``), S = 1/(1+L), T = L/(1+L). All
+    hold for the sampled loop up to the Nyquist frequency. Of an unstable loop only the
+    poles are given, all else is None. A limit that no change reaches is infinite, a
+    frequency that then does not exist None.
+
+    - ``stable``: every pole of the closed loop inside the unit circle;
+    - ``poles``: of the closed loop in the z plane, largest first, without ``conserved``
+      poles at z = 1: what hysteresis remembers and nothing moves;
+    - ``slowest_time_constant_s``: of the pole nearest to the unit circle;
+    - ``gain_margin``: factor above 1 on the loop gain at which it becomes unstable
+      (``gain_margin_dB`` the same), and at which frequency it then oscillates;
+      ``gain_reduction_margin``: the factor below 1, 0 where there is none;
+    - ``phase_margin_deg``: smallest phase, lag or lead, that makes it unstable;
+    - ``delay_margin_s``, ``delay_margin_samples``: smallest delay that does, exact
+      for whole samples: the loop is stable with any whole number below it;
+    - ``disk_margin``: alpha, 1 / max |(S - T)/2|; gain and phase may vary at once
+      within ``disk_gain_margin`` (that factor up, or its inverse) and
+      ``disk_phase_margin_deg``. Source: Seiler, Packard and Gahinet, An introduction to
+      disk margins, 2020;
+    - ``sensitivity_peak``: Ms = max |S|, ``complementary_peak``: Mt = max |T|.
+
+    ``reference_um``, ``voltage_V`` and ``branch`` say where the loop was linearised.
+    Frequencies in Hz, angles in degrees.
+    """
+
+    stable: bool
+    dt_s: float
+    poles: tuple[complex, ...]
+    conserved: int
+    slowest_time_constant_s: float | None
+    gain_margin: float | None
+    gain_margin_dB: float | None  # noqa: N815
+    phase_crossover_Hz: float | None  # noqa: N815
+    gain_reduction_margin: float | None
+    phase_margin_deg: float | None
+    gain_crossover_Hz: float | None  # noqa: N815
+    delay_margin_s: float | None
+    delay_margin_samples: float | None
+    disk_margin: float | None
+    disk_gain_margin: float | None
+    disk_phase_margin_deg: float | None
+    sensitivity_peak: float | None
+    sensitivity_peak_Hz: float | None  # noqa: N815
+    complementary_peak: float | None
+    complementary_peak_Hz: float | None  # noqa: N815
+    reference_um: float | None = None
+    voltage_V: float | None = None  # noqa: N815
+    branch: str | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON: poles as [real, imaginary], infinity None."""
+        return plain(dataclasses.asdict(self))
+
+
+def plain(value: Any) -> Any:
+    """Return ``value`` for JSON: complex as [real, imaginary], infinity None."""
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    if isinstance(value, dict):
+        return {name: plain(part) for name, part in value.items()}
+    if isinstance(value, tuple):
+        return [plain(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+@eqx.filter_jit
+def _linearised(
+    loop: Feedback,
+    reference: Signal,
+    side: Scalar,
+    state: LoopState | None,
+    dt: float,
+) -> tuple[StateSpace, LoopState]:
+    broken = cut(loop, reference, side, state)
+    model = linearise(broken, broken.start.voltage, broken.init(), dt)
+    return model, broken.start
+
+
+def located_report(
+    model: LinearLoop, reference: float, start: LoopState, branch: str
+) -> StabilityReport:
+    """Return the report on ``model`` with the operating point it was made for."""
+    return dataclasses.replace(
+        report_of(model),
+        reference_um=reference,
+        voltage_V=float(start.voltage),
+        branch=branch,
+    )
+
+
+def linear_loop(
+    loop: Feedback,
+    reference: ScalarLike = 0.0,
+    branch: str = "ascending",
+    state: LoopState | None = None,
+    dt: float | None = None,
+) -> tuple[LinearLoop, LoopState]:
+    """Return L in matrices, for ``report_of`` and pictures, and the operating point.
+
+    Arguments and errors as for ``stability_report``; ``linear_axes`` is for several
+    axes.
+    """
+    model, start = _model(loop, as_array(reference), branch, state, dt)
+    return without_conserved(
+        balanced(LinearLoop(model.A, model.B[:, 0], model.C[0], model.dt))
+    ), start
+
+
+def linear_axes(
+    loop: Feedback,
+    reference: Any,
+    branch: str = "ascending",
+    state: LoopState | None = None,
+    dt: float | None = None,
+) -> tuple[LinearAxes, LoopState]:
+    """Return L of a loop of several axes, cut in all, and the operating point.
+
+    Arguments and errors as for ``stability_report``.
+    """
+    model, start = _model(loop, as_signal(reference), branch, state, dt)
+    return without_conserved(balanced(model)), start
+
+
+def _model(
+    loop: Feedback,
+    reference: Signal,
+    branch: str,
+    state: LoopState | None,
+    dt: float | None,
+) -> tuple[LinearAxes, LoopState]:
+    side = as_array(side_of(branch))
+    dt = loop_sample_time(loop) if dt is None else dt
+    model, start = _linearised(loop, reference, side, state, dt)
+    if state is None:
+        check_operating_point(start, reference)
+    A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
+    if not all(np.isfinite(m).all() for m in (A, B, C)):
+        shown = ", ".join(f"{float(r):g}" for r in jax.tree.leaves(reference))
+        raise ValueError(
+            f"the loop has no finite derivative at {shown} um; "
+            "it cannot be linearised there"
+        )
+    assert not D.any()  # the plant answers one sample later
+    return LinearAxes(A, B, C, dt), start
+
+
+def report_of(loop: LinearLoop) -> StabilityReport:
+    """Return the report on a loop that is linear already."""
+    found = poles_of(loop)
+    figures: dict[str, Any] = dict.fromkeys(_FIGURES)
+    if found["stable"]:
+        figures |= _figures(loop)
+    return StabilityReport(**(figures | found))
+
+
+def poles_of(loop: LinearLoop | LinearAxes) -> dict[str, Any]:
+    """Return what a report says about the poles of the closed loop."""
+    poles = np.linalg.eigvals(loop.closed())
+    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
+    largest = float(np.abs(poles).max(initial=0.0))
+    stable = largest < 1.0
+    speed = -math.log(largest) if 0.0 < largest < 1.0 else math.inf
+    return {
+        "stable": stable,
+        "dt_s": loop.dt,
+        "poles": tuple(complex(pole) for pole in poles),
+        "conserved": loop.conserved,
+        "slowest_time_constant_s": loop.dt / speed if stable else None,
+    }
+
+
+def disk_figures(largest: float) -> dict[str, float]:
+    """Return alpha = 1/``largest``, of (S - T)/2, as margins of gain and phase."""
+    alpha = 1.0 / largest
+    return {
+        "disk_margin": alpha,
+        "disk_gain_margin": (2 + alpha) / (2 - alpha) if alpha < 2 else math.inf,
+        "disk_phase_margin_deg": math.degrees(2.0 * math.atan(alpha / 2.0)),
+    }
+
+
+_FIGURES = [
+    field.name
+    for field in dataclasses.fields(StabilityReport)
+    if field.default is dataclasses.MISSING
+    and field.name not in ("stable", "dt_s", "poles", "conserved")
+]
+
+
+def _figures(loop: LinearLoop) -> dict[str, float | None]:
+    grid = angle_grid(loop)
+    response = loop.response(grid)
+    peaks = {
+        name: peak(lambda x, f=f: f(loop.response(x)), grid, f(response))
+        for name, f in (
+            ("sensitivity_peak", lambda L: np.abs(1.0 / (1.0 + L))),
+            ("complementary_peak", lambda L: np.abs(L / (1.0 + L))),
+            ("disk", lambda L: np.abs(0.5 * (1.0 - L) / (1.0 + L))),
+        )
+    }
+    figures: dict[str, float | None] = {}
+    for name in ("sensitivity_peak", "complementary_peak"):
+        figures[name] = peaks[name][0]
+        figures[f"{name}_Hz"] = hertz(peaks[name][1], loop.dt)
+    return (
+        figures
+        | disk_figures(peaks["disk"][0])
+        | _gain_margins(loop, grid, response)
+        | _phase_margins(loop, grid, response)
+    )
+
+
+def _gain_margins(
+    loop: LinearLoop, grid: np.ndarray, response: np.ndarray
+) -> dict[str, float | None]:
+    places = roots(
+        lambda x: np.imag(loop.response(x)), grid[:-1], np.imag(response)[:-1]
+    )
+    # At the Nyquist frequency, and at rest, L is real: a pole can leave there too.
+    places = np.append(places, np.pi)
+    crossing = np.real(loop.response(places))
+    if not loop.integrates():
+        places = np.append(places, 0.0)
+        crossing = np.append(crossing, np.real(loop.response(np.zeros(1))))
+    places, crossing = places[crossing < 0.0], crossing[crossing < 0.0]
+    factors = -1.0 / crossing
+    up, down = factors > 1.0, factors < 1.0
+    found = bool(up.any())
+    first = int(np.argmin(np.where(up, factors, np.inf))) if found else 0
+    margin = float(factors[first]) if found else math.inf
+    return {
+        "gain_margin": margin,
+        "gain_margin_dB": 20.0 * math.log10(margin),
+        "phase_crossover_Hz": hertz(float(places[first]), loop.dt) if found else None,
+        "gain_reduction_margin": float(factors[down].max(initial=0.0)),
+    }
+
+
+def _phase_margins(
+    loop: LinearLoop, grid: np.ndarray, response: np.ndarray
+) -> dict[str, float | None]:
+    def gain(x: np.ndarray) -> np.ndarray:
+        return np.log(np.abs(loop.response(x)) + 1e-300)
+
+    places = roots(gain, grid, np.log(np.abs(response) + 1e-300))
+    if places.size == 0:
+        return {
+            "phase_margin_deg": math.inf,
+            "gain_crossover_Hz": None,
+            "delay_margin_s": math.inf,
+            "delay_margin_samples": math.inf,
+        }
+    lag = np.mod(np.angle(loop.response(places)) + np.pi, 2.0 * np.pi)
+    either = np.minimum(lag, 2.0 * np.pi - lag)
+    worst = int(np.argmin(either))
+    samples = float((lag / places).min())
+    return {
+        "phase_margin_deg": math.degrees(float(either[worst])),
+        "gain_crossover_Hz": hertz(float(places[worst]), loop.dt),
+        "delay_margin_s": samples * loop.dt,
+        "delay_margin_samples": samples,
+    }
+
+
+def hertz(angle: float, dt: float) -> float:
+    """Return an angle in rad a sample as a frequency in Hz."""
+    return angle / (2.0 * math.pi * dt)

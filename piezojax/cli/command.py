@@ -1,0 +1,84 @@
+"""What all commands share: options, the results folder, errors in one line."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+
+from ..core.files import fresh_folder, numbered_folder
+from ..report.console import console
+
+RESULTS = Path("results")
+"""Where results go if no folder is named."""
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it."""
+
+
+def common(function: Callable) -> Callable:
+    """Add the options every command takes."""
+    for option in (
+        click.option("--quiet", is_flag=True, help="Print nothing but errors."),
+        click.option(
+            "--seed",
+            type=click.IntRange(min=0),
+            default=None,
+            help="Seed of all noise and sampling (default: the study's).",
+        ),
+        click.option(
+            "--out",
+            type=click.Path(path_type=Path),
+            default=None,
+            help="New folder for the results (default: a fresh one under results/).",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+class Command(click.Command):
+    """A command whose usage errors, too, are one line."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse as click does."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.UsageError as error:
+            raise _one_line(error.format_message()) from None
+
+
+@contextmanager
+def results_folder(out: Path | None, name: str) -> Iterator[Path]:
+    """Give an empty folder for results: ``out``, or a fresh one named after ``name``.
+
+    It is taken away again if the work fails before anything is in it. Raises ValueError
+    if ``out`` is in use or cannot be written.
+    """
+    folder = fresh_folder(out if out is not None else numbered_folder(RESULTS / name))
+    try:
+        yield folder
+    except BaseException:
+        if not any(folder.iterdir()):
+            folder.rmdir()
+        raise
+
+
+def run(quiet: bool, body: Callable[[Console], Any]) -> None:
+    """Run ``body``; turn bad input into one line and a non-zero exit status."""
+    try:
+        body(console(quiet))
+    except ValueError as error:
+        raise _one_line(str(error)) from None
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        raise _one_line(f"{where}{error.strerror or error}") from None
+    except KeyboardInterrupt:
+        click.echo("interrupted before there was anything to keep", err=True)
+        raise SystemExit(INTERRUPTED) from None
+
+
+def _one_line(message: str) -> click.ClickException:
+    return click.ClickException(" ".join(message.split()))

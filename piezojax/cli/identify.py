@@ -1,0 +1,162 @@
+"""``python -m piezojax.identify RECORD --model NAME --out DIR``."""
+
+from pathlib import Path
+
+import click
+
+from ..identification.chain import DEFAULT
+from ..identification.compare import identify_all
+from ..identification.estimators.estimate import Options
+from ..identification.fit import identify
+from ..identification.records.record import read_record
+from ..report.console import Bar, fit_table, models_table
+from ..report.fit_pictures import write_fit
+from ..report.model_ranking import comparison_notes, comparison_table, write_comparison
+from .command import Command, common, results_folder, run
+
+ALL = "all"
+"""The model that stands for every one that the records support."""
+
+
+class _Part(click.ParamType):
+    name = "START:STOP"
+
+    def convert(self, value, param, ctx):
+        try:
+            start, stop = (int(number) for number in value.split(":"))
+        except ValueError:
+            self.fail(f"{value!r} must be two sample numbers, as in 0:1200", param, ctx)
+        return slice(start, stop)
+
+
+@click.command(cls=Command)
+@click.argument(
+    "records", nargs=-1, type=click.Path(path_type=Path), metavar="RECORD..."
+)
+@click.option(
+    "--model",
+    default=DEFAULT,
+    show_default=True,
+    help="Model to fit, parts joined by '+'; 'help' lists them, 'all' tries all.",
+)
+@click.option("--among", help="With 'all': these and linear models only, by commas.")
+@click.option("--time", help="Time column, by name or number from zero.")
+@click.option("--input", default="0", show_default=True, help="Input column.")
+@click.option("--output", default="1", show_default=True, help="Output column.")
+@click.option("--rate", type=float, help="Sampling rate, Hz, if no time column.")
+@click.option("--period", type=int, help="Samples in a period of a periodic input.")
+@click.option("--resample", type=float, help="Put the record on this rate, Hz.")
+@click.option("--method", help="How to fit it (default: the first that can).")
+@click.option(
+    "--order",
+    type=click.IntRange(min=1),
+    default=Options.order,
+    show_default=True,
+    help="States of a linear or neural model.",
+)
+@click.option(
+    "--window",
+    type=click.IntRange(min=1),
+    default=Options.window,
+    show_default=True,
+    help="p of the Hankel-Toeplitz regression, samples.",
+)
+@click.option(
+    "--oversample",
+    type=click.IntRange(min=1),
+    default=Options.oversample,
+    show_default=True,
+    help="Steps of bouc_wen in a sample.",
+)
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    default=Options.steps,
+    show_default=True,
+    help="Most steps of a descent.",
+)
+@click.option("--train", type=_Part(), help="Samples to fit (default: first half).")
+@click.option("--validate", type=_Part(), help="Samples to judge on (default: rest).")
+@click.option("--test", type=_Part(), help="With 'all': samples kept from the choice.")
+@common
+def main(
+    records,
+    model,
+    among,
+    method,
+    order,
+    window,
+    oversample,
+    steps,
+    train,
+    validate,
+    test,
+    out,
+    seed,
+    quiet,
+    **columns,
+):
+    """Fit a plant model to measured RECORDs of one stage.
+
+    Text (.csv, .txt, .dat), .npz, .mat and .h5 files; .tdms, .lvm and .xlsx with
+    piezojax[lab].
+    """
+    del seed  # this fit draws nothing
+
+    def body(console):
+        if model == "help":
+            console.print(models_table())
+            return
+        if not records:
+            raise ValueError("name the RECORD to fit a model to")
+        if model == ALL and method is not None:
+            raise ValueError("--method goes with one model; 'all' takes each one's own")
+        if model != ALL and (among is not None or test):
+            raise ValueError("--among and --test go with --model all")
+        loaded = [read_record(record, **columns) for record in records]
+        options = Options(order, window, oversample, steps)
+        if model == ALL:
+            compare(console, loaded, options)
+            return
+        with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
+            fit = identify(
+                loaded,
+                model,
+                method=method,
+                train=train,
+                validate=validate,
+                options=options,
+                progress=bar,
+            )
+            bar.stage("drawing")
+            write_fit(fit, folder)
+        console.print(fit_table(fit.report))
+        for warning in fit.report.warnings:
+            console.print(f"note: {warning}", soft_wrap=True)
+        console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
+
+    def compare(console, loaded, options):
+        with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
+            comparison = identify_all(
+                loaded,
+                hysteresis=None if among is None else among.split(","),
+                train=train,
+                validate=validate,
+                test=test,
+                options=options,
+                progress=bar,
+            )
+            bar.finish()
+            bar.stage("drawing")
+            write_comparison(comparison, folder)
+        report = comparison.report
+        console.print(comparison_table(report))
+        notes = comparison_notes(report)
+        for note in [
+            *notes,
+            *(f"note: {text}" for text in comparison.best.report.warnings),
+        ]:
+            console.print(note, soft_wrap=True)
+        console.print(f"{report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
+
+    run(quiet, body)

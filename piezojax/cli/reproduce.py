@@ -1,0 +1,94 @@
+"""``python -m piezojax.reproduce [--table T ... | --calibrate] --out DIR``."""
+
+import json
+
+import click
+
+from ..core.files import write_text
+from ..report.calibrated_cells import (
+    calibration_table,
+    together_table,
+    write_calibration,
+)
+from ..report.console import Bar, reproduction_table
+from ..report.table_pictures import write_picture, write_rates
+from ..reproduction import TABLES, reproduce
+from ..reproduction.calibration import EXPERIMENTS
+from ..reproduction.calibration import calibrate as calibrated
+from ..reproduction.judged import as_plain, together
+from ..reproduction.rates import FIGURE, errors_by_rate, rates_as_csv
+from ..reproduction.summary import as_csv, summarise
+from .command import Command, common, results_folder, run
+
+
+@click.command(cls=Command)
+@click.option(
+    "--table",
+    "tables",
+    multiple=True,
+    metavar="T",
+    help=f"Table to redo, repeatable (default: all): {', '.join((*TABLES, FIGURE))}.",
+)
+@click.option(
+    "--calibrate",
+    is_flag=True,
+    help="Fit the stage to half of the cells and predict the others, then swap "
+    "(half an hour or more).",
+)
+@common
+def main(tables, calibrate, out, seed, quiet):
+    """Redo result tables of the thesis in simulation, with the printed gains."""
+    del seed  # what noise there is has seeds of its own
+
+    def body(console):
+        asked = tuple(dict.fromkeys(tables)) or (*TABLES, FIGURE)
+        for table in asked:
+            if table not in (*TABLES, FIGURE):
+                raise ValueError(
+                    f"--table {table} is unknown; there are "
+                    f"{', '.join((*TABLES, FIGURE))}"
+                )
+        wanted = [table for table in asked if table != FIGURE]
+        cells = []
+        with (
+            results_folder(out, "reproduce") as folder,
+            console.status("simulating") as status,
+        ):
+            for table in wanted:
+                status.update(f"simulating Table {table}")
+                cells += reproduce(table)
+            summary = summarise(cells)
+            write_text(folder / "cells.csv", as_csv(cells))
+            plain = {table: entry.model_dump() for table, entry in summary.items()}
+            write_text(folder / "summary.json", json.dumps(plain, indent=2) + "\n")
+            if cells:
+                write_picture(cells, folder)
+            if FIGURE in asked:  # its numbers are not printed: a curve, not cells
+                status.update("simulating Figure 4.10")
+                errors = errors_by_rate()
+                write_text(folder / f"{FIGURE}.csv", rates_as_csv(errors))
+                write_rates(errors, folder)
+        for table in wanted:
+            console.print(
+                reproduction_table(
+                    table, [c for c in cells if c.table == table], summary[table]
+                )
+            )
+        console.print(f"results in {folder}", soft_wrap=True)
+
+    def calibration(console):
+        if tables:
+            raise ValueError("--calibrate has tables of its own; leave --table out")
+        with results_folder(out, "calibrate") as folder:
+            with Bar(console) as bar:
+                found = {n: calibrated(n, progress=bar) for n in EXPERIMENTS}
+            plain = {n: as_plain(n, swaps) for n, swaps in found.items()}
+            plain |= {"together": together(found)}
+            write_text(folder / "calibration.json", json.dumps(plain, indent=2) + "\n")
+            write_calibration(found, folder)
+        for name, swaps in found.items():
+            console.print(calibration_table(name, swaps))
+        console.print(together_table(found))
+        console.print(f"results in {folder}", soft_wrap=True)
+
+    run(quiet, calibration if calibrate else body)

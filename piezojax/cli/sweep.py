@@ -1,0 +1,126 @@
+"""``python -m piezojax.sweep [STUDY.toml] --out DIR [--shard i/n]``."""
+
+import re
+from contextlib import nullcontext
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from .. import study as studies
+from ..core.files import numbered_folder
+from ..core.runtime import simulate_side_by_side
+from ..report.console import Bar
+from ..report.sweep_maps import best_table, write_pictures
+from ..sweeping.cluster import client_of
+from ..sweeping.sweeper import DEFAULT, Swept, read_swept, run_sweep
+from .command import INTERRUPTED, RESULTS, Command, common, run
+
+
+def _shard(context: click.Context, option: click.Parameter, text: str) -> tuple:
+    found = re.fullmatch(r"(\d+)/(\d+)", text)
+    if not found or not 1 <= int(found[1]) <= int(found[2]):
+        raise click.BadParameter(f"{text!r}; it must be i/n, from 1/n to n/n")
+    return int(found[1]), int(found[2])
+
+
+@click.command(cls=Command)
+@click.argument("study", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "--shard",
+    default="1/1",
+    callback=_shard,
+    metavar="i/n",
+    help="Do the i-th of n parts; who finishes the last one merges them all.",
+)
+@click.option(
+    "--samples",
+    type=click.IntRange(min=1),
+    default=None,
+    help="Number of points drawn; of the study's [parameters] if it has no [sweep].",
+)
+@click.option(
+    "--dask",
+    metavar="WHERE",
+    default=None,
+    help="Simulate on Dask workers: a scheduler's address, or how many to start here.",
+)
+@common
+def main(
+    study: Path | None,
+    shard: tuple[int, int],
+    samples: int | None,
+    dask: str | None,
+    out: Path | None,
+    seed: int | None,
+    quiet: bool,
+) -> None:
+    """Simulate every point of the [sweep] of STUDY into one labelled data set.
+
+    STUDY is a TOML file or the name of a study that comes with piezojax; without it,
+    two gains of the P-753's controller are mapped. A sweep that was interrupted, or
+    killed, goes on where it was when called again with the same --out.
+    """
+    simulate_side_by_side()
+
+    def body(console: Console) -> None:
+        if shard != (1, 1) and out is None:
+            raise ValueError("--shard needs --out, the folder that all shards share")
+        path = _path_of(study)
+        folder = out
+        try:
+            with Bar(console) as bar:
+                bar.stage(f"reading {path.name}")
+                case = read_swept(path, seed=seed, samples=samples)
+                folder = out or numbered_folder(RESULTS / path.stem)
+                with nullcontext() if dask is None else client_of(dask) as client:
+                    swept = run_sweep(
+                        case, folder, shard=shard, client=client, progress=bar
+                    )
+                if swept.finished:
+                    bar.finish()
+                    bar.stage("drawing")
+                    write_pictures(swept.path, folder)
+        except KeyboardInterrupt:
+            if folder is None or not folder.exists():
+                raise
+            click.echo(
+                "interrupted; what is done is kept, and the same command with "
+                f"--out {folder} goes on from there",
+                err=True,
+            )
+            raise SystemExit(INTERRUPTED) from None
+        _report(swept, folder, shard, console)
+
+    run(quiet, body)
+
+
+def _report(
+    swept: Swept, folder: Path, shard: tuple[int, int], console: Console
+) -> None:
+    if swept.finished:
+        console.print(best_table(swept.path))
+    if swept.simulated:
+        rate = swept.lane_steps / swept.core_s
+        console.print(
+            f"{swept.lane_steps:.3g} samples in {swept.wall_s:.1f} s, "
+            f"{swept.core_s:.3g} core-seconds of simulating: {rate:.3g} samples a "
+            "second and core",
+            soft_wrap=True,
+        )
+    if swept.finished:
+        console.print(f"results in {folder}, data set {swept.path}", soft_wrap=True)
+    else:
+        console.print(
+            f"shard {shard[0]}/{shard[1]} is there, {swept.chunks} chunks; the data "
+            f"set is merged when the other shards are in {folder}, too",
+            soft_wrap=True,
+        )
+
+
+def _path_of(study: Path | None) -> Path:
+    if study is None:
+        return studies.shipped(DEFAULT)
+    if study.suffix or study.exists():
+        return study
+    return studies.shipped(str(study))

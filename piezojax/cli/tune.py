@@ -1,0 +1,167 @@
+"""``python -m piezojax.tune [STUDY.toml ...] --out DIR``."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+import tomli_w
+from rich.console import Console
+
+from .. import study as studies
+from ..core.files import write_text
+from ..report.baseline_curves import baselines_table, baselines_text, write_baselines
+from ..report.bode import compared, write_stability
+from ..report.comparison_map import comparison_table, write_comparison
+from ..report.console import (
+    Bar,
+    gains_table,
+    perturbed_text,
+    stability_table,
+    tuning_table,
+)
+from ..report.fit_pictures import write_fit
+from ..report.limit_bars import limit_of, limit_text, write_limit
+from ..report.robustness import constraints_table, front_table
+from ..report.tuning_pictures import write_numbers, write_results
+from ..tuning.baselines import Budget
+from ..tuning.comparison import compare
+from ..tuning.tuner import Outcome, tune
+from .command import INTERRUPTED, Command, common, results_folder, run
+
+
+@click.command(cls=Command)
+@click.argument("study", nargs=-1, type=click.Path(path_type=Path))
+@click.option(
+    "--baselines",
+    is_flag=True,
+    help="Also tune by Ziegler-Nichols, a relay, CMA-ES and Nelder-Mead (minutes).",
+)
+@common
+def main(
+    study: tuple[Path, ...],
+    baselines: bool,
+    out: Path | None,
+    seed: int | None,
+    quiet: bool,
+) -> None:
+    """Tune the controller that STUDY describes, by gradients through the simulation.
+
+    STUDY is a TOML file or the name of a study that comes with piezojax; without it,
+    the DOB-based PID-SMC of the P-753 stage is tuned. Several studies, or a comparison
+    (controllers and rates in one file, as comparison/p753), are tuned one after
+    another, each into its own folder, and end in one table and picture.
+    """
+
+    def body(console: Console) -> None:
+        paths = [_path_of(name) for name in study] or [studies.shipped()]
+        if len(paths) > 1 or studies.is_comparison(paths[0]):
+            if baselines:
+                raise ValueError("--baselines takes one study, not a comparison")
+            _compare(paths, out, seed, console)
+        else:
+            _tune(paths[0], out, seed, Budget() if baselines else None, console)
+
+    run(quiet, body)
+
+
+def _tune(
+    path: Path,
+    out: Path | None,
+    seed: int | None,
+    baselines: Budget | None,
+    console: Console,
+) -> None:
+    with Bar(console) as bar:
+        bar.stage(f"reading {path.name}")
+        description = studies.load(path)
+        with results_folder(out, path.stem) as folder:
+            case = studies.build(description, path, seed=seed)
+            outcome = tune(case, baselines=baselines, progress=bar)
+            bar.finish()
+            bar.stage("drawing")
+            if outcome.baselines is not None:
+                write_baselines(outcome.baselines, folder)
+            write_results(outcome, folder)
+            if case.fit is not None:
+                write_fit(case.fit, folder)
+            bar.stage("working out margins")
+            # At the top of the references the branches differ most.
+            stability = compared(
+                case.study.highest,
+                case.study.dt,
+                case.study.axes.names if case.study.axes else (),
+                before=outcome.before,
+                after=outcome.after,
+            )
+            write_stability(stability, folder, outcome.result.title)
+            bar.stage("working out the limit of linear control")
+            limit = limit_of(outcome)
+            write_limit(limit, folder, outcome.result.title)
+    result = outcome.result
+    console.print(tuning_table(result))
+    console.print(gains_table(result))
+    console.print(stability_table(stability))
+    if result.constraints:
+        console.print(constraints_table(result))
+    if result.front and case.study.pareto:
+        console.print(front_table(result.front, case.study.pareto.constraint))
+    console.print(limit_text(limit), soft_wrap=True)
+    if result.perturbed is not None:
+        console.print(perturbed_text(result.perturbed), soft_wrap=True)
+    if outcome.baselines is not None:
+        console.print(baselines_table(outcome.baselines))
+        console.print(baselines_text(outcome.baselines), soft_wrap=True)
+        for note in outcome.baselines.notes:
+            console.print(f"note: {note}", soft_wrap=True)
+    for name, why in stability.problems.items():
+        console.print(f"note: no margins {name} tuning: {why}", soft_wrap=True)
+    for warning in result.warnings:
+        console.print(f"note: {warning}", soft_wrap=True)
+    console.print(
+        f"{result.status} after {result.evaluations} evaluations, "
+        f"{result.wall_s:.1f} s ({result.compile_s:.1f} s of it compiling); "
+        f"results in {folder}",
+        soft_wrap=True,
+    )
+    if result.status == "interrupted":
+        raise SystemExit(INTERRUPTED)
+
+
+def _compare(
+    paths: Sequence[Path], out: Path | None, seed: int | None, console: Console
+) -> None:
+    with Bar(console) as bar:
+        bar.stage(f"reading {', '.join(path.name for path in paths)}")
+        title, entries = studies.read_entries(paths, seed)
+        with results_folder(out, "comparison") as folder:
+
+            def keep(outcome: Outcome) -> None:
+                own = folder / outcome.case.name
+                own.mkdir()
+                write_numbers(outcome, own)
+                text = tomli_w.dumps(
+                    outcome.case.study.model_dump(mode="json", exclude_none=True)
+                )
+                write_text(own / "study.toml", text)
+
+            comparison = compare(title, entries, progress=bar, done=keep)
+            bar.finish()
+            bar.stage("drawing")
+            write_comparison(comparison, folder)
+    console.print(comparison_table(comparison))
+    for row in comparison.rows:
+        for note in row.notes:
+            console.print(f"note: {row.study}: {note}", soft_wrap=True)
+    console.print(
+        f"{comparison.status}: {len(comparison.rows)} of {len(entries)} studies, "
+        f"{comparison.wall_s:.0f} s; results in {folder}",
+        soft_wrap=True,
+    )
+    if comparison.status == "interrupted":
+        raise SystemExit(INTERRUPTED)
+
+
+def _path_of(study: Path) -> Path:
+    if study.suffix or study.exists():
+        return study
+    return studies.shipped(str(study))

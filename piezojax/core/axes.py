@@ -1,0 +1,208 @@
+"""Signals of several axes: tuples of scalars, an axis each.
+
+A packed array would be two to seven times slower in batches: XLA keeps scalars in
+registers, lanes side by side. Matrices are therefore rows of scalars, multiplied out.
+"""
+
+from collections.abc import Iterable
+from typing import Any, TypeAlias, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .arrays import Scalar, State, as_array, as_scalars, check
+from .rollout import Metric
+from .system import System
+
+Axes: TypeAlias = tuple[Scalar, ...]
+Rows: TypeAlias = tuple[tuple[Scalar, ...], ...]
+Plain: TypeAlias = tuple[Any, ...]
+"""Either of them where they are multiplied out: checking every scalar of every product
+for its type would take most of the time of a traced test."""
+
+T = TypeVar("T")
+
+
+def as_rows(values: Any) -> Rows:
+    """Return a matrix, an array or nested sequences, as rows of scalars.
+
+    Raises ValueError unless all rows are of one length.
+    """
+    rows = tuple(as_scalars(row) for row in values)
+    if len({len(row) for row in rows}) != 1:
+        lengths = ", ".join(str(len(row)) for row in rows) or "none"
+        raise ValueError(f"a matrix has rows of lengths {lengths}; they must be equal")
+    return rows
+
+
+def as_matrices(values: Iterable[Any]) -> tuple[Rows, ...]:
+    """Return several matrices as rows of scalars."""
+    return tuple(as_rows(value) for value in values)
+
+
+def diagonal(values: Iterable[Any]) -> Rows:
+    """Return the diagonal matrix of ``values``."""
+    values = as_scalars(values)
+    zero = as_array(0.0)
+    return tuple(
+        tuple(value if i == j else zero for j in range(len(values)))
+        for i, value in enumerate(values)
+    )
+
+
+def as_matrix_of(rows: Rows) -> jax.Array:
+    """Return rows of scalars as a packed matrix [rows, columns]."""
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def product(matrix: Plain, vector: Plain) -> Plain:
+    """Return ``matrix @ vector``."""
+    return tuple(
+        sum(
+            (m * v for m, v in zip(row[1:], vector[1:], strict=True)),
+            row[0] * vector[0],
+        )
+        for row in matrix
+    )
+
+
+def matrix_product(left: Plain, right: Plain) -> Plain:
+    """Return ``left @ right``."""
+    columns = tuple(zip(*right, strict=True))
+    return tuple(zip(*(product(left, column) for column in columns), strict=True))
+
+
+def plus(*terms: T) -> T:
+    """Return the sum of vectors, or, row by row, of matrices."""
+    return jax.tree.map(lambda *values: sum(values[1:], values[0]), *terms)
+
+
+def minus(left: T, right: T) -> T:
+    """Return the difference of two vectors or matrices."""
+    return jax.tree.map(lambda a, b: a - b, left, right)
+
+
+def inverse(matrix: Plain) -> Plain:
+    """Return the inverse of a square matrix.
+
+    Closed form up to 3 rows; beyond, a linear solve, which is slow inside a loop.
+    """
+    size = len(matrix)
+    if size > 3:
+        return as_rows(jnp.linalg.inv(as_matrix_of(matrix)))
+    cofactors = tuple(
+        tuple((-1.0) ** (i + j) * _minor(matrix, i, j) for j in range(size))
+        for i in range(size)
+    )
+    determinant = sum(m * c for m, c in zip(matrix[0], cofactors[0], strict=True))
+    return tuple(
+        tuple(cofactors[j][i] / determinant for j in range(size)) for i in range(size)
+    )
+
+
+def _minor(matrix: Plain, row: int, column: int) -> Any:
+    rest = [
+        [value for j, value in enumerate(values) if j != column]
+        for i, values in enumerate(matrix)
+        if i != row
+    ]
+    if not rest:
+        return as_array(1.0)
+    if len(rest) == 1:
+        return rest[0][0]
+    return rest[0][0] * rest[1][1] - rest[0][1] * rest[1][0]
+
+
+def _is_axes(node: Any) -> bool:
+    """Whether ``node`` is a signal of several axes: an innermost plain tuple."""
+    return type(node) is tuple and not any(isinstance(part, tuple) for part in node)
+
+
+def axis_of(signals: Any, axis: int) -> Any:
+    """Return ``signals``, such as an Observation of several axes, for one of them."""
+    return jax.tree.map(lambda node: node[axis], signals, is_leaf=_is_axes)
+
+
+class PerAxis(System):
+    """A system of its own on each axis: nothing passes from one to another.
+
+    Every signal in its input, a tuple of scalars, is taken apart; the outputs make up a
+    tuple again. ``names``, if given, are those of the axes in paths
+    (``controller.Rx.integral``); without them axes count from 0. Raises ValueError for
+    names that are not as many as the parts.
+    """
+
+    parts: tuple[System, ...]
+    names: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self):
+        if self.names and len(self.names) != len(self.parts):
+            raise ValueError(f"{len(self.parts)} parts but names {self.names}")
+
+    def init(self, input: Any) -> State:
+        return tuple(part.init(axis_of(input, i)) for i, part in enumerate(self.parts))
+
+    def step(self, state: State, input: Any) -> tuple[State, tuple[Any, ...]]:
+        stepped = [
+            part.step(s, axis_of(input, i))
+            for i, (part, s) in enumerate(zip(self.parts, state, strict=True))
+        ]
+        return tuple(s for s, _ in stepped), tuple(output for _, output in stepped)
+
+
+class Packed(System):
+    """``system``, which works on vectors, among systems of tuples of scalars.
+
+    Input and output are tuples, an axis or actuator each. Meant for a few: an
+    allocation, a geometry.
+    """
+
+    system: System
+
+    def init(self, input: Axes) -> State:
+        return self.system.init(jnp.stack(as_scalars(input)))
+
+    def step(self, state: State, input: Axes) -> tuple[State, Axes]:
+        state, output = self.system.step(state, jnp.stack(as_scalars(input)))
+        return state, tuple(output[i] for i in range(output.shape[0]))
+
+
+class PerAxisMetric(Metric):
+    """``metric`` of each axis; figures of shape [axes]."""
+
+    metric: Metric
+    axes: int = eqx.field(static=True)
+
+    def init(self) -> State:
+        return (self.metric.init(),) * self.axes
+
+    def update(self, total: State, index: jax.Array, output: Any) -> State:
+        return tuple(
+            self.metric.update(one, index, axis_of(output, axis))
+            for axis, one in enumerate(total)
+        )
+
+    def result(self, total: State) -> Any:
+        figures = [self.metric.result(one) for one in total]
+        return jax.tree.map(lambda *values: jnp.stack(values), *figures)
+
+
+def packed(signals: Any) -> Any:
+    """Return ``signals``, such as a log of several axes, with arrays [..., axes]."""
+    return jax.tree.map(
+        lambda node: jnp.stack(node, axis=-1) if _is_axes(node) else node,
+        signals,
+        is_leaf=_is_axes,
+    )
+
+
+def check_square(name: str, matrix: Rows, size: int) -> None:
+    """Raise ValueError unless ``matrix`` has ``size`` rows and columns, all finite."""
+    shape = len(matrix), len(matrix[0])
+    if shape != (size, size):
+        raise ValueError(
+            f"{name} is {shape[0]} x {shape[1]}; it must be {size} x {size}"
+        )
+    for row in matrix:
+        check(name, row)

@@ -1,0 +1,156 @@
+"""Figures of a loop, accumulated while it runs."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .arrays import Scalar, State
+from .rollout import Metric
+from .system import LoopSample
+
+
+class TrackingFigures(NamedTuple):
+    """What a run of a loop came to.
+
+    Over the window of its Tracking metric: ``rms_error`` and ``peak_error`` of the true
+    displacement against the reference in um; ``rms_effort`` of the voltage in V;
+    ``rms_slew`` of its change a sample in V. Over the whole run, because an actuator
+    that rails at the start has railed: ``saturated``, the share of samples at which it
+    did not give what was asked for (0 to 1), and ``peak_voltage`` in V.
+    """
+
+    rms_error: Scalar
+    peak_error: Scalar
+    rms_effort: Scalar
+    rms_slew: Scalar
+    saturated: Scalar
+    peak_voltage: Scalar
+
+
+class Tracking(Metric):
+    """Tracking error, effort and saturation of a Feedback loop from a sample on.
+
+    ``start`` is the first sample counted: the thesis leaves the start-up transient out.
+    A voltage that differs from the command by more than ``tolerance`` (V) counts as
+    saturated, so that a converter's rounding does not. The figures of a run that ends
+    before ``start`` are NaN: it was not perfect, nothing of it was counted.
+    """
+
+    start: int = eqx.field(static=True, default=0)
+    tolerance: float = eqx.field(static=True, default=0.1)
+
+    def init(self) -> State:
+        zero = jnp.zeros(())
+        return {
+            "samples": zero,
+            "count": zero,
+            "error": zero,
+            "peak": zero,
+            "effort": zero,
+            "slew": zero,
+            "saturated": zero,
+            "voltage": zero,
+            "last": zero,
+        }
+
+    def update(self, total: State, index: Array, output: LoopSample) -> State:
+        inside = jnp.where(index >= self.start, 1.0, 0.0)
+        error = output.displacement - output.reference
+        voltage = output.voltage
+        change = jnp.where(index > self.start, voltage - total["last"], 0.0)
+        clipped = jnp.abs(output.command - voltage) > self.tolerance
+        return {
+            "samples": total["samples"] + 1.0,
+            "count": total["count"] + inside,
+            "error": total["error"] + inside * error**2,
+            "peak": jnp.maximum(total["peak"], inside * jnp.abs(error)),
+            "effort": total["effort"] + inside * voltage**2,
+            "slew": total["slew"] + inside * change**2,
+            "saturated": total["saturated"] + jnp.where(clipped, 1.0, 0.0),
+            "voltage": jnp.maximum(total["voltage"], jnp.abs(voltage)),
+            "last": voltage,
+        }
+
+    def result(self, total: State) -> TrackingFigures:
+        count = jnp.maximum(total["count"], 1.0)
+        counted = jnp.where(total["count"] > 0.0, 0.0, jnp.nan)
+        return TrackingFigures(
+            rms_error=root(total["error"] / count) + counted,
+            peak_error=total["peak"] + counted,
+            rms_effort=root(total["effort"] / count) + counted,
+            rms_slew=root(total["slew"] / count) + counted,
+            saturated=total["saturated"] / jnp.maximum(total["samples"], 1.0),
+            peak_voltage=total["voltage"],
+        )
+
+
+class ExtremeFigures(NamedTuple):
+    """Extremes of a run of a loop: ``peak_slew``, the largest change of the voltage
+    from one sample to the next, V; ``overshoot``, how far the displacement goes beyond
+    the highest reference, as a share of the reference's range (0 where it rests).
+    """
+
+    peak_slew: Scalar
+    overshoot: Scalar
+
+
+class Extremes(Metric):
+    """Largest step of the voltage and overshoot, over the whole run."""
+
+    def init(self) -> State:
+        zero, least = jnp.zeros(()), jnp.asarray(-jnp.inf)
+        return {
+            "slew": zero,
+            "last": jnp.asarray(jnp.nan),
+            "highest": least,
+            "top": least,
+            "bottom": -least,
+        }
+
+    def update(self, total: State, index: Array, output: LoopSample) -> State:
+        first = index == 0
+        change = output.voltage - jnp.where(first, output.voltage, total["last"])
+        return {
+            "slew": jnp.maximum(total["slew"], jnp.abs(change)),
+            "last": output.voltage,
+            "highest": jnp.maximum(total["highest"], output.displacement),
+            "top": jnp.maximum(total["top"], output.reference),
+            "bottom": jnp.minimum(total["bottom"], output.reference),
+        }
+
+    def result(self, total: State) -> ExtremeFigures:
+        swing = total["top"] - total["bottom"]
+        beyond = total["highest"] - total["top"]
+        moves = swing > 0.0
+        overshoot = jnp.maximum(beyond, 0.0) / jnp.where(moves, swing, 1.0)
+        return ExtremeFigures(total["slew"], jnp.where(moves, overshoot, 0.0))
+
+
+class Both(Metric):
+    """Two metrics of one run; their figures in a tuple."""
+
+    first: Metric
+    second: Metric
+
+    def init(self) -> State:
+        return self.first.init(), self.second.init()
+
+    def update(self, total: State, index: Array, output: LoopSample) -> State:
+        return (
+            self.first.update(total[0], index, output),
+            self.second.update(total[1], index, output),
+        )
+
+    def result(self, total: State) -> tuple[Any, Any]:
+        return self.first.result(total[0]), self.second.result(total[1])
+
+
+def root(square: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the square root with the slope 0 at 0, NaN of NaN.
+
+    The slope of sqrt there is infinite; a perfect run must have the gradient 0.
+    """
+    positive = square > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0 * square)

@@ -1,0 +1,98 @@
+"""Parameters of systems, each declared once, beside its field."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
+
+import equinox as eqx
+import numpy as np
+
+from .arrays import as_array, check
+
+Scale = Literal["linear", "log", "logit"]
+
+_KEY = "parameter"
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """Declaration of a parameter: its unit, meaning, limits and search range.
+
+    ``above`` and ``below`` are limits that the value must not reach, ``least`` and
+    ``most`` limits that it may. ``typical`` is the range that a search takes if a study
+    gives none, on ``scale``: "log" for positive values that span decades, "logit" for
+    values between 0 and 1. ``unit`` "1" is a pure number.
+    """
+
+    unit: str
+    meaning: str
+    above: float = -np.inf
+    least: float = -np.inf
+    most: float = np.inf
+    below: float = np.inf
+    scale: Scale = "linear"
+    typical: tuple[float, float] | None = None
+
+    def check(self, name: str, value: Any) -> None:
+        """Raise ValueError unless ``value`` is finite and within the limits."""
+        shown = name.replace("_", " ")
+        check(
+            shown if self.unit == "1" else f"{shown} in {self.unit}",
+            value,
+            above=self.above,
+            least=self.least,
+            most=self.most,
+            below=self.below,
+        )
+
+
+def parameter(
+    unit: str,
+    meaning: str,
+    *,
+    above: float = -np.inf,
+    least: float = -np.inf,
+    most: float = np.inf,
+    below: float = np.inf,
+    scale: Scale = "linear",
+    typical: tuple[float, float] | None = None,
+    converter: Callable[[Any], Any] = as_array,
+    static: bool = False,
+    **options: Any,
+) -> Any:
+    """Return a field of a System together with its declaration.
+
+    The first arguments are those of ``Parameter``. ``static`` fields, such as a sample
+    time, are plain numbers that cannot be tuned; others go through ``converter``.
+    ``options`` are those of ``dataclasses.field``: ``default``, ``kw_only``.
+
+    The constructor of the System checks the declared limits; tables, pictures, bounds
+    of a search and the API page read unit, meaning and range from here.
+    """
+    declared = Parameter(unit, meaning, above, least, most, below, scale, typical)
+    if static:
+        return eqx.field(static=True, metadata={_KEY: declared}, **options)
+    return eqx.field(converter=converter, metadata={_KEY: declared}, **options)
+
+
+def sample_time(**options: Any) -> Any:
+    """Return the field of a sample time in s."""
+    return parameter("s", "sample time", above=0.0, static=True, **options)
+
+
+def declarations(kind: Any) -> Iterator[tuple[str, Parameter]]:
+    """Yield name and declaration of each declared field of a System or its class."""
+    for field in dataclasses.fields(kind):
+        if _KEY in field.metadata:
+            yield field.name, field.metadata[_KEY]
+
+
+def check_declared(system: Any) -> None:
+    """Check every declared field of ``system``.
+
+    Raises ValueError naming the field, its unit, the value and what is allowed.
+    """
+    for name, declared in declarations(system):
+        value = getattr(system, name)
+        if value is not None:
+            declared.check(name, value)

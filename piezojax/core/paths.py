@@ -1,0 +1,86 @@
+"""Parameters by name: ``"controller.feedback.proportional"`` in a tree of systems."""
+
+import dataclasses
+import difflib
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .arrays import as_array
+from .axes import PerAxis
+from .system import Series
+
+S = TypeVar("S", bound=eqx.Module)
+
+
+def _children(node: Any) -> dict[str, Any]:
+    if isinstance(node, Series | PerAxis) and node.names:
+        return dict(zip(node.names, node.parts, strict=True))
+    if isinstance(node, Series | PerAxis):
+        return {str(i): part for i, part in enumerate(node.parts)}
+    if isinstance(node, tuple):
+        return {str(i): part for i, part in enumerate(node)}
+    if isinstance(node, eqx.Module):
+        names = [f.name for f in dataclasses.fields(node)]
+        return {name: getattr(node, name) for name in names}
+    return {}
+
+
+def parameters(system: Any, prefix: str = "") -> dict[str, Any]:
+    """Return every array leaf of ``system`` by its path."""
+    found = {}
+    for name, child in _children(system).items():
+        path = f"{prefix}{name}"
+        if eqx.is_array(child):
+            found[path] = child
+        else:
+            found.update(parameters(child, f"{path}."))
+    return found
+
+
+def static_fields(system: Any, name: str) -> list[Any]:
+    """Return the values of every field called ``name`` in the tree of ``system``."""
+    found = []
+    for key, child in _children(system).items():
+        found += [child] if key == name else static_fields(child, name)
+    return found
+
+
+def _walk(node: Any, path: str) -> Any:
+    for part in path.split("."):
+        node = _children(node)[part]
+    return node
+
+
+def get(system: eqx.Module, path: str) -> Any:
+    """Return the array leaf at ``path``.
+
+    Raises ValueError, with the nearest names, where there is none.
+    """
+    try:
+        node = _walk(system, path)
+    except KeyError:
+        node = None
+    if not eqx.is_array(node):
+        raise ValueError(_unknown(system, path))
+    return node
+
+
+def replace(system: S, values: Mapping[str, Any]) -> S:
+    """Return ``system`` with the leaves at the given paths replaced."""
+    if not values:
+        return system
+    names = list(values)
+    new = [
+        jnp.broadcast_to(as_array(values[name]), get(system, name).shape)
+        for name in names
+    ]
+    return eqx.tree_at(lambda tree: [_walk(tree, name) for name in names], system, new)
+
+
+def _unknown(system: eqx.Module, path: str) -> str:
+    known = list(parameters(system))
+    near = difflib.get_close_matches(path, known, n=3, cutoff=0.3) or known[:5]
+    return f"no parameter {path!r}; the nearest are {', '.join(near)}"

@@ -1,0 +1,152 @@
+"""Systems as plain data: TOML or JSON files that load back, and nothing executable."""
+
+import dataclasses
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+import equinox as eqx
+import numpy as np
+import tomli_w
+
+from .files import write_text
+from .registry import kinds
+from .system import System
+
+
+def to_data(system: System) -> dict[str, Any]:
+    """Return ``system`` as nested tables of numbers and strings."""
+    data: dict[str, Any] = {"type": type(system).__name__}
+    for field in dataclasses.fields(system):
+        data[field.name] = _value_to_data(getattr(system, field.name))
+    return data
+
+
+def _value_to_data(value: Any) -> Any:
+    if isinstance(value, System):
+        return to_data(value)
+    if eqx.is_array(value):
+        return np.asarray(value).tolist()
+    if isinstance(value, tuple):
+        return [_value_to_data(item) for item in value]
+    return value
+
+
+def from_data(data: Any, where: str = "system") -> System:
+    """Return the System that ``data``, as made by ``to_data``, describes.
+
+    Raises ValueError naming the key, the value and what is allowed.
+    """
+    known = kinds()
+    allowed = ", ".join(known)
+    if not isinstance(data, Mapping) or "type" not in data:
+        raise ValueError(f"{where} needs a key 'type'; one of {allowed}")
+    kind = known.get(data["type"]) if isinstance(data["type"], str) else None
+    if kind is None:
+        raise ValueError(
+            f"{where}.type is {data['type']!r}; it must be one of {allowed}"
+        )
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    arguments = {key: value for key, value in data.items() if key != "type"}
+    for key in arguments:
+        if key not in fields:
+            raise ValueError(
+                f"{where}.{key} is unknown; {kind.__name__} has {', '.join(fields)}"
+            )
+    built = {
+        key: _value_from_data(value, fields[key].type, f"{where}.{key}")
+        for key, value in arguments.items()
+    }
+    missing = [
+        name
+        for name, field in fields.items()
+        if name not in built and field.default is dataclasses.MISSING
+    ]
+    if missing:
+        raise ValueError(f"{where}.{missing[0]} is missing")
+    try:
+        return kind(**built)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _value_from_data(value: Any, kind: Any, where: str) -> Any:
+    """Return ``value`` as a field of type ``kind`` takes it."""
+    if get_origin(kind) is tuple:
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"{where} is {value!r}; it must be a list")
+        (item, _) = get_args(kind)
+        return tuple(
+            _value_from_data(v, item, f"{where}.{i}") for i, v in enumerate(value)
+        )
+    if isinstance(kind, type) and issubclass(kind, System):
+        system = from_data(value, where)
+        if not isinstance(system, kind):
+            raise ValueError(
+                f"{where} is of type {type(system).__name__}; "
+                f"it must be {kind.__name__}"
+            )
+        return system
+    rank = len(getattr(kind, "dims", ()))
+    if rank:
+        return _array_from_data(value, rank, where)
+    accepted, name = _PLAIN.get(kind, ((int, float), "a number"))
+    if not isinstance(value, accepted) or isinstance(value, bool):
+        raise ValueError(f"{where} is {value!r}; it must be {name}")
+    return value
+
+
+def _array_from_data(value: Any, rank: int, where: str) -> np.ndarray:
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.ndim != rank:
+        kind = "a list" if rank == 1 else "lists of one length in a list"
+        raise ValueError(f"{where} is {value!r}; it must be numbers in {kind}")
+    return array
+
+
+_PLAIN: dict[Any, tuple[Any, str]] = {
+    str: (str, "a text"),
+    int: (int, "a whole number"),
+}
+"""What fields that are not parameters take; every other field takes a number."""
+
+
+def save(system: System, path: str | Path) -> None:
+    """Write ``system`` to ``path`` (``.toml`` or ``.json``), whole or not at all."""
+    path, data = Path(path), to_data(system)
+    if _format(path) == "toml":
+        write_text(path, tomli_w.dumps(data))
+    else:
+        write_text(path, json.dumps(data, indent=2) + "\n")
+
+
+def load(path: str | Path) -> System:
+    """Read back what ``save`` wrote.
+
+    Raises ValueError for a file that is missing, is no TOML or JSON, or describes no
+    System.
+    """
+    path = Path(path)
+    kind = _format(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        data = tomllib.loads(text) if kind == "toml" else json.loads(text)
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from None
+    except RecursionError:
+        raise ValueError(f"{path} is no {kind.upper()} file: nested too deep") from None
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no {kind.upper()} file: {error}") from None
+    return from_data(data, path.name)
+
+
+def _format(path: Path) -> str:
+    suffix = path.suffix.lower().lstrip(".")
+    if suffix not in ("toml", "json"):
+        raise ValueError(f"{path}: the name must end in .toml or .json")
+    return suffix

@@ -1,0 +1,63 @@
+"""A mass on a spring, a damper and a hysteretic element."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.runge_kutta import Point, runge_kutta
+from ..core.system import System
+from .bouc_wen import BoucWen
+
+
+class OscillatorState(NamedTuple):
+    """Displacement (m), velocity (m/s) and force of the hysteretic element (N)."""
+
+    displacement: Scalar
+    velocity: Scalar
+    force: Scalar
+
+
+class HystereticOscillator(System):
+    """``mass y'' + damping y' + stiffness y + z = u``, z the Bouc-Wen force of y.
+
+    Input u in N, held during the step; output y in m, at its end. ``mass`` in kg,
+    ``damping`` in N s/m, ``stiffness`` in N/m, ``dt`` in s, integrated by the
+    Runge-Kutta rule in the substeps of ``hysteresis``. Source: Noel & Schoukens,
+    Hysteretic benchmark with a dynamic nonlinearity, 2016.
+
+    Raises ValueError unless mass, stiffness and dt are positive and damping is finite.
+    """
+
+    mass: Scalar = eqx.field(converter=as_array)
+    damping: Scalar = eqx.field(converter=as_array)
+    stiffness: Scalar = eqx.field(converter=as_array)
+    hysteresis: BoucWen
+    dt: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        check("mass in kg", self.mass, above=0.0)
+        check("damping in N s/m", self.damping)
+        check("stiffness in N/m", self.stiffness, above=0.0)
+        check("sample time in s", self.dt, above=0.0)
+
+    def init(self, input: ScalarLike = 0.0) -> OscillatorState:
+        """Return the state at rest under ``input`` (N), the element without force."""
+        still = jnp.zeros(())
+        return OscillatorState(as_array(input) / self.stiffness, still, still)
+
+    def step(
+        self, state: OscillatorState, input: ScalarLike
+    ) -> tuple[OscillatorState, Scalar]:
+        input = as_array(input)
+
+        def rate(point: Point) -> Point:
+            displacement, velocity, force = point
+            spring = self.damping * velocity + self.stiffness * displacement
+            acceleration = (input - spring - force) / self.mass
+            return velocity, acceleration, self.hysteresis.rate(force, velocity)
+
+        parts = self.hysteresis.substeps
+        state = OscillatorState(*runge_kutta(rate, state, self.dt, parts))
+        return state, state.displacement

@@ -1,0 +1,94 @@
+"""Models to fit: chains of parts in series, with an offset."""
+
+from collections.abc import Mapping
+from itertools import product
+
+import numpy as np
+
+from ..core.arrays import as_array
+from ..core.paths import get, replace
+from ..core.space import INSIDE, Space, space_of
+from ..core.system import Affine, Series, series
+from .estimators.structure import Structure
+from .part import around
+from .parts import OWN_DYNAMICS, PARTS, Part, extent_of
+from .records.record import Record
+
+LINEAR = ("dynamics", "lag", "delay")
+"""Places of linear dynamics, which a record must hold frequencies enough for."""
+
+DEFAULT = "shaped_coleman_hodgdon+exponential_creep+lag"
+"""The model that is fitted if none is named."""
+
+
+def chain(name: str) -> list[str]:
+    """Return the parts of a model such as ``"coleman_hodgdon+logarithmic_creep+lag"``.
+
+    A hysteresis by itself is followed by a lag, unless it has past outputs. Raises
+    ValueError for a part that is not in PARTS, or for two in one place.
+    """
+    parts = [part.strip() for part in name.split("+")]
+    for part in parts:
+        if part not in PARTS:
+            raise ValueError(
+                f"a model has no part {part!r}; there are {', '.join(PARTS)}, "
+                "joined by '+'; whole models stand by themselves (--model help)"
+            )
+    places = [PARTS[part][0] for part in parts]
+    for place in places:
+        if places.count(place) > 1:
+            raise ValueError(f"model {name!r} has two parts for its {place}")
+    lagged = places == ["hysteresis"] and parts[0] not in OWN_DYNAMICS
+    return [*parts, "lag"] if lagged else parts
+
+
+def structure(name: str, record: Record) -> Structure:
+    """Return the chain ``name`` with starts and bounds that suit ``record``.
+
+    An offset of the output is always added. Raises ValueError as ``chain``.
+    """
+    extent = extent_of(record)
+    parts = {PARTS[part][0]: PARTS[part][1](extent) for part in chain(name)}
+    reach = 2.0 * extent.span
+    # Without a hysteresis nothing else turns volts into the output's unit.
+    slope = 1.0 if "hysteresis" in parts else extent.slope
+    scaled = "hysteresis" in parts or any(part.gain for part in parts.values())
+    parts["calibration"] = Part(
+        Affine(slope, extent.centre),
+        {
+            **({} if scaled else {"gain": around(slope, 0.0, 3.0)}),
+            "offset": (extent.centre - reach, extent.centre + reach, "linear"),
+        },
+    )
+    system = series(**{place: part.system for place, part in parts.items()})
+    gains = [f"{place}.{part.gain}" for place, part in parts.items() if part.gain]
+    bounds = {
+        f"{place}.{path}": bound
+        for place, part in parts.items()
+        for path, bound in part.bounds.items()
+        # Of two gains in a row only the product shows in the record.
+        if f"{place}.{path}" not in gains[:-1]
+    }
+    space = space_of(bounds)
+    return Structure(
+        system,
+        space,
+        _starts(system, space, parts),
+        tuple(f"{place}.{path}" for place, part in parts.items() for path in part.own),
+        sum(path.split(".")[0] in LINEAR for path in bounds),
+    )
+
+
+def _starts(system: Series, space: Space, parts: Mapping[str, Part]) -> np.ndarray:
+    """Return every combination of the parts' alternatives, in the unit box."""
+    choices = [
+        [{f"{place}.{path}": value for path, value in one.items()} for one in part[2]]
+        for place, part in parts.items()
+    ]
+    found = []
+    for combination in product(*choices):
+        changes = {path: value for one in combination for path, value in one.items()}
+        changed = replace(system, changes)
+        values = as_array([get(changed, path) for path in space.paths])
+        found.append(np.asarray(space.to_unit(values)))
+    return np.clip(np.stack(found), INSIDE, 1.0 - INSIDE)

@@ -1,0 +1,271 @@
+"""Every model that records can support, fitted and judged side by side."""
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..core.progress import Progress, Silent
+from .candidates import Candidate, Untried, at, first_round, later_rounds
+from .criteria import Criteria, criteria, effective_samples, first_alike, ranking
+from .estimators.estimate import Options
+from .fit import Fit, check_together, identify, parts_of
+from .ranking import RULE, Comparison, ComparisonReport, Row, file_name
+from .records.record import Record
+
+KEPT = 2
+"""Chains with a hysteresis that go on to each further round."""
+
+
+def identify_all(
+    records: Record | Sequence[Record],
+    *,
+    hysteresis: Sequence[str] | None = None,
+    train: slice | None = None,
+    validate: slice | None = None,
+    test: slice | None = None,
+    options: Options | None = None,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Fit every model that ``records`` support, and choose one by RULE.
+
+    First each hysteresis (of those named, if any) with the richest creep and dynamics
+    that the records can show, a linear model and the models that are no chain; then the
+    best few with other creeps or none, and with simpler dynamics. A model that fails is
+    a row of the report, as is one that the records cannot support. Parts as in
+    ``identify``;
+    without ``train`` and ``validate`` they are the halves of what comes before
+    ``test``. Ctrl-C ends the search and keeps what is fitted.
+
+    Raises ValueError as ``identify`` for records and parts, for a ``test`` that shares
+    samples with the others, and when no model can be fitted.
+    """
+    began = time.perf_counter()
+    records = (records,) if isinstance(records, Record) else tuple(records)
+    check_together(records)
+    samples = min(record.samples for record in records)
+    train, validate, test = _split(samples, train, validate, test)
+    options = options or Options()
+    first, untried = first_round(records, train, options, hysteresis)
+    search = _Search(records, train, validate, options, progress or Silent())
+    rounds = later_rounds(records, train)
+    total = len(first) + sum(len(later(_chains(first)[:KEPT])) for later in rounds)
+    interrupted = False
+    try:
+        search.fit(first, total)
+        for later in rounds:
+            twins = search.twins()
+            chains = _chains(
+                [Candidate(model) for model in search.ranked() if model not in twins]
+            )
+            search.fit(
+                [c for c in later(chains[:KEPT]) if c.model not in search.fits], total
+            )
+    except KeyboardInterrupt:
+        if not search.fits:
+            raise
+        interrupted = True
+        untried += [Untried(c.model, "interrupted before") for c in search.waiting]
+    if not search.fits:
+        why = "; ".join(f"{row.model}: {row.note}" for row in search.failed) or (
+            "; ".join(f"{one.model}: {one.reason}" for one in untried)
+        )
+        raise ValueError(f"no model could be fitted ({why})")
+    return _judged(search, untried, test, interrupted, time.perf_counter() - began)
+
+
+def _chains(candidates: Sequence[Candidate]) -> list[str]:
+    """Return the models that are chains with a hysteresis."""
+    names = at("hysteresis")
+    return [c.model for c in candidates if c.model.split("+")[0] in names]
+
+
+def _split(
+    samples: int, train: slice | None, validate: slice | None, test: slice | None
+) -> tuple[slice, slice, slice | None]:
+    if test is None:
+        return *parts_of(samples, train, validate), None
+    test = slice(test.start or 0, samples if test.stop is None else test.stop)
+    if not 0 <= test.start < test.stop <= samples:
+        raise ValueError(
+            f"test is {test.start}:{test.stop}; "
+            f"it must lie in 0:{samples} and hold a sample"
+        )
+    train = train or slice(0, test.start // 2)
+    validate = validate or slice(train.stop, test.start)
+    train, validate = parts_of(samples, train, validate)
+    for name, part in (("train", train), ("validate", validate)):
+        if part.start < test.stop and test.start < part.stop:
+            raise ValueError(
+                f"test {test.start}:{test.stop} shares samples with {name} "
+                f"{part.start}:{part.stop}; it must hold others"
+            )
+    return train, validate, test
+
+
+class _Numbered:
+    """Progress that says which model of how many is meant."""
+
+    def __init__(self, progress: Progress, label: str):
+        self._progress, self._label = progress, label
+
+    def stage(self, text: str, steps: int = 0) -> None:
+        self._progress.stage(f"{self._label}: {text}", steps)
+
+    def advance(self, best: float, note: str = "") -> None:
+        self._progress.advance(best, note)
+
+
+class _Search:
+    """Fits so far, what failed, and what still waits."""
+
+    def __init__(
+        self,
+        records: Sequence[Record],
+        train: slice,
+        validate: slice,
+        options: Options,
+        progress: Progress,
+    ):
+        self.records, self.train, self.validate = records, train, validate
+        self._options, self._progress = options, progress
+        self.fits: dict[str, Fit] = {}
+        self.failed: list[Row] = []
+        self.waiting: list[Candidate] = []
+
+    def fit(self, candidates: Sequence[Candidate], total: int) -> None:
+        self.waiting = list(candidates)
+        for candidate in candidates:
+            number = len(self.fits) + len(self.failed) + 1
+            label = f"{number} of about {total}, {candidate.model}"
+            began = time.perf_counter()
+            try:
+                fit = identify(
+                    self.records,
+                    candidate.model,
+                    method=candidate.method,
+                    train=self.train,
+                    validate=self.validate,
+                    options=self._options,
+                    progress=_Numbered(self._progress, label),
+                )
+                rmse = fit.report.train.rmse + fit.report.validation.rmse
+                if not np.isfinite(rmse):
+                    raise ValueError("its free run is not finite")
+            # One model's failure, of whatever kind, must not cost the others.
+            except Exception as error:
+                kind = "" if isinstance(error, ValueError) else type(error).__name__
+                note = ": ".join(text for text in (kind, str(error)) if text)
+                self.failed.append(
+                    Row(
+                        model=candidate.model,
+                        status="failed",
+                        note=" ".join(note.split()),
+                        wall_s=time.perf_counter() - began,
+                    )
+                )
+            else:
+                self.fits[candidate.model] = fit
+            self.waiting.remove(candidate)
+
+    def samples(self) -> np.ndarray:
+        """Return the effective number of training samples [p] for the best fit."""
+        best = min(self.fits.values(), key=lambda fit: fit.report.train.rmse)
+        return effective_samples(best.errors(self.train))
+
+    def criteria(self) -> dict[str, Criteria]:
+        """Return AIC and BIC by model."""
+        samples = self.samples()
+        return {
+            model: criteria(
+                np.mean(np.concatenate(fit.errors(self.train)) ** 2, axis=0),
+                samples,
+                fit.count,
+            )
+            for model, fit in self.fits.items()
+        }
+
+    def twins(self) -> dict[str, str]:
+        """Return the models that are another way to write one, and that one.
+
+        In the order in which hysteresis parts are listed, not in that of the fits.
+        """
+        if not self.fits:
+            return {}
+        models = self._listed()
+        worth = self.criteria()
+        alike = first_alike(
+            [worth[model].bic for model in models],
+            [self.fits[model].count for model in models],
+            [self.fits[model].errors(slice(None)) for model in models],
+        )
+        return {
+            models[i]: models[j] for i, j in enumerate(alike) if models[i] != models[j]
+        }
+
+    def ranked(self) -> dict[str, bool]:
+        """Return whether each model validates as well as the best; best model first."""
+        if not self.fits:
+            return {}
+        models, worth, twins = self._listed(), self.criteria(), self.twins()
+        # One model has one BIC, so that of its ways to be written the first is taken.
+        bics = [
+            min(worth[m].bic for m in models if twins.get(m, m) == twins.get(own, own))
+            for own in models
+        ]
+        errors = [self.fits[model].errors(self.validate) for model in models]
+        order, well = ranking(bics, errors)
+        return {models[i]: well[i] for i in order}
+
+    def _listed(self) -> list[str]:
+        names = at("hysteresis")
+        places = {name: place for place, name in enumerate(names)}
+        return sorted(
+            self.fits, key=lambda model: places.get(model.split("+")[0], len(names))
+        )
+
+
+def _judged(
+    search: _Search,
+    untried: Sequence[Untried],
+    test: slice | None,
+    interrupted: bool,
+    wall_s: float,
+) -> Comparison:
+    ranked, worth = search.ranked(), search.criteria()
+    fits = {model: search.fits[model] for model in ranked}
+    best, twins = next(iter(ranked)), search.twins()
+    rows = [
+        Row(
+            model=model,
+            status="fitted",
+            note=f"another way to write {twins[model]}" if model in twins else "",
+            parameters=fit.count,
+            train_rmse=fit.report.train.rmse,
+            validation_rmse=fit.report.validation.rmse,
+            validation_rmse_percent_of_span=fit.report.validation.rmse_percent_of_span,
+            aic=worth[model].aic,
+            bic=worth[model].bic,
+            as_good=ranked[model],
+            wall_s=fit.report.wall_s,
+            warnings=fit.report.warnings,
+            folder="." if model == best else f"models/{file_name(model)}",
+        )
+        for model, fit in fits.items()
+    ]
+    left = [Row(model=u.model, status="not tried", note=u.reason) for u in untried]
+    report = ComparisonReport(
+        best=best,
+        rule=RULE,
+        unit=fits[best].report.validation.unit,
+        train=(search.train.start, search.train.stop),
+        validation=(search.validate.start, search.validate.stop),
+        test_part=None if test is None else (test.start, test.stop),
+        test=None if test is None else fits[best].error_over(test),
+        samples=sum(len(part) for part in fits[best].errors(search.train)),
+        effective_samples=[float(n) for n in search.samples()],
+        interrupted=interrupted,
+        rows=[*rows, *search.failed, *left],
+        wall_s=wall_s,
+    )
+    return Comparison(fits, report)

@@ -1,0 +1,84 @@
+"""The Bouc-Wen oscillator as a structure to fit: box and starts from the record."""
+
+import numpy as np
+
+from ...core.arrays import as_array
+from ...core.space import space_of
+from ...hysteresis import BoucWen, HystereticOscillator
+from ..records.record import Record
+from .structure import Structure
+
+SHARES = (0.25, 0.5, 0.75)
+"""Parts of the stiffness seen in the record that the hysteretic element may have."""
+
+NU = 1.5
+"""Exponent of the starts."""
+
+WIDE = 100.0
+"""Upper bound of the bends, in bends of the starts: their unit depends on nu."""
+
+
+def bouc_wen(record: Record) -> Structure:
+    """Return a mass on a spring, a damper and a Bouc-Wen element, driven by a force.
+
+    The starts share out the stiffness of the best linear oscillator between the spring
+    and the element, whose loop bends over the displacements in the record in one of two
+    ways. Raises ValueError where no linear oscillator of positive mass and stiffness
+    comes close to the record.
+    """
+    mass, damping, stiffness = linear_oscillator(record)
+    # At the typical force the loop is to bend over the typical displacement; of the
+    # exponents in the box none is preferred.
+    displacement = float(np.std(record.output))
+    bend = (0.5 * stiffness * displacement) ** (1.0 - NU) / displacement
+    system = HystereticOscillator(
+        mass,
+        damping,
+        0.5 * stiffness,
+        BoucWen(0.5 * stiffness, 0.5 * bend, 0.0, NU),
+        record.dt,
+    )
+    space = space_of(
+        {
+            "mass": (0.1 * mass, 10.0 * mass, "log"),
+            "damping": (1e-3 * abs(damping), 10.0 * abs(damping), "log"),
+            "stiffness": (0.01 * stiffness, 2.0 * stiffness, "log"),
+            "hysteresis.alpha": (0.01 * stiffness, 2.0 * stiffness, "log"),
+            "hysteresis.beta_gamma": (0.0, WIDE * bend, "linear"),
+            "hysteresis.beta_delta": (-WIDE * bend, WIDE * bend, "linear"),
+            "hysteresis.nu": (0.5, 3.0, "linear"),
+        }
+    )
+    starts = [
+        [mass, 0.5 * damping, (1.0 - share) * stiffness, share * stiffness, g, d, NU]
+        for share in SHARES
+        for g, d in ((0.5 * bend, 0.5 * bend), (0.5 * bend, -0.5 * bend))
+    ]
+    units = [np.asarray(space.to_unit(as_array(start))) for start in starts]
+    return Structure(system, space, np.stack(units))
+
+
+def linear_oscillator(record: Record) -> tuple[float, float, float]:
+    """Return mass (kg), damping (N s/m), stiffness (N/m) of the best linear oscillator.
+
+    Least squares of ``u = m y'' + c y' + k y`` over the frequencies that the input
+    holds, where a derivative is a product with i w.
+    """
+    u, y = np.fft.rfft(record.input), np.fft.rfft(record.output)
+    held = np.abs(u) > HELD * np.max(np.abs(u))
+    held[0] = False
+    s = 2j * np.pi * np.fft.rfftfreq(record.samples, record.dt)[held]
+    columns = np.stack([s**2 * y[held], s * y[held], y[held]], axis=1)
+    split = np.concatenate([columns.real, columns.imag])
+    target = np.concatenate([u[held].real, u[held].imag])
+    mass, damping, stiffness = np.linalg.lstsq(split, target, rcond=None)[0]
+    if not (mass > 0.0 and stiffness > 0.0):
+        raise ValueError(
+            f"{record.source}: the best linear oscillator has mass {mass:g} and "
+            f"stiffness {stiffness:g}; both must be above 0"
+        )
+    return float(mass), float(damping), float(stiffness)
+
+
+HELD = 0.05
+"""Frequencies with this share of the input's largest line count as held by it."""

@@ -1,0 +1,280 @@
+"""Preisach models behind a lag, as fine as the record can tell their cells apart."""
+
+import itertools
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from scipy.optimize import OptimizeResult, least_squares
+
+from ...core.arrays import as_array
+from ...core.paths import parameters, replace
+from ...core.system import Series, series
+from ...dynamics import FirstOrderLag
+from ...hysteresis import Preisach, RateDependentPreisach
+from ...hysteresis.preisach import STARTS
+from ..records.record import Record
+from .estimate import at_edge
+from .output_error import from_rest, standard_errors
+from .preisach_density import (
+    empty,
+    fit_preisach,
+    fit_rate_dependent_preisach,
+    line_by_line,
+    responses,
+)
+
+_free_run = eqx.filter_jit(from_rest)
+
+Model = Preisach | RateDependentPreisach
+
+PLAIN, RATE_DEPENDENT = "preisach", "rate_dependent_preisach"
+"""The models' names; the second one has two densities, blended by the rate."""
+
+CELLS = range(3, 11)
+"""Cells a side that a fit may have."""
+
+TOLD_APART = 1e-3
+"""Least rms that the output changes by with weights moved by 1 um in all, shared out in
+whatever way shows least: below that, nanometres decide about tenths of a micrometre."""
+
+TOO_FEW = {
+    PLAIN: "the turning points of the training part do not tell even the cells of a "
+    f"Preisach triangle with {CELLS[0]} a side apart",
+    RATE_DEPENDENT: "turning points and paces of the training part do not tell even "
+    f"the cells of two Preisach triangles with {CELLS[0]} a side apart",
+}
+"""Why a record supports no such model."""
+
+LAGS = (0.05, 50.0)
+"""Bounds of the lag, samples."""
+
+LAG = 1.5
+"""Where the search for the lag begins, samples."""
+
+RATES = (0.1, 10.0)
+"""Bounds of the rate at which both densities count alike, over the input's own: how
+fast it moves in the root mean square."""
+
+FIRST_RATES = (0.3, 1.0, 3.0)
+"""The best of these is where the search for that rate begins, in the same way."""
+
+STEP = 1e-4
+"""Share by which a lag or a rate is changed for the slope of the output by it."""
+
+ENDED = 1e-5
+"""Change of the logarithms at which their search ends: far below standard errors."""
+
+STEPS = 20
+"""Most steps of that search."""
+
+
+class Chain(NamedTuple):
+    """A model and what follows it."""
+
+    hysteresis: Model
+    lag: FirstOrderLag
+
+    def system(self) -> Series:
+        """Return both as one plant."""
+        return series(hysteresis=self.hysteresis, lag=self.lag)
+
+
+class Unknown(NamedTuple):
+    """What is searched for, above 0: its bounds, and of which the best is the start."""
+
+    name: str
+    least: float
+    most: float
+    firsts: tuple[float, ...]
+
+
+class PreisachFit(NamedTuple):
+    """The plant, values and standard errors of its parameters by name, what to say."""
+
+    system: Series
+    values: dict[str, float]
+    deviations: list[float | None]
+    warnings: list[str]
+
+
+def cells_told_apart(record: Record, train: slice, model: str = PLAIN) -> int:
+    """Return how many cells a side the samples ``train`` can tell apart, 0 for none.
+
+    Whatever the material remembers before the record.
+    """
+    seen = _a_sample_later(record.until(train.stop))
+    return next(
+        (
+            cells
+            for cells in reversed(CELLS)
+            if all(_told_apart(seen, train, model, cells, start) for start in STARTS)
+        ),
+        0,
+    )
+
+
+def _told_apart(
+    record: Record, train: slice, model: str, cells: int, start: str
+) -> bool:
+    shape = empty(record, cells, None, start)
+    if model == RATE_DEPENDENT:
+        shape = RateDependentPreisach(shape, shape.weights, _pace(record), record.dt)
+    rows = responses(shape, record.input, None, train)
+    strength = np.linalg.svd(rows - rows.mean(axis=0), compute_uv=False)
+    least = TOLD_APART * np.sqrt(len(rows))
+    return len(rows) >= rows.shape[1] and bool(strength[-1] >= least)
+
+
+def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:
+    """Return the Preisach model and lag whose free run fits ``record`` best.
+
+    For each lag (and rate) the weights are those of ``fit_preisach`` (or
+    ``fit_rate_dependent_preisach``), so only these are searched for; of both histories
+    before the record, virgin and saturated, the better is taken. Raises ValueError as
+    those functions, and where the record tells too few cells apart.
+    """
+    cells = cells_told_apart(record, train, model)
+    if not cells:
+        raise ValueError(TOO_FEW[model])
+    seen = record.until(train.stop)
+    problem = _Problem(seen, _a_sample_later(seen), train, cells)
+    unknowns = _unknowns(problem.shifted, model)
+    ends = {start: problem.end(unknowns, start) for start in STARTS}
+    start = min(STARTS, key=lambda start: ends[start].cost)
+    logs, warnings = ends[start].x, _at_edges(unknowns, ends[start].x)
+    if not ends[start].status:
+        warnings.append(f"lag and rate were still moving after {STEPS} steps")
+    chain = problem.fitted(logs, start)
+    searched = {u.name: float(v) for u, v in zip(unknowns, np.exp(logs), strict=True)}
+    return PreisachFit(
+        chain.system(),
+        _named(chain.hysteresis, cells) | searched,
+        problem.deviations(chain, searched),
+        warnings,
+    )
+
+
+class _Problem(NamedTuple):
+    """A record up to the end of the part to fit, and with its input a sample later."""
+
+    seen: Record
+    shifted: Record
+    train: slice
+    cells: int
+
+    def fitted(self, logs: np.ndarray, start: str) -> Chain:
+        """Return the model with the best weights at logarithms of the unknowns."""
+        lag, *rate = (float(value) for value in np.exp(logs))
+        dynamics = FirstOrderLag(lag, self.seen.dt)
+        fit = fit_rate_dependent_preisach if rate else fit_preisach
+        hysteresis = fit(
+            self.shifted,
+            *rate,
+            cells=self.cells,
+            train=self.train,
+            dynamics=dynamics.as_arma(),
+            start=start,
+        )
+        return Chain(hysteresis, dynamics)
+
+    def errors(self, system: Series) -> np.ndarray:
+        """Return the errors of the free run over the part, um."""
+        run = np.asarray(_free_run(system, as_array(self.seen.input)))
+        return (run - self.seen.output)[self.train]
+
+    def reduced(self, logs: np.ndarray, start: str) -> np.ndarray:
+        """Return the errors with the best weights."""
+        return self.errors(self.fitted(logs, start).system())
+
+    def slopes(self, logs: np.ndarray, start: str) -> np.ndarray:
+        """Return the slopes of those errors, a column an unknown."""
+        here = self.reduced(logs, start)
+        moved = [self.reduced(logs + s, start) for s in STEP * np.eye(logs.size)]
+        return (np.column_stack(moved) - here[:, None]) / STEP
+
+    def end(self, unknowns: list[Unknown], start: str) -> OptimizeResult:
+        """Return where the search ends, with one of the histories."""
+
+        def loss(logs: np.ndarray) -> float:
+            return float(np.sum(self.reduced(logs, start) ** 2))
+
+        firsts = map(np.log, itertools.product(*(u.firsts for u in unknowns)))
+        bounds = np.log([[u.least, u.most] for u in unknowns]).T
+        options = {"jac": self.slopes, "bounds": bounds, "args": (start,)}
+        ending = {"xtol": ENDED, "max_nfev": STEPS}
+        first = min(firsts, key=loss)
+        return least_squares(self.reduced, first, **options, **ending)
+
+    def deviations(
+        self, chain: Chain, searched: dict[str, float]
+    ) -> list[float | None]:
+        """Return the standard errors of weights, lowest output and what is searched."""
+        system = chain.system()
+        left = self.errors(system)
+        moved = [
+            (self.errors(replace(system, {name: value * (1.0 + STEP)})) - left)
+            / (value * STEP)
+            for name, value in searched.items()
+        ]
+        rows = responses(
+            chain.hysteresis, self.shifted.input, chain.lag.as_arma(), self.train
+        )
+        jacobian = np.column_stack([rows, np.ones(left.size), *moved])
+        freedom = max(left.size - jacobian.shape[1], 1)
+        return standard_errors(jacobian, float(np.sum(left**2)) / freedom)
+
+
+def _unknowns(record: Record, model: str) -> list[Unknown]:
+    """Return what the weights do not follow from, in the order of ``fitted``."""
+    found = [
+        Unknown(
+            "lag.time_constant",
+            LAGS[0] * record.dt,
+            LAGS[1] * record.dt,
+            (LAG * record.dt,),
+        )
+    ]
+    if model == RATE_DEPENDENT:
+        pace = _pace(record)
+        firsts = tuple(pace * first for first in FIRST_RATES)
+        found.append(
+            Unknown("hysteresis.rate", RATES[0] * pace, RATES[1] * pace, firsts)
+        )
+    return found
+
+
+def _named(hysteresis: Model, cells: int) -> dict[str, float]:
+    """Return the weights and the lowest output, in the order of the responses."""
+    known = parameters(hysteresis, "hysteresis.")
+    values = {
+        f"{name}.{i}.{j}": float(leaf[i, j])
+        for name, leaf in known.items()
+        if leaf.ndim == 2
+        for i, j in line_by_line(cells)
+    }
+    return values | {
+        name: float(leaf) for name, leaf in known.items() if name.endswith(".lowest")
+    }
+
+
+def _at_edges(unknowns: list[Unknown], logs: np.ndarray) -> list[str]:
+    return [
+        text
+        for u, log in zip(unknowns, logs, strict=True)
+        for text in at_edge(u.name, (log - np.log(u.least)) / np.log(u.most / u.least))
+    ]
+
+
+def _pace(record: Record) -> float:
+    """Return how fast the input moves in the root mean square, V/s."""
+    return float(np.sqrt(np.mean(np.diff(record.input) ** 2))) / record.dt
+
+
+def _a_sample_later(record: Record) -> Record:
+    """Return ``record`` with the input that a model has at each output.
+
+    A plant maps u(k) to y(k+1).
+    """
+    input = np.concatenate([record.input[:1], record.input[:-1]])
+    return Record(input, record.output, record.dt)

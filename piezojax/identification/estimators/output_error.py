@@ -1,0 +1,268 @@
+"""Fitting any System to records by its free-run simulation error."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ...core.arrays import ScalarLike, as_array
+from ...core.paths import parameters
+from ...core.progress import Progress, Silent
+from ...core.rollout import simulate
+from ...core.space import Space, squash
+from ...core.system import System, rest_output
+from ...solve.optimisers import Optimiser, damped_gauss_newton
+from ..records.record import Record
+from .structure import REST_INPUT, Structure
+
+AT_ONCE = 4
+"""Starts that descend together in one program."""
+
+TRIAL_STEPS = 12
+"""Steps after which only the best starts go on."""
+
+TOLERANCE = 1e-10
+"""Relative change of the loss and of the point at which a start is done."""
+
+STALL_STEPS, STALL = 15, 1e-6
+"""Steps in which the best mean square must fall by this share, or the fit has ended."""
+
+HOPELESS = 1e11
+"""A mean square this large stands for a simulation that is not finite."""
+
+UNDETERMINED = 1e-12
+"""A parameter direction whose share of the Jacobian is below this is not determined."""
+
+
+class Optimum(NamedTuple):
+    """Points the starts led to, best first: [starts, n] in the unit box, mean squares.
+
+    ``deviations``: standard errors at the best, None where a parameter is not
+    determined. ``finished``: whether the best start came to an end.
+    """
+
+    problem: "Problem"
+    names: tuple[str, ...]
+    units: np.ndarray
+    losses: np.ndarray
+    values: np.ndarray
+    deviations: list[float | None]
+    finished: bool
+
+
+class Problem(eqx.Module):
+    """Records side by side: padded to one length, with weights that leave out the rest.
+
+    ``which`` [records, n] tells which of the unknowns each record's parameters are:
+    all records share them but for what was in force before each began.
+    """
+
+    system: System
+    space: Space
+    which: Int[Array, "records n"]
+    inputs: Float[Array, "records samples"]
+    outputs: Float[Array, "records samples"]
+    weights: Float[Array, "records samples"]
+
+    def simulated(self, unknown: Float[Array, " unknowns"]) -> Float[Array, "..."]:
+        """Return the free run of every record, [records, samples]."""
+
+        def one(unit, input):
+            return from_rest(self.space.put(self.system, unit), input)
+
+        return jax.vmap(one)(unknown[self.which], self.inputs)
+
+    def residuals(self, unknown: Float[Array, " unknowns"]) -> Float[Array, " all"]:
+        """Return the weighted errors; their sum of squares is the mean square."""
+        error = self.simulated(unknown) - self.outputs
+        # A start that diverges must not poison the others of its batch.
+        error = jnp.where(jnp.isfinite(error), jnp.clip(error, -1e6, 1e6), 1e6)
+        return (self.weights * error).ravel()
+
+
+def free_run(
+    system: System, input: Float[Array, "n ..."], before: ScalarLike | Array
+) -> Float[Array, "n ..."]:
+    """Return the output samples that ``system`` predicts from ``input`` alone.
+
+    A plant maps u(k) to y(k+1), as in the loop; the first output is that at rest under
+    ``before``, the input in force when the record begins.
+    """
+    _, outputs = simulate(system, input, system.init(before))
+    first = rest_output(system, before)
+    return jnp.concatenate([first[None], outputs[:-1]])
+
+
+def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """Free run from the rest point the model carries, or from the first input."""
+    return free_run(system, input, parameters(system).get(REST_INPUT, input[0]))
+
+
+def problem_of(
+    structure: Structure, records: Sequence[Record], train: slice
+) -> tuple[Problem, tuple[str, ...]]:
+    """Return the fit of ``structure`` to ``records``, and the names of its unknowns.
+
+    Errors count over the samples ``train`` of each record.
+    """
+    space, count = structure.space, len(records)
+
+    def name(path: str, row: int) -> str:
+        alone = path not in structure.own or count == 1
+        return path if alone else f"{path} of record {row}"
+
+    used = [[name(path, row) for path in space.paths] for row in range(count)]
+    names = list(dict.fromkeys(itertools.chain(*used)))
+    which = [[names.index(name) for name in row] for row in used]
+    samples = min(train.stop, max(record.samples for record in records))
+    inputs, outputs, weights = np.zeros((3, count, samples))
+    for row, record in enumerate(records):
+        size = min(record.samples, samples)
+        inputs[row] = np.pad(record.input[:size], (0, samples - size), mode="edge")
+        outputs[row, :size] = record.output[:size]
+        weights[row, train.start : size] = 1.0
+    weights /= np.sqrt(np.sum(weights))
+    problem = Problem(
+        structure.system,
+        space,
+        jnp.asarray(which),
+        as_array(inputs),
+        as_array(outputs),
+        as_array(weights),
+    )
+    return problem, tuple(names)
+
+
+def output_error(
+    structure: Structure,
+    records: Sequence[Record],
+    train: slice,
+    *,
+    steps: int = 200,
+    progress: Progress | None = None,
+) -> Optimum:
+    """Fit ``structure`` to ``records`` by the mean square of the free-run error.
+
+    Levenberg-Marquardt with the forward Jacobian, from all starts of the structure;
+    after a few steps the best go on, to at most ``steps``. The error counts over the
+    samples ``train`` of each record; the model sees the input alone, from the first
+    sample on. Raises ValueError when no start leads to a finite simulation.
+    """
+    progress = progress or Silent()
+    problem, names = problem_of(structure, records, train)
+    starts = _for_every_record(structure, problem)
+    width = min(AT_ONCE, len(starts))
+    progress.stage(f"compiling the fit of {len(names)} parameters")
+    carries = [
+        _begin(problem, as_array(np.resize(starts[i : i + width], (width, len(names)))))
+        for i in range(0, len(starts), width)
+    ]
+    trial = min(TRIAL_STEPS, steps)
+    progress.stage(f"trying {len(starts)} starts", trial * len(carries))
+    carries = [_descended(problem, carry, trial, progress)[0] for carry in carries]
+    every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *carries)
+    best = np.argsort(np.asarray(every.loss))[:width]
+    carry = jax.tree.map(lambda leaf: leaf[best], every)
+    progress.stage(f"fitting from the best {width}", steps - trial)
+    carry, finished = _descended(problem, carry, steps - trial, progress)
+    order = np.argsort(np.asarray(carry.loss))
+    losses = np.asarray(carry.loss)[order]
+    if losses[0] >= HOPELESS:
+        raise ValueError("no start led to a finite simulation of the record")
+    units = np.asarray(squash(carry.point))[order]
+    values, deviations = _with_errors(problem, as_array(units[0]), losses[0])
+    return Optimum(problem, names, units, losses, values, deviations, finished)
+
+
+def _for_every_record(structure: Structure, problem: Problem) -> np.ndarray:
+    """Return the starts with the values of its own for every record."""
+    unknowns = int(np.max(problem.which)) + 1
+    starts = np.empty((len(structure.starts), unknowns))
+    for row in np.asarray(problem.which):
+        starts[:, row] = structure.starts
+    return starts
+
+
+def _optimiser(problem: Problem) -> Optimiser:
+    # A lambda, because a bound method would be hashed with its arrays.
+    residuals = lambda unknown: problem.residuals(unknown)  # noqa: E731
+    return damped_gauss_newton(residuals, TOLERANCE)
+
+
+@eqx.filter_jit
+def _begin(problem: Problem, starts: Float[Array, "starts unknowns"]) -> Any:
+    return jax.vmap(_optimiser(problem).start)(starts)
+
+
+@eqx.filter_jit
+def _advance(problem: Problem, carry: Any) -> Any:
+    return jax.vmap(_optimiser(problem).step)(carry)
+
+
+def _descended(
+    problem: Problem, carry: Any, steps: int, progress: Progress
+) -> tuple[Any, bool]:
+    """Step until all starts are done or the best gets no better."""
+    bests = [np.inf]
+    for _ in range(steps):
+        carry = _advance(problem, carry)
+        bests.append(float(np.min(carry.loss)))
+        progress.advance(float(np.sqrt(bests[-1])))
+        if np.all(carry.done) or _stalled(bests):
+            break
+    return carry, bool(np.any(carry.done)) or _stalled(bests)
+
+
+def _stalled(bests: Sequence[float]) -> bool:
+    # Where a parameter runs to its bound the point itself never comes to rest.
+    return len(bests) > STALL_STEPS and bests[-1] > bests[-STALL_STEPS] * (1 - STALL)
+
+
+@eqx.filter_jit
+def _sensitivity(problem: Problem, unit: Array) -> tuple[Array, Array, Array]:
+    """Return the unknowns' values, their slopes, the residuals' weighted Jacobian."""
+    jacobian = jax.jacfwd(lambda unknown: problem.residuals(unknown))(unit)
+    slopes = jax.jacfwd(lambda u: _values(problem, u))(unit).diagonal()
+    return _values(problem, unit), slopes, jacobian
+
+
+def _values(problem: Problem, unit: Array) -> Array:
+    """Return the values of all unknowns at ``unit``."""
+    values = jnp.zeros_like(unit)
+    for row in problem.which:
+        values = values.at[row].set(problem.space.from_unit(unit[row]))
+    return values
+
+
+def _with_errors(
+    problem: Problem, unit: Array, loss: float
+) -> tuple[np.ndarray, list[float | None]]:
+    """Return values and Gauss-Newton standard errors, white residuals assumed.
+
+    The covariance is s^2 (J'J)^-1; a parameter in a direction that the record says
+    nothing about has no standard error.
+    """
+    values, slopes, jacobian = map(np.asarray, _sensitivity(problem, unit))
+    jacobian = jacobian / np.where(slopes == 0.0, 1.0, slopes)
+    counted = int(np.sum(np.asarray(problem.weights) > 0))
+    return values, standard_errors(jacobian, loss / max(counted - unit.size, 1))
+
+
+def standard_errors(jacobian: np.ndarray, variance: float) -> list[float | None]:
+    """Return the square roots of the diagonal of ``variance`` (J'J)^-1.
+
+    None for a parameter in a direction that the ``jacobian`` says nothing about.
+    """
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    _, strength, directions = np.linalg.svd(jacobian / scale, full_matrices=False)
+    weak = strength < UNDETERMINED * strength[0]
+    known = np.sum(directions[weak] ** 2, axis=0) < 1e-6
+    inverse = np.where(weak, 0.0, 1.0 / np.where(weak, 1.0, strength))
+    spread = np.sqrt(variance * np.sum((directions.T * inverse) ** 2, axis=1)) / scale
+    return [float(d) if k else None for d, k in zip(spread, known, strict=True)]

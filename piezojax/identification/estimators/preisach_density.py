@@ -1,0 +1,232 @@
+"""Densities of Preisach models from a record, by non-negative least squares."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import nnls
+from scipy.signal import lfilter
+
+from ...core.arrays import State, as_array
+from ...core.rollout import simulate
+from ...core.system import System
+from ...dynamics import ARMA
+from ...hysteresis import Preisach, RateDependentPreisach
+from ...hysteresis.preisach import Levels, PlayLines
+from ...hysteresis.rate_dependent_preisach import fast_share
+from ..records.record import Record
+
+LEAST_SLOPE = 0.01
+"""Slope after a turn, at least, over the mean slope of the record: see fit_preisach."""
+
+
+def fit_preisach(
+    record: Record,
+    cells: int = 20,
+    *,
+    train: slice | None = None,
+    limits: tuple[float, float] | None = None,
+    dynamics: ARMA | None = None,
+    smoothing: float = 0.0,
+    start: str = "virgin",
+) -> Preisach:
+    """Return the Preisach model, ``cells`` a side, that fits ``record`` best.
+
+    The output is linear in the weights for a given input: (2.1) is solved for the
+    weights over the samples ``train`` (all of them; with a step only some are compared)
+    by least squares under the condition that none is negative. ``limits`` (V) are the
+    least and the highest input of the model, those of the record if left out;
+    ``dynamics`` is what follows the hysteresis before the output, nothing if left out.
+    The record is taken to begin at rest, its memory by ``start``: ``"virgin"`` about
+    the first input, or ``"saturated"``.
+
+    Cells that no turn of the input reaches are only told apart by ``smoothing``: its
+    square weighs the squared differences between neighbours against the mean squared
+    error, 0 for none. Weights on the diagonal are at least what gives 1 % of the
+    record's mean slope, so that the model has a continuous inverse.
+
+    Raises ValueError for an empty ``train``, limits that do not hold the record's
+    input, ``cells`` or ``smoothing`` out of range, or an output that falls while the
+    input rises.
+    """
+    shape = empty(record, cells, limits, start)
+    (weights,), lowest = _densities(record, shape, train, dynamics, smoothing)
+    return _filled(shape, weights, lowest)
+
+
+def fit_rate_dependent_preisach(
+    record: Record,
+    rate: float,
+    cells: int = 20,
+    *,
+    train: slice | None = None,
+    limits: tuple[float, float] | None = None,
+    dynamics: ARMA | None = None,
+    smoothing: float = 0.0,
+    start: str = "virgin",
+) -> RateDependentPreisach:
+    """Return the two densities, half way at ``rate`` (V/s), that fit ``record`` best.
+
+    For a given rate the output is linear in both, (2.10): all is as in fit_preisach,
+    for each of the two. A record that knows one speed only does not tell them apart.
+    Raises ValueError as fit_preisach, and for ``rate <= 0``.
+    """
+    slow = empty(record, cells, limits, start)
+    shape = RateDependentPreisach(slow, slow.weights, rate, record.dt)
+    (weights, fast), lowest = _densities(record, shape, train, dynamics, smoothing)
+    slow = _filled(slow, weights, lowest)
+    return RateDependentPreisach(slow, fast, rate, record.dt)
+
+
+def _filled(shape: Preisach, weights: np.ndarray, lowest: float) -> Preisach:
+    return Preisach(
+        weights, shape.low, shape.high, lowest, shape.rest_input, shape.start
+    )
+
+
+def empty(
+    record: Record, cells: int, limits: tuple[float, float] | None, start: str
+) -> Preisach:
+    """Return a model with no weights for the input of ``record``, and its limits.
+
+    Raises ValueError for less than one cell or limits that do not hold the input.
+    """
+    if cells < 1:
+        raise ValueError(f"cells is {cells}; it must be at least 1")
+    extremes = float(record.input.min()), float(record.input.max())
+    low, high = limits or extremes
+    if not (low <= extremes[0] and extremes[1] <= high):
+        raise ValueError(
+            f"limits are {low:g} to {high:g} V; the input runs from {extremes[0]:g} "
+            f"to {extremes[1]:g} V"
+        )
+    return Preisach(np.zeros((cells, cells)), low, high, 0.0, record.input[0], start)
+
+
+def _densities(
+    record: Record,
+    shape: Preisach | RateDependentPreisach,
+    train: slice | None,
+    dynamics: ARMA | None,
+    smoothing: float,
+) -> tuple[list[np.ndarray], float]:
+    """Return the weights of each density of ``shape``, and the lowest output, um."""
+    if not smoothing >= 0.0:
+        raise ValueError(f"smoothing is {smoothing:g}; it must be at least 0")
+    part = train or slice(None)
+    wanted = record.output[part]
+    if not wanted.size:
+        raise ValueError(
+            f"train is {part.start}:{part.stop}; it must hold some of "
+            f"{record.samples} samples"
+        )
+    slope = float(np.cov(record.input, record.output)[0, 1] / np.var(record.input))
+    if slope <= 0.0:
+        raise ValueError(
+            "the output falls while the input rises; give one with the other sign"
+        )
+    slow = _slow(shape)
+    cells = slow.cells
+    places = line_by_line(cells)
+    rows = responses(shape, record.input, dynamics, part)
+    count = rows.shape[1] // len(places)
+    least = np.zeros(len(places))
+    least[:cells] = LEAST_SLOPE * slope * float(slow.high - slow.low) / cells
+    least = np.tile(least, count)
+    centre = rows.mean(axis=0)
+    rough = smoothing * np.sqrt(wanted.size) * _differences(places)
+    rough = np.kron(np.eye(count), rough)
+    matrix = np.vstack([rows - centre, rough])
+    right = np.append(wanted - wanted.mean(), np.zeros(len(rough))) - matrix @ least
+    # The triangle of the factorisation holds all that the search needs.
+    both = np.column_stack([matrix, right])
+    small = np.asarray(np.linalg.qr(both, mode="r"))
+    found = least + nnls(small[:, :-1], small[:, -1], maxiter=100 * least.size)[0]
+    densities = []
+    for own in np.split(found, count):
+        weights = np.zeros((cells, cells))
+        weights[tuple(np.transpose(places))] = own
+        densities.append(weights)
+    gain = 1.0 if dynamics is None else float(dynamics.dc_gain())
+    return densities, float(wanted.mean() - centre @ found) / gain
+
+
+def _slow(shape: Preisach | RateDependentPreisach) -> Preisach:
+    return shape.slow if isinstance(shape, RateDependentPreisach) else shape
+
+
+def line_by_line(cells: int) -> list[tuple[int, int]]:
+    """Return the cells in the order of ``responses``: that of PlayLines."""
+    return [(j + k, j) for k in range(cells) for j in range(cells - k)]
+
+
+class _Memory(System):
+    """The levels of a Preisach model, as an output."""
+
+    lines: PlayLines
+
+    def init(self, input: Any = 0.0) -> State:
+        return self.lines.init(input)
+
+    def step(self, state: Levels, input: Any) -> tuple[State, Any]:
+        state = self.lines.played(state, input)
+        return state, state
+
+
+@jax.jit
+def _levels(shape: Preisach, input: Any) -> Any:
+    memory = _Memory(shape.law())
+    return simulate(memory, input, memory.init(input[0]))[1]
+
+
+def responses(
+    shape: Preisach | RateDependentPreisach,
+    input: np.ndarray,
+    dynamics: ARMA | None,
+    part: slice,
+) -> np.ndarray:
+    """Return what a weight of 1 um in each cell puts out over ``part``, a column each.
+
+    Cells ``line_by_line``, first those of the slow density, then of a fast one.
+    """
+    slow = _slow(shape)
+    levels = np.asarray(_levels(slow, jnp.asarray(input)))
+    up = np.hstack(
+        [
+            np.clip(levels[:, [k]] - np.arange(slow.cells - k), 0.0, 1.0)
+            for k in range(slow.cells)
+        ]
+    )
+    if isinstance(shape, RateDependentPreisach):
+        rate = np.diff(input, prepend=input[0]) / shape.dt
+        fast = np.asarray(fast_share(as_array(rate) / shape.rate))[:, None]
+        up = np.hstack([(1.0 - fast) * up, fast * up])
+    return _passed(up, dynamics)[part]
+
+
+def _passed(signals: np.ndarray, dynamics: ARMA | None) -> np.ndarray:
+    """Return ``signals`` behind ``dynamics``, at rest under their first samples."""
+    if dynamics is None:
+        return signals
+    moving = [float(b) for b in dynamics.moving]
+    past = [1.0, *(-float(a) for a in dynamics.autoregressive)]
+    rest = float(dynamics.dc_gain()) * signals[0]
+    return lfilter(moving, past, signals - signals[0], axis=0) + rest
+
+
+def _differences(places: list[tuple[int, int]]) -> np.ndarray:
+    """Return the matrix of differences between neighbours off the diagonal.
+
+    The diagonal is not smoothed into the rest: it is what has no hysteresis.
+    """
+    index = {place: at for at, place in enumerate(places)}
+    rows = []
+    for (i, j), at in index.items():
+        for other in ((i + 1, j), (i, j + 1), (i + 1, j + 1)):
+            within = (i == j) == (other[0] == other[1])
+            if other in index and within:
+                row = np.zeros(len(places))
+                row[[at, index[other]]] = -1.0, 1.0
+                rows.append(row)
+    return np.array(rows).reshape(-1, len(places))

@@ -1,0 +1,135 @@
+"""The regression of chapter 3 sample by sample, with forgetting."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ...core.arrays import Scalar, ScalarLike, as_array, check
+from ...core.rollout import simulate
+from ...core.system import System
+from ...hysteresis import HystereticARMA
+from ...hysteresis.coleman_hodgdon import HysteresisState
+from ...hysteresis.hysteretic_arma import operators
+from ..records.record import Record
+from .regressors import Orders
+
+
+class Measured(NamedTuple):
+    """What is known at sample k: ``voltage`` u(k-1) in V, ``displacement`` z(k) in um.
+
+    A controller finds both in its ``Observation``: ``applied`` and ``measured``.
+    """
+
+    voltage: ScalarLike
+    displacement: ScalarLike
+
+
+REST = Measured(0.0, 0.0)
+"""A plant at rest at zero."""
+
+
+class RecursiveState(NamedTuple):
+    """Coefficients, a root of their covariance (S S' = P) and the row's memory."""
+
+    theta: Float[Array, " n"]
+    root: Float[Array, "n n"]
+    hysteresis: tuple[HysteresisState, ...]
+    outputs: Float[Array, " autoregressive"]
+    operated: Float[Array, "2 moving"]
+
+
+class RecursiveLeastSquares(System):
+    """Recursive least squares for the coefficients of a ``HystereticARMA``.
+
+    Input ``Measured``, output the ``HystereticARMA`` known after it; give a loop its
+    step to follow a plant that changes. ``c`` (1/V) is not estimated: take it from a
+    fit. ``forgetting`` lambda in (0, 1]: a sample n samples old counts lambda^n.
+    ``prior`` is the variance of every coefficient before the first sample; the larger,
+    the less the start (zero) counts. The covariance is carried as its square root
+    (Potter's update), which stays positive over any run. Without noise, or at
+    lambda = 1 and a large prior, the result is that of ``least_squares``, its bias
+    under noise included.
+
+    Raises ValueError for ``c >= 0``, forgetting outside (0, 1], a prior that is not
+    positive, no coefficients or an unknown scheme.
+    """
+
+    c: Scalar = eqx.field(converter=as_array)
+    forgetting: Scalar = eqx.field(converter=as_array, default=1.0)
+    prior: Scalar = eqx.field(converter=as_array, default=1e6)
+    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+    autoregressive: int = eqx.field(static=True, default=2)
+    moving: int = eqx.field(static=True, default=3)
+    scheme: str = eqx.field(static=True, default="trapezoid")
+
+    def __check_init__(self):
+        check("forgetting", self.forgetting, above=0.0, most=1.0)
+        check("prior variance", self.prior, above=0.0)
+        self._structure()
+        self._operators()
+
+    def init(self, input: Measured = REST) -> RecursiveState:
+        """Return the start: nothing known, the plant at rest under ``input``."""
+        size = self._structure().size
+        hysteresis, now = self._operate(None, input.voltage)
+        return RecursiveState(
+            jnp.zeros(size),
+            jnp.sqrt(self.prior) * jnp.eye(size),
+            hysteresis,
+            jnp.full(self.autoregressive, input.displacement),
+            jnp.tile(now[:, None], self.moving),
+        )
+
+    def step(
+        self, state: RecursiveState, input: Measured
+    ) -> tuple[RecursiveState, HystereticARMA]:
+        hysteresis, now = self._operate(state.hysteresis, input.voltage)
+        operated = jnp.concatenate([now[:, None], state.operated[:, :-1]], axis=1)
+        row = jnp.concatenate([state.outputs, operated.ravel(), jnp.ones(1)])
+        measured = as_array(input.displacement)
+
+        along = state.root.T @ row
+        spread = self.forgetting + along @ along
+        gain = state.root @ along
+        theta = state.theta + gain / spread * (measured - row @ state.theta)
+        share = 1.0 / (spread + jnp.sqrt(self.forgetting * spread))
+        root = state.root - share * jnp.outer(gain, along)
+        root = root / jnp.sqrt(self.forgetting)
+
+        outputs = jnp.concatenate([measured[None], state.outputs[:-1]])
+        state = RecursiveState(theta, root, hysteresis, outputs, operated)
+        return state, self._structure().model(self.c, theta)
+
+    def _structure(self) -> Orders:
+        return Orders(self.autoregressive, self.moving, self.rest_input, self.scheme)
+
+    def _operators(self):
+        return operators(self.c, self.rest_input, self.scheme)
+
+    def _operate(self, states, voltage):
+        """Advance both operators, from rest under ``voltage`` if they have no state."""
+        both = self._operators()
+        states = states or [operator.init(voltage) for operator in both]
+        stepped = [o.step(s, voltage) for o, s in zip(both, states, strict=True)]
+        return tuple(s for s, _ in stepped), jnp.stack([y for _, y in stepped])
+
+
+def recursive_least_squares(
+    record: Record, estimator: RecursiveLeastSquares
+) -> HystereticARMA:
+    """Run ``estimator`` over ``record``; the plant is taken to begin at rest.
+
+    Returns the models sample by sample: a ``HystereticARMA`` whose numbers have a
+    leading axis [samples - 1]; the first is that after the second sample.
+    """
+    seen = Measured(jnp.asarray(record.input[:-1]), jnp.asarray(record.output[1:]))
+    first = Measured(record.input[0], record.output[0])
+    return _run(estimator, seen, jax.tree.map(as_array, first))
+
+
+@eqx.filter_jit
+def _run(estimator, seen, first):
+    return simulate(estimator, seen, estimator.init(first))[1]

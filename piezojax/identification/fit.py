@@ -1,0 +1,231 @@
+"""From records to a plant: the verb ``identify``, its report, its warnings."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import AliasChoices, BaseModel, Field
+
+from ..core.progress import Progress, Silent
+from ..core.system import System
+from .chain import DEFAULT
+from .estimators.estimate import FittedParameter, LinearDetail, Options
+from .methods import method_for
+from .records.checks import record_warnings
+from .records.record import Record
+
+POOR = 0.2
+"""A validation error above this share of the output's deviation gives a warning."""
+
+
+class FitError(BaseModel):
+    """RMS of the free-run simulation error over a part of the records.
+
+    ``rmse`` is that over all outputs, ``each`` has one an output.
+    """
+
+    rmse: float
+    rmse_percent_of_span: float
+    unit: str
+    each: list[float] = []
+
+
+class FitReport(BaseModel):
+    """What a fit found: the content of ``fit.json``."""
+
+    model: str
+    parameters: dict[str, FittedParameter]
+    train: FitError
+    validation: FitError = Field(
+        serialization_alias="validate",
+        validation_alias=AliasChoices("validate", "validation"),
+    )
+    warnings: list[str]
+    wall_s: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted plant, its report, the records and the simulated outputs (their unit).
+
+    ``system`` holds what was in force before the first record. ``count``: how many
+    parameters were fitted.
+    """
+
+    system: System
+    report: FitReport
+    records: tuple[Record, ...]
+    simulations: tuple[np.ndarray, ...]
+    train: slice
+    validate: slice
+    linear: LinearDetail | None = None
+    count: int = 0
+
+    def errors(self, part: slice) -> list[np.ndarray]:
+        """Return the errors over ``part``, [samples, p] for each record."""
+        return [
+            (run - record.outputs)[part]
+            for record, run in zip(self.records, self.simulations, strict=True)
+        ]
+
+    def error_over(self, part: slice) -> FitError:
+        """Return the RMS of the errors over ``part``."""
+        return _fit_error(self.records, self.simulations, part)
+
+    @property
+    def record(self) -> Record:
+        """The first record."""
+        return self.records[0]
+
+    @property
+    def simulated(self) -> np.ndarray:
+        """The simulated output of the first record, which has only one."""
+        if self.simulations[0].shape[1] != 1:
+            raise ValueError(
+                f"the model has {self.simulations[0].shape[1]} outputs; this needs one"
+            )
+        return self.simulations[0][:, 0]
+
+
+def identify(
+    records: Record | Sequence[Record],
+    model: str = DEFAULT,
+    *,
+    method: str | None = None,
+    train: slice | None = None,
+    validate: slice | None = None,
+    options: Options | None = None,
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit ``model`` to one record or to several with the same sample time.
+
+    ``model`` is a chain of parts such as ``"prandtl_ishlinskii+logarithmic_creep+lag"``
+    (see ``identify.PARTS``) or one of the models of ``identify.METHODS``, ``method`` a
+    name there (left out, the first that can fit the model). Fitted over the samples
+    ``train`` of each record (its first half if left out), judged by its free run on
+    ``validate`` (the rest). Raises ValueError for an unknown model or method, an empty
+    part, records that do not go together, or when no start leads to a finite fit.
+    """
+    began = time.perf_counter()
+    chosen = method_for(model, method)
+    records = (records,) if isinstance(records, Record) else tuple(records)
+    check_together(records)
+    train, validate = parts_of(min(r.samples for r in records), train, validate)
+    estimate = chosen.estimate(
+        model, records, train, options or Options(), progress or Silent()
+    )
+    warnings = [
+        f"{record.source}: {text}" if len(records) > 1 else text
+        for record in records
+        for text in record_warnings(
+            record,
+            train,
+            validate,
+            order=estimate.order,
+            hysteresis=estimate.hysteresis,
+        )
+    ]
+    runs = estimate.simulations
+    report = FitReport(
+        model=model,
+        parameters=estimate.parameters,
+        train=_fit_error(records, runs, train),
+        validation=_fit_error(records, runs, validate),
+        warnings=[
+            *warnings,
+            *estimate.warnings,
+            *_error_warnings(records, runs, validate),
+        ],
+        wall_s=time.perf_counter() - began,
+    )
+    return Fit(
+        estimate.system,
+        report,
+        records,
+        runs,
+        train,
+        validate,
+        estimate.linear,
+        estimate.counted(),
+    )
+
+
+def check_together(records: tuple[Record, ...]) -> None:
+    """Raise ValueError unless there are records, of one sample time and units."""
+    if not records:
+        raise ValueError("no record to fit a model to")
+    for record in records[1:]:
+        if not np.isclose(record.dt, records[0].dt, rtol=1e-6, atol=0.0):
+            raise ValueError(
+                f"{record.source} has the sample time {record.dt:g} s and "
+                f"{records[0].source} {records[0].dt:g} s; they must be the same"
+            )
+        for side in ("input_units", "output_units"):
+            if getattr(record, side) != getattr(records[0], side):
+                raise ValueError(
+                    f"{record.source} has the {side.replace('_', ' ')} "
+                    f"{getattr(record, side)} and {records[0].source} "
+                    f"{getattr(records[0], side)}; they must be the same"
+                )
+
+
+def parts_of(
+    samples: int, train: slice | None, validate: slice | None
+) -> tuple[slice, slice]:
+    """Return the parts to fit and to judge on: halves where they are left out.
+
+    Raises ValueError for a part that is empty or outside of the ``samples``.
+    """
+    train = _closed(train or slice(0, samples // 2), samples)
+    validate = _closed(validate or slice(min(train.stop, samples), samples), samples)
+    for name, part in (("train", train), ("validate", validate)):
+        if not 0 <= part.start < part.stop <= samples:
+            raise ValueError(
+                f"{name} is {part.start}:{part.stop}; "
+                f"it must lie in 0:{samples} and hold a sample"
+            )
+    return train, validate
+
+
+def _closed(part: slice, samples: int) -> slice:
+    stop = samples if part.stop is None else part.stop
+    return slice(part.start or 0, stop)
+
+
+def _errors(
+    records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
+) -> np.ndarray:
+    """Return the errors over ``part`` of all records, [samples, p]."""
+    return np.concatenate(
+        [(run - r.outputs)[part] for r, run in zip(records, runs, strict=True)]
+    )
+
+
+def _fit_error(
+    records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
+) -> FitError:
+    each = np.sqrt(np.mean(_errors(records, runs, part) ** 2, axis=0))
+    rmse = float(np.sqrt(np.mean(each**2)))
+    span = max(float(r.spans.max()) for r in records)
+    return FitError(
+        rmse=rmse,
+        rmse_percent_of_span=100.0 * rmse / span,
+        unit=records[0].output_unit,
+        each=[float(e) for e in each],
+    )
+
+
+def _error_warnings(
+    records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
+) -> list[str]:
+    error = _errors(records, runs, part)
+    outputs = np.concatenate([r.outputs[part] for r in records])
+    deviation = np.sqrt(np.mean(np.var(outputs, axis=0)))
+    share = float(np.sqrt(np.mean(error**2)) / max(deviation, 1e-30))
+    if share <= POOR:
+        return []
+    return [
+        f"the model explains little: its validation error is {100.0 * share:.0f} % of "
+        "the output's own deviation"
+    ]

@@ -1,0 +1,231 @@
+"""The ways to fit a model to records, by name, behind one signature."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from ..core.arrays import as_array
+from ..core.paths import parameters
+from ..core.progress import Progress
+from ..core.system import System
+from .chain import structure
+from .estimators.estimate import Estimate, FittedParameter, Options, at_edge
+from .estimators.linear import by_frequency_response, by_subspace
+from .estimators.model_bouc_wen import bouc_wen
+from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
+from .estimators.neural import fit_neural_state_space
+from .estimators.output_error import Optimum, from_rest, output_error
+from .estimators.regression import instrumental_variables, least_squares
+from .estimators.steady_state import fit_structure, steady_response
+from .estimators.structure import REST_INPUT
+from .records.record import Record
+from .records.resample import average_periods, resample, whole_periods
+
+AS_GOOD = 1e-3
+"""Starts whose mean square comes this close (as a share) to the best fit as well."""
+
+AMBIGUOUS = 0.01
+"""Share of its range over which a parameter of fits as good must differ to be said."""
+
+Records = Sequence[Record]
+
+
+def _free_runs(systems: Sequence[System], records: Records) -> tuple[np.ndarray, ...]:
+    run = eqx.filter_jit(from_rest)
+    return tuple(
+        np.asarray(run(system, as_array(record.input)))[:, None]
+        for system, record in zip(systems, records, strict=True)
+    )
+
+
+def _by_output_error(
+    model: str, records: Records, train: slice, options: Options, progress: Progress
+) -> Estimate:
+    # Bounds and starts, too, must not see what the fit is judged on.
+    seen = [record.until(train.stop) for record in records]
+    shape = structure(model, max(seen, key=lambda record: record.span))
+    optimum = output_error(
+        shape, records, train, steps=options.steps, progress=progress
+    )
+    systems = [
+        shape.space.put(shape.system, as_array(optimum.units[0][row]))
+        for row in np.asarray(optimum.problem.which)
+    ]
+    named = {
+        name: FittedParameter(value=float(value), standard_error=deviation)
+        for name, value, deviation in zip(
+            optimum.names, optimum.values, optimum.deviations, strict=True
+        )
+    }
+    return Estimate(
+        systems[0],
+        _free_runs(systems, records),
+        named,
+        _optimum_warnings(optimum, options.steps),
+        shape.order,
+        REST_INPUT in parameters(shape.system),
+    )
+
+
+def _optimum_warnings(optimum: Optimum, steps: int) -> list[str]:
+    found = []
+    if not optimum.finished:
+        found.append(
+            f"the fit was still getting better when its {steps} steps were used up"
+        )
+    as_good = optimum.units[optimum.losses <= optimum.losses[0] * (1.0 + AS_GOOD)]
+    spread = np.ptp(as_good, axis=0)
+    for i, name in enumerate(optimum.names):
+        found += at_edge(name, optimum.units[0, i])
+        if optimum.deviations[i] is None:
+            found.append(f"{name} is not determined by this record")
+        elif spread[i] > AMBIGUOUS:
+            found.append(
+                f"{name} is ambiguous: other values fit equally well, over "
+                f"{100.0 * spread[i]:.2g} % of its range"
+            )
+    return found
+
+
+def _by_regression(estimator: Callable) -> Callable[..., Estimate]:
+    """Return the method that fits (3.32) by ``estimator``."""
+
+    def estimate(model, records, train, options, progress) -> Estimate:
+        del model, options
+        record = _single(records)
+        progress.stage("searching for the c of the hysteresis")
+        found = estimator(record, train=train)
+        errors = parameters(found.standard_errors)
+        named = {
+            path: FittedParameter(
+                value=float(value),
+                standard_error=float(errors[path])
+                if np.isfinite(errors[path])
+                else None,
+            )
+            for path, value in parameters(found.model).items()
+            if path != "rest_input"
+        }
+        runs = _free_runs([found.model], [record])
+        return Estimate(found.model, runs, named, [], len(named) - 2, True)
+
+    return estimate
+
+
+def _by_steady_state(
+    model: str, records: Records, train: slice, options: Options, progress: Progress
+) -> Estimate:
+    record = _single(records)
+    periods = whole_periods(record, train)
+    period = record.period or 0
+    # The first holds the transient, unless it is all there is.
+    one = average_periods(periods, skip=int(periods.samples > period))
+    factor = options.oversample if model == "bouc_wen" else 1
+    fine = resample(one, factor)
+    progress.stage(f"fitting {model} to a period of {fine.samples} samples")
+    if model == "bouc_wen":
+        system, _ = fit_structure(bouc_wen(fine), fine, steps=options.steps)
+    else:
+        system = fit_neural_state_space(fine, options.order, steps=options.steps)
+    inputs = fine.input if fine.inputs.shape[1] == 1 else fine.inputs
+    response = np.asarray(steady_response(system, as_array(inputs), fine.samples))
+    response = response.reshape(fine.samples, -1)[::factor]
+    phase = (np.arange(record.samples) - train.start) % period
+    named = {
+        path: FittedParameter(value=float(value), standard_error=None)
+        for path, value in parameters(system).items()
+        if np.ndim(value) == 0
+    }
+    warnings = [
+        f"the model runs at {1.0 / fine.dt:g} Hz on input means: see identify.resample"
+    ]
+    count = sum(int(np.size(value)) for value in parameters(system).values())
+    return Estimate(system, (response[phase],), named, warnings, count=count)
+
+
+def _by_nonnegative_least_squares(
+    model: str, records: Records, train: slice, options: Options, progress: Progress
+) -> Estimate:
+    del options
+    record = _single(records)
+    progress.stage(f"searching for the lag behind the {model} model")
+    found = preisach_with_lag(record, train, model)
+    named = {
+        name: FittedParameter(value=value, standard_error=deviation)
+        for (name, value), deviation in zip(
+            found.values.items(), found.deviations, strict=True
+        )
+    }
+    runs = _free_runs([found.system], [record])
+    return Estimate(found.system, runs, named, found.warnings, 1, True)
+
+
+def _single(records: Records) -> Record:
+    if len(records) != 1:
+        raise ValueError(f"{len(records)} records; this method takes one")
+    return records[0]
+
+
+class Method(NamedTuple):
+    """What it is, the ``models`` it can fit (none: chains of parts), the fit itself."""
+
+    summary: str
+    models: tuple[str, ...]
+    estimate: Callable[[str, Records, slice, Options, Progress], Estimate]
+
+
+METHODS: dict[str, Method] = {
+    "output_error": Method(
+        "Levenberg-Marquardt on the free-run error", (), _by_output_error
+    ),
+    "instrumental_variables": Method(
+        "(3.32) by regression, unbiased under sensor noise",
+        ("hysteretic_arma",),
+        _by_regression(instrumental_variables),
+    ),
+    "least_squares": Method(
+        "(3.32) by (3.35); sensor noise biases it",
+        ("hysteretic_arma",),
+        _by_regression(least_squares),
+    ),
+    "nonnegative_least_squares": Method(
+        "weights of Preisach triangles behind the lag that fits best",
+        (PLAIN, RATE_DEPENDENT),
+        _by_nonnegative_least_squares,
+    ),
+    "subspace": Method(
+        "Hankel-Toeplitz regression with a prior (MAP); a record an input channel",
+        ("state_space",),
+        by_subspace,
+    ),
+    "frequency_response": Method(
+        "least squares on the transfer matrix of periodic records",
+        ("state_space",),
+        by_frequency_response,
+    ),
+    "steady_state": Method(
+        "Levenberg-Marquardt on the mean of the periods",
+        ("bouc_wen", "neural_state_space"),
+        _by_steady_state,
+    ),
+}
+"""Methods by name; for a model that several can fit the first one is the default."""
+
+
+def method_for(model: str, name: str | None) -> Method:
+    """Return the method ``name`` for ``model``, or the default for that model.
+
+    Raises ValueError, listing what there is, for a method that does not exist or cannot
+    fit the model.
+    """
+    able = [key for key, method in METHODS.items() if model in method.models]
+    able = able or [key for key, method in METHODS.items() if not method.models]
+    if name is None:
+        return METHODS[able[0]]
+    if name not in METHODS:
+        raise ValueError(f"method {name!r} is unknown; there are {', '.join(METHODS)}")
+    if name not in able:
+        raise ValueError(f"method {name!r} cannot fit {model!r}; {', '.join(able)} can")
+    return METHODS[name]

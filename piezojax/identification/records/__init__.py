@@ -1,0 +1,1 @@
+"""Records: file formats, units, checks, resampling."""

@@ -1,0 +1,218 @@
+"""Files that labs have, each read into columns of numbers by name.
+
+Libraries are imported where they are used: a record of one kind needs one of them.
+"""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+
+from .columns import Column, Columns, ContentError, decoded, parsed, table
+
+
+def read_columns(path: Path) -> Columns:
+    """Return the columns of the file ``path``, whose kind its suffix tells (FORMATS).
+
+    Scalars and text are no columns. A matrix ``u`` becomes ``u[0]``, ``u[1]``, ...,
+    with time along its longer side; a field of a structure ``s`` becomes ``s.field``.
+    Raises ValueError, in one line, for a file that is missing, of another kind or
+    broken, or whose kind needs a package that is missing.
+    """
+    kind = path.suffix.lower()
+    if kind not in FORMATS:
+        raise ValueError(
+            f"record {path}: its suffix {kind!r} is unknown; "
+            f"it must be one of {', '.join(FORMATS)}"
+        )
+    form = FORMATS[kind]
+    try:
+        with open(path, "rb") as file:
+            columns = form.read(file)
+        if not columns:
+            raise ContentError("there is no column of numbers in it")
+    except ContentError as error:
+        raise ValueError(f"{path.name}: {error}") from None
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"{path.name}: reading {kind} needs the package {error.name}: "
+            "pip install 'piezojax[lab]'"
+        ) from None
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno:
+            raise ValueError(f"record {path}: {error.strerror}") from None
+        # A library that is fed a broken file may raise anything.
+        raise ValueError(
+            f"record {path} cannot be read: it is no {form.content}"
+        ) from error
+    return columns
+
+
+def _delimited(file: BinaryIO) -> Columns:
+    return parsed(decoded(file.read()))
+
+
+def _npz(file: BinaryIO) -> Columns:
+    with np.load(file, allow_pickle=False) as archive:
+        return _merged(_spread(name, archive[name]) for name in archive.files)
+
+
+def _mat(file: BinaryIO) -> Columns:
+    from scipy.io import loadmat
+    from scipy.io.matlab import matfile_version
+
+    if matfile_version(file)[0] == 2:  # version 7.3: HDF5 behind a text header
+        return _hdf5(file, separator=".")
+    return _merged(
+        _spread(name, values)
+        for name, values in loadmat(file).items()
+        if not name.startswith("__")
+    )
+
+
+def _hdf5(file: BinaryIO, separator: str = "/") -> Columns:
+    import h5py
+
+    found = []
+
+    def visit(path, item):
+        # MATLAB keeps text and empty matrices as numbers, and its own tables under #.
+        said = item.attrs
+        text = "MATLAB_empty" in said or said.get("MATLAB_class") == b"char"
+        if isinstance(item, h5py.Dataset) and not text and not path.startswith("#"):
+            unit = _text(said.get("units", said.get("unit")))
+            found.append(_spread(path.replace("/", separator), item[()], unit))
+
+    with h5py.File(file, "r") as tree:
+        tree.visititems(visit)
+    return _merged(found)
+
+
+def _tdms(file: BinaryIO) -> Columns:
+    from nptdms import TdmsFile
+
+    content = TdmsFile.read(file)
+    if content.file_status.incomplete_final_segment:
+        raise ContentError("the file is cut short")
+    return _prefixed(
+        {
+            group.name: _merged(
+                _spread(
+                    channel.name,
+                    channel[:],
+                    _text(channel.properties.get("unit_string")),
+                    channel.properties.get("wf_increment") or None,
+                )
+                for channel in group.channels()
+            )
+            for group in content.groups()
+        }
+    )
+
+
+def _lvm(file: BinaryIO) -> Columns:
+    # Not `lvm_read.read`: that one leaves a pickle beside the file, and trusts it.
+    from lvm_read import read_str
+
+    content = read_str(decoded(file.read()))
+    first = 0 if content.get("X_Columns") == "No" else -1
+    return _prefixed(
+        {str(i): _segment(content[i], first=first) for i in range(content["Segments"])}
+    )
+
+
+def _segment(segment: dict[str, Any], first: int) -> Columns:
+    """Columns of an LVM segment; ``first``: where its header has the first of them."""
+    names = segment["Channel names"]
+    columns = {}
+    for j, (name, values) in enumerate(zip(names, segment["data"].T, strict=False)):
+        unit, dt = (
+            dict(enumerate(segment.get(key, ()), start=-first)).get(j)
+            for key in ("Y_Unit_Label", "Delta_X")
+        )
+        if names.count(name) > 1:  # each channel may have an X_Value of its own
+            name = f"{name}[{names[:j].count(name)}]"
+        if name != "Comment":
+            columns[name] = Column(values, unit or None, dt if dt and dt > 0 else None)
+    return columns
+
+
+def _xlsx(file: BinaryIO) -> Columns:
+    from openpyxl import load_workbook
+
+    book = load_workbook(file, read_only=True, data_only=True)
+    rows = book.worksheets[0].iter_rows(values_only=True)
+    return table(
+        [["" if cell is None else str(cell).strip() for cell in row] for row in rows]
+    )
+
+
+class _Format(NamedTuple):
+    content: str
+    read: Callable[[BinaryIO], Columns]
+
+
+_TEXT = _Format("text table", _delimited)
+_HDF5 = _Format("HDF5 file of plain arrays", _hdf5)
+
+FORMATS = {
+    ".csv": _TEXT,
+    ".txt": _TEXT,
+    ".dat": _TEXT,
+    ".npz": _Format("NPZ archive of plain arrays", _npz),
+    ".mat": _Format("MATLAB file of plain arrays", _mat),
+    ".h5": _HDF5,
+    ".hdf5": _HDF5,
+    ".tdms": _Format("TDMS file", _tdms),
+    ".lvm": _Format("LabVIEW measurement file", _lvm),
+    ".xlsx": _Format("Excel workbook", _xlsx),
+}
+"""How a file is read, by its suffix; a workbook is read from its first sheet."""
+
+
+def _spread(
+    name: str, values: Any, unit: str | None = None, dt: float | None = None
+) -> Columns:
+    """Return the columns in an array, a matrix, a structure or a cell array."""
+    values = np.asarray(values)
+    if values.dtype.names:
+        parts = {f"{name}.{field}": values[field] for field in values.dtype.names}
+    elif values.dtype.kind == "O":
+        arrays = [part for part in values.flat if isinstance(part, np.ndarray)]
+        parts = {name: arrays[0]} if len(arrays) == 1 else _numbered(name, arrays)
+    else:
+        values = values.squeeze()
+        if values.size < 2 or values.ndim > 2 or values.dtype.kind in "SU":
+            return {}
+        if values.ndim == 1:
+            return {name: Column(values, unit, dt)}
+        parts = _numbered(name, max(values, values.T, key=len).T)
+    return _merged(_spread(part, inner, unit, dt) for part, inner in parts.items())
+
+
+def _numbered(name: str, parts: Iterable[np.ndarray]) -> dict[str, np.ndarray]:
+    return {f"{name}[{i}]": part for i, part in enumerate(parts)}
+
+
+def _merged(parts: Iterable[Columns]) -> Columns:
+    return {name: column for part in parts for name, column in part.items()}
+
+
+def _prefixed(groups: dict[str, Columns]) -> Columns:
+    """Columns of several groups as ``group/name``; of a single one as they are."""
+    groups = {group: columns for group, columns in groups.items() if columns}
+    if len(groups) == 1:
+        return next(iter(groups.values()))
+    return {
+        f"{group}/{name}": column
+        for group, columns in groups.items()
+        for name, column in columns.items()
+    }
+
+
+def _text(value: Any) -> str | None:
+    """Return a file's property if it is text, in whatever way the library gives it."""
+    value = np.asarray(value).flat[0] if np.size(value) == 1 else None
+    value = value.decode(errors="replace") if isinstance(value, bytes) else value
+    return str(value) if isinstance(value, str) else None

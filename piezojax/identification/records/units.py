@@ -1,0 +1,40 @@
+"""Units of a file's columns, from the file or from the names of the columns."""
+
+import re
+
+from .columns import Column, ContentError
+
+# In brackets anything; after a blank or an underscore a unit proper: `drive_raw` is in
+# no "raw".
+_UNIT = re.compile(
+    r"[\[(]\s*([^\])]+?)\s*[\])]\s*$"
+    r"|[_\s]([fpnumk]?(?:V|A|m|N|g|s|rad|deg|Hz)|sec|min|h|d|arcsec|counts)$"
+)
+
+_SYMBOLS = {"Volts": "V", "Seconds": "s", "seconds": "s", "sec": "s"}
+
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+def unit_of(name: str, column: Column) -> str | None:
+    """Return the unit that the file holds, or that in ``drive_V`` or ``drive [V]``."""
+    unit = _ascii(column.unit or "").strip(" []()")
+    if not unit:
+        found = _UNIT.search(_ascii(re.sub(r"\[\d+\]$", "", name)))
+        unit = found[1] or found[2] if found else None
+    return _SYMBOLS.get(unit, unit) if unit else None
+
+
+def _ascii(text: str) -> str:
+    return re.sub("[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}]", "u", text)
+
+
+def seconds_of(name: str, column: Column) -> float:
+    """Return the unit of a time column, s. Raises ContentError for one unknown."""
+    unit = unit_of(name, column) or "s"
+    if unit not in _SECONDS:
+        raise ContentError(
+            f"time column {name!r} is in {unit!r}, an unknown unit; "
+            f"it must be one of {', '.join(_SECONDS)}"
+        )
+    return _SECONDS[unit]

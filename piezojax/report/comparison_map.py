@@ -1,0 +1,188 @@
+"""The table, the picture and the files of a comparison of tuned controllers."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+from rich.table import Table
+from rich.text import Text
+
+from ..core.files import write_text
+from ..tuning.comparison import COMPARISON_FILE, Comparison, Row
+from .figures import AFTER, BEFORE, MEASURED, figure, styled, write
+
+MARKERS = "osD^vPX*<>hp"
+COLOURS = (
+    "#1f6f8b",
+    "#c9753d",
+    "#5b8c3a",
+    "#8a4f9e",
+    "#b03a48",
+    "#7a6a2b",
+    "#3f5fa8",
+    "#4a4a4a",
+)
+_COLUMNS = 4
+
+
+def comparison_table(comparison: Comparison) -> Table:
+    """Return before beside tuned by controller and rate, in nm rms."""
+    table = Table(
+        title=Text(
+            f"{comparison.title}\nrms tracking error, nm: geometric mean over the "
+            "references, noise not tuned on\n(new: references not tuned on either; "
+            "* before: gains scaled from another rate)"
+        )
+    )
+    table.add_column("controller")
+    for title in ("kHz", "before", "tuned", "better", "new: before", "tuned", "better"):
+        table.add_column(title, justify="right")
+    for controller in dict.fromkeys(row.controller for row in comparison.rows):
+        for row in _of(comparison, controller):
+            wins = comparison.best.get(f"{row.rate_Hz:g}") == controller
+            table.add_row(
+                controller,
+                f"{row.rate_Hz / 1000:g}",
+                _shown(row.before_um) + ("*" if row.start == "scaled" else ""),
+                "failed" if row.status == "failed" else _shown(row.after_um),
+                _times(row.ratio),
+                _shown(row.unseen_before_um),
+                _shown(row.unseen_um),
+                _times(row.unseen_ratio),
+                style="bold" if wins else None,
+            )
+        table.add_section()
+        better = comparison.better[controller], comparison.unseen_better[controller]
+        table.add_row(
+            "geometric mean", "", "", "", _times(better[0]), "", "", _times(better[1])
+        )
+        table.add_section()
+    return table
+
+
+def write_comparison(comparison: Comparison, folder: Path) -> None:
+    """Write comparison.json and comparison.png into ``folder``."""
+    text = comparison.model_dump_json(indent=2)
+    write_text(folder / COMPARISON_FILE, text + "\n")
+    if any(row.after_um for row in comparison.rows):
+        with styled():
+            write(comparison_figure(comparison), folder / "comparison.png")
+
+
+def comparison_figure(comparison: Comparison) -> Figure:
+    """Error against sampling rate: before and tuned by controller, all tuned in one."""
+    controllers = list(comparison.better)
+    columns = min(_COLUMNS, len(controllers) + 1)
+    lines = math.ceil((len(controllers) + 1) / columns)
+    picture = figure(2.45 * columns + 0.5, 2.3 * lines + 0.7)
+    axes = picture.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
+    places = list(axes.flat)
+    lowest = _lowest(comparison)
+    for i, (controller, ax) in enumerate(zip(controllers, places, strict=False)):
+        _before_and_tuned(ax, _of(comparison, controller), lowest)
+        better = comparison.better[controller]
+        shown = f"{better:.3g}x better" if better else "no factor"
+        ax.set_title(f"({chr(97 + i)}) {controller}\n{shown}", fontsize=8.0)
+    every = places[len(controllers)]
+    for i, controller in enumerate(controllers):
+        rows = [row for row in _of(comparison, controller) if row.after_um]
+        every.plot(
+            *_line(rows, "after_um"),
+            color=COLOURS[i % len(COLOURS)],
+            marker=MARKERS[i % len(MARKERS)],
+            ms=3.5,
+            label=controller,
+        )
+    every.set_title(f"({chr(97 + len(controllers))}) all, tuned", fontsize=8.0)
+    for ax in places[len(controllers) + 1 :]:
+        ax.set_visible(False)
+    rates = sorted({row.rate_Hz for row in comparison.rows})
+    for ax in places:
+        ax.set(xscale="log", yscale="log")
+        ax.set_xticks([rate / 1000 for rate in rates])
+        ax.set_xticklabels([f"{rate / 1000:g}" for rate in rates])
+        ax.xaxis.set_minor_locator(NullLocator())
+    for ax in axes[-1]:
+        ax.set_xlabel("sampling rate (kHz)")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("rms error (nm)")
+    handles = _legend_of(axes)
+    picture.legend(
+        handles.values(),
+        handles.keys(),
+        loc="outside lower center",
+        ncols=columns,
+        fontsize=7.5,
+    )
+    return picture
+
+
+def _before_and_tuned(
+    ax: Axes, rows: Sequence[Row], lowest: dict[float, float]
+) -> None:
+    ax.plot(
+        [rate / 1000 for rate in lowest],
+        [1e3 * error for error in lowest.values()],
+        color=MEASURED,
+        ls=":",
+        label="lowest of all",
+    )
+    known = [row for row in rows if row.before_um]
+    ax.plot(*_line(known, "before_um"), color=BEFORE, lw=1.0)
+    for start, face, label in (
+        ("printed", BEFORE, "before, printed gains"),
+        ("scaled", "white", "before, scaled gains"),
+        ("rule", "#eed3bc", "before, by rule"),
+        ("own", BEFORE, "before"),
+    ):
+        some = [row for row in known if row.start == start]
+        if some:
+            ax.plot(
+                *_line(some, "before_um"),
+                color=BEFORE,
+                mfc=face,
+                marker="o",
+                ms=4.5,
+                ls="",
+                label=label,
+            )
+    tuned = [row for row in rows if row.after_um]
+    ax.plot(*_line(tuned, "after_um"), color=AFTER, marker="s", ms=4.0, label="tuned")
+
+
+def _line(rows: Sequence[Row], field: str) -> tuple[list[float], list[float]]:
+    rows = sorted(rows, key=lambda row: row.rate_Hz)
+    return [row.rate_Hz / 1000 for row in rows], [
+        1e3 * getattr(row, field) for row in rows
+    ]
+
+
+def _legend_of(axes) -> dict:
+    found: dict = {}
+    for ax in axes.flat:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    return found
+
+
+def _lowest(comparison: Comparison) -> dict[float, float]:
+    found: dict[float, float] = {}
+    for row in sorted(comparison.rows, key=lambda row: row.rate_Hz):
+        if row.after_um:
+            found[row.rate_Hz] = min(row.after_um, found.get(row.rate_Hz, math.inf))
+    return found
+
+
+def _of(comparison: Comparison, controller: str) -> list[Row]:
+    return [row for row in comparison.rows if row.controller == controller]
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{1e3 * value:.1f}"
+
+
+def _times(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}x"

@@ -1,0 +1,98 @@
+"""The picture of what each axis does to the others, before and after tuning."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from ..study import Study
+from ..tuning.coupling import Coupling, coupling_matrix
+from ..tuning.result import Result, Scores
+from .figures import UNITS, figure, headed
+
+_LEAST = 1e-6  # %; a smaller share has no colour of its own
+
+
+def coupling_figure(study: Study, result: Result) -> Figure | None:
+    """Heat maps of the errors on the hold-out while one axis alone is driven.
+
+    None if there is nothing to show: one axis, or none driven alone.
+    """
+    if study.axes is None:
+        return None
+    before, after = (
+        coupling_matrix(study, _errors(*scores))
+        for scores in (
+            (result.holdout_before, result.unseen_before, result.coupling_before),
+            (result.holdout, result.unseen, result.coupling),
+        )
+    )
+    shares = np.stack([before.percent, after.percent])
+    shown = shares[np.isfinite(shares)]
+    if not shown.size:
+        return None
+    limits = np.maximum([shown.min(), shown.max()], _LEAST)
+    norm = LogNorm(limits[0], max(limits[1], 1.001 * limits[0]))
+    picture = figure(10.0, 1.1 + 0.95 * len(before.names))
+    panels = picture.subplots(1, 2)
+    images = [
+        _map(ax, found, norm, title)
+        for ax, found, title in zip(
+            panels, (before, after), ("before", "tuned"), strict=True
+        )
+    ]
+    picture.colorbar(
+        images[-1],
+        ax=panels,
+        label="rms error, % of the driven amplitude\n"
+        "(of unlike units: µm per 100 µrad, µrad per 100 µm)",
+    )
+    headed(picture, f"{result.title}: rms errors with one axis driven, hold-out")
+    return picture
+
+
+def _errors(*parts: Scores | None) -> dict[str, float | None]:
+    found: dict[str, float | None] = {}
+    for part in parts:
+        found |= part.per_reference_rms_um if part else {}
+    return found
+
+
+def _map(ax: Axes, found: Coupling, norm: LogNorm, title: str) -> AxesImage:
+    shares = np.clip(found.percent, norm.vmin, norm.vmax)
+    image = ax.imshow(shares, norm=norm, cmap="YlGnBu", aspect="auto")
+    places = range(len(found.names))
+    driven = [
+        f"{name}\n{amplitude:g} {UNITS[unit][0]}"
+        for name, amplitude, unit in zip(
+            found.names, found.amplitudes, found.units, strict=True
+        )
+    ]
+    ax.set(xlabel="axis measured", ylabel="axis driven, amplitude", title=title)
+    ax.set_xticks(places, found.names)
+    ax.set_yticks(places, driven)
+    ax.grid(visible=False)
+    for row in places:
+        for column in places:
+            dark = np.isfinite(shares[row, column]) and norm(shares[row, column]) > 0.6
+            ax.text(
+                column,
+                row,
+                _written(found, row, column),
+                ha="center",
+                va="center",
+                color="white" if dark else "black",
+            )
+    return image
+
+
+def _written(found: Coupling, row: int, column: int) -> str:
+    share, error = found.percent[row, column], found.errors[row, column]
+    if not np.isfinite(error):
+        return "-"
+    driven, (large, small) = UNITS[found.units[row]][0], UNITS[found.units[column]]
+    alike = found.units[row] == found.units[column]
+    ratio = f"{share:.3g} %" if alike else f"{10.0 * share:.3g} {small}/{driven}"
+    amount = f"{error:.3g} {large}" if error >= 1.0 else f"{1e3 * error:.3g} {small}"
+    return f"{ratio}\n{amount}"

@@ -1,0 +1,159 @@
+"""Pictures and files of a fit."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..core.files import write_text
+from ..core.serial import save
+from ..identification.estimators.estimate import LinearDetail
+from ..identification.fit import Fit
+from ..identification.records.record import Record
+from .figures import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    figure,
+    headed,
+    legend_above,
+    styled,
+    write,
+)
+from .frequency_response import response_figure, singular_values_figure
+
+SHOWN = 400
+"""Samples of an output drawn over time where there are several outputs."""
+
+MODEL_FILE, FIT_FILE, PICTURE_FILE = "model.json", "fit.json", "fit.png"
+
+
+def write_fit(fit: Fit, folder: Path) -> None:
+    """Write model.json, fit.json and the pictures into ``folder``."""
+    write_model(fit, folder)
+    with styled():
+        single = fit.simulations[0].shape[1] == 1
+        picture = fit_figure(fit) if single else outputs_figure(fit)
+        write(picture, folder / PICTURE_FILE)
+        if fit.linear is not None:
+            _write_linear(fit.linear, fit.record, folder)
+
+
+def write_model(fit: Fit, folder: Path) -> None:
+    """Write model.json and fit.json into ``folder``."""
+    save(fit.system, folder / MODEL_FILE)
+    text = fit.report.model_dump_json(indent=2, by_alias=True)
+    write_text(folder / FIT_FILE, text + "\n")
+
+
+def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> None:
+    for number, (title, values) in enumerate(linear.singular_values.items()):
+        picture = singular_values_figure(values, linear.order, title)
+        write(picture, folder / f"singular_values_{number}.png")
+    if linear.measured is not None:
+        names = [
+            [f"{side} {i}" for i in range(count)]
+            for side, count in (
+                ("input", record.inputs.shape[1]),
+                ("output", record.outputs.shape[1]),
+            )
+        ]
+        unit = f"{record.output_unit}/{record.input_unit}"
+        picture = response_figure(
+            linear.measured, linear.model, names[0], names[1], unit
+        )
+        write(picture, folder / "response.png")
+
+
+def outputs_figure(fit: Fit) -> Figure:
+    """Every output of the first record: the end of it, and the residual's spectrum."""
+    record, run, part = fit.record, fit.simulations[0], fit.validate
+    error = run - record.outputs
+    shown = slice(max(part.start, part.stop - SHOWN), part.stop)
+    picture = figure(9.0, 2.4 * run.shape[1] + 0.8)
+    panels = picture.subplots(run.shape[1], 2, squeeze=False)
+    for i, (course, spectrum) in enumerate(panels):
+        unit = shown_unit(record.output_units[i])
+        time = record.time[shown]
+        course.plot(time, record.outputs[shown, i], color=MEASURED, label="measured")
+        course.plot(time, run[shown, i], color=AFTER, lw=0.9, label="simulated")
+        course.set(ylabel=f"output {i} ({unit})")
+        course.locator_params(axis="x", nbins=5)
+        frequency = np.fft.rfftfreq(error[part].shape[0], record.dt)[1:]
+        for signal, colour, label in (
+            (record.outputs[part, i], MEASURED, "measured"),
+            (error[part, i], BEFORE, "residual"),
+        ):
+            size = np.abs(np.fft.rfft(signal - signal.mean()))[1:] * 2.0 / signal.size
+            spectrum.loglog(frequency, size, color=colour, lw=0.7, label=label)
+        rmse = fit.report.validation.each[i]
+        spectrum.set(
+            ylabel=f"amplitude ({unit})",
+            title=f"validation residual {rmse:.3g} {unit} rms",
+        )
+        if i == 0:
+            course.legend()
+            spectrum.legend()
+    panels[-1, 0].set(xlabel="time (s)")
+    panels[-1, 1].set(xlabel="frequency (Hz)")
+    headed(picture, f"{fit.report.model} fitted to {record.source}")
+    return picture
+
+
+def loop_panel(ax: Axes, fit: Fit, label: str) -> None:
+    """Output against input over the validation part, the model under ``label``."""
+    record, part = fit.record, fit.validate
+    ax.plot(
+        record.input[part],
+        record.output[part],
+        ".",
+        ms=2,
+        color=MEASURED,
+        label="measured",
+    )
+    ax.plot(record.input[part], fit.simulated[part], color=AFTER, label=label)
+    ax.set(
+        xlabel=f"input ({record.input_unit})",
+        ylabel=f"output ({shown_unit(record.output_unit)})",
+        title="Hysteresis loop, validation part",
+    )
+    ax.legend()
+
+
+def fit_figure(fit: Fit) -> Figure:
+    """Loop, time course and residual with its spectrum."""
+    record, report = fit.record, fit.report
+    time, error = record.time, fit.simulated - record.output
+    unit = shown_unit(record.output_unit)
+    picture = figure(9.0, 5.6)
+    (loop, course), (residual, spectrum) = picture.subplots(2, 2)
+    part = fit.validate
+    loop_panel(loop, fit, "simulated")
+    course.plot(time, record.output, color=MEASURED, label="measured")
+    course.plot(time, fit.simulated, color=AFTER, lw=0.9, label="free-run simulation")
+    course.set(xlabel="time (s)", ylabel=f"output ({unit})", title="Whole record\n")
+    legend_above(course)
+    residual.plot(time, error, color=BEFORE, lw=0.7)
+    residual.axvspan(time[part.start], time[part.stop - 1], color="#eef4f6", zorder=0)
+    residual.set(
+        xlabel="time (s)",
+        ylabel=f"residual ({unit})",
+        title=f"Residual, {unit} rms: {report.train.rmse:.3g} training, "
+        f"{report.validation.rmse:.3g} validation",
+    )
+    density = np.abs(np.fft.rfft(error[part])) * 2.0 / error[part].size
+    frequency = np.fft.rfftfreq(error[part].size, record.dt)
+    spectrum.loglog(frequency[1:], density[1:], color=BEFORE, lw=0.7)
+    spectrum.set(
+        xlabel="frequency (Hz)",
+        ylabel=f"amplitude ({unit})",
+        title="Spectrum of the validation residual",
+    )
+    headed(picture, f"{report.model} fitted to {record.source}")
+    return picture
+
+
+def shown_unit(unit: str) -> str:
+    """Return ``unit`` as it is written in a picture."""
+    return unit.replace("um", "µm") if unit in ("um", "um/s") else unit

@@ -1,0 +1,96 @@
+"""Pictures of state-space identification: the order, and the transfer matrix."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..dynamics import StateSpace
+from ..identification.estimators.frequency import EmpiricalResponse
+from .figures import AFTER, BEFORE, MEASURED, figure
+
+CONFIDENCE = 1.96
+"""Deviations on either side that hold 95 % of normal errors."""
+
+SHOWN = 60
+"""Most singular values drawn."""
+
+
+def singular_values_figure(
+    values: Sequence[float] | np.ndarray, order: int, title: str = ""
+) -> Figure:
+    """Singular values over their largest, on a log scale, ``order`` marked."""
+    shares = np.asarray(values)[: max(SHOWN, order + 5)] / np.max(values)
+    number = np.arange(1, len(shares) + 1)
+    picture = figure(5.6, 3.4)
+    ax = picture.subplots()
+    kept = number <= order
+    ax.semilogy(number[kept], shares[kept], "o", ms=4, color=AFTER, label="kept")
+    ax.semilogy(number[~kept], shares[~kept], "o", ms=4, color=MEASURED, label="left")
+    ax.axvline(order + 0.5, color=BEFORE, lw=1.0)
+    ax.annotate(
+        f"order {order}",
+        (order + 0.5, 1.0),
+        xytext=(4, -2),
+        textcoords="offset points",
+        color=BEFORE,
+        va="top",
+    )
+    ax.set(xlabel="number", ylabel="singular value / largest", title=title)
+    ax.legend()
+    return picture
+
+
+def response_figure(
+    measured: EmpiricalResponse,
+    model: StateSpace,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    unit: str = "um/V",
+) -> Figure:
+    """Bode plot, a column an input: measured with its 95 % band, and the model."""
+    fitted = np.asarray(model.frequency_response(measured.frequency))
+    spread = CONFIDENCE * np.sqrt(0.5 * measured.variance)
+    picture = figure(3.4 * len(inputs) + 0.6, 3.0 * len(outputs))
+    panels = picture.subplots(
+        2 * len(outputs),
+        len(inputs),
+        sharex=True,
+        sharey="row",
+        squeeze=False,
+        height_ratios=(2, 1) * len(outputs),
+    )
+    unit = unit.replace("um", "µm")
+    for i, output in enumerate(outputs):
+        for j, name in enumerate(inputs):
+            magnitude, phase = panels[2 * i, j], panels[2 * i + 1, j]
+            size = np.abs(measured.response[:, i, j])
+            band = spread[:, i, j]
+            magnitude.fill_between(
+                measured.frequency,
+                np.maximum(size - band, 0.3 * size),
+                size + band,
+                color=MEASURED,
+                alpha=0.35,
+                lw=0.0,
+                label="measured, 95 %",
+            )
+            magnitude.semilogy(measured.frequency, size, color=MEASURED, lw=0.8)
+            magnitude.semilogy(
+                measured.frequency,
+                np.abs(fitted[:, i, j]),
+                color=AFTER,
+                lw=0.9,
+                label="model",
+            )
+            magnitude.set(title=f"{name} to {output}")
+            for response, colour in ((measured.response, MEASURED), (fitted, AFTER)):
+                angle = np.degrees(np.angle(response[:, i, j]))
+                phase.plot(measured.frequency, angle, ".", ms=0.8, color=colour)
+            phase.set(ylim=(-190, 190), yticks=(-180, 0, 180))
+        panels[2 * i, 0].set(ylabel=f"gain ({unit})")
+        panels[2 * i + 1, 0].set(ylabel="phase (°)")
+    for ax in panels[-1]:
+        ax.set(xlabel="frequency (Hz)")
+    panels[0, 0].legend(fontsize=7.0)
+    return picture

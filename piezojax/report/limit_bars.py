@@ -1,0 +1,147 @@
+"""The limit of linear control as file, picture and words."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..analysis.limit import NEAR, LimitReport, performance_limit
+from ..core.files import write_text
+from ..tuning.tuner import Outcome
+from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, headed, styled, write
+
+LIMIT_FILE, LIMIT_PICTURE = "limit.json", "limit.png"
+
+CAUSES: dict[str | None, str] = {
+    "noise": "lets through more sensor noise than it has to",
+    "unforeseen": "cancels too little of what the reference does not foretell",
+    "foreseen": "leaves what a linear filter of the reference would cancel",
+    None: "is too far from linear to say why",
+}
+"""What a loop does where a share of its error exceeds the limit's."""
+
+
+def limit_of(outcome: Outcome) -> LimitReport | str:
+    """Return the limit for the tuned loop on its held-out noise, or why there is none.
+
+    The references are those it was tuned on.
+    """
+    study = outcome.case.study
+    if study.axes is not None:
+        return "the limit is known for one axis only"
+    names, signals = study.references.tune, outcome.holdout
+    moved = signals.disturbance
+    try:
+        return performance_limit(
+            outcome.after,
+            names,
+            signals.references[: len(names)],
+            signals.noise[: len(names)],
+            None if moved is None else moved[: len(names)],
+            start=round(study.references.settle * study.rate),
+            dt=study.dt,
+        )
+    # Whatever goes wrong here, the gains that were found stay worth having.
+    except Exception as error:
+        return str(error).partition("\n")[0] or type(error).__name__
+
+
+def write_limit(found: LimitReport | str, folder: Path, title: str = "") -> None:
+    """Write limit.json, and limit.png if there is a limit, into ``folder``."""
+    content = {"problem": found} if isinstance(found, str) else found.as_dict()
+    text = json.dumps(content, indent=2, allow_nan=False)
+    write_text(folder / LIMIT_FILE, text + "\n")
+    if not isinstance(found, str):
+        with styled():
+            write(limit_figure(found, title), folder / LIMIT_PICTURE)
+
+
+def limit_text(found: LimitReport | str) -> str:
+    """Return a few lines: how near, and where not, what exceeds the limit."""
+    if isinstance(found, str):
+        return f"note: no limit of linear control: {found}"
+    count = len(found.references)
+    lines = [
+        "limit of linear control with full preview (resolved to "
+        f"{found.resolution:.3g} Hz): tuned is {found.over:.2f}x that, {found.near} of "
+        f"{count} references within {NEAR:g}x; it is {found.over_one_controller:.2f}x "
+        "what one such controller for all of them leaves, "
+        f"{found.near_one_controller} of {count}"
+    ]
+    by_cause: dict[str | None, list[str]] = {}
+    below = []
+    for name, one in found.references.items():
+        if one.over < 1.0:
+            below.append(f"{name} {one.over:.2f}x")
+        elif one.over > NEAR:
+            by_cause.setdefault(one.exceeding, []).append(f"{name} {one.over:.2f}x")
+    lines += [
+        f"note: on {', '.join(names)} the loop {CAUSES[cause]}"
+        for cause, names in by_cause.items()
+    ]
+    if below:
+        lines.append(
+            f"note: {', '.join(below)}: below the limit, as a controller may be that "
+            "is not linear or knows more of the stage"
+        )
+    return "\n".join(lines)
+
+
+def limit_figure(found: LimitReport, title: str = "") -> Figure:
+    """Errors by reference beside their limits, and where in frequency they arise."""
+    picture = figure(9.0, 3.8)
+    left, right = picture.subplots(1, 2, width_ratios=(1.0, 1.1))
+    _errors(left, found)
+    _spectra(right, found)
+    if title:
+        headed(picture, title)
+    return picture
+
+
+def _errors(ax: Axes, found: LimitReport) -> None:
+    names = list(found.references)
+    rows = np.arange(len(names))[::-1]
+    for key, colour, marker, label in (
+        ("limit", REFERENCE, "|", "limit, a linear controller for each"),
+        ("one_controller", BEFORE, "d", "best linear controller for all"),
+        ("tuned", AFTER, "o", "tuned"),
+    ):
+        values = [1e3 * getattr(found.references[name], key) for name in names]
+        ax.plot(values, rows, marker, color=colour, label=label, ms=6.0, mew=1.6)
+    limits = np.array([1e3 * found.references[name].limit for name in names])
+    ax.hlines(rows, limits, NEAR * limits, color=MEASURED, lw=0.8)
+    ax.set(
+        xlabel=f"rms error (nm); lines end {NEAR:g} times above the limit",
+        yticks=rows,
+        yticklabels=names,
+        ylim=(-0.6, len(names) + 1.4),  # room for the legend
+        xlim=(0.0, None),
+    )
+    ax.legend(loc="upper left", fontsize=7.5)
+
+
+def _spectra(ax: Axes, found: LimitReport) -> None:
+    """Draw the spectra of the reference that is furthest above its limit."""
+    names = list(found.references)
+    worst = max(names, key=lambda name: found.references[name].over)
+    i, curves = names.index(worst), found.curves
+    density = 2e6 * found.dt  # um^2 over the circle to nm^2/Hz, one-sided
+    for values, colour, width, label in (
+        (curves.unforeseen[i], MEASURED, 0.9, "disturbance, not foretold"),
+        (np.full_like(curves.frequency, curves.noise), BEFORE, 0.9, "sensor noise"),
+        (curves.limit[i], REFERENCE, 1.2, "error at the limit"),
+        (curves.tuned[i], AFTER, 1.2, "error, tuned"),
+    ):
+        root = np.sqrt(density * values)
+        ax.loglog(curves.frequency, root, color=colour, lw=width, label=label)
+    top = np.sqrt(density * np.max(curves.unforeseen[i]))
+    ax.set(
+        xlim=(found.resolution / 2.0, None),
+        ylim=(1e-5 * top, 30.0 * top),
+        xlabel="frequency (Hz)",
+        ylabel="amplitude density (nm/√Hz)",
+        title=f"{worst}, {found.references[worst].over:.2f} times its limit",
+    )
+    ax.legend(loc="upper right", fontsize=7.5)

@@ -1,0 +1,188 @@
+"""What ``identify --model all`` leaves: files, a picture, a table."""
+
+import csv
+import io
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from ..core.files import write_text
+from ..identification.fit import Fit
+from ..identification.ranking import Comparison, ComparisonReport, Row
+from .figures import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    REFERENCE,
+    figure,
+    headed,
+    styled,
+    ticks_in_full,
+    write,
+)
+from .fit_pictures import loop_panel, shown_unit, write_fit, write_model
+
+COMPARISON_FILE, TABLE_FILE = "comparison.json", "comparison.csv"
+COMPARISON_PICTURE = "comparison.png"
+
+SHOWN = 3
+"""Models whose residuals are drawn."""
+
+SHADES = (AFTER, BEFORE, REFERENCE)
+
+
+def write_comparison(comparison: Comparison, folder: Path) -> None:
+    """Write the comparison, the best fit as a single one, the others under models/."""
+    report = comparison.report
+    for row in report.rows:
+        if row.folder is None or row.model == report.best:
+            continue
+        place = folder / row.folder
+        place.mkdir(parents=True)
+        write_model(comparison.fits[row.model], place)
+    write_text(folder / COMPARISON_FILE, report.model_dump_json(indent=2) + "\n")
+    write_text(folder / TABLE_FILE, _csv(report))
+    with styled():
+        write(comparison_figure(comparison), folder / COMPARISON_PICTURE)
+    write_fit(comparison.best, folder)
+
+
+def _csv(report: ComparisonReport) -> str:
+    text = io.StringIO()
+    rows = [row.model_dump() for row in report.rows]
+    for row in rows:
+        row["warnings"] = " | ".join(row["warnings"])
+    writer = csv.DictWriter(text, list(Row.model_fields), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _broken(model: str) -> str:
+    """Return ``model`` on two lines, so that it fits a narrow column."""
+    return model.replace("+", "\n+", 1)
+
+
+def comparison_table(report: ComparisonReport) -> Table:
+    """Return the fitted models, best first, and those that failed."""
+    table = Table(title=f"free-run rms error on the validation part, {report.unit}")
+    table.add_column("model", no_wrap=True)
+    for title in ("error  ", "para-\nmeters", "BIC", "time,\ns", "notes"):
+        table.add_column(title, justify="right", no_wrap=True)
+    least = min(row.bic for row in report.rows if row.bic is not None)
+    for row in report.rows:
+        if row.status == "not tried":
+            continue
+        if row.bic is None or row.validation_rmse is None:
+            table.add_row(_broken(row.model), "failed", "-", "-", f"{row.wall_s:.1f}")
+            continue
+        table.add_row(
+            _broken(row.model),
+            f"{row.validation_rmse:.3g} {' ' if row.as_good else '*'}",
+            str(row.parameters),
+            f"+{row.bic - least:.0f}",
+            f"{row.wall_s:.1f}",
+            str(len(row.warnings)),
+            style="bold" if row.model == report.best else None,
+        )
+    table.caption = (
+        "BIC above the lowest; * validates worse than the best, beyond chance"
+    )
+    return table
+
+
+def comparison_notes(report: ComparisonReport) -> list[str]:
+    """Return what must be said beside the table, a line each."""
+    found = [f"{row.model} failed: {row.note}" for row in _with(report, "failed")]
+    for reason, rows in groupby(_with(report, "not tried"), key=lambda row: row.note):
+        found.append(f"not tried: {', '.join(row.model for row in rows)}: {reason}")
+    found += [
+        f"{row.model} is {row.note}" for row in _with(report, "fitted") if row.note
+    ]
+    share = sum(report.effective_samples) / len(report.effective_samples)
+    found.append(
+        f"{report.samples} training samples count as {share:.0f} in BIC: errors of a "
+        "free run are correlated"
+    )
+    if report.interrupted:
+        found.append("interrupted: the best of those that were fitted by then")
+    found.append(f"best: {report.best} ({report.rule})")
+    if report.test is None:
+        found.append(
+            "the choice has seen the validation part: its error there is no hold-out "
+            "figure; --test START:STOP keeps samples for one"
+        )
+    else:
+        found.append(
+            f"its error on the test part, which neither fits nor choice have seen: "
+            f"{report.test.rmse:.4g} {report.test.unit}, "
+            f"{report.test.rmse_percent_of_span:.2f} % of span"
+        )
+    return found
+
+
+def _with(report: ComparisonReport, status: str) -> list[Row]:
+    return [row for row in report.rows if row.status == status]
+
+
+def comparison_figure(comparison: Comparison) -> Figure:
+    """Validation error by model with its parameters; loop and residuals of the best."""
+    report = comparison.report
+    picture = figure(10.0, max(4.5, 0.9 + 0.36 * len(comparison.fits)))
+    grid = picture.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
+    _errors_panel(picture.add_subplot(grid[:, 0]), report)
+    best = list(comparison.fits.values())[:SHOWN]
+    record, outputs = best[0].record, best[0].simulations[0].shape[1]
+    single = (record.inputs.shape[1], outputs) == (1, 1)
+    if single:
+        loop_panel(picture.add_subplot(grid[0, 1]), best[0], "chosen")
+    _residual_panel(picture.add_subplot(grid[1 if single else slice(None), 1]), best)
+    headed(picture, f"Models fitted to {record.source}")
+    return picture
+
+
+def _errors_panel(ax: Axes, report: ComparisonReport) -> None:
+    rows = [row for row in report.rows if row.validation_rmse is not None]
+    rows.sort(key=lambda row: row.validation_rmse or 0.0, reverse=True)
+    errors = np.array([row.validation_rmse for row in rows], dtype=float)
+    for place, row in enumerate(rows):
+        chosen = row.model == report.best
+        colour = AFTER if chosen else MEASURED
+        ax.plot(errors[place], place, "o", color=colour, ms=7 if chosen else 5)
+        ax.annotate(
+            f"{row.parameters}",
+            (errors[place], place),
+            xytext=(7, 0),
+            textcoords="offset points",
+            va="center",
+            color=colour,
+            fontweight="bold" if chosen else "normal",
+        )
+    ax.set_yticks(range(len(rows)), [_broken(row.model) for row in rows], fontsize=7)
+    ax.set_ylim(-0.7, len(rows) - 0.3)
+    ax.margins(x=0.12)
+    if errors.max() > 5.0 * errors.min():
+        ax.set_xscale("log")
+        ticks_in_full(ax.xaxis)
+    ax.set(
+        xlabel=f"validation error ({shown_unit(report.unit)} rms)",
+        title="Error and number of parameters; chosen in blue",
+    )
+
+
+def _residual_panel(ax: Axes, fits: list[Fit]) -> None:
+    part = fits[0].validate
+    time = fits[0].record.time[part]
+    for fit, colour in reversed(list(zip(fits, SHADES, strict=False))):
+        label = f"{fit.report.model}: {fit.report.validation.rmse:.3g}"
+        ax.plot(time, fit.errors(part)[0][:, 0], color=colour, lw=0.7, label=label)
+    ax.set(
+        xlabel="time (s)",
+        ylabel=f"residual ({shown_unit(fits[0].record.output_unit)})",
+        title="Residuals of the best, validation part",
+    )
+    ax.legend(fontsize=6, loc="upper left", bbox_to_anchor=(0.0, -0.25))

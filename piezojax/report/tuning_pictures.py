@@ -1,0 +1,253 @@
+"""Pictures and files of a tuning run."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..core.axes import axis_of
+from ..core.files import write_text
+from ..core.rollout import simulate
+from ..core.serial import save
+from ..core.system import LoopSample, loop_inputs
+from ..signals.waveforms import parse
+from ..study import Study
+from ..tuning.result import GAINS_FILE, RESULT_FILE
+from ..tuning.traces import Trace, traces_of
+from ..tuning.tuner import Outcome
+from .contour_path import contour_figure, contours_in
+from .coupling_map import coupling_figure
+from .figures import (
+    AFTER,
+    BEFORE,
+    REFERENCE,
+    UNITS,
+    figure,
+    headed,
+    legend_above,
+    styled,
+    write,
+)
+from .robustness import front_figure, perturbed_figure
+
+_SHOWN = 3  # references in the tracking picture
+_BEYOND = 1e9  # um or V
+_PERIODS = 4.0  # of the reference, at the end of the run
+
+
+def write_results(outcome: Outcome, folder: Path) -> None:
+    """Write result.json, gains.toml and the pictures into ``folder``.
+
+    On a stage with several axes that of their coupling, and of the contours if there
+    are any, too.
+    """
+    write_numbers(outcome, folder)
+    study, result = outcome.case.study, outcome.result
+    shown = _shown(outcome)
+    chosen = {trace.run for trace in shown} | {c.run for c in contours_in(study)}
+    runs = _runs(outcome, chosen)
+    logs = {trace: _of_axis(study, trace, runs[trace.run]) for trace in shown}
+    with styled():
+        pictures = {
+            "tracking": tracking_figure(outcome, logs),
+            "hysteresis": hysteresis_figure(outcome, logs),
+            "convergence": convergence_figure(outcome) if result.history else None,
+            "coupling": coupling_figure(study, result),
+            "contour": contour_figure(study, result.title, runs),
+            "robustness": perturbed_figure(result.perturbed, result.title),
+            "pareto": front_figure(
+                result.front,
+                study.pareto.constraint if study.pareto else None,
+                result.title,
+            ),
+        }
+        for name, picture in pictures.items():
+            if picture:
+                write(picture, folder / f"{name}.png")
+
+
+def write_numbers(outcome: Outcome, folder: Path) -> None:
+    """Write result.json and gains.toml into ``folder``."""
+    write_text(folder / RESULT_FILE, outcome.result.model_dump_json(indent=2) + "\n")
+    save(outcome.controller, folder / GAINS_FILE)
+
+
+Both = tuple[LoopSample, LoopSample]
+"""What the loop logs before and after tuning."""
+
+Logs = dict[Trace, Both]
+
+
+def _moved(trace: Trace) -> str:
+    return "rotation" if trace.unit == "urad" else "displacement"
+
+
+def _runs(outcome: Outcome, chosen: set[int]) -> dict[int, Both]:
+    """Run both loops over the chosen references, as in the hold-out."""
+
+    signals = outcome.holdout
+
+    @jax.jit
+    def run(loop, index):
+        reference, noise = signals.references[index], signals.noise[index, 0]
+        moved = signals.disturbance
+        inputs = loop_inputs(
+            reference, noise, None if moved is None else moved[index, 0]
+        )
+        return simulate(loop, inputs, loop.init(reference[0]))[1]
+
+    runs = {}
+    for index in sorted(chosen):
+        before, after = (run(loop, index) for loop in (outcome.before, outcome.after))
+        runs[index] = jax.tree.map(_drawable, (before, after))
+    return runs
+
+
+def _of_axis(study: Study, trace: Trace, both: Both) -> Both:
+    if not study.axes:
+        return both
+    before, after = (axis_of(log, trace.axis) for log in both)
+    return before, after
+
+
+def _drawable(values: jax.Array) -> np.ndarray:
+    # A run that diverges ends at the edge of the picture, not in an overflow.
+    array = np.asarray(values)
+    return np.where(np.abs(array) < _BEYOND, array, np.nan)
+
+
+def _shown(outcome: Outcome) -> list[Trace]:
+    """Pick, of each kind of signal on each axis, the one that was hardest before."""
+    errors = outcome.result.before.per_reference_rms_um
+    study = outcome.case.study
+    by_kind: dict[tuple[int, str], Trace] = {}
+    for trace in traces_of(study):
+        if trace.name not in errors:
+            continue
+        place = trace.axis, parse(_signal_of(study, trace))[0]
+        current = by_kind.get(place)
+        error = errors[trace.name] or np.inf
+        if current is None or error > (errors[current.name] or np.inf):
+            by_kind[place] = trace
+    # With several axes one of each comes before a second of the first.
+    first = {trace.axis: trace for trace in reversed(by_kind.values())}
+    rest = [trace for trace in by_kind.values() if trace not in first.values()]
+    return [*(first[axis] for axis in sorted(first)), *rest][:_SHOWN]
+
+
+def _signal_of(study: Study, trace: Trace) -> str:
+    """Return the name of the signal that drives a trace."""
+    run = (*study.references.tune, *study.references.unseen)[trace.run]
+    axis = study.axes.names[trace.axis] if study.axes else ""
+    return study.driven(run)[axis]
+
+
+def _window(study: Study, trace: Trace) -> float:
+    table = study.references
+    frequency = parse(_signal_of(study, trace))[1] or 1.0
+    return max(table.settle, table.duration - _PERIODS / frequency)
+
+
+def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
+    """Displacement and error against time, before and after."""
+    study = outcome.case.study
+    table, dt = study.references, study.dt
+    picture = figure(9.0, 2.3 * len(logs) + 0.4)
+    axes = picture.subplots(len(logs), 2, squeeze=False)
+    for (trace, (before, after)), (left, right) in zip(logs.items(), axes, strict=True):
+        unit, small = UNITS[trace.unit]
+        time = np.arange(before.reference.size) * dt
+        shown = time >= _window(study, trace)
+        for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
+            error = 1e3 * (log.displacement - log.reference)
+            rms = np.sqrt(np.mean(error[time >= table.settle] ** 2))
+            left.plot(time[shown], log.displacement[shown], color=colour, label=label)
+            right.plot(
+                time[shown],
+                error[shown],
+                color=colour,
+                lw=0.9,
+                label=f"{label}, {rms:.4g} {small} rms" if np.isfinite(rms) else label,
+            )
+        left.plot(
+            time[shown],
+            before.reference[shown],
+            color=REFERENCE,
+            ls="--",
+            lw=0.9,
+            label="reference",
+        )
+        left.set(ylabel=f"{trace.name}\n{_moved(trace)} ({unit})")
+        right.set(ylabel=f"tracking error ({small})")
+        legend_above(left)
+        legend_above(right)
+    for ax in axes[-1]:
+        ax.set_xlabel("time (s)")
+    headed(picture, f"{outcome.result.title}: hold-out runs")
+    return picture
+
+
+def hysteresis_figure(outcome: Outcome, logs: Logs) -> Figure:
+    """The stage's own loop, and what control leaves of it."""
+    table, dt = outcome.case.study.references, outcome.case.study.dt
+    trace = next(iter(logs))
+    name, (before, after) = trace.name, logs[trace]
+    unit, small = UNITS[trace.unit]
+    drive = "command" if outcome.case.study.axes else "voltage"
+    drive_unit = unit if outcome.case.study.axes else "V"
+    settled = np.arange(before.reference.size) * dt >= table.settle
+    picture = figure(9.0, 3.4)
+    left, right = picture.subplots(1, 2)
+    left.plot(after.voltage[settled], after.displacement[settled], color=AFTER)
+    left.set(
+        xlabel=f"{drive} ({drive_unit})",
+        ylabel=f"{_moved(trace)} ({unit})",
+        title=f"{name}: the stage's hysteresis, in the tuned loop",
+    )
+    for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
+        error = 1e3 * (log.displacement - log.reference)
+        right.plot(
+            log.reference[settled], error[settled], color=colour, lw=0.9, label=label
+        )
+    right.set(
+        xlabel=f"reference ({unit})",
+        ylabel=f"{_moved(trace)} less reference ({small})",
+        title=f"{name}: what is left in closed loop\n",
+    )
+    legend_above(right)
+    return picture
+
+
+def convergence_figure(outcome: Outcome) -> Figure:
+    """Objective of each start against steps, the best one drawn strong."""
+    history = np.array(outcome.result.history, dtype=float)
+    geometric = outcome.case.study.objective.aggregate == "geometric_mean"
+    shown = np.exp(history) if geometric else history
+    best = int(np.nanargmin(history[-1]))
+    picture = figure(6.0, 3.6)
+    ax = picture.subplots()
+    steps = np.arange(1, len(shown) + 1)
+    for i, line in enumerate(shown.T):
+        strong = i == best
+        ax.plot(
+            steps,
+            line,
+            color=AFTER if strong else "#b9cdd4",
+            lw=1.8 if strong else 0.9,
+            zorder=3 if strong else 2,
+            label="best start"
+            if strong
+            else ("other starts" if i in (0, 1) and i == (best == 0) else None),
+        )
+    if geometric:
+        ax.axhline(1.0, color=BEFORE, lw=1.0, ls="--", label="gains before")
+        ax.set(
+            ylabel="error, geometric mean of all\nreferences, relative to before (-)",
+            yscale="log",
+        )
+    else:
+        ax.set(ylabel="objective (-)")
+    ax.set(xlabel=f"step of {outcome.result.method}", title="Convergence")
+    ax.legend()
+    return picture

@@ -1,0 +1,49 @@
+"""Tables 5-3 and 5-5: three PID-based sliding mode controllers, ten references."""
+
+import equinox as eqx
+import jax
+
+from ..catalog import p753
+from ..core.metrics import Tracking
+from ..core.rollout import simulate
+from ..core.system import System, loop_inputs
+from ..signals import waveforms as signals
+from .cell import Cell, printed, window
+
+COLUMNS = {
+    "pid_smc": p753.sliding_mode,
+    "inversion": p753.inversion,
+    "dob": p753.disturbance_observer,
+}
+"""Columns of the tables by the name ``cells.csv`` uses."""
+
+TABLES = {"5-3": "5-2", "5-5": "5-4"}
+"""Result table: the table that prints its gains."""
+
+
+@eqx.filter_jit
+def _rms_error(controller: System, reference: jax.Array) -> jax.Array:
+    loop = p753.loop(controller, noise_rms=0.0)
+    metric = Tracking(start=reference.size // 2)
+    inputs = loop_inputs(reference)
+    return simulate(loop, inputs, loop.init(0.0), metric=metric)[1].rms_error
+
+
+def cells(table: str) -> list[Cell]:
+    """Return the 30 cells of ``table`` ("5-3" or "5-5"), simulated.
+
+    One reading for all of them, nothing tuned: the gains as printed, the stage with
+    unit DC gain behind its hysteresis, no sensor noise, a start from rest at zero, and
+    the RMS of the true displacement against the reference over the second half of a run
+    of two windows (see ``window``).
+    """
+    paper = printed("ch5", table)
+    found = []
+    for name in signals.THESIS:
+        reference = signals.signal(
+            name, signals.time_grid(2.0 * window(name), p753.RATE)
+        )
+        for column, make in COLUMNS.items():
+            error = float(_rms_error(make(TABLES[table]), reference))
+            found.append(paper[name, column].simulated(error))
+    return found

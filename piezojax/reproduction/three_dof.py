@@ -1,0 +1,162 @@
+"""What chapters 7 and 8 share: the simulated stage, its references and its errors."""
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..catalog import p558, p558_control, p558_stage
+from ..core.arrays import State
+from ..core.axes import PerAxisMetric
+from ..core.metrics import Tracking
+from ..core.rollout import Metric, simulate
+from ..core.system import LoopSample, System, loop_inputs
+from ..signals import waveforms as signals
+from .cell import Cell, printed
+
+AXES = p558.OUTPUTS
+
+FREQUENCIES = (1, 5, 10)
+"""Hz, of the sines in the tables."""
+
+LENGTH_S = 4.0
+"""Length of a run in s; the second half counts. Not printed."""
+
+SEED = 7
+"""Of the sensor noise."""
+
+EXPERIMENTS = ("experiment_1", "experiment_2")
+"""The combined experiments of sections 7.5.4.3 and 8.5.4.2."""
+
+
+class Column(NamedTuple):
+    """A controller, and the samples by which its stage is slower than (7.53)."""
+
+    make: Callable[[], System]
+    delay: int
+
+
+def references() -> dict[str, np.ndarray]:
+    """Return what the axes are to follow [samples, 3] by the name of the run.
+
+    The tables drive one axis at a time with a sine of 10 um or urad. Of the combined
+    experiments the first has 2 Hz, 10 um in Z and 5 Hz, 50 urad in Rx; the second 2 Hz,
+    10 um PWSW in Z and 10 Hz SW in Ry, whose largest distance from its mean is 50 urad.
+    """
+    time = signals.time_grid(LENGTH_S, 1.0 / p558.DT)
+    still = np.zeros((time.size, 3))
+    found: dict[str, np.ndarray] = {}
+    for axis, name in enumerate(AXES):
+        for hertz in FREQUENCIES:
+            wave = still.copy()
+            wave[:, axis] = 10.0 * _sine(time, float(hertz))
+            found[f"drive_{name}_{hertz}Hz"] = wave
+    first, second = still.copy(), still.copy()
+    first[:, 0], first[:, 1] = 10.0 * _sine(time, 2.0), 50.0 * _sine(time, 5.0)
+    second[:, 0] = signals.piecewise_sine(time, 2.0, 10.0)
+    wave = np.asarray(signals.superposed_sine(time, 10.0, 5.0)) - 5.0
+    second[:, 2] = 50.0 * wave / np.abs(wave).max()
+    found.update(zip(EXPERIMENTS, (first, second), strict=True))
+    return found
+
+
+def _sine(time: Array, hertz: float) -> np.ndarray:
+    return np.sin(2.0 * np.pi * hertz * np.asarray(time))
+
+
+def draws(runs: int, samples: int) -> Float[Array, "runs samples axes"]:
+    """Return the noise of the sensors with unit variance, the same in every call."""
+    noise = np.random.default_rng(SEED).standard_normal((runs, samples, 3))
+    return jnp.asarray(noise)
+
+
+class Measured(Metric):
+    """``metric`` of a loop whose displacement is what the sensors say."""
+
+    metric: Metric
+
+    def init(self) -> State:
+        return self.metric.init()
+
+    def update(self, total: State, index: Array, output: LoopSample) -> State:
+        seen = output._replace(displacement=output.measured)
+        return self.metric.update(total, index, seen)
+
+    def result(self, total: State) -> Any:
+        return self.metric.result(total)
+
+
+def _rest_at_zero(loop: System) -> State:
+    """Return ``loop.init`` at zero, which is zero throughout.
+
+    Compiling the search for it would take as long as compiling the run.
+    """
+    shapes = eqx.filter_eval_shape(loop.init, jnp.zeros(3))
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+
+@eqx.filter_jit
+def _rms_errors(loop: System, targets: Array, noise: Array) -> Float[Array, "runs 3"]:
+    rest = _rest_at_zero(loop)
+    metric = Measured(PerAxisMetric(Tracking(start=targets.shape[1] // 2), 3))
+
+    def one(target, noise):
+        inputs = loop_inputs(target, noise)
+        return simulate(loop, inputs, rest, metric=metric, segment=target.shape[0])[
+            1
+        ].rms_error
+
+    return jax.vmap(one)(targets, noise)
+
+
+@cache
+def rms_errors(column: Column) -> Mapping[str, Mapping[str, float]]:
+    """Return the rms errors of all runs by name and axis, um and urad.
+
+    Measured outputs less the reference, as section 7.5.4.3 has it, over the second
+    half, from rest at zero.
+    """
+    wanted = references()
+    targets = jnp.asarray(np.stack(list(wanted.values())))
+    loop = p558_control.loop(column.make(), plant=p558_stage.plant(delay=column.delay))
+    found = np.asarray(_rms_errors(loop, targets, draws(*targets.shape[:2])))
+    return {
+        name: dict(zip(AXES, map(float, errors), strict=True))
+        for name, errors in zip(wanted, found, strict=True)
+    }
+
+
+def table_cells(
+    chapter: str, table: str, columns: Mapping[str, Column], *, transposed: bool = False
+) -> list[Cell]:
+    """Return the cells of a table of single sines, 27 for each of ``columns``.
+
+    Rows are the driven axes, columns those that are measured; ``transposed`` where
+    print has it the other way round off the diagonal. Groups are the cells of the
+    driven axes and the couplings.
+    """
+    found = []
+    for (row, column), cell in printed(chapter, table).items():
+        name, measured = column.split(":")
+        _, driven, hertz = row.split("_")
+        group = "driven" if measured == driven else "coupling"
+        if transposed:
+            driven, measured = measured, driven
+        errors = rms_errors(columns[name])[f"drive_{driven}_{hertz}"]
+        found.append(cell.simulated(errors[measured], f"{name} {group}"))
+    return found
+
+
+def experiment_cells(
+    chapter: str, table: str, columns: Mapping[str, Column], run: str
+) -> list[Cell]:
+    """Return what is printed on the combined experiment ``run``, simulated."""
+    return [
+        cell.simulated(rms_errors(columns[column])[run][axis])
+        for (axis, column), cell in printed(chapter, table).items()
+    ]

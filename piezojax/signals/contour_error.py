@@ -1,0 +1,147 @@
+"""How far off its contour a stage is, however late it is on it."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..core.arrays import Scalar, State
+from ..core.metrics import root
+from ..core.rollout import Metric
+from ..core.system import LoopSample
+
+_Point = tuple[Scalar, Scalar]
+
+
+class ContourFigures(NamedTuple):
+    """Distance from the contour over the window of a ContourError: its root mean square
+    and its largest value, in the unit of the axes."""
+
+    rms: Scalar
+    peak: Scalar
+
+
+class ContourError(Metric):
+    """Distance of the displacement from the path of the reference, from a sample on.
+
+    ``axes`` are the places of the two axes of the contour, which should be of one unit;
+    ``start`` is the first sample counted. Being late or early along the path does not
+    count, unlike in Tracking.
+
+    Measured from the circle through three successive points of the reference, the
+    straight line where they lie on one: exact on circles and lines, however large the
+    lag, elsewhere while error and curvature change little over the lag. (The usual
+    estimate, the error's component across the reference's velocity, takes lag on a
+    curve for contour error.) At rest and at a sharp corner the path is a point, from
+    which the whole distance counts. The last sample has no successor and is left out;
+    figures of a run that ends before ``start`` are NaN. Gradients are 0 where the
+    distance is.
+    """
+
+    axes: tuple[int, int] = eqx.field(static=True, default=(0, 1))
+    start: int = eqx.field(static=True, default=0)
+
+    def init(self) -> State:
+        zero = jnp.zeros(())
+        origin = (zero, zero)
+        return {
+            "count": zero,
+            "square": zero,
+            "peak": zero,
+            "before": origin,
+            "last": origin,
+            "displacement": origin,
+        }
+
+    def update(self, total: State, index: Array, output: LoopSample) -> State:
+        first, second = self.axes
+        reference = output.reference[first], output.reference[second]
+        error = _less(total["displacement"], total["last"])
+        square = _square_distance(
+            error,
+            _less(total["last"], total["before"]),
+            _less(reference, total["last"]),
+        )
+        # What is judged is the sample before; the first has no predecessor.
+        inside = (index > self.start) & (index > 1)
+        square = jnp.where(inside, square, 0.0)
+        return {
+            "count": total["count"] + jnp.where(inside, 1.0, 0.0),
+            "square": total["square"] + square,
+            "peak": jnp.maximum(total["peak"], square),
+            "before": total["last"],
+            "last": reference,
+            "displacement": (output.displacement[first], output.displacement[second]),
+        }
+
+    def result(self, total: State) -> ContourFigures:
+        count = jnp.maximum(total["count"], 1.0)
+        counted = jnp.where(total["count"] > 0.0, 0.0, jnp.nan)
+        return ContourFigures(
+            rms=root(total["square"] / count) + counted,
+            peak=root(total["peak"]) + counted,
+        )
+
+
+def _less(a: _Point, b: _Point) -> _Point:
+    return a[0] - b[0], a[1] - b[1]
+
+
+def _square_distance(error: _Point, there: _Point, on: _Point) -> Scalar:
+    """Return the square distance of ``error`` from the circle through -there, 0, on."""
+    squares = [a * a + b * b for a, b in (there, on)]
+    # Inversion turns the circle into a line: its tangent at 0.
+    tangent = [
+        a / _positive(squares[0]) + b / _positive(squares[1])
+        for a, b in zip(there, on, strict=True)
+    ]
+    steepness = tangent[0] ** 2 + tangent[1] ** 2
+    # A path that stands, or returns on itself, has no tangent: it is a point.
+    smooth = (squares[0] > 0.0) & (squares[1] > 0.0) & (steepness > 0.0)
+    length = jnp.sqrt(jnp.where(smooth, steepness, 1.0))
+    across = (tangent[0] * error[1] - tangent[1] * error[0]) / length
+    chord = (there[0] + on[0]) ** 2 + (there[1] + on[1]) ** 2
+    sides = _positive(squares[0]) * _positive(squares[1]) * _positive(chord)
+    curvature = 2.0 * (there[0] * on[1] - there[1] * on[0]) / jnp.sqrt(sides)
+    whole = error[0] ** 2 + error[1] ** 2
+    # |error - centre| - radius, written so that a line is a circle of curvature 0.
+    bend = curvature**2 * whole - 2.0 * curvature * across
+    distance = (curvature * whole - 2.0 * across) / (1.0 + root(1.0 + bend))
+    return jnp.where(smooth, distance**2, whole)
+
+
+def _positive(square: Scalar) -> Scalar:
+    return jnp.where(square > 0.0, square, 1.0)
+
+
+def nearest_on(
+    points: Float[np.ndarray, "points 2"], path: Float[np.ndarray, "samples 2"]
+) -> Float[np.ndarray, "points 2"]:
+    """Return the place on the polyline ``path`` that is nearest to each point.
+
+    On the nearest of all its segments, so where a path crosses itself the branch that
+    was meant is not told from the other. In NumPy, for pictures and checks: takes
+    points x samples. NaN for a point that is not finite. Raises ValueError unless the
+    path has two points or more.
+    """
+    points, path = np.asarray(points, float), np.asarray(path, float)
+    if len(path) < 2:
+        raise ValueError(f"path has {len(path)} points; it must have 2 or more")
+    begin, leg = path[:-1], np.diff(path, axis=0)
+    square = np.sum(leg**2, axis=1)
+    square = np.where(square > 0.0, square, 1.0)
+    found = np.full_like(points, np.nan)
+    for i in np.flatnonzero(np.all(np.isfinite(points), axis=1)):
+        along = np.clip(np.sum((points[i] - begin) * leg, axis=1) / square, 0.0, 1.0)
+        places = begin + along[:, None] * leg
+        found[i] = places[np.argmin(np.sum((points[i] - places) ** 2, axis=1))]
+    return found
+
+
+def distance_to(
+    points: Float[np.ndarray, "points 2"], path: Float[np.ndarray, "samples 2"]
+) -> Float[np.ndarray, " points"]:
+    """Return how far each point is from the polyline ``path``; see ``nearest_on``."""
+    return np.linalg.norm(points - nearest_on(points, path), axis=1)

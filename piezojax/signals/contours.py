@@ -1,0 +1,160 @@
+"""Contours: paths of two axes in time, and their names in a motion.
+
+A named contour is two signals of ``piezojax.signals``: ``Rx+Ry:CIRCLE5`` is a
+shorthand for ``Rx:SIN5 Ry:COS5``. Every contour lies on its path from the first sample
+on, so that a loop, at rest on its first point, has only a jump in speed to get over
+(the SIN, the SCAN and the stairs have none); with ``rise`` the functions below have
+none at all.
+"""
+
+import math
+import re
+from fractions import Fraction
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..core.arrays import ScalarLike, check
+from . import waveforms as signals
+
+Path = Float[Array, "samples 2"]
+Pair = ScalarLike | tuple[ScalarLike, ScalarLike]
+"""One value for both axes, or one for each."""
+
+LINES = 20
+"""Lines of a raster up to its end, unless told."""
+
+FORMS = ("CIRCLE5", "LISSAJOUS5/4", "RASTER10", "RASTER10/0.5")
+"""How contours are named: frequencies in Hz, of both axes where there are two."""
+
+
+def circle(
+    time: signals.Time,
+    frequency: ScalarLike = 10.0,
+    amplitude: Pair = 5.0,
+    offset: Pair = 0.0,
+    rise: float = 0.0,
+) -> Path:
+    """Return a circle about ``offset + amplitude``; of two amplitudes, an ellipse.
+
+    Clockwise from the middle of its left side, seen with the first axis to the right
+    and the second up. ``frequency`` in Hz; ``amplitude``, the radius, and ``offset`` in
+    the unit of the axes. The speed rises evenly from rest over the first ``rise`` s.
+    Differentiable in all but ``rise``. Raises ValueError for a ``rise`` below 0.
+    """
+    return lissajous(time, frequency, (1, 1), amplitude, offset, rise)
+
+
+def lissajous(
+    time: signals.Time,
+    frequency: ScalarLike = 1.0,
+    cycles: tuple[int, int] = (5, 4),
+    amplitude: Pair = 5.0,
+    offset: Pair = 0.0,
+    rise: float = 0.0,
+) -> Path:
+    """Return the Lissajous figure that closes after 1/``frequency`` s.
+
+    Each axis swings ``cycles`` times meanwhile, a quarter of a period apart, the one
+    ahead chosen so that the figure does not run back on itself. Other arguments as for
+    ``circle``. Raises ValueError for cycles that are not whole, positive and without
+    common factor.
+    """
+    whole = all(isinstance(count, int) and count > 0 for count in cycles)
+    if not whole or math.gcd(*cycles) > 1:
+        raise ValueError(
+            f"cycles are {cycles}; they must be positive whole numbers without a "
+            "common factor"
+        )
+    eased = _eased(time, rise)
+    columns = [
+        signals.SIGNALS[kind](eased, count * frequency, a, o)
+        for kind, count, a, o in zip(
+            _quadrature(cycles[0]), cycles, _pair(amplitude), _pair(offset), strict=True
+        )
+    ]
+    return jnp.stack(columns, axis=1)
+
+
+def raster(
+    time: signals.Time,
+    frequency: ScalarLike = 10.0,
+    amplitude: Pair = 5.0,
+    offset: Pair = 0.0,
+    lines: int = LINES,
+    turnaround: float = 0.1,
+    stepped: bool = False,
+    rise: float = 0.0,
+) -> Path:
+    """Return a raster scan: the first axis to and fro, the second slowly up and down.
+
+    ``frequency`` in Hz of the first axis, two lines a period, whose turns take the
+    share ``turnaround`` of it (0 for a triangle). The second covers its range in
+    ``lines`` lines, at constant speed, or ``stepped`` by one line in each turn. Both
+    from ``offset`` to ``offset + 2 amplitude``. ``rise`` as for ``circle``. Raises
+    ValueError for fewer than 2 lines or a turnaround outside 0 to 0.5.
+    """
+    if not isinstance(lines, int) or lines < 2:
+        raise ValueError(f"lines is {lines!r}; it must be a whole number of 2 or more")
+    (a_fast, a_slow), (o_fast, o_slow) = _pair(amplitude), _pair(offset)
+    eased = _eased(time, rise)
+    fast = signals.scan(eased, frequency, a_fast, o_fast, turnaround)
+    if stepped:
+        share = _stairs(2.0 * eased * frequency, lines, turnaround)
+        slow = o_slow + 2.0 * a_slow * share
+    else:
+        slow = signals.triangle(eased, frequency / lines, a_slow, o_slow)
+    return jnp.stack([fast, slow], axis=1)
+
+
+def signals_of(name: str) -> tuple[str, str]:
+    """Return the signals that a contour's name stands for.
+
+    ``CIRCLE5`` is SIN5 and COS5. ``LISSAJOUS5/4`` is SIN5 and COS4, or COS and SIN
+    where these would run back on themselves. ``RASTER10/0.5`` is SCAN10 and TRI0.5;
+    without the second number there are 20 lines. Raises ValueError for another name.
+    """
+    found = re.fullmatch(r"([A-Z]+)(\d*\.?\d+)(?:/(\d*\.?\d+))?", name)
+    kind, first, second = found.groups() if found else ("", "1", None)
+    if all(float(number) > 0.0 for number in (first, second or "1")):
+        if kind == "CIRCLE" and not second:
+            return f"SIN{first}", f"COS{first}"
+        if kind == "LISSAJOUS" and second:
+            ratio = Fraction(first) / Fraction(second)
+            one, other = _quadrature(ratio.numerator)
+            return f"{one}{first}", f"{other}{second}"
+        if kind == "RASTER":
+            slow = second or str(Fraction(first) / LINES * 1.0)
+            return f"SCAN{first}", f"TRI{slow}"
+    raise ValueError(
+        f"contour {name!r} is unknown; it must be as one of {', '.join(FORMS)}, with "
+        "frequencies in Hz above 0"
+    )
+
+
+def _quadrature(first: int) -> tuple[str, str]:
+    # cos(p w) and sin(q w), p and q coprime, have a mirror in w, and so run back on
+    # themselves, just if p is even.
+    return ("COS", "SIN") if first % 2 == 0 else ("SIN", "COS")
+
+
+def _pair(value: Pair) -> tuple[ScalarLike, ScalarLike]:
+    return value if isinstance(value, tuple) else (value, value)
+
+
+def _eased(time: signals.Time, rise: float) -> signals.Time:
+    """Return a time whose pace rises evenly from 0 to 1 over ``rise`` s."""
+    check("rise in s", rise, least=0.0)
+    if rise == 0.0:
+        return time
+    return jnp.where(time < rise, time**2 / (2.0 * rise), time - 0.5 * rise)
+
+
+def _stairs(line: signals.Time, lines: int, turnaround: float) -> signals.Time:
+    """Return 0 to 1 in equal steps, one at each whole ``line`` but 0, and back down."""
+    nearest = jnp.floor(line + 0.5)
+    width = max(turnaround, 1e-9)
+    along = jnp.clip((line - nearest + width) / (2.0 * width), 0.0, 1.0)
+    climbed = jnp.maximum(nearest - 1.0 + along**2 * (3.0 - 2.0 * along), 0.0)
+    last = lines - 1
+    return 1.0 - jnp.abs(jnp.mod(climbed, 2.0 * last) - last) / last

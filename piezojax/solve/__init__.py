@@ -1,0 +1,1 @@
+"""Solvers of bounded problems; they know nothing of studies."""

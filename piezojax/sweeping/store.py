@@ -1,0 +1,189 @@
+"""The folder of a sweep: its manifest and the chunks that are done, each in a file."""
+
+import hashlib
+import json
+import math
+import time
+from collections.abc import Iterable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..core.files import write_bytes, write_text
+from ..core.serial import to_data
+from .simulator import Simulator
+
+MANIFEST, CHUNKS, RESULT = "manifest.json", "chunks", "sweep.nc"
+"""Names in the folder."""
+
+VERSIONED = ("piezojax", "jax", "jaxlib", "numpy", "scipy")
+
+_DIGITS = 9  # of numbers in the fingerprint: machines differ in the last ones
+_FORGOTTEN = 3600.0  # s: a half-written file this old has no process any more
+
+
+def identity_of(simulator: Simulator) -> dict[str, Any]:
+    """Return what decides on the numbers of a sweep: the same for the same numbers."""
+    case, plan = simulator.case, simulator.plan
+    systems = {
+        "controller": case.loop.controller,
+        "actuator": case.loop.actuator,
+        "sensor": case.loop.sensor,
+        **{f"plant {name}": plant for name, plant in simulator.plants.items()},
+    }
+    # Files that the study names are in here, by what was built from them.
+    built = {name: _rounded(to_data(system)) for name, system in systems.items()}
+    return {
+        "study": case.study.model_dump(mode="json", exclude_none=True),
+        "systems": _hash(built),
+        "points": _hash(_rounded(plan.values(0, min(plan.points, 4096)).tolist())),
+        "plan": {
+            "shape": list(plan.shape),
+            "points": plan.points,
+            "chunk": plan.chunk,
+            "chunks": plan.chunks,
+            "width": plan.width,
+        },
+        "versions": {n: version(n) for n in VERSIONED},
+        "platform": jax.default_backend(),
+    }
+
+
+def _hash(data: Any) -> str:
+    text = json.dumps(data, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _rounded(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: _rounded(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_rounded(value) for value in data]
+    return f"{data:.{_DIGITS}g}" if isinstance(data, float) else data
+
+
+class Store:
+    """Finished chunks of one sweep, in a folder that several processes may share.
+
+    A chunk is written beside its place, put on the disk and moved there in one step: it
+    is there whole or not at all, and who writes it a second time writes the same.
+    """
+
+    def __init__(self, folder: Path, identity: dict[str, Any]):
+        self.folder, self.identity = folder, identity
+        self.fingerprint = _hash(identity)
+
+    def open(self) -> None:
+        """Make the folder, or go on in it.
+
+        Raises ValueError if it holds something else, or a sweep with other settings, or
+        cannot be written.
+        """
+        manifest = self.folder / MANIFEST
+        try:
+            (self.folder / CHUNKS).mkdir(parents=True, exist_ok=True)
+            others = [
+                path.name
+                for path in self.folder.iterdir()
+                if path.name != CHUNKS and not path.name.startswith(".")
+            ]
+        except OSError as error:
+            raise ValueError(
+                f"--out {self.folder} cannot be written: {error.strerror}"
+            ) from None
+        if manifest.exists():
+            self._compare(manifest)
+        elif others:
+            raise ValueError(
+                f"--out {self.folder} already holds results that are no sweep; "
+                "name a new folder"
+            )
+        else:
+            content = {"fingerprint": self.fingerprint, **self.identity}
+            write_text(manifest, json.dumps(content, indent=2) + "\n")
+        for path in (*self.folder.glob(".*"), *(self.folder / CHUNKS).glob(".*")):
+            self._forget(path)
+
+    def _forget(self, path: Path) -> None:
+        """Delete what a process that was killed had half written."""
+        try:
+            if time.time() - path.stat().st_mtime > _FORGOTTEN:
+                path.unlink(missing_ok=True)
+        except OSError:
+            pass  # gone already, or not ours
+
+    def _compare(self, manifest: Path) -> None:
+        try:
+            found = json.loads(manifest.read_text(encoding="utf-8"))
+            same = found["fingerprint"] == self.fingerprint
+        except (OSError, ValueError, KeyError, TypeError):
+            raise ValueError(
+                f"{manifest} is damaged; name a new folder with --out"
+            ) from None
+        if same:
+            return
+        differing = [k for k in self.identity if found.get(k) != self.identity[k]]
+        if "study" in differing and isinstance(found.get("study"), dict):
+            own, old = self.identity["study"], found["study"]
+            tables = [k for k in {**old, **own} if old.get(k) != own.get(k)]
+            differing = [f"study.{key}" for key in tables]
+        raise ValueError(
+            f"--out {self.folder} holds another sweep (other in "
+            f"{', '.join(differing) or 'its fingerprint'}); name a new folder"
+        )
+
+    def path(self, chunk: int) -> Path:
+        """Return where a chunk is kept."""
+        return self.folder / CHUNKS / f"{chunk:08d}.chunk"
+
+    def write(self, chunk: int, arrays: dict[str, np.ndarray], seconds: float) -> None:
+        """Keep a chunk, which took ``seconds`` of one core or device."""
+        payload = b"".join(
+            np.ascontiguousarray(array, dtype="<f8").tobytes()
+            for array in arrays.values()
+        )
+        header = {
+            "fingerprint": self.fingerprint,
+            "chunk": chunk,
+            "seconds": seconds,
+            "shapes": {name: list(array.shape) for name, array in arrays.items()},
+        }
+        content = json.dumps(header).encode() + b"\n" + payload
+        checksum = hashlib.sha256(content).hexdigest().encode()
+        write_bytes(self.path(chunk), checksum + b"\n" + content, durable=True)
+
+    def read(self, chunk: int) -> tuple[dict[str, np.ndarray], float] | None:
+        """Return a chunk and its seconds; None if it is not there whole.
+
+        Raises ValueError for one of another sweep.
+        """
+        path = self.path(chunk)
+        try:
+            checksum, _, content = path.read_bytes().partition(b"\n")
+        except OSError:
+            return None
+        if hashlib.sha256(content).hexdigest().encode() != checksum:
+            return None
+        first, _, payload = content.partition(b"\n")
+        header = json.loads(first)
+        if (header["fingerprint"], header["chunk"]) != (self.fingerprint, chunk):
+            raise ValueError(
+                f"{path} belongs to another sweep, or to another place in this one; "
+                "delete it, or name a new folder with --out"
+            )
+        arrays, flat = {}, np.frombuffer(payload, dtype="<f8")
+        for name, shape in header["shapes"].items():
+            count = math.prod(shape)
+            arrays[name], flat = flat[:count].reshape(shape), flat[count:]
+        return arrays, float(header["seconds"])
+
+    def missing(self, chunks: Iterable[int]) -> list[int]:
+        """Return which of ``chunks`` are not there whole. Raises ValueError as read."""
+        return [chunk for chunk in chunks if self.read(chunk) is None]
+
+    def there(self, chunks: Iterable[int]) -> bool:
+        """Tell whether all are there, without a look at what is in them."""
+        return all(self.path(chunk).exists() for chunk in chunks)

@@ -1,0 +1,102 @@
+"""The baselines beside the search, on one objective in one run."""
+
+import equinox as eqx
+import numpy as np
+
+from ...core.arrays import as_array
+from ...core.progress import Progress
+from ...core.system import Feedback
+from ...study import Case
+from ..data import Data
+from ..objective import Objective
+from ..result import scores
+from ..runs import evaluate
+from ..search import Search
+from .entries import Baselines, Contestant, against, contestant
+from .pids import by_rules
+from .searches import Budget, Method, cma_es, nelder_mead
+
+LARGER = 2
+"""How many times larger the second population of CMA-ES is."""
+
+
+def methods(seed: int, size: int) -> dict[str, Method]:
+    """Return the searches by name, for ``size`` parameters."""
+    larger = LARGER * (4 + int(3.0 * np.log(size)))
+    return {
+        "CMA-ES": cma_es(seed=seed + 1),
+        f"CMA-ES, population {larger}": cma_es(larger, seed + 1),
+        "Nelder-Mead": nelder_mead,
+    }
+
+
+def contest(
+    objective: Objective,
+    case: Case,
+    data: Data,
+    search: Search,
+    budget: Budget,
+    progress: Progress,
+) -> Baselines:
+    """Run every baseline on the objective of ``search`` and set it beside that.
+
+    Searches begin where ``search`` did and get the same box. ``Ctrl-C`` ends the
+    contest with the methods that have finished.
+    """
+
+    def entry_of(name, course, stop, unit):
+        place = as_array(unit)
+        loop = case.space.put(case.loop, place)
+        gains = {path: float(x) for path, x in case.space.named(place).items()}
+        held = holdout_geomean(loop, data, objective.start)
+        return contestant(name, course, stop, held, gains, unit)
+
+    name = f"piezojax ({case.study.optimiser.method})"
+    ours = entry_of(name, search.course, search.status, search.unit)
+    rivals: list[Contestant] = []
+    notes: list[str] = []
+    try:
+        progress.stage("baselines: ultimate gain and relay")
+        found, skipped = by_rules(objective, case)
+        notes += skipped
+        for name, course, loop, gains in found:
+            held = holdout_geomean(loop, data, objective.start)
+            rivals.append(contestant(name, course, "rule", held, gains, None))
+        size = len(case.space.paths)
+        for name, method in methods(case.study.seed, size).items():
+            progress.stage(f"baseline: {name}")
+            end = method(objective, search.starts, budget, progress)
+            rivals.append(entry_of(name, end.course, end.stop, end.unit))
+    except KeyboardInterrupt:
+        notes.append("interrupted: baselines after the last one shown were not run")
+    stable = {r.method: r.loss for r in rivals if r.loss is not None}
+    return Baselines(
+        study=case.name,
+        title=case.study.title,
+        seed=case.study.seed,
+        aggregate=case.study.objective.aggregate,
+        ours=ours,
+        rivals=[against(rival, ours) for rival in rivals],
+        best=min(stable, key=lambda name: stable[name], default=None),
+        notes=notes,
+    )
+
+
+@eqx.filter_jit
+def _figures(loop, signals, start):
+    return evaluate(lambda x: x, loop, signals, start)
+
+
+def holdout_geomean(loop: Feedback, data: Data, start: int) -> float | None:
+    """Return the geometric mean of the errors on the tuning references, um.
+
+    With the hold-out's noise, on the axes that are driven; None if the loop diverges
+    or rails.
+    """
+    figures = _figures(loop, data.holdout, start)
+    chosen = [i for i, t in enumerate(data.traces[: data.tuned]) if t.driven]
+    part = eqx.tree_at(
+        lambda f: tuple(f), figures, tuple(np.asarray(x)[chosen] for x in figures)
+    )
+    found = scores(part, tuple(data.names[i] for i in chosen))
+    return found.geomean_rms_um if found.stable else None

@@ -1,0 +1,192 @@
+"""Two experiments that find the ultimate gain and period of a stage in its loop."""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ...control import PID
+from ...core.arrays import Scalar, as_array, check
+from ...core.rollout import simulate
+from ...core.system import Feedback, Observation, System, loop_inputs
+from ...solve.clock import Clock
+from .rules import Ultimate
+
+GAINS = 64
+"""Proportional gains tried at once."""
+
+NARROWINGS = 3
+"""How often the interval between the last calm and the first wild gain is divided."""
+
+STEP = 0.02
+"""Step of the ultimate-gain experiment, as a share of the references' amplitude."""
+
+RELAY = 0.1
+"""Height of the relay, as a share of the voltage span."""
+
+SIGMAS = 3.0
+"""Hysteresis of the relay, in standard deviations of the sensor's noise."""
+
+_DECADES = (-6.0, 1.0)  # of the gains, around the voltage span over the step
+_WILD = 10.0  # steps: what swings further has left the linear range
+_CALM = 0.05  # steps: what swings less has settled
+_FEWEST = 3.0  # periods
+
+
+class RelayState(NamedTuple):
+    """The side that the relay is on, and the voltage it switches about."""
+
+    side: Scalar
+    centre: Scalar
+
+
+class Relay(System):
+    """``u = centre + height`` or ``centre - height`` by the sign of the error, um to V.
+
+    It switches when the error passes ``hysteresis`` (um) on the other side, so that
+    noise does not switch it; the centre is the voltage at rest. Astrom and Hagglund
+    (1984). Raises ValueError unless ``height`` (V) is positive and ``hysteresis`` not
+    negative.
+    """
+
+    height: Scalar = eqx.field(converter=as_array)
+    hysteresis: Scalar = eqx.field(converter=as_array, default=0.0)
+
+    def __check_init__(self):
+        check("height of the relay in V", self.height, above=0.0)
+        check("hysteresis of the relay in um", self.hysteresis, least=0.0)
+
+    def init(self, input: Observation) -> RelayState:
+        centre = as_array(input.applied)
+        return RelayState(jnp.ones_like(centre), centre)
+
+    def step(self, state: RelayState, input: Observation) -> tuple[RelayState, Scalar]:
+        error = input.reference - input.measured
+        switched = jnp.where(error < 0.0, -1.0, 1.0)
+        side = jnp.where(jnp.abs(error) > self.hysteresis, switched, state.side)
+        command = state.centre + self.height * side
+        return RelayState(side, state.centre), command
+
+
+def ultimate_by_gain(
+    loop: Feedback, *, step: float, span: float, dt: float, samples: int, clock: Clock
+) -> Ultimate:
+    """Return the ultimate gain and period by raising a proportional gain.
+
+    ``loop`` gets a P controller, no noise, and a step of ``step`` um from rest at 0.
+    The ultimate gain is the lowest whose oscillation does not decay from the second to
+    the last quarter of ``samples``; ``span`` (V) bounds what is tried. Raises
+    ValueError if every gain decays, or none.
+    """
+    reference = jnp.full(samples, step).at[0].set(0.0)
+
+    def displacement(loop, gain):
+        controller = PID(gain, 0.0, 0.0, 0.0, 0.0, dt=dt)
+        around = Feedback(controller, loop.plant, loop.actuator, loop.sensor)
+        log = simulate(around, loop_inputs(reference), around.init(reference[0]))[1]
+        return log.displacement
+
+    def swings(loop, gains):
+        runs = jax.vmap(lambda gain: displacement(loop, gain))(gains)
+        return jax.vmap(lambda run: _swing(run, step))(runs)
+
+    low, high = (10.0**decade * span / step for decade in _DECADES)
+    gains = np.geomspace(low, high, GAINS)
+    program = clock.compiled(swings, loop, as_array(gains))
+    for _ in range(1 + NARROWINGS):
+        wild = np.asarray(program(loop, as_array(gains)))
+        first = int(np.argmax(wild))
+        if wild[0] or not wild.any():
+            raise ValueError(
+                "no ultimate gain: a proportional loop oscillates at "
+                f"{'all' if wild[0] else 'none'} of the gains from {gains[0]:.3g} to "
+                f"{gains[-1]:.3g} V/um"
+            )
+        low, high = gains[first - 1], gains[first]
+        gains = np.geomspace(low, high, GAINS)
+    run = clock.compiled(displacement, loop, as_array(high))
+    last = np.asarray(run(loop, as_array(high)))[samples // 4 :]
+    return Ultimate(float(high), period_of(np.diff(last), dt))
+
+
+def _swing(run: Float[jax.Array, " samples"], step: float) -> jax.Array:
+    """Return whether a step response swings on, rather than settling."""
+    quarter = run.shape[0] // 4
+    early = jnp.std(run[quarter : 2 * quarter])
+    late = jnp.std(run[3 * quarter :])
+    far = jnp.max(jnp.abs(run)) > _WILD * abs(step)
+    growing = (late >= early) & (late > _CALM * abs(step))
+    return far | growing | ~jnp.all(jnp.isfinite(run))
+
+
+def ultimate_by_relay(
+    loop: Feedback,
+    *,
+    height: float,
+    hysteresis: float,
+    dt: float,
+    noise: Float[np.ndarray, " samples"],
+    clock: Clock,
+) -> Ultimate:
+    """Return the ultimate gain and period by a relay in the place of the controller.
+
+    With the loop's own sensor and its noise, from rest at the reference 0. By the
+    describing function of the relay the gain is 4 h / (pi a), with a, in um, the
+    amplitude at the cycle's frequency of what was measured in the second half of the
+    run. Raises ValueError if there is no cycle.
+    """
+
+    def run(loop, relay, noise):
+        around = Feedback(relay, loop.plant, loop.actuator, loop.sensor)
+        reference = jnp.zeros_like(noise)
+        log = simulate(around, loop_inputs(reference, noise), around.init(0.0))[1]
+        return log.measured, log.voltage
+
+    drawn = as_array(noise)
+    relay = Relay(height, hysteresis)
+    program = clock.compiled(run, loop, relay, drawn)
+    measured, voltage = (np.asarray(x) for x in program(loop, relay, drawn))
+    half = noise.size // 2
+    amplitude, period = cycle_of(measured[half:], voltage[half:], dt)
+    return Ultimate(4.0 * height / (np.pi * amplitude), period)
+
+
+def cycle_of(
+    wave: Float[np.ndarray, " samples"],
+    switched: Float[np.ndarray, " samples"],
+    dt: float,
+) -> tuple[float, float]:
+    """Return amplitude, at its own frequency, and period (s) of a relay's cycle.
+
+    ``switched`` is what the relay put out, ``wave`` what came of it. Noise moves the
+    switching: each period is taken by itself, from rise to rise, and their fundamentals
+    are averaged. Raises ValueError for fewer than three periods.
+    """
+    middle = 0.5 * (switched.max() + switched.min())
+    period = period_of(switched - middle, dt)
+    above = switched >= middle
+    rises = np.flatnonzero(~above[:-1] & above[1:]) + 1
+    sums = []
+    for start, stop in pairwise(rises):
+        turns = np.arange(stop - start) / (stop - start)
+        sums.append(2.0 * np.mean(wave[start:stop] * np.exp(-2j * np.pi * turns)))
+    return float(np.abs(np.mean(sums))), period
+
+
+def period_of(wave: Float[np.ndarray, " samples"], dt: float) -> float:
+    """Return the mean period (s) of ``wave`` by its rises through 0, between samples.
+
+    Raises ValueError for fewer than three periods.
+    """
+    rises = np.flatnonzero((wave[:-1] < 0.0) & (wave[1:] >= 0.0))
+    if rises.size < _FEWEST + 1 or not np.all(np.isfinite(wave)):
+        raise ValueError(
+            f"no oscillation: {max(rises.size - 1, 0)} periods in {wave.size} samples; "
+            f"it takes {_FEWEST:g}"
+        )
+    places = rises + wave[rises] / (wave[rises] - wave[rises + 1])
+    return float((places[-1] - places[0]) / (rises.size - 1) * dt)

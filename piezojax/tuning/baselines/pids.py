@@ -1,0 +1,135 @@
+"""PIDs by rules, judged in the loop of a study by its own objective."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ...control import PID
+from ...core.arrays import as_array
+from ...core.paths import get
+from ...core.space import Space
+from ...core.system import Feedback
+from ...solve.clock import Clock
+from ...solve.history import Course, batch_loss
+from ...study import Case
+from ..objective import Objective
+from .experiments import RELAY, SIGMAS, STEP, ultimate_by_gain, ultimate_by_relay
+from .rules import TYREUS_LUYBEN, ZIEGLER_NICHOLS, Rule, Ultimate
+
+PATHS = tuple(
+    f"controller.{name}"
+    for name in (
+        "proportional",
+        "integral",
+        "derivative",
+        "derivative_filter",
+        "anti_windup",
+    )
+)
+
+
+class ByRule(NamedTuple):
+    """A PID's name, its course, the loop around it, and its numbers by path."""
+
+    name: str
+    course: Course
+    loop: Feedback
+    gains: dict[str, float]
+
+
+def by_rules(objective: Objective, case: Case) -> tuple[list[ByRule], list[str]]:
+    """Return the PIDs that rules give for a case, with the loss of each.
+
+    Ziegler and Nichols' from the ultimate gain; theirs and Tyreus and Luyben's, which
+    are slower, from a relay. In the study's own loop: same stage, actuator, sensor,
+    noise, signals and scale, only the controller is another. Also returns what could
+    not be found, and why.
+    """
+    if case.study.axes is not None:
+        return [], ["rules for a PID: they are for a stage with one axis"]
+    ways = {
+        "ultimate gain": (_by_gain, _named("Ziegler-Nichols", ZIEGLER_NICHOLS)),
+        "relay": (
+            _by_relay,
+            _named("relay, Ziegler-Nichols", ZIEGLER_NICHOLS)
+            | _named("relay, Tyreus-Luyben", TYREUS_LUYBEN),
+        ),
+    }
+    found: list[ByRule] = []
+    notes: list[str] = []
+    for name, (experiment, rules) in ways.items():
+        clock = Clock()
+        try:
+            ultimate = experiment(objective, case, clock)
+        except ValueError as error:
+            notes.append(f"{name}: {error}")
+            continue
+        found += judged(objective, ultimate, rules, case.study.dt, clock)
+    return found, notes
+
+
+def _named(name: str, rules: Mapping[str, Rule]) -> dict[str, Rule]:
+    return {f"{name} {kind}": rule for kind, rule in rules.items()}
+
+
+def _by_gain(objective: Objective, case: Case, clock: Clock) -> Ultimate:
+    study = case.study
+    return ultimate_by_gain(
+        case.loop,
+        step=STEP * study.by_axis(study.references.amplitude)[0],
+        span=float(objective.voltage_span),
+        dt=study.dt,
+        samples=objective.signals.references.shape[1],
+        clock=clock,
+    )
+
+
+def _by_relay(objective: Objective, case: Case, clock: Clock) -> Ultimate:
+    return ultimate_by_relay(
+        case.loop,
+        height=RELAY * float(objective.voltage_span),
+        hysteresis=SIGMAS * case.study.by_axis(case.study.sensor.noise_rms)[0],
+        dt=case.study.dt,
+        noise=np.asarray(objective.signals.noise[0, 0]),
+        clock=clock,
+    )
+
+
+def judged(
+    objective: Objective,
+    ultimate: Ultimate,
+    rules: Mapping[str, Rule],
+    dt: float,
+    clock: Clock,
+) -> list[ByRule]:
+    """Return the PID of each rule with its loss, all simulated in one batch."""
+    loops = {
+        name: _around(objective.loop, rule.pid(ultimate, dt))
+        for name, rule in rules.items()
+    }
+    values = np.array([[get(loop, path) for path in PATHS] for loop in loops.values()])
+    # Their own box, so that one program runs them all: each number from 0 to twice the
+    # largest, and 1 where every rule has 0.
+    upper = np.where(values.max(axis=0) > 0.0, 2.0 * values.max(axis=0), 1.0)
+    space = Space(
+        paths=PATHS,
+        transforms=("linear",) * len(PATHS),
+        lower=as_array(np.zeros(len(PATHS))),
+        upper=as_array(upper),
+    )
+    mine = replace(objective, loop=next(iter(loops.values())), space=space)
+    units = as_array(values / upper)
+    losses = np.asarray(batch_loss(mine, units, clock)(units))
+    found = []
+    for (name, loop), row, loss in zip(loops.items(), values, losses, strict=True):
+        course = Course(clock)
+        course.add(1, float(loss))
+        gains = dict(zip(PATHS, map(float, row), strict=True))
+        found.append(ByRule(name, course, loop, gains))
+    return found
+
+
+def _around(loop: Feedback, pid: PID) -> Feedback:
+    return Feedback(pid, loop.plant, loop.actuator, loop.sensor)

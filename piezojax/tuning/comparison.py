@@ -1,0 +1,160 @@
+"""Several studies tuned one after another, and what came of them side by side."""
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from pydantic import BaseModel
+
+from ..core.progress import Progress, Silent
+from ..study import Entry
+from ..study.contenders import Start
+from .result import Result, Status
+from .tuner import Outcome, tune
+
+COMPARISON_FILE = "comparison.json"
+
+
+class Row(BaseModel):
+    """A study of the comparison: geometric means of rms errors over references, um.
+
+    ``before`` and ``after`` are on noise the optimiser has not seen,
+    ``unseen_before`` and ``unseen`` on references it has not seen either; None where a
+    run diverges or rails. A study that could not be tuned has the status "failed" and
+    says why in ``notes``.
+    """
+
+    study: str
+    controller: str
+    rate_Hz: float  # noqa: N815
+    start: Start
+    status: Status | str
+    before_um: float | None = None
+    after_um: float | None = None
+    unseen_before_um: float | None = None
+    unseen_um: float | None = None
+    notes: list[str] = []
+    wall_s: float = 0.0
+
+    @property
+    def ratio(self) -> float | None:
+        """How many times better on held-out noise."""
+        return _ratio(self.before_um, self.after_um)
+
+    @property
+    def unseen_ratio(self) -> float | None:
+        """How many times better on references not tuned on."""
+        return _ratio(self.unseen_before_um, self.unseen_um)
+
+
+class Comparison(BaseModel):
+    """``comparison.json``: the rows, and what they come to by controller and rate.
+
+    ``better`` and ``unseen_better`` are geometric means over the rates of a controller,
+    and None where one of its starts diverges or rails or one of its rows failed.
+    ``best`` is the controller with the lowest error after tuning at each rate (Hz).
+    """
+
+    title: str
+    status: str
+    rows: list[Row]
+    better: dict[str, float | None]
+    unseen_better: dict[str, float | None]
+    best: dict[str, str]
+    versions: dict[str, str]
+    seed: int
+    wall_s: float
+
+
+def compare(
+    title: str,
+    entries: Sequence[Entry],
+    *,
+    progress: Progress | None = None,
+    done: Callable[[Outcome], None] = lambda outcome: None,
+) -> Comparison:
+    """Tune every entry and return how they compare.
+
+    ``done`` is called with each Outcome. A study without a stable point becomes a row
+    that says so; ``Ctrl-C`` ends the one that runs, keeps it, and leaves out the rest.
+    """
+    progress = progress or Silent()
+    began = time.perf_counter()
+    rows: list[Row] = []
+    versions: dict[str, str] = {}
+    status = "complete"
+    for number, entry in enumerate(entries, 1):
+        progress.stage(f"{number} of {len(entries)}: {entry.case.study.title}")
+        try:
+            outcome = tune(entry.case, progress=progress)
+        except ValueError as error:
+            rows.append(_row(entry, "failed", notes=[str(error)]))
+            continue
+        rows.append(_row_of(entry, outcome.result))
+        versions = outcome.result.versions
+        done(outcome)
+        if outcome.result.status == "interrupted":
+            status = "interrupted"
+            break
+    return Comparison(
+        title=title,
+        status=status,
+        rows=rows,
+        better=_by_controller(rows, "ratio"),
+        unseen_better=_by_controller(rows, "unseen_ratio"),
+        best=_best(rows),
+        versions=versions,
+        seed=entries[0].case.study.seed,
+        wall_s=time.perf_counter() - began,
+    )
+
+
+def _row(entry: Entry, status: str, **rest) -> Row:
+    return Row(
+        study=entry.name,
+        controller=entry.controller,
+        rate_Hz=entry.case.study.rate,
+        start=entry.start,
+        status=status,
+        **rest,
+    )
+
+
+def _row_of(entry: Entry, result: Result) -> Row:
+    def geomean(scores):
+        return scores.geomean_rms_um if scores is not None and scores.stable else None
+
+    return _row(
+        entry,
+        result.status,
+        before_um=geomean(result.holdout_before),
+        after_um=geomean(result.holdout),
+        unseen_before_um=geomean(result.unseen_before),
+        unseen_um=geomean(result.unseen),
+        notes=result.warnings,
+        wall_s=result.wall_s,
+    )
+
+
+def _ratio(before: float | None, after: float | None) -> float | None:
+    return before / after if before and after else None
+
+
+def _by_controller(rows: Sequence[Row], figure: str) -> dict[str, float | None]:
+    found: dict[str, float | None] = {}
+    for controller in dict.fromkeys(row.controller for row in rows):
+        ratios = [getattr(row, figure) for row in rows if row.controller == controller]
+        known = [ratio for ratio in ratios if ratio is not None]
+        all_known = len(known) == len(ratios)
+        found[controller] = float(np.exp(np.mean(np.log(known)))) if all_known else None
+    return found
+
+
+def _best(rows: Sequence[Row]) -> dict[str, str]:
+    best: dict[float, Row] = {}
+    for row in rows:
+        leader = best.get(row.rate_Hz)
+        error = row.after_um
+        if error is not None and (leader is None or error < (leader.after_um or 0.0)):
+            best[row.rate_Hz] = row
+    return {f"{rate:g}": best[rate].controller for rate in sorted(best)}

@@ -1,0 +1,142 @@
+"""What a case is tuned and judged on: references, noise draws, disturbances."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..core.arrays import as_array, as_signal
+from ..core.system import holding_input
+from ..signals import motions
+from ..signals import waveforms as signal_library
+from ..study import Case, Study
+from .runs import Signals
+from .traces import Trace, traces_of
+
+
+@dataclass
+class Data:
+    """Signals of a case: what tunes, what judges, and the traces among them."""
+
+    tuned: int  # the first so many traces are tuned on
+    traces: tuple[Trace, ...]
+    tuning: Signals
+    holdout: Signals
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the traces."""
+        return tuple(trace.name for trace in self.traces)
+
+
+def make_data(case: Case) -> Data:
+    """Return references and noise of ``case``: the hold-out's are drawn apart."""
+    study = case.study
+    table = study.references
+    time_s = signal_library.time_grid(table.duration, study.rate)
+    runs = (*table.tune, *table.unseen)
+    references = jnp.stack([_reference(study, name, time_s) for name in runs])
+    # Two streams of one seed: the hold-out draws are new for every reference.
+    streams = np.random.SeedSequence(study.seed).spawn(2)
+    counts = study.objective.noise_draws, study.holdout_draws
+    holding = _holding(case, references[:, 0])
+    tuning, holdout = (
+        _signals(
+            case,
+            references,
+            holding,
+            time_s,
+            np.random.default_rng(stream),
+            count,
+            part,
+        )
+        for stream, count, part in zip(
+            streams, counts, ("train", "validate"), strict=True
+        )
+    )
+    traces = traces_of(study)
+    count = len(table.tune)
+    tuned = sum(trace.run < count for trace in traces)
+    picked = tuple((t.run, t.axis) for t in traces) if study.axes else ()
+    first = jax.tree.map(lambda x: x[:count], tuning)
+    return Data(
+        tuned,
+        traces,
+        tuning=dataclasses.replace(first, traces=picked[:tuned]),
+        holdout=dataclasses.replace(holdout, traces=picked),
+    )
+
+
+def _signals(
+    case: Case,
+    references: jax.Array,
+    holding: jax.Array,
+    time_s: jax.Array,
+    random: np.random.Generator,
+    draws: int,
+    part: Literal["train", "validate"],
+) -> Signals:
+    count, samples, *axes = references.shape
+    shape = (count, draws, samples, *axes)
+    noise = as_array(random.standard_normal(shape))
+    disturbance = None
+    unexplained = _unexplained(case, time_s, part)
+    if unexplained is not None:
+        disturbance = jnp.broadcast_to(unexplained, shape)
+    drift = np.array(case.study.by_axis(case.study.disturbance.drift_rms))
+    if drift.any():
+        steps = random.standard_normal(shape) * np.sqrt(case.study.dt)
+        # By axis only where there are several.
+        walk = as_array(np.cumsum(steps, axis=2) * (drift if axes else drift[0]))
+        disturbance = walk if disturbance is None else disturbance + walk
+    return Signals(references, noise, disturbance, (), holding)
+
+
+def _holding(case: Case, begins: jax.Array) -> jax.Array:
+    """Return the inputs under which the stage rests where the references begin."""
+
+    def one(begin):
+        held = holding_input(case.loop.plant, as_signal(begin))
+        return jnp.stack(held) if isinstance(held, tuple) else held
+
+    # References begin in a few places, most of them in one.
+    places, which = np.unique(np.asarray(begins), axis=0, return_inverse=True)
+    return jax.jit(jax.vmap(one))(as_array(places))[which.ravel()]
+
+
+def _reference(study: Study, name: str, time_s: jax.Array) -> jax.Array:
+    table = study.references
+    amplitudes, offsets = study.by_axis(table.amplitude), study.by_axis(table.offset)
+    if study.axes is None:
+        return signal_library.signal(name, time_s, amplitudes[0], offsets[0])
+    return motions.motion(name, time_s, study.axes.names, amplitudes, offsets)
+
+
+def _unexplained(
+    case: Case, time_s: jax.Array, part: Literal["train", "validate"]
+) -> jax.Array | None:
+    """Return what the fitted plant leaves unexplained of its record, as a disturbance.
+
+    A controller that contains the fitted model would otherwise be tuned and judged as
+    if the stage were that model. Run forth and back to last as long as the references.
+    """
+    if case.fit is None:
+        return None
+    fit = case.fit
+    where = getattr(fit, part)
+    # The first half of the training part holds the initial loading, a single event.
+    start = where.start if part == "validate" else (where.start + where.stop) // 2
+    residual = (fit.record.output - fit.simulated)[start : where.stop]
+    there_and_back = np.concatenate([residual, residual[-2:0:-1]])
+    dt = fit.record.dt
+    return as_array(
+        np.interp(
+            np.asarray(time_s),
+            np.arange(there_and_back.size) * dt,
+            there_and_back,
+            period=there_and_back.size * dt,
+        )
+    )

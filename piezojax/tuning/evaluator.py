@@ -1,0 +1,68 @@
+"""Loops simulated on signals and stages, compiled once for each shape of them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+
+from ..analysis.stability.impulse import sensitivities
+from ..core.metrics import Extremes, TrackingFigures
+from ..core.system import Feedback
+from ..solve.clock import Clock
+from ..study import Case, Stage
+from .constraints import Seen, needs
+from .runs import Signals, evaluate
+
+
+class Judge:
+    """Simulates loops on signals; compiled once for each shape of them."""
+
+    def __init__(self, clock: Clock, case: Case, start: int):
+        self._clock, self._case, self._start = clock, case, start
+        self._programs: dict[str, Callable] = {}
+
+    def _compiled(self, key: str, function: Callable, *arguments: Any) -> Callable:
+        if key not in self._programs:
+            self._programs[key] = self._clock.compiled(function, *arguments)
+        return self._programs[key]
+
+    def figures(self, loop: Feedback, signals: Signals) -> TrackingFigures:
+        """Return the figures by reference and draw."""
+        program = self._compiled(
+            f"figures {signals.noise.shape}",
+            lambda loop, signals: evaluate(lambda x: x, loop, signals, self._start),
+            loop,
+            signals,
+        )
+        return program(loop, signals)
+
+    def on_stages(self, loop: Feedback, stages: Stage, signals: Signals) -> Seen:
+        """Return what is seen of ``loop`` on ``stages``, stacked on a leading axis."""
+        dynamic, static = eqx.partition(stages, eqx.is_array)
+        signals = signals.for_another_plant()
+        limits = self._case.study.constraints.limits
+        beside = Extremes() if needs(limits, "extremes") else None
+
+        def run(loop, dynamic, signals):
+            def around(part):
+                return eqx.combine(part, static).around(loop)
+
+            def one(part):
+                return evaluate(lambda x: x, around(part), signals, self._start, beside)
+
+            figures = jax.lax.map(one, dynamic)
+            figures, extremes = figures if beside else (figures, None)
+            margins = None
+            if needs(limits, "sensitivity"):
+                study = self._case.study
+                margins = jax.vmap(
+                    lambda part: sensitivities(around(part), study.highest, study.dt)
+                )(dynamic)
+            return figures, extremes, margins
+
+        count = jax.tree.leaves(dynamic)[0].shape[0]
+        program = self._compiled(
+            f"{count} stages {signals.noise.shape}", run, loop, dynamic, signals
+        )
+        return Seen(*program(loop, dynamic, signals), dt=self._case.study.dt)

@@ -1,0 +1,278 @@
+"""What tuning minimises: normalised tracking errors over references and noise draws."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Literal, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..analysis.stability.impulse import sensitivities
+from ..core.arrays import as_array
+from ..core.metrics import Extremes, TrackingFigures
+from ..core.space import Space
+from ..core.system import Feedback
+from ..study import Stage
+from .constraints import Seen, augmented, needs, violations
+from .runs import Signals, sampled
+
+T = TypeVar("T")
+
+Aggregate = Literal["geometric_mean", "mean_square", "worst"]
+Over = Literal["mean", "worst", "cvar"]
+
+PENALTY = 10.0
+"""First penalty on violated limits, on a scale where a factor e too much is 1."""
+
+HOPELESS = 1e6
+"""Objective of a run that diverged: finite, so that a line search can step back."""
+
+RAILED = 0.9
+"""A run whose actuator saturates for more than this share of it has lost its loop."""
+
+_SHARPNESS = 20.0  # of the smooth maximum in "worst"
+_FLOOR = 1e-9  # um: an error below a femtometre is as good as none
+
+
+class Verdict(NamedTuple):
+    """What a point comes to: the objective, and by how much it violates what most."""
+
+    loss: Float[Array, ""]
+    violation: Float[Array, ""]
+
+
+class Errors(NamedTuple):
+    """A point as a problem of least squares.
+
+    ``loss`` is what is minimised, ``errors`` of each run in um, ``added`` what the
+    augmented Lagrangian adds. A weight is how much the loss rises with half the mean
+    square of a run's error: with these weights, and 2 on what is added, they are
+    residuals whose squares have the loss's gradient, as far as it depends on them.
+    """
+
+    loss: Float[Array, ""]
+    verdict: Verdict
+    errors: Float[Array, "runs samples"]
+    added: Float[Array, " constraints"]
+    weights: Float[Array, " runs"]
+
+
+def _on_each(function: Callable[[Stage | None], T], stages: Stage | None) -> T:
+    """Return ``function`` of each of the stacked ``stages``, or of None alone."""
+    if stages is None:
+        return jax.tree.map(lambda x: x[None], function(None))
+    return eqx.filter_vmap(function)(stages)
+
+
+class Objective(eqx.Module):
+    """The objective over a Space.
+
+    Each reference's RMS error, over its noise draws, is divided by ``scale`` (um), one
+    for each stage and reference. ``aggregate`` joins them: ``geometric_mean`` (mean of
+    logarithms: a tenfold gain counts the same on every reference), ``mean_square``, or
+    ``worst`` (a smooth maximum of the logarithms). ``weights`` says how much each
+    counts (alike if left out); what is ``resting``, an axis that should not move,
+    counts only as far as its error exceeds its scale.
+
+    ``stages``, stacked on a leading axis, take the place of the loop's own; ``over``
+    joins them: their mean, the worst, or the mean of the worst ``tail`` of them.
+    ``effort_weight`` and ``slew_weight`` add the mean RMS voltage and RMS voltage
+    change a sample, both as a share of ``voltage_span``.
+
+    ``limits`` are constraints by name (``constraints.CONSTRAINTS``), kept on every
+    stage, margins on every one of ``margin_stages`` at the reference ``highest`` (um).
+    ``multipliers`` and ``penalty`` are those of the augmented Lagrangian that ``loss``
+    is.
+    """
+
+    loop: Feedback
+    space: Space
+    signals: Signals
+    scale: Float[Array, "stages references"]
+    voltage_span: Float[Array, ""]
+    start: int = eqx.field(static=True)
+    weights: Float[Array, " references"] | None = None
+    stages: Stage | None = None
+    margin_stages: Stage | None = None
+    resting: tuple[bool, ...] = eqx.field(static=True, default=())
+    aggregate: Aggregate = eqx.field(static=True, default="geometric_mean")
+    over: Over = eqx.field(static=True, default="mean")
+    tail: float = eqx.field(static=True, default=1.0)
+    effort_weight: float = eqx.field(static=True, default=0.0)
+    slew_weight: float = eqx.field(static=True, default=0.0)
+    limits: dict[str, Array] = eqx.field(default_factory=dict)
+    highest: Array | None = None
+    dt: float = eqx.field(static=True, default=1.0)
+    multipliers: Float[Array, " constraints"] = eqx.field(
+        default_factory=lambda: jnp.zeros(0)
+    )
+    penalty: Float[Array, ""] = eqx.field(converter=as_array, default=PENALTY)
+
+    @property
+    def lanes(self) -> int:
+        """Runs in one evaluation."""
+        runs = self.signals.noise.shape[0] * self.signals.noise.shape[1]
+        return runs * self.scale.shape[0]
+
+    def with_multipliers(self, multipliers: Array) -> "Objective":
+        """Return the objective with these multipliers of its limits."""
+        return dataclasses.replace(self, multipliers=multipliers)
+
+    def with_penalty(self, penalty: float) -> "Objective":
+        """Return the objective with this penalty on violated limits."""
+        return dataclasses.replace(self, penalty=penalty)
+
+    def with_limits(self, limits: Mapping[str, float]) -> "Objective":
+        """Return the objective with other limits of the same constraints."""
+        arrays = {name: as_array(limit) for name, limit in limits.items()}
+        return dataclasses.replace(self, limits=arrays)
+
+    def seen(self, unit: Float[Array, " n"]) -> Seen:
+        """Return what errors and constraints are read from.
+
+        Figures of shape [stages, references, draws].
+        """
+        return self._sampled(unit)[0]
+
+    def _sampled(
+        self, unit: Float[Array, " n"], every: int = 1
+    ) -> tuple[Seen, Array | None]:
+        beside = Extremes() if needs(self.limits, "extremes") else None
+        signals = self.signals
+        if self.stages is not None:
+            signals = signals.for_another_plant()
+
+        def loop_of(unit, stage):
+            loop = self.space.put(self.loop, unit)
+            return loop if stage is None else stage.around(loop)
+
+        def run(stage):
+            return sampled(
+                lambda unit: loop_of(unit, stage),
+                unit,
+                signals,
+                self.start,
+                beside,
+                every,
+            )
+
+        def margins(stage):
+            return sensitivities(loop_of(unit, stage), self.highest, self.dt)
+
+        figures, errors = _on_each(run, self.stages)
+        figures, extremes = figures if beside else (figures, None)
+        known = needs(self.limits, "sensitivity")
+        found = _on_each(margins, self.margin_stages) if known else None
+        return Seen(figures, extremes, found, dt=self.dt), errors
+
+    def _normalised(self, figures: TrackingFigures) -> Array:
+        square = jnp.mean(figures.rms_error**2, axis=2)
+        normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
+        if any(self.resting):
+            # A smooth maximum with 1: no gain in stillness, a price for motion.
+            above = jnp.logaddexp(0.0, _SHARPNESS * jnp.log(normalised)) / _SHARPNESS
+            normalised = jnp.where(jnp.array(self.resting), jnp.exp(above), normalised)
+        # Limits turn divergence into a limit cycle between them.
+        railed = jnp.any(figures.saturated > RAILED)
+        return jnp.where(railed, jnp.inf, normalised)
+
+    def _prices(self, figures: TrackingFigures) -> tuple[tuple[float, Array], ...]:
+        """Return weights and values of effort and slew."""
+        return (
+            (self.effort_weight, jnp.mean(figures.rms_effort) / self.voltage_span),
+            (self.slew_weight, jnp.mean(figures.rms_slew) / self.voltage_span),
+        )
+
+    def _shares(self) -> Array:
+        """Return how much each reference's error counts; the shares sum to 1."""
+        count = self.scale.shape[1]
+        weights = jnp.ones(count) if self.weights is None else self.weights
+        return weights / jnp.sum(weights)
+
+    def _error(self, figures: TrackingFigures) -> Array:
+        """Return the errors, joined over references and then over stages."""
+        normalised, shares = self._normalised(figures), self._shares()
+        if self.aggregate == "mean_square":
+            joined = jnp.sum(shares * normalised**2, axis=1)
+        elif self.aggregate == "geometric_mean":
+            joined = jnp.sum(shares * jnp.log(normalised), axis=1)
+        else:
+            logs = _SHARPNESS * jnp.log(normalised)
+            each = jnp.broadcast_to(shares * shares.size, logs.shape)
+            joined = jax.nn.logsumexp(logs, axis=1, b=each) / _SHARPNESS
+        if self.over == "worst":
+            return jnp.max(joined)
+        if self.over == "cvar":
+            worst = max(1, math.ceil(self.tail * joined.size))
+            return jnp.mean(jnp.sort(joined)[-worst:])
+        return jnp.mean(joined)
+
+    def _judged(self, seen: Seen) -> tuple[Array, Array]:
+        prices = [weight * value for weight, value in self._prices(seen.figures)]
+        return self._error(seen.figures) + sum(prices), violations(self.limits, seen)
+
+    def _added(self, violation: Array) -> Array:
+        multipliers = self.multipliers
+        if multipliers.size == 0:
+            multipliers = jnp.zeros_like(violation)
+        return augmented(violation, multipliers, self.penalty)
+
+    def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
+        """Return what is minimised; ``HOPELESS`` where the loop diverges or rails."""
+        return self.both(unit)[0]
+
+    def both(self, unit: Float[Array, " n"]) -> tuple[Float[Array, ""], Verdict]:
+        """Return ``loss`` and ``verdict`` of one simulation."""
+        return self._whole(self.seen(unit))[:2]
+
+    def _whole(self, seen: Seen) -> tuple[Array, Verdict, Array]:
+        """Return loss, verdict, and what the augmented Lagrangian adds."""
+        total, violation = self._judged(seen)
+        added = self._added(violation)
+        loss, alone = (
+            jnp.where(jnp.isfinite(x), x, HOPELESS)
+            for x in (total + jnp.sum(added**2), total)
+        )
+        return loss, Verdict(alone, jnp.max(violation, initial=0.0)), added
+
+    def errors(self, unit: Float[Array, " n"], every: int) -> Errors:
+        """Return the objective and one of ``every`` errors of each run."""
+        seen, errors = self._sampled(unit, every)
+        assert errors is not None
+        slope = jax.grad(lambda rms: self._error(seen.figures._replace(rms_error=rms)))(
+            seen.figures.rms_error
+        )
+        weights = slope / jnp.maximum(seen.figures.rms_error, _FLOOR)
+        loss, verdict, added = self._whole(seen)
+        flat = errors.reshape(-1, errors.shape[-1])
+        return Errors(loss, verdict, flat, added, weights.ravel())
+
+    def verdict(self, unit: Float[Array, " n"]) -> Verdict:
+        """Return the objective without constraints, and the worst violation."""
+        return self.both(unit)[1]
+
+    def violated(self, unit: Float[Array, " n"]) -> Float[Array, " constraints"]:
+        """Return every violation, as ``constraints.violations``."""
+        return self._judged(self.seen(unit))[1]
+
+    def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " residuals"]:
+        """Return what least squares minimises: the squares sum to a mean-square loss.
+
+        Raises ValueError for another aggregate.
+        """
+        if self.aggregate != "mean_square":
+            raise ValueError(f"least squares cannot minimise {self.aggregate!r}")
+        seen = self.seen(unit)
+        normalised = self._normalised(seen.figures)
+        shares = self._shares() / normalised.shape[0]
+        parts = [(normalised * jnp.sqrt(shares)).ravel()]
+        for weight, value in self._prices(seen.figures):
+            if weight > 0.0:
+                parts.append(jnp.sqrt(weight * value)[None])
+        parts.append(self._added(violations(self.limits, seen)))
+        every = jnp.concatenate(parts)
+        finite = jnp.all(jnp.isfinite(every))
+        return jnp.where(finite, every, jnp.sqrt(HOPELESS / every.size))

@@ -1,0 +1,242 @@
+"""The outcome of tuning: what ``result.json`` holds, and how it is written and read."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from ..core.files import read_model
+from ..core.metrics import TrackingFigures
+from .constraints import CONSTRAINTS, TOLERANCE, Seen, by_stage
+from .objective import RAILED
+
+Status = Literal["converged", "step limit", "interrupted"]
+
+RESULT_FILE = "result.json"
+GAINS_FILE = "gains.toml"
+
+
+class Scores(BaseModel):
+    """Tracking errors of one set of gains, um, by reference, over all noise draws."""
+
+    per_reference_rms_um: dict[str, float | None]
+    geomean_rms_um: float | None
+    worst_rms_um: float | None
+    peak_error_um: dict[str, float | None]
+    saturated_percent: dict[str, float]
+    peak_voltage_V: float | None  # noqa: N815
+
+    @property
+    def stable(self) -> bool:
+        """Whether every run stayed finite and off the limits most of the time."""
+        railed = max(self.saturated_percent.values()) > 100.0 * RAILED
+        return self.geomean_rms_um is not None and not railed
+
+
+class Kept(BaseModel):
+    """A limit and what became of it: the ``value`` nearest to it, over all plants.
+
+    ``kept`` allows for ``constraints.TOLERANCE``; ``active`` is a limit that is kept,
+    but by less than 2 %: it costs something.
+    """
+
+    limit: float
+    value: float | None
+    unit: str
+    sense: Literal["at most", "at least"]
+    kept: bool
+    active: bool
+    on: int
+    """Plants on which it is kept."""
+    of: int
+
+    @classmethod
+    def of_values(cls, name: str, limit: float, values: np.ndarray) -> "Kept":
+        """Return what became of constraint ``name``, given its value on each plant."""
+        kind = CONSTRAINTS[name]
+        at_most = kind.sense == "at most"
+        values = np.where(np.isfinite(values), values, np.inf if at_most else -np.inf)
+        worst = float(values.max() if at_most else values.min())
+        sign = 1.0 if at_most else -1.0
+        inside = sign * values <= sign * limit * (1.0 + sign * TOLERANCE)
+        kept = bool(inside.all())
+        near = sign * worst >= sign * limit * (1.0 - sign * 0.02)
+        return cls(
+            limit=limit,
+            value=_number(worst),
+            unit=kind.unit,
+            sense=kind.sense,
+            kept=kept,
+            active=kept and bool(near),
+            on=int(inside.sum()),
+            of=values.size,
+        )
+
+
+class FrontPoint(BaseModel):
+    """One point of a Pareto front: a limit, and the best gains found that keep it.
+
+    ``value`` is what the limited figure came to on the plants of the objective,
+    ``loss`` the objective, ``geomean_rms_um`` the error on the nominal plant.
+    """
+
+    limit: float
+    value: float | None
+    loss: float
+    kept: bool
+    geomean_rms_um: float | None
+    gains: dict[str, float]
+
+
+class Perturbed(BaseModel):
+    """The same gains on ``plants`` off their nominal values, drawn for the hold-out.
+
+    ``unstable`` counts plants on which a run diverges or rails. ``geomeans_um`` and
+    ``geomeans_before_um`` hold the geometric mean of the errors of the driven axes by
+    plant, None where a loop is unstable. ``median_better`` and ``worst_better`` are how
+    many times smaller it is than before, on the plant in the middle and on the worst
+    one of those on which both are stable; ``coupling_better`` is the median of the axes
+    at rest. ``constraints`` say what became of the limits there, ``values`` holds what
+    they limit by plant.
+    """
+
+    plants: int
+    unstable_before: int
+    unstable: int
+    geomean_rms_um: float | None
+    worst_rms_um: float | None
+    median_better: float | None
+    worst_better: float | None
+    coupling_better: float | None
+    geomeans_before_um: list[float | None] = []
+    geomeans_um: list[float | None] = []
+    constraints: dict[str, Kept] = {}
+    values: dict[str, list[float | None]] = {}
+
+    @classmethod
+    def of(
+        cls,
+        before: Seen,
+        after: Seen,
+        driven: np.ndarray,
+        limits: Mapping[str, float],
+    ) -> "Perturbed":
+        """Return what is seen [plant, trace, draw] before and after tuning comes to."""
+        means, lost = [], []
+        for figures in (before.figures, after.figures):
+            rms = np.sqrt(np.mean(np.asarray(figures.rms_error) ** 2, axis=2))
+            railed = np.max(np.asarray(figures.saturated), axis=(1, 2)) > RAILED
+            lost.append(railed | ~np.all(np.isfinite(rms), axis=1))
+            with np.errstate(divide="ignore"):
+                means.append(np.log(rms))
+        usable = ~lost[0] & ~lost[1]
+        better = np.exp(np.mean((means[0] - means[1])[usable][:, driven], axis=1))
+        rest = (means[0] - means[1])[usable][:, ~driven]
+        every = [np.exp(np.mean(mean[:, driven], axis=1)) for mean in means]
+        errors = every[1][~lost[1]]
+        values = by_stage(limits, after)
+        return cls(
+            plants=len(usable),
+            unstable_before=int(lost[0].sum()),
+            unstable=int(lost[1].sum()),
+            geomean_rms_um=_number(np.median(errors)) if errors.size else None,
+            worst_rms_um=_number(errors.max()) if errors.size else None,
+            median_better=_number(np.median(better)) if better.size else None,
+            worst_better=_number(better.min()) if better.size else None,
+            coupling_better=(
+                _number(np.median(np.exp(np.mean(rest, axis=1)))) if rest.size else None
+            ),
+            geomeans_before_um=_numbers(np.where(lost[0], np.nan, every[0])),
+            geomeans_um=_numbers(np.where(lost[1], np.nan, every[1])),
+            constraints={
+                name: Kept.of_values(name, limits[name], np.asarray(found))
+                for name, found in values.items()
+            },
+            values={name: _numbers(found) for name, found in values.items()},
+        )
+
+
+class Result(BaseModel):
+    """Everything a tuning run found; ``result.json`` is this as JSON.
+
+    ``before`` and ``after`` are the study's own gains and the tuned ones on the tuning
+    references and draws; ``holdout_before`` and ``holdout`` are the same two on noise
+    the optimiser has not seen, and ``unseen_before`` and ``unseen`` on references it
+    has not seen, with that noise too. On a stage with several axes these are the driven
+    ones, each error in its own unit of ``units``; ``coupling_before`` and ``coupling``
+    are the axes that should rest, under all references of the hold-out.
+    ``constraints`` says what became of the study's limits, ``front`` is its Pareto
+    front, and ``perturbed`` how the gains do on the held-out plants of its ensemble.
+    ``history`` holds the lowest loss of each start after each step, ``times_s`` the
+    seconds from the begin of the search to the end of that step.
+    """
+
+    model_config = ConfigDict(extra="ignore")
+
+    study: str
+    title: str
+    status: Status
+    method: str
+    gains: dict[str, float]
+    start: dict[str, float]
+    at_bound: list[str]
+    before: Scores
+    after: Scores
+    holdout_before: Scores
+    holdout: Scores
+    unseen_before: Scores | None
+    unseen: Scores | None
+    coupling_before: Scores | None = None
+    coupling: Scores | None = None
+    constraints: dict[str, Kept] = {}
+    front: list[FrontPoint] | None = None
+    perturbed: Perturbed | None = None
+    units: dict[str, str] = {}
+    warnings: list[str]
+    history: list[list[float | None]]
+    times_s: list[float] = []
+    evaluations: int
+    compile_s: float
+    wall_s: float
+    versions: dict[str, str]
+    seed: int
+
+
+def scores(figures: TrackingFigures, names: tuple[str, ...]) -> Scores:
+    """Return the Scores of figures of shape [reference, draw]."""
+    rms = np.sqrt(np.mean(np.asarray(figures.rms_error) ** 2, axis=1))
+    peak = np.max(np.asarray(figures.peak_error), axis=1)
+    saturated = 100.0 * np.mean(np.asarray(figures.saturated), axis=1)
+    finite = bool(np.all(np.isfinite(rms)))
+    voltage = float(np.max(np.asarray(figures.peak_voltage)))
+    return Scores(
+        per_reference_rms_um=dict(zip(names, map(_number, rms), strict=True)),
+        geomean_rms_um=_number(np.exp(np.mean(np.log(rms)))) if finite else None,
+        worst_rms_um=_number(np.max(rms)) if finite else None,
+        peak_error_um=dict(zip(names, map(_number, peak), strict=True)),
+        saturated_percent={
+            name: float(share) for name, share in zip(names, saturated, strict=True)
+        },
+        peak_voltage_V=_number(voltage),
+    )
+
+
+def _number(value: float) -> float | None:
+    # JSON has no infinity: a run that diverged has no figure.
+    return float(value) if np.isfinite(value) else None
+
+
+def _numbers(values: Any) -> list[float | None]:
+    return [_number(value) for value in np.asarray(values)]
+
+
+def load_result(path: str | Path) -> Result:
+    """Read a ``result.json``, or the folder that holds one.
+
+    Raises ValueError if there is none or it is damaged.
+    """
+    path = Path(path)
+    path = path / RESULT_FILE if path.is_dir() else path
+    return read_model(Result, path, "is no result of tuning")

@@ -1,0 +1,102 @@
+"""Runs of a loop: what drives them, and their figures all at once."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..core.axes import PerAxisMetric
+from ..core.metrics import Both, Tracking
+from ..core.rollout import Metric, simulate
+from ..core.system import Feedback, loop_inputs
+
+
+class Signals(eqx.Module):
+    """References (um), unit-variance noise draws and disturbances (um) for a loop.
+
+    With several axes all have a last dimension for them, in the unit of each.
+    ``traces`` then are what is judged: pairs of a reference and an axis. ``holding`` is
+    the input under which the loop's own plant rests at the begin of each reference,
+    worked out if left out.
+    """
+
+    references: Float[Array, "references samples *axes"]
+    noise: Float[Array, "references draws samples *axes"]
+    disturbance: Float[Array, "references draws samples *axes"] | None = None
+    traces: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
+    holding: Float[Array, "*begins"] | None = None
+
+    def for_another_plant(self) -> "Signals":
+        """Return the same without ``holding``."""
+        return dataclasses.replace(self, holding=None)
+
+
+def evaluate(
+    loop_of: Callable[[Any], Feedback],
+    parameters: Any,
+    signals: Signals,
+    start: int,
+    beside: Metric | None = None,
+) -> Any:
+    """Return the figures of ``loop_of(parameters)`` for each reference and noise draw.
+
+    With several axes, for each trace and noise draw. Every run starts at rest at its
+    reference; samples before ``start`` do not count. With ``beside``, another metric of
+    the same runs, a pair of both figures.
+    """
+    return sampled(loop_of, parameters, signals, start, beside)[0]
+
+
+def sampled(
+    loop_of: Callable[[Any], Feedback],
+    parameters: Any,
+    signals: Signals,
+    start: int,
+    beside: Metric | None = None,
+    every: int = 1,
+) -> tuple[Any, Array | None]:
+    """Return what ``evaluate`` does, and one of ``every`` errors (um) of each run.
+
+    The errors are those at samples counted, with time last; None unless ``every`` is
+    above 1.
+    """
+    metric: Metric = Tracking(start=start)
+    if beside is not None:
+        metric = Both(metric, beside)
+    if signals.references.ndim > 2:
+        metric = PerAxisMetric(metric, signals.references.shape[2])
+
+    def one(parameters, reference, noise, disturbance, holding):
+        loop = loop_of(parameters)
+        inputs = loop_inputs(reference, noise, disturbance)
+        state = loop.init(reference[0], holding)
+        found = simulate(loop, inputs, state, metric=metric, every=every)[1]
+        if every == 1:
+            return found, None
+        figures, log = found
+        error = jax.tree.map(jnp.subtract, log.displacement, log.reference)
+        counted = jax.tree.map(lambda x: x[start // every :], error)
+        return figures, jnp.stack(counted) if isinstance(counted, tuple) else counted
+
+    # A copy of the parameters for each run: their gradients are then summed once, at
+    # the end, and not in each step.
+    runs = signals.noise.shape[:2]
+    copies = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (*runs, *jnp.shape(x))), parameters
+    )
+    draws = jax.vmap(one, in_axes=(0, None, 0, 0, None))
+    found = jax.vmap(draws)(
+        copies,
+        signals.references,
+        signals.noise,
+        signals.disturbance,
+        signals.holding,
+    )
+    if not signals.traces:
+        return found
+    run, axis = (list(indices) for indices in zip(*signals.traces, strict=True))
+    return jax.tree.map(lambda x: x[jnp.array(run), :, jnp.array(axis)], found)

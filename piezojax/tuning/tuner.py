@@ -1,0 +1,297 @@
+"""Tuning: screen the box, descend from the best starts, judge on what was held out."""
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..core.arrays import as_array
+from ..core.metrics import TrackingFigures
+from ..core.progress import Progress, Silent
+from ..core.system import Feedback
+from ..solve.clock import Clock
+from ..study import Case, Stage, read, shipped
+from ..study.ensemble import Part
+from .baselines import Baselines, Budget, contest
+from .constraints import by_stage
+from .data import Data, make_data
+from .evaluator import Judge
+from .front import trace_front
+from .objective import RAILED, Objective
+from .result import FrontPoint, Kept, Perturbed, Result, Scores, scores
+from .runs import Signals
+from .search import search_box
+from .search_state import Search
+
+
+@dataclass
+class Outcome:
+    """A Result with the loops and signals behind it, for pictures and further use.
+
+    ``baselines`` are there if they were asked for.
+    """
+
+    result: Result
+    before: Feedback
+    after: Feedback
+    case: Case
+    holdout: Signals
+    baselines: Baselines | None = None
+
+    @property
+    def controller(self):
+        """The tuned controller."""
+        return self.after.controller
+
+
+def tune(
+    study: Case | str | Path | None = None,
+    *,
+    baselines: Budget | None = None,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Tune the controller of a study and judge it on held-out noise and references.
+
+    ``study`` is a Case, the path of a study file, or None for the default study.
+    With a budget the ``baselines`` are run on the same objective once that is done.
+    ``Ctrl-C`` ends the search and keeps the best gains found so far. A start that
+    diverges is replaced by the best of the candidates. Raises ValueError when no point
+    of the box, the start included, gives a stable loop.
+    """
+    progress = progress or Silent()
+    clock = Clock()
+    case = study if isinstance(study, Case) else read(study or shipped())
+    table, space = case.study, case.space
+    data = make_data(case)
+    first = round(table.references.settle * table.rate)
+
+    progress.stage("simulating the start")
+    judge = Judge(clock, case, first)
+    before = judge.figures(case.loop, data.tuning)
+    stages = _stages(case, "tune")
+    scale = _scale(before, data)[None]
+    if stages is not None:
+        found = judge.on_stages(case.loop, stages, data.tuning).figures
+        scale = jax.vmap(lambda one: _scale(one, data, scale[0]))(found)
+    objective = Objective(
+        loop=case.loop,
+        space=space,
+        signals=data.tuning,
+        scale=scale,
+        voltage_span=as_array(
+            np.mean(np.subtract(table.actuator.upper, table.actuator.lower))
+        ),
+        start=first,
+        aggregate=table.objective.aggregate,
+        effort_weight=table.objective.effort_weight,
+        slew_weight=table.objective.slew_weight,
+        weights=_weights(case, data),
+        resting=tuple(not trace.driven for trace in data.traces[: data.tuned]),
+        stages=stages,
+        margin_stages=_stages(case, "margins"),
+        over=table.ensemble.aggregate if table.ensemble else "mean",
+        tail=table.ensemble.tail if table.ensemble else 1.0,
+        highest=as_array(table.highest),
+        dt=table.dt,
+    ).with_limits(table.constraints.limits)
+    search, way = search_box(objective, case, clock, progress)
+
+    after = space.put(case.loop, as_array(search.unit))
+    try:
+        front, kept = None, _kept(objective, search, clock)
+        if table.pareto is not None and way and search.status != "interrupted":
+            front = trace_front(objective, case, search, way, clock, progress)
+        progress.stage("judging on held-out noise")
+        result = _report(case, data, judge, before, after, search, clock, kept, front)
+    except KeyboardInterrupt:
+        # What was found is kept; only a second interrupt ends this too.
+        search.status = "interrupted"
+        result = _report(case, data, judge, before, after, search, clock, {}, None)
+    rivals = (
+        contest(objective, case, data, search, baselines, progress)
+        if baselines and search.status != "interrupted"
+        else None
+    )
+    return Outcome(result, case.loop, after, case, data.holdout, rivals)
+
+
+def _scale(
+    before: TrackingFigures, data: Data, otherwise: jax.Array | None = None
+) -> jax.Array:
+    """Return what each trace's error is measured against: what it was before.
+
+    Where the start diverges that is no measure: ``otherwise`` is, or, without it, the
+    reference's own swing.
+    """
+    rms = jnp.sqrt(jnp.mean(jnp.asarray(before.rms_error) ** 2, axis=1))
+    usable = jnp.all(jnp.isfinite(rms)) & (jnp.max(before.saturated) <= RAILED)
+    own = jnp.where(rms > 0.0, rms, 1e-9)
+    return jnp.where(usable, own, _swing(data) if otherwise is None else otherwise)
+
+
+def _swing(data: Data) -> jax.Array:
+    swing = jnp.maximum(jnp.std(data.tuning.references, axis=1), 1e-3)
+    if swing.ndim == 1:
+        return swing
+    largest = jnp.max(swing, axis=1)
+    return jnp.stack(
+        [
+            swing[trace.run, trace.axis] if trace.driven else largest[trace.run]
+            for trace in data.traces[: data.tuned]
+        ]
+    )
+
+
+def _weights(case: Case, data: Data) -> jax.Array | None:
+    """Return how much each trace counts: less where the axis should rest."""
+    if case.study.axes is None:
+        return None
+    coupling = case.study.objective.coupling_weight
+    tuned = data.traces[: data.tuned]
+    return as_array([1.0 if trace.driven else coupling for trace in tuned])
+
+
+def _stages(case: Case, part: Part) -> Stage | None:
+    """Return the nominal stage and the drawn ones of a part, stacked; None if alone."""
+    others = case.ensemble.stages(part) if case.ensemble else None
+    if others is None:
+        return None
+    own = Stage(case.loop.plant, case.loop.sensor)
+    return jax.tree.map(
+        lambda own, drawn: jnp.concatenate([own[None], drawn]), own, others
+    )
+
+
+def _perturbed(
+    case: Case, data: Data, judge: Judge, before: Feedback, after: Feedback
+) -> Perturbed | None:
+    stages = case.ensemble.stages("holdout") if case.ensemble else None
+    if stages is None:
+        return None
+    driven = np.array([trace.driven for trace in data.traces])
+    seen = [judge.on_stages(loop, stages, data.holdout) for loop in (before, after)]
+    return Perturbed.of(seen[0], seen[1], driven, case.study.constraints.limits)
+
+
+def _kept(objective: Objective, search: Search, clock: Clock) -> dict[str, Kept]:
+    """Return the limits and what became of them, on the plants of the tuning."""
+    if not objective.limits:
+        return {}
+    unit = as_array(search.unit)
+    look = clock.compiled(lambda o, u: by_stage(o.limits, o.seen(u)), objective, unit)
+    values = jax.tree.map(np.asarray, look(objective, unit))
+    return {
+        name: Kept.of_values(name, float(limit), values[name])
+        for name, limit in objective.limits.items()
+    }
+
+
+def _report(
+    case: Case,
+    data: Data,
+    judge: Judge,
+    before: TrackingFigures,
+    after: Feedback,
+    search: Search,
+    clock: Clock,
+    kept: dict[str, Kept],
+    front: list[FrontPoint] | None,
+) -> Result:
+    driven = np.array([trace.driven for trace in data.traces])
+    seen = np.arange(len(data.traces)) < data.tuned
+
+    def held(figures: TrackingFigures, chosen: np.ndarray) -> Scores | None:
+        return _chosen(figures, data.names, chosen) if chosen.any() else None
+
+    def both(figures: TrackingFigures) -> tuple[Scores, Scores | None, Scores | None]:
+        return (
+            _chosen(figures, data.names, driven & seen),
+            held(figures, driven & ~seen),
+            held(figures, ~driven),
+        )
+
+    on_holdout = [judge.figures(loop, data.holdout) for loop in (case.loop, after)]
+    holdout_before, unseen_before, coupling_before = both(on_holdout[0])
+    holdout, unseen_after, coupling = both(on_holdout[1])
+    tuned = driven[: data.tuned]
+    names = data.names[: data.tuned]
+    after_scores = _chosen(judge.figures(after, data.tuning), names, tuned)
+    unit = np.asarray(search.unit)
+    values = case.space.from_unit(as_array(unit))
+    at_bound = [
+        path
+        for path, place in zip(case.space.paths, unit, strict=True)
+        if place < 1e-2 or place > 1.0 - 1e-2
+    ]
+    return Result(
+        study=case.name,
+        title=case.study.title,
+        status=search.status,
+        method=case.study.optimiser.method,
+        gains=_named(case, values),
+        start=_named(case, case.space.from_unit(case.space.start(case.loop))),
+        at_bound=at_bound,
+        before=_chosen(before, names, tuned),
+        after=after_scores,
+        holdout_before=holdout_before,
+        holdout=holdout,
+        unseen_before=unseen_before,
+        unseen=unseen_after,
+        coupling_before=coupling_before,
+        coupling=coupling,
+        constraints=kept,
+        front=front,
+        perturbed=_perturbed(case, data, judge, case.loop, after),
+        units={trace.name: trace.unit for trace in data.traces},
+        warnings=[*search.warnings, *_warnings(case, at_bound, after_scores, holdout)],
+        history=search.history,
+        times_s=search.times_s,
+        evaluations=search.evaluations,
+        compile_s=clock.compile_s,
+        wall_s=clock.wall_s(),
+        versions={n: version(n) for n in _VERSIONED},
+        seed=case.study.seed,
+    )
+
+
+_VERSIONED = ("piezojax", "jax", "jaxlib", "optimistix", "jaxopt", "equinox", "numpy")
+
+
+def _chosen(
+    figures: TrackingFigures, names: tuple[str, ...], chosen: np.ndarray
+) -> Scores:
+    """Return the scores of the traces that ``chosen`` marks."""
+    where = np.flatnonzero(chosen)
+    part = jax.tree.map(lambda x: np.asarray(x)[where], figures)
+    return scores(part, tuple(names[i] for i in where))
+
+
+def _named(case: Case, values: jax.Array) -> dict[str, float]:
+    return dict(zip(case.space.paths, map(float, values), strict=True))
+
+
+def _warnings(
+    case: Case, at_bound: list[str], after: Scores, holdout: Scores
+) -> list[str]:
+    found = []
+    if case.fit is not None:
+        part = case.fit.report.validation
+        found.append(
+            f"the fitted plant leaves {part.rmse:.3g} {part.unit} rms of its record "
+            "unexplained; that acts on the loop as a disturbance, the training part's "
+            "while tuning, the validation part's in the hold-out"
+        )
+    if at_bound:
+        found.append(f"at the edge of its bounds: {', '.join(at_bound)}")
+    for where, figures in (("tuning", after), ("hold-out", holdout)):
+        railed = [n for n, share in figures.saturated_percent.items() if share > 0]
+        if railed:
+            found.append(
+                f"the actuator saturates on {where} runs of {', '.join(railed)}"
+            )
+        if not figures.stable:
+            found.append(f"the tuned loop diverges or rails on {where} runs")
+    return found

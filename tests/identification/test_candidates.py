@@ -1,0 +1,136 @@
+"""Which models a record can support."""
+
+import numpy as np
+import pytest
+
+from piezojax import (
+    Record,
+)
+from piezojax.identification import METHODS, PARTS
+from piezojax.identification.candidates import at, companions, first_round, later_rounds
+from piezojax.identification.estimators.estimate import Options
+from piezojax.identification.parts import OWN_DYNAMICS
+
+HYSTERESIS = at("hysteresis")
+OPTIONS = Options()
+HALF = slice(0, 1000)
+
+
+def sines(frequencies, samples=2000, dt=1e-3, **more):
+    time = np.arange(samples) * dt
+    input = sum(np.sin(2 * np.pi * f * time + f) for f in frequencies)
+    return Record(input, 0.1 * input + 1.0, dt, source="made up", **more)
+
+
+RICH, ONE = sines((2.0, 9.0, 31.0, 77.0)), sines((2.0,))
+
+
+def models(candidates):
+    return [candidate.model for candidate in candidates]
+
+
+def reasons(untried):
+    return {one.model: one.reason for one in untried}
+
+
+def test_every_hysteresis_is_tried_with_what_the_record_shows():
+    found, untried = first_round([RICH], HALF, OPTIONS)
+    chains = [
+        f"{name}+exponential_creep{'' if name in OWN_DYNAMICS else '+arma'}"
+        for name in HYSTERESIS
+    ]
+    assert models(found)[: len(chains) + 1] == ["exponential_creep+arma", *chains]
+    assert {"hysteretic_arma", "state_space"} <= set(models(found))
+    assert set(reasons(untried)) >= {"bouc_wen", "neural_state_space"}
+
+
+def test_named_ones_are_tried_beside_linear_models():
+    names = ["hysteretic_arma", "prandtl_ishlinskii", "bouc_wen"]
+    found, untried = first_round([RICH], HALF, OPTIONS, names)
+    assert set(models(found)) == {
+        "exponential_creep+arma",
+        "prandtl_ishlinskii+exponential_creep+arma",
+        "hysteretic_arma",
+        "state_space",
+    }
+    assert set(reasons(untried)) == {"bouc_wen"}
+
+
+def test_named_ones_of_which_none_can_be_tried():
+    with pytest.raises(ValueError, match="none of them can be tried: bouc_wen: it nee"):
+        first_round([RICH], HALF, OPTIONS, ["bouc_wen"])
+
+
+def test_nothing_is_dropped_in_silence():
+    for record in (RICH, ONE, sines((2.0,), period=500), sines((3.0,), 200)):
+        found, untried = first_round([record], slice(0, record.samples // 2), OPTIONS)
+        named = {part for model in models(found) for part in model.split("+")}
+        whole = {model for method in METHODS.values() for model in method.models}
+        assert {*HYSTERESIS, *whole} <= named | set(reasons(untried))
+        assert all(reasons(untried).values())
+
+
+def test_one_frequency_carries_no_second_order_dynamics():
+    found, untried = first_round([ONE], HALF, OPTIONS)
+    assert "1 frequency in the training part" in reasons(untried)["arma"]
+    assert "state_space" in reasons(untried)
+    assert "hysteretic_arma" in reasons(untried)
+    assert all(
+        model.endswith("+lag") or model.split("+")[0] in OWN_DYNAMICS
+        for model in models(found)
+    )
+
+
+def test_a_short_record_shows_no_creep():
+    found, untried = first_round([RICH], slice(0, 900), OPTIONS)
+    assert not any("creep" in model for model in models(found))
+    assert "lasts 0.9 s" in reasons(untried)["exponential_creep"]
+
+
+def test_later_rounds_try_other_creeps_and_simpler_dynamics():
+    best = ["coleman_hodgdon+exponential_creep+arma"]
+    behind, _ = companions([RICH], HALF)
+    assert set(behind.creeps) == {*at("creep"), ""}
+    creeps, dynamics = later_rounds([RICH], HALF)
+    others = [name for name in behind.creeps if name != "exponential_creep"]
+    chains = ["+".join(p for p in ("coleman_hodgdon", c, "arma") if p) for c in others]
+    assert models(creeps(best)) == chains
+    assert models(dynamics(best)) == ["coleman_hodgdon+exponential_creep+lag"]
+    assert models(dynamics(["coleman_hodgdon+arma"])) == ["coleman_hodgdon+lag"]
+    for later in later_rounds([ONE], slice(0, 900)):
+        assert later(["coleman_hodgdon+lag"]) == []
+
+
+def test_a_model_with_past_outputs_stands_without_dynamics():
+    for name in OWN_DYNAMICS:
+        found, _ = first_round([RICH], HALF, OPTIONS, [name])
+        assert f"{name}+exponential_creep" in models(found)
+        _, dynamics = later_rounds([RICH], HALF)
+        assert dynamics([f"{name}+exponential_creep"]) == []
+
+
+def test_several_inputs_leave_the_linear_model():
+    time = np.arange(2000)
+    inputs = np.stack([np.sin(0.1 * time), np.cos(0.23 * time)], axis=1)
+    record = Record(inputs, inputs @ [[1.0, 0.2], [0.1, 2.0]], 1e-3, period=1000)
+    found, untried = first_round([record], HALF, OPTIONS)
+    assert ("state_space", "frequency_response") in found
+    assert all("2 inputs and 2 outputs" in reasons(untried)[h] for h in HYSTERESIS)
+    assert later_rounds([record], HALF) == []
+
+
+def test_several_records_of_one_stage_are_fitted_together():
+    found, untried = first_round([RICH, RICH], HALF, OPTIONS)
+    assert "coleman_hodgdon+exponential_creep+arma" in models(found)
+    assert "another input" in reasons(untried)["state_space"]
+    assert "2 records" in reasons(untried)["hysteretic_arma"]
+
+
+def test_every_part_has_a_place_that_is_known():
+    assert {place for place, _ in PARTS.values()} <= {
+        "hysteresis",
+        "creep",
+        "dynamics",
+        "lag",
+        "delay",
+    }

@@ -1,0 +1,294 @@
+"""What a comparison does with fits and failures, and what it writes."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from piezojax import (
+    Record,
+    load,
+)
+from piezojax.cli.identify import main
+from piezojax.core.system import (
+    Affine,
+)
+from piezojax.identification import (
+    compare,
+    identify_all,
+)
+from piezojax.identification.candidates import at
+from piezojax.identification.fit import Fit, FitError, FitReport
+from piezojax.report.model_ranking import (
+    comparison_notes,
+    comparison_table,
+    write_comparison,
+)
+
+HYSTERESIS = at("hysteresis")
+TIME = np.arange(2000) * 1e-3
+TONES = sum(np.sin(2 * np.pi * f * TIME + f) for f in (2.0, 9.0, 31.0, 77.0))
+RICH = Record(TONES, 0.1 * TONES + 1.0, 1e-3, source="made up")
+
+
+def test_a_name_that_is_no_hysteresis():
+    with pytest.raises(ValueError, match="'lag' is no hysteresis; there are coleman"):
+        identify_all(RICH, hysteresis=["lag"])
+
+
+# The course of it, with fits that are made up
+
+NOISE = np.random.default_rng(0).standard_normal((2000, 1))
+BIAS = {"coleman_hodgdon": 1e-4}
+"""What simulations are off by, beside the noise; others are further off."""
+
+
+def made_up(records, model, *, train, validate, progress, method, options):
+    """A fit with the noise for its errors, and the model's own share."""
+    progress.stage("fitting", 1)
+    head = model.split("+")[0]
+    own = BIAS.get(head, 0.5) * np.sin(np.arange(2000))[:, None]
+    off = 0.01 * (NOISE + own)
+    runs = tuple(record.outputs + off[: record.samples] for record in records)
+    blank = FitError(rmse=0.0, rmse_percent_of_span=0.0, unit="um")
+    report = FitReport(
+        model=model, parameters={}, train=blank, validation=blank, warnings=[], wall_s=0
+    )
+    fit = Fit(Affine(2.0), report, tuple(records), runs, train, validate, None, 5)
+    fit.report.train = fit.error_over(train)
+    fit.report.validation = fit.error_over(validate)
+    return fit
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Put ``made_up`` in place of the fits, with chosen models going wrong."""
+
+    def install(wrong=()):
+        def fit(records, model, **more):
+            for part, error in dict(wrong).items():
+                if part in model:
+                    raise error
+            return made_up(records, model, **more)
+
+        monkeypatch.setattr(compare, "identify", fit)
+
+    return install
+
+
+def test_of_two_ways_to_write_one_model_the_first_is_chosen(made, monkeypatch):
+    made()
+    monkeypatch.setitem(BIAS, "prandtl_ishlinskii", 1e-4)
+    monkeypatch.setitem(BIAS, "stop_prandtl_ishlinskii", 2e-4)
+    monkeypatch.delitem(BIAS, "coleman_hodgdon")
+    found = identify_all(RICH)
+    rows = {row.model: row for row in found.report.rows}
+    stop = rows["stop_prandtl_ishlinskii+exponential_creep+arma"]
+    plays = "prandtl_ishlinskii+exponential_creep+arma"
+    assert stop.bic < rows[plays].bic
+    assert found.report.best.split("+")[0] == "prandtl_ishlinskii"
+    assert stop.note == f"another way to write {plays}"
+    assert f"{stop.model} is {stop.note}" in comparison_notes(found.report)
+    # Another model has its place in the further rounds.
+    assert not any(
+        "stop_" in model and "exponential" not in model for model in found.fits
+    )
+
+
+def test_the_best_is_chosen_and_the_others_are_there(made):
+    made()
+    found = identify_all(RICH)
+    report = found.report
+    assert report.best.split("+")[0] == "coleman_hodgdon"
+    assert found.best is found.fits[report.best]
+    fitted = [row for row in report.rows if row.status == "fitted"]
+    assert fitted[0].model == report.best
+    assert fitted[0].as_good
+    assert len(fitted) == len(found.fits)
+    assert {row.model.split("+")[0] for row in fitted} >= set(HYSTERESIS)
+    assert report.samples == 1000
+    assert 500 < report.effective_samples[0] <= 1000
+    assert not report.interrupted
+
+
+def test_a_model_that_fails_is_a_row_with_its_error(made):
+    made({"prandtl_ishlinskii+": ValueError("no start"), "shaped": RuntimeError("xla")})
+    rows = {row.model: row for row in identify_all(RICH).report.rows}
+    failed = [row for row in rows.values() if row.status == "failed"]
+    assert {row.note for row in failed} >= {"no start", "RuntimeError: xla"}
+    assert any(row.status == "fitted" for row in rows.values())
+
+
+def test_a_fit_that_is_not_finite_has_failed(made, monkeypatch):
+    made()
+
+    def fit(records, model, **more):
+        found = made_up(records, model, **more)
+        if "shaped" in model:
+            found.report.validation.rmse = np.inf
+        return found
+
+    monkeypatch.setattr(compare, "identify", fit)
+    rows = identify_all(RICH).report.rows
+    (row,) = (row for row in rows if row.model.startswith("shaped"))
+    assert (row.status, row.note) == ("failed", "its free run is not finite")
+
+
+def test_nothing_fitted_at_all(made):
+    made({"": ValueError("nothing helps")})
+    with pytest.raises(ValueError, match=r"no model could be fitted .*nothing helps"):
+        identify_all(RICH)
+
+
+def test_ctrl_c_keeps_what_is_fitted(made):
+    made({"prandtl_ishlinskii": KeyboardInterrupt()})
+    report = identify_all(RICH).report
+    assert report.interrupted
+    assert report.best.startswith("coleman_hodgdon")
+    left = [row.model for row in report.rows if row.note == "interrupted before"]
+    assert any(model.startswith("prandtl_ishlinskii") for model in left)
+    assert "interrupted" in " ".join(comparison_notes(report))
+
+
+def test_ctrl_c_before_anything_is_fitted(made):
+    made({"": KeyboardInterrupt()})
+    with pytest.raises(KeyboardInterrupt):
+        identify_all(RICH)
+
+
+def test_progress_counts_the_models(made):
+    class Told:
+        def __init__(self):
+            self.stages = []
+
+        def stage(self, text, steps=0):
+            self.stages.append(text)
+
+        def advance(self, best, note=""):
+            pass
+
+    made()
+    told = Told()
+    fits = identify_all(RICH, progress=told).fits
+    assert len(told.stages) == len(fits)
+    assert told.stages[0].startswith("1 of about ")
+    assert told.stages[0].endswith(", exponential_creep+arma: fitting")
+    assert told.stages[-1].startswith(f"{len(fits)} of about ")
+
+
+# A part that the choice does not see
+
+
+def test_the_test_part_is_kept_from_fits_and_choice(made):
+    made()
+    report = identify_all(RICH, test=slice(1600, None)).report
+    assert (report.train, report.validation) == ((0, 800), (800, 1600))
+    assert report.test_part == (1600, 2000)
+    off = 0.01 * (NOISE[:, 0] + 1e-4 * np.sin(np.arange(2000)))[1600:]
+    assert report.test.rmse == pytest.approx(np.sqrt(np.mean(off**2)))
+    notes = " ".join(comparison_notes(report))
+    assert "neither fits nor choice have seen" in notes
+    assert "no hold-out" not in notes
+
+
+def test_without_a_test_part_the_choice_is_said_to_have_seen_it_all(made):
+    made()
+    notes = " ".join(comparison_notes(identify_all(RICH).report))
+    assert "--test START:STOP keeps samples" in notes
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"test": slice(5, 5)}, "test is 5:5; it must lie in 0:2000 and hold a"),
+        ({"test": slice(5, 2001)}, "test is 5:2001; it must lie in 0:2000"),
+        (
+            {"test": slice(900, 950), "validate": slice(600, 1000)},
+            "test 900:950 shares samples with validate 600:1000",
+        ),
+        ({"test": slice(0, 900)}, "train is 0:0; it must lie in 0:2000"),
+    ],
+)
+def test_bad_test_parts(parts, message):
+    with pytest.raises(ValueError, match=message):
+        identify_all(RICH, **parts)
+
+
+# What is written
+
+
+def test_the_files(made, tmp_path):
+    made({"shaped": ValueError("no start")})
+    found = identify_all(RICH)
+    write_comparison(found, tmp_path)
+    for name in ("comparison.png", "fit.png"):
+        assert (tmp_path / name).stat().st_size > 5000
+    report = json.loads((tmp_path / "comparison.json").read_text())
+    assert report["best"] == found.report.best
+    assert json.loads((tmp_path / "fit.json").read_text())["model"] == report["best"]
+    lines = (tmp_path / "comparison.csv").read_text().splitlines()
+    assert len(lines) == len(report["rows"]) + 1
+    for row in report["rows"]:
+        if row["status"] == "fitted":
+            assert "+" not in row["folder"]
+            assert load(tmp_path / row["folder"] / "model.json") == Affine(2.0)
+            fit = json.loads((tmp_path / row["folder"] / "fit.json").read_text())
+            assert fit["model"] == row["model"]
+        else:
+            assert row["note"]
+    assert comparison_table(found.report).row_count == len(found.fits) + 1
+
+
+# The command
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+@pytest.fixture
+def file(tmp_path):
+    time = np.arange(300) * 1e-3
+    level = np.where(time < 0.2, 20.0, 10.0)
+    drive = level * (1.0 - np.cos(2 * np.pi * 20.0 * time))
+    path = tmp_path / "bench.csv"
+    rows = zip(time, drive, 0.12 * np.roll(drive, 1) + 4.0, strict=True)
+    text = "\n".join(f"{t:.4f},{u:.6f},{y:.6f}" for t, u, y in rows)
+    path.write_text("time_s,drive_V,sensor_um\n" + text + "\n")
+    return path
+
+
+def test_the_command(made, file, tmp_path):
+    made()
+    out = tmp_path / "out"
+    arguments = ("--time", "time_s", "--input", "1", "--output", "2", "--model", "all")
+    among = ("--among", "coleman_hodgdon,prandtl_ishlinskii", "--test", "250:300")
+    result = call(file, *among, *arguments, "--out", out)
+    assert result.exit_code == 0, result.output
+    report = json.loads((out / "comparison.json").read_text())
+    assert report["best"] == "coleman_hodgdon+lag"
+    fitted = [row["model"] for row in report["rows"] if row["status"] == "fitted"]
+    assert sorted(fitted) == ["coleman_hodgdon+lag", "lag", "prandtl_ishlinskii+lag"]
+    assert report["test_part"] == [250, 300]
+    for text in ("best: coleman_hodgdon+lag", "not tried: exponential_creep"):
+        assert text in result.output
+    assert (out / "models" / "prandtl_ishlinskii-lag" / "model.json").is_file()
+    again = call(file, *arguments, "--out", out)
+    assert again.exit_code == 1
+    assert "already holds results" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--model", "all", "--method", "subspace"), "--method goes with one model"),
+        (("--test", "0:5"), "--among and --test go with --model all"),
+        (("--among", "coleman_hodgdon"), "--among and --test go with --model all"),
+        (("--among", ""), "--among and --test go with --model all"),
+    ],
+)
+def test_options_that_do_not_go_together(file, arguments, message):
+    result = call(file, *arguments)
+    assert result.exit_code == 1
+    assert message in result.stderr

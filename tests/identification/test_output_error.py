@@ -1,0 +1,128 @@
+"""Free-run fits against known truth and the measured micromanipulator."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from piezojax import (
+    Record,
+)
+from piezojax import (
+    identification as identify,
+)
+from piezojax.catalog import p753
+from piezojax.core.paths import replace
+from piezojax.identification import free_run
+from piezojax.identification.chain import structure
+from piezojax.identification.estimators.output_error import problem_of
+
+MICROMANIPULATOR = (
+    Path(__file__).parents[2].parent / "shared/data/micromanipulator/Model_Vi_Do.dat"
+)
+MODEL = "coleman_hodgdon+arma"
+
+
+def p753_record(samples, seed):
+    """Large slow strokes with tones up to 2.9 kHz on them, and 12 nm sensor noise."""
+    time = np.arange(samples) * p753.DT
+    u = 45.0 + 25.0 * np.linspace(1.0, 0.3, samples) * np.sin(2 * np.pi * 7.0 * time)
+    for hertz, volts in ((43, 15), (310, 6), (700, 4), (1500, 4), (2900, 4)):
+        u += volts * np.sin(2 * np.pi * hertz * time + hertz)
+    clean = np.asarray(free_run(p753.plant(), jnp.asarray(u), 0.0))
+    noise = np.random.default_rng(seed).standard_normal(samples)
+    return Record(u, clean + p753.NOISE_RMS * noise, p753.DT, source="P-753")
+
+
+@pytest.mark.slow
+def test_noise_does_not_bias_the_p753():
+    record = p753_record(20_000, 1)
+    fit = identify(record, MODEL, train=slice(0, 18_000))
+    truth = p753.plant()
+    np.testing.assert_allclose(
+        np.sort(fit.system.parts[1].poles()),
+        np.sort(truth.parts[1].poles()),
+        rtol=0.01,
+    )
+    found = fit.report.parameters["hysteresis.c"]
+    assert found.value == pytest.approx(float(truth.parts[0].c), rel=0.02)
+    assert abs(found.value - float(truth.parts[0].c)) < 4.0 * found.standard_error
+    assert fit.report.validation.rmse == pytest.approx(p753.NOISE_RMS, rel=0.03)
+
+
+@pytest.mark.slow
+def test_the_measured_micromanipulator():
+    if not MICROMANIPULATOR.is_file():
+        pytest.skip(f"{MICROMANIPULATOR} is not here; its excerpt is tested elsewhere")
+    columns = np.loadtxt(MICROMANIPULATOR)
+    record = Record(columns[:, 0], columns[:, 4], 1.0 / 200.0, source="Model_Vi_Do.dat")
+    fit = identify(record)
+    assert (fit.train.start, fit.validate.stop) == (0, record.samples)
+    # Its sensor's noise is 0.067 um, cycles differ by as much.
+    assert fit.report.validation.rmse < 0.15
+
+
+def test_residuals_of_records_of_different_length_leave_the_padding_out():
+    short, long = p753_record(100, 1), p753_record(160, 2)
+    shape = structure(MODEL, long)
+    problem, names = problem_of(shape, [short, long], slice(20, 160))
+    assert len(names) == len(shape.space.paths) + len(shape.own)
+    unknown = jnp.full(len(names), 0.4)
+    square = jnp.sum(jax.jit(lambda u: problem.residuals(u))(unknown) ** 2)
+    errors = []
+    for row, record in zip(np.asarray(problem.which), (short, long), strict=True):
+        system = shape.space.put(shape.system, unknown[row])
+        rest = system.parts[0].rest_input
+        run = free_run(system, jnp.asarray(record.input), rest)
+        errors.append(np.asarray(run - record.output)[20:])
+    np.testing.assert_allclose(square, np.mean(np.concatenate(errors) ** 2), rtol=1e-9)
+
+
+def test_a_record_that_says_nothing_of_a_parameter_gives_it_no_error():
+    # Without motion below 30 V the rest point is out of sight.
+    time = np.arange(600) * p753.DT
+    u = 50.0 + 15.0 * np.sin(2 * np.pi * 100.0 * time)
+    u[:2] = 30.0, 40.0
+    y = np.asarray(free_run(p753.plant(), jnp.asarray(u), 0.0))
+    y = y + 1e-3 * np.random.default_rng(0).standard_normal(600)
+    fit = identify(Record(u, y, p753.DT, source="one tone"), MODEL)
+    text = " ".join(fit.report.warnings)
+    assert "not exciting enough" in text or "one frequency" in text
+
+
+@pytest.mark.slow
+def test_hysteresis_creep_lag_and_delay_are_told_apart():
+    # Three frequencies a decade apart: a lag and a delay turn with frequency, a loop
+    # of hysteresis does not, creep fades with it.
+    model, dt = "coleman_hodgdon+logarithmic_creep+lag+delay", 2e-3
+    time = np.arange(3000) * dt
+    level = np.select([time < 2.5, time < 4.5], [1.0, 0.7], 0.5)
+    tone = [np.sin(2 * np.pi * f * time) for f in (0.8, 8.0, 40.0)]
+    u = 40.0 + level * (25.0 * tone[0] + 12.0 * tone[1] + 5.0 * tone[2])
+    shape = structure(model, Record(u, 0.12 * u, dt))
+    truth = {
+        "hysteresis.a": 0.0077,
+        "hysteresis.b": 0.1167,
+        "hysteresis.c": -0.0487,
+        "hysteresis.rest_input": 30.0,
+        "hysteresis.rest_output": 0.0,
+        "creep.gain_per_decade": 0.02,
+        "lag.time_constant": 4e-3,
+        "delay.delay": 3.3e-3,
+        "calibration.offset": 2.0,
+    }
+    clean = free_run(replace(shape.system, truth), jnp.asarray(u), 30.0)
+    noise = 3e-3 * np.random.default_rng(3).standard_normal(u.size)
+    fit = identify(Record(u, np.asarray(clean) + noise, dt, source="made"), model)
+    assert fit.report.validation.rmse == pytest.approx(3e-3, rel=0.1)
+    for path, accuracy in {
+        "hysteresis.c": 0.05,
+        "creep.gain_per_decade": 0.05,
+        "lag.time_constant": 0.03,
+        "delay.delay": 0.03,
+    }.items():
+        found = fit.report.parameters[path]
+        assert found.value == pytest.approx(truth[path], rel=accuracy), path
+        assert abs(found.value - truth[path]) < 4.0 * found.standard_error, path

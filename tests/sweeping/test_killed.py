@@ -1,0 +1,92 @@
+"""Processes that are killed in the midst of a sweep."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import piezojax as pj
+from piezojax.sweeping.cluster import client_of
+
+# Some 60 chunks of a few milliseconds each.
+MANY = {"method": "latin_hypercube", "samples": 4000, "chunk": 64}
+
+
+def bits(dataset):
+    return {name: dataset[name].values.tobytes() for name in ("rms_error", "saturated")}
+
+
+def start(path, out, tmp_path):
+    return subprocess.Popen(
+        [sys.executable, "-m", "piezojax.sweep", path, "--out", out, "--quiet"],
+        env=os.environ | {"PIEZOJAX_COMPILATION_CACHE": str(tmp_path / "programs")},
+    )
+
+
+def chunks(out):
+    return len(list((out / "chunks").glob("*.chunk")))
+
+
+@pytest.mark.slow
+def test_a_sweep_killed_again_and_again_loses_nothing(write, tmp_path):
+    path, out = write(MANY), tmp_path / "killed"
+    whole = pj.sweep(path)
+    assert whole is not None
+    draw, before = random.Random(1), 0
+    for _ in range(2):
+        process = start(path, out, tmp_path)
+        # Killed while it simulates and writes, after a few new chunks.
+        wanted = before + draw.randint(1, 12)
+        while chunks(out) < wanted and process.poll() is None:
+            time.sleep(0.002)
+        time.sleep(0.01 * draw.random())
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+        before = chunks(out)
+        assert wanted <= before < 63
+        assert not (out / "sweep.nc").exists()
+    assert start(path, out, tmp_path).wait() == 0
+    with xr.open_dataset(out / "sweep.nc", engine="h5netcdf") as found:
+        assert found.identical(whole)
+        assert bits(found) == bits(whole)
+
+
+@pytest.mark.slow
+def test_workers_of_a_cluster_give_the_same_and_may_be_killed(
+    write, tmp_path, monkeypatch
+):
+    # Each worker compiles for itself; the one that replaces the killed one, too.
+    monkeypatch.setenv("PIEZOJAX_COMPILATION_CACHE", str(tmp_path / "programs"))
+    path = write(MANY | {"samples": 700})
+    whole = pj.sweep(path)
+    assert whole is not None
+    with client_of("2") as client:
+        victims = list(client.run(os.getpid).values())
+        assert len(set(victims)) == 2
+
+        class Killing:
+            """Kills one worker when a few chunks are there."""
+
+            done = 0
+
+            def stage(self, text, steps=0):
+                pass
+
+            def advance(self, best, note=""):
+                self.done += 1
+                if self.done == 3:
+                    os.kill(victims[0], signal.SIGKILL)
+
+        killing = Killing()
+        found = pj.sweep(path, client=client, progress=killing, out=tmp_path / "out")
+    assert found is not None
+    with found:
+        assert bits(found) == bits(whole)
+        assert np.isfinite(found.rms_error).any()
+    assert killing.done == 11

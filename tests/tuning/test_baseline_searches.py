@@ -1,0 +1,221 @@
+"""Baselines that search, on a known minimum, and a contest on a small study."""
+
+import copy
+import dataclasses
+import json
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import piezojax as pj
+from piezojax.report.baseline_curves import (
+    baselines_table,
+    baselines_text,
+    write_baselines,
+)
+from piezojax.report.console import console
+from piezojax.solve.clock import Clock
+from piezojax.solve.history import Course
+from piezojax.study import Study, build
+from piezojax.tuning.baselines import Budget, cma_es, load_baselines, nelder_mead
+from piezojax.tuning.baselines.contest import holdout_geomean
+from piezojax.tuning.baselines.entries import Contestant, against
+from piezojax.tuning.data import make_data
+
+METHODS = {
+    "CMA-ES": cma_es(seed=2),
+    "CMA-ES, larger": cma_es(14, seed=2),
+    "Nelder-Mead": nelder_mead,
+}
+
+
+class Bowl(eqx.Module):
+    """An objective with its minimum where it is put."""
+
+    minimum: jnp.ndarray
+
+    def loss(self, unit):
+        return jnp.sum(jnp.array([1.0, 3.0, 9.0]) * (unit - self.minimum) ** 2)
+
+
+class Silent:
+    def stage(self, text, steps=0):
+        pass
+
+    def advance(self, best):
+        pass
+
+
+STARTS = np.array([[0.8, 0.2, 0.9], [0.1, 0.1, 0.1]])
+TIGHT = Budget(evaluations=3000, tolerance=1e-10)
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    ("minimum", "expected"),
+    [((0.3, 0.7, 0.55), (0.3, 0.7, 0.55)), ((0.3, 1.4, 0.55), (0.3, 1.0, 0.55))],
+)
+def test_the_minimum_inside_the_box(name, minimum, expected):
+    objective = Bowl(jnp.array(minimum))
+    found = METHODS[name](objective, STARTS, TIGHT, Silent())
+    np.testing.assert_allclose(found.unit, expected, atol=2e-4)
+    assert np.all((found.unit >= 0.0) & (found.unit <= 1.0))
+    course = found.course
+    assert course.loss == pytest.approx(float(objective.loss(found.unit)), rel=1e-12)
+    assert course.evaluations[-1] <= TIGHT.evaluations
+    assert np.all(np.diff(course.losses) <= 0.0)
+    assert np.all(np.diff(course.times_s) >= 0.0)
+    assert 0.0 < course.compile_s[-1] < course.times_s[-1]
+    assert found.stop != "evaluations"
+    assert "maxfevals" not in found.stop
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_budget_ends_a_search(name):
+    few = Budget(evaluations=28, tolerance=1e-12)
+    found = METHODS[name](Bowl(jnp.array([0.3, 0.7, 0.5])), STARTS, few, Silent())
+    assert 28 <= found.course.evaluations[-1] <= 28 + 14
+    assert found.stop in ("evaluations", "maxfevals")
+
+
+def test_nelder_and_mead_take_every_start():
+    """Two bowls: the one at the second start is the deeper."""
+
+    class Two(eqx.Module):
+        def loss(self, unit):
+            near = jnp.sum((unit - 0.8) ** 2)
+            deep = jnp.sum((unit - 0.1) ** 2) - 0.05
+            return jnp.minimum(near, deep)
+
+    starts = np.array([[0.8, 0.8, 0.7], [0.1, 0.2, 0.1]])
+    one, both = (
+        nelder_mead(Two(), starts[:count], TIGHT, Silent()).unit for count in (1, 2)
+    )
+    np.testing.assert_allclose(one, 0.8, atol=1e-3)
+    np.testing.assert_allclose(both, 0.1, atol=1e-3)
+
+
+def test_a_course_says_when_a_loss_was_reached():
+    course = Course(Clock())
+    for loss in (3.0, 5.0, 1.0):
+        course.add(4, loss)
+    assert course.losses == [3.0, 3.0, 1.0]
+    assert course.evaluations == [4, 8, 12]
+    assert [course.reached(x) for x in (4.0, 3.0, 2.0, 0.5)] == [0, 0, 2, None]
+
+
+def entry(**changes):
+    numbers = dict(
+        method="m", loss=1.0, holdout_geomean_um=0.1, evaluations=10, wall_s=20.0,
+        compile_s=2.0, cpu_s=30.0, best_s=15.0, stop="", gains={},
+    )  # fmt: skip
+    return Contestant(**(numbers | changes))
+
+
+def test_the_ratio_is_of_the_time_to_the_same_loss():
+    ours = entry(
+        losses=[3.0, 1.0, 0.5],
+        times_s=[2.0, 4.0, 9.0],
+        compiled_s=[1.0, 3.0, 3.0],
+        used_s=[1.0, 6.0, 7.0],
+        evaluated=[5, 6, 7],
+    )
+    found = against(entry(), ours)
+    assert (found.reached_s, found.reached_evaluations) == (4.0, 6)
+    assert (found.ratio, found.ratio_running, found.ratio_best) == (5.0, 18.0, 3.75)
+    assert found.ratio_cpu == 5.0
+    assert against(entry(loss=0.4), ours).ratio is None
+    assert against(entry(loss=None), ours).reached_s == 2.0
+
+
+STUDY = {
+    "title": "a PID on a lag",
+    "rate": 20_000.0,
+    "seed": 3,
+    "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
+    "actuator": {"lower": -20.0, "upper": 120.0},
+    "sensor": {"noise_rms": 0.012},
+    "controller": {"catalog": "p753_pid"},
+    "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
+    "parameters": {
+        "controller.proportional": {"lower": 0.1, "upper": 100.0, "transform": "log"},
+        "controller.integral": {"lower": 100.0, "upper": 1e6, "transform": "log"},
+    },
+    "optimiser": {
+        "method": "gauss_newton",
+        "starts": 2,
+        "candidates": 4,
+        "steps": 25,
+    },
+}
+
+
+def case_of(**changes):
+    return build(Study.model_validate(copy.deepcopy(STUDY) | changes), "small.toml")
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    return pj.tune(case_of(), baselines=Budget(evaluations=150))
+
+
+def test_a_contest_on_one_objective(outcome):
+    found = outcome.baselines
+    names = [rival.method for rival in found.rivals]
+    assert names[:2] == ["Ziegler-Nichols PI", "Ziegler-Nichols PID"]
+    assert names[-3:] == ["CMA-ES", "CMA-ES, population 12", "Nelder-Mead"]
+    assert found.notes == []
+    assert found.ours.loss == pytest.approx(min(outcome.result.history[-1]), abs=1e-9)
+    assert found.ours.holdout_geomean_um == pytest.approx(
+        outcome.result.holdout.geomean_rms_um, rel=1e-9
+    )
+    for rival in found.rivals[-3:]:
+        assert rival.loss == pytest.approx(found.ours.loss, abs=0.05)
+    # A PI by a rule lies in the box of this study: the searches can only be better.
+    rule = found.rival("Ziegler-Nichols PI")
+    assert rule.loss > found.ours.loss
+    assert rule.unit is None
+
+
+def test_a_rule_is_judged_like_the_gains_of_the_box(outcome):
+    """Its PI put into the study by hand has the loss and the error of its entry."""
+    rule = outcome.baselines.rival("Ziegler-Nichols PI")
+    table = {"type": "PID", "dt": 5e-5}
+    table |= {path.split(".")[1]: value for path, value in rule.gains.items()}
+    case = case_of(controller=table)
+    data, start = make_data(case), round(0.02 * 20_000)
+    error = holdout_geomean(case.loop, data, start)
+    assert error == pytest.approx(rule.holdout_geomean_um, rel=1e-9)
+    # With the noise that tunes in the hold-out's place: what the loss is made of.
+    again = dataclasses.replace(data, holdout=data.tuning)
+    tuned = holdout_geomean(case.loop, again, start)
+    before = outcome.result.before.geomean_rms_um
+    assert rule.loss == pytest.approx(np.log(tuned / before), rel=1e-9)
+
+
+def test_the_steps_have_times(outcome):
+    times = outcome.result.times_s
+    assert len(times) == len(outcome.result.history)
+    assert np.all(np.diff(times) > 0.0)
+    assert times[-1] <= outcome.result.wall_s
+
+
+def test_files_and_table(outcome, tmp_path, capsys):
+    write_baselines(outcome.baselines, tmp_path)
+    assert load_baselines(tmp_path) == outcome.baselines
+    assert (tmp_path / "baselines.png").read_bytes().startswith(b"\x89PNG")
+    console(False).print(baselines_table(outcome.baselines))
+    printed = capsys.readouterr().out
+    for rival in outcome.baselines.rivals:
+        assert rival.method.split()[-1] in printed
+    assert "best baseline" in baselines_text(outcome.baselines)
+
+
+def test_damaged_files(tmp_path):
+    with pytest.raises(ValueError, match="No such file"):
+        load_baselines(tmp_path)
+    (tmp_path / "baselines.json").write_text(json.dumps({"study": 1}))
+    with pytest.raises(ValueError, match="holds no baselines"):
+        load_baselines(tmp_path)

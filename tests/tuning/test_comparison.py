@@ -1,0 +1,272 @@
+"""Several studies in one go: what is compared, what is written, what is refused."""
+
+import json
+import tomllib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import tomli_w
+from click.testing import CliRunner
+
+from piezojax.catalog import p753_chapter4
+from piezojax.cli.tune import main
+from piezojax.core.paths import get
+from piezojax.report.comparison_map import comparison_table
+from piezojax.study import entries_of, load_comparison, read_entries, shipped
+from piezojax.study.contenders import Comparison as ComparisonFile
+from piezojax.tuning import compare, load_result
+from piezojax.tuning import comparison as comparing
+from piezojax.tuning.comparison import Comparison
+
+# The lag is given no sample time of its own (an ARMA has none), so any rate fits it.
+LAG = {"type": "ARMA", "autoregressive": [0.5], "moving": [0.0, 0.067]}
+FILE = {
+    "title": "two controllers",
+    "rates": [5000.0, 10_000.0],
+    "seed": 3,
+    "plant": LAG,
+    "actuator": {"lower": -20.0, "upper": 120.0},
+    "sensor": {"noise_rms": 0.012},
+    "references": {
+        "tune": ["SIN50"],
+        "unseen": ["SW50"],
+        "duration": 0.03,
+        "settle": 0.01,
+    },
+    "optimiser": {"starts": 1, "candidates": 2, "steps": 2},
+    "bounds": {"default": {"factor": 10.0}, "integral": {"factor": 30.0}},
+    "controllers": {
+        "pid": {
+            "label": "PID",
+            "catalog": "p753_ziegler_nichols",
+            "elsewhere": "rule",
+            "tune": ["proportional", "integral"],
+        },
+        "continuous": {
+            "catalog": "p753_continuous",
+            "printed": [5000.0],
+            "rates": [5000.0],
+            "tune": ["integral", "surface"],
+            "bounds": {"surface": {"lower": 0.1, "upper": 5.0, "per_sample": True}},
+        },
+    },
+}
+KEYS = {
+    *("title", "status", "rows", "better", "unseen_better", "best"),
+    *("versions", "seed", "wall_s"),
+}
+
+
+def entries(file):
+    return entries_of(file, "both.toml")
+
+
+def hopeless(case, progress):
+    raise ValueError("the loop diverges everywhere")
+
+
+def file_with(**tables):
+    return ComparisonFile.model_validate(FILE | tables)
+
+
+def with_controller(**changes):
+    return file_with(controllers={"pid": FILE["controllers"]["pid"] | changes})
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compared")
+    path = folder / "both.toml"
+    path.write_text(tomli_w.dumps(FILE | {"rates": [5000.0]}), encoding="utf-8")
+    done = CliRunner().invoke(main, [str(path), "--out", str(folder / "out")])
+    assert done.exit_code == 0, done.output
+    assert done.stderr == ""
+    text = (folder / "out" / "comparison.json").read_text(encoding="utf-8")
+    return done.stdout, folder / "out", json.loads(text)
+
+
+def test_a_row_for_each_controller_and_rate(compared):
+    _, _, data = compared
+    assert set(data) == KEYS
+    assert data["status"] == "complete"
+    found = [(row["controller"], row["rate_Hz"], row["start"]) for row in data["rows"]]
+    assert found == [
+        ("PID", 5000.0, "rule"),
+        ("continuous", 5000.0, "printed"),
+    ]
+
+
+def test_rows_are_the_studies_results(compared):
+    _, out, data = compared
+    assert {entry.name for entry in out.iterdir()} == {
+        *("comparison.json", "comparison.png"),
+        *(row["study"] for row in data["rows"]),
+    }
+    for row in data["rows"]:
+        result = load_result(out / row["study"])
+        assert row["before_um"] == result.holdout_before.geomean_rms_um
+        assert row["after_um"] == result.holdout.geomean_rms_um
+        assert row["unseen_um"] == result.unseen.geomean_rms_um
+        assert row["status"] == result.status
+        assert (out / row["study"] / "gains.toml").exists()
+
+
+def with_errors(result, before, after):
+    def scores(error):
+        return result.holdout.model_copy(update={"geomean_rms_um": error})
+
+    return result.model_copy(
+        update={"holdout_before": scores(before), "holdout": scores(after)}
+    )
+
+
+def tuned_to(monkeypatch, result, errors):
+    """Let tuning find the given errors (um), before and after, one after another."""
+    results = iter([with_errors(result, *pair) for pair in errors])
+    monkeypatch.setattr(
+        comparing,
+        "tune",
+        lambda case, progress: SimpleNamespace(result=next(results), case=case),
+    )
+
+
+def test_means_and_winners_follow_from_the_rows(compared, monkeypatch):
+    _, out, data = compared
+    result = load_result(out / data["rows"][0]["study"])
+    # PID at 5 and 10 kHz, then the continuous one at 5 kHz.
+    tuned_to(monkeypatch, result, [(0.8, 0.1), (0.6, 0.3), (0.5, 0.05)])
+    comparison = compare("made up", entries(file_with()))
+    assert comparison.better["PID"] == pytest.approx(4.0, rel=1e-12)
+    assert comparison.better["continuous"] == pytest.approx(10.0, rel=1e-12)
+    assert comparison.best == {"5000": "continuous", "10000": "PID"}
+
+
+def test_a_start_that_diverges_has_no_ratio(compared, monkeypatch):
+    _, out, data = compared
+    result = load_result(out / data["rows"][0]["study"])
+    tuned_to(monkeypatch, result, [(None, 0.1), (0.6, 0.3), (0.5, None)])
+    comparison = compare("made up", entries(file_with()))
+    assert [row.ratio for row in comparison.rows] == [None, 2.0, None]
+    assert comparison.better == {"PID": None, "continuous": None}
+    assert comparison.best["5000"] == "PID"
+
+
+def test_its_studies_can_be_tuned_alone(compared):
+    _, out, data = compared
+    study = out / data["rows"][0]["study"] / "study.toml"
+    (entry,) = read_entries([study])[1]
+    assert entry.case.study.rate == 5000.0
+    assert tomllib.loads(study.read_text())["controller"] == {
+        "catalog": "p753_ziegler_nichols"
+    }
+
+
+def test_the_command_ends_with_the_table(compared):
+    printed, out, _ = compared
+    assert "2 of 2: continuous at 5 kHz" in printed
+    assert "rms tracking error, nm" in printed
+    assert "geometric mean" in printed
+    assert "complete: 2 of 2 studies" in printed
+    assert (out / "comparison.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_several_studies_are_compared(compared, tmp_path, monkeypatch):
+    _, out, data = compared
+    paths = []
+    for row in data["rows"]:
+        paths.append(tmp_path / f"{row['controller']}.toml")
+        paths[-1].write_text((out / row["study"] / "study.toml").read_text())
+    monkeypatch.setattr(comparing, "tune", hopeless)
+    done = CliRunner().invoke(main, [*map(str, paths), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    comparison = Comparison.model_validate_json(
+        (tmp_path / "out" / "comparison.json").read_text(encoding="utf-8")
+    )
+    assert [row.study for row in comparison.rows] == ["PID", "continuous"]
+    assert [row.start for row in comparison.rows] == ["own", "own"]
+    assert "note: PID: the loop diverges everywhere" in done.stdout
+
+
+def test_two_studies_of_one_name_are_refused(compared, tmp_path):
+    _, out, data = compared
+    path = out / data["rows"][0]["study"] / "study.toml"
+    with pytest.raises(ValueError, match="two studies are named study"):
+        read_entries([path, path])
+
+
+def test_bounds_by_factor_and_by_sample():
+    pid, _, continuous = entries(file_with())
+    start = float(get(pid.case.loop, "controller.integral"))
+    bounds = pid.case.study.parameters["controller.integral"]
+    np.testing.assert_allclose([bounds.lower, bounds.upper], [start / 30, start * 30])
+    bounds = continuous.case.study.parameters["controller.surface"]
+    assert (bounds.lower, bounds.upper) == (500.0, 25_000.0)
+
+
+def test_a_bound_gives_way_to_the_start():
+    narrow = {"proportional": {"lower": 1e-6, "upper": 1e-5}}
+    (entry, _) = entries(with_controller(bounds=narrow))
+    bounds = entry.case.study.parameters["controller.proportional"]
+    assert bounds.lower == 1e-6
+    assert bounds.upper == float(get(entry.case.loop, "controller.proportional"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"catalog": "p753_pdi"}, "pid at 5000 Hz: 'p753_pdi' is unknown; there are "),
+        ({"rates": [3000.0]}, "pid at 3000 Hz: rate in Hz is 3000; it must be one of"),
+        ({"tune": ["gain"]}, "pid at 5000 Hz: no parameter 'gain'; the nearest are"),
+        ({"tune": ["derivative"]}, "derivative starts at 0; a factor takes a start ab"),
+    ],
+)
+def test_bad_controllers(changes, message):
+    with pytest.raises(ValueError, match=message):
+        entries(with_controller(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rates": [1e3, 1e3]}, "the rates of pid hold one of them twice"),
+        ({"bounds": {"integral": {"lower": 1.0}}}, "lower and upper, or a factor"),
+        ({"controllers": {"pid": {"label": "PID"}}}, "controllers.pid.catalog is miss"),
+        (
+            {"controllers": {"pid": {**FILE["controllers"]["pid"], "catalogue": "x"}}},
+            "controllers.pid.catalogue is unknown; allowed are catalog, tune, label",
+        ),
+    ],
+)
+def test_bad_files_in_one_line(changes, message, tmp_path):
+    path = tmp_path / "bad.toml"
+    path.write_text(tomli_w.dumps(FILE | changes), encoding="utf-8")
+    done = CliRunner().invoke(main, [str(path), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 1
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_study_that_cannot_be_tuned_is_a_row(monkeypatch):
+    monkeypatch.setattr(comparing, "tune", hopeless)
+    comparison = compare("none", entries(file_with()))
+    assert {row.status for row in comparison.rows} == {"failed"}
+    assert comparison.rows[0].notes == ["the loop diverges everywhere"]
+    assert comparison.better == {"PID": None, "continuous": None}
+    assert comparison.best == {}
+    assert comparison_table(comparison).row_count > 0
+
+
+def test_the_shipped_comparison_is_valid():
+    comparison = load_comparison(shipped("comparison/p753"))
+    assert set(comparison.rates) == {1e3, 2e3, 5e3, 1e4, 2e4}
+    one = comparison.model_copy(update={"rates": (2e3,)})
+    found = {entry.controller: entry for entry in entries_of(one, "p753.toml")}
+    assert len(found) == len(comparison.controllers)
+    tuned = found["model-reference PID-SMC"].case.loop.controller
+    printed = p753_chapter4.MODEL_REFERENCE_GAINS["4-4"][2000]
+    assert float(tuned.controller.integral) == printed["integral"]
+    assert found["model-reference PID-SMC"].start == "printed"
+    assert found["traditional PID-SMC"].start == "scaled"
+    assert found["PID"].start == "rule"

@@ -1,0 +1,52 @@
+"""The order in which a Pareto front is solved; test_robust has one of a loop."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from piezojax.tuning.front import undominated
+from piezojax.tuning.result import FrontPoint
+
+
+def place(limit, loss, kept=True, unit=0.0):
+    point = FrontPoint(
+        limit=limit, value=limit, loss=loss, kept=kept, geomean_rms_um=1.0, gains={}
+    )
+    return np.array([unit]), point
+
+
+@pytest.mark.parametrize(
+    ("losses", "kept", "again"),
+    [
+        ([-4.0, -3.0, -2.0], [True, True, True], []),
+        # Worse than a tighter one, and then better: the next is as it was.
+        ([-4.0, -1.0, -2.0], [True, True, True], [1.3]),
+        # The first is worse than the second one solved again.
+        ([-2.4, -1.0, -2.0], [True, True, True], [1.3, 1.4]),
+        # What misses its limit says nothing about others.
+        ([-4.0, -3.0, -9.0], [True, True, False], []),
+        ([-4.0, -9.0, -2.0], [True, False, True], [1.3]),
+    ],
+)
+def test_a_limit_is_solved_again_from_a_tighter_one_that_is_better(losses, kept, again):
+    found = [
+        place(limit, loss, keeps, unit)
+        for limit, loss, keeps, unit in zip(
+            (1.4, 1.3, 1.2), losses, kept, (0.4, 0.3, 0.2), strict=True
+        )
+    ]
+    asked = []
+
+    def solved(limit, unit):
+        asked.append(limit)
+        return place(limit, -2.5 if limit == 1.3 else -5.0, unit=float(unit[0]))
+
+    front = undominated(found, solved)
+    assert asked == again
+    assert [point.limit for _, point in front] == [1.4, 1.3, 1.2]
+    for i, limit in enumerate((1.4, 1.3)):
+        from_tighter = limit in again
+        assert float(front[i][0][0]) == (0.2 if from_tighter else found[i][0][0])
+    for (_, looser), (_, tighter) in pairwise(front):
+        assert not tighter.kept or looser.loss <= tighter.loss

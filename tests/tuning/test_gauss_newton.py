@@ -1,0 +1,307 @@
+"""Gauss-Newton on the errors: derivatives, steps within the box, known minima."""
+
+import copy
+from functools import cache
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import piezojax as pj
+from piezojax import (
+    simulate,
+)
+from piezojax.core.arrays import as_array
+from piezojax.core.system import loop_inputs
+from piezojax.solve.clock import Clock
+from piezojax.study import Study, build
+from piezojax.tuning.data import make_data
+from piezojax.tuning.gauss_newton import (
+    LANES,
+    RUNS,
+    Descent,
+    boxed_step,
+    lanes_of,
+    slopes_of,
+    spacing,
+)
+from piezojax.tuning.objective import Errors, Objective, Verdict
+from piezojax.tuning.successive_halving import Race, halved
+
+
+class Problem(eqx.Module):
+    """Residuals as one run's errors; the loss is half their mean square."""
+
+    kind: str = eqx.field(static=True)
+
+    def residuals(self, unit):
+        if self.kind == "valley":
+            x, y = 4.0 * unit - 2.0
+            return jnp.stack([100.0 * (y - x**2), 1.0 - x])
+        if self.kind == "bound":
+            return jnp.stack([unit[0] + 0.5, 10.0 * (unit[1] - 0.4 + unit[0])])
+        time = jnp.linspace(0.0, 1.0, 40)
+        height, rate = unit * jnp.array([4.0, 10.0])
+        return height * jnp.exp(-rate * time) - 1.6 * jnp.exp(-3.5 * time)
+
+    def errors(self, unit, every):
+        errors = self.residuals(unit)[None]
+        loss = 0.5 * jnp.mean(errors**2)
+        verdict = Verdict(loss, jnp.zeros(()))
+        return Errors(loss, verdict, errors, jnp.zeros(0), jnp.ones(1))
+
+    def loss(self, unit):
+        return self.errors(unit, 1).loss
+
+
+PROBLEMS = {
+    "valley": (0.75, 0.75),
+    "bound": (0.0, 0.4),
+    "decay": (0.4, 0.35),
+}
+
+
+@cache
+def programs_of(kind):
+    problem = Problem(kind)
+    return (
+        jax.jit(lambda u: slopes_of(problem, u, 1)),
+        jax.jit(lambda u: lanes_of(problem, u, 1)),
+    )
+
+
+def descent_on(kind, unit, tolerance=1e-14):
+    problem, unit = Problem(kind), np.array(unit)
+    slopes, lanes = programs_of(kind)
+    return Descent(
+        unit,
+        float(problem.loss(unit)),
+        problem.errors(unit, 1).verdict,
+        lambda u: slopes(as_array(u)),
+        lambda u: lanes(as_array(u)),
+        tolerance,
+    )
+
+
+@pytest.mark.parametrize("kind", PROBLEMS)
+@pytest.mark.parametrize("start", [(0.15, 0.9), (0.9, 0.2), (0.5, 0.5)])
+def test_descents_reach_the_minimum(kind, start):
+    descent = descent_on(kind, start)
+    for _ in range(60):
+        descent.step()
+        assert np.all((descent.unit >= 0.0) & (descent.unit <= 1.0))
+        if descent.done:
+            break
+    assert descent.done
+    np.testing.assert_allclose(descent.unit, PROBLEMS[kind], atol=1e-5)
+    assert np.all(np.diff(descent.losses) <= 0.0)
+
+
+def test_a_bent_valley_takes_few_steps():
+    """A hundred times steeper across than Rosenbrock's is along; gradients zigzag."""
+    descent = descent_on("valley", (0.2, 0.56))
+    taken = 0
+    while descent.loss > 1e-8:
+        descent.step()
+        taken += 1
+    assert taken <= 12
+
+
+def test_a_point_without_slopes_ends_its_descent():
+    descent = descent_on("valley", (0.2, 0.5))
+    good = descent.slopes(descent.unit)
+    descent.slopes = lambda unit: good._replace(jacobian=good.jacobian * jnp.nan)
+    assert descent.step() == 1
+    assert descent.done
+    np.testing.assert_array_equal(descent.unit, (0.2, 0.5))
+
+
+def test_steps_stop_at_the_sides_of_the_box():
+    curvature = np.array([[2.0, 1.9], [1.9, 2.0]])
+    target = np.array([-0.5, 0.9])
+    unit = np.array([0.2, 0.5])
+    model = SimpleNamespace(gradient=curvature @ (unit - target), curvature=curvature)
+    step = boxed_step(model, unit, 0.0)
+    # At x = 0 the best y solves 1.9 (0 + 0.5) + 2 (y - 0.9) = 0.
+    np.testing.assert_allclose(unit + step, [0.0, 0.9 - 0.5 * 0.95], atol=1e-12)
+    inside = SimpleNamespace(
+        gradient=curvature @ (unit - [0.3, 0.6]), curvature=curvature
+    )
+    np.testing.assert_allclose(unit + boxed_step(inside, unit, 0.0), [0.3, 0.6])
+    # On the side, pushed outwards, it stays there.
+    edge = np.array([0.0, 0.5])
+    model = SimpleNamespace(gradient=np.array([3.0, 0.0]), curvature=curvature)
+    assert boxed_step(model, edge, 0.1)[0] == 0.0
+
+
+@pytest.mark.parametrize(("runs", "counted"), [(1, 10), (4, 600), (10, 10_000)])
+def test_spacing_is_prime_and_leaves_samples(runs, counted):
+    every = spacing(runs, counted)
+    assert all(every % d for d in range(2, every))
+    assert counted // every >= 2
+    assert runs * counted / every <= 25_000
+
+
+def test_the_better_half_goes_on():
+    descents = [descent_on("valley", (0.1, 0.1)) for _ in range(3)]
+    for descent, loss in zip(descents, (3.0, 1.0, 2.0), strict=True):
+        descent.loss = loss
+    assert [d.loss for d in halved(descents)] == [1.0, 2.0]
+    assert [d.loss for d in halved(descents[:1])] == [3.0]
+
+
+STUDY = {
+    "title": "a PID on a lag",
+    "rate": 20_000.0,
+    "seed": 3,
+    "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
+    "actuator": {"lower": -20.0, "upper": 120.0},
+    "sensor": {"noise_rms": 0.012},
+    "controller": {"catalog": "p753_pid"},
+    "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
+    "parameters": {
+        "controller.proportional": {"lower": 0.1, "upper": 50.0, "transform": "log"},
+        "controller.integral": {"lower": 100.0, "upper": 2e5, "transform": "log"},
+    },
+    "objective": {"noise_draws": 2},
+    "optimiser": {
+        "method": "gauss_newton",
+        "starts": 3,
+        "candidates": 8,
+        "steps": 30,
+    },
+}
+
+
+def case_of(**optimiser):
+    study = copy.deepcopy(STUDY)
+    study["optimiser"] |= optimiser
+    return build(Study.model_validate(study), "small.toml")
+
+
+def objective_of(case, **options):
+    return Objective(
+        loop=case.loop,
+        space=case.space,
+        signals=make_data(case).tuning,
+        scale=jnp.array([[0.5, 2.0]]),
+        voltage_span=as_array(140.0),
+        start=400,
+        **options,
+    )
+
+
+def test_weighted_errors_have_the_gradient_of_the_objective():
+    """From errors of every sample, by a run of its own: sum of w mean(e de)."""
+    case = case_of()
+    objective = objective_of(case, aggregate="worst")
+    unit = jnp.array([0.4, 0.6])
+
+    def errors(unit):
+        loop = case.space.put(case.loop, unit)
+
+        def one(reference, noise):
+            inputs = loop_inputs(reference, noise)
+            log = simulate(loop, inputs, loop.init(reference[0]))[1]
+            return (log.displacement - log.reference)[400:]
+
+        signals = objective.signals
+        references = jnp.repeat(signals.references, 2, axis=0)
+        return jax.vmap(one)(references, signals.noise.reshape(4, -1))
+
+    every = 7
+    whole = jax.jit(lambda u: objective.errors(u, every))(unit)
+    loss, sample, weights = whole.loss, whole.errors, whole.weights
+    both = jax.jacfwd(lambda u: (errors(u),) * 2, has_aux=True)
+    slopes, dense = jax.jit(both)(unit)
+    # The gradient of the objective goes the other way: through its figures.
+    here = jax.jit(lambda u: slopes_of(objective, u, every))(unit)
+    found = jnp.einsum("r,rt,rti->i", weights, dense, slopes) / dense.shape[1]
+    np.testing.assert_allclose(found, here.gradient, rtol=1e-8)
+    np.testing.assert_allclose(loss, here.loss, rtol=1e-12)
+    np.testing.assert_allclose(weights, here.weights, rtol=1e-12)
+    # Every seventh sample of the run, of those that count.
+    at = np.arange(6, 1000, 7)
+    at = at[400 // 7 :] - 400
+    np.testing.assert_allclose(sample, dense[:, at], atol=1e-12)
+    np.testing.assert_allclose(
+        here.jacobian, jnp.moveaxis(slopes[:, at], 2, 0), rtol=1e-8, atol=1e-9
+    )
+
+
+@pytest.fixture(scope="module")
+def objective():
+    return objective_of(case_of())
+
+
+@pytest.fixture(scope="module")
+def programs(objective):
+    clock = Clock()
+    found = Race(objective, case_of(), clock)
+    found.wait()
+    assert clock.compile_s > 0.0
+    return found
+
+
+def test_screening_any_number_of_points(objective, programs):
+    points = np.random.default_rng(0).uniform(0.1, 0.9, (LANES + 1, 2))
+    found, verdict = programs.losses(points)
+    np.testing.assert_array_equal(found, verdict.loss)
+    expected = jax.jit(jax.vmap(lambda u: objective.loss(u)))(jnp.asarray(points))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    return pj.tune(case_of())
+
+
+def test_a_study_is_tuned(outcome):
+    result = outcome.result
+    assert result.method == "gauss_newton"
+    assert result.status == "converged"
+    assert result.holdout.geomean_rms_um < 0.5 * result.holdout_before.geomean_rms_um
+    history = np.array(result.history, dtype=float)
+    assert history.shape[1] == 3
+    assert np.all(np.diff(history, axis=0) <= 0.0)
+    assert len(result.times_s) == len(history)
+    # Each step of each descent: its derivatives, as many probes and trials as lanes.
+    steps = (result.evaluations - 9 - 3) / RUNS
+    assert steps == int(steps)
+    assert len(history) < steps <= 3 * len(history)
+
+
+def test_no_point_around_is_better(outcome, programs):
+    """Of grids in the box; their loss is the tuner's, less a constant."""
+    case = case_of()
+    values = jnp.array([outcome.result.gains[path] for path in case.space.paths])
+    unit = np.asarray(case.space.to_unit(values))
+    side = np.linspace(-1.0, 1.0, 9)
+    grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    around = np.clip(
+        np.concatenate([unit + scale * grid for scale in (1e-3, 0.03, 1.0)]), 0.0, 1.0
+    )
+    here = programs.losses(unit[None])[0][0]
+    assert np.all(programs.losses(around)[0] >= here - 1e-5)
+
+
+class Stopping:
+    def __init__(self, steps):
+        self._left = steps
+
+    def stage(self, text, steps=0):
+        pass
+
+    def advance(self, best):
+        self._left -= 1
+        if self._left == 0:
+            raise KeyboardInterrupt
+
+
+def test_ctrl_c_keeps_the_best_so_far(outcome):
+    found = pj.tune(case_of(), progress=Stopping(2)).result
+    assert found.status == "interrupted"
+    assert found.history == outcome.result.history[:2]

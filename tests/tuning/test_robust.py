@@ -1,0 +1,364 @@
+"""Robust tuning: ensembles, limits, the augmented Lagrangian, the Pareto front."""
+
+import dataclasses
+import json
+import tomllib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tomli_w
+
+import piezojax as pj
+from piezojax.analysis.stability import stability_report
+from piezojax.catalog import p753, p753_stage
+from piezojax.core.metrics import TrackingFigures
+from piezojax.core.paths import replace
+from piezojax.study import Stage, read, shipped
+from piezojax.study.schema import ConstraintsTable
+from piezojax.tuning.constraints import CONSTRAINTS, augmented, updated
+from piezojax.tuning.data import make_data
+from piezojax.tuning.objective import Objective
+
+STUDY = {
+    "title": "integral action on the P-753",
+    "rate": 20000.0,
+    "seed": 5,
+    "plant": {"catalog": "p753_stage"},
+    "actuator": {"lower": -20.0, "upper": 120.0},
+    "sensor": {"noise_rms": 0.001},
+    "disturbance": {"drift_rms": 0.02},
+    "controller": {"type": "PID", "proportional": 0.0, "integral": 200.0, "dt": 5e-5},
+    "references": {
+        "tune": ["SIN50", "SIN20"],
+        "amplitude": 2.0,
+        "duration": 0.05,
+        "settle": 0.02,
+    },
+    "parameters": {
+        "controller.integral": {"lower": 20.0, "upper": 2e4, "transform": "log"}
+    },
+    "ensemble": {
+        "spread": {"gain": 0.2, "poles": 0.1, "sensor.noise.noise_rms": 0.5},
+        "range": {"mode_frequency": [2000.0, 6000.0], "delay": [0.0, 1.0]},
+        "tune": 2,
+        "margins": 4,
+        "holdout": 5,
+    },
+    "constraints": {
+        "sensitivity_peak": 1.3,
+        "delay_margin": 3.0,
+        "overshoot": 0.5,
+        "peak_voltage": 100.0,
+        "peak_slew": 1e6,
+        "effort": 50.0,
+    },
+    "pareto": {"constraint": "sensitivity_peak", "limits": [1.2, 1.4], "steps": 5},
+    "optimiser": {
+        "method": "gauss_newton",
+        "starts": 2,
+        "candidates": 3,
+        "steps": 10,
+    },
+}
+
+
+def written(folder, study, name="study.toml"):
+    path = folder / name
+    path.write_text(tomli_w.dumps(study), encoding="utf-8")
+    return path
+
+
+def changed(**tables):
+    """Return STUDY with tables replaced; ``a__b`` sets key b of table a."""
+    study = json.loads(json.dumps(STUDY))
+    for name, value in tables.items():
+        table, _, key = name.partition("__")
+        if key:
+            study[table][key] = value
+        elif value is None:
+            del study[table]
+        else:
+            study[table] = value
+    return study
+
+
+@pytest.fixture(scope="module")
+def outcome(tmp_path_factory):
+    return pj.tune(written(tmp_path_factory.mktemp("robust"), STUDY))
+
+
+def exact_peak(loop, stage):
+    """Return Ms on the worse branch at the top of the references, by poles and QR."""
+    other = stage.around(loop)
+    reports = [stability_report(other, 2.0, b) for b in ("ascending", "descending")]
+    return max(report.sensitivity_peak for report in reports)
+
+
+def each(stages):
+    count = jax.tree.leaves(stages)[0].shape[0]
+    return [jax.tree.map(lambda x, i=i: x[i], stages) for i in range(count)]
+
+
+# The augmented Lagrangian
+
+
+def test_multipliers_of_a_known_problem():
+    """Minimise (x-3)^2 with ln x <= ln 2: x = 2, multiplier -df/dx / dg/dx = 4."""
+
+    def total(x, multipliers, penalty):
+        added = augmented(jnp.log(x / 2.0)[None], multipliers, penalty)
+        return (x - 3.0) ** 2 + jnp.sum(added**2)
+
+    @jax.jit
+    def newton(x, multipliers):
+        slope = jax.grad(total)(x, multipliers, penalty)
+        return x - slope / jax.hessian(total)(x, multipliers, penalty)
+
+    x, multipliers, penalty = jnp.asarray(3.0), jnp.zeros(1), jnp.asarray(5.0)
+    for _ in range(30):
+        for _ in range(10):
+            x = newton(x, multipliers)
+        multipliers = updated(jnp.log(x / 2.0)[None], multipliers, penalty)
+    assert x == pytest.approx(2.0, abs=1e-6)
+    assert multipliers[0] == pytest.approx(4.0, rel=1e-4)
+
+
+def test_what_is_kept_costs_nothing():
+    added = augmented(jnp.array([-0.1, 0.2]), jnp.zeros(2), jnp.asarray(8.0))
+    np.testing.assert_allclose(added, [0.0, 2.0 * 0.2])
+
+
+# Limits
+
+
+def test_the_limit_is_kept_active_and_where_the_margin_says(outcome):
+    kept = outcome.result.constraints["sensitivity_peak"]
+    assert (kept.kept, kept.active, kept.of) == (True, True, 5)
+    stages = each(outcome.case.ensemble.stages("margins"))
+    assert len(stages) == 4
+    own = exact_peak(outcome.after, Stage(
+        outcome.case.loop.plant, outcome.case.loop.sensor))  # fmt: skip
+    worst = max(own, *(exact_peak(outcome.after, stage) for stage in stages))
+    assert kept.value == pytest.approx(worst, rel=2e-3)
+    assert worst == pytest.approx(1.3, rel=5e-3)
+
+
+def test_no_larger_gain_keeps_the_limit(outcome):
+    """One gain: the error falls with it, so the limit alone holds it back."""
+    (gain,) = outcome.result.gains.values()
+    larger = replace(outcome.case.loop, {"controller.integral": 1.03 * gain})
+    stages = each(outcome.case.ensemble.stages("margins"))
+    assert max(exact_peak(larger, stage) for stage in stages) > 1.3
+    assert outcome.result.after.geomean_rms_um < outcome.result.before.geomean_rms_um
+
+
+def test_held_out_plants_are_judged_one_by_one(outcome):
+    found = outcome.result.perturbed
+    stages = each(outcome.case.ensemble.stages("holdout"))
+    peaks = [exact_peak(outcome.after, stage) for stage in stages]
+    np.testing.assert_allclose(found.values["sensitivity_peak"], peaks, rtol=2e-3)
+    within = sum(peak <= 1.3 for peak in peaks)
+    assert found.constraints["sensitivity_peak"].on == within
+    assert (found.plants, found.unstable) == (5, 0)
+    ratios = np.divide(found.geomeans_before_um, found.geomeans_um)
+    assert found.median_better == pytest.approx(np.median(ratios))
+    assert found.worst_better == pytest.approx(ratios.min())
+
+
+def test_the_front_trades_error_for_robustness(outcome):
+    loose, tight = outcome.result.front
+    assert (loose.limit, tight.limit) == (1.4, 1.2)
+    assert loose.kept
+    assert tight.kept
+    assert loose.value == pytest.approx(1.4, rel=0.02)
+    assert tight.value == pytest.approx(1.2, rel=0.02)
+    assert loose.geomean_rms_um < tight.geomean_rms_um
+
+
+def test_the_result_loads_back(outcome, tmp_path):
+    (tmp_path / "result.json").write_text(outcome.result.model_dump_json())
+    assert pj.load_result(tmp_path) == outcome.result
+
+
+def test_figures_of_runs_are_those_of_their_logs(outcome):
+    """Voltage, slew, effort and overshoot against NumPy on whole logs."""
+    found, case = outcome.result.constraints, outcome.case
+    signals = make_data(case).tuning.for_another_plant()
+    own = Stage(case.loop.plant, case.loop.sensor)
+
+    @eqx.filter_jit
+    def logged(stage, *signals):
+        loop = stage.around(outcome.after)
+        return pj.simulate(loop, pj.loop_inputs(*signals), loop.init(signals[0][0]))[1]
+
+    logs = [
+        jax.tree.map(
+            np.asarray,
+            logged(
+                stage,
+                signals.references[run],
+                signals.noise[run, 0],
+                signals.disturbance[run, 0],
+            ),
+        )
+        for stage in (own, *each(case.ensemble.stages("tune")))
+        for run in range(2)
+    ]
+    assert len(logs) == 6
+    voltage = [log.voltage for log in logs]
+    assert found["peak_voltage"].value == pytest.approx(
+        max(np.abs(v).max() for v in voltage)
+    )
+    assert found["peak_slew"].value == pytest.approx(
+        max(np.abs(np.diff(v)).max() for v in voltage) / 5e-5
+    )
+    assert found["effort"].value == pytest.approx(
+        max(np.sqrt(np.mean(v[400:] ** 2)) for v in voltage)
+    )
+    beyond = [
+        (log.displacement.max() - log.reference.max()) / np.ptp(log.reference)
+        for log in logs
+    ]
+    assert found["overshoot"].value == pytest.approx(max(*beyond, 0.0))
+
+
+# Ensembles
+
+
+def test_draws_lie_where_the_study_says(tmp_path):
+    ensemble = read(written(tmp_path, STUDY)).ensemble
+    stages = ensemble.stages("holdout")
+    other = read(written(tmp_path, changed(ensemble__holdout=300), "more.toml"))
+    plants = other.ensemble.stages("holdout").plant.parts
+    names = p753_stage.stage().names
+    gain = np.asarray(plants[names.index("gain")].gain)
+    assert 0.8 <= gain.min() < 0.81
+    assert 1.19 < gain.max() <= 1.2
+    hertz = np.asarray(plants[names.index("mode")].frequency) / (2.0 * np.pi)
+    assert 2000.0 <= hertz.min() < 2060.0
+    assert 5940.0 < hertz.max() <= 6000.0
+    delay = np.asarray(plants[names.index("delay")].delay) / 5e-5
+    assert 0.0 <= delay.min() < 0.02
+    noise = np.asarray(other.ensemble.stages("holdout").sensor.parts[0].noise_rms)
+    assert 0.0005 <= noise.min() < noise.max() <= 0.0015
+    first = each(ensemble.stages("tune"))[0], each(ensemble.stages("margins"))[0]
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, *first))
+    assert not jnp.isin(stages.plant.parts[names.index("gain")].gain, gain[5:]).any()
+
+
+def test_a_stage_without_deviation_is_the_printed_one_and_what_is_added():
+    stage = p753_stage.stage()
+    printed = p753.plant()
+    named = dict(zip(stage.names, stage.parts, strict=True))
+    for one, other in zip(
+        jax.tree.leaves(named["dynamics"]),
+        jax.tree.leaves(printed.parts[1]),
+        strict=True,
+    ):
+        assert one == pytest.approx(float(other), rel=1e-12)
+    assert named["mode"].init(1.0)[0] == 1.0
+
+
+def test_poles_and_zeros_move_along_their_rays():
+    named = dict(zip(p753_stage.stage().names, p753_stage.stage(
+        poles=0.2, zeros=-0.1, gain=0.1).parts, strict=True))  # fmt: skip
+    printed = p753.plant().parts[1]
+    expected = np.sort(printed.poles() ** 1.2)
+    np.testing.assert_allclose(np.sort(named["dynamics"].poles()), expected)
+    expected = np.sort_complex(printed.zeros() ** 0.9)
+    np.testing.assert_allclose(np.sort_complex(named["dynamics"].zeros()), expected)
+    assert named["dynamics"].dc_gain() == pytest.approx(1.0)
+    assert named["gain"].gain == pytest.approx(1.1)
+
+
+def test_standard_errors_of_a_fit_are_drawn_from(tmp_path):
+    fit = {"parameters": {
+        "dynamics.moving.0": {"value": 1.0, "standard_error": 1e-3},
+        "hysteresis.a": {"value": 1.0, "standard_error": None},
+    }}  # fmt: skip
+    (tmp_path / "fit.json").write_text(json.dumps(fit))
+    tables = {"standard_errors": "fit.json", "holdout": 400}
+    study = changed(ensemble=tables)
+    case = read(written(tmp_path, study))
+    drawn = case.ensemble.stages("holdout").plant.parts
+    names = p753_stage.stage().names
+    first = np.asarray(drawn[names.index("dynamics")].moving[0])
+    own = float(p753_stage.stage().parts[names.index("dynamics")].moving[0])
+    assert np.mean(first) == pytest.approx(own, abs=2e-4)
+    assert np.std(first) == pytest.approx(1e-3, rel=0.1)
+    assert np.ptp(np.asarray(drawn[0].a)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("over", "tail"), [("mean", 1.0), ("worst", 1.0), ("cvar", 0.4)]
+)
+def test_plants_are_joined_as_named(over, tail, tmp_path):
+    none = jnp.zeros((5, 2, 1))
+    rms = jnp.exp(jnp.arange(10.0).reshape(5, 2, 1) % 7.0)
+    figures = TrackingFigures(rms, none, none, none, none, none)
+    case = read(written(tmp_path, STUDY))
+    objective = Objective(
+        case.loop,
+        case.space,
+        make_data(case).tuning,
+        jnp.ones((5, 2)),
+        jnp.asarray(1.0),
+        0,
+    )
+    objective = dataclasses.replace(objective, over=over, tail=tail)
+    each_plant = np.sort(np.mean(np.arange(10.0).reshape(5, 2) % 7.0, axis=1))
+    expected = {
+        "mean": each_plant.mean(),
+        "worst": each_plant[-1],
+        "cvar": each_plant[-2:].mean(),
+    }[over]
+    assert objective._error(figures) == pytest.approx(expected, abs=1e-6)
+
+
+def test_drift_is_a_random_walk_that_moves_the_stage(tmp_path):
+    study = changed(disturbance={"drift_rms": 0.5}, holdout_draws=64)
+    signals = make_data(read(written(tmp_path, study))).holdout
+    walk = np.asarray(signals.disturbance)
+    # 0.5 um after a second: 0.5 sqrt(0.05) after this run.
+    assert np.std(walk[..., -1]) == pytest.approx(0.5 * np.sqrt(0.05), rel=0.15)
+    assert np.std(np.diff(walk, axis=-1)) == pytest.approx(
+        0.5 * np.sqrt(5e-5), rel=0.02
+    )
+
+
+# What is wrong
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"constraints__sensitivity_peak": 1.0}, r"constraints.sensitivity_peak is 1"),
+        ({"constraints__phase": 1.0}, r"constraints.phase is unknown; allowed are"),
+        ({"pareto__constraint": "disk_margin"}, r"constraint is 'disk_margin'"),
+        ({"pareto__constraint": "speed"}, r"'speed' is unknown; there are"),
+        ({"ensemble__range": {"delay": [1.0, 0.0]}}, r"range.delay is 1 to 0"),
+        ({"ensemble__range": {"gain": [0.0, 1.0]}}, r"gain is in both spread"),
+        ({"ensemble__spread": {"mass": 0.1}}, r"spread.mass is unknown"),
+        ({"ensemble__spread": {"plant.x": 0.1}}, r"ensemble.spread: no param"),
+        ({"ensemble__standard_errors": "no.json"}, r"standard_errors: .*no.json"),
+        ({"ensemble__aggregate": "cvor"}, r"ensemble.aggregate is 'cvor'"),
+        ({"disturbance__drift_rms": -1.0}, r"disturbance.drift_rms is -1.0"),
+    ],
+)  # fmt: skip
+def test_a_bad_study_is_refused(tables, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        read(written(tmp_path, changed(**tables)))
+
+
+def test_limits_are_for_one_axis(tmp_path):
+    text = shipped("three_dof_sliding_mode").read_text(encoding="utf-8")
+    study = tomllib.loads(text) | {"constraints": {"disk_margin": 0.5}}
+    with pytest.raises(ValueError, match=r"disk_margin: constraints are for"):
+        read(written(tmp_path, study))
+
+
+def test_every_limit_of_a_study_is_known():
+    assert set(CONSTRAINTS) == set(ConstraintsTable.model_fields)
