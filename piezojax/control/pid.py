@@ -26,11 +26,11 @@ class PID(System):
     gives back what the actuator could not deliver. The integral is rectangular and
     holds volts, so that a new gain causes no jump.
 
-    ``proportional_weight`` b and ``derivative_weight`` c are the set-point weights of Astrom and Hagglund (Advanced PID Control, 2006): 1 is the PID
-    of the error alone, below it a jump of r is softened, and above it P (b - 1) r and
-    D (c - 1) dr/dt feed the reference and its rate forward, while what feeds back, and
-    with it the noise and the stability, stays as it is. The rate is that up to r(k);
-    r(k+1) is not looked at.
+    ``proportional_weight`` b and ``derivative_weight`` c are the set-point weights of
+    Astrom and Hagglund (Advanced PID Control, 2006). With 1 the PID acts on the error
+    alone. Below 1 a jump of r is softened; above 1, P (b - 1) r and D (c - 1) dr/dt
+    feed the reference and its rate forward. The feedback, and with it noise and
+    stability, does not depend on them. The rate is that up to r(k); r(k+1) is not used.
 
     Raises ValueError for a parameter outside its limits.
     """

@@ -1,14 +1,19 @@
 """Array types and the conversions and checks every constructor shares."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-Scalar = Float[Array, ""]
+if TYPE_CHECKING:
+    # Constructors convert numbers to arrays, which a checker sees only where the
+    # converter is spelled out at the field.
+    Scalar = Any
+else:
+    Scalar = Float[Array, ""]
 ScalarLike = Float[Array, ""] | float | int
 Matrix = Float[Array, "rows columns"]
 Signal = Any  # a Scalar, or a tuple of one Scalar an axis

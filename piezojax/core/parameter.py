@@ -35,9 +35,8 @@ class Parameter:
 
     def check(self, name: str, value: Any) -> None:
         """Raise ValueError unless ``value`` is finite and within the limits."""
-        shown = name.replace("_", " ")
         check(
-            shown if self.unit == "1" else f"{shown} in {self.unit}",
+            name if self.unit == "1" else f"{name} in {self.unit}",
             value,
             above=self.above,
             least=self.least,

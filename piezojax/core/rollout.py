@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .arrays import State
-from .system import System, worked_out
+from .system import System, resolve
 
 T = TypeVar("T")
 
@@ -71,7 +71,7 @@ def simulate(
     samples = _length(inputs)
     if metric is not None and every > samples:
         raise ValueError(f"every is {every}; the run has {samples} samples")
-    system = worked_out(system)
+    system = resolve(system)
     state = system.init() if state is None else state
     if metric is not None and every > 1:
         return _sampled(system, inputs, state, metric, every, samples)

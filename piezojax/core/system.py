@@ -1,7 +1,8 @@
 """The one protocol, System, and its compositions."""
 
 import abc
-from typing import Any, NamedTuple
+import dataclasses
+from typing import Any, NamedTuple, dataclass_transform
 
 import equinox as eqx
 import jax
@@ -10,9 +11,10 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from .arrays import Scalar, ScalarLike, Signal, State, as_array, as_signal, check
-from .parameter import check_declared
+from .parameter import check_declared, parameter
 
 
+@dataclass_transform(field_specifiers=(dataclasses.field, eqx.field, parameter))
 class System(eqx.Module):
     """Anything that runs in time: a plant, a filter, an observer, a controller, a loop.
 
@@ -65,14 +67,14 @@ class Designed(System):
         return self.law().step(state, input)
 
 
-def worked_out(system: Any) -> Any:
+def resolve(system: Any) -> Any:
     """Return ``system`` with every part that is Designed replaced by its law."""
 
     def is_designed(part: Any) -> bool:
         return isinstance(part, Designed)
 
     return jax.tree.map(
-        lambda part: worked_out(part.law()) if is_designed(part) else part,
+        lambda part: resolve(part.law()) if is_designed(part) else part,
         system,
         is_leaf=is_designed,
     )
