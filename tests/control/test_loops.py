@@ -300,11 +300,11 @@ def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
         ),
         (
             lambda: weighted_pid(np.inf, 1.0),
-            "proportional weight is inf; it must be finite",
+            "proportional_weight is inf; it must be finite",
         ),
         (
             lambda: weighted_pid(1.0, np.nan),
-            "derivative weight is nan; it must be finite",
+            "derivative_weight is nan; it must be finite",
         ),
         (
             lambda: sliding_mode(model=FIRST_ORDER),
