@@ -292,7 +292,7 @@ def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
         (lambda: PID(1.0, 1.0, dt=0.0), "dt in s is 0; it must be finite"),
         (
             lambda: PID(1.0, 1.0, derivative_filter=-1e-4, dt=DT),
-            "derivative filter in s is -0.0001; it must be finite and at least 0",
+            "derivative_filter in s is -0.0001; it must be finite and at least 0",
         ),
         (
             lambda: PID(1.0, 1.0, anti_windup=-1.0, dt=DT),
