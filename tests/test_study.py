@@ -420,8 +420,8 @@ def test_cut_off_beyond_nyquist(refusal, upper):
         "parameters": {"controller.cutoff": {"lower": 100.0, "upper": upper}},
     }
     assert refusal(changes) == (
-        f"parameters.controller.cutoff.upper is {upper:g} rad/s; it must be below the "
-        "Nyquist frequency, 62831.9 rad/s"
+        f"parameters.controller.cutoff.upper: system: cutoff in rad/s is {upper:g}; "
+        "it must be finite and above 0 and below 62831.9"
     )
 
 

@@ -1,13 +1,14 @@
 """Disturbance observer (DOB) with its Q-filter, around any controller."""
 
-import math
 from typing import NamedTuple
 
 import equinox as eqx
 
-from ..core.arrays import Scalar, State, as_array, check, check_not_zero
+from ..core.arrays import Scalar, State, check_not_zero
+from ..core.parameter import parameter, sample_time
 from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
+from .output_tracking import check_second_order
 
 COEFFICIENTS = ("corrected", "printed")
 
@@ -28,36 +29,41 @@ class DisturbanceObserverControl(System):
     """``u = f / gain - w``: the controller's f less the observed input disturbance w.
 
     Figure 5.2, (5.26)-(5.32): w = Q/(gain G) z - Q u, where G is ``model``
-    (a_1, a_2 | b_0, b_1, b_2, DC gain near 1), ``gain`` K_e in um/V is the linear part
-    of the hysteresis, and Q has G's zeros, unit DC gain and a double pole at
-    ``cutoff`` (rad/s). u is the voltage that was applied, after the limits.
+    (a_1, a_2 | b_0, b_1, b_2, DC gain near 1), ``gain`` K_e is the linear part of the
+    hysteresis, and Q has G's zeros, unit DC gain and a double pole at ``cutoff``. u is
+    the voltage that was applied, after the limits.
 
     ``coefficients`` is ``"corrected"`` (the bilinear double pole) or ``"printed"``
     ((5.32) as printed, whose poles lie at -0.54 and -7.46 times the cut-off). Input an
     Observation, output in V.
 
-    Raises ValueError for a model of another order, gain = 0, a cut-off that is not
-    between 0 and the Nyquist frequency pi/dt, or an unknown name in ``coefficients``.
+    Raises ValueError for a model of another order or with DC gain 0, and for an unknown
+    name in ``coefficients``.
     """
 
     feedback: System
     model: ARMA
-    gain: Scalar = eqx.field(converter=as_array)
-    cutoff: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
+    gain: Scalar = parameter(
+        "um/V",
+        "linear gain K_e of the hysteresis",
+        above=0.0,
+        scale="log",
+        typical=(1e-3, 1e2),
+    )
+    cutoff: Scalar = parameter(
+        "rad/s",
+        "cut-off frequency of the Q-filter",
+        above=0.0,
+        below_nyquist=True,
+        scale="log",
+        typical=(1.0, 1e5),
+    )
+    dt: float = sample_time()
     coefficients: str = eqx.field(static=True, default="corrected")
 
     def __check_init__(self):
-        orders = len(self.model.autoregressive), len(self.model.moving)
-        if orders != (2, 3):
-            raise ValueError(
-                f"the model has {orders[0]} a and {orders[1]} b coefficients; "
-                "it must have 2 and 3"
-            )
+        check_second_order(self.model)
         check_not_zero("DC gain of the model", sum(self.model.moving))
-        check("sample time in s", self.dt, above=0.0)
-        check("gain K_e in um/V", self.gain, above=0.0)
-        check("cut-off in rad/s", self.cutoff, above=0.0, below=math.pi / self.dt)
         if self.coefficients not in COEFFICIENTS:
             raise ValueError(
                 f"coefficients {self.coefficients!r}; "
@@ -91,7 +97,7 @@ class DisturbanceObserverControl(System):
         )
 
     def _past(self, input: Observation, w: Scalar) -> tuple[Scalar, Scalar]:
-        """What one sample adds to c_0 w one and two samples later."""
+        """Return what one sample adds to c_0 w one and two samples later."""
         _, b1, b2 = self.model.moving
         a1, a2 = self.model.autoregressive
         _, c1, c2 = self.denominator()

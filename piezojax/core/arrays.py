@@ -1,8 +1,9 @@
 """Array types and the conversions and checks every constructor shares."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -70,9 +71,10 @@ def check(
 ) -> None:
     """Raise ValueError unless ``value`` is finite and inside the stated bounds.
 
-    Values that are being traced have no number to check and pass.
+    ``value`` is a number, an array or nested sequences of them. Values that are being
+    traced have no number to check and pass.
     """
-    for element in value if isinstance(value, Sequence) else (value,):
+    for element in jax.tree.leaves(value):
         number = _known(element)
         if number is None:
             continue

@@ -1,6 +1,7 @@
 """Parameters of systems, each declared once, beside its field."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
@@ -21,7 +22,8 @@ class Parameter:
     ``above`` and ``below`` are limits that the value must not reach, ``least`` and
     ``most`` limits that it may. ``typical`` is the range that a search takes if a study
     gives none, on ``scale``: "log" for positive values that span decades, "logit" for
-    values between 0 and 1. ``unit`` "1" is a pure number.
+    values between 0 and 1. ``unit`` "1" is a pure number. A frequency with
+    ``below_nyquist`` must stay below pi / dt of the System that declares it.
     """
 
     unit: str
@@ -32,6 +34,13 @@ class Parameter:
     below: float = np.inf
     scale: Scale = "linear"
     typical: tuple[float, float] | None = None
+    below_nyquist: bool = False
+
+    def at(self, dt: float) -> "Parameter":
+        """Return the declaration for a System with sample time ``dt`` in s."""
+        if not self.below_nyquist:
+            return self
+        return dataclasses.replace(self, below=min(self.below, math.pi / dt))
 
     def check(self, name: str, value: Any) -> None:
         """Raise ValueError unless ``value`` is finite and within the limits."""
@@ -55,6 +64,7 @@ def parameter(
     below: float = np.inf,
     scale: Scale = "linear",
     typical: tuple[float, float] | None = None,
+    below_nyquist: bool = False,
     converter: Callable[[Any], Any] = as_array,
     static: bool = False,
     **options: Any,
@@ -68,7 +78,9 @@ def parameter(
     The constructor of the System checks the declared limits; tables, pictures, bounds
     of a search and the API page read unit, meaning and range from here.
     """
-    declared = Parameter(unit, meaning, above, least, most, below, scale, typical)
+    declared = Parameter(
+        unit, meaning, above, least, most, below, scale, typical, below_nyquist
+    )
     if static:
         return eqx.field(static=True, metadata={_KEY: declared}, **options)
     return eqx.field(converter=converter, metadata={_KEY: declared}, **options)
@@ -91,7 +103,9 @@ def check_declared(system: Any) -> None:
 
     Raises ValueError naming the field, its unit, the value and what is allowed.
     """
-    for name, declared in declarations(system):
+    # The sample time first: other limits may follow from it.
+    for name, declared in sorted(declarations(system), key=lambda d: d[0] != "dt"):
         value = getattr(system, name)
         if value is not None:
+            declared = declared.at(system.dt) if declared.below_nyquist else declared
             declared.check(name, value)

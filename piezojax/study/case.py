@@ -154,11 +154,6 @@ def _search_space(study: Study, loop: Feedback) -> tuple[Feedback, Space]:
                 f"parameters.{path}: the path must start with 'controller.'; "
                 "the stage is not for tuning"
             )
-        if path.endswith(".cutoff") and bounds[path].upper >= np.pi * study.rate:
-            raise ValueError(
-                f"parameters.{path}.upper is {bounds[path].upper:g} rad/s; it must be "
-                f"below the Nyquist frequency, {np.pi * study.rate:g} rad/s"
-            )
     starts = {path: b.start for path, b in bounds.items() if b.start is not None}
     loop = replace(loop, starts)
     space = space_of(

@@ -326,12 +326,12 @@ def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
             lambda: observer(FIRST_ORDER),
             "the model has 1 a and 1 b coefficients; it must have 2 and 3",
         ),
-        (lambda: observer(gain=0.0), "gain K_e in um/V is 0; it must be finite and"),
+        (lambda: observer(gain=0.0), "gain in um/V is 0; it must be finite and"),
         (
             lambda: observer(cutoff=7e4),
-            "cut-off in rad/s is 70000; it must be finite and above 0 and below 62831",
+            "cutoff in rad/s is 70000; it must be finite and above 0 and below 62831",
         ),
-        (lambda: observer(dt=0.0), "sample time in s is 0"),
+        (lambda: observer(dt=0.0), "dt in s is 0"),
         (
             lambda: observer(coefficients="right"),
             "coefficients 'right'; it must be one of .*'corrected', 'printed'",
