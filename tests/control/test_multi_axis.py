@@ -64,6 +64,22 @@ class Published(NamedTuple):
     options: dict
 
 
+DERIVATIVE = {"multi-axis": [4e-4, 6e-4, 8e-4], "nominal": [1e-4, 2e-4, 3e-4]}
+"""D, s: every printed one is zero, which would hide its sign."""
+
+
+def derived(controller, kind):
+    """Return a controller with DERIVATIVE on its axes."""
+    names = [n for n in paths.parameters(controller) if "derivative" in n]
+    diagonal = [n for n in names if kind == "nominal" or n[-1] == n[-3]]
+    return paths.replace(controller, dict(zip(diagonal, DERIVATIVE[kind], strict=True)))
+
+
+def with_derivative(gains, kind):
+    """Return the plain loop's table of gains with DERIVATIVE."""
+    return {**gains, "D": DERIVATIVE[kind]}
+
+
 def passing(controller):
     """Return a filtered controller whose filters pass everything unchanged."""
     names = [n for n in paths.parameters(controller) if "filter." in n]
@@ -80,7 +96,20 @@ CASES = {
         "pid_smc",
         {"gains": "step", "alpha_beta": False},
     ),
+    "multi-axis, derivative": Published(
+        derived(catalog.multi_axis(), "multi-axis"),
+        "pid_smc",
+        {"gains": with_derivative(three_dof.PID_SMC_GAINS["dynamic"], "multi-axis")},
+    ),
     "nominal": Published(catalog.nominal(), "nominal_smc", {"arx": "matched"}),
+    "nominal, derivative": Published(
+        derived(catalog.nominal(), "nominal"),
+        "nominal_smc",
+        {
+            "arx": "matched",
+            "gains": with_derivative(three_dof.DOB_SMC_GAINS["nominal_smc"], "nominal"),
+        },
+    ),
     "observer": Published(
         catalog.disturbance_observer(), "dob_smc", {"arx": "matched"}
     ),

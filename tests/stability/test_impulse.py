@@ -1,5 +1,7 @@
 """Margins from an impulse response, against the exact report, and their slopes."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,16 +9,20 @@ import pytest
 
 import piezojax as pj
 from piezojax.analysis.stability import sensitivity, stability_report
+from piezojax.analysis.stability.conserved import LinearLoop
 from piezojax.analysis.stability.impulse import (
     UNREACHED,
     delay_margin_of,
     disk_margin_of,
     peak_of,
+    sensitivities,
 )
+from piezojax.analysis.stability.margins import report_of
 from piezojax.catalog import p753, p753_stage
 from piezojax.core.paths import replace
 
 INTEGRAL = "controller.integral"
+BRANCHES = ("ascending", "descending")
 
 
 def pid_loop(integral=3000.0):
@@ -38,7 +44,7 @@ LOOPS = {
 }
 
 
-@pytest.mark.parametrize("branch", ["ascending", "descending"])
+@pytest.mark.parametrize("branch", BRANCHES)
 @pytest.mark.parametrize("name", LOOPS)
 def test_figures_are_those_of_the_exact_report(name, branch):
     loop = LOOPS[name]()
@@ -48,6 +54,41 @@ def test_figures_are_those_of_the_exact_report(name, branch):
     assert peak_of(found) == pytest.approx(exact.sensitivity_peak, rel=5e-3)
     assert disk_margin_of(found) == pytest.approx(exact.disk_margin, rel=5e-3)
     assert delay_margin_of(found) == pytest.approx(exact.delay_margin_samples, rel=5e-3)
+
+
+def test_every_branch_is_the_exact_report_s():
+    # The branches differ: one of them cannot stand for both.
+    exact = [stability_report(pid_loop(), 5.0, b).sensitivity_peak for b in BRANCHES]
+    assert max(exact) > 1.02 * min(exact)
+    found = jax.jit(lambda loop: sensitivities(loop, 5.0))(pid_loop())
+    np.testing.assert_allclose(jax.vmap(peak_of)(found), exact, rtol=5e-3)
+
+
+def test_a_crossing_with_phase_lead_limits_the_delay_too():
+    """L = -k / A(z) of a mode turned by a quarter: |L| = 1 with lead on both sides."""
+    radius, angle = 0.99, 0.3
+    A = np.array([1.0, -2.0 * radius * np.cos(angle), radius**2])
+    k = 1.5 * (1.0 - radius) * 2.0 * np.sin(angle)
+
+    def stable(delay):
+        closed = np.append(A, np.zeros(delay))
+        closed[-1] -= k
+        return np.abs(np.roots(closed)).max() < 1.0
+
+    whole = next(n for n in range(100) if not stable(n + 1))
+    z = np.exp(1j * np.linspace(0.0, np.pi, 20_001))
+    loop = -k / np.polyval(A, z)
+    assert np.angle(loop[np.abs(loop) > 1.0]).min() > 0.2  # no lag at all
+    assert whole > 5
+    # z^-2 (...) in companion form: the loop as a state space.
+    system = LinearLoop(
+        np.array([[-A[1], -A[2]], [1.0, 0.0]]),
+        np.array([1.0, 0.0]),
+        np.array([0.0, -k]),
+        p753.DT,
+    )
+    assert math.floor(report_of(system).delay_margin_samples) == whole
+    assert math.floor(delay_margin_of(jnp.asarray(1.0 / (1.0 + loop)))) == whole
 
 
 def test_a_loop_that_is_never_as_strong_as_1_has_no_delay_margin():

@@ -16,6 +16,7 @@ from piezojax.analysis.stability import stability_report
 from piezojax.catalog import p753, p753_stage
 from piezojax.core.metrics import TrackingFigures
 from piezojax.core.paths import replace
+from piezojax.core.system import rest_output
 from piezojax.study import Stage, read, shipped
 from piezojax.study.schema import ConstraintsTable
 from piezojax.tuning.constraints import CONSTRAINTS, augmented, updated
@@ -272,6 +273,29 @@ def test_poles_and_zeros_move_along_their_rays():
     np.testing.assert_allclose(np.sort_complex(named["dynamics"].zeros()), expected)
     assert named["dynamics"].dc_gain() == pytest.approx(1.0)
     assert named["gain"].gain == pytest.approx(1.1)
+
+
+def test_every_deviation_of_the_stage_acts_on_its_part():
+    names = p753_stage.stage().names
+
+    def part(name, **deviations):
+        return p753_stage.stage(**deviations).parts[names.index(name)]
+
+    # At rest all of it has crept: 1 % of a step in each of three decades.
+    assert rest_output(part("creep"), 1.0) == pytest.approx(1.03, rel=1e-12)
+    less = part("creep", creep=-0.5)
+    assert rest_output(less, 1.0) == pytest.approx(1.015, rel=1e-12)
+    # y' = |x'| (a x + c y) + b x' with a and c doubled is half of it at twice x.
+    drive = 40.0 * np.sin(2.0 * np.pi * np.arange(400) / 200.0)
+    found = pj.simulate(part("hysteresis", hysteresis=1.0), drive)[1]
+    twice = pj.simulate(part("hysteresis"), 2.0 * drive)[1]
+    np.testing.assert_allclose(2.0 * found, twice, rtol=0.0, atol=1e-12)
+    ramp = pj.simulate(part("delay", delay=0.4), np.arange(4.0))[1]
+    np.testing.assert_allclose(ramp[1:], np.arange(1.0, 4.0) - 0.4, atol=1e-12)
+    # 4 kHz at 20 kHz: nearly undamped, a fifth of a turn each sample.
+    ringing = pj.simulate(part("mode", mode_damping=1e-9), np.ones(10))[1]
+    turns = np.arange(1, 11) / 5.0
+    np.testing.assert_allclose(ringing, 1.0 - np.cos(2.0 * np.pi * turns), atol=1e-6)
 
 
 def test_standard_errors_of_a_fit_are_drawn_from(tmp_path):

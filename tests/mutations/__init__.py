@@ -1,0 +1,1 @@
+"""Changes of the package that its tests must notice."""

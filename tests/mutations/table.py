@@ -1,0 +1,313 @@
+"""The mutations: one wrong line each, and the tests that must fail with it."""
+
+from typing import NamedTuple
+
+
+class Mutation(NamedTuple):
+    """``old`` becomes ``new`` in ``file`` (of the package); ``tests`` must then fail.
+
+    ``old`` stands in the file exactly once. ``tests`` are arguments of pytest.
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+_DATA = "tests/tuning/test_data.py"
+_LOOPS = "tests/control/test_loops.py"
+_ROBUST = "tests/tuning/test_robust.py"
+_MULTI_AXIS = ("tests/control/test_multi_axis.py", "-k", "published")
+
+MUTATIONS = (
+    # Signals of a study
+    Mutation(
+        "hold-out noise from the tuning's stream",
+        "tuning/data.py",
+        "np.random.default_rng(stream),",
+        "np.random.default_rng(streams[0]),",
+        (_DATA,),
+    ),
+    Mutation(
+        "validation residual from the training part",
+        "tuning/data.py",
+        "where = getattr(fit, part)",
+        "where = fit.train",
+        (_DATA,),
+    ),
+    Mutation(
+        "drift without the root of the sample time",
+        "tuning/data.py",
+        "* np.sqrt(case.study.dt)",
+        "* case.study.dt",
+        (_ROBUST, "-k", "drift"),
+    ),
+    Mutation(
+        "one noise draw for all references",
+        "tuning/data.py",
+        "noise = as_array(random.standard_normal(shape))",
+        "noise = as_array(0.0 * random.standard_normal(shape)"
+        " + random.standard_normal(shape[1:]))",
+        (_DATA,),
+    ),
+    Mutation(
+        "hold-out plants from the tuning's stream",
+        "study/ensemble.py",
+        'stream = 3 if part == "holdout" else 2',
+        "stream = 2",
+        (_ROBUST, "-k", "draws_lie"),
+    ),
+    Mutation(
+        "SW without its shift",
+        "signals/waveforms.py",
+        "t = time - 0.1",
+        "t = time",
+        ("tests/test_signals.py",),
+    ),
+    # Objective and evaluation
+    Mutation(
+        "railing needs all runs",
+        "tuning/objective.py",
+        "railed = jnp.any(",
+        "railed = jnp.all(",
+        (_DATA,),
+    ),
+    Mutation(
+        "nominal plant left out of the mean",
+        "tuning/objective.py",
+        "return jnp.mean(joined)",
+        "return jnp.mean(joined[1:] if joined.size > 1 else joined)",
+        (_ROBUST, "-k", "joined"),
+    ),
+    Mutation(
+        "perturbed plants start with the nominal holding voltage",
+        "tuning/evaluator.py",
+        "signals = signals.for_another_plant()",
+        "signals = signals",
+        (_DATA,),
+    ),
+    Mutation(
+        "perturbed plants are tuned from the nominal holding voltage",
+        "tuning/objective.py",
+        "signals = signals.for_another_plant()",
+        "signals = signals",
+        (_DATA,),
+    ),
+    Mutation(
+        "measured instead of true error",
+        "core/metrics.py",
+        "error = output.displacement - output.reference",
+        "error = output.measured - output.reference",
+        ("tests/test_metrics.py",),
+    ),
+    Mutation(
+        "window one sample late",
+        "core/metrics.py",
+        "inside = jnp.where(index >= self.start, 1.0, 0.0)",
+        "inside = jnp.where(index > self.start, 1.0, 0.0)",
+        ("tests/test_metrics.py",),
+    ),
+    # Stability and limit
+    Mutation(
+        "Ms on one branch",
+        "analysis/stability/impulse.py",
+        "jnp.asarray(list(BRANCHES.values()))",
+        "jnp.asarray([*BRANCHES.values()][:1] * 2)",
+        ("tests/stability/test_impulse.py", "-k", "every_branch"),
+    ),
+    Mutation(
+        "delay margin without crossings with phase lead",
+        "analysis/stability/margins.py",
+        "samples = float((lag / places).min())",
+        "samples = float(np.where(lag < np.pi, lag / places, np.inf).min())",
+        ("tests/stability/test_impulse.py", "-k", "lead"),
+    ),
+    Mutation(
+        "delay margin of a response without crossings with phase lead",
+        "analysis/stability/impulse.py",
+        "jnp.min(jnp.where(crosses, there",
+        "jnp.min(jnp.where(crosses & (there < jnp.pi), there",
+        ("tests/stability/test_impulse.py", "-k", "lead"),
+    ),
+    Mutation(
+        "delay not counted by the limit",
+        "analysis/limit/wiener.py",
+        "response = w**delay",
+        "response = w**0",
+        ("tests/limit/test_wiener.py",),
+    ),
+    # The loop and its hardware
+    Mutation(
+        "controller sees the command",
+        "core/system.py",
+        "            displacement,\n            voltage,\n        )",
+        "            displacement,\n            command,\n        )",
+        ("tests/test_system.py", _LOOPS),
+    ),
+    Mutation(
+        "slew per sample",
+        "hardware.py",
+        "most = self.rate * self.dt",
+        "most = self.rate",
+        ("tests/test_hardware.py",),
+    ),
+    Mutation(
+        "sign of the charge drive's leakage",
+        "hardware.py",
+        "+ self.dt * leakage",
+        "- self.dt * leakage",
+        ("tests/test_charge_drive.py",),
+    ),
+    # Controllers
+    Mutation(
+        "sign of D, multi-axis",
+        "control/multi_axis.py",
+        "                product(self.derivative, slope),",
+        "                product(self.derivative, tuple(-x for x in slope)),",
+        _MULTI_AXIS,
+    ),
+    Mutation(
+        "sign of D, nominal",
+        "control/nominal.py",
+        "- self.derivative * (sliding",
+        "+ self.derivative * (sliding",
+        _MULTI_AXIS,
+    ),
+    Mutation(
+        "integral used one sample late",
+        "control/sliding_mode.py",
+        "            integral\n            - self.proportional * s",
+        "            state.integral\n            - self.proportional * s",
+        (_LOOPS,),
+    ),
+    Mutation(
+        "start with a bump of 2 %",
+        "control/sliding_mode.py",
+        "needed = input.applied *",
+        "needed = 1.02 * input.applied *",
+        (_LOOPS,),
+    ),
+    Mutation(
+        "anti-windup dropped",
+        "control/pid.py",
+        "self.anti_windup * shortfall",
+        "0.0 * shortfall",
+        (_LOOPS,),
+    ),
+    Mutation(
+        "c_1 with the square",
+        "control/disturbance_observer.py",
+        "(0.5 - double) * total",
+        "(0.5 - square) * total",
+        (_LOOPS,),
+    ),
+    Mutation(
+        "cut-off in Hz",
+        "control/disturbance_observer.py",
+        "x = 1.0 / (self.cutoff * self.dt)",
+        "x = 6.283185307179586 / (self.cutoff * self.dt)",
+        (_LOOPS,),
+    ),
+    Mutation(
+        "start memory swapped",
+        "control/disturbance_observer.py",
+        "memory=(next_term + last_term, last_term),",
+        "memory=(last_term, next_term + last_term),",
+        (_LOOPS,),
+    ),
+    Mutation(
+        "surface reversed",
+        "control/model_reference.py",
+        "return newest + _dot(reversed(self.surface), older)",
+        "return newest + _dot(self.surface, older)",
+        ("tests/control/test_chapter4.py",),
+    ),
+    Mutation(
+        "r(k) shifted, r(k+1) not",
+        "control/anticipation.py",
+        "return now + rise, following + rise",
+        "return now + rise, following",
+        ("tests/control/test_anticipation.py",),
+    ),
+    Mutation(
+        "input one sample older",
+        "control/kalman.py",
+        "zip(self.model.moving, inputs, strict=True)",
+        "zip(self.model.moving, (*inputs[1:], inputs[-1]), strict=True)",
+        ("tests/control/test_kalman.py",),
+    ),
+    Mutation(
+        "forgetting ten times faster",
+        "control/recursive_weights.py",
+        "kept = jnp.exp(-self.dt / self.memory)",
+        "kept = jnp.exp(-10.0 * self.dt / self.memory)",
+        ("tests/control/test_adaptive_inverse.py",),
+    ),
+    Mutation(
+        "half the width",
+        "control/boundary_layer.py",
+        "jnp.clip(input / self.width",
+        "jnp.clip(2.0 * input / self.width",
+        ("tests/control/test_boundary_layer.py",),
+    ),
+    # Models
+    Mutation(
+        "direct part of creep ignored",
+        "dynamics/creep.py",
+        "output = self.direct * input\n        for gain, lag",
+        "output = input\n        for gain, lag",
+        ("tests/dynamics/test_creep.py", "tests/dynamics/test_creep_separation.py"),
+    ),
+    Mutation(
+        "direct part of logarithmic creep ignored",
+        "dynamics/creep.py",
+        "output = self.direct * input\n        for lag in",
+        "output = input\n        for lag in",
+        ("tests/dynamics/test_creep.py", "tests/dynamics/test_creep_separation.py"),
+    ),
+    Mutation(
+        "spread of creep ignored",
+        "catalog/p753_stage.py",
+        "share * (1.0 + creep)",
+        "share",
+        (_ROBUST, "-k", "deviation"),
+    ),
+    Mutation(
+        "creep ten times smaller",
+        "catalog/p753_stage.py",
+        '"gains": (0.01, 0.01, 0.01)',
+        '"gains": (0.001, 0.001, 0.001)',
+        (_ROBUST, "-k", "deviation"),
+    ),
+    Mutation(
+        "mode frequency with 6 for 2 pi",
+        "catalog/p753_stage.py",
+        "2.0 * jnp.pi * mode_frequency",
+        "6.0 * mode_frequency",
+        (_ROBUST, "-k", "deviation"),
+    ),
+    Mutation(
+        "poles the other way",
+        "catalog/p753_stage.py",
+        "jnp.exp((1.0 + faster)",
+        "jnp.exp((1.0 - faster)",
+        (_ROBUST, "-k", "rays"),
+    ),
+    Mutation(
+        "delay doubled",
+        "catalog/p753_stage.py",
+        "as_array(delay) * p753.DT",
+        "as_array(delay) * 2.0 * p753.DT",
+        (_ROBUST, "-k", "deviation"),
+    ),
+    Mutation(
+        "hysteresis spread in a alone",
+        "catalog/p753_stage.py",
+        'material["c"] * (1.0 + hysteresis)',
+        'material["c"]',
+        (_ROBUST, "-k", "deviation"),
+    ),
+)
+"""Every mutation that once survived or might; see ``run.py``."""

@@ -1,0 +1,23 @@
+"""The table of mutations stays applicable: run.py tries them, which takes minutes."""
+
+from pathlib import Path
+
+import pytest
+
+from mutations.table import MUTATIONS
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_names_differ():
+    assert len({mutation.name for mutation in MUTATIONS}) == len(MUTATIONS)
+
+
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.name)
+def test_a_mutation_still_has_its_place(mutation):
+    text = (ROOT / "piezojax" / mutation.file).read_text(encoding="utf-8")
+    assert text.count(mutation.old) == 1
+    assert mutation.new != mutation.old
+    files = [part for part in mutation.tests if part.endswith(".py")]
+    assert files
+    assert all((ROOT / file).is_file() for file in files)

@@ -1,0 +1,163 @@
+"""Signals that a study is tuned and judged on, and the plants they act on."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from piezojax.identification.fit import Fit, FitError, FitReport
+from piezojax.identification.records.record import Record
+from piezojax.solve.clock import Clock
+from piezojax.study import Study, build
+from piezojax.tuning.data import make_data
+from piezojax.tuning.evaluator import Judge
+from piezojax.tuning.objective import HOPELESS, Objective
+from piezojax.tuning.runs import Signals
+
+STUDY = {
+    "title": "a PID on a stage without dynamics",
+    "rate": 20_000.0,
+    "seed": 3,
+    "plant": {"type": "Affine", "gain": 0.15},
+    "actuator": {"lower": -20.0, "upper": 120.0},
+    "sensor": {"noise_rms": 0.01},
+    "controller": {"type": "PID", "proportional": 0.0, "integral": 300.0, "dt": 5e-5},
+    "references": {
+        "tune": ["SIN50", "CONST2"],
+        "unseen": ["TRI50"],
+        "duration": 0.02,
+        "settle": 0.0,
+    },
+    "parameters": {"controller.integral": {"lower": 30.0, "upper": 3e3}},
+}
+
+
+def case_of(**tables):
+    return build(Study.model_validate(STUDY | tables), "small.toml")
+
+
+def apart(series):
+    """Tell whether no two of the series (last dimension: time) are related."""
+    rows = np.asarray(series).reshape(-1, np.shape(series)[-1])
+    related = np.corrcoef(rows) - np.eye(len(rows))
+    return np.abs(related).max() < 5.0 / np.sqrt(rows.shape[1])
+
+
+# Draws
+
+
+@pytest.mark.parametrize("draws", [1, 3])
+def test_no_run_of_the_holdout_repeats_one_of_the_tuning(draws):
+    """As many draws in both, as by default: one stream would give the same."""
+    data = make_data(
+        case_of(
+            objective={"noise_draws": draws},
+            holdout_draws=draws,
+            disturbance={"drift_rms": 0.1},
+        )
+    )
+    assert data.tuning.noise.shape == (2, draws, 400)
+    assert data.holdout.noise.shape == (3, draws, 400)
+    for one, other in (
+        (data.tuning.noise, data.holdout.noise),
+        (data.tuning.disturbance, data.holdout.disturbance),
+    ):
+        steps = np.diff(np.concatenate([np.asarray(one), np.asarray(other)]), axis=-1)
+        assert apart(steps)
+
+
+def test_noise_is_of_unit_variance():
+    noise = make_data(case_of(holdout_draws=64)).holdout.noise
+    assert np.std(noise) == pytest.approx(1.0, rel=0.02)
+    assert np.mean(noise) == pytest.approx(0.0, abs=0.02)
+
+
+# What a fitted plant leaves unexplained
+
+
+def fitted(simulated):
+    """Return a case whose plant was fitted to a record of 0, 1, 0, 1, ... um."""
+    case = case_of()
+    output = np.arange(400.0) % 2.0
+    record = Record(output, output, case.study.dt)
+    error = FitError(rmse=1.0, rmse_percent_of_span=1.0, unit="um")
+    report = FitReport(
+        model="none",
+        parameters={},
+        train=error,
+        validation=error,
+        warnings=[],
+        wall_s=0.0,
+    )
+    run = (output - simulated)[:, None]
+    fit = Fit(
+        case.loop.plant, report, (record,), (run,), slice(0, 200), slice(200, 400)
+    )
+    return make_data(dataclasses.replace(case, fit=fit))
+
+
+def test_each_part_of_the_record_disturbs_its_own_runs():
+    # The initial loading, the rest of the training part, the validation part.
+    residual = np.repeat([9.0, 1.0, -2.0], [100, 100, 200])
+    data = fitted(residual)
+    np.testing.assert_allclose(data.tuning.disturbance, np.full((2, 1, 400), 1.0))
+    np.testing.assert_allclose(data.holdout.disturbance, np.full((3, 1, 400), -2.0))
+
+
+def test_a_short_residual_runs_forth_and_back():
+    ramp = np.arange(400.0)
+    held = np.asarray(fitted(ramp).holdout.disturbance)[0, 0]
+    np.testing.assert_allclose(held[:200], ramp[200:])
+    np.testing.assert_allclose(held[200:398], ramp[398:200:-1])
+    np.testing.assert_allclose(held[398:], ramp[200:202])
+
+
+# Perturbed plants
+
+ENSEMBLE = {"spread": {"plant.gain": 0.3}, "tune": 2, "margins": 0, "holdout": 3}
+STILL = {"tune": ["CONST2"], "duration": 0.02, "settle": 0.0}
+
+
+@pytest.fixture(scope="module")
+def still():
+    """References that rest at 2 um, stages whose gains differ, no noise."""
+    case = case_of(references=STILL, sensor={"noise_rms": 0.0}, ensemble=ENSEMBLE)
+    stages = case.ensemble.stages("holdout")
+    assert np.ptp(np.asarray(stages.plant.gain)) > 0.02
+    return case, stages, make_data(case)
+
+
+def test_a_perturbed_plant_starts_at_rest_where_it_is_judged(still):
+    case, stages, data = still
+    seen = Judge(Clock(), case, 0).on_stages(case.loop, stages, data.holdout)
+    np.testing.assert_allclose(seen.figures.rms_error, 0.0, atol=1e-12)
+
+
+def test_a_perturbed_plant_starts_at_rest_where_it_is_tuned(still):
+    case, stages, data = still
+    objective = objective_of(case, data.tuning, stages=stages)
+    figures = objective.seen(case.space.start(case.loop)).figures
+    np.testing.assert_allclose(figures.rms_error, 0.0, atol=1e-12)
+
+
+# Railing
+
+
+def objective_of(case, signals, **options):
+    count = 1 if "stages" not in options else 3
+    scale = jnp.ones((count, len(signals.references)))
+    loop, space = case.loop, case.space
+    return Objective(loop, space, signals, scale, jnp.asarray(100.0), 0, **options)
+
+
+@pytest.mark.parametrize(
+    ("heights", "lost"), [((1.0, 2.0), False), ((1.0, 500.0), True)]
+)
+def test_one_run_that_rails_is_enough(heights, lost):
+    """120 V hold 18 um: at 500 um the actuator stays at its limit, at 2 um never."""
+    case = case_of()
+    references = jnp.asarray(heights)[:, None] * jnp.ones(400)
+    signals = Signals(references, jnp.zeros((2, 1, 400)))
+    loss = objective_of(case, signals).loss(case.space.start(case.loop))
+    assert bool(loss == HOPELESS) is lost
