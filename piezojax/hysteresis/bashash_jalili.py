@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, check, check_order
-from ..core.system import System
+from .inverse import Inverse, InverseHysteresis
+from .model import Hysteresis
 
 Points = tuple[Scalar, ...]
 
@@ -27,7 +28,7 @@ class ExtremaState(NamedTuple):
     outputs: Points
 
 
-class BashashJalili(System):
+class BashashJalili(Hysteresis):
     """Hysteresis by a rule: every branch is a curve between two remembered extrema.
 
     Input v in V, output x in um. The curve from a turning point (v1, x1) towards the
@@ -164,6 +165,9 @@ class BashashJalili(System):
         )
         after = ExtremaState(input, output, count, direction, inputs, outputs)
         return after, output
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        return InverseHysteresis(self, lower, upper)
 
     def _curve(
         self,

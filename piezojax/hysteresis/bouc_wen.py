@@ -7,7 +7,8 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, check
 from ..core.runge_kutta import runge_kutta
-from ..core.system import System
+from .inverse import Inverse, InverseHysteresis
+from .model import Hysteresis
 
 
 class BoucWenState(NamedTuple):
@@ -17,7 +18,7 @@ class BoucWenState(NamedTuple):
     force: Scalar
 
 
-class BoucWen(System):
+class BoucWen(Hysteresis):
     """Rate-independent force z of a displacement y, in any consistent units (m, N).
 
     ``z' = alpha y' - beta_gamma |y'| |z|^(nu - 1) z - beta_delta y' |z|^nu``
@@ -64,6 +65,9 @@ class BoucWen(System):
     def init(self, input: ScalarLike = 0.0) -> BoucWenState:
         """Return the state without force at the displacement ``input`` (m)."""
         return BoucWenState(as_array(input), jnp.zeros(()))
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        return InverseHysteresis(self, lower, upper)
 
     def step(
         self, state: BoucWenState, input: ScalarLike

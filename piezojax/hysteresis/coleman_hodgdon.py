@@ -1,14 +1,15 @@
 """Coleman-Hodgdon (ferromagnetic) hysteresis, four discretisations, and its inverse."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, check
-from ..core.system import System, holding_input
-from .inverse import Inverse
+from ..core.system import holding_input
+from .inverse import Inverse, InverseHysteresis, check_rising
+from .model import Hysteresis
 
 
 class HysteresisState(NamedTuple):
@@ -19,7 +20,7 @@ class HysteresisState(NamedTuple):
     older: tuple[Scalar, Scalar] | None = None
 
 
-class ColemanHodgdon(System):
+class ColemanHodgdon(Hysteresis):
     """Rate-independent hysteresis ``y' = |x'| (a x + c y) + b x'``.
 
     Input x in V, output y in um. ``a`` in um/V^2, ``b`` in um/V, ``c`` in 1/V (negative
@@ -41,6 +42,8 @@ class ColemanHodgdon(System):
 
     Raises ValueError for non-finite parameters, ``c >= 0`` or an unknown scheme.
     """
+
+    before: ClassVar[str | None] = "rest_input"
 
     a: Scalar = eqx.field(converter=as_array)
     b: Scalar = eqx.field(converter=as_array)
@@ -73,6 +76,12 @@ class ColemanHodgdon(System):
         output = SCHEMES[self.scheme](self, state, input)
         older = None if state.older is None else (state.input, state.output)
         return HysteresisState(input, output, older), output
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        if self.scheme != "trapezoid":
+            return InverseHysteresis(self, lower, upper)
+        check_rising(self, lower, upper)
+        return InverseColemanHodgdon(self)
 
 
 def _direction(dx: Scalar) -> Scalar:

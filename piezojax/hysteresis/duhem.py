@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -10,8 +10,9 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
 from ..core.runge_kutta import runge_kutta
-from ..core.system import System
+from .inverse import Inverse, InverseHysteresis
 from .loading import loaded
+from .model import Hysteresis
 
 Surface: TypeAlias = tuple[tuple[Scalar, ...], ...]
 
@@ -27,7 +28,7 @@ class DuhemState(NamedTuple):
     memory: Scalar
 
 
-class Duhem(System):
+class Duhem(Hysteresis):
     """``x' = F(x, u) u' + G(x, u) |u'|``, ``y = h(x, u)``: rate-independent hysteresis.
 
     The generalised Duhem model, (2.4), with g(u') = (u', |u'|) and f = (F, G); in the
@@ -54,6 +55,8 @@ class Duhem(System):
     Raises ValueError for numbers that are not finite, an empty ``output`` or
     ``substeps < 1``.
     """
+
+    before: ClassVar[str | None] = "rest_input"
 
     reversible: Surface = eqx.field(converter=_as_surface)
     irreversible: Surface = eqx.field(converter=_as_surface)
@@ -95,6 +98,9 @@ class Duhem(System):
     def init(self, input: ScalarLike = 0.0) -> DuhemState:
         virgin = DuhemState(self.rest_input, self.rest_memory)
         return loaded(self, virgin, as_array(input))
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        return InverseHysteresis(self, lower, upper)
 
     # In reverse mode a step is worked out again: its stages take longer to store.
     @partial(jax.checkpoint, prevent_cse=False)

@@ -5,12 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..core.arrays import Scalar, ScalarLike, State, as_array, as_scalars
-from ..core.system import Affine, Series, System, series
+from ..core.system import Affine, Series, series
 from ..dynamics import ARMA
 from .coleman_hodgdon import ColemanHodgdon
+from .inverse import Inverse
+from .model import Hysteresis
 
 
-class HystereticARMA(System):
+class HystereticARMA(Hysteresis):
     """Two Coleman-Hodgdon operators behind one autoregressive denominator, (3.32).
 
     ``z(k) = sum_i autoregressive[i] z(k-1-i) + sum_i moving_1[i] y_1(k-i) +
@@ -57,6 +59,14 @@ class HystereticARMA(System):
 
     def step(self, state: State, input: ScalarLike) -> tuple[State, Scalar]:
         return self.expanded().step(state, input)
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        """Raise ValueError: the output depends on past outputs."""
+        del lower, upper
+        raise ValueError(
+            "a HystereticARMA contains dynamics and has no inverse; cascade() returns "
+            "its hysteresis, which has one"
+        )
 
     def cascade(self, tolerance: float = 1e-3) -> Series:
         """Return one hysteresis, then one ARMA of unit DC gain, then the offset.

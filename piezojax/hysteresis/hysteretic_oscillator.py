@@ -7,8 +7,9 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, check
 from ..core.runge_kutta import Point, runge_kutta
-from ..core.system import System
 from .bouc_wen import BoucWen
+from .inverse import Inverse
+from .model import Hysteresis
 
 
 class OscillatorState(NamedTuple):
@@ -19,7 +20,7 @@ class OscillatorState(NamedTuple):
     force: Scalar
 
 
-class HystereticOscillator(System):
+class HystereticOscillator(Hysteresis):
     """``mass y'' + damping y' + stiffness y + z = u``, z the Bouc-Wen force of y.
 
     Input u in N, held during the step; output y in m, at its end. ``mass`` in kg,
@@ -61,3 +62,8 @@ class HystereticOscillator(System):
         parts = self.hysteresis.substeps
         state = OscillatorState(*runge_kutta(rate, state, self.dt, parts))
         return state, state.displacement
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        """Raise ValueError: the output follows the input through a mass."""
+        del lower, upper
+        raise ValueError("a HystereticOscillator contains dynamics and has no inverse")

@@ -71,8 +71,7 @@ class InverseHysteresis(Inverse):
         check("upper in V", self.upper)
         check_order("lower", self.lower, "upper", self.upper)
         check("iterations", self.iterations, least=1.0)
-        if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self)):
-            _check_monotone(self.model, float(self.lower), float(self.upper))
+        check_rising(self.model, self.lower, self.upper)
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return self.model.init(holding_input(self.model, input))
@@ -117,8 +116,16 @@ class InverseHysteresis(Inverse):
         return jnp.clip(voltage - (output - wanted) / slope, self.lower, self.upper)
 
 
-def _check_monotone(model: System, lower: float, upper: float) -> None:
-    path = _reversals(lower, upper)
+def check_rising(model: System, lower: ScalarLike, upper: ScalarLike) -> None:
+    """Raise ValueError where the output of ``model`` does not rise with its input.
+
+    The model runs through large and small reversals between ``lower`` and ``upper``
+    (V). Values that are being traced pass.
+    """
+    leaves = jax.tree.leaves((model, lower, upper))
+    if any(isinstance(leaf, Tracer) for leaf in leaves):
+        return
+    path = _reversals(float(lower), float(upper))
     outputs = _along(model, as_array(path))
     if isinstance(outputs, Tracer):
         return

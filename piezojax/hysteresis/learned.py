@@ -1,13 +1,14 @@
 """A learned operator: plays of the input, a layer of neurons, past outputs."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
 from ..core.axes import Rows, as_rows
-from ..core.system import System
+from .inverse import Inverse, InverseHysteresis
+from .model import Hysteresis
 from .plays import Memory, played
 
 
@@ -19,7 +20,7 @@ class LearnedState(NamedTuple):
     outputs: Memory
 
 
-class LearnedOperator(System):
+class LearnedOperator(Hysteresis):
     """``y(k) = sum_i a_i y(k-i) + linear . s(k) + output . tanh(mixing s(k) + bias)``.
 
     For a loop that no closed form fits: a nonlinear autoregressive model with input
@@ -36,6 +37,8 @@ class LearnedOperator(System):
     Raises ValueError for sizes that do not fit, thresholds, a scale or a pace that are
     not positive, numbers that are not finite, or past outputs that hold any output.
     """
+
+    before: ClassVar[str | None] = "rest_input"
 
     autoregressive: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
     linear: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
@@ -100,6 +103,14 @@ class LearnedOperator(System):
         output = output + _dot(self.autoregressive, state.outputs)
         outputs = (output, *state.outputs)[: len(state.outputs)]
         return LearnedState(input, plays, outputs), output
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        if self.autoregressive:
+            raise ValueError(
+                "a LearnedOperator with past outputs contains dynamics and has no "
+                "inverse"
+            )
+        return InverseHysteresis(self, lower, upper)
 
 
 def _dot(weights: Memory, values: Memory) -> Scalar:

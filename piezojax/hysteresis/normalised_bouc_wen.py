@@ -1,14 +1,15 @@
 """The normalised Bouc-Wen model: an actuator's line and a bounded hysteretic part."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, check
-from ..core.system import System
 from .bouc_wen import BoucWen, BoucWenState
+from .inverse import Inverse, InverseHysteresis
 from .loading import loaded
+from .model import Hysteresis
 
 SCHEMES = ("runge_kutta", "exact")
 
@@ -20,7 +21,7 @@ class NormalisedBoucWenState(NamedTuple):
     memory: Scalar
 
 
-class NormalisedBoucWen(System):
+class NormalisedBoucWen(Hysteresis):
     """``y = k_x x + k_w w``: a straight line and a bounded part with hysteresis.
 
     ``w' = rho (x' - sigma |x'| |w|^(n-1) w + (sigma - 1) x' |w|^n)``, (2.5) with its
@@ -49,6 +50,8 @@ class NormalisedBoucWen(System):
     Raises ValueError for numbers outside these bounds, an unknown scheme, or "exact"
     with another n.
     """
+
+    before: ClassVar[str | None] = "rest_input"
 
     k_x: Scalar = eqx.field(converter=as_array)
     k_w: Scalar = eqx.field(converter=as_array)
@@ -99,6 +102,9 @@ class NormalisedBoucWen(System):
             memory = self.classical().step(before, input)[1]
         output = self.k_x * input + self.k_w * memory
         return NormalisedBoucWenState(input, memory), output
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        return InverseHysteresis(self, lower, upper)
 
     def _branch(self, memory: Scalar, change: Scalar) -> Scalar:
         """Return w after ``change`` (V), n = 1: unloading to w = 0, then loading.

@@ -1,10 +1,16 @@
-"""Play and stop operators: what Prandtl-Ishlinskii models are sums of."""
+"""Play and stop operators, their weighted sums and the inverse of such a sum."""
 
+import itertools
+
+import jax
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, as_array, check
+from ..core.arrays import Scalar, as_array, check, check_order
 
 Memory = tuple[Scalar, ...]
+
+ITERATIONS = 20
+"""Newton steps, halving where one leaves the bracket, for a polynomial P."""
 
 
 def played(input: Scalar, memory: Memory, thresholds: Memory) -> Memory:
@@ -56,3 +62,76 @@ def memoryless(polynomial: Memory, x: Scalar) -> Scalar:
 def weighted(weights: Memory, plays: Memory) -> Scalar:
     """Return the sum of ``plays``, each by its weight."""
     return sum((w * p for w, p in zip(weights, plays, strict=True)), as_array(0.0))
+
+
+def check_invertible(polynomial: Memory, thresholds: Memory, weights: Memory) -> None:
+    """Raise ValueError unless ``solved`` finds the one input for any output."""
+    if not polynomial:
+        raise ValueError("the polynomial is empty; an inverse needs its linear term")
+    for i, (low, high) in enumerate(itertools.pairwise(thresholds)):
+        check_order(f"thresholds.{i}", low, f"thresholds.{i + 1}", high)
+    if len(polynomial) == 1:
+        slopes = itertools.accumulate((*polynomial, *weights))
+        check("slope of the model in um/V", tuple(slopes), above=0.0)
+
+
+def solved(
+    polynomial: Memory,
+    thresholds: Memory,
+    weights: Memory,
+    memory: Memory,
+    wanted: Scalar,
+) -> Scalar:
+    """Return the input x for which P(x) + sum weights play(x) from memory is wanted.
+
+    ``memory`` must be one that plays with these thresholds can have: two of them differ
+    by no more than their thresholds do.
+    """
+    slope, constant = as_array(0.0), as_array(0.0)
+    low, high = as_array(-jnp.inf), as_array(jnp.inf)
+    # Where the i-th play begins to move all before it do, and none after it.
+    moving, reach, resting = slope, slope, weighted(weights, memory)
+    for r, w, m in zip(thresholds, weights, memory, strict=True):
+        moving, reach, resting = moving + w, reach + w * r, resting - w * m
+        upper, lower = m + r, m - r
+        rises = (
+            wanted > memoryless(polynomial, upper) + moving * upper - reach + resting
+        )
+        falls = (
+            wanted < memoryless(polynomial, lower) + moving * lower + reach + resting
+        )
+        slope = slope + jnp.where(rises | falls, w, 0.0)
+        constant = constant + w * jnp.where(rises, -r, jnp.where(falls, r, m))
+        low = jnp.where(rises, upper, jnp.where(falls, low, jnp.maximum(low, lower)))
+        high = jnp.where(falls, lower, jnp.where(rises, high, jnp.minimum(high, upper)))
+    rest = wanted - constant
+    linear = polynomial[0] + slope
+    if len(polynomial) == 1:
+        return rest / linear
+    return _root((linear, *polynomial[1:]), rest, low, high)
+
+
+def _root(polynomial: Memory, value: Scalar, low: Scalar, high: Scalar) -> Scalar:
+    """Return x between low and high, infinite or not, with ``polynomial`` at value."""
+    fixed, target, low, high = jax.lax.stop_gradient((polynomial, value, low, high))
+    x = jnp.clip(target / jnp.where(fixed[0] > 0.0, fixed[0], jnp.inf), low, high)
+    for _ in range(ITERATIONS):
+        error = memoryless(fixed, x) - target
+        low, high = jnp.where(error < 0.0, x, low), jnp.where(error > 0.0, x, high)
+        newton = x - error / _rising(fixed, x)
+        middle = 0.5 * (low + high)
+        middle = jnp.where(jnp.isfinite(middle), middle, x)
+        # At the root itself rounding decides which side a step falls to.
+        arrived = jnp.abs(newton - x) <= 1e-9 * (1.0 + jnp.abs(x))
+        inside = (newton >= low) & (newton <= high)
+        x = jnp.where(inside | arrived, newton, middle)
+    # One step more, differentiated with the slope held: the implicit derivative.
+    return x - (memoryless(polynomial, x) - value) / _rising(fixed, x)
+
+
+def _rising(polynomial: Memory, x: Scalar) -> Scalar:
+    """Return the slope of ``polynomial`` at x, infinite where it does not rise."""
+    derivative = jnp.zeros_like(x)
+    for i, coefficient in reversed(list(enumerate(polynomial, 1))):
+        derivative = derivative * x + i * coefficient
+    return jnp.where(derivative > 0.0, derivative, jnp.inf)

@@ -1,14 +1,24 @@
-"""Prandtl-Ishlinskii hysteresis: weighted play operators, symmetric and asymmetric."""
+"""Prandtl-Ishlinskii hysteresis of weighted play operators, and its exact inverse."""
+
+from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
-from ..core.system import System
-from .plays import Memory, check_plays, memoryless, played, weighted
+from .inverse import Inverse, check_rising
+from .model import Hysteresis
+from .plays import (
+    Memory,
+    check_invertible,
+    check_plays,
+    memoryless,
+    played,
+    solved,
+    weighted,
+)
 
 
-class PrandtlIshlinskii(System):
+class PrandtlIshlinskii(Hysteresis):
     """``y = P(x) + sum_i weights[i] play_i(x)``: rate-independent, symmetric loops.
 
     Input x in V, output y in um. Each play operator is a backlash of half-width
@@ -21,6 +31,8 @@ class PrandtlIshlinskii(System):
     Raises ValueError for thresholds that are not positive, numbers that are not finite,
     or a different count of thresholds and weights.
     """
+
+    before: ClassVar[str | None] = "rest_input"
 
     polynomial: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
     thresholds: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
@@ -40,53 +52,68 @@ class PrandtlIshlinskii(System):
         state = played(input, state, self.thresholds)
         return state, memoryless(self.polynomial, input) + weighted(self.weights, state)
 
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        if len(self.polynomial) > 1:
+            check_rising(self, lower, upper)
+        return InversePrandtlIshlinskii(self)
 
-class AsymmetricPrandtlIshlinskii(System):
-    """A Prandtl-Ishlinskii model with loops that are wider on one side.
 
-    ``y = P(x) + sum_i weights[i] play_i(x) + sum_i skew[i] play_i(q(x))``, where q is
-    the one-sided square (x - origin)^2 / (2 scale) for x above ``origin`` and 0 below:
-    plays of q have a width in x that shrinks as x grows, which is how the envelope
-    functions of a generalised play skew a loop (Al Janaideh, Rakheja and Su 2009,
-    Mechatronics 19(5)), here with the weights still linear. ``origin`` and ``scale`` in
-    V: where the loop is widest, and the span of the input. Everything else as in
-    PrandtlIshlinskii; ``skew`` in um/V. Raises ValueError as there, and for
-    ``scale <= 0``.
+class InversePrandtlIshlinskii(Inverse):
+    """Voltage that moves a Prandtl-Ishlinskii model to a wanted output.
+
+    Input f(k) in um, output u(k) in V. From a given memory the model's next output
+    rises with its input in pieces, a corner where each play begins to move; the plays
+    move in the order of their thresholds. Which ones do for f is seen by the outputs at
+    the corners; what is left is linear and solved in closed form, or, with terms above
+    the first in P, a polynomial that rises on a known interval, solved by a bracketed
+    Newton method to 1e-9 um. For a linear P it is the inverse of Krejci and Kuhnen
+    (2001, IEE Proc. Control Theory Appl. 148(3)), which ``operator`` gives as the
+    Prandtl-Ishlinskii operator it is. The state is that of the model itself, so a
+    controller whose voltage was clipped can advance it with what was really applied.
+
+    Raises ValueError for thresholds that do not ascend, for an empty polynomial, or,
+    with a linear P, for weights that do not leave the output rising with the input.
+    With a polynomial P the sum must rise over the inputs that are used; where it does
+    not the voltage is finite, but another.
     """
 
-    polynomial: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    thresholds: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    weights: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    skew: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    origin: Scalar = eqx.field(converter=as_array)
-    scale: Scalar = eqx.field(converter=as_array)
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+    model: PrandtlIshlinskii
 
     def __check_init__(self):
-        check("polynomial", self.polynomial)
-        check_plays(self.thresholds, self.weights)
-        check_plays(self.thresholds, self.skew, "skew weights")
-        check("scale in V", self.scale, above=0.0)
-
-    def _square(self, x: Scalar) -> Scalar:
-        return 0.5 * jnp.maximum(x - self.origin, 0.0) ** 2 / self.scale
-
-    def init(self, input: ScalarLike = 0.0) -> tuple[Memory, Memory]:
-        input, virgin = as_array(input), self.rest_input
-        count = len(self.thresholds)
-        return (
-            played(input, (virgin,) * count, self.thresholds),
-            played(
-                self._square(input), (self._square(virgin),) * count, self.thresholds
-            ),
+        check_invertible(
+            self.model.polynomial, self.model.thresholds, self.model.weights
         )
 
-    def step(
-        self, state: tuple[Memory, Memory], input: ScalarLike
-    ) -> tuple[tuple[Memory, Memory], Scalar]:
-        input = as_array(input)
-        plain = played(input, state[0], self.thresholds)
-        skewed = played(self._square(input), state[1], self.thresholds)
-        output = memoryless(self.polynomial, input)
-        output = output + weighted(self.weights, plain) + weighted(self.skew, skewed)
-        return (plain, skewed), output
+    def init(self, input: ScalarLike = 0.0) -> Memory:
+        virgin = (self.model.rest_input,) * len(self.model.thresholds)
+        return self.model.init(self.solve(virgin, input))
+
+    def solve(self, state: Memory, wanted: ScalarLike) -> Scalar:
+        """Return the voltage (V) for which the model's next output is ``wanted``."""
+        model = self.model
+        return solved(
+            model.polynomial, model.thresholds, model.weights, state, as_array(wanted)
+        )
+
+    def operator(self) -> PrandtlIshlinskii:
+        """Return the inverse as a Prandtl-Ishlinskii operator from um to V.
+
+        Its plays follow the wanted output alone, from the virgin state. Raises
+        ValueError for a polynomial with terms above the first.
+        """
+        model = self.model
+        first, *others = model.polynomial
+        if others:
+            raise ValueError(
+                f"the polynomial has {len(model.polynomial)} terms; only with a linear "
+                "one is the inverse a Prandtl-Ishlinskii operator"
+            )
+        slope, reach = first, as_array(0.0)
+        thresholds, weights = [], []
+        for r, w in zip(model.thresholds, model.weights, strict=True):
+            thresholds.append(slope * r - reach)
+            weights.append(-w / (slope * (slope + w)))
+            slope, reach = slope + w, reach + w * r
+        return PrandtlIshlinskii(
+            (1.0 / first,), thresholds, weights, slope * model.rest_input
+        )

@@ -1,7 +1,7 @@
 """Preisach hysteresis with a density on a triangle of cells, and its exact inverse."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,6 +20,7 @@ from ..core.arrays import (
 )
 from ..core.system import Designed, System
 from .inverse import Inverse
+from .model import Hysteresis
 
 Levels = Float[Array, " cells"]
 Rows = tuple[Float[Array, " cells"], ...]
@@ -32,7 +33,7 @@ ROUNDING = 1e-13
 """Change of the output, um, below which the inverse stays where it is."""
 
 
-class Preisach(Designed):
+class Preisach(Hysteresis, Designed):
     """A weighted sum of relays, (2.1)-(2.2): the weights of those that are up.
 
     A relay goes up where the input rises through its alpha and down where it falls
@@ -59,6 +60,8 @@ class Preisach(Designed):
     Raises ValueError for weights that are not square, negative or above the diagonal,
     ``low >= high``, numbers that are not finite or an unknown start.
     """
+
+    before: ClassVar[str | None] = "rest_input"
 
     weights: Matrix = eqx.field(converter=as_matrix)
     low: Scalar = eqx.field(converter=as_array)
@@ -94,6 +97,10 @@ class Preisach(Designed):
             self.rest_input,
             self.start,
         )
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        del lower, upper  # the inverse holds over the triangle, and saturates beyond it
+        return InversePreisach(self)
 
 
 def check_weights(name: str, weights: Matrix) -> None:

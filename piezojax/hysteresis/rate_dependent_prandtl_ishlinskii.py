@@ -1,15 +1,23 @@
 """Prandtl-Ishlinskii hysteresis that widens with the rate, and its inverse."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
-from ..core.system import System
-from .inverse import Inverse
-from .inverse_prandtl_ishlinskii import check_invertible, solved
-from .plays import Memory, check_plays, memoryless, played, weighted
+from .inverse import Inverse, check_rising
+from .model import Hysteresis
+from .plays import (
+    Memory,
+    check_invertible,
+    check_plays,
+    memoryless,
+    played,
+    solved,
+    weighted,
+)
+from .prandtl_ishlinskii import PrandtlIshlinskii
 
 
 class RateState(NamedTuple):
@@ -20,7 +28,7 @@ class RateState(NamedTuple):
     rate: Scalar
 
 
-class RateDependentPrandtlIshlinskii(System):
+class RateDependentPrandtlIshlinskii(Hysteresis):
     """A Prandtl-Ishlinskii model whose thresholds grow with the rate of the input.
 
     ``y = P(x) + sum_i weights[i] play_i(x)`` with plays of the half-width
@@ -34,6 +42,8 @@ class RateDependentPrandtlIshlinskii(System):
 
     Raises ValueError as ``PrandtlIshlinskii``, for ``growth < 0`` and ``dt <= 0``.
     """
+
+    before: ClassVar[str | None] = "rest_input"
 
     polynomial: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
     thresholds: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
@@ -65,6 +75,15 @@ class RateDependentPrandtlIshlinskii(System):
         """Return the half-widths (V) of the plays in the next step."""
         wider = self.growth * jnp.abs(state.rate)
         return tuple(r + wider for r in self.thresholds)
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        if len(self.polynomial) > 1:
+            # The slopes are those at rest: the rate moves the corners between them.
+            at_rest = PrandtlIshlinskii(
+                self.polynomial, self.thresholds, self.weights, self.rest_input
+            )
+            check_rising(at_rest, lower, upper)
+        return InverseRateDependentPrandtlIshlinskii(self)
 
 
 class InverseRateDependentPrandtlIshlinskii(Inverse):

@@ -6,10 +6,12 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import Matrix, Scalar, ScalarLike, as_array, as_matrix, check
 from ..core.system import Designed, System
+from .inverse import Inverse, InverseHysteresis
+from .model import Hysteresis
 from .preisach import Levels, PlayLines, Preisach, Rows, check_weights, outputs, rows_of
 
 
-class RateDependentPreisach(Designed):
+class RateDependentPreisach(Hysteresis, Designed):
     """``y = integral of mu(alpha, beta, du/dt) relay(u)``, (2.10), of a Preisach model.
 
     mu goes from the density of ``slow`` to that of ``fast_weights`` (um, n x n as in
@@ -42,6 +44,11 @@ class RateDependentPreisach(Designed):
         slow = self.slow.law()
         half_way = self.rate * self.dt / slow.size
         return _Blend(slow, rows_of(self.fast_weights), half_way)
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        # Beyond the triangle the output is flat.
+        within = jnp.maximum(lower, self.slow.low), jnp.minimum(upper, self.slow.high)
+        return InverseHysteresis(self, *within)
 
 
 class _Blend(System):

@@ -1,13 +1,14 @@
 """Coleman-Hodgdon hysteresis with nonlinear shape functions."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
-from ..core.system import System
+from .inverse import Inverse, InverseHysteresis
+from .model import Hysteresis
 
 
 class LastPoint(NamedTuple):
@@ -17,7 +18,7 @@ class LastPoint(NamedTuple):
     output: Scalar
 
 
-class ShapedColemanHodgdon(System):
+class ShapedColemanHodgdon(Hysteresis):
     """``y' = |x'| (p(x) + c y) + g(x) x'`` with polynomials p and g.
 
     The general model of Coleman and Hodgdon, alpha |x'| (f(x) - y) + g(x) x', with
@@ -33,6 +34,8 @@ class ShapedColemanHodgdon(System):
 
     Raises ValueError for numbers that are not finite, empty polynomials or ``c >= 0``.
     """
+
+    before: ClassVar[str | None] = "rest_input"
 
     pull: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
     slope: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
@@ -72,6 +75,9 @@ class ShapedColemanHodgdon(System):
         force = sign * _integral(self.pull, last, x) + _integral(self.slope, last, x)
         output = (force + (1.0 + half) * state.output) / (1.0 - half)
         return LastPoint(x, output), output
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        return InverseHysteresis(self, lower, upper)
 
 
 def _value(polynomial: Sequence[Scalar], x: Scalar) -> Scalar:

@@ -1,12 +1,13 @@
 """Prandtl-Ishlinskii hysteresis by stop operators, the dual of plays."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
-from ..core.system import System
+from .inverse import Inverse
+from .model import Hysteresis
 from .plays import Memory, check_plays, memoryless, stopped, weighted
 from .prandtl_ishlinskii import PrandtlIshlinskii
 
@@ -18,7 +19,7 @@ class StopState(NamedTuple):
     stops: Memory
 
 
-class StopPrandtlIshlinskii(System):
+class StopPrandtlIshlinskii(Hysteresis):
     """``y = P(x) - sum_i weights[i] stop_i(x)``: what the stops hold back.
 
     Input x in V, output y in um. A stop of half-width ``thresholds[i]`` (V) follows x
@@ -31,6 +32,8 @@ class StopPrandtlIshlinskii(System):
     Raises ValueError for thresholds that are not positive, numbers that are not finite,
     or a different count of thresholds and weights.
     """
+
+    before: ClassVar[str | None] = "rest_input"
 
     polynomial: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
     thresholds: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
@@ -61,3 +64,6 @@ class StopPrandtlIshlinskii(System):
         return PrandtlIshlinskii(
             (first, *others), self.thresholds, self.weights, self.rest_input
         )
+
+    def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
+        return self.as_plays().inverse(lower, upper)

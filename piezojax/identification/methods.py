@@ -10,6 +10,7 @@ from ..core.arrays import as_array
 from ..core.paths import parameters
 from ..core.progress import Progress
 from ..core.system import System
+from ..hysteresis.model import hystereses
 from .chain import structure
 from .estimators.estimate import Estimate, FittedParameter, Options, at_edge
 from .estimators.linear import by_frequency_response, by_subspace
@@ -19,7 +20,6 @@ from .estimators.neural import fit_neural_state_space
 from .estimators.output_error import Optimum, from_rest, output_error
 from .estimators.regression import instrumental_variables, least_squares
 from .estimators.steady_state import fit_structure, steady_response
-from .estimators.structure import REST_INPUT
 from .records.record import Record
 from .records.resample import average_periods, resample, whole_periods
 
@@ -65,7 +65,7 @@ def _by_output_error(
         named,
         _optimum_warnings(optimum, options.steps),
         shape.order,
-        REST_INPUT in parameters(shape.system),
+        bool(hystereses(shape.system)),
     )
 
 

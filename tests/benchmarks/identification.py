@@ -23,9 +23,7 @@ from scipy.optimize import least_squares
 
 from piezojax import (
     Record,
-)
-from piezojax import (
-    identification as identify,
+    identify,
 )
 from piezojax.catalog import p753
 from piezojax.identification import free_run

@@ -7,9 +7,7 @@ from oracles import hysteresis as oracle
 
 from piezojax import (
     Record,
-)
-from piezojax import (
-    identification as identify,
+    identify,
 )
 from piezojax.identification import free_run
 

@@ -8,10 +8,8 @@ from oracles import hysteresis as oracle
 
 from piezojax import (
     Record,
+    identify,
     simulate,
-)
-from piezojax import (
-    identification as identify,
 )
 from piezojax.hysteresis import (
     LearnedOperator,

@@ -9,13 +9,11 @@ import pytest
 
 from piezojax import (
     Record,
+    identify,
     load,
     read_record,
     save,
     series,
-)
-from piezojax import (
-    identification as identify,
 )
 from piezojax.core.system import (
     Affine,
@@ -26,7 +24,7 @@ from piezojax.dynamics import (
 from piezojax.hysteresis import (
     ColemanHodgdon,
 )
-from piezojax.identification import PARTS, free_run
+from piezojax.identification import PARTS, Options, free_run
 from piezojax.study import shipped
 
 DT = 1e-3
@@ -230,6 +228,13 @@ def test_the_lag_of_the_shipped_record(shipped_fit):
     # (tuning/data/micromanipulator.md).
     lag = shipped_fit.report.parameters["lag.time_constant"].value
     assert lag == pytest.approx(0.014, abs=0.004)
+
+
+@pytest.mark.parametrize("model", ["bashash_jalili", "prandtl_ishlinskii"])
+def test_every_hysteresis_is_warned_of_one_frequency(model):
+    input = 50.0 - 50.0 * np.cos(0.05 * np.arange(400))
+    fit = identify(record_of(input, 0.1 * input), model, options=Options(steps=1))
+    assert any("one frequency: hysteresis and" in w for w in fit.report.warnings)
 
 
 # What is refused

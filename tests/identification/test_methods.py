@@ -7,10 +7,8 @@ from scipy import signal
 
 from piezojax import (
     Record,
+    identify,
     series,
-)
-from piezojax import (
-    identification as identify,
 )
 from piezojax.core.system import (
     Affine,

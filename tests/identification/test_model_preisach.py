@@ -10,11 +10,9 @@ from oracles import preisach as oracle
 
 from piezojax import (
     Record,
+    identify,
     load,
     read_record,
-)
-from piezojax import (
-    identification as identify,
 )
 from piezojax.identification import free_run
 from piezojax.identification.candidates import whole_models

@@ -9,9 +9,7 @@ import pytest
 
 from piezojax import (
     Record,
-)
-from piezojax import (
-    identification as identify,
+    identify,
 )
 from piezojax.catalog import p753
 from piezojax.core.paths import replace

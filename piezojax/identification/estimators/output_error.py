@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...core.arrays import ScalarLike, as_array
-from ...core.paths import parameters
 from ...core.progress import Progress, Silent
 from ...core.rollout import simulate
 from ...core.space import Space, squash
 from ...core.system import System, rest_output
+from ...hysteresis.model import input_before
 from ...solve.optimisers import Optimiser, damped_gauss_newton
 from ..records.record import Record
-from .structure import REST_INPUT, Structure
+from .structure import Structure
 
 AT_ONCE = 4
 """Starts that descend together in one program."""
@@ -100,7 +100,7 @@ def free_run(
 
 def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """Free run from the rest point the model carries, or from the first input."""
-    return free_run(system, input, parameters(system).get(REST_INPUT, input[0]))
+    return free_run(system, input, input_before(system, input[0]))
 
 
 def problem_of(

@@ -7,9 +7,6 @@ import numpy as np
 from ...core.space import Space
 from ...core.system import System
 
-REST_INPUT = "hysteresis.rest_input"
-"""Path of the input in force before the record, where the model has a memory of it."""
-
 
 class Structure(NamedTuple):
     """A model to fit: its System, the box of its parameters, starts in the box.
