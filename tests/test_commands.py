@@ -37,8 +37,8 @@ STUDY = {
     "controller": {"catalog": "p753_pid"},
     "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
     "parameters": {
-        "controller.proportional": {"lower": 0.1, "upper": 5.0, "transform": "log"},
-        "controller.integral": {"lower": 100.0, "upper": 2e4, "transform": "log"},
+        "controller.proportional": {"lower": 0.1, "upper": 5.0, "scale": "log"},
+        "controller.integral": {"lower": 100.0, "upper": 2e4, "scale": "log"},
     },
     "optimiser": {"starts": 2, "candidates": 4, "steps": 5},
 }
@@ -637,7 +637,7 @@ def test_pictures_of_a_start_that_diverges(tmp_path):
         parameters={
             "controller.integral": {
                 **{"lower": 100.0, "upper": 1e7, "start": 5e6},
-                "transform": "log",
+                "scale": "log",
             }
         },
     )

@@ -13,7 +13,7 @@ from piezojax.control import (
     PID,
 )
 from piezojax.core.paths import replace
-from piezojax.core.space import INSIDE, TRANSFORMS, space_of, squash, unsquash
+from piezojax.core.space import INSIDE, SCALES, Range, space_of, squash, unsquash
 from piezojax.core.system import (
     Affine,
 )
@@ -31,11 +31,11 @@ examples = settings(max_examples=60, deadline=None)
 
 @st.composite
 def bounds(draw):
-    transform = draw(st.sampled_from(sorted(TRANSFORMS)))
-    low, high = sorted((draw(SIDES[transform]), draw(SIDES[transform])))
+    scale = draw(st.sampled_from(sorted(SCALES)))
+    low, high = sorted((draw(SIDES[scale]), draw(SIDES[scale])))
     # Sides that differ by rounding only leave nothing to invert.
     assume(high - low > 1e-3 * max(abs(low), abs(high)) + 1e-9)
-    return low, high, transform
+    return low, high, scale
 
 
 # Plain numbers are drawn and the box is built in the test: checking its types draws
@@ -45,7 +45,7 @@ POINTS = st.lists(UNIT, min_size=4, max_size=4).map(np.array)
 
 
 def box_of(several):
-    return space_of({f"p{i}": bound for i, bound in enumerate(several)})
+    return space_of({f"p{i}": Range(*bound) for i, bound in enumerate(several)})
 
 
 @examples
@@ -98,9 +98,9 @@ def test_larger_in_the_box_is_larger_in_the_parameter(bound, one, other):
 def test_middle_of_each_scale():
     space = space_of(
         {
-            "linear": (-2.0, 4.0, "linear"),
-            "log": (1e-3, 1e3, "log"),
-            "logit": (0.1, 0.9, "logit"),
+            "linear": Range(-2.0, 4.0),
+            "log": Range(1e-3, 1e3, "log"),
+            "logit": Range(0.1, 0.9, "logit"),
         }
     )
     np.testing.assert_allclose(space.from_unit(jnp.full(3, 0.5)), [1.0, 1.0, 0.5])
@@ -108,14 +108,14 @@ def test_middle_of_each_scale():
 
 @pytest.mark.parametrize("outside", [-0.2, 1.3])
 def test_beyond_the_unit_cube_the_bounds_still_hold(outside):
-    space = space_of({"a": (1.0, 2.0, "linear"), "b": (1.0, 2.0, "log")})
+    space = space_of({"a": Range(1.0, 2.0), "b": Range(1.0, 2.0, "log")})
     values = np.asarray(space.from_unit(jnp.full(2, outside)))
     assert set(values) == {1.0 if outside < 0 else 2.0}
 
 
-@pytest.mark.parametrize("transform", sorted(TRANSFORMS))
-def test_the_map_has_a_slope_everywhere_inside(transform):
-    space = space_of({"p": (0.1, 0.9, transform)})
+@pytest.mark.parametrize("scale", sorted(SCALES))
+def test_the_map_has_a_slope_everywhere_inside(scale):
+    space = space_of({"p": Range(0.1, 0.9, scale)})
     slope = jax.jacfwd(lambda u: space.from_unit(u)[0])
     for place in (1e-6, 0.3, 1.0 - 1e-6):
         assert slope(jnp.array([place]))[0] > 1e-3
@@ -138,8 +138,8 @@ def test_squash_stays_in_the_cube_with_a_finite_slope(free):
 
 
 def box(**changes):
-    entry = {"lower": 1.0, "upper": 10.0, "transform": "log"} | changes
-    return space_of({"controller.gain": tuple(entry.values())})
+    entry = {"lower": 1.0, "upper": 10.0, "scale": "log"} | changes
+    return space_of({"controller.gain": Range(**entry)})
 
 
 @pytest.mark.parametrize(
@@ -153,21 +153,21 @@ def box(**changes):
         (0.0, float("nan")),
     ],
 )
-@pytest.mark.parametrize("transform", sorted(TRANSFORMS))
-def test_bounds_that_are_none(lower, upper, transform):
+@pytest.mark.parametrize("scale", sorted(SCALES))
+def test_bounds_that_are_none(lower, upper, scale):
     message = (
         f"controller.gain: bounds are {lower:g} and {upper:g}; "
         "they must be finite and the lower below the upper"
     )
     with pytest.raises(ValueError, match=re.escape(message)):
-        box(lower=lower, upper=upper, transform=transform)
+        box(lower=lower, upper=upper, scale=scale)
 
 
 @pytest.mark.parametrize("lower", [0.0, -1.0])
 def test_log_needs_what_is_positive(lower):
     message = (
         f"controller.gain: the lower bound is {lower:g}; "
-        "with transform 'log' it must be above 0"
+        "with scale 'log' it must be above 0"
     )
     with pytest.raises(ValueError, match=re.escape(message)):
         box(lower=lower)
@@ -179,18 +179,18 @@ def test_log_needs_what_is_positive(lower):
 def test_logit_needs_what_lies_between_0_and_1(lower, upper):
     message = (
         f"controller.gain: the bounds are {lower:g} and {upper:g}; "
-        "with transform 'logit' they must lie between 0 and 1"
+        "with scale 'logit' they must lie between 0 and 1"
     )
     with pytest.raises(ValueError, match=re.escape(message)):
-        box(lower=lower, upper=upper, transform="logit")
+        box(lower=lower, upper=upper, scale="logit")
 
 
 def test_the_first_bad_path_is_named():
     with pytest.raises(ValueError, match=r"^offset: bounds are 2 and 1"):
-        space_of({"gain": (0.0, 1.0, "linear"), "offset": (2.0, 1.0, "linear")})
+        space_of({"gain": Range(0.0, 1.0), "offset": Range(2.0, 1.0)})
 
 
-GAIN = space_of({"gain": (1.0, 10.0, "log"), "offset": (-1.0, 1.0, "linear")})
+GAIN = space_of({"gain": Range(1.0, 10.0, "log"), "offset": Range(-1.0, 1.0)})
 
 
 def test_start_is_where_the_system_lies():
@@ -219,12 +219,13 @@ def test_start_on_a_bound_is_moved_inside(gain, place):
 
 def test_start_names_a_parameter_that_is_not_there():
     with pytest.raises(ValueError, match=r"no parameter 'gian'; .* gain"):
-        space_of({"gian": (0.0, 1.0, "linear")}).start(Affine())
+        space_of({"gian": Range(0.0, 1.0)}).start(Affine())
 
 
 def test_put_changes_its_parameters_and_no_other():
     pid = PID(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, dt=1e-4)
-    space = space_of({"integral": (0.5, 8.0, "log"), "proportional": (0, 4, "linear")})
+    ranges = {"integral": Range(0.5, 8.0, "log"), "proportional": Range(0.0, 4.0)}
+    space = space_of(ranges)
     moved = space.put(pid, jnp.array([0.5, 0.25]))
     found = [float(value) for value in jax.tree.leaves(moved)]
     assert found == pytest.approx([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0])

@@ -38,8 +38,8 @@ BASE = {
         "settle": 0.02,
     },
     "parameters": {
-        "controller.proportional": {"lower": 0.1, "upper": 5.0, "transform": "log"},
-        "controller.integral": {"lower": 100.0, "upper": 2e4, "transform": "log"},
+        "controller.proportional": {"lower": 0.1, "upper": 5.0, "scale": "log"},
+        "controller.integral": {"lower": 100.0, "upper": 2e4, "scale": "log"},
     },
     "objective": {"aggregate": "geometric_mean"},
     "optimiser": {"method": "bfgs", "starts": 2, "candidates": 4, "steps": 6},
@@ -134,7 +134,7 @@ def test_a_small_study(study):
     assert case.study.dt == pytest.approx(5e-5)
     assert isinstance(case.loop.plant, FirstOrderLag)
     assert case.space.paths == ("controller.proportional", "controller.integral")
-    assert case.space.transforms == ("log", "log")
+    assert case.space.scales == ("log", "log")
     np.testing.assert_array_equal(case.space.lower, [0.1, 100.0])
     np.testing.assert_array_equal(case.space.upper, [5.0, 2e4])
 
@@ -244,13 +244,13 @@ def test_a_cut_off_just_below_nyquist(study):
             "parameters/controller.integral/max",
             1.0,
             "parameters.controller.integral.max is unknown; allowed are lower, upper, "
-            "transform, start",
+            "scale, start",
         ),
         (
-            "parameters/controller.integral/transfrom",
+            "parameters/controller.integral/scael",
             "log",
-            "parameters.controller.integral.transfrom is unknown; allowed are lower, "
-            "upper, transform, start; did you mean 'transform'?",
+            "parameters.controller.integral.scael is unknown; allowed are lower, "
+            "upper, scale, start; did you mean 'scale'?",
         ),
         (
             "objective/effort",
@@ -336,10 +336,10 @@ def test_unknown_keys(refusal, place, value, message):
             "plant.type is 'os.system'; it must be one of ARMA, AdaptiveInverse, Affi",
         ),
         (
-            "parameters/controller.integral/transform",
+            "parameters/controller.integral/scale",
             "sqrt",
-            "parameters.controller.integral.transform is 'sqrt': Input should be "
-            "'log', 'logit' or 'linear'",
+            "parameters.controller.integral.scale is 'sqrt': Input should be "
+            "'linear', 'log' or 'logit'",
         ),
         (
             "objective/aggregate",
@@ -379,16 +379,16 @@ def test_unknown_names(refusal, place, value, message):
         ),
         (
             {"lower": 0.0},
-            "controller.proportional: the lower bound is 0; with transform 'log' it "
+            "controller.proportional: the lower bound is 0; with scale 'log' it "
             "must be above 0",
         ),
         (
             {"lower": -1.0},
-            "controller.proportional: the lower bound is -1; with transform 'log' it",
+            "controller.proportional: the lower bound is -1; with scale 'log' it",
         ),
         (
-            {"transform": "logit"},
-            "controller.proportional: the bounds are 0.1 and 5; with transform "
+            {"scale": "logit"},
+            "controller.proportional: the bounds are 0.1 and 5; with scale "
             "'logit' they must lie between 0 and 1",
         ),
         (

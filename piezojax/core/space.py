@@ -1,7 +1,8 @@
 """The box that tuning and identification search: paths, bounds, scales."""
 
 from collections.abc import Callable, Mapping
-from typing import Literal, TypeVar
+from dataclasses import dataclass
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -10,55 +11,73 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .arrays import as_array
+from .parameter import Scale
 from .paths import get, replace
 from .system import System
 
 S = TypeVar("S", bound=System)
 
-Transform = Literal["log", "logit", "linear"]
-
-TRANSFORMS: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]] = {
+SCALES: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]] = {
     "linear": (lambda x: x, lambda x: x),
     "log": (jnp.log, jnp.exp),
     "logit": (lambda x: jnp.log(x) - jnp.log1p(-x), jax.nn.sigmoid),
 }
-"""Scales by name, forth and back: ``log`` for what is positive and spans decades,
-``logit`` for what lies between 0 and 1."""
+"""Maps of each scale, forth and back: ``log`` for positive values that span decades,
+``logit`` for values between 0 and 1."""
 
 INSIDE = 1e-6
-"""How far inside its box, as a share of its side, a start on a bound is moved: the
-smooth map to the whole line has no slope on the bound itself."""
+"""Distance to its bound, as a share of the box, to which a start on a bound is moved:
+the smooth map to the whole line has no slope on the bound itself."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """Bounds of a parameter in its ``unit``, and the scale on which it is searched.
+
+    ``start`` is the value that a search begins with; None leaves the value that the
+    System has.
+    """
+
+    lower: float
+    upper: float
+    scale: Scale = "linear"
+    start: float | None = None
+    unit: str = ""
+
+    def check(self, name: str) -> None:
+        """Raise ValueError unless the bounds are in order and suit the scale."""
+        low, high = self.lower, self.upper
+        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+            raise ValueError(
+                f"{name}: bounds are {low:g} and {high:g}; "
+                "they must be finite and the lower below the upper"
+            )
+        if self.scale == "log" and low <= 0:
+            raise ValueError(
+                f"{name}: the lower bound is {low:g}; "
+                "with scale 'log' it must be above 0"
+            )
+        if self.scale == "logit" and (low <= 0 or high >= 1):
+            raise ValueError(
+                f"{name}: the bounds are {low:g} and {high:g}; "
+                "with scale 'logit' they must lie between 0 and 1"
+            )
 
 
 class Space(eqx.Module):
-    """A box of parameters, each seen through its transform and scaled to [0, 1]."""
+    """A box of parameters, each mapped through its scale onto [0, 1].
+
+    ``space_of`` makes one from Ranges. The bounds are arrays, so that programs compiled
+    for a Space serve any other bounds of the same parameters.
+    """
 
     paths: tuple[str, ...] = eqx.field(static=True)
-    transforms: tuple[str, ...] = eqx.field(static=True)
+    scales: tuple[Scale, ...] = eqx.field(static=True)
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
 
-    def __check_init__(self):
-        for i, path in enumerate(self.paths):
-            low, high = float(self.lower[i]), float(self.upper[i])
-            if not (np.isfinite(low) and np.isfinite(high) and low < high):
-                raise ValueError(
-                    f"{path}: bounds are {low:g} and {high:g}; "
-                    "they must be finite and the lower below the upper"
-                )
-            if self.transforms[i] == "log" and low <= 0:
-                raise ValueError(
-                    f"{path}: the lower bound is {low:g}; "
-                    "with transform 'log' it must be above 0"
-                )
-            if self.transforms[i] == "logit" and (low <= 0 or high >= 1):
-                raise ValueError(
-                    f"{path}: the bounds are {low:g} and {high:g}; "
-                    "with transform 'logit' they must lie between 0 and 1"
-                )
-
     def start(self, system: System) -> Float[Array, " n"]:
-        """Return where ``system`` lies in the box.
+        """Return the place of ``system`` in the box, in [0, 1]^n.
 
         Raises ValueError for a parameter outside its bounds.
         """
@@ -75,8 +94,8 @@ class Space(eqx.Module):
 
     def _map(self, values: Array, direction: int) -> Array:
         mapped = [
-            TRANSFORMS[name][direction](value)
-            for name, value in zip(self.transforms, values, strict=True)
+            SCALES[name][direction](value)
+            for name, value in zip(self.scales, values, strict=True)
         ]
         return jnp.stack(mapped)
 
@@ -101,15 +120,19 @@ class Space(eqx.Module):
         return dict(zip(self.paths, self.from_unit(unit), strict=True))
 
 
-def space_of(
-    bounds: Mapping[str, tuple[float, float, Transform]],
-) -> Space:
-    """Return the Space of ``{path: (lower, upper, transform)}``."""
+def space_of(ranges: Mapping[str, Range]) -> Space:
+    """Return the Space of Ranges by path.
+
+    Raises ValueError, naming the path, for bounds that are not in order or do not suit
+    their scale.
+    """
+    for path, one in ranges.items():
+        one.check(path)
     return Space(
-        paths=tuple(bounds),
-        transforms=tuple(transform for _, _, transform in bounds.values()),
-        lower=as_array([low for low, _, _ in bounds.values()]),
-        upper=as_array([high for _, high, _ in bounds.values()]),
+        paths=tuple(ranges),
+        scales=tuple(one.scale for one in ranges.values()),
+        lower=as_array([one.lower for one in ranges.values()]),
+        upper=as_array([one.upper for one in ranges.values()]),
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..core.arrays import as_array
 from ..core.paths import get, replace
-from ..core.space import INSIDE, Space, space_of
+from ..core.space import INSIDE, Range, Space, space_of
 from ..core.system import Affine, Series, series
 from .estimators.structure import Structure
 from .part import around
@@ -57,7 +57,7 @@ def structure(name: str, record: Record) -> Structure:
         Affine(slope, extent.centre),
         {
             **({} if scaled else {"gain": around(slope, 0.0, 3.0)}),
-            "offset": (extent.centre - reach, extent.centre + reach, "linear"),
+            "offset": Range(extent.centre - reach, extent.centre + reach),
         },
     )
     system = series(**{place: part.system for place, part in parts.items()})

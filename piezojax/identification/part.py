@@ -5,11 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.space import Transform
+from ..core.space import Range
 from ..core.system import System
 from .records.record import Record
-
-Bounds = Mapping[str, tuple[float, float, Transform]]
 
 
 class Part(NamedTuple):
@@ -20,7 +18,7 @@ class Part(NamedTuple):
     """
 
     system: System
-    bounds: Bounds
+    bounds: Mapping[str, Range]
     alternatives: Sequence[Mapping[str, float]] = ({},)
     gain: str | None = None
     own: tuple[str, ...] = ()
@@ -60,16 +58,16 @@ def extent_of(record: Record) -> Extent:
     )
 
 
-def around(value: float, below: float, above: float) -> tuple[float, float, Transform]:
-    """Bounds at multiples of ``value``, which may be negative."""
+def around(value: float, below: float, above: float) -> Range:
+    """Return the range between multiples of ``value``, which may be negative."""
     low, high = sorted((below * value, above * value))
-    return low, high, "linear"
+    return Range(low, high)
 
 
-def rest_bounds(extent: Extent) -> Bounds:
-    """Bounds of the input in force before the record."""
+def rest_bounds(extent: Extent) -> dict[str, Range]:
+    """Return the range of the input in force before the record."""
     margin = 0.5 * extent.width
-    return {"rest_input": (extent.low - margin, extent.high + margin, "linear")}
+    return {"rest_input": Range(extent.low - margin, extent.high + margin)}
 
 
 def rests(extent: Extent) -> list[dict[str, float]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from ..core.space import Range
 from ..dynamics import ARMA, FirstOrderLag, FractionalDelay
 from . import parts_creep as creep
 from . import parts_curves as curves
@@ -14,7 +15,9 @@ from .part import extent_of as extent_of
 def lag(extent: Extent) -> Part:
     """First-order lag: amplifier, sensor filter"""
     dt = extent.dt
-    return Part(FirstOrderLag(dt, dt), {"time_constant": (0.05 * dt, 50.0 * dt, "log")})
+    return Part(
+        FirstOrderLag(dt, dt), {"time_constant": Range(0.05 * dt, 50.0 * dt, "log")}
+    )
 
 
 def arma(extent: Extent) -> Part:
@@ -23,9 +26,9 @@ def arma(extent: Extent) -> Part:
     return Part(
         ARMA((0.9, -0.2), (0.3, 0.0, 0.0)),
         {
-            "autoregressive.0": (-2.0, 2.0, "linear"),
-            "autoregressive.1": (-1.0, 1.0, "linear"),
-            **{f"moving.{i}": (-3.0, 3.0, "linear") for i in range(3)},
+            "autoregressive.0": Range(-2.0, 2.0),
+            "autoregressive.1": Range(-1.0, 1.0),
+            **{f"moving.{i}": Range(-3.0, 3.0) for i in range(3)},
         },
         [
             {"autoregressive.0": 2.0 * p, "autoregressive.1": -p * p, "moving.0": q}
@@ -39,7 +42,7 @@ def delay(extent: Extent) -> Part:
     """Delay of up to five samples"""
     return Part(
         FractionalDelay(0.5 * extent.dt, extent.dt, 5),
-        {"delay": (0.0, 5.0 * extent.dt, "linear")},
+        {"delay": Range(0.0, 5.0 * extent.dt)},
         [{"delay": n * extent.dt} for n in (0.5, 2.5)],
     )
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..core.space import Range
 from ..dynamics import ExponentialCreep, LogarithmicCreep, SpringDamperCreep
 from .part import Extent, Part
 
@@ -17,7 +18,7 @@ def exponential_creep(extent: Extent) -> Part:
     times = np.geomspace(*_creep_times(extent), 4)
     return Part(
         ExponentialCreep((0.01,) * 4, times, extent.dt),
-        {f"gains.{i}": (-0.5, 0.5, "linear") for i in range(4)},
+        {f"gains.{i}": Range(-0.5, 0.5) for i in range(4)},
     )
 
 
@@ -25,7 +26,7 @@ def logarithmic_creep(extent: Extent) -> Part:
     """Creep with the logarithm of time"""
     return Part(
         LogarithmicCreep(0.01, *_creep_times(extent), extent.dt),
-        {"gain_per_decade": (-0.2, 0.2, "linear")},
+        {"gain_per_decade": Range(-0.2, 0.2)},
     )
 
 
@@ -38,9 +39,9 @@ def spring_damper_creep(extent: Extent) -> Part:
     return Part(
         SpringDamperCreep((stiffness,) * 3, stiffness * times, 1.0, 1.0, extent.dt),
         {
-            **{f"stiffness.{i}": (2.0, 1e4, "log") for i in range(3)},
+            **{f"stiffness.{i}": Range(2.0, 1e4, "log") for i in range(3)},
             **{
-                f"damping.{i}": (0.02 * stiffness * t, 50.0 * stiffness * t, "log")
+                f"damping.{i}": Range(0.02 * stiffness * t, 50.0 * stiffness * t, "log")
                 for i, t in enumerate(times)
             },
         },

@@ -1,6 +1,6 @@
 """Hysteresis to fit that follows a law from its last point: starts and bounds."""
 
-from ..core.space import Transform
+from ..core.space import Range
 from ..hysteresis import (
     BashashJalili,
     ColemanHodgdon,
@@ -27,9 +27,9 @@ def coleman_hodgdon(extent: Extent) -> Part:
         {
             "a": around(slope / width, 0.0, 20.0),
             "b": around(slope, 0.0, 3.0),
-            "c": (-20.0 / width, -0.01 / width, "linear"),
+            "c": Range(-20.0 / width, -0.01 / width),
             **rest_bounds(extent),
-            "rest_output": (rest - reach, rest + reach, "linear"),
+            "rest_output": Range(rest - reach, rest + reach),
         },
         # Keep the slope -a/c of the loop's axis while its decay c changes.
         [
@@ -59,17 +59,14 @@ def shaped_coleman_hodgdon(extent: Extent) -> Part:
         {
             # A constant pull and an offset of the output are the same thing.
             **{
-                f"pull.{i}": (-50 * s, 50 * s, "linear")
+                f"pull.{i}": Range(-50 * s, 50 * s)
                 for i, s in enumerate(scales)
                 if i > 0
             },
-            **{
-                f"slope.{i}": (-10 * s, 10 * s, "linear")
-                for i, s in enumerate(scales[:3])
-            },
-            "c": (-50.0 / width, -0.01 / width, "linear"),
+            **{f"slope.{i}": Range(-10 * s, 10 * s) for i, s in enumerate(scales[:3])},
+            "c": Range(-50.0 / width, -0.01 / width),
             **rest_bounds(extent),
-            "rest_output": (rest - reach, rest + reach, "linear"),
+            "rest_output": Range(rest - reach, rest + reach),
         },
         [
             {"c": -steep / width, "pull.1": steep * slope / width, **before}
@@ -98,13 +95,13 @@ def duhem(extent: Extent) -> Part:
             rest_memory=rest,
         ),
         {
-            "reversible.0.0": (-10.0 * size, 10.0 * size, "linear"),
-            "reversible.0.1": (-20.0 * size / width, 20.0 * size / width, "linear"),
-            "reversible.1.0": (-10.0 / width, 10.0 / width, "linear"),
+            "reversible.0.0": Range(-10.0 * size, 10.0 * size),
+            "reversible.0.1": Range(-20.0 * size / width, 20.0 * size / width),
+            "reversible.1.0": Range(-10.0 / width, 10.0 / width),
             "irreversible.0.1": around(pull, -1.0, 50.0),
-            "irreversible.1.0": (-50.0 / width, -0.01 / width, "linear"),
+            "irreversible.1.0": Range(-50.0 / width, -0.01 / width),
             **rest_bounds(extent),
-            "rest_memory": (rest - reach, rest + reach, "linear"),
+            "rest_memory": Range(rest - reach, rest + reach),
         },
         [
             {"irreversible.1.0": -steep / width, "irreversible.0.1": steep * pull}
@@ -133,9 +130,9 @@ def normalised_bouc_wen(extent: Extent) -> Part:
         {
             "k_x": around(slope, 0.0, 3.0),
             "k_w": around(slope * width, -1.0, 1.0),
-            "rho": (0.3 / width, 100.0 / width, "log"),
-            "sigma": (0.51, 20.0, "log"),
-            "n": (1.0, 5.0, "linear"),
+            "rho": Range(0.3 / width, 100.0 / width, "log"),
+            "sigma": Range(0.51, 20.0, "log"),
+            "n": Range(1.0, 5.0),
             **rest_bounds(extent),
         },
         [
@@ -160,12 +157,12 @@ def bashash_jalili(extent: Extent) -> Part:
     # output only one of its two ends is free.
     lower, upper = slope * extent.low, slope * extent.high
     steepness = (0.2 / width, 100.0 / width)
-    bounds: dict[str, tuple[float, float, Transform]] = {
-        "upper_output": (lower + 0.3 * extent.span, lower + 3.0 * extent.span, "linear")
+    bounds: dict[str, Range] = {
+        "upper_output": Range(lower + 0.3 * extent.span, lower + 3.0 * extent.span)
     }
     for branch in ("rising", "falling"):
-        bounds[f"{branch}_alpha"] = (-0.99, 3.0, "linear")
-        bounds[f"{branch}_tau"] = (*steepness, "log")
+        bounds[f"{branch}_alpha"] = Range(-0.99, 3.0)
+        bounds[f"{branch}_tau"] = Range(*steepness, "log")
     return Part(
         BashashJalili(
             lower_input=extent.low,

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.space import Range
 from ..hysteresis import (
     AsymmetricPrandtlIshlinskii,
     LearnedOperator,
@@ -11,7 +12,7 @@ from ..hysteresis import (
     RateDependentPrandtlIshlinskii,
     StopPrandtlIshlinskii,
 )
-from .part import Bounds, Extent, Part, around, rest_bounds, rests
+from .part import Extent, Part, around, rest_bounds, rests
 
 PLAYS = 10
 """Play operators of a fitted Prandtl-Ishlinskii model."""
@@ -27,7 +28,7 @@ in a worse place than the true one for two of three draws of the noise, of sixte
 """
 
 
-def _plays(extent: Extent) -> tuple[dict[str, Any], Bounds]:
+def _plays(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
     """Fields and bounds that both Prandtl-Ishlinskii models share."""
     width, slope = extent.width, extent.slope
     # A play wider than half the range of the input never moves.
@@ -99,7 +100,7 @@ def rate_dependent_prandtl_ishlinskii(extent: Extent) -> Part:
     most = 0.05 * extent.duration
     return Part(
         RateDependentPrandtlIshlinskii(**fields, growth=0.01 * most, dt=extent.dt),
-        {**bounds, "growth": (0.0, most, "linear")},
+        {**bounds, "growth": Range(0.0, most)},
         rests(extent),
         gain="polynomial.0",
         own=("rest_input",),
@@ -131,16 +132,16 @@ def learned_operator(extent: Extent) -> Part:
             rest_input=extent.first[0],
         ),
         {
-            "autoregressive.0": (-1.9, 1.9, "linear"),
-            "autoregressive.1": (-0.95, 0.95, "linear"),
-            **{f"linear.{j}": (-reach, reach, "linear") for j in range(count)},
+            "autoregressive.0": Range(-1.9, 1.9),
+            "autoregressive.1": Range(-0.95, 0.95),
+            **{f"linear.{j}": Range(-reach, reach) for j in range(count)},
             **{
-                f"mixing.{i}.{j}": (-6.0, 6.0, "linear")
+                f"mixing.{i}.{j}": Range(-6.0, 6.0)
                 for i in range(NEURONS)
                 for j in range(count)
             },
-            **{f"bias.{i}": (-4.0, 4.0, "linear") for i in range(NEURONS)},
-            **{f"output.{i}": (-reach, reach, "linear") for i in range(NEURONS)},
+            **{f"bias.{i}": Range(-4.0, 4.0) for i in range(NEURONS)},
+            **{f"output.{i}": Range(-reach, reach) for i in range(NEURONS)},
             **rest_bounds(extent),
         },
         starts,

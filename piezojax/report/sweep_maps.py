@@ -119,7 +119,7 @@ def parameters(dataset: "Dataset") -> list[Parameter]:
     """Return the swept parameters, in the order of the study."""
     found = []
     for name, variable in dataset.coords.items():
-        if "transform" not in variable.attrs:
+        if "scale" not in variable.attrs:
             continue
         parts = str(name).split(".")
         unit = variable.attrs["units"]
@@ -128,7 +128,7 @@ def parameters(dataset: "Dataset") -> list[Parameter]:
             f" ({unit.replace('um', 'µm')})" if unit else ""
         )
         found.append(
-            Parameter(label, variable.values, variable.attrs["transform"] == "log")
+            Parameter(label, variable.values, variable.attrs["scale"] == "log")
         )
     return found
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..catalog import p753
 from ..core.progress import Progress, Silent
-from ..core.space import space_of
+from ..core.space import Range, space_of
 from ..dynamics import ARMA
 from . import chapter5
 from .cell import Cell, printed
@@ -24,7 +24,7 @@ from .doubts import candidates
 from .lanes import by_column, lanes_of
 from .selection import Round, select
 from .stage_fit import STEPS, Point, Problem, log_ratios
-from .stage_parameters import Quantity, quantities
+from .stage_parameters import quantities, within
 
 HALVES = ("even", "odd")
 """The cells' place in the printed order, row by row, table after table."""
@@ -54,18 +54,18 @@ class Experiment:
             for i, half in enumerate(HALVES)
         }
 
-    def quantities(self) -> dict[str, Quantity]:
+    def quantities(self) -> dict[str, Range]:
         """Return what may be fitted: the stage's, then every candidate for a doubt."""
         every = [cell for half in self.cells().values() for cell in half]
         return quantities(self.dynamics) | {
-            name: Quantity(1.0, 1.0 / doubt.span, doubt.span, "of print")
+            name: within(1.0, doubt.span, "of print")
             for name, doubt in candidates(every).items()
         }
 
     def problem(self, cells: Sequence[Cell], *, short: bool) -> Problem:
         """Return the Problem of ``cells``, in the order of ``by_column``."""
         found = self.quantities()
-        space = space_of({n: (q.lower, q.upper, q.scale) for n, q in found.items()})
+        space = space_of(found)
         order = [cell for group in by_column(cells) for cell in group]
         return Problem(
             space=space,

@@ -1,14 +1,13 @@
-"""What is fitted: what may differ from print, and the stage and sensor it makes."""
+"""Properties of the P-753 stage that are fitted, and the stage and sensor of them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from ..catalog import p753
-from ..core.space import Transform
+from ..core.space import Range
 from ..core.system import Series, series
 from ..dynamics import ARMA, FirstOrderLag, FractionalDelay, scaled_to_dc
 from ..hardware import Sensor
@@ -18,23 +17,13 @@ LONGEST_DELAY = 4
 """Samples that the delay line of the stage holds."""
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """A property of the stage: where its fit starts, its range and its unit."""
-
-    start: float
-    lower: float
-    upper: float
-    unit: str
-    scale: Transform = "log"
+def within(value: float, ratio: float, unit: str) -> Range:
+    """Return the range of factors 1/``ratio`` to ``ratio`` around a start value."""
+    return Range(value / ratio, value * ratio, "log", value, unit)
 
 
-def _within(value: float, ratio: float, unit: str) -> Quantity:
-    return Quantity(value, value / ratio, value * ratio, unit)
-
-
-def quantities(dynamics: ARMA) -> dict[str, Quantity]:
-    """Return what is fitted, starting from the printed ``dynamics``.
+def quantities(dynamics: ARMA) -> dict[str, Range]:
+    """Return the ranges of the fitted properties, starting from printed ``dynamics``.
 
     ``gain`` is the DC gain behind the hysteresis. The b of the hysteresis is not among
     them: gain, a and c already reach every curve that it could. ``noise`` is what the
@@ -42,14 +31,14 @@ def quantities(dynamics: ARMA) -> dict[str, Quantity]:
     """
     slow, fast = sorted(-p753.RATE * np.log(np.abs(dynamics.poles())))
     return {
-        "slow_pole": _within(float(slow), 3.0, "rad/s"),
-        "fast_pole": _within(float(fast), 4.0, "rad/s"),
-        "gain": _within(1.0, 2.0, "1"),
-        "hysteresis_a": _within(p753.HYSTERESIS_CHAPTER_5["a"], 3.0, "um/V^2"),
-        "hysteresis_c": _within(-p753.HYSTERESIS_CHAPTER_5["c"], 3.0, "-1/V"),
-        "delay": Quantity(1e-5, 0.0, 1.5e-4, "s", "linear"),
-        "sensor_lag": Quantity(1e-5, 1e-7, 3e-4, "s", "linear"),
-        "noise": Quantity(p753.NOISE_RMS, 0.0, 0.03, "um", "linear"),
+        "slow_pole": within(float(slow), 3.0, "rad/s"),
+        "fast_pole": within(float(fast), 4.0, "rad/s"),
+        "gain": within(1.0, 2.0, "1"),
+        "hysteresis_a": within(p753.HYSTERESIS_CHAPTER_5["a"], 3.0, "um/V^2"),
+        "hysteresis_c": within(-p753.HYSTERESIS_CHAPTER_5["c"], 3.0, "-1/V"),
+        "delay": Range(0.0, 1.5e-4, start=1e-5, unit="s"),
+        "sensor_lag": Range(1e-7, 3e-4, start=1e-5, unit="s"),
+        "noise": Range(0.0, 0.03, start=p753.NOISE_RMS, unit="um"),
     }
 
 

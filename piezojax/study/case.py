@@ -15,7 +15,7 @@ from ..core.axes import PerAxis
 from ..core.paths import replace, static_fields
 from ..core.serial import from_data, to_data
 from ..core.serial import load as load_system
-from ..core.space import Space, space_of
+from ..core.space import Range, Space, space_of
 from ..core.system import Feedback, Observation, System, rest_output, series
 from ..hardware import Quantiser, Saturation, Sensor, SlewLimit
 from ..identification import Fit, identify, read_record
@@ -157,7 +157,7 @@ def _search_space(study: Study, loop: Feedback) -> tuple[Feedback, Space]:
     starts = {path: b.start for path, b in bounds.items() if b.start is not None}
     loop = replace(loop, starts)
     space = space_of(
-        {path: (b.lower, b.upper, b.transform) for path, b in bounds.items()}
+        {path: Range(b.lower, b.upper, b.scale) for path, b in bounds.items()}
     )
     space.start(loop)
     _check_values(study, loop)

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from ..catalog import CONTROLLERS, at_rate
+from ..core.parameter import Scale
 from ..core.paths import get
-from ..core.space import Transform
 from .case import Case, build, read
 from .schema import ObjectiveTable, OptimiserTable, References, Study
 from .stage_tables import SensorTable
@@ -31,7 +31,7 @@ class Range(Table):
 
     lower: Finite | None = None
     upper: Finite | None = None
-    transform: Transform = "log"
+    scale: Scale = "log"
     per_sample: bool = False
     factor: Annotated[float, Field(gt=1, allow_inf_nan=False)] | None = None
 
@@ -49,7 +49,7 @@ class Range(Table):
             lower, upper = self.lower * unit, self.upper * unit
             # Bounds hold the starts of all rates: they are wide, not judged.
             lower, upper = min(lower, start), max(upper, start)
-            return {"lower": lower, "upper": upper, "transform": self.transform}
+            return {"lower": lower, "upper": upper, "scale": self.scale}
         assert self.factor is not None
         if start <= 0.0:
             raise ValueError(
@@ -59,7 +59,7 @@ class Range(Table):
         return {
             "lower": start / self.factor,
             "upper": start * self.factor,
-            "transform": "log",
+            "scale": "log",
         }
 
 

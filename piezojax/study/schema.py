@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from ..core.space import Transform
+from ..core.parameter import Scale
 from ..signals import motions
 from ..signals import waveforms as signals
 from ..solve.optimisers import GAUSS_NEWTON, METHODS
@@ -70,7 +70,7 @@ class Bounds(Table):
 
     lower: Finite
     upper: Finite
-    transform: Transform = "linear"
+    scale: Scale = "linear"
     start: Finite | None = None
 
 

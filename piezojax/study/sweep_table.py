@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ..core.metrics import TrackingFigures
-from ..core.space import Transform
+from ..core.parameter import Scale
 from .tables import Finite, Table, one_of
 
 SENSITIVITY = "sensitivity_peak"
@@ -22,14 +22,14 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 class SweptParameter(Table):
     """Where a parameter is tried: ``values``, or ``lower`` to ``upper``.
 
-    ``count`` points of a grid lie evenly on the scale ``transform``; samples need none.
+    ``count`` points of a grid lie evenly on the scale ``scale``; samples need none.
     ``unit`` is what pictures and the data set say.
     """
 
     lower: Finite | None = None
     upper: Finite | None = None
     count: Annotated[int, Field(strict=True, ge=2)] | None = None
-    transform: Transform = "linear"
+    scale: Scale = "linear"
     values: tuple[Finite, ...] | None = None
     unit: str | None = None
 

@@ -191,7 +191,7 @@ class Merger:
                 dimension = "sample"
             variable = file.create_variable(axis.path, (dimension,), data=values)
             variable.attrs["units"] = axis.unit
-            variable.attrs["transform"] = axis.transform
+            variable.attrs["scale"] = axis.scale
 
 
 class DamagedError(Exception):

@@ -8,10 +8,11 @@ import jax
 import numpy as np
 
 from ..core.arrays import as_array
+from ..core.parameter import Scale
 from ..core.paths import get, replace
 from ..core.rollout import BLOCK
 from ..core.serial import from_data, to_data
-from ..core.space import space_of
+from ..core.space import Range, space_of
 from ..core.system import System
 from ..study import Case, Study
 from ..study.sweep_table import SweepTable, SweptParameter
@@ -47,7 +48,7 @@ class Axis:
 
     path: str
     unit: str
-    transform: str
+    scale: Scale
     lower: float
     upper: float
     values: np.ndarray | None = None
@@ -124,7 +125,7 @@ def swept(study: Study) -> SweepTable:
         raise ValueError(
             'the study has no table [sweep]: add method = "grid" and a parameter, as '
             'in [sweep.parameters] "controller.cutoff" = { lower = 100.0, upper = 2e4, '
-            'count = 20, transform = "log" }, or give --samples N to draw points of '
+            'count = 20, scale = "log" }, or give --samples N to draw points of '
             "the box that [parameters] describes"
         )
     return study.sweep
@@ -166,7 +167,7 @@ def _axes(study: Study, table: SweepTable) -> list[Axis]:
     if table.parameters:
         return [_axis(path, swept) for path, swept in table.parameters.items()]
     return [
-        Axis(path, _unit(path), bound.transform, bound.lower, bound.upper)
+        Axis(path, _unit(path), bound.scale, bound.lower, bound.upper)
         for path, bound in study.parameters.items()
     ]
 
@@ -179,20 +180,20 @@ def _axis(path: str, table: SweptParameter) -> Axis:
     unit = _unit(path, table.unit)
     if table.values is not None:
         values = np.array(table.values, dtype=float)
-        return Axis(path, unit, table.transform, values[0], values[-1], values)
+        return Axis(path, unit, table.scale, values[0], values[-1], values)
     assert table.lower is not None
     assert table.upper is not None
-    bounds = (table.lower, table.upper, table.transform)
+    bounds = Range(table.lower, table.upper, table.scale)
     try:
         space = space_of({path: bounds})
     except ValueError as error:
         raise ValueError(f"sweep.parameters.{error}") from None
     if table.count is None:
-        return Axis(path, unit, table.transform, table.lower, table.upper)
+        return Axis(path, unit, table.scale, table.lower, table.upper)
     unit_points = as_array(np.linspace(0.0, 1.0, table.count)[:, None])
     values = np.array(jax.vmap(space.from_unit)(unit_points))[:, 0]
     values[[0, -1]] = table.lower, table.upper
-    return Axis(path, unit, table.transform, table.lower, table.upper, values)
+    return Axis(path, unit, table.scale, table.lower, table.upper, values)
 
 
 def _samples(table: SweepTable, axes: Sequence[Axis], seed: int) -> np.ndarray:
@@ -209,7 +210,7 @@ def _samples(table: SweepTable, axes: Sequence[Axis], seed: int) -> np.ndarray:
         unit = engine.random_base2(power)[: table.samples]
     else:
         unit = qmc.LatinHypercube(len(axes), rng=generator).random(table.samples)
-    space = space_of({a.path: (a.lower, a.upper, a.transform) for a in axes})  # type: ignore[misc]
+    space = space_of({a.path: Range(a.lower, a.upper, a.scale) for a in axes})
     return np.array(jax.vmap(space.from_unit)(as_array(unit)))
 
 

@@ -6,7 +6,7 @@ from scipy.signal import lfilter
 from piezojax import (
     Record,
 )
-from piezojax.core.space import space_of
+from piezojax.core.space import Range, space_of
 from piezojax.core.system import (
     Affine,
 )
@@ -80,8 +80,8 @@ def test_the_fit_averages_noise_out():
 def lag_structure(upper):
     space = space_of(
         {
-            "0.time_constant": (0.1 * DT, upper, "log"),
-            "1.gain": (0.1, 10.0, "linear"),
+            "0.time_constant": Range(0.1 * DT, upper, "log"),
+            "1.gain": Range(0.1, 10.0),
         }
     )
     return Structure(

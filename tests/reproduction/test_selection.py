@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.core.space import space_of
+from piezojax.core.space import Range, space_of
 from piezojax.reproduction import selection
 from piezojax.reproduction.selection import FOLDS, cross_validated, select
 from piezojax.reproduction.stage_fit import Problem
@@ -34,7 +34,9 @@ def errors(self, values):
 def made_up(wrong, scatter):
     names = [f"stage {i}" for i in range(STAGE)] + [f"print {i}" for i in range(PRINTS)]
     spans = [3.0] * STAGE + [100.0] * PRINTS
-    space = space_of({n: (1 / s, s, "log") for n, s in zip(names, spans, strict=True)})
+    space = space_of(
+        {n: Range(1 / s, s, "log") for n, s in zip(names, spans, strict=True)}
+    )
     problem = Problem(
         space=space,
         stage=STAGE,

@@ -1,8 +1,8 @@
 """A study that is quick to compile and to run, and a grid to sweep it on."""
 
 PARAMETERS = {
-    "controller.proportional": {"lower": 0.1, "upper": 5.0, "transform": "log"},
-    "controller.integral": {"lower": 100.0, "upper": 2e4, "transform": "log"},
+    "controller.proportional": {"lower": 0.1, "upper": 5.0, "scale": "log"},
+    "controller.integral": {"lower": 100.0, "upper": 2e4, "scale": "log"},
 }
 GRID = {
     "metrics": ["rms_error", "peak_voltage"],
@@ -12,7 +12,7 @@ GRID = {
             "lower": 5e-4,
             "upper": 2e-3,
             "count": 3,
-            "transform": "log",
+            "scale": "log",
         },
     },
 }

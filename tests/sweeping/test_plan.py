@@ -116,7 +116,7 @@ LAG = "plant.time_constant"
         (["parameters", LAG, "steps"], 3, "steps is unknown; allowed are lower, upper"),
         (["parameters", LAG, "values"], [1.0], "either values, or lower and upper"),
         (["parameters", LAG, "lower"], 3e-3, "the lower below the upper"),
-        (["parameters", LAG, "lower"], -1.0, "transform 'log' it must be above 0"),
+        (["parameters", LAG, "lower"], -1.0, "scale 'log' it must be above 0"),
         (["parameters", PID, "values"], [2.0, 1.0], "values must rise"),
         (["parameters", PID, "values"], [], "at least one number"),
         (

@@ -32,8 +32,8 @@ STUDY = {
         "settle": 0.2,
     },
     "parameters": {
-        "controller.Z.integral": {"lower": 10.0, "upper": 500.0, "transform": "log"},
-        "controller.Rx.integral": {"lower": 10.0, "upper": 500.0, "transform": "log"},
+        "controller.Z.integral": {"lower": 10.0, "upper": 500.0, "scale": "log"},
+        "controller.Rx.integral": {"lower": 10.0, "upper": 500.0, "scale": "log"},
     },
     "ensemble": {"spread": {"gain": 0.2, "coupling": 0.5}, "tune": 2, "holdout": 5},
     "optimiser": {"starts": 1, "candidates": 0, "steps": 8},

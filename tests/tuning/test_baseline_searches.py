@@ -140,8 +140,8 @@ STUDY = {
     "controller": {"catalog": "p753_pid"},
     "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
     "parameters": {
-        "controller.proportional": {"lower": 0.1, "upper": 100.0, "transform": "log"},
-        "controller.integral": {"lower": 100.0, "upper": 1e6, "transform": "log"},
+        "controller.proportional": {"lower": 0.1, "upper": 100.0, "scale": "log"},
+        "controller.integral": {"lower": 100.0, "upper": 1e6, "scale": "log"},
     },
     "optimiser": {
         "method": "gauss_newton",

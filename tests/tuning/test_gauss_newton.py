@@ -163,8 +163,8 @@ STUDY = {
     "controller": {"catalog": "p753_pid"},
     "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
     "parameters": {
-        "controller.proportional": {"lower": 0.1, "upper": 50.0, "transform": "log"},
-        "controller.integral": {"lower": 100.0, "upper": 2e5, "transform": "log"},
+        "controller.proportional": {"lower": 0.1, "upper": 50.0, "scale": "log"},
+        "controller.integral": {"lower": 100.0, "upper": 2e5, "scale": "log"},
     },
     "objective": {"noise_draws": 2},
     "optimiser": {

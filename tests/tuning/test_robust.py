@@ -39,7 +39,7 @@ STUDY = {
         "settle": 0.02,
     },
     "parameters": {
-        "controller.integral": {"lower": 20.0, "upper": 2e4, "transform": "log"}
+        "controller.integral": {"lower": 20.0, "upper": 2e4, "scale": "log"}
     },
     "ensemble": {
         "spread": {"gain": 0.2, "poles": 0.1, "sensor.noise.noise_rms": 0.5},

@@ -34,8 +34,8 @@ BASE = {
         "settle": 0.02,
     },
     "parameters": {
-        PROPORTIONAL: {"lower": 0.1, "upper": 5.0, "transform": "log"},
-        INTEGRAL: {"lower": 100.0, "upper": 2e4, "transform": "log"},
+        PROPORTIONAL: {"lower": 0.1, "upper": 5.0, "scale": "log"},
+        INTEGRAL: {"lower": 100.0, "upper": 2e4, "scale": "log"},
     },
     "optimiser": {"starts": 2, "candidates": 4, "steps": 6},
 }
@@ -385,7 +385,7 @@ def test_no_saturation_is_not_reported(plain):
 # Here effort and slew grow with the integral gain, all the way.
 WEIGHTED = {
     "references/tune": ["SIN50"],
-    "parameters": {INTEGRAL: {"lower": 1.0, "upper": 2e4, "transform": "log"}},
+    "parameters": {INTEGRAL: {"lower": 1.0, "upper": 2e4, "scale": "log"}},
 }
 
 

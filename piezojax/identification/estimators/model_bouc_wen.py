@@ -3,7 +3,7 @@
 import numpy as np
 
 from ...core.arrays import as_array
-from ...core.space import space_of
+from ...core.space import Range, space_of
 from ...hysteresis import BoucWen, HystereticOscillator
 from ..records.record import Record
 from .structure import Structure
@@ -40,13 +40,13 @@ def bouc_wen(record: Record) -> Structure:
     )
     space = space_of(
         {
-            "mass": (0.1 * mass, 10.0 * mass, "log"),
-            "damping": (1e-3 * abs(damping), 10.0 * abs(damping), "log"),
-            "stiffness": (0.01 * stiffness, 2.0 * stiffness, "log"),
-            "hysteresis.alpha": (0.01 * stiffness, 2.0 * stiffness, "log"),
-            "hysteresis.beta_gamma": (0.0, WIDE * bend, "linear"),
-            "hysteresis.beta_delta": (-WIDE * bend, WIDE * bend, "linear"),
-            "hysteresis.nu": (0.5, 3.0, "linear"),
+            "mass": Range(0.1 * mass, 10.0 * mass, "log"),
+            "damping": Range(1e-3 * abs(damping), 10.0 * abs(damping), "log"),
+            "stiffness": Range(0.01 * stiffness, 2.0 * stiffness, "log"),
+            "hysteresis.alpha": Range(0.01 * stiffness, 2.0 * stiffness, "log"),
+            "hysteresis.beta_gamma": Range(0.0, WIDE * bend),
+            "hysteresis.beta_delta": Range(-WIDE * bend, WIDE * bend),
+            "hysteresis.nu": Range(0.5, 3.0),
         }
     )
     starts = [

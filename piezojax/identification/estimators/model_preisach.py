@@ -9,6 +9,7 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from ...core.arrays import as_array
 from ...core.paths import parameters, replace
+from ...core.space import Range, space_of
 from ...core.system import Series, series
 from ...dynamics import FirstOrderLag
 from ...hysteresis import Preisach, RateDependentPreisach
@@ -81,11 +82,10 @@ class Chain(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """What is searched for, above 0: its bounds, and of which the best is the start."""
+    """A positive search parameter: name, range and candidate starting values."""
 
     name: str
-    least: float
-    most: float
+    range: Range
     firsts: tuple[float, ...]
 
 
@@ -200,7 +200,7 @@ class _Problem(NamedTuple):
             return float(np.sum(self.reduced(logs, start) ** 2))
 
         firsts = map(np.log, itertools.product(*(u.firsts for u in unknowns)))
-        bounds = np.log([[u.least, u.most] for u in unknowns]).T
+        bounds = np.log([[u.range.lower, u.range.upper] for u in unknowns]).T
         options = {"jac": self.slopes, "bounds": bounds, "args": (start,)}
         ending = {"xtol": ENDED, "max_nfev": STEPS}
         first = min(firsts, key=loss)
@@ -230,8 +230,7 @@ def _unknowns(record: Record, model: str) -> list[Unknown]:
     found = [
         Unknown(
             "lag.time_constant",
-            LAGS[0] * record.dt,
-            LAGS[1] * record.dt,
+            Range(LAGS[0] * record.dt, LAGS[1] * record.dt, "log", unit="s"),
             (LAG * record.dt,),
         )
     ]
@@ -239,7 +238,11 @@ def _unknowns(record: Record, model: str) -> list[Unknown]:
         pace = _pace(record)
         firsts = tuple(pace * first for first in FIRST_RATES)
         found.append(
-            Unknown("hysteresis.rate", RATES[0] * pace, RATES[1] * pace, firsts)
+            Unknown(
+                "hysteresis.rate",
+                Range(RATES[0] * pace, RATES[1] * pace, "log", unit="V/s"),
+                firsts,
+            )
         )
     return found
 
@@ -259,10 +262,12 @@ def _named(hysteresis: Model, cells: int) -> dict[str, float]:
 
 
 def _at_edges(unknowns: list[Unknown], logs: np.ndarray) -> list[str]:
+    space = space_of({u.name: u.range for u in unknowns})
+    places = space.to_unit(as_array(np.exp(logs)))
     return [
         text
-        for u, log in zip(unknowns, logs, strict=True)
-        for text in at_edge(u.name, (log - np.log(u.least)) / np.log(u.most / u.least))
+        for name, place in zip(space.paths, places, strict=True)
+        for text in at_edge(name, float(place))
     ]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ...control import PID
 from ...core.arrays import as_array
 from ...core.paths import get
-from ...core.space import Space
+from ...core.space import Range, space_of
 from ...core.system import Feedback
 from ...solve.clock import Clock
 from ...solve.history import Course, batch_loss
@@ -113,11 +113,8 @@ def judged(
     # Their own box, so that one program runs them all: each number from 0 to twice the
     # largest, and 1 where every rule has 0.
     upper = np.where(values.max(axis=0) > 0.0, 2.0 * values.max(axis=0), 1.0)
-    space = Space(
-        paths=PATHS,
-        transforms=("linear",) * len(PATHS),
-        lower=as_array(np.zeros(len(PATHS))),
-        upper=as_array(upper),
+    space = space_of(
+        {path: Range(0.0, high) for path, high in zip(PATHS, upper, strict=True)}
     )
     mine = replace(objective, loop=next(iter(loops.values())), space=space)
     units = as_array(values / upper)
