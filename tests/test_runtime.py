@@ -162,3 +162,32 @@ def test_threads_simulate_side_by_side_if_asked_in_time():
         "print(_runtime.simulate_side_by_side())\n"
     )
     assert late.stdout.split() == ["False"], late.stderr
+
+
+# What is imported, and when
+
+LATER = (
+    *("scipy.signal", "scipy.stats", "matplotlib", "rich", "click"),
+    *("h5py", "xarray", "dask", "cma", "jaxopt"),
+)
+
+
+def imported_by(code):
+    done = python(f"import sys\n{code}\nprint(*sys.modules)")
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_an_import_takes_nothing_heavy_along():
+    modules = imported_by("import piezojax")
+    assert "piezojax.core.runtime" in modules
+    assert modules.isdisjoint({"jax", "scipy", "numpy", "pydantic", *LATER})
+
+
+def test_names_that_are_used_take_along_what_they_need():
+    simulation = imported_by("import piezojax; piezojax.simulate; piezojax.PerAxis")
+    assert {"jax", "equinox"} < simulation
+    assert simulation.isdisjoint({"scipy", "pydantic", *LATER})
+    every = imported_by("import piezojax\nfor n in dir(piezojax): getattr(piezojax, n)")
+    assert {"piezojax.tuning.tuner", "piezojax.sweeping.sweeper"} < every
+    assert every.isdisjoint(LATER)

@@ -1,7 +1,7 @@
 """The search: screen the box, then descend from the best starts, all at once."""
 
 import numpy as np
-from scipy.stats import qmc
+import scipy
 
 from ..core.progress import Progress
 from ..solve.clock import Clock
@@ -55,7 +55,7 @@ def candidates(case: Case) -> np.ndarray:
     own = np.asarray(case.space.start(case.loop))
     table, size = case.study.optimiser, len(case.space.paths)
     count = max(table.candidates, table.starts - 1)
-    sampler = qmc.Sobol(size, rng=np.random.default_rng(case.study.seed))
+    sampler = scipy.stats.qmc.Sobol(size, rng=np.random.default_rng(case.study.seed))
     # Sobol points are balanced in powers of two.
     others = sampler.random_base2(int(np.ceil(np.log2(max(count, 1)))))[:count]
     return np.concatenate([own[None], others])

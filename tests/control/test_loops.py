@@ -153,6 +153,20 @@ def test_loop_is_the_published_one(name, plant):
     assert clipped == (name != "inversion")
 
 
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_start_away_from_zero_holds_the_stage(name):
+    loop = Feedback(
+        CONTROLLERS[name][0], p753.plant("exact"), p753.actuator(), Sensor(0.0)
+    )
+    holding = loop.init(5.0)
+    still = jnp.asarray(5.0), jnp.asarray(0.0)
+    moved, first = loop.step(holding, LoopInput(*still))
+    second = loop.step(moved, LoopInput(*still))[1]
+    assert holding.voltage > 20.0
+    for sample in (first, second):
+        assert sample.command == pytest.approx(float(holding.voltage), rel=1e-9)
+
+
 def test_the_model_of_the_inverse_is_the_stage_also_after_clipping():
     loop = around(p753.inversion(), p753.plant())
     state, samples = run(loop, hard_references()[-1:])

@@ -57,7 +57,7 @@ MUTATIONS = (
         "study/ensemble.py",
         'stream = 3 if part == "holdout" else 2',
         "stream = 2",
-        (_ROBUST, "-k", "draws_lie"),
+        (_ROBUST, "-k", "no_plant_of_the_holdout"),
     ),
     Mutation(
         "SW without its shift",
@@ -187,7 +187,7 @@ MUTATIONS = (
         "control/sliding_mode.py",
         "needed = input.applied *",
         "needed = 1.02 * input.applied *",
-        (_LOOPS,),
+        (_LOOPS, "-k", "away_from_zero"),
     ),
     Mutation(
         "anti-windup dropped",
@@ -215,7 +215,7 @@ MUTATIONS = (
         "control/disturbance_observer.py",
         "memory=(next_term + last_term, last_term),",
         "memory=(last_term, next_term + last_term),",
-        (_LOOPS,),
+        (_LOOPS, "-k", "away_from_zero"),
     ),
     Mutation(
         "surface reversed",

@@ -250,6 +250,17 @@ def test_draws_lie_where_the_study_says(tmp_path):
     assert not jnp.isin(stages.plant.parts[names.index("gain")].gain, gain[5:]).any()
 
 
+def test_no_plant_of_the_holdout_is_one_of_the_tuning(tmp_path):
+    ensemble = read(written(tmp_path, STUDY)).ensemble
+    gain = p753_stage.stage().names.index("gain")
+    held, seen = (
+        np.asarray(ensemble.stages(part).plant.parts[gain].gain)
+        for part in ("holdout", "margins")
+    )
+    assert held.size == 5
+    assert not np.isin(held, seen).any()
+
+
 def test_a_stage_without_deviation_is_the_printed_one_and_what_is_added():
     stage = p753_stage.stage()
     printed = p753.plant()

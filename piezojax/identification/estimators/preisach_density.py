@@ -5,8 +5,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from scipy.optimize import nnls
-from scipy.signal import lfilter
 
 from ...core.arrays import State, as_array
 from ...core.rollout import simulate
@@ -212,7 +212,7 @@ def _passed(signals: np.ndarray, dynamics: ARMA | None) -> np.ndarray:
     moving = [float(b) for b in dynamics.moving]
     past = [1.0, *(-float(a) for a in dynamics.autoregressive)]
     rest = float(dynamics.dc_gain()) * signals[0]
-    return lfilter(moving, past, signals - signals[0], axis=0) + rest
+    return scipy.signal.lfilter(moving, past, signals - signals[0], axis=0) + rest
 
 
 def _differences(places: list[tuple[int, int]]) -> np.ndarray:

@@ -15,9 +15,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from scipy import linalg
 from scipy.optimize import minimize_scalar
-from scipy.signal import lfilter
 
 from ...core.arrays import as_array, check
 from ...hysteresis import HystereticARMA
@@ -130,7 +130,7 @@ class _Problem:
             # The measured output starts at rest where the run does, free of noise.
             start = np.array([run[0], run[0], *hysteresis[:, 0]])[:, None]
             signals = np.array([self.record.output, run, *hysteresis])
-            moving = lfilter([1.0], denominator, signals - start)
+            moving = scipy.signal.lfilter([1.0], denominator, signals - start)
             output, run, *filtered = moving + start / denominator.sum()
             matrix, instruments = (
                 row_matrix(self.structure, signal, np.array(filtered))[self.part]

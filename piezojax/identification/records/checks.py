@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.signal.windows import blackmanharris
+import scipy
 
 from .record import Record
 
@@ -170,7 +170,7 @@ def _excitation(
 
 def lines(input: np.ndarray) -> int:
     """Return how many sines the spectrum of ``input`` [samples] amounts to."""
-    window = blackmanharris(input.size)
+    window = scipy.signal.windows.blackmanharris(input.size)
     spectrum = np.abs(np.fft.rfft((input - np.mean(input)) * window))
     strong = np.concatenate([[0], spectrum > LINE * spectrum.max(), [0]])
     edges = np.diff(strong.astype(int))
