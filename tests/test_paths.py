@@ -1,5 +1,8 @@
 """Parameters by name."""
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +13,21 @@ from piezojax import (
     series,
 )
 from piezojax.catalog import CONTROLLERS, PLANTS, p753
-from piezojax.core.paths import get, parameters, replace, static_fields
+from piezojax.control import PID, DisturbanceObserverControl
+from piezojax.core.arrays import as_array, as_scalars
+from piezojax.core.parameter import declarations, parameter, sample_time
+from piezojax.core.paths import (
+    declared,
+    get,
+    matching,
+    parameters,
+    replace,
+    static_fields,
+)
 from piezojax.core.system import (
     Affine,
     Delay,
+    System,
 )
 from piezojax.dynamics import (
     FirstOrderLag,
@@ -127,3 +141,54 @@ def test_static_fields_are_found_wherever_they_are():
     assert static_fields(loop, "dt") == [5e-5, 1e-4]
     assert static_fields(loop, "samples") == [3]
     assert static_fields(loop, "nothing") == []
+
+
+class Bank(System):
+    """Filters with gains of their own, and a corner."""
+
+    gains: tuple[Any, ...] = parameter("V/um", "gains", converter=as_scalars)
+    corner: Any = parameter("rad/s", "corner frequency", below_nyquist=True)
+    bare: Any = eqx.field(converter=as_array)
+    dt: float = sample_time()
+
+    def init(self, input=0.0):
+        return as_array(input)
+
+    def step(self, state, input):
+        return state, input
+
+
+def test_declarations_are_found_by_path():
+    loop = p753.loop(p753.pid())
+    known = dict(declarations(PID))
+    assert declared(loop, "controller.integral") is known["integral"]
+    assert declared(loop, "controller.dt") is known["dt"]
+    inner = series(bank=Bank((1.0, 2.0), 5.0, 3.0, 1e-3), lag=FirstOrderLag(1e-3, 1e-3))
+    assert declared(inner, "bank.gains.1").unit == "V/um"
+    assert declared(inner >> Affine(), "0.bank.gains.0").meaning == "gains"
+
+
+def test_declarations_know_the_nyquist_frequency():
+    for dt in (1e-3, 1e-4):
+        bank = Bank((1.0,), 5.0, 3.0, dt)
+        assert declared(bank, "corner").below == np.pi / dt
+    cutoff = dict(declarations(DisturbanceObserverControl))["cutoff"]
+    assert cutoff.below_nyquist
+    assert cutoff.below == np.inf
+
+
+@pytest.mark.parametrize(
+    "path", ["bare", "bare.gains", "nothing", "corner.x", "gains.7", "gains.0.x", ""]
+)
+def test_nothing_is_declared_there(path):
+    assert declared(Bank((1.0,), 5.0, 3.0, 1e-3), path) is None
+
+
+def test_patterns_match_across_dots_and_keep_the_order():
+    loop = p753.loop(p753.pid())
+    every = list(parameters(loop))
+    assert matching(loop, "*") == every
+    controller = [path for path in every if path.startswith("controller.")]
+    assert matching(loop, "controller.*") == controller
+    assert matching(loop, "*.integral") == ["controller.integral"]
+    assert matching(loop, "controller.Integral") == []

@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,10 @@ from piezojax import (
     save,
 )
 from piezojax.catalog import CONTROLLERS, p753
+from piezojax.control import PID, DisturbanceObserverControl
+from piezojax.core.parameter import declarations
 from piezojax.core.paths import get, parameters
+from piezojax.core.space import Range
 from piezojax.dynamics import (
     FirstOrderLag,
 )
@@ -162,6 +166,138 @@ def test_start_replaces_the_value_of_the_controller(study):
     np.testing.assert_allclose(start, [p753.pid().proportional, 777.0])
 
 
+# What is left to the declarations
+
+
+PROPORTIONAL, INTEGRAL = "controller.proportional", "controller.integral"
+
+
+def declared_range(path):
+    """The range that PID declares for a path of it."""
+    declared = dict(declarations(PID))[path.removeprefix("controller.")]
+    return Range(*declared.typical, declared.scale)
+
+
+def test_a_path_alone_takes_the_declared_range(study):
+    case = read(study({"parameters": GONE, "tune": [INTEGRAL, PROPORTIONAL]}))
+    assert case.space.ranges() == {
+        path: declared_range(path) for path in (INTEGRAL, PROPORTIONAL)
+    }
+
+
+def test_a_table_keeps_what_it_says_and_takes_the_rest(study):
+    tables = {PROPORTIONAL: {"lower": 0.2}, INTEGRAL: {"scale": "linear"}}
+    found = read(study({"parameters": tables})).space.ranges()
+    assert found[PROPORTIONAL] == replace(declared_range(PROPORTIONAL), lower=0.2)
+    assert found[INTEGRAL] == replace(declared_range(INTEGRAL), scale="linear")
+
+
+def test_a_pattern_takes_every_parameter_below(study):
+    tables = {"controller.derivative": {"start": 1e-5, "upper": 1e-3}}
+    starts = {"anti_windup": 10.0, "derivative_filter": 1e-4}
+    tables |= {f"controller.{name}": {"start": s} for name, s in starts.items()}
+    case = read(study({"parameters": tables, "tune": ["controller.*"]}))
+    # Those of the table first; then the others, in the order of the fields.
+    names = [name for name, known in declarations(PID) if known.typical]
+    assert set(case.space.paths) == {f"controller.{name}" for name in names}
+    rest = [f"controller.{name}" for name in names]
+    rest = [path for path in rest if path not in tables]
+    assert case.space.paths == (*tables, *rest)
+    assert case.space.ranges()["controller.derivative"].upper == 1e-3
+    assert case.space.ranges()[INTEGRAL] == declared_range(INTEGRAL)
+    assert float(get(case.loop, "controller.anti_windup")) == 10.0
+
+
+def test_patterns_and_paths_name_a_parameter_once(study):
+    case = read(
+        study({"tune": ["controller.i*", INTEGRAL, "controller.*_weight"]}),
+    )
+    assert case.space.paths == (
+        *(PROPORTIONAL, INTEGRAL),
+        *("controller.proportional_weight", "controller.derivative_weight"),
+    )
+    assert case.space.upper[1] == 2e4
+
+
+def observed(dt):
+    """A PID with a disturbance observer, as a table."""
+    return {
+        "type": "DisturbanceObserverControl",
+        "feedback": {"type": "PID", "proportional": 1.0, "integral": 9.0, "dt": dt},
+        "model": {
+            "type": "ARMA",
+            "autoregressive": [0.9, -0.1],
+            "moving": [0.1, 0.1, 0.0],
+        },
+        "gain": 0.2,
+        "cutoff": 500.0,
+        "dt": dt,
+    }
+
+
+def test_a_declared_range_ends_below_nyquist(study):
+    changes = {"rate": 10_000.0, "plant/dt": 1e-4, "controller": observed(1e-4)}
+    changes |= {"parameters": GONE, "tune": ["*.cutoff"]}
+    (found,) = read(study(changes)).space.ranges().values()
+    assert found.upper == pytest.approx(0.99 * np.pi * 1e4, rel=1e-12)
+    declared = dict(declarations(DisturbanceObserverControl))["cutoff"]
+    assert found.upper < declared.typical[1]
+
+
+@pytest.mark.parametrize(
+    ("tune", "message"),
+    [
+        (
+            ["controller.gain*"],
+            "tune: controller.gain* has no match in the controller; name paths under "
+            '[parameters], as in "controller.cutoff" = { lower = 100.0, upper = 2e4 }',
+        ),
+        (["plant.*"], "tune: plant.* has no match in the controller; name paths unde"),
+        (
+            ["plant.time_constant"],
+            "tune: plant.time_constant: the path must start with 'controller.'",
+        ),
+        (["controller.gain"], "no parameter 'controller.gain'; the nearest are "),
+        (
+            ["controller.derivative"],
+            "controller.derivative starts at 0; its bounds 1e-08 to 0.1 must include",
+        ),
+        ("controller.*", "tune is 'controller.*': Input should be a valid tuple"),
+    ],
+)
+def test_names_that_cannot_be_tuned(refusal, tune, message):
+    assert refusal({"tune": tune}).startswith(message)
+
+
+def test_a_parameter_without_a_declared_range_needs_bounds(refusal):
+    named = {"controller": observed(5e-5), "parameters": GONE}
+    path = "controller.model.moving.0"
+    expected = (
+        f"parameters.{path}.lower is missing; no range is declared for this parameter, "
+        "so give it lower and upper"
+    )
+    assert refusal(named | {"tune": [path]}) == expected
+    assert refusal(named | {"parameters": {path: {"upper": 9.0}}}) == expected
+    message = refusal(named | {"tune": ["controller.model.*"]})
+    assert message.startswith("tune: controller.model.* has no declared range; name")
+
+
+def test_an_array_is_no_number_to_tune(refusal):
+    ones = {key: [[1.0]] for key in "ABCD"}
+    law = {"type": "StateSpace", **ones, "dt": 5e-5}
+    controller = {"type": "StateSpaceController", "law": law}
+    tables = {"controller.law.A": {"lower": 0.0, "upper": 1.0}}
+    assert refusal({"controller": controller, "parameters": tables}) == (
+        "parameters.controller.law.A has shape (1, 1); it must be a number"
+    )
+
+
+def test_units_are_those_of_the_declarations(study):
+    case = read(study({}))
+    assert case.unit(PROPORTIONAL) == "V/um"
+    assert case.unit("controller.nothing") == ""
+
+
 def test_converters_and_slew_limit(study):
     case = read(
         study(
@@ -223,7 +359,7 @@ def test_a_cut_off_just_below_nyquist(study):
             "rat",
             1.0,
             "rat is unknown; allowed are title, rate, seed, axes, plant, actuator, "
-            "sensor, controller, references, parameters, objective, optimiser, "
+            "sensor, controller, references, tune, parameters, objective, optimiser, "
             "disturbance, ensemble, constraints, pareto, holdout_draws, sweep; "
             "did you mean 'rate'?",
         ),
@@ -403,7 +539,6 @@ def test_unknown_names(refusal, place, value, message):
             {"upper": "much"},
             "parameters.controller.proportional.upper is 'much': Input should be a va",
         ),
-        ({"upper": GONE}, "parameters.controller.proportional.upper is missing"),
     ],
 )
 def test_bad_bounds(refusal, changes, message):
@@ -474,7 +609,7 @@ def test_paths_must_lead_to_a_parameter_of_the_controller(refusal, path, message
         ("optimiser/steps", 0, "optimiser.steps is 0: Input should be greater than or"),
         ("optimiser/candidates", -1, "optimiser.candidates is -1: Input should be gr"),
         ("optimiser/tolerance", 0.0, "optimiser.tolerance is 0.0: Input should be gr"),
-        ("parameters", {}, "parameters: Dictionary should have at least 1 item"),
+        ("parameters", {}, "tune and parameters are missing; name at least one param"),
     ],
 )
 def test_values_out_of_range(refusal, place, value, message):
@@ -510,7 +645,7 @@ def test_values_of_another_type(refusal, place, value, message):
     "place",
     [
         *("title", "rate", "plant", "actuator", "controller", "references"),
-        *("parameters", "actuator/lower", "actuator/upper", "references/tune"),
+        *("actuator/lower", "actuator/upper", "references/tune"),
     ],
 )
 def test_what_must_not_be_missing(refusal, place):

@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 from collections.abc import Mapping
+from fnmatch import fnmatchcase
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 
 from .arrays import as_array
 from .axes import PerAxis
+from .parameter import Parameter, declarations
 from .system import Series
 
 S = TypeVar("S", bound=eqx.Module)
@@ -37,6 +39,36 @@ def parameters(system: Any, prefix: str = "") -> dict[str, Any]:
             found[path] = child
         else:
             found.update(parameters(child, f"{path}."))
+    return found
+
+
+def matching(system: Any, pattern: str) -> list[str]:
+    """Return the paths of the array leaves that match ``pattern``, in tree order.
+
+    ``*`` stands for any characters, dots included: ``controller.feedback.*`` matches
+    every parameter of the feedback.
+    """
+    return [path for path in parameters(system) if fnmatchcase(path, pattern)]
+
+
+def declared(system: Any, path: str) -> Parameter | None:
+    """Return the declaration of the parameter at ``path``; None without one.
+
+    The elements of a tuple, such as coefficients, share the declaration of their field.
+    A limit below the Nyquist frequency is that at the sample time of the declaring
+    System.
+    """
+    node: Any = system
+    found = None
+    for name in path.split("."):
+        children = _children(node)
+        if name not in children:
+            return None
+        if isinstance(node, eqx.Module):
+            found = dict(declarations(type(node))).get(name)
+            if found is not None and found.below_nyquist:
+                found = found.at(children["dt"])
+        node = children[name]
     return found
 
 

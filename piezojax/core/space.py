@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .arrays import as_array
-from .parameter import Scale
+from .parameter import Parameter, Scale
 from .paths import get, replace
 from .system import System
 
@@ -44,6 +44,18 @@ class Range:
     start: float | None = None
     unit: str = ""
 
+    @classmethod
+    def of(cls, declared: Parameter) -> "Range | None":
+        """Return the typical range of a declared parameter; None without one.
+
+        It ends 1 % below a limit that the parameter must not reach.
+        """
+        if declared.typical is None:
+            return None
+        lower, upper = declared.typical
+        upper = min(upper, 0.99 * declared.below)
+        return cls(lower, upper, declared.scale, unit=declared.unit)
+
     def check(self, name: str) -> None:
         """Raise ValueError unless the bounds are in order and suit the scale."""
         low, high = self.lower, self.upper
@@ -75,6 +87,12 @@ class Space(eqx.Module):
     scales: tuple[Scale, ...] = eqx.field(static=True)
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
+
+    def ranges(self) -> dict[str, Range]:
+        """Return the Range of each parameter by path."""
+        rows = zip(self.lower, self.upper, self.scales, strict=True)
+        found = [Range(float(low), float(high), scale) for low, high, scale in rows]
+        return dict(zip(self.paths, found, strict=True))
 
     def start(self, system: System) -> Float[Array, " n"]:
         """Return the place of ``system`` in the box, in [0, 1]^n.

@@ -125,7 +125,7 @@ def parameters(dataset: "Dataset") -> list[Parameter]:
         unit = variable.attrs["units"]
         # What is left of a long path still tells the parameters apart.
         label = ".".join(parts[-2:]).replace("_", " ") + (
-            f" ({unit.replace('um', 'µm')})" if unit else ""
+            f" ({unit.replace('um', 'µm')})" if unit not in ("", "1") else ""
         )
         found.append(
             Parameter(label, variable.values, variable.attrs["scale"] == "log")

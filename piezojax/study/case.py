@@ -1,5 +1,6 @@
 """A study made ready to run: files read, plant fitted, loop and search space built."""
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,14 +13,15 @@ from ..catalog import CONTROLLERS, PLANTS, at_rate
 from ..control.design import DESIGNS
 from ..core.arrays import as_array
 from ..core.axes import PerAxis
-from ..core.paths import replace, static_fields
-from ..core.serial import from_data, to_data
+from ..core.paths import declared, static_fields
+from ..core.serial import from_data
 from ..core.serial import load as load_system
-from ..core.space import Range, Space, space_of
+from ..core.space import Space
 from ..core.system import Feedback, Observation, System, rest_output, series
 from ..hardware import Quantiser, Saturation, Sensor, SlewLimit
 from ..identification import Fit, identify, read_record
 from .ensemble import Ensemble, Stage, ensemble_of
+from .parameters import search_space
 from .schema import Study, load
 from .stage_tables import RecordPlant
 from .tables import one_of, validated
@@ -40,6 +42,18 @@ class Case:
     fit: Fit | None = None
     ensemble: Ensemble | None = None
     plants: Mapping[str, System] = field(default_factory=dict)
+
+    def unit(self, path: str) -> str:
+        """Return the declared unit of the parameter at ``path`` in the loop.
+
+        It is "" without a declaration, and on a stage with several axes for a unit with
+        um or V in it: there each axis has units of its own.
+        """
+        known = declared(self.loop, path)
+        if known is None:
+            return ""
+        lengths = {"um", "V"} & set(re.findall("[A-Za-z]+", known.unit))
+        return "" if self.study.axes and lengths else known.unit
 
 
 def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
@@ -65,7 +79,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     seen = Observation(zero, zero, zero, zero)
     _check_role(controller, seen, "controller", "an Observation to a command")
     loop = Feedback(controller, plant, _actuator(study), _sensor(study))
-    loop, space = _search_space(study, loop)
+    loop, space = search_space(study, loop)
     _check_rates(study, loop, "the controller or plant")
     stage = Stage(loop.plant, loop.sensor)
     ensemble = ensemble_of(study, stage, path.parent)
@@ -144,37 +158,6 @@ def _sensor(study: Study) -> System:
         return series(**parts)
 
     return _systems(study, one)
-
-
-def _search_space(study: Study, loop: Feedback) -> tuple[Feedback, Space]:
-    bounds = study.parameters
-    for path in bounds:
-        if not path.startswith("controller."):
-            raise ValueError(
-                f"parameters.{path}: the path must start with 'controller.'; "
-                "the stage is not for tuning"
-            )
-    starts = {path: b.start for path, b in bounds.items() if b.start is not None}
-    loop = replace(loop, starts)
-    space = space_of(
-        {path: Range(b.lower, b.upper, b.scale) for path, b in bounds.items()}
-    )
-    space.start(loop)
-    _check_values(study, loop)
-    return loop, space
-
-
-def _check_values(study: Study, loop: Feedback) -> None:
-    """Build the controller at every start and bound, so that its own checks speak."""
-    for path, bound in study.parameters.items():
-        values = {"start": bound.start, "lower": bound.lower, "upper": bound.upper}
-        for name, value in values.items():
-            if value is None:
-                continue
-            try:
-                from_data(to_data(replace(loop, {path: value}).controller))
-            except ValueError as error:
-                raise ValueError(f"parameters.{path}.{name}: {error}") from None
 
 
 def _check_role(system: System, example: Any, where: str, role: str) -> None:

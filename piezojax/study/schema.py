@@ -6,14 +6,22 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from ..core.parameter import Scale
 from ..signals import motions
 from ..signals import waveforms as signals
 from ..solve.optimisers import GAUSS_NEWTON, METHODS
 from .ensemble_table import EnsembleTable
 from .stage_tables import Actuator, DisturbanceTable, SensorTable
 from .sweep_table import SweepTable, quoted
-from .tables import ByAxis, Finite, NotNegative, Positive, Table, one_of, validated
+from .tables import (
+    ByAxis,
+    Finite,
+    NotNegative,
+    Positive,
+    RangeTable,
+    Table,
+    one_of,
+    validated,
+)
 
 
 class AxesTable(Table):
@@ -65,12 +73,9 @@ class References(Table):
         return self
 
 
-class Bounds(Table):
-    """Bounds of a tuned parameter, in its own unit; ``start`` replaces its value."""
+class TunedTable(RangeTable):
+    """Range of a tuned parameter; ``start`` replaces the value in the controller."""
 
-    lower: Finite
-    upper: Finite
-    scale: Scale = "linear"
     start: Finite | None = None
 
 
@@ -140,7 +145,12 @@ class OptimiserTable(Table):
 
 
 class Study(Table):
-    """A whole study; README and tuning/ show examples."""
+    """A whole study; README and tuning/ show examples.
+
+    ``tune`` names the parameters to tune: paths in the loop, or patterns such as
+    ``controller.feedback.*``. ``parameters`` names more of them, and holds the bounds,
+    scales and starts that differ from those declared beside the parameter.
+    """
 
     title: str
     rate: Positive
@@ -151,7 +161,8 @@ class Study(Table):
     sensor: SensorTable = SensorTable()
     controller: dict[str, Any]
     references: References
-    parameters: dict[str, Bounds] = Field(min_length=1)
+    tune: tuple[str, ...] = ()
+    parameters: dict[str, TunedTable] = Field(default_factory=dict)
     objective: ObjectiveTable = ObjectiveTable()
     optimiser: OptimiserTable = OptimiserTable()
     disturbance: DisturbanceTable = DisturbanceTable()
@@ -165,6 +176,14 @@ class Study(Table):
     @classmethod
     def _quoted(cls, tables: Any) -> Any:
         return quoted(tables)
+
+    @model_validator(mode="after")
+    def _tuned(self) -> "Study":
+        if not (self.tune or self.parameters):
+            raise ValueError(
+                "tune and parameters are missing; name at least one parameter to tune"
+            )
+        return self
 
     @model_validator(mode="after")
     def _sampled(self) -> "Study":

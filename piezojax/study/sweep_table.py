@@ -1,45 +1,37 @@
-"""The table ``[sweep]`` of a study: which parameters are varied, and what is kept."""
+"""The table ``[sweep]`` of a study: its parameters, and the metrics that are kept."""
 
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from ..core.metrics import TrackingFigures
-from ..core.parameter import Scale
-from .tables import Finite, Table, one_of
+from .tables import Finite, RangeTable, Table, one_of
 
 SENSITIVITY = "sensitivity_peak"
 METRICS = (*TrackingFigures._fields, SENSITIVITY)
-"""What can be kept of each run: figures of the simulation, and the peak of |1/(1+L)|
-of the linearised loop."""
+"""Metrics of a run: figures of the simulation, and the peak of |1/(1+L)| of the
+linearised loop."""
 
 PARTS = ("controller", "plant", "actuator", "sensor")
-"""Parts of a loop, with which the path of a parameter starts."""
+"""Parts of a loop; the path of a parameter starts with one of them."""
 
 Count = Annotated[int, Field(strict=True, ge=1)]
 
 
-class SweptParameter(Table):
-    """Where a parameter is tried: ``values``, or ``lower`` to ``upper``.
+class SweptTable(RangeTable):
+    """Range of a swept parameter, or its ``values``.
 
-    ``count`` points of a grid lie evenly on the scale ``scale``; samples need none.
-    ``unit`` is what pictures and the data set say.
+    A grid has ``count`` points, evenly spaced on the scale; samples need none.
     """
 
-    lower: Finite | None = None
-    upper: Finite | None = None
     count: Annotated[int, Field(strict=True, ge=2)] | None = None
-    scale: Scale = "linear"
     values: tuple[Finite, ...] | None = None
-    unit: str | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> "SweptParameter":
-        bounds = self.lower is not None and self.upper is not None
-        some = self.lower is not None or self.upper is not None or self.count
-        if bounds == (self.values is not None) or (self.values is not None and some):
-            raise ValueError("it takes either values, or lower and upper")
+    def _one_way(self) -> "SweptTable":
         if self.values is not None:
+            if not (self.lower is None and self.upper is None and self.count is None):
+                raise ValueError("it takes either values, or lower and upper")
             if not self.values:
                 raise ValueError("values must hold at least one number")
             if list(self.values) != sorted(set(self.values)):
@@ -48,7 +40,7 @@ class SweptParameter(Table):
 
 
 class SweepTable(Table):
-    """What ``python -m piezojax.sweep`` does with a study.
+    """Points that a sweep simulates, and the metrics that it keeps.
 
     ``method`` "grid" tries every combination of the parameters; "latin_hypercube" and
     "sobol" draw ``samples`` points of their box. Without ``parameters`` the box is that
@@ -60,7 +52,7 @@ class SweepTable(Table):
 
     method: Literal["grid", "latin_hypercube", "sobol"] = "grid"
     samples: Count | None = None
-    parameters: dict[str, SweptParameter] = Field(default_factory=dict)
+    parameters: dict[str, SweptTable] = Field(default_factory=dict)
     plants: tuple[str, ...] = ()
     references: tuple[str, ...] = ()
     metrics: tuple[str, ...] = Field(

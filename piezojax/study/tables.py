@@ -1,10 +1,14 @@
-"""How a table of a file is validated: strictly, and with errors in one line."""
+"""Strict validation of the tables of a file, with errors in one line."""
 
 import difflib
 import re
 from typing import Annotated, Any, TypeVar, get_args
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ..core.parameter import Parameter, Scale
+from ..core.space import Range
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
@@ -12,9 +16,42 @@ Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 
 
 class Table(BaseModel):
-    """A table of a study: nothing in it is guessed, nothing unknown is passed over."""
+    """A table of a study; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RangeTable(Table):
+    """Bounds of a parameter in its unit, and its scale.
+
+    A key that is left out comes from the parameter's declaration.
+    """
+
+    lower: Finite | None = None
+    upper: Finite | None = None
+    scale: Scale | None = None
+
+    def range(self, declared: Parameter | None, where: str) -> Range:
+        """Return the Range, completed from the declaration of the parameter.
+
+        Raises ValueError, naming the key, for a bound that neither gives.
+        """
+        typical = Range.of(declared) if declared else None
+        for key in ("lower", "upper"):
+            if getattr(self, key) is None and typical is None:
+                raise ValueError(
+                    f"{where}.{key} is missing; no range is declared for this "
+                    "parameter, so give it lower and upper"
+                )
+        base = typical or Range(
+            -np.inf, np.inf, declared.scale if declared else "linear"
+        )
+        return Range(
+            base.lower if self.lower is None else self.lower,
+            base.upper if self.upper is None else self.upper,
+            self.scale or base.scale,
+            unit=declared.unit if declared else "",
+        )
 
 
 Each = TypeVar("Each")

@@ -26,7 +26,7 @@ LONG_NAMES = {
     "voltage": "voltage",
     "followed": "reference",
 }
-"""What each variable holds."""
+"""Meaning of each variable."""
 
 _ERRORS = ("rms_error", "peak_error", "displacement", "followed")
 _PLAIN = ("saturated", SENSITIVITY)
@@ -67,7 +67,7 @@ def boxes(
 
 
 class Merger:
-    """Writes the data set of a sweep, chunk by chunk: memory does not grow with it."""
+    """Writer of the data set of a sweep, chunk by chunk, in constant memory."""
 
     def __init__(self, simulator: Simulator, store: Store):
         self._simulator, self._store = simulator, store
@@ -89,7 +89,7 @@ class Merger:
     def merge(self) -> None:
         """Write the data set, in one move.
 
-        Raises DamagedError, and writes nothing, if chunks turn out not to be whole.
+        Raises DamagedError, and writes nothing, if chunks are damaged.
         """
         import h5netcdf
 
@@ -190,12 +190,12 @@ class Merger:
                 values = plan.values(0, plan.points)[:, column]
                 dimension = "sample"
             variable = file.create_variable(axis.path, (dimension,), data=values)
-            variable.attrs["units"] = axis.unit
-            variable.attrs["scale"] = axis.scale
+            variable.attrs["units"] = axis.range.unit
+            variable.attrs["scale"] = axis.range.scale
 
 
 class DamagedError(Exception):
-    """Chunks that are not whole; they are to be simulated again."""
+    """Damaged chunks, which must be simulated again."""
 
     def __init__(self, chunks: list[int]):
         super().__init__(f"damaged chunks: {chunks}")
@@ -203,7 +203,7 @@ class DamagedError(Exception):
 
 
 def merged(folder: Path, fingerprint: str) -> bool:
-    """Tell whether the data set of this sweep is there."""
+    """Return whether ``folder`` holds the data set of this sweep."""
     import h5netcdf
 
     try:

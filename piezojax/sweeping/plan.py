@@ -1,70 +1,59 @@
-"""Which points a sweep tries, cut into chunks: a pure function of the study."""
+"""Points of a sweep, cut into chunks: a pure function of the study."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from ..core.arrays import as_array
-from ..core.parameter import Scale
-from ..core.paths import get, replace
+from ..core.paths import declared, get
+from ..core.paths import replace as put
 from ..core.rollout import BLOCK
 from ..core.serial import from_data, to_data
 from ..core.space import Range, space_of
 from ..core.system import System
 from ..study import Case, Study
-from ..study.sweep_table import SweepTable, SweptParameter
+from ..study.sweep_table import SweepTable, SweptTable
 
 CHUNK_LANE_STEPS = 5e7
-"""Simulated samples of a chunk, plants and references included: a good part of a
-second, so that an interrupt costs little and writing less."""
+"""Simulated samples of a chunk, plants and references included: most of a second, so
+that an interrupt loses little and writing costs less."""
 
 CHUNK_BYTES = 64e6
-"""What a chunk may hold in memory, whatever is kept of its runs."""
+"""Largest size of the kept results of a chunk in memory, bytes."""
 
 MOST_CHUNKS = 4096
-"""Beyond this many chunks they grow, as far as memory lets them."""
+"""Largest number of chunks; beyond it chunks grow, as far as memory allows."""
 
 FEWEST_CHUNKS = 16
-"""Small sweeps, too, keep several cores busy."""
+"""Smallest number of chunks, so that small sweeps keep several cores busy."""
 
 TRAJECTORIES = ("displacement", "voltage")
-"""Signals that are kept at every N-th sample if a study asks for them."""
-
-UNITS = {
-    "cutoff": "rad/s",
-    "noise_rms": "um",
-    "surface": "1/s",
-    "time_constant": "s",
-}
-"""Units of parameters that mean the same wherever they occur, by their name."""
+"""Signals of which a study may keep every N-th sample."""
 
 
-@dataclass(frozen=True)
-class Axis:
-    """A parameter that is varied; ``values`` are its points in a grid."""
+class Axis(NamedTuple):
+    """A swept parameter: its path, its Range, and its points if they form a grid."""
 
     path: str
-    unit: str
-    scale: Scale
-    lower: float
-    upper: float
+    range: Range
     values: np.ndarray | None = None
 
 
 class Plan:
     """The points of a sweep.
 
-    ``shape`` is that of the grid, or the number of samples. Points are counted through
-    in C order; ``chunk`` of them belong together, in blocks of ``width``. Any process
-    that makes the plan of the same study gets the same points.
+    ``shape`` is that of the grid, or the number of samples. Points are numbered in
+    C order; a chunk holds ``chunk`` of them, in blocks of ``width``. Every process plans
+    the same points for the same study.
     """
 
     def __init__(self, case: Case):
         study, table = case.study, swept(case.study)
-        self.axes = tuple(_axes(study, table))
+        self.axes = tuple(_axes(case, table))
         self.method = table.method
         _check_paths(case, self.axes)
         if table.method == "grid":
@@ -108,7 +97,7 @@ class Plan:
     def share(self, shard: tuple[int, int]) -> range:
         """Return the chunks of shard i of n, counted from 1.
 
-        Raises ValueError for a shard that is none.
+        Raises ValueError for a shard outside 1/n to n/n.
         """
         number, count = shard
         if not 1 <= number <= count:
@@ -120,7 +109,7 @@ class Plan:
 
 
 def swept(study: Study) -> SweepTable:
-    """Return the table ``[sweep]``; raise ValueError, saying what to add, without."""
+    """Return the table ``[sweep]``; raise ValueError without one."""
     if study.sweep is None:
         raise ValueError(
             'the study has no table [sweep]: add method = "grid" and a parameter, as '
@@ -144,18 +133,18 @@ def plants_of(case: Case) -> dict[str, System]:
 
 
 def runs_of_point(study: Study) -> int:
-    """Return how many simulations a point takes."""
+    """Return the number of simulations of a point."""
     plants = len(swept(study).plants) or 1
     return plants * len(references_of(study)) * study.holdout_draws
 
 
 def samples_of(study: Study) -> int:
-    """Return the samples of a simulation."""
+    """Return the number of samples of a simulation."""
     return round(study.references.duration * study.rate)
 
 
 def bytes_of_point(study: Study) -> int:
-    """Return what is kept of a point."""
+    """Return the size of the kept results of a point, bytes."""
     table = swept(study)
     kept = len(table.metrics)
     if table.every:
@@ -163,37 +152,31 @@ def bytes_of_point(study: Study) -> int:
     return 8 * runs_of_point(study) * kept * study.axis_count
 
 
-def _axes(study: Study, table: SweepTable) -> list[Axis]:
+def _axes(case: Case, table: SweepTable) -> list[Axis]:
     if table.parameters:
-        return [_axis(path, swept) for path, swept in table.parameters.items()]
+        return [_axis(case, path, swept) for path, swept in table.parameters.items()]
     return [
-        Axis(path, _unit(path), bound.scale, bound.lower, bound.upper)
-        for path, bound in study.parameters.items()
+        Axis(path, replace(one, unit=case.unit(path)))
+        for path, one in case.space.ranges().items()
     ]
 
 
-def _unit(path: str, given: str | None = None) -> str:
-    return given if given is not None else UNITS.get(path.split(".")[-1], "")
-
-
-def _axis(path: str, table: SweptParameter) -> Axis:
-    unit = _unit(path, table.unit)
+def _axis(case: Case, path: str, table: SweptTable) -> Axis:
+    unit, where = case.unit(path), f"sweep.parameters.{path}"
     if table.values is not None:
         values = np.array(table.values, dtype=float)
-        return Axis(path, unit, table.scale, values[0], values[-1], values)
-    assert table.lower is not None
-    assert table.upper is not None
-    bounds = Range(table.lower, table.upper, table.scale)
-    try:
-        space = space_of({path: bounds})
-    except ValueError as error:
-        raise ValueError(f"sweep.parameters.{error}") from None
+        scale = table.scale or "linear"
+        return Axis(path, Range(values[0], values[-1], scale, unit=unit), values)
+    wanted = table.range(declared(case.loop, path), where)
+    wanted = replace(wanted, unit=unit)
+    wanted.check(where)
     if table.count is None:
-        return Axis(path, unit, table.scale, table.lower, table.upper)
+        return Axis(path, wanted)
+    space = space_of({path: wanted})
     unit_points = as_array(np.linspace(0.0, 1.0, table.count)[:, None])
     values = np.array(jax.vmap(space.from_unit)(unit_points))[:, 0]
-    values[[0, -1]] = table.lower, table.upper
-    return Axis(path, unit, table.scale, table.lower, table.upper, values)
+    values[[0, -1]] = wanted.lower, wanted.upper
+    return Axis(path, wanted, values)
 
 
 def _samples(table: SweepTable, axes: Sequence[Axis], seed: int) -> np.ndarray:
@@ -210,12 +193,12 @@ def _samples(table: SweepTable, axes: Sequence[Axis], seed: int) -> np.ndarray:
         unit = engine.random_base2(power)[: table.samples]
     else:
         unit = qmc.LatinHypercube(len(axes), rng=generator).random(table.samples)
-    space = space_of({a.path: Range(a.lower, a.upper, a.scale) for a in axes})
+    space = space_of({axis.path: axis.range for axis in axes})
     return np.array(jax.vmap(space.from_unit)(as_array(unit)))
 
 
 def _check_paths(case: Case, axes: Sequence[Axis]) -> None:
-    """Raise ValueError for a path or a bound that one of the loops does not take."""
+    """Raise ValueError for a path or a bound that one of the loops refuses."""
     for name, plant in plants_of(case).items():
         for axis in axes:
             part = axis.path.split(".")[0]
@@ -231,9 +214,9 @@ def _check_paths(case: Case, axes: Sequence[Axis]) -> None:
                 where = f"{where}, plant {name}"
             try:
                 get(parts[part], inner)
-                for value in (axis.lower, axis.upper):
+                for value in (axis.range.lower, axis.range.upper):
                     # Built anew, so that the constructor's own checks speak.
-                    changed = replace(parts[part], {inner: value})
+                    changed = put(parts[part], {inner: value})
                     from_data(to_data(changed))
             except ValueError as error:
                 raise ValueError(f"{where}: {error}") from None
