@@ -9,7 +9,8 @@ from .alpha_beta import AlphaBeta
 from .disturbance_observer import DisturbanceObserverControl
 from .inversion import InversionControl
 from .pid import PID
-from .sliding_mode import SlidingModePID
+from .sliding_mode import SlidingMode
+from .switching import SwitchingPID
 
 
 def _part(plant: System, kind: type[System]) -> System:
@@ -35,14 +36,12 @@ def _hysteresis(plant: System) -> ColemanHodgdon:
     return hysteresis
 
 
-def _sliding_mode(plant: System, dt: float) -> SlidingModePID:
+def _sliding_mode(plant: System, dt: float) -> SlidingMode:
     # Scaled from the printed P-753 set, whose surface is 0.9 / dt: the loop then
     # crosses over near 0.1 / dt whatever the rate.
     surface, weight = 0.5 / dt, 100.0
-    return SlidingModePID(
-        proportional=1e-3,
-        integral=0.1 * weight / (dt * surface),
-        derivative=1e-3 * dt,
+    return SlidingMode(
+        SwitchingPID(1e-3, 0.1 * weight / (dt * surface), 1e-3 * dt, dt=dt),
         surface=surface,
         error_weight=1.0,
         control_weight=weight,
