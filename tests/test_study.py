@@ -338,7 +338,14 @@ def test_a_design_for_the_plant_at_hand(study):
         "parameters": {"controller.cutoff": {"lower": 1.0, "upper": 2e4}},
     }
     case = read(study(changes))
-    assert float(case.loop.controller.gain) == pytest.approx(0.0077 / 0.0487)
+    # The mean slope of the loading curve from 0 V: y = p x + s q (1 - exp(s c x)) on
+    # the branch of direction s, with p = -a/c and q = (p - b)/c.
+    a, b, c = 0.0077, 0.1167, -0.0487
+    p, q = -a / c, (-a / c - b) / c
+    top, bottom = (
+        p * x + s * q * (1.0 - np.exp(s * c * x)) for s, x in ((1, 120.0), (-1, -20.0))
+    )
+    assert float(case.loop.controller.gain) == pytest.approx((top - bottom) / 140.0)
 
 
 def test_a_cut_off_just_below_nyquist(study):
@@ -754,9 +761,17 @@ def test_a_record_without_time_or_rate(study, refusal):
 
 
 def test_a_design_that_does_not_fit_the_plant(refusal):
-    assert refusal({"controller": {"design": "inversion_pid"}}) == (
-        "controller.design: this design needs a plant with a ColemanHodgdon; it has "
-        "FirstOrderLag"
+    falls = {"type": "ColemanHodgdon", "a": 0.0077, "b": 0.01, "c": -0.0487}
+    message = refusal({"plant": falls, "controller": {"design": "inversion_pid"}})
+    assert message.startswith(
+        "controller.design: no inverse of the hysteresis from -20 to 120 V: between "
+    )
+    integrator = {"type": "ARMA", "autoregressive": [1.0], "moving": [0.1]}
+    assert refusal(
+        {"plant": integrator, "controller": {"design": "inversion_pid"}}
+    ) == (
+        "controller.design: the plant has a pole of modulus 1; a design needs a plant "
+        "that comes to rest, with all poles below 1"
     )
 
 

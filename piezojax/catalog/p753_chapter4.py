@@ -11,11 +11,11 @@ from ..control import (
     AlphaBeta,
     Anticipation,
     BangBang,
-    ContinuousSlidingMode,
-    ModelReferenceSlidingMode,
+    ContinuousSlidingModePID,
+    ModelReferencePID,
     Observer,
-    SlidingMode,
-    SwitchingPID,
+    SlidingModePID,
+    SwitchedSlidingMode,
 )
 from ..core.arrays import ScalarLike
 from ..core.system import Feedback, Series, System, series
@@ -127,13 +127,6 @@ UNPRINTED_FILTER = (0.1, 1e-4)
 """Alpha and beta where none are printed: those of 20 kHz, an assumption."""
 
 
-def with_law(gains: Mapping[str, float], rate: int) -> dict[str, Any]:
-    """Return ``gains`` with P, I and D collected in a ``SwitchingPID`` at ``rate``."""
-    names = ("proportional", "integral", "derivative")
-    law = SwitchingPID(*(gains[name] for name in names), dt=1.0 / rate)
-    return {"law": law} | {k: v for k, v in gains.items() if k not in names}
-
-
 def alpha_beta(rate: int = 20_000) -> AlphaBeta:
     """Return the printed filter at ``rate``, or that of 20 kHz where there is none."""
     return AlphaBeta(*FILTERS.get(rate, UNPRINTED_FILTER), 1.0 / rate)
@@ -151,15 +144,15 @@ def model(rate: int = 20_000) -> ARMA:
 
 def model_reference(
     rate: int = 20_000, table: str = "4-4", filter: Observer | None = None
-) -> ModelReferenceSlidingMode:
+) -> ModelReferencePID:
     """Return the model-reference PID-SMC of ``table`` "4-3" or "4-4", um to V.
 
     ``filter`` stands in for the printed one. Raises ValueError for a rate or a table
     that is not printed.
     """
     gains = _printed("table", MODEL_REFERENCE_GAINS, table)
-    return ModelReferenceSlidingMode(
-        **with_law(_printed("rate in Hz", gains, rate), rate),
+    return ModelReferencePID(
+        **_printed("rate in Hz", gains, rate),
         surface=SURFACE,
         error_weight=ERROR_WEIGHT,
         model=model(rate),
@@ -173,18 +166,18 @@ def anticipating_model_reference(rate: int = 20_000) -> Anticipation:
     return Anticipation(model_reference(rate), (0.0,))
 
 
-def traditional(rate: int = 20_000) -> SlidingMode:
+def traditional(rate: int = 20_000) -> SlidingModePID:
     """Return the traditional PID-SMC of Table 4-2 (1 or 20 kHz), um to V."""
-    return SlidingMode(
-        **with_law(_printed("rate in Hz", TRADITIONAL_GAINS, rate), rate),
+    return SlidingModePID(
+        **_printed("rate in Hz", TRADITIONAL_GAINS, rate),
         model=model(rate),
         filter=alpha_beta(rate),
     )
 
 
-def bang_bang(rate: int = 20_000) -> SlidingMode:
+def bang_bang(rate: int = 20_000) -> SwitchedSlidingMode:
     """Return the nominal DSMC with bang-bang switching (1 or 20 kHz), um to V."""
-    return SlidingMode(
+    return SwitchedSlidingMode(
         BangBang(_printed("rate in Hz", BANG_BANG_GAINS, rate)),
         surface=TRADITIONAL_GAINS[rate]["surface"],
         error_weight=ERROR_WEIGHT,
@@ -194,10 +187,10 @@ def bang_bang(rate: int = 20_000) -> SlidingMode:
     )
 
 
-def continuous(rate: int = 20_000) -> ContinuousSlidingMode:
+def continuous(rate: int = 20_000) -> ContinuousSlidingModePID:
     """Return the continuous PID-SMC (5, 10 or 20 kHz), um to V."""
-    return ContinuousSlidingMode(
-        **with_law(_printed("rate in Hz", CONTINUOUS_GAINS, rate), rate),
+    return ContinuousSlidingModePID(
+        **_printed("rate in Hz", CONTINUOUS_GAINS, rate),
         surface=p753.SURFACE,
         filter=alpha_beta(rate),
     )

@@ -1,80 +1,104 @@
-"""First controllers for an identified plant: stable and slow, for tuning to improve."""
+"""First controllers for an identified plant: stable and slow, for tuning to improve.
+
+A design is a function of a plant, the sample time of the loop in s and the limits of
+the actuator in V; ``DESIGNS`` names it for studies. It takes what it needs of the plant
+from ``design_model``.
+"""
 
 from collections.abc import Callable
 
-from ..core.system import Series, System
-from ..dynamics import ARMA, FirstOrderLag
-from ..hysteresis import ColemanHodgdon, InverseColemanHodgdon
+from ..core.system import Affine, System
+from ..dynamics import ARMA, scaled_to_dc
 from .alpha_beta import AlphaBeta
+from .design_model import CROSSOVER, design_model
 from .disturbance_observer import DisturbanceObserverControl
 from .inversion import InversionControl
 from .pid import PID
-from .sliding_mode import SlidingMode
-from .switching import SwitchingPID
+from .sliding_mode import SlidingModePID
+
+Limits = tuple[float, float]
 
 
-def _part(plant: System, kind: type[System]) -> System:
-    parts = plant.parts if isinstance(plant, Series) else (plant,)
-    for part in parts:
-        if isinstance(part, kind):
-            return part
-    raise ValueError(
-        f"this design needs a plant with a {kind.__name__}; it has "
-        f"{', '.join(type(part).__name__ for part in parts)}"
-    )
+def inversion_sliding_mode(
+    plant: System, dt: float, limits: Limits
+) -> InversionControl:
+    """Return an inversion-based PID-SMC.
 
-
-def _model(plant: System) -> ARMA:
-    lag = _part(plant, FirstOrderLag)
-    assert isinstance(lag, FirstOrderLag)
-    return lag.as_arma()
-
-
-def _hysteresis(plant: System) -> ColemanHodgdon:
-    hysteresis = _part(plant, ColemanHodgdon)
-    assert isinstance(hysteresis, ColemanHodgdon)
-    return hysteresis
-
-
-def _sliding_mode(plant: System, dt: float) -> SlidingMode:
-    # Scaled from the printed P-753 set, whose surface is 0.9 / dt: the loop then
-    # crosses over near 0.1 / dt whatever the rate.
-    surface, weight = 0.5 / dt, 100.0
-    return SlidingMode(
-        SwitchingPID(1e-3, 0.1 * weight / (dt * surface), 1e-3 * dt, dt=dt),
-        surface=surface,
-        error_weight=1.0,
-        control_weight=weight,
-        model=_model(plant),
-        filter=AlphaBeta(0.3, 1e-3, dt),
-    )
-
-
-def inversion_sliding_mode(plant: System, dt: float) -> InversionControl:
-    """Return an inversion-based PID-SMC for a plant of hysteresis and lag."""
-    return InversionControl(
-        _sliding_mode(plant, dt), InverseColemanHodgdon(_hysteresis(plant))
-    )
+    Raises ValueError where the hysteresis has no inverse between ``limits`` (V), and as
+    ``design_model``; ``dt`` in s.
+    """
+    model = design_model(plant, dt, limits)
+    inverse = model.inverse()
+    feedback = model.slowed(lambda pace: _sliding_mode(model.dynamics, dt, pace))
+    return InversionControl(feedback, inverse)
 
 
 def disturbance_observer_sliding_mode(
-    plant: System, dt: float
+    plant: System, dt: float, limits: Limits
 ) -> DisturbanceObserverControl:
-    """Return a DOB-based PID-SMC for a plant of hysteresis and lag."""
-    hysteresis = _hysteresis(plant)
-    gain = -hysteresis.a / hysteresis.c  # slope of the axis of the loop
-    return DisturbanceObserverControl(
-        _sliding_mode(plant, dt), _model(plant), gain, 0.05 / dt, dt
+    """Return a DOB-based PID-SMC on the mean slope of the plant between ``limits`` (V).
+
+    Raises ValueError where that is not positive, and as ``design_model``; ``dt`` in s.
+    """
+    model = design_model(plant, dt, limits)
+    # The observer has the whole gain from V to um, the model none.
+    dynamics = scaled_to_dc(model.dynamics, 1.0)
+    slope = model.gain()
+    if slope <= 0.0:
+        raise ValueError(
+            f"the output falls as the voltage rises, {slope:.6g} um/V between the "
+            "limits; the disturbance observer needs a gain above 0"
+        )
+
+    def observed(pace: float) -> DisturbanceObserverControl:
+        return DisturbanceObserverControl(
+            _sliding_mode(dynamics, dt, pace),
+            dynamics,
+            slope * model.dynamics.dc_gain(),
+            0.5 * CROSSOVER * pace / dt,
+            dt,
+        )
+
+    return model.slowed(observed, Affine(slope))
+
+
+def inversion_pid(plant: System, dt: float, limits: Limits) -> InversionControl:
+    """Return an integral-dominated PID behind the inverse of the plant's hysteresis.
+
+    Raises ValueError where there is no inverse between ``limits`` (V), and as
+    ``design_model``; ``dt`` in s.
+    """
+    model = design_model(plant, dt, limits)
+    inverse = model.inverse()
+
+    def pid(pace: float) -> PID:
+        scale = pace / model.dynamics.dc_gain()
+        return PID(
+            0.05 * scale, 0.05 * scale / dt, 1e-3 * scale * dt, dt, 0.1 / dt, dt=dt
+        )
+
+    return InversionControl(model.slowed(pid), inverse)
+
+
+def _sliding_mode(model: ARMA, dt: float, pace: float) -> SlidingModePID:
+    # Scaled from the printed P-753 set, whose surface is 0.9 / dt: the loop then
+    # crosses over near 0.1 / dt whatever the rate, and ``pace`` times that if slowed.
+    surface, weight = 0.5 / dt, 100.0
+    scale = pace / model.dc_gain()
+    return SlidingModePID(
+        proportional=1e-3 * scale,
+        integral=CROSSOVER * weight / (dt * surface) * scale,
+        derivative=1e-3 * dt * scale,
+        surface=surface,
+        error_weight=1.0,
+        control_weight=weight,
+        model=model,
+        filter=AlphaBeta(0.3, 1e-3, dt),
+        correction=pace,
     )
 
 
-def inversion_pid(plant: System, dt: float) -> InversionControl:
-    """Return an integral-dominated PID behind the plant's inverse hysteresis."""
-    pid = PID(0.05, 0.05 / dt, 1e-3 * dt, dt, 0.1 / dt, dt=dt)
-    return InversionControl(pid, InverseColemanHodgdon(_hysteresis(plant)))
-
-
-DESIGNS: dict[str, Callable[[System, float], System]] = {
+DESIGNS: dict[str, Callable[[System, float, Limits], System]] = {
     "inversion_sliding_mode": inversion_sliding_mode,
     "disturbance_observer_sliding_mode": disturbance_observer_sliding_mode,
     "inversion_pid": inversion_pid,

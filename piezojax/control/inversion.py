@@ -1,9 +1,9 @@
 """Inversion-based control: an inverse hysteresis behind any controller."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ..core.arrays import Scalar, State
-from ..core.system import Observation, System, rest_output
+from ..core.arrays import Scalar, ScalarLike, State, as_array, check_not_zero
+from ..core.system import Affine, Observation, System, rest_output
 from ..hysteresis.inverse import Inverse
 
 
@@ -40,3 +40,23 @@ class InversionControl(System):
         feedback, wanted = self.feedback.step(state.feedback, seen)
         voltage = self.inverse.solve(hysteresis, wanted)
         return InversionState(feedback, hysteresis), voltage
+
+
+class InverseGain(Inverse):
+    """Voltage of a plant without hysteresis: the inverse of a gain.
+
+    ``model`` maps V to um. Raises ValueError for a gain of 0.
+    """
+
+    model: Affine
+
+    def __check_init__(self):
+        check_not_zero("gain in um/V", self.model.gain)
+
+    def init(self, input: ScalarLike = 0.0) -> State:
+        return self.model.init(input)
+
+    def solve(self, state: Any, wanted: ScalarLike) -> Scalar:
+        """Return the voltage (V) for which the model's output is ``wanted``."""
+        del state
+        return (as_array(wanted) - self.model.offset) / self.model.gain

@@ -14,11 +14,14 @@ from .held import Held as Held
 from .lag import FirstOrderLag as FirstOrderLag
 from .lag import SecondOrderLag as SecondOrderLag
 from .linear_map import LinearMap as LinearMap
+from .linearise import linearise as linearise
 from .matrix_arma import MatrixARMA as MatrixARMA
 from .matrix_arma import observability_form as observability_form
 from .neural_state_space import NeuralStateSpace as NeuralStateSpace
 from .reduction import Reduction as Reduction
 from .reduction import balanced_reduction as balanced_reduction
+from .reduction import fast_part as fast_part
+from .reduction import reduced as reduced
 from .scheduled import AmplitudeScheduled as AmplitudeScheduled
 from .state_space import StateSpace as StateSpace
 from .state_space import reflected as reflected

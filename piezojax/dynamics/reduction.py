@@ -1,11 +1,16 @@
-"""Fewer states for nearly the same inputs and outputs."""
+"""Models of fewer states with nearly the same response."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import linalg
 
 from .state_space import StateSpace
+
+NEGLIGIBLE = 1e-7
+"""Hankel singular values below this share of the largest may be rounding: the roots of
+the Gramians, from which they are computed, hold half the digits."""
 
 
 class Reduction(NamedTuple):
@@ -35,9 +40,76 @@ def balanced_reduction(model: StateSpace, order: int) -> Reduction:
     stable, or an ``order`` that is not between 1 and the number of states, or that
     reaches into states that are not connected at all.
     """
+    if not 1 <= order <= model.order:
+        raise ValueError(f"order is {order}; it must be between 1 and {model.order}")
+    balance = _balance(model)
+    if order > balance.connected:
+        raise ValueError(
+            f"order is {order}; only {balance.connected} states connect inputs and "
+            "outputs"
+        )
+    return balance.truncated(model, order)
+
+
+def reduced(model: StateSpace, most: int) -> StateSpace:
+    """Return ``model`` with at most ``most`` states, by balanced reduction.
+
+    A model that has no more is returned unchanged; states that do not connect input and
+    output are left out whatever ``most`` is. Raises ValueError for a model to be
+    reduced that is not stable.
+    """
+    if model.order <= most:
+        return model
+    balance = _balance(model)
+    connected = int(np.sum(balance.hankel > NEGLIGIBLE * balance.hankel[0]))
+    return balance.truncated(model, min(most, connected)).model
+
+
+def fast_part(model: StateSpace, angle: float, share: float = 0.1) -> StateSpace:
+    """Return ``model`` without the slow modes that hardly respond at ``angle``.
+
+    Slow are modes of a natural frequency abs(log z) below a tenth of ``angle`` (rad a
+    sample), such as creep, or a memory with a pole at z = 1. As many of the slowest are
+    left out together as change the response at ``angle`` by at most ``share`` of it.
+    What is left keeps its own gain at rest, not that of ``model``.
+    """
     A, B, C = (np.asarray(matrix) for matrix in (model.A, model.B, model.C))
-    if not 1 <= order <= len(A):
-        raise ValueError(f"order is {order}; it must be between 1 and {len(A)}")
+    rates = natural_rates(np.linalg.eigvals(A))
+    whole = _response(A, B, C, angle) + np.asarray(model.D)
+    for rate in np.unique(rates[rates < 0.1 * angle])[::-1]:
+        fast, slow = _split(A, B, C, float(rate))
+        if np.abs(_response(*slow, angle)).max() <= share * np.abs(whole).max():
+            return StateSpace(*fast, model.D, model.dt)
+    return model
+
+
+def natural_rates(poles: Sequence[complex] | np.ndarray) -> np.ndarray:
+    """Return the natural frequencies abs(log z) (rad a sample) of ``poles`` z.
+
+    That of a pole at 0, a pure delay, is infinite.
+    """
+    with np.errstate(divide="ignore"):
+        return np.abs(np.log(np.asarray(poles, dtype=complex)))
+
+
+class _Balance(NamedTuple):
+    """Change into balanced coordinates and back, largest Hankel value first."""
+
+    hankel: np.ndarray
+    into: np.ndarray
+    out: np.ndarray
+    connected: int
+
+    def truncated(self, model: StateSpace, order: int) -> Reduction:
+        A, B, C = (np.asarray(matrix) for matrix in (model.A, model.B, model.C))
+        scale = np.sqrt(self.hankel[:order])
+        into, out = self.into[:, :order].T / scale[:, None], self.out[:, :order] / scale
+        kept = StateSpace(into @ A @ out, into @ B, C @ out, model.D, model.dt)
+        return Reduction(kept, self.hankel, 2.0 * float(np.sum(self.hankel[order:])))
+
+
+def _balance(model: StateSpace) -> _Balance:
+    A, B, C = (np.asarray(matrix) for matrix in (model.A, model.B, model.C))
     radius = np.abs(np.linalg.eigvals(A)).max()
     if radius >= 1.0:
         raise ValueError(
@@ -48,18 +120,43 @@ def balanced_reduction(model: StateSpace, order: int) -> Reduction:
     shown = _root(linalg.solve_discrete_lyapunov(A.T, C.T @ C))
     left, hankel, right = np.linalg.svd(shown.T @ reached)
     connected = int(np.sum(hankel > len(A) * np.finfo(float).eps * hankel[0]))
-    if order > connected:
-        raise ValueError(
-            f"order is {order}; only {connected} states connect inputs and outputs"
-        )
-    scale = np.sqrt(hankel[:order])
-    into = (shown @ left[:, :order] / scale).T
-    out = reached @ right[:order].T / scale
-    reduced = StateSpace(into @ A @ out, into @ B, C @ out, model.D, model.dt)
-    return Reduction(reduced, hankel, 2.0 * float(np.sum(hankel[order:])))
+    return _Balance(hankel, shown @ left, reached @ right.T, connected)
 
 
 def _root(gramian: np.ndarray) -> np.ndarray:
     """Return R with R R' = ``gramian``, which rounding may have made indefinite."""
     values, vectors = np.linalg.eigh(0.5 * (gramian + gramian.T))
     return vectors * np.sqrt(np.clip(values, 0.0, None))
+
+
+Matrices = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _split(
+    A: np.ndarray, B: np.ndarray, C: np.ndarray, rate: float
+) -> tuple[Matrices, Matrices]:
+    """Return the modes faster than ``rate``, and those that are not, in parallel."""
+
+    # A lambda: SciPy counts the arguments, which a decorator would hide.
+    ordered: Any = linalg.schur(
+        A,
+        output="real",
+        sort=lambda x, y: bool(natural_rates([complex(x, y)])[0] > 1.000001 * rate),
+    )
+    schur, basis, count = ordered
+    fast, slow = slice(0, count), slice(count, None)
+    B, C = basis.T @ B, C @ basis
+    # The Sylvester equation takes the coupling out of the triangular form.
+    X = linalg.solve_sylvester(
+        schur[fast, fast], -schur[slow, slow], -schur[fast, slow]
+    )
+    return (
+        (schur[fast, fast], B[fast] - X @ B[slow], C[:, fast]),
+        (schur[slow, slow], B[slow], C[:, fast] @ X + C[:, slow]),
+    )
+
+
+def _response(A: np.ndarray, B: np.ndarray, C: np.ndarray, angle: float) -> np.ndarray:
+    """Return ``C (z I - A)^-1 B`` at z = exp(i ``angle``)."""
+    z = np.exp(1j * angle)
+    return C @ np.linalg.solve(z * np.eye(len(A)) - A, B + 0j)

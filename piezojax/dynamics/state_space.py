@@ -11,6 +11,7 @@ from scipy import linalg
 
 from ..core.arrays import Matrix, as_array, as_matrix, check
 from ..core.system import System
+from .arma import ARMA
 
 INNERMOST = 1.0 - 1e-6
 """Largest modulus that ``stabilised`` gives to a pole it has moved."""
@@ -83,6 +84,24 @@ class StateSpace(System):
         if np.any(np.asarray(self.D)):
             raise ValueError("D is not zero; an input must not reach its own sample")
         return StateSpace(self.A, self.B, self.C @ self.A, self.C @ self.B, self.dt)
+
+    def as_arma(self) -> ARMA:
+        """Return the difference equation of a model with one input and one output.
+
+        The order stays. Raises ValueError for several inputs or outputs.
+        """
+        outputs, inputs = self.D.shape
+        if (outputs, inputs) != (1, 1):
+            raise ValueError(
+                f"the model has {inputs} inputs and {outputs} outputs; "
+                "a difference equation is for one of each"
+            )
+        A, B, C, D = (np.asarray(m) for m in (self.A, self.B, self.C, self.D))
+        if self.order == 0:
+            return ARMA((), (D[0, 0],))
+        denominator = np.poly(A)
+        numerator = np.poly(A - B @ C) + (float(D[0, 0]) - 1.0) * denominator
+        return ARMA(-denominator[1:], numerator)
 
     def delayed(self) -> "StateSpace":
         """Return the model with its input a sample later: D = 0, and m states more.

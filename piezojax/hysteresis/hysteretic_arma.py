@@ -1,5 +1,7 @@
 """Hysteresis and dynamics in one model that is linear in all parameters but one."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +28,8 @@ class HystereticARMA(Hysteresis):
     Raises ValueError for ``c >= 0``, non-finite coefficients, numerators of different
     length or an unknown scheme.
     """
+
+    dynamic: ClassVar[bool] = True
 
     c: Scalar = eqx.field(converter=as_array)
     autoregressive: tuple[Scalar, ...] = eqx.field(converter=as_scalars)

@@ -1,6 +1,6 @@
 """A mass on a spring, a damper and a hysteretic element."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,6 +30,8 @@ class HystereticOscillator(Hysteresis):
 
     Raises ValueError unless mass, stiffness and dt are positive and damping is finite.
     """
+
+    dynamic: ClassVar[bool] = True
 
     mass: Scalar = eqx.field(converter=as_array)
     damping: Scalar = eqx.field(converter=as_array)

@@ -39,6 +39,7 @@ class LearnedOperator(Hysteresis):
     """
 
     before: ClassVar[str | None] = "rest_input"
+    dynamic: ClassVar[bool] = True
 
     autoregressive: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
     linear: tuple[Scalar, ...] = eqx.field(converter=as_scalars)

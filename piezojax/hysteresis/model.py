@@ -18,9 +18,13 @@ class Hysteresis(System):
     ``before`` names the field that holds the input in force before a record begins, if
     the model has one; a free run then starts at rest under that input, otherwise at
     rest under the record's first input.
+
+    ``dynamic`` says that the output may go on while the input rests: the model holds
+    dynamics that cannot be separated from the hysteresis.
     """
 
     before: ClassVar[str | None] = None
+    dynamic: ClassVar[bool] = False
 
     @abc.abstractmethod
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

@@ -72,7 +72,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         path.parent,
         CONTROLLERS,
         study.rate,
-        design=lambda name: DESIGNS[one_of(name, DESIGNS)](plant, study.dt),
+        design=lambda name: _designed(study, name, plant),
     )
     zero = _per_axis(study, lambda axis: as_array(0.0))
     _check_role(plant, zero, "plant", "a voltage to a displacement")
@@ -126,6 +126,19 @@ def _per_axis(study: Study, make: Callable[[int], Any]) -> Any:
     if study.axes is None:
         return make(0)
     return tuple(make(axis) for axis in range(study.axis_count))
+
+
+def _designed(study: Study, name: str, plant: System) -> System:
+    design = DESIGNS[one_of(name, DESIGNS)]
+    if study.axes is not None:
+        raise ValueError(
+            f"designs are for one axis; the study has {study.axis_count}: give the "
+            "controller as catalog, file or type"
+        )
+    (lower,), (upper,) = (
+        study.by_axis(limit) for limit in (study.actuator.lower, study.actuator.upper)
+    )
+    return design(plant, study.dt, (lower, upper))
 
 
 def _systems(study: Study, make: Callable[[int], System]) -> System:

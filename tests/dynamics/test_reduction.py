@@ -13,6 +13,7 @@ from piezojax.dynamics import (
     SecondOrderLag,
     StateSpace,
     balanced_reduction,
+    fast_part,
     observability_form,
 )
 
@@ -122,8 +123,10 @@ def test_as_many_states_as_rows_are_the_printed_form(chapter, lags):
 def test_a_controller_on_such_a_model_stabilises_it(order):
     model = observability_form(balanced_reduction(WHOLE, order).model)
     unit = np.eye(3)
-    controller = pj.control.MultiAxisSlidingMode(
-        pj.control.SwitchingPID(0.5 * unit, 20.0 * unit, 0.0 * unit, dt=p558.DT),
+    controller = pj.control.MultiAxisSlidingModePID(
+        proportional=0.5 * unit,
+        integral=20.0 * unit,
+        derivative=0.0 * unit,
         reaching=0.9 * unit,
         decoupling=-0.3 * unit,
         surface=(unit, unit, unit),
@@ -153,3 +156,69 @@ def test_what_is_refused():
     )
     with pytest.raises(ValueError, match="cannot be observed in 2 samples"):
         observability_form(twice)
+
+
+def response(model, angle):
+    z = np.exp(1j * angle)
+    A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
+    return (C @ np.linalg.solve(z * np.eye(len(A)) - A, B + 0j) + D)[0, 0]
+
+
+def single(poles, residues, through):
+    """sum_i residues[i] / (z - poles[i]) + through, in mixed coordinates."""
+    change = np.random.default_rng(3).normal(size=(len(poles),) * 2)
+    return StateSpace(
+        change @ np.diag(poles) @ np.linalg.inv(change),
+        change @ np.ones((len(poles), 1)),
+        np.array([residues]) @ np.linalg.inv(change),
+        [[through]],
+        1e-3,
+    )
+
+
+def test_creep_and_memory_are_left_out_of_the_fast_part():
+    # A lag of 3 samples, creep by 10 % in 1000 and 5 % in 5000 samples, a memory.
+    lag, creep, slower = np.exp([-1 / 3, -1 / 1000, -1 / 5000])
+    whole = single(
+        [lag, creep, slower, 1.0],
+        [1 - lag, 0.1 * (1 - creep), 0.05 * (1 - slower), 0.0],
+        0.2,
+    )
+    fast = fast_part(whole, 0.1)
+    np.testing.assert_allclose(fast.poles(), [lag], rtol=1e-9)
+    assert float(fast.dc_gain()[0, 0]) == pytest.approx(1.2, rel=1e-6)
+    assert response(fast, 0.1) == pytest.approx(response(whole, 0.1), rel=0.02)
+
+
+def test_a_slow_plant_keeps_its_dynamics():
+    # The lag is slow, but it is what the plant does at the angle; its creep is not.
+    lag, creep = np.exp([-1 / 300, -1 / 30_000])
+    whole = single([lag, creep], [1 - lag, 0.1 * (1 - creep)], 0.0)
+    np.testing.assert_allclose(fast_part(whole, 0.1).poles(), [lag], rtol=1e-9)
+    alone = single([lag], [1 - lag], 0.0)
+    assert fast_part(alone, 0.1) is alone
+    integrator = single([1.0], [0.1], 0.0)
+    assert fast_part(integrator, 0.1) is integrator
+
+
+def test_no_more_states_than_connect():
+    lag = single([0.7], [0.3], 0.0)
+    assert pj.dynamics.reduced(lag, 2) is lag
+    hidden = single([0.7, 0.5, 0.2], [0.3, 0.0, 0.0], 0.1)
+    found = pj.dynamics.reduced(hidden, 2)
+    np.testing.assert_allclose(found.poles(), [0.7], rtol=1e-9)
+    assert response(found, 0.4) == pytest.approx(response(hidden, 0.4), rel=1e-9)
+    three = single([0.9, 0.5, -0.3], [0.1, 0.2, 0.05], 0.1)
+    expected = balanced_reduction(three, 2).model
+    np.testing.assert_allclose(pj.dynamics.reduced(three, 2).A, expected.A)
+
+
+def test_a_difference_equation_has_the_same_response():
+    model = single([0.9, 0.5, -0.3], [0.1, 0.2, 0.05], 0.1)
+    arma = model.as_arma()
+    z = np.exp(0.4j)
+    numerator = np.polyval(arma.moving, z)
+    denominator = np.polyval([1.0, *(-float(a) for a in arma.autoregressive)], z)
+    assert numerator / denominator == pytest.approx(response(model, 0.4), rel=1e-9)
+    with pytest.raises(ValueError, match="the model has 3 inputs and 3 outputs"):
+        WHOLE.as_arma()

@@ -162,24 +162,31 @@ MUTATIONS = (
     ),
     # Controllers
     Mutation(
-        "sign of D of the sliding variable",
-        "control/switching.py",
-        "i - p - d / self.dt",
-        "i - p + d / self.dt",
+        "sign of D, multi-axis",
+        "control/multi_axis.py",
+        "                product(self.derivative, slope),",
+        "                product(self.derivative, tuple(-x for x in slope)),",
+        _MULTI_AXIS,
+    ),
+    Mutation(
+        "sign of D, nominal",
+        "control/nominal.py",
+        "- self.derivative * (sliding",
+        "+ self.derivative * (sliding",
         _MULTI_AXIS,
     ),
     Mutation(
         "integral used one sample late",
-        "control/switching.py",
-        "            integral,\n            _times(self.proportional, input)",
-        "            state.integral,\n            _times(self.proportional, input)",
+        "control/sliding_mode.py",
+        "            integral\n            - self.proportional * s",
+        "            state.integral\n            - self.proportional * s",
         (_LOOPS,),
     ),
     Mutation(
         "start with a bump of 2 %",
         "control/sliding_mode.py",
-        "needed = applied *",
-        "needed = 1.02 * applied *",
+        "needed = input.applied *",
+        "needed = 1.02 * input.applied *",
         (_LOOPS, "-k", "away_from_zero"),
     ),
     Mutation(
@@ -240,9 +247,9 @@ MUTATIONS = (
     ),
     Mutation(
         "half the width",
-        "control/switching.py",
-        "jnp.clip(sliding / self.width",
-        "jnp.clip(2.0 * sliding / self.width",
+        "control/boundary_layer.py",
+        "jnp.clip(input / self.width",
+        "jnp.clip(2.0 * input / self.width",
         ("tests/control/test_boundary_layer.py",),
     ),
     # Models

@@ -11,13 +11,13 @@ import piezojax as pj
 from piezojax.analysis.stability import (
     broken_loop,
     closed_loop_poles,
-    linearise,
     loop_response,
     open_loop,
     sensitivity_peak,
 )
 from piezojax.catalog import p753
 from piezojax.core.system import LoopInput
+from piezojax.dynamics import linearise
 from piezojax.report.bode import compared, write_stability
 
 a, b, c = published.HYSTERESIS

@@ -12,8 +12,8 @@ from ...core.arrays import Scalar, ScalarLike, as_array
 from ...core.rollout import simulate
 from ...core.system import Feedback, System
 from ...dynamics import StateSpace
+from ...dynamics.linearise import linearise
 from ..stability.conserved import LinearLoop, without_conserved
-from ..stability.linearise import linearise
 
 _CHUNK = 2048  # points of the circle at a time: few states, little memory
 _ROUNDS = 8

@@ -8,7 +8,6 @@ from .differentiable import closed_loop_poles as closed_loop_poles
 from .differentiable import loop_response as loop_response
 from .differentiable import sensitivity_peak as sensitivity_peak
 from .impulse import sensitivity as sensitivity
-from .linearise import linearise as linearise
 from .margins import StabilityReport as StabilityReport
 from .margins import report_of as report_of
 from .multi_axis import MultiAxisReport as MultiAxisReport

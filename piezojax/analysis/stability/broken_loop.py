@@ -10,8 +10,8 @@ import numpy as np
 from ...core.arrays import ScalarLike, Signal, State, as_signal
 from ...core.system import Affine, Feedback, LoopState, Observation, System
 from ...dynamics import StateSpace
+from ...dynamics.linearise import linearise, sample_time
 from ...hardware import Saturation
-from .linearise import linearise, sample_time
 
 BRANCHES = {"ascending": 1.0, "descending": -1.0}
 """Ways in which the plant's input may be about to move, by name."""

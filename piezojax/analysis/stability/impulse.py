@@ -16,8 +16,8 @@ from jaxtyping import Array, Complex, Float
 from ...core.arrays import Scalar, ScalarLike, State, as_array
 from ...core.rollout import simulate
 from ...core.system import Feedback, LoopState, System
+from ...dynamics.linearise import parted
 from .broken_loop import BRANCHES, BrokenLoop, cut, loop_sample_time, side_of
-from .linearise import parted
 
 DURATION = 0.2
 """Length of the impulse response, s: what is slower than that rings on unseen, and

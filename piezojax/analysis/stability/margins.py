@@ -12,10 +12,10 @@ import numpy as np
 from ...core.arrays import Scalar, ScalarLike, Signal, as_array, as_signal
 from ...core.system import Feedback, LoopState
 from ...dynamics import StateSpace
+from ...dynamics.linearise import linearise
 from .broken_loop import check_operating_point, cut, loop_sample_time, side_of
 from .conserved import LinearAxes, LinearLoop, balanced, without_conserved
 from .crossings import angle_grid, peak, roots
-from .linearise import linearise
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from ...core.arrays import as_array
 from ...core.progress import Progress
 from ...core.rollout import simulate
 from ...core.system import Affine, System, series
-from ...dynamics import ARMA, StateSpace, stacked
+from ...dynamics import StateSpace, stacked
 from ..records.record import Record
 from ..records.resample import whole_periods
 from .estimate import Estimate, FittedParameter, LinearDetail, Options
@@ -171,7 +171,7 @@ def _linear(
         gain = float(stage.dc_gain()[0, 0])
         offset = float(centre.output[0] - gain * centre.input[0])
         system: System = series(
-            dynamics=_as_arma(plant), calibration=Affine(1.0, offset)
+            dynamics=plant.as_arma(), calibration=Affine(1.0, offset)
         )
     else:
         system = plant
@@ -182,11 +182,3 @@ def _linear(
     return Estimate(
         system, runs, named, warnings, 2 * stage.order, linear=detail, count=int(count)
     )
-
-
-def _as_arma(model: StateSpace) -> ARMA:
-    """The difference equation of a model with one input and one output."""
-    A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
-    denominator = np.poly(A)
-    numerator = np.poly(A - B @ C) + (float(D[0, 0]) - 1.0) * denominator
-    return ARMA(-denominator[1:], numerator)

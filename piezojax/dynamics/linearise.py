@@ -9,10 +9,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ...core.arrays import State
-from ...core.paths import static_fields
-from ...core.system import Learned, System
-from ...dynamics import StateSpace
+from ..core.arrays import State
+from ..core.paths import static_fields
+from ..core.system import Learned, System
+from .state_space import StateSpace
 
 
 def linearise(
@@ -33,7 +33,7 @@ def linearise(
     the parts of the system. Where a step has a kink, as hysteresis has at rest, the
     derivative is the one JAX takes at that very point: that of the ascending branch for
     Coleman-Hodgdon models, the mean of both for a play operator. An ``input`` a little
-    to one side of the point picks the branch; ``broken_loop`` does that.
+    to one side of the point picks the branch.
 
     Usable inside ``jax.jit`` and differentiable. Raises ValueError where the parts of
     the system name no sample time or several, and ``dt`` is not given.
