@@ -447,7 +447,7 @@ def test_the_model_is_a_plant_for_a_study(identified, tmp_path):
         rate=1000.0,
         plant={"file": "model.json"},
         controller={"design": "inversion_sliding_mode"},
-        parameters={"controller.feedback.integral": {"lower": 1e-3, "upper": 1e6}},
+        parameters={"controller.feedback.law.integral": {"lower": 1e-3, "upper": 1e6}},
     )
     case = read(path)
     assert float(case.loop.plant.parts[0].b) == float(model.parts[0].b)

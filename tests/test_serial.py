@@ -357,7 +357,7 @@ def test_bad_values(data, message):
 @pytest.mark.parametrize(
     ("part", "message"),
     [
-        ({"type": "Delay", "samples": -1}, "system.parts.1: delay in samples is -1"),
+        ({"type": "Delay", "samples": -1}, "system.parts.1: samples is -1"),
         ({"type": "Dealy", "samples": 1}, "system.parts.1.type is 'Dealy'; it must"),
         ({"type": "Delay", "smaples": 1}, "system.parts.1.smaples is unknown; Delay"),
         ({"samples": 1}, "system.parts.1 needs a key 'type'; one of ARMA"),
@@ -423,9 +423,9 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
 # leads to is therefore seen in a process of its own.
 ALPHA_BETA = {"type": "AlphaBeta", "alpha": 0.1, "beta": 0.1, "dt": 1e-4}
 SLIDING_MODE = {
-    "type": "SlidingModePID",
-    **dict.fromkeys(("proportional", "integral", "derivative", "surface"), 1.0),
-    **dict.fromkeys(("error_weight", "control_weight"), 1.0),
+    "type": "SlidingMode",
+    "law": {"type": "BangBang", "gain": 1.0},
+    **dict.fromkeys(("surface", "error_weight", "control_weight"), 1.0),
 }
 WRONG_TYPES = {
     "a number for a system": {"type": "InverseColemanHodgdon", "model": 3},

@@ -129,7 +129,7 @@ def test_negative_delay_is_refused():
 
 def test_fractional_delay_is_refused():
     # While the tests run, the check of the annotations comes first.
-    message = r"delay in samples is 1\.5; it must be whole|parameter 'samples'"
+    message = r"samples is 1\.5; it must be whole|parameter 'samples'"
     with pytest.raises((ValueError, TypeError), match=message):
         Delay(1.5)
 

@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 
 from ..control.anticipation import Anticipation
-from ..control.multi_axis import MultiAxisSlidingModePID
-from ..core.axes import PerAxis
+from ..control.multi_axis import MultiAxisSlidingMode
+from ..control.switching import SwitchingPID
+from ..core.axes import PerAxis, as_matrices, as_rows, diagonal
 from ..core.system import Feedback, System
 from ..dynamics import MatrixARMA, SecondOrderLag, StateSpace, observability_form
 from ..hardware import Saturation, Sensor
@@ -82,7 +83,7 @@ def stage(order: int = 12) -> MatrixARMA:
     return observability_form(model(order).delayed())
 
 
-def multi_axis() -> MultiAxisSlidingModePID:
+def multi_axis() -> MultiAxisSlidingMode:
     """Return the control of chapter 7 on the model of 12 states and a sample's delay.
 
     ``SURFACE``, ``REACHING``, ``PROPORTIONAL`` and ``INTEGRAL`` are ours: from a random
@@ -97,13 +98,11 @@ def multi_axis() -> MultiAxisSlidingModePID:
     scale = _surface_scale(plant)
     unit = np.eye(3)
     lags = FREQUENCY, DAMPING, DT
-    return MultiAxisSlidingModePID(
-        proportional=PROPORTIONAL * unit,
-        integral=INTEGRAL * unit,
-        derivative=0.0 * unit,
-        reaching=np.diag(REACHING),
-        decoupling=0.0 * unit,
-        surface=tuple(scale @ np.diag(weights) for weights in SURFACE),
+    return MultiAxisSlidingMode(
+        SwitchingPID(PROPORTIONAL * unit, INTEGRAL * unit, 0.0 * unit, dt=DT),
+        reaching=diagonal(REACHING),
+        decoupling=as_rows(0.0 * unit),
+        surface=as_matrices(scale @ np.diag(weights) for weights in SURFACE),
         model=plant,
         reference_model=PerAxis(tuple(SecondOrderLag(*lags) for _ in range(3))),
     )

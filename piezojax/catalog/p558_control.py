@@ -11,9 +11,10 @@ from ..control.alpha_beta import AlphaBeta
 from ..control.anticipation import Anticipation
 from ..control.disturbance_observer import DisturbanceObserverControl
 from ..control.filtered import Filtered
-from ..control.multi_axis import MultiAxisSlidingModePID
-from ..control.nominal import NominalSlidingModePID
+from ..control.multi_axis import MultiAxisSlidingMode
+from ..control.nominal import NominalSlidingMode
 from ..control.pid import PID
+from ..control.switching import SwitchingPID
 from ..core.axes import PerAxis, diagonal
 from ..core.system import Feedback, System
 from ..dynamics import ARMA, Channels, SecondOrderLag, channels_of, observability_form
@@ -106,10 +107,14 @@ def multi_axis(gains: str = "dynamic", filtered: bool = True) -> System:
     """
     chosen = _one_of(MULTI_AXIS_GAINS, gains)
     scale = (SURFACE**2, 2.0 * SURFACE, 1.0)
-    controller = MultiAxisSlidingModePID(
-        proportional=diagonal(chosen["proportional"]),
-        integral=diagonal(chosen["integral"]),
-        derivative=diagonal((0.0, 0.0, 0.0)),
+    law = SwitchingPID(
+        diagonal(chosen["proportional"]),
+        diagonal(chosen["integral"]),
+        diagonal((0.0, 0.0, 0.0)),
+        dt=DT,
+    )
+    controller = MultiAxisSlidingMode(
+        law,
         reaching=diagonal(REACHING),
         decoupling=DECOUPLING,
         surface=tuple(diagonal((s, s, s)) for s in scale),
@@ -138,7 +143,7 @@ def anticipating_disturbance_observer() -> System:
 def nominal(arx: str = "repaired", filtered: bool = True, **options: Any) -> System:
     """Return a nominal PID-based sliding mode control on each axis, Table 8-1.
 
-    ``arx`` is "repaired" or "printed"; ``options`` are of ``NominalSlidingModePID``.
+    ``arx`` is "repaired" or "printed"; ``options`` are of ``NominalSlidingMode``.
     """
     return _per_axis("nominal", arx, filtered, options)
 
@@ -159,13 +164,15 @@ def _per_axis(name: str, arx: str, filtered: bool, options: dict[str, Any]) -> S
     gains = NOMINAL_GAINS[name]
     parts = []
     for axis, model in enumerate(arx_models(arx)):
-        part: System = NominalSlidingModePID(
-            **{key: values[axis] for key, values in gains.items()},
-            derivative=0.0,
+        law = SwitchingPID(
+            gains["proportional"][axis], gains["integral"][axis], 0.0, dt=DT
+        )
+        part: System = NominalSlidingMode(
+            law,
+            control_weight=gains["control_weight"][axis],
             surface=NOMINAL_SURFACE,
             error_weight=1.0,
             model=model,
-            dt=DT,
             **options,
         )
         if name == "disturbance_observer":

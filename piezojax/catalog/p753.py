@@ -4,8 +4,6 @@ Every number carries its equation or table in Y. Cao's thesis (2013). All sets h
 20 kHz unless their name says otherwise.
 """
 
-from typing import Any
-
 import numpy as np
 
 from ..control import (
@@ -17,7 +15,8 @@ from ..control import (
     InversionControl,
     KalmanFilter,
     Observer,
-    SlidingModePID,
+    SlidingMode,
+    SwitchingPID,
     first_order_weight,
     mixed_sensitivity,
 )
@@ -177,10 +176,10 @@ def kalman(model: ARMA) -> KalmanFilter:
 
 
 def _sliding_mode(
-    model: ARMA, gains: dict[str, Any], observer: Observer | None = None
-) -> SlidingModePID:
-    return SlidingModePID(
-        **gains,
+    model: ARMA, gains: dict[str, float], observer: Observer | None = None
+) -> SlidingMode:
+    return SlidingMode(
+        SwitchingPID(**gains, dt=DT),
         surface=SURFACE,
         error_weight=ERROR_WEIGHT,
         control_weight=CONTROL_WEIGHT,
@@ -189,7 +188,7 @@ def _sliding_mode(
     )
 
 
-def sliding_mode(table: str = "5-2") -> SlidingModePID:
+def sliding_mode(table: str = "5-2") -> SlidingMode:
     """Return the nominal PID-based SMC with the printed gains, um to V."""
     return _sliding_mode(ARMA(**DYNAMICS_FROM_VOLTAGE), GAINS[table]["pid"])
 
@@ -263,7 +262,7 @@ def pid() -> PID:
     return PID(0.5, 3000.0, 0.0, 1e-4, 100.0, dt=DT)
 
 
-def kalman_sliding_mode(table: str = "5-2") -> SlidingModePID:
+def kalman_sliding_mode(table: str = "5-2") -> SlidingMode:
     """Return ``sliding_mode`` with a Kalman filter for its alpha-beta filter."""
     model = ARMA(**DYNAMICS_FROM_VOLTAGE)
     return _sliding_mode(model, GAINS[table]["pid"], kalman(model))

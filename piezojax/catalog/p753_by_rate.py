@@ -19,11 +19,10 @@ from ..control import (
     PID,
     AlphaBeta,
     BangBang,
-    ContinuousSlidingModePID,
+    ContinuousSlidingMode,
     DisturbanceObserverControl,
     InversionControl,
-    SlidingModePID,
-    SwitchedSlidingMode,
+    SlidingMode,
 )
 from ..core.system import Series, System, series
 from ..dynamics import ARMA, scaled_to_dc
@@ -118,24 +117,28 @@ def ziegler_nichols(rate: int = 20_000) -> PID:
     )
 
 
-def traditional(rate: int = 20_000) -> SlidingModePID:
+def traditional(rate: int = 20_000) -> SlidingMode:
     """Return the traditional PID-SMC (Table 4-2: 1 and 20 kHz), um to V."""
     model = p753_chapter4.model(rate)
     near = _start("traditional", p753_chapter4.TRADITIONAL_GAINS, rate)
     gains = _scaled(p753_chapter4.TRADITIONAL_GAINS[near], near / rate)
-    return SlidingModePID(**gains, model=model, filter=_filter(near, rate))
+    return SlidingMode(
+        **p753_chapter4.with_law(gains, rate), model=model, filter=_filter(near, rate)
+    )
 
 
-def continuous(rate: int = 20_000) -> ContinuousSlidingModePID:
+def continuous(rate: int = 20_000) -> ContinuousSlidingMode:
     """Return the continuous PID-SMC (section 4.5.4.3: 5, 10 and 20 kHz), um to V."""
     p753_chapter4.model(rate)  # it has no model, but the stage has those rates
     near = _start("continuous", p753_chapter4.CONTINUOUS_GAINS, rate)
     printed = p753_chapter4.CONTINUOUS_GAINS[near] | {"surface": p753.SURFACE}
     gains = _scaled(printed, near / rate)
-    return ContinuousSlidingModePID(**gains, filter=_filter(near, rate))
+    return ContinuousSlidingMode(
+        **p753_chapter4.with_law(gains, rate), filter=_filter(near, rate)
+    )
 
 
-def bang_bang(rate: int = 20_000) -> SwitchedSlidingMode:
+def bang_bang(rate: int = 20_000) -> SlidingMode:
     """Return the nominal DSMC with bang-bang switching (1 and 20 kHz), um to V.
 
     K is printed, R by trial; the R of 1 with which ``p753_chapter4.bang_bang`` gives
@@ -144,7 +147,7 @@ def bang_bang(rate: int = 20_000) -> SwitchedSlidingMode:
     model = p753_chapter4.model(rate)
     near = _start("bang_bang", p753_chapter4.BANG_BANG_GAINS, rate)
     surface = p753_chapter4.TRADITIONAL_GAINS[near]["surface"]
-    return SwitchedSlidingMode(
+    return SlidingMode(
         BangBang(p753_chapter4.BANG_BANG_GAINS[near]),
         **_scaled({"surface": surface}, near / rate),
         error_weight=p753_chapter4.ERROR_WEIGHT,
@@ -169,7 +172,7 @@ def disturbance_observer(rate: int = 20_000) -> DisturbanceObserverControl:
     )
 
 
-def _behind_hysteresis(name: str, rate: int) -> SlidingModePID:
+def _behind_hysteresis(name: str, rate: int) -> SlidingMode:
     """Return chapter 5's PID-SMC, in um, for dynamics behind a hysteresis.
 
     Where (5.33) is not printed the model is the row of Table 4-1 at unit DC gain.
@@ -181,8 +184,8 @@ def _behind_hysteresis(name: str, rate: int) -> SlidingModePID:
         model = scaled_to_dc(model, 1.0)
     near = _start("chapter 5", (), rate)
     printed = p753.GAINS["5-2"][name] | {"surface": p753.SURFACE}
-    return SlidingModePID(
-        **_scaled(printed, near / rate),
+    return SlidingMode(
+        **p753_chapter4.with_law(_scaled(printed, near / rate), rate),
         error_weight=p753.ERROR_WEIGHT,
         control_weight=p753.CONTROL_WEIGHT,
         model=model,

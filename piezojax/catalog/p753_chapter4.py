@@ -11,11 +11,11 @@ from ..control import (
     AlphaBeta,
     Anticipation,
     BangBang,
-    ContinuousSlidingModePID,
-    ModelReferencePID,
+    ContinuousSlidingMode,
+    ModelReferenceSlidingMode,
     Observer,
-    SlidingModePID,
-    SwitchedSlidingMode,
+    SlidingMode,
+    SwitchingPID,
 )
 from ..core.arrays import ScalarLike
 from ..core.system import Feedback, Series, System, series
@@ -127,6 +127,13 @@ UNPRINTED_FILTER = (0.1, 1e-4)
 """Alpha and beta where none are printed: those of 20 kHz, an assumption."""
 
 
+def with_law(gains: Mapping[str, float], rate: int) -> dict[str, Any]:
+    """Return ``gains`` with P, I and D collected in a ``SwitchingPID`` at ``rate``."""
+    names = ("proportional", "integral", "derivative")
+    law = SwitchingPID(*(gains[name] for name in names), dt=1.0 / rate)
+    return {"law": law} | {k: v for k, v in gains.items() if k not in names}
+
+
 def alpha_beta(rate: int = 20_000) -> AlphaBeta:
     """Return the printed filter at ``rate``, or that of 20 kHz where there is none."""
     return AlphaBeta(*FILTERS.get(rate, UNPRINTED_FILTER), 1.0 / rate)
@@ -144,15 +151,15 @@ def model(rate: int = 20_000) -> ARMA:
 
 def model_reference(
     rate: int = 20_000, table: str = "4-4", filter: Observer | None = None
-) -> ModelReferencePID:
+) -> ModelReferenceSlidingMode:
     """Return the model-reference PID-SMC of ``table`` "4-3" or "4-4", um to V.
 
     ``filter`` stands in for the printed one. Raises ValueError for a rate or a table
     that is not printed.
     """
     gains = _printed("table", MODEL_REFERENCE_GAINS, table)
-    return ModelReferencePID(
-        **_printed("rate in Hz", gains, rate),
+    return ModelReferenceSlidingMode(
+        **with_law(_printed("rate in Hz", gains, rate), rate),
         surface=SURFACE,
         error_weight=ERROR_WEIGHT,
         model=model(rate),
@@ -166,18 +173,18 @@ def anticipating_model_reference(rate: int = 20_000) -> Anticipation:
     return Anticipation(model_reference(rate), (0.0,))
 
 
-def traditional(rate: int = 20_000) -> SlidingModePID:
+def traditional(rate: int = 20_000) -> SlidingMode:
     """Return the traditional PID-SMC of Table 4-2 (1 or 20 kHz), um to V."""
-    return SlidingModePID(
-        **_printed("rate in Hz", TRADITIONAL_GAINS, rate),
+    return SlidingMode(
+        **with_law(_printed("rate in Hz", TRADITIONAL_GAINS, rate), rate),
         model=model(rate),
         filter=alpha_beta(rate),
     )
 
 
-def bang_bang(rate: int = 20_000) -> SwitchedSlidingMode:
+def bang_bang(rate: int = 20_000) -> SlidingMode:
     """Return the nominal DSMC with bang-bang switching (1 or 20 kHz), um to V."""
-    return SwitchedSlidingMode(
+    return SlidingMode(
         BangBang(_printed("rate in Hz", BANG_BANG_GAINS, rate)),
         surface=TRADITIONAL_GAINS[rate]["surface"],
         error_weight=ERROR_WEIGHT,
@@ -187,10 +194,10 @@ def bang_bang(rate: int = 20_000) -> SwitchedSlidingMode:
     )
 
 
-def continuous(rate: int = 20_000) -> ContinuousSlidingModePID:
+def continuous(rate: int = 20_000) -> ContinuousSlidingMode:
     """Return the continuous PID-SMC (5, 10 or 20 kHz), um to V."""
-    return ContinuousSlidingModePID(
-        **_printed("rate in Hz", CONTINUOUS_GAINS, rate),
+    return ContinuousSlidingMode(
+        **with_law(_printed("rate in Hz", CONTINUOUS_GAINS, rate), rate),
         surface=p753.SURFACE,
         filter=alpha_beta(rate),
     )

@@ -12,10 +12,11 @@ from ..control import (
     InverseFeedforward,
     LearningLaw,
     RepetitiveControl,
+    SlidingMode,
     SuperTwisting,
-    SwitchedSlidingMode,
+    SwitchingLaw,
 )
-from ..core.system import Affine, System
+from ..core.system import Affine
 from ..dynamics import ARMA, FirstOrderLag
 from ..hardware import ChargeDrive
 from ..hysteresis import InverseColemanHodgdon
@@ -37,8 +38,8 @@ CHARGE_TIME = 1.0
 """R C of amplifier and load, s: charge is followed from 0.16 Hz on."""
 
 
-def _switched(law: System) -> SwitchedSlidingMode:
-    return SwitchedSlidingMode(
+def _switched(law: SwitchingLaw) -> SlidingMode:
+    return SlidingMode(
         law=law,
         surface=p753.SURFACE,
         error_weight=p753.ERROR_WEIGHT,
@@ -52,12 +53,12 @@ def _inverse() -> InverseColemanHodgdon:
     return InverseColemanHodgdon(p753.hysteresis())
 
 
-def boundary_layer() -> SwitchedSlidingMode:
+def boundary_layer() -> SlidingMode:
     """Return sliding mode control with a boundary layer, um to V; gains ours."""
     return _switched(BoundaryLayer(**BOUNDARY_LAYER))
 
 
-def super_twisting() -> SwitchedSlidingMode:
+def super_twisting() -> SlidingMode:
     """Return super-twisting sliding mode control, um to V; gains ours."""
     return _switched(SuperTwisting(**SUPER_TWISTING, dt=p753.DT))
 

@@ -5,9 +5,6 @@ from .allocation import Allocated as Allocated
 from .allocation import Allocation as Allocation
 from .alpha_beta import AlphaBeta as AlphaBeta
 from .anticipation import Anticipation as Anticipation
-from .bang_bang import BangBang as BangBang
-from .boundary_layer import BoundaryLayer as BoundaryLayer
-from .continuous import ContinuousSlidingModePID as ContinuousSlidingModePID
 from .disturbance_observer import (
     DisturbanceObserverControl as DisturbanceObserverControl,
 )
@@ -22,9 +19,9 @@ from .iterative_learning import learn as learn
 from .kalman import KalmanFilter as KalmanFilter
 from .mixed_sensitivity import first_order_weight as first_order_weight
 from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
-from .model_reference import ModelReferencePID as ModelReferencePID
-from .multi_axis import MultiAxisSlidingModePID as MultiAxisSlidingModePID
-from .nominal import NominalSlidingModePID as NominalSlidingModePID
+from .model_reference import ModelReferenceSlidingMode as ModelReferenceSlidingMode
+from .multi_axis import MultiAxisSlidingMode as MultiAxisSlidingMode
+from .nominal import NominalSlidingMode as NominalSlidingMode
 from .observer import Motion as Motion
 from .observer import Observer as Observer
 from .pid import PID as PID
@@ -33,7 +30,11 @@ from .preview import direct_inverse as direct_inverse
 from .preview import stable_inverse as stable_inverse
 from .preview import zero_phase_inverse as zero_phase_inverse
 from .repetitive import RepetitiveControl as RepetitiveControl
-from .sliding_mode import SlidingModePID as SlidingModePID
+from .sliding_mode import ContinuousSlidingMode as ContinuousSlidingMode
+from .sliding_mode import SlidingMode as SlidingMode
 from .state_space_controller import StateSpaceController as StateSpaceController
-from .super_twisting import SuperTwisting as SuperTwisting
-from .switched import SwitchedSlidingMode as SwitchedSlidingMode
+from .switching import BangBang as BangBang
+from .switching import BoundaryLayer as BoundaryLayer
+from .switching import SuperTwisting as SuperTwisting
+from .switching import SwitchingLaw as SwitchingLaw
+from .switching import SwitchingPID as SwitchingPID

@@ -1,9 +1,9 @@
 """Alpha-beta filter: displacement and velocity from a noisy measurement."""
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, as_array, check
+from ..core.arrays import Scalar, as_array
+from ..core.parameter import parameter, sample_time
 from ..core.system import Observation
 from .observer import Motion, Observer
 
@@ -11,20 +11,28 @@ from .observer import Motion, Observer
 class AlphaBeta(Observer):
     """Fixed-gain observer of position and velocity (section 4.5.4.1).
 
-    Of an Observation only z(k) in um is looked at; output a Motion. ``alpha`` in (0, 1]
-    corrects the position, ``beta`` in (0, 2) the velocity, both without unit; ``dt`` in
-    s. A ramp is followed without lag only as fast as ``beta`` lets the velocity in;
-    until then the position lags by (1 - alpha) / alpha samples.
+    Uses only z(k) in um of an Observation; output a Motion. The position follows a ramp
+    without lag once ``beta`` has corrected the velocity; until then it lags by
+    (1 - alpha) / alpha samples.
     """
 
-    alpha: Scalar = eqx.field(converter=as_array)
-    beta: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
-
-    def __check_init__(self):
-        check("alpha", self.alpha, above=0.0, most=1.0)
-        check("beta", self.beta, least=0.0, below=2.0)
-        check("sample time in s", self.dt, above=0.0)
+    alpha: Scalar = parameter(
+        "1",
+        "share of the residual that corrects the position",
+        above=0.0,
+        most=1.0,
+        scale="logit",
+        typical=(0.02, 0.999),
+    )
+    beta: Scalar = parameter(
+        "1",
+        "share of the residual that corrects the velocity",
+        least=0.0,
+        below=2.0,
+        scale="log",
+        typical=(1e-9, 0.9),
+    )
+    dt: float = sample_time()
 
     def init(self, input: Observation) -> Motion:
         position = as_array(input.measured)

@@ -14,7 +14,8 @@ from .design_model import CROSSOVER, design_model
 from .disturbance_observer import DisturbanceObserverControl
 from .inversion import InversionControl
 from .pid import PID
-from .sliding_mode import SlidingModePID
+from .sliding_mode import SlidingMode
+from .switching import SwitchingPID
 
 Limits = tuple[float, float]
 
@@ -80,15 +81,14 @@ def inversion_pid(plant: System, dt: float, limits: Limits) -> InversionControl:
     return InversionControl(model.slowed(pid), inverse)
 
 
-def _sliding_mode(model: ARMA, dt: float, pace: float) -> SlidingModePID:
+def _sliding_mode(model: ARMA, dt: float, pace: float) -> SlidingMode:
     # Scaled from the printed P-753 set, whose surface is 0.9 / dt: the loop then
     # crosses over near 0.1 / dt whatever the rate, and ``pace`` times that if slowed.
     surface, weight = 0.5 / dt, 100.0
     scale = pace / model.dc_gain()
-    return SlidingModePID(
-        proportional=1e-3 * scale,
-        integral=CROSSOVER * weight / (dt * surface) * scale,
-        derivative=1e-3 * dt * scale,
+    integral = CROSSOVER * weight / (dt * surface)
+    return SlidingMode(
+        SwitchingPID(1e-3 * scale, integral * scale, 1e-3 * dt * scale, dt=dt),
         surface=surface,
         error_weight=1.0,
         control_weight=weight,

@@ -1,4 +1,4 @@
-"""PID-based sliding mode control by the model-reference design (section 4.5.3.3)."""
+"""Sliding mode control by the model-reference design (section 4.5.3.3)."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -6,11 +6,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, State, as_array, as_scalars, check
+from ..core.arrays import Scalar, State, as_array, as_scalars
+from ..core.parameter import parameter
 from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
 from .observer import Observer
-from .output_tracking import INVERSIONS, check_inversion
+from .output_tracking import check_inversion, inversion_gain
+from .switching import SwitchingLaw
 
 
 class ModelReferenceState(NamedTuple):
@@ -22,38 +24,40 @@ class ModelReferenceState(NamedTuple):
     errors: tuple[Scalar, ...]
     forward: tuple[Scalar, ...]
     feedback: tuple[Scalar, ...]
-    integral: Scalar
-    sliding: Scalar
+    law: State
 
 
-class ModelReferencePID(System):
+class ModelReferenceSlidingMode(System):
     """Makes a model of any order n follow a reference model with output y_d.
 
     With e = y - y_d, the output y from ``filter``, the sliding variable is
     ``s(k) = surface[0] e(k-n+1) + ... + surface[n-2] e(k-1) + e(k)`` in um, (4.41) at
-    the last n errors that are known: the printed one holds e(k+1), which is not. The
-    voltage is u1 + u_eq + du, of which u1 moves ``model`` (a_1, ..., a_n | b_0, ...,
-    b_0 not zero) along y_d (4.32), u_eq takes s to zero (4.42) and du is a PID of s
-    (4.43) with ``proportional`` in V/um, ``integral`` in V/(um s) and ``derivative``
-    in V s/um. Both u1 and u_eq divide by b_0, in the form ``inversion`` of
-    ``INVERSIONS`` with the weights ``error_weight`` Q and ``control_weight`` R; du does
-    not. ``reference_model`` turns r(k) into y_d(k+1), so that y_d is late by a sample
-    and its own lag: ``Anticipation`` makes up for that.
+    the last n known errors: the printed one holds e(k+1), which is not known. The
+    voltage is u1 + u_eq + du: u1 moves ``model`` (a_1, ..., a_n | b_0, ..., b_0 not
+    zero) along y_d (4.32), u_eq takes s to zero (4.42) and du is the output of ``law``
+    in V, a ``SwitchingPID`` in (4.43). Both u1 and u_eq divide by b_0, in the form
+    ``inversion`` of ``INVERSIONS``; du does not. ``reference_model`` turns r(k) into
+    y_d(k+1), so y_d is late by a sample and by its own lag: ``Anticipation`` makes up
+    for that.
 
-    Input an Observation (the next reference is not looked at), output in V. Raises
-    ValueError for a model without a_1, a surface of another length than n - 1, b_0 = 0,
-    Q <= 0, R < 0 or an unknown inversion.
+    Input an Observation, whose next reference is not used; output in V. Raises
+    ValueError for a model without a_1, a surface of another length than n - 1, b_0 = 0
+    or an unknown inversion.
     """
 
-    proportional: Scalar = eqx.field(converter=as_array)
-    integral: Scalar = eqx.field(converter=as_array)
-    derivative: Scalar = eqx.field(converter=as_array)
-    surface: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    error_weight: Scalar = eqx.field(converter=as_array)
-    control_weight: Scalar = eqx.field(converter=as_array)
+    law: SwitchingLaw
     model: ARMA
     reference_model: System
     filter: Observer
+    surface: tuple[Scalar, ...] = parameter(
+        "1", "weights of older errors in s", typical=(-0.99, 0.99), converter=as_scalars
+    )
+    error_weight: Scalar = parameter(
+        "1", "weight Q of the inversion", above=0.0, scale="log", typical=(1e-2, 1e2)
+    )
+    control_weight: Scalar = parameter(
+        "1", "weight R of the inversion", least=0.0, scale="log", typical=(1e-4, 1e3)
+    )
     inversion: str = eqx.field(static=True, default="tikhonov")
 
     def __check_init__(self):
@@ -65,18 +69,14 @@ class ModelReferencePID(System):
                 f"surface holds {len(self.surface)} weights; it must hold {order - 1} "
                 f"for a model of order {order}"
             )
-        check("proportional in V/um", self.proportional)
-        check("integral in V/(um s)", self.integral)
-        check("derivative in V s/um", self.derivative)
-        check("surface", self.surface)
-        check_inversion(
-            self.inversion, self.model, self.error_weight, self.control_weight
-        )
+        check_inversion(self.inversion, self.model)
 
     def _inverse(self, wanted: Scalar, past: tuple[Scalar, ...]) -> Scalar:
         """Return the input that makes the model add ``wanted`` (um) to its output."""
-        b0, *later = self.model.moving
-        gain = INVERSIONS[self.inversion](b0, self.error_weight, self.control_weight)
+        later = self.model.moving[1:]
+        gain = inversion_gain(
+            self.inversion, self.model, self.error_weight, self.control_weight
+        )
         return gain * (wanted - _dot(later, past))
 
     def _advanced(self, outputs: tuple[Scalar, ...]) -> Scalar:
@@ -105,14 +105,13 @@ class ModelReferencePID(System):
             errors=errors[1:],
             forward=(forward,) * lags,
             feedback=(feedback,) * lags,
-            integral=feedback - slope * feedback,  # s = 0: the rest is u_eq
-            sliding=self._sliding(errors),
+            # The rest of the feedback is u_eq.
+            law=self.law.start(self._sliding(errors), feedback - slope * feedback),
         )
 
     def step(
         self, state: ModelReferenceState, input: Observation
     ) -> tuple[ModelReferenceState, Scalar]:
-        dt = self.filter.dt
         filter_state, motion = self.filter.step(state.filter, input)
         errors = (motion.position - state.desired[0], *state.errors)
         reference_model, following = self.reference_model.step(
@@ -126,12 +125,7 @@ class ModelReferencePID(System):
         # S A_e delta: each error one sample older, the newest as the model has it.
         kept = _dot(reversed(self.surface), errors)
         equivalent = self._inverse(-(self._advanced(errors) + kept), state.feedback)
-        integral = state.integral - self.integral * dt * sliding
-        switching = (
-            integral
-            - self.proportional * sliding
-            - self.derivative * (sliding - state.sliding) / dt
-        )
+        law, switching = self.law.step(state.law, sliding)
         feedback = equivalent + switching
 
         state = ModelReferenceState(
@@ -141,8 +135,7 @@ class ModelReferencePID(System):
             errors=errors[:-1],
             forward=(forward, *state.forward)[: len(state.forward)],
             feedback=(feedback, *state.feedback)[: len(state.feedback)],
-            integral=integral,
-            sliding=sliding,
+            law=law,
         )
         return state, forward + feedback
 

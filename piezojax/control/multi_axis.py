@@ -1,8 +1,7 @@
-"""PID-based sliding mode control of square multi-axis stages (chapter 7)."""
+"""Sliding mode control of square multi-axis stages (chapter 7)."""
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -20,16 +19,18 @@ from ..core.axes import (
     plus,
     product,
 )
+from ..core.parameter import declarations, parameter
 from ..core.system import Designed, Observation, System
 from ..dynamics.matrix_arma import MatrixARMA
+from .switching import SwitchingLaw
 
 
 class MultiAxisState(NamedTuple):
     """Histories newest first, in the units of the axes; commands likewise.
 
     ``desired`` holds y_d of the next sample and before; ``forward`` past u1;
-    ``feedback`` the last u2; ``predicted`` the state X2 of (7.27); ``integral`` the I
-    part of the command; ``sliding`` the last s.
+    ``feedback`` the last u2; ``predicted`` the state X2 of (7.27); ``law`` the state of
+    the switching law.
     """
 
     reference_model: State
@@ -37,57 +38,61 @@ class MultiAxisState(NamedTuple):
     forward: tuple[Axes, ...]
     feedback: Axes
     predicted: tuple[Axes, ...]
-    integral: Axes
-    sliding: Axes
+    law: State
 
 
-class MultiAxisSlidingModePID(Designed):
+class MultiAxisSlidingMode(Designed):
     """Output-tracking sliding mode control with static decoupling, (7.16)-(7.40).
 
     For ``model``, q axes with p matrices each, any p. The command is u1 + u2. u1 moves
     the model along the output y_d of ``reference_model``, which turns r(k) into
     y_d(k+1): ``u1(k) = F1 R1 - K_s (u1(k-1) + ... + u1(k-p+1))`` with
     ``R1 = y_d(k+1) - sum_i A_i y_d``, ``decoupling`` K_s [q, q], lower triangular in
-    the thesis, and F1 = (I + (p-1) K_s)(sum B)^-1, so that at rest the axes are
-    decoupled. u2 acts on e = y - y_d: the state X2 = [e(k); e(k+1); ...; e(k+p-1)], the
-    later ones as far as they are known, follows from past e and u2 alone, and
+    the thesis, and F1 = (I + (p-1) K_s)(sum B)^-1, so that the axes are decoupled at
+    rest. u2 acts on e = y - y_d. The state X2 = [e(k); e(k+1); ...; e(k+p-1)], later
+    errors as far as they are known, follows from past e and u2 alone, and
     ``s = surface[0] e(k) + surface[1] e(k+1) + ...`` (7.28), each [q, q];
-    ``u2 = (S B)^-1 (reaching s - S A X2) - (P s + I int s dt + D ds/dt)`` with
-    ``proportional``, ``integral`` (1/s), ``derivative`` (s) and ``reaching`` PHI, all
-    [q, q], of commands in the unit of the output. PHI enters with the sign of (7.29),
-    (7.31) and (7.40); that of (7.30) and (7.34) is unstable.
+    ``u2 = (S B)^-1 (reaching s - S A X2) + law(s)`` with ``reaching`` PHI [q, q]. The
+    law is a ``SwitchingPID`` with matrices [q, q] of gains in the thesis; its output
+    [v] is in the unit of the commands. PHI enters with the sign of (7.29), (7.31) and
+    (7.40); that of (7.30) and (7.34) is unstable.
 
     Input an Observation of q axes, output a tuple of q commands. (The thesis filters
     the measurements: see ``Filtered``.) No parameter is limited in sign: a loop of
     other gains may be unstable. The integral does not stop at a limit.
 
     At rest without disturbance the state stays where it is. Where the model's DC gain
-    is not the stage's, s = 0 leaves a small error: the prediction knows of no
+    is not the stage's, s = 0 leaves a small error, because the prediction contains no
     disturbance, and the start moves there slowly.
 
     Raises ValueError for matrices that are not [q, q] or a surface that has not p of
     them.
     """
 
-    proportional: Rows = eqx.field(converter=as_rows)
-    integral: Rows = eqx.field(converter=as_rows)
-    derivative: Rows = eqx.field(converter=as_rows)
-    reaching: Rows = eqx.field(converter=as_rows)
-    decoupling: Rows = eqx.field(converter=as_rows)
-    surface: tuple[Rows, ...] = eqx.field(converter=as_matrices)
+    law: SwitchingLaw
     model: MatrixARMA
     reference_model: System
+    reaching: Rows = parameter(
+        "1", "reaching gain PHI", typical=(0.0, 0.99), converter=as_rows
+    )
+    decoupling: Rows = parameter(
+        "1", "static decoupling K_s", typical=(-0.45, 0.45), converter=as_rows
+    )
+    surface: tuple[Rows, ...] = parameter(
+        "1",
+        "weights of the errors in s",
+        typical=(-1.98, 1.98),
+        converter=as_matrices,
+    )
 
     def __check_init__(self):
         q, p = self.model.axes, len(self.model.moving)
-        for name in (
-            "proportional",
-            "integral",
-            "derivative",
-            "reaching",
-            "decoupling",
-        ):
-            check_square(name, getattr(self, name), q)
+        for name, _ in declarations(self.law):
+            gain = getattr(self.law, name)
+            if isinstance(gain, tuple):
+                check_square(f"law.{name}", gain, q)
+        check_square("reaching", self.reaching, q)
+        check_square("decoupling", self.decoupling, q)
         if len(self.surface) != p:
             raise ValueError(
                 f"surface holds {len(self.surface)} matrices; it must hold {p}, one "
@@ -101,8 +106,8 @@ class MultiAxisSlidingModePID(Designed):
         """Sample time, s."""
         return self.model.dt
 
-    def law(self) -> "MultiAxisLaw":
-        """Return the controller with its gain matrices worked out."""
+    def resolved(self) -> "ResolvedMultiAxis":
+        """Return the controller with its gain matrices computed."""
         A, surface = self.model.autoregressive, self.surface
         q, lags = self.model.axes, len(self.model.moving) - 1
         unit = diagonal([1.0] * q)
@@ -123,10 +128,8 @@ class MultiAxisSlidingModePID(Designed):
                 moved = plus(moved, surface[j - 1])
             wanted = minus(matrix_product(self.reaching, S), moved)
             equivalent.append(matrix_product(reach, wanted))
-        return MultiAxisLaw(
-            self.proportional,
-            self.integral,
-            self.derivative,
+        return ResolvedMultiAxis(
+            self.law,
             self.decoupling,
             surface,
             self.model,
@@ -138,16 +141,14 @@ class MultiAxisSlidingModePID(Designed):
         )
 
 
-class MultiAxisLaw(System):
-    """What MultiAxisSlidingModePID runs: its own matrices, and those worked out.
+class ResolvedMultiAxis(System):
+    """The System that a MultiAxisSlidingMode steps: its matrices and those computed.
 
     ``forward`` F1, ``past_desired`` F1 A_i, ``rest`` (I + (p-1) K_s)^-1 and
     ``equivalent`` (S B)^-1 (PHI S - S A), a block for each of X2.
     """
 
-    proportional: Rows
-    integral: Rows
-    derivative: Rows
+    law: SwitchingLaw
     decoupling: Rows
     surface: tuple[Rows, ...]
     model: MatrixARMA
@@ -213,7 +214,6 @@ class MultiAxisLaw(System):
             terms += [product(B[i], feedback) for i in range(j, p)]
             predicted.append(plus(*terms))
         sliding = self._sliding(tuple(predicted))
-        proportional = product(self.proportional, sliding)
         equivalent = _summed(self.equivalent, tuple(predicted))
         return MultiAxisState(
             reference_model=self.reference_model.init(desired[0]),
@@ -221,14 +221,12 @@ class MultiAxisLaw(System):
             forward=(forward,) * (p - 1),
             feedback=feedback,
             predicted=tuple(predicted),
-            integral=plus(minus(feedback, equivalent), proportional),
-            sliding=sliding,
+            law=self.law.start(sliding, minus(feedback, equivalent)),
         )
 
     def step(
         self, state: MultiAxisState, input: Observation
     ) -> tuple[MultiAxisState, Axes]:
-        dt = self.model.dt
         error = minus(input.measured, state.desired[0])
         reference_model, following = self.reference_model.step(
             state.reference_model, input.reference
@@ -238,20 +236,7 @@ class MultiAxisLaw(System):
 
         predicted = self._predicted(error, state.predicted, state.feedback)
         sliding = self._sliding(predicted)
-        summed = product(self.integral, sliding)
-        integral = tuple(
-            i - dt * s for i, s in zip(state.integral, summed, strict=True)
-        )
-        slope = tuple(
-            (s - last) / dt for s, last in zip(sliding, state.sliding, strict=True)
-        )
-        switching = minus(
-            integral,
-            plus(
-                product(self.proportional, sliding),
-                product(self.derivative, slope),
-            ),
-        )
+        law, switching = self.law.step(state.law, sliding)
         feedback = plus(_summed(self.equivalent, predicted), switching)
         state = MultiAxisState(
             reference_model=reference_model,
@@ -259,8 +244,7 @@ class MultiAxisLaw(System):
             forward=(forward, *state.forward)[: len(state.forward)],
             feedback=feedback,
             predicted=predicted,
-            integral=integral,
-            sliding=sliding,
+            law=law,
         )
         return state, plus(forward, feedback)
 

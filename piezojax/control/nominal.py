@@ -1,70 +1,73 @@
-"""PID-based sliding mode control on the state of a nominal model (chapter 8)."""
+"""Sliding mode control on the state of a nominal model (chapter 8)."""
 
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, State, as_array, check
+from ..core.arrays import Scalar, State, as_array
+from ..core.parameter import parameter
 from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
 from .output_tracking import check_second_order
+from .switching import SwitchingLaw
 
 READINGS = ("nominal_state", "measured_state")
 
 
 class NominalState(NamedTuple):
-    """Model state; past measurement, reference and disturbance in the output's unit."""
+    """States of model and law; last measurement, reference and disturbance, each in the
+    unit of the output."""
 
     model: State
-    integral: Scalar
-    sliding: Scalar
+    law: State
     measured: Scalar
     reference: Scalar
     disturbance: Scalar
 
 
-class NominalSlidingModePID(System):
-    """PID-based sliding mode control of one axis, its model run along (8.17)-(8.39).
+class NominalSlidingMode(System):
+    """Sliding mode control of one axis on the state of a nominal model, (8.17)-(8.39).
 
     The printed equivalent control is unstable on the measured state in every form
-    tried. ``reading`` says what takes its place:
+    tried. ``reading`` selects its replacement:
 
-    - ``"nominal_state"``: it acts on the state of ``model`` run along with what was
-      applied, y_n(k) and y_n(k+1); the PID acts on the measured error, with
-      s(k) = ``surface`` e(k) + e(k+1), e(k+1) as the model predicts it. r(k+2) is
-      extrapolated.
-    - ``"measured_state"``: there is none, and s(k) = ``surface`` e(k-1) + e(k).
+    - ``"nominal_state"``: the equivalent control acts on the state of ``model``, which
+      runs on the applied input: y_n(k) and y_n(k+1). The law acts on the measured
+      error, s(k) = ``surface`` e(k) + e(k+1), with e(k+1) predicted by the model.
+      r(k+2) is extrapolated.
+    - ``"measured_state"``: there is no equivalent control, and
+      s(k) = ``surface`` e(k-1) + e(k).
 
-    ``correction`` weighs epsilon of (8.22), what d = y - y_n adds to the next states: 1
-    as printed with a disturbance observer, 0 for the nominal controller. ``model`` is a
-    second-order ARMA (a_1, a_2 | b_0, b_1, b_2) from commands to outputs of one unit;
-    its numerator, whose zero may lie outside the unit circle, is inverted by its sum,
-    with Q/(Q+R) of (8.39) from ``error_weight`` Q and ``control_weight`` R.
-    ``proportional``, ``integral`` in 1/s and ``derivative`` in s act on s, ``dt`` in s.
+    ``correction`` weighs epsilon of (8.22), the effect of d = y - y_n on the next
+    states: 1 as printed with a disturbance observer, 0 for the nominal controller.
+    ``model`` is a second-order ARMA (a_1, a_2 | b_0, b_1, b_2) whose input and output
+    have one unit; its numerator, whose zero may lie outside the unit circle, is
+    inverted at rest, by the sum of its coefficients, with Q/(Q+R) of (8.39). ``law``, a
+    ``SwitchingPID`` in the thesis, turns s into the switching part.
 
     Input an Observation, output the command. Raises ValueError for a model of another
-    order, Q <= 0, R < 0, ``dt <= 0`` or an unknown reading.
+    order or an unknown reading.
     """
 
-    proportional: Scalar = eqx.field(converter=as_array)
-    integral: Scalar = eqx.field(converter=as_array)
-    derivative: Scalar = eqx.field(converter=as_array)
-    surface: Scalar = eqx.field(converter=as_array)
-    error_weight: Scalar = eqx.field(converter=as_array)
-    control_weight: Scalar = eqx.field(converter=as_array)
+    law: SwitchingLaw
     model: ARMA
-    dt: float = eqx.field(static=True)
-    correction: Scalar = eqx.field(converter=as_array, default=0.0)
+    surface: Scalar = parameter(
+        "1", "weight m of the older error in s", typical=(-0.98, 0.98)
+    )
+    error_weight: Scalar = parameter(
+        "1", "weight Q of the inversion", above=0.0, scale="log", typical=(1e-2, 1e2)
+    )
+    control_weight: Scalar = parameter(
+        "1", "weight R of the inversion", least=0.0, scale="log", typical=(1e-4, 1e3)
+    )
+    correction: Scalar = parameter(
+        "1", "weight of the disturbance epsilon", typical=(-1.0, 2.0), default=0.0
+    )
     reading: str = eqx.field(static=True, default="nominal_state")
 
     def __check_init__(self):
         check_second_order(self.model)
-        for name in ("proportional", "integral", "derivative", "surface", "correction"):
-            check(name, getattr(self, name))
-        check("error_weight Q", self.error_weight, above=0.0)
-        check("control_weight R", self.control_weight, least=0.0)
-        check("sample time in s", self.dt, above=0.0)
         if self.reading not in READINGS:
             raise ValueError(
                 f"reading {self.reading!r}; it must be one of {list(READINGS)}"
@@ -74,16 +77,16 @@ class NominalSlidingModePID(System):
         share = self.error_weight / (self.error_weight + self.control_weight)
         return share / sum(self.model.moving)
 
-    def _law(
+    def _advance(
         self, state: NominalState, input: Observation
     ) -> tuple[Scalar, Scalar, NominalState]:
-        """Return v without the PID of s, s, and the next state but for the PID."""
+        """Return v less its switching part, s, and the next state but for the law."""
         a1, a2 = (-a for a in self.model.autoregressive)
         y, r, r_next = input.measured, input.reference, input.next_reference
         model, modelled = self.model.step(state.model, input.applied)
         disturbance = y - modelled
         if self.reading == "nominal_state":
-            # As if the last command were held: the next one is what is looked for.
+            # As if the last command were held: the next one is not known yet.
             _, ahead = self.model.step(model, input.applied)
             held = sum(self.model.moving) * input.applied
             predicted = -a1 * y - a2 * state.measured + held
@@ -106,34 +109,23 @@ class NominalSlidingModePID(System):
         return forward + equivalent, sliding, following
 
     def init(self, input: Observation) -> NominalState:
-        zero = jnp.zeros_like(as_array(input.measured))
-        rest = self.model.init(input.applied)
         modelled = self.model.dc_gain() * input.applied
         state = NominalState(
-            model=rest,
-            integral=zero,
-            sliding=zero,
+            model=self.model.init(input.applied),
+            law=(),
             measured=as_array(input.measured),
             reference=as_array(input.reference),
             disturbance=input.measured - modelled,
         )
-        # The integral holds what the command needs at rest.
-        v, sliding, _ = self._law(state, input)
-        total = sum(self.model.moving)
-        needed = (input.applied / self._inverse() - v) / total
-        return state._replace(
-            integral=needed + self.proportional * sliding, sliding=sliding
-        )
+        # The law holds what the command needs at rest.
+        v, sliding, _ = self._advance(state, input)
+        needed = (input.applied / self._inverse() - v) / sum(self.model.moving)
+        return state._replace(law=self.law.start(sliding, needed))
 
     def step(
         self, state: NominalState, input: Observation
     ) -> tuple[NominalState, Scalar]:
-        v, sliding, following = self._law(state, input)
-        integral = state.integral - self.integral * self.dt * sliding
-        switching = (
-            integral
-            - self.proportional * sliding
-            - self.derivative * (sliding - state.sliding) / self.dt
-        )
+        v, sliding, following = self._advance(state, input)
+        law, switching = self.law.step(state.law, sliding)
         command = self._inverse() * (v + sum(self.model.moving) * switching)
-        return following._replace(integral=integral, sliding=sliding), command
+        return following._replace(law=law), command

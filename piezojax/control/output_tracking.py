@@ -1,8 +1,8 @@
-"""What sliding mode controllers that track an output share (chapters 4 and 5)."""
+"""Equations shared by sliding mode controllers that track an output (ch. 4 and 5)."""
 
 from collections.abc import Callable
 
-from ..core.arrays import Scalar, check, check_not_zero
+from ..core.arrays import Scalar, check_not_zero
 from ..dynamics.arma import ARMA
 from .observer import Motion
 
@@ -17,15 +17,16 @@ INVERSIONS: dict[str, Callable[[Scalar, Scalar, Scalar], Scalar]] = {
 smaller R of Tables 4-3 and 4-4."""
 
 
-def check_inversion(
-    form: str, model: ARMA, error_weight: Scalar, control_weight: Scalar
-) -> None:
-    """Raise ValueError for an unknown form, b_0 = 0, Q <= 0 or R < 0."""
+def check_inversion(form: str, model: ARMA) -> None:
+    """Raise ValueError for an unknown form or b_0 = 0."""
     if form not in INVERSIONS:
         raise ValueError(f"inversion {form!r}; it must be one of {list(INVERSIONS)}")
     check_not_zero("b_0 of the model", model.moving[0])
-    check("error_weight Q", error_weight, above=0.0)
-    check("control_weight R", control_weight, least=0.0)
+
+
+def inversion_gain(form: str, model: ARMA, error: Scalar, control: Scalar) -> Scalar:
+    """Return the inverse of b_0 of ``model`` with the weights Q and R."""
+    return INVERSIONS[form](model.moving[0], error, control)
 
 
 def check_second_order(model: ARMA) -> None:

@@ -1,79 +1,75 @@
-"""PID-based discrete sliding mode control with optimal inversion (chapters 4 and 5)."""
+"""Output-tracking sliding mode control with any switching law (chapters 4 and 5)."""
 
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 
-from ..core.arrays import Scalar, State, as_array, check
+from ..core.arrays import Scalar, State, as_array
+from ..core.parameter import parameter
 from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
 from .observer import Observer
 from .output_tracking import (
-    INVERSIONS,
     check_inversion,
     check_second_order,
     equivalent_control,
     feedforward,
+    inversion_gain,
     inverted,
     tracking_error,
 )
+from .switching import SwitchingLaw
 
 
 class SlidingModeState(NamedTuple):
-    """Filter state, PID memory of s, past references and past outputs."""
+    """States of filter and law, the last reference, and the last two outputs."""
 
     filter: State
-    integral: Scalar
-    surface: Scalar
+    law: State
     older_reference: Scalar
     outputs: tuple[Scalar, Scalar]
 
 
-class SlidingModePID(System):
-    """PID-based sliding mode control of a second-order model, output tracking.
+class SlidingMode(System):
+    """Sliding mode control of a second-order model that makes its output track.
 
-    The state is x = [y, dy/dt] from ``filter``, an observer, and the sliding variable
-    ``s = surface * e1 + e2`` (5.15): ``surface`` m in 1/s. The equivalent control and
-    the reference part v1 come from ``model`` (a_1, a_2 | b_0, b_1, b_2, b_0 not zero),
-    a PID of s with ``proportional``, ``integral``, ``derivative`` replaces the
-    switching term (5.18), and the zeros of the model, which may lie outside the unit
-    circle, are inverted in the least-squares sense with the weights ``error_weight`` Q
-    and ``control_weight`` R: f = Q/(Q+R) [v - (b1/b0) f' - (b2/b0) f''] (5.23), or in
-    another form ``inversion`` of ``INVERSIONS``. ``correction`` weighs the equivalent
-    control, 1 as printed: with less of it the feedback is weaker, the reference part
-    is not.
+    The state x = [y, dy/dt] comes from ``filter``, an observer. The sliding variable is
+    ``s = surface e1 + e2`` in um/s (5.15). The equivalent control and the reference
+    part v1 come from ``model`` (a_1, a_2 | b_0, b_1, b_2, b_0 not zero), the switching
+    part from ``law``: a ``SwitchingPID`` (5.18), ``BangBang``, ``BoundaryLayer`` or
+    ``SuperTwisting``. The zeros of the model, which may lie outside the unit circle,
+    are inverted in the least-squares sense: f = Q/(Q+R) [v - (b1/b0) f' - (b2/b0) f'']
+    (5.23), or in another form ``inversion`` of ``INVERSIONS``. ``correction`` weighs
+    the equivalent control: less of it weakens the feedback and leaves the reference
+    part.
 
-    Input an Observation; output f in the unit of the model's input: volts if the model
-    was identified from voltage (the nominal controller), um behind an inverse
-    hysteresis, um for a disturbance observer with its own gain. Of the PID, P acts per
-    um/s of s in that unit, I per um, D per um/s^2; ``dt`` in s.
+    Input an Observation; output f in the unit of the model's input: V if the model was
+    identified from voltage, um behind an inverse hysteresis or in a disturbance
+    observer with its own gain. The law's [v] is that unit.
 
-    Raises ValueError for a model of another order, b_0 = 0, Q <= 0, R < 0 or an unknown
-    inversion.
+    Raises ValueError for a model of another order, b_0 = 0 or an unknown inversion.
     """
 
-    proportional: Scalar = eqx.field(converter=as_array)
-    integral: Scalar = eqx.field(converter=as_array)
-    derivative: Scalar = eqx.field(converter=as_array)
-    surface: Scalar = eqx.field(converter=as_array)
-    error_weight: Scalar = eqx.field(converter=as_array)
-    control_weight: Scalar = eqx.field(converter=as_array)
+    law: SwitchingLaw
     model: ARMA
     filter: Observer
+    surface: Scalar = parameter(
+        "1/s", "slope m of the sliding surface", scale="log", typical=(10.0, 1e5)
+    )
+    error_weight: Scalar = parameter(
+        "1", "weight Q of the inversion", above=0.0, scale="log", typical=(1e-2, 1e2)
+    )
+    control_weight: Scalar = parameter(
+        "1", "weight R of the inversion", least=0.0, scale="log", typical=(1e-4, 1e3)
+    )
     inversion: str = eqx.field(static=True, default="printed")
-    correction: Scalar = eqx.field(converter=as_array, default=1.0)
+    correction: Scalar = parameter(
+        "1", "weight of the equivalent control", typical=(0.0, 1.2), default=1.0
+    )
 
     def __check_init__(self):
         check_second_order(self.model)
-        check_inversion(
-            self.inversion, self.model, self.error_weight, self.control_weight
-        )
-        check("proportional", self.proportional)
-        check("integral", self.integral)
-        check("derivative", self.derivative)
-        check("surface in 1/s", self.surface)
-        check("correction", self.correction)
+        check_inversion(self.inversion, self.model)
 
     @property
     def dt(self) -> float:
@@ -81,23 +77,21 @@ class SlidingModePID(System):
         return self.filter.dt
 
     def _inversion_gain(self) -> Scalar:
-        return INVERSIONS[self.inversion](
-            self.model.moving[0], self.error_weight, self.control_weight
+        return inversion_gain(
+            self.inversion, self.model, self.error_weight, self.control_weight
         )
 
     def init(self, input: Observation) -> SlidingModeState:
-        reference = input.reference
+        reference, applied = as_array(input.reference), as_array(input.applied)
         b0, b1, b2 = self.model.moving
-        # At rest s = 0: the integral alone must hold the output.
-        needed = input.applied * (1.0 / self._inversion_gain() + b1 + b2) / b0
-        integral = needed - feedforward(self.model, reference, reference, reference)
-        zero = jnp.zeros_like(integral)
+        # At rest s = 0: the law alone holds what the feedforward leaves.
+        needed = applied * (1.0 / self._inversion_gain() + b1 + b2) / b0
+        held = needed - feedforward(self.model, reference, reference, reference)
         return SlidingModeState(
             filter=self.filter.init(input),
-            integral=integral,
-            surface=zero,
-            older_reference=reference + zero,
-            outputs=(input.applied + zero, input.applied + zero),
+            law=self.law.start(as_array(0.0), held),
+            older_reference=reference,
+            outputs=(applied, applied),
         )
 
     def step(
@@ -108,20 +102,54 @@ class SlidingModePID(System):
         reference, older = input.reference, state.older_reference
         error = tracking_error(motion, reference, older, dt)
         s = self.surface * error.position + error.velocity
-
-        integral = state.integral - self.integral * dt * s
-        switching = (
-            integral
-            - self.proportional * s
-            - self.derivative * (s - state.surface) / dt
-        )
+        law, switching = self.law.step(state.law, s)
         v = (
             feedforward(self.model, input.next_reference, reference, older)
             + self.correction * equivalent_control(self.model, self.surface, error, dt)
             + switching
         )
         f = inverted(self.model, self._inversion_gain(), v, state.outputs)
-        state = SlidingModeState(
-            filter_state, integral, s, reference, (f, state.outputs[0])
+        return SlidingModeState(
+            filter_state, law, as_array(reference), (f, state.outputs[0])
+        ), f
+
+
+class ContinuousSlidingModeState(NamedTuple):
+    """States of filter and law, and the last reference in um."""
+
+    filter: State
+    law: State
+    older_reference: Scalar
+
+
+class ContinuousSlidingMode(System):
+    """``u = law(s)`` with s = ``surface`` e + de/dt, sampled: no model of the stage.
+
+    The comparison of section 4.5.4.3, reference [98] there, for which the thesis prints
+    gains but no equation: the continuous design needs no model, so none is used.
+    e = y - r, where y and dy/dt come from ``filter``; s is in um/s, the law's output
+    in V. Input an Observation, output in V.
+    """
+
+    law: SwitchingLaw
+    filter: Observer
+    surface: Scalar = parameter(
+        "1/s", "slope m of the sliding surface", scale="log", typical=(10.0, 1e5)
+    )
+
+    def init(self, input: Observation) -> ContinuousSlidingModeState:
+        return ContinuousSlidingModeState(
+            filter=self.filter.init(input),
+            law=self.law.start(as_array(0.0), as_array(input.applied)),
+            older_reference=as_array(input.reference),
         )
-        return state, f
+
+    def step(
+        self, state: ContinuousSlidingModeState, input: Observation
+    ) -> tuple[ContinuousSlidingModeState, Scalar]:
+        filter_state, motion = self.filter.step(state.filter, input)
+        reference = as_array(input.reference)
+        error = tracking_error(motion, reference, state.older_reference, self.filter.dt)
+        s = self.surface * error.position + error.velocity
+        law, voltage = self.law.step(state.law, s)
+        return ContinuousSlidingModeState(filter_state, law, reference), voltage

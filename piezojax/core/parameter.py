@@ -23,7 +23,8 @@ class Parameter:
     ``most`` limits that it may. ``typical`` is the range that a search takes if a study
     gives none, on ``scale``: "log" for positive values that span decades, "logit" for
     values between 0 and 1. ``unit`` "1" is a pure number. A frequency with
-    ``below_nyquist`` must stay below pi / dt of the System that declares it.
+    ``below_nyquist`` must stay below pi / dt of the System that declares it; a count
+    is ``whole``.
     """
 
     unit: str
@@ -35,6 +36,7 @@ class Parameter:
     scale: Scale = "linear"
     typical: tuple[float, float] | None = None
     below_nyquist: bool = False
+    whole: bool = False
 
     def at(self, dt: float) -> "Parameter":
         """Return the declaration for a System with sample time ``dt`` in s."""
@@ -44,8 +46,11 @@ class Parameter:
 
     def check(self, name: str, value: Any) -> None:
         """Raise ValueError unless ``value`` is finite and within the limits."""
+        name = name if self.unit == "1" else f"{name} in {self.unit}"
+        if self.whole and not isinstance(value, int):
+            raise ValueError(f"{name} is {value!r}; it must be whole")
         check(
-            name if self.unit == "1" else f"{name} in {self.unit}",
+            name,
             value,
             above=self.above,
             least=self.least,
@@ -65,6 +70,7 @@ def parameter(
     scale: Scale = "linear",
     typical: tuple[float, float] | None = None,
     below_nyquist: bool = False,
+    whole: bool = False,
     converter: Callable[[Any], Any] = as_array,
     static: bool = False,
     **options: Any,
@@ -72,14 +78,15 @@ def parameter(
     """Return a field of a System together with its declaration.
 
     The first arguments are those of ``Parameter``. ``static`` fields, such as a sample
-    time, are plain numbers that cannot be tuned; others go through ``converter``.
-    ``options`` are those of ``dataclasses.field``: ``default``, ``kw_only``.
+    time or a count, are plain numbers that cannot be tuned; others go through
+    ``converter``. ``options`` are those of ``dataclasses.field``: ``default``,
+    ``kw_only``.
 
     The constructor of the System checks the declared limits; tables, pictures, bounds
     of a search and the API page read unit, meaning and range from here.
     """
     declared = Parameter(
-        unit, meaning, above, least, most, below, scale, typical, below_nyquist
+        unit, meaning, above, least, most, below, scale, typical, below_nyquist, whole
     )
     if static:
         return eqx.field(static=True, metadata={_KEY: declared}, **options)

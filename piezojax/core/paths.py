@@ -1,4 +1,4 @@
-"""Parameters by name: ``"controller.feedback.proportional"`` in a tree of systems."""
+"""Parameters by name: ``"controller.feedback.surface"`` in a tree of systems."""
 
 import dataclasses
 import difflib

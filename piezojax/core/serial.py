@@ -5,6 +5,7 @@ import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
+from types import UnionType
 from typing import Any, get_args, get_origin
 
 import equinox as eqx
@@ -74,6 +75,12 @@ def from_data(data: Any, where: str = "system") -> System:
 
 def _value_from_data(value: Any, kind: Any, where: str) -> Any:
     """Return ``value`` as a field of type ``kind`` takes it."""
+    if isinstance(kind, UnionType):
+        listed = isinstance(value, list | tuple)
+        kind = next(
+            (one for one in get_args(kind) if (get_origin(one) is tuple) == listed),
+            kind,
+        )
     if get_origin(kind) is tuple:
         if not isinstance(value, list | tuple):
             raise ValueError(f"{where} is {value!r}; it must be a list")

@@ -10,11 +10,13 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .arrays import Scalar, ScalarLike, Signal, State, as_array, as_signal, check
-from .parameter import check_declared, parameter
+from .arrays import Scalar, ScalarLike, Signal, State, as_array, as_signal
+from .parameter import check_declared, parameter, sample_time
 
 
-@dataclass_transform(field_specifiers=(dataclasses.field, eqx.field, parameter))
+@dataclass_transform(
+    field_specifiers=(dataclasses.field, eqx.field, parameter, sample_time)
+)
 class System(eqx.Module):
     """Anything that runs in time: a plant, a filter, an observer, a controller, a loop.
 
@@ -51,30 +53,30 @@ class System(eqx.Module):
 class Designed(System):
     """A system whose parameters are not the numbers that it steps with.
 
-    ``law`` works those out, a gain matrix from a model say, as a system with the same
-    state, input and output. ``simulate`` does so once, before the loop over time; left
-    in the step it would be done, and differentiated, at every sample.
+    ``resolved`` computes those, such as a gain matrix from a model, and returns a
+    system with the same state, input and output. ``simulate`` does so once, before the
+    loop over time; in the step it would be done, and differentiated, at every sample.
     """
 
     @abc.abstractmethod
-    def law(self) -> System:
-        """Return what is run."""
+    def resolved(self) -> System:
+        """Return the equivalent System to step."""
 
     def init(self, input: Any = 0.0) -> State:
-        return self.law().init(input)
+        return self.resolved().init(input)
 
     def step(self, state: State, input: Any) -> tuple[State, Any]:
-        return self.law().step(state, input)
+        return self.resolved().step(state, input)
 
 
 def resolve(system: Any) -> Any:
-    """Return ``system`` with every part that is Designed replaced by its law."""
+    """Return ``system`` with every part that is Designed resolved."""
 
     def is_designed(part: Any) -> bool:
         return isinstance(part, Designed)
 
     return jax.tree.map(
-        lambda part: resolve(part.law()) if is_designed(part) else part,
+        lambda part: resolve(part.resolved()) if is_designed(part) else part,
         system,
         is_leaf=is_designed,
     )
@@ -155,12 +157,8 @@ def _parallel_parts(system: System) -> tuple[System, ...]:
 class Affine(System):
     """``output = gain * input + offset``: a calibration, a sensor's zero."""
 
-    gain: Scalar = eqx.field(converter=as_array, default=1.0)
-    offset: Scalar = eqx.field(converter=as_array, default=0.0)
-
-    def __check_init__(self):
-        check("gain", self.gain)
-        check("offset", self.offset)
+    gain: Scalar = parameter("1", "gain", default=1.0)
+    offset: Scalar = parameter("1", "offset", default=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return ()
@@ -172,12 +170,9 @@ class Affine(System):
 class Delay(System):
     """A pure delay by a whole number of samples."""
 
-    samples: int = eqx.field(static=True)
-
-    def __check_init__(self):
-        if not isinstance(self.samples, int):
-            raise ValueError(f"delay in samples is {self.samples!r}; it must be whole")
-        check("delay in samples", self.samples, least=0.0)
+    samples: int = parameter(
+        "1", "number of samples", least=0.0, whole=True, static=True
+    )
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return (as_array(input),) * self.samples

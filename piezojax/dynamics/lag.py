@@ -58,7 +58,7 @@ class SecondOrderLag(Designed):
         check("damping", self.damping, least=0.0)
         check("sample time in s", self.dt, above=0.0)
 
-    def law(self) -> "LinearOscillator":
+    def resolved(self) -> "LinearOscillator":
         """Return the lag with its coefficients for one sample."""
         decay = self.damping * self.frequency
         even, odd = _cosine_and_sinc((self.frequency**2 - decay**2) * self.dt**2)

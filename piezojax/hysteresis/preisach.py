@@ -85,7 +85,7 @@ class Preisach(Hysteresis, Designed):
         """Cells along one side of the triangle."""
         return self.weights.shape[0]
 
-    def law(self) -> "PlayLines":
+    def resolved(self) -> "PlayLines":
         rows = rows_of(self.weights)
         return PlayLines(
             rows,
@@ -182,7 +182,7 @@ class PlayLines(System):
     rest_input: Scalar
     start: str = eqx.field(static=True)
 
-    def law(self) -> "PlayLines":
+    def resolved(self) -> "PlayLines":
         """Return itself: there is nothing more to work out."""
         return self
 
@@ -282,8 +282,8 @@ class InversePreisach(Inverse):
     model: Preisach
 
     def init(self, input: ScalarLike = 0.0) -> Levels:
-        law = self.model.law()
+        law = self.model.resolved()
         return law.init(law.solve(law.rest(), input))
 
     def solve(self, state: Levels, wanted: ScalarLike) -> Scalar:
-        return self.model.law().solve(state, wanted)
+        return self.model.resolved().solve(state, wanted)

@@ -40,8 +40,8 @@ class RateDependentPreisach(Hysteresis, Designed):
         check("rate in V/s", self.rate, above=0.0)
         check("sample time in s", self.dt, above=0.0)
 
-    def law(self) -> System:
-        slow = self.slow.law()
+    def resolved(self) -> System:
+        slow = self.slow.resolved()
         half_way = self.rate * self.dt / slow.size
         return _Blend(slow, rows_of(self.fast_weights), half_way)
 

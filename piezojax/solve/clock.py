@@ -1,4 +1,4 @@
-"""Wall time of a piece of work, and the part of it that went into compiling."""
+"""Wall time of a piece of work, and the part of it spent compiling."""
 
 import time
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import jax
 
 
 class Clock:
-    """Wall time since it was made, and how much of it went into compiling (s)."""
+    """Wall time since construction; ``compile_s`` of it was spent compiling (s)."""
 
     def __init__(self):
         self._began = time.perf_counter()
@@ -17,14 +17,14 @@ class Clock:
         self.compile_s = 0.0
 
     def compiled(self, function: Callable, *arguments: Any) -> Callable:
-        """Return ``function`` compiled for ``arguments``, its time counted."""
+        """Return ``function`` compiled for ``arguments``; count the time."""
         start = time.perf_counter()
         program = jax.jit(function).lower(*arguments).compile()
         self.compile_s += time.perf_counter() - start
         return program
 
-    def waited(self, program: Future) -> None:
-        """Wait for a program that another thread compiles, and count the waiting."""
+    def wait_for(self, program: Future) -> None:
+        """Wait for a program that another thread compiles; count the time."""
         start = time.perf_counter()
         program.result()
         self.compile_s += time.perf_counter() - start

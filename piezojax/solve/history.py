@@ -1,4 +1,4 @@
-"""How a search went: what it had found, when, and after how many evaluations."""
+"""Search history: best loss against time and evaluations."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,13 +9,13 @@ from .clock import Clock
 
 
 @dataclass
-class Course:
+class History:
     """The best loss after each batch of evaluations of one search.
 
-    ``times_s`` are seconds since the search began, waiting for the compiler included;
-    ``compile_s`` is how much of each went into that, ``cpu_s`` the processor's seconds
-    till then, of all threads: what a busy machine does not lengthen. ``evaluations``
-    counts simulations of all references, those that carry derivatives too.
+    ``times_s`` are seconds since the search began, compiling included; ``compile_s`` is
+    the part of them spent compiling, ``cpu_s`` the processor time of all threads, which
+    other work on the machine does not lengthen. ``evaluations`` counts evaluations of
+    the loss, those with derivatives too.
     """
 
     clock: Clock = field(default_factory=Clock)
@@ -26,7 +26,7 @@ class Course:
     losses: list[float] = field(default_factory=list)
 
     def add(self, evaluations: int, loss: float) -> None:
-        """Note ``evaluations`` more, the best of which has ``loss``."""
+        """Append a batch of ``evaluations``, the best of which has ``loss``."""
         before = self.evaluations[-1] if self.evaluations else 0
         self.times_s.append(self.clock.wall_s())
         self.compile_s.append(self.clock.compile_s)
@@ -44,11 +44,14 @@ class Course:
         return next((i for i, best in enumerate(self.losses) if best <= loss), None)
 
 
-def batch_loss(objective, units: jax.Array, clock: Clock) -> Callable:
-    """Return the losses of points in [0, 1]^n, compiled for so many at once."""
+def batch_loss(problem, units: jax.Array, clock: Clock) -> Callable:
+    """Return the function of points that returns their losses.
+
+    Compiled for as many points of the unit box as ``units``.
+    """
     program = clock.compiled(
-        lambda objective, units: jax.vmap(lambda unit: objective.loss(unit))(units),
-        objective,
+        lambda problem, units: jax.vmap(lambda unit: problem.loss(unit))(units),
+        problem,
         units,
     )
-    return lambda units: program(objective, units)
+    return lambda units: program(problem, units)

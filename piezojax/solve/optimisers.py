@@ -1,7 +1,8 @@
-"""Optimisers behind one interface: start, step, look; one point at a time.
+"""Optimisers of optimistix and jaxopt behind one interface: start, step, view.
 
-Each is run for many starts at once by ``jax.vmap`` and stepped from Python, so that
-progress can be shown, the history kept and a run stopped with its best point in hand.
+Each follows one point; ``jax.vmap`` runs many starts at once. They are stepped from
+Python, so that progress can be shown, the history kept and a run interrupted with its
+best point in hand.
 """
 
 import warnings
@@ -17,13 +18,13 @@ from jaxtyping import Array, Bool, Float
 
 from ..core.arrays import as_array
 from ..core.space import squash, unsquash
+from .problem import Unit
 
-Unit = Float[Array, " n"]
 Function = Callable[[Unit], Array]
 
 
 class View(NamedTuple):
-    """Where an optimiser stands: a point in [0, 1]^n, its loss, whether it is done."""
+    """Present point in [0, 1]^n, its loss, and whether the optimiser is done."""
 
     unit: Unit
     loss: Float[Array, ""]
@@ -38,22 +39,25 @@ class Optimiser(NamedTuple):
     view: Callable[[Any], View]
 
 
-class _Carry(NamedTuple):
+class Carry(NamedTuple):
+    """An optimiser between steps: point, its own state, loss of the point."""
+
     point: Array
     state: Any
     loss: Array
     done: Array
 
 
-def _settled(carry: _Carry) -> _Carry:
+def settled(carry: Carry) -> Carry:
+    """Return ``carry`` with leaves of definite type."""
     # Weakly typed leaves would make the second step compile anew.
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), carry)
 
 
-def _advanced(old: _Carry, new: _Carry) -> _Carry:
-    """Return ``new``, or ``old`` where that start had already finished."""
+def frozen_when_done(old: Carry, new: Carry) -> Carry:
+    """Return ``new``, or ``old`` if that start had already finished."""
     kept = jax.tree.map(lambda o, n: jnp.where(old.done, o, n), old, new)
-    return _settled(kept)
+    return settled(kept)
 
 
 def _optimistix(
@@ -78,7 +82,7 @@ def _optimistix(
     def start(unit):
         free = unsquash(unit)
         arrays = eqx.filter(initial(free), eqx.is_array)
-        return _settled(_Carry(free, arrays, as_array(jnp.inf), jnp.asarray(False)))
+        return settled(Carry(free, arrays, as_array(jnp.inf), jnp.asarray(False)))
 
     def step(carry):
         state = eqx.combine(carry.state, fixed(carry.point))
@@ -88,7 +92,9 @@ def _optimistix(
         )
         done, _ = solver.terminate(objective, point, None, options, state, frozenset())
         arrays = eqx.filter(state, eqx.is_array)
-        return _advanced(carry, _Carry(point, arrays, state.aux, carry.done | done))
+        return frozen_when_done(
+            carry, Carry(point, arrays, state.aux, carry.done | done)
+        )
 
     def view(carry):
         return View(squash(carry.point), carry.loss, carry.done)
@@ -122,67 +128,6 @@ def levenberg_marquardt(
     )
 
 
-class _Quadratic(NamedTuple):
-    """The point to try next, and the quadratic model at the present one."""
-
-    trial: Array
-    hessian: Array
-    gradient: Array
-    size: Array  # 1 / damping
-    predicted: Array  # change of half the sum of squares at `trial`
-
-
-def damped_gauss_newton(residuals: Function, tolerance: float) -> Optimiser:
-    """Levenberg-Marquardt, the steps of optimistix, compiled in a third of the time.
-
-    One evaluation of residuals and forward Jacobian a step, of which J'J and J'r are
-    kept: for long residuals of few unknowns. The damping follows the trust-region rule
-    of optimistix with its constants (Gould et al. 2005, 4OR 3).
-    """
-
-    def objective(free):
-        value = residuals(squash(free))
-        return value, value
-
-    def start(unit):
-        free = unsquash(unit)
-        blank = jnp.zeros((free.size, free.size))
-        one, none = jnp.ones(()), jnp.zeros(())
-        first = _Quadratic(free, blank, jnp.zeros_like(free), one, none)
-        return _settled(_Carry(free, first, as_array(jnp.inf), jnp.asarray(False)))
-
-    def step(carry):
-        old, point = carry.state, carry.point
-        jacobian, value = jax.jacfwd(objective, has_aux=True)(old.trial)
-        loss = jnp.sum(value**2)
-        first = jnp.isinf(carry.loss)
-        change = 0.5 * (loss - carry.loss)
-        accept = first | (change <= 0.01 * old.predicted)
-        good = accept & ~first & (change < 0.99 * old.predicted) & (old.predicted < 0.0)
-        size = old.size * jnp.where(good, 3.5, jnp.where(accept, 1.0, 0.25))
-        hessian = jnp.where(accept, jacobian.T @ jacobian, old.hessian)
-        gradient = jnp.where(accept, jacobian.T @ value, old.gradient)
-        reached = jnp.where(accept, old.trial, point)
-        near = jnp.abs(old.trial - point) < tolerance * (1.0 + jnp.abs(point))
-        level = jnp.abs(change) < tolerance * (1.0 + 0.5 * carry.loss)
-        done = accept & ~first & jnp.all(near) & level
-        # A direction without any slope must not make the matrix singular.
-        floor = 1e-14 * jnp.max(jnp.diagonal(hessian))
-        damping = jnp.maximum(jnp.maximum(1.0 / size, floor), 1e-300)
-        factor = jax.scipy.linalg.cho_factor(hessian + damping * jnp.eye(point.size))
-        move = -jax.scipy.linalg.cho_solve(factor, gradient)
-        move = jnp.where(jnp.all(jnp.isfinite(move)), move, 0.0)
-        predicted = gradient @ move + 0.5 * move @ hessian @ move
-        state = _Quadratic(reached + move, hessian, gradient, size, predicted)
-        kept = jnp.where(accept, loss, carry.loss)
-        return _advanced(carry, _Carry(reached, state, kept, carry.done | done))
-
-    def view(carry):
-        return View(squash(carry.point), carry.loss, carry.done)
-
-    return Optimiser(start, step, view)
-
-
 def lbfgsb(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
     """L-BFGS-B (jaxopt) on the loss, which takes the bounds as they are."""
     del residuals
@@ -200,12 +145,12 @@ def lbfgsb(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
 
     def start(unit):
         state: Any = solver.init_state(unit, bounds(unit))
-        return _settled(_Carry(unit, state, state.value, jnp.asarray(False)))
+        return settled(Carry(unit, state, state.value, jnp.asarray(False)))
 
     def step(carry):
         point, state = solver.update(carry.point, carry.state, bounds(carry.point))
         done = carry.done | (state.error <= tolerance)
-        return _advanced(carry, _Carry(point, state, state.value, done))
+        return frozen_when_done(carry, Carry(point, state, state.value, done))
 
     def view(carry):
         return View(carry.point, carry.loss, carry.done)
@@ -221,4 +166,4 @@ METHODS: dict[str, Callable[[Function, Function, float], Optimiser]] = {
 """Optimisers by the name a study uses."""
 
 GAUSS_NEWTON = "gauss_newton"
-"""The search of ``tune.gauss_newton``: on the errors of a loop, so only for tuning."""
+"""Successive halving of Gauss-Newton descents on the errors, by the study's name."""

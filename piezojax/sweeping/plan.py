@@ -47,8 +47,8 @@ class Plan:
     """The points of a sweep.
 
     ``shape`` is that of the grid, or the number of samples. Points are numbered in
-    C order; a chunk holds ``chunk`` of them, in blocks of ``width``. Every process plans
-    the same points for the same study.
+    C order; a chunk holds ``chunk`` of them, in blocks of ``width``. The points depend
+    on the study alone.
     """
 
     def __init__(self, case: Case):

@@ -15,9 +15,6 @@ from ..analysis.stability.impulse import (
 )
 from ..core.metrics import ExtremeFigures, TrackingFigures
 
-TOLERANCE = 1e-3
-"""A limit missed by less than this share of it counts as kept."""
-
 CAP = 3.0
 """Logarithm of value over limit beyond which a violation grows slowly: the loop is
 unstable then, and how much so has no meaning."""
@@ -123,26 +120,3 @@ def by_stage(limits: Iterable[str], seen: Seen) -> dict[str, Array]:
         values = values.reshape(values.shape[0], -1)
         found[name] = pick[CONSTRAINTS[name].sense](values, axis=1)
     return found
-
-
-def augmented(
-    violation: Float[Array, " constraints"],
-    multipliers: Float[Array, " constraints"],
-    penalty: Array,
-) -> Float[Array, " constraints"]:
-    """Return what the augmented Lagrangian adds, each as a number to be squared.
-
-    The squares sum to ``penalty``/2 max(0, g + multiplier/penalty)^2 over all g.
-    Source: Nocedal and Wright, Numerical Optimization, 2006, section 17.4.
-    """
-    shifted = violation + multipliers / penalty
-    return jnp.sqrt(0.5 * penalty) * jnp.maximum(shifted, 0.0)
-
-
-def updated(
-    violation: Float[Array, "*starts constraints"],
-    multipliers: Float[Array, "*starts constraints"],
-    penalty: Array,
-) -> Float[Array, "*starts constraints"]:
-    """Return the multipliers after a round of minimisation."""
-    return jnp.maximum(multipliers + penalty * violation, 0.0)

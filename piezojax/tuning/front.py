@@ -9,12 +9,13 @@ from jax import Array
 from ..core.arrays import as_array
 from ..core.progress import Progress
 from ..solve.clock import Clock
+from ..solve.multi_start import Strategy, minimise
+from ..solve.problem import TOLERANCE
+from ..solve.search_state import SearchState
 from ..study import Case
-from .constraints import CONSTRAINTS, TOLERANCE, by_stage
+from .constraints import CONSTRAINTS, by_stage
 from .objective import Objective
 from .result import FrontPoint, Kept
-from .search import Way
-from .search_state import Search
 
 Place = tuple[np.ndarray, FrontPoint]
 """A point of the unit box, and what it is on the front."""
@@ -23,17 +24,17 @@ Place = tuple[np.ndarray, FrontPoint]
 def trace_front(
     objective: Objective,
     case: Case,
-    search: Search,
-    way: Way,
+    search: SearchState,
+    strategy: Strategy,
     clock: Clock,
     progress: Progress,
 ) -> list[FrontPoint]:
     """Return the best gains found for each limit of the study's front.
 
     Each limit starts from the gains of the one before, the limits from the loosest to
-    the tightest; what ``search`` found by ``way`` is where the first starts. Where a
-    tighter limit came out better than a looser one, that is done again from its gains,
-    which keep both.
+    the tightest, and the first from the result of ``search`` by ``strategy``. Where a
+    tighter limit came out better than a looser one, the looser one is solved again from
+    its gains, which keep both.
     """
     table = case.study.pareto
     assert table is not None
@@ -50,8 +51,8 @@ def trace_front(
 
     def solved(limit: float, unit: np.ndarray) -> Place:
         asked = objective.with_limits(limits | {table.constraint: limit})
-        here = Search(unit, starts=unit[None])
-        way.descend(asked, unit[None], here, table.steps, progress)
+        here = SearchState(unit, starts=unit[None])
+        minimise(strategy, asked, unit[None], here, table.steps, progress)
         unit = here.unit
         values, rms = jax.tree.map(np.asarray, program(asked, as_array(unit)))
         rms = np.sqrt(np.mean(rms**2, axis=1))

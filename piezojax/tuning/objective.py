@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -15,8 +15,10 @@ from ..core.arrays import as_array
 from ..core.metrics import Extremes, TrackingFigures
 from ..core.space import Space
 from ..core.system import Feedback
+from ..solve.augmented_lagrangian import PENALTY, augmented
+from ..solve.problem import HOPELESS, Errors, Verdict
 from ..study import Stage
-from .constraints import Seen, augmented, needs, violations
+from .constraints import Seen, needs, violations
 from .runs import Signals, sampled
 
 T = TypeVar("T")
@@ -24,40 +26,11 @@ T = TypeVar("T")
 Aggregate = Literal["geometric_mean", "mean_square", "worst"]
 Over = Literal["mean", "worst", "cvar"]
 
-PENALTY = 10.0
-"""First penalty on violated limits, on a scale where a factor e too much is 1."""
-
-HOPELESS = 1e6
-"""Objective of a run that diverged: finite, so that a line search can step back."""
-
 RAILED = 0.9
 """A run whose actuator saturates for more than this share of it has lost its loop."""
 
 _SHARPNESS = 20.0  # of the smooth maximum in "worst"
 _FLOOR = 1e-9  # um: an error below a femtometre is as good as none
-
-
-class Verdict(NamedTuple):
-    """What a point comes to: the objective, and by how much it violates what most."""
-
-    loss: Float[Array, ""]
-    violation: Float[Array, ""]
-
-
-class Errors(NamedTuple):
-    """A point as a problem of least squares.
-
-    ``loss`` is what is minimised, ``errors`` of each run in um, ``added`` what the
-    augmented Lagrangian adds. A weight is how much the loss rises with half the mean
-    square of a run's error: with these weights, and 2 on what is added, they are
-    residuals whose squares have the loss's gradient, as far as it depends on them.
-    """
-
-    loss: Float[Array, ""]
-    verdict: Verdict
-    errors: Float[Array, "runs samples"]
-    added: Float[Array, " constraints"]
-    weights: Float[Array, " runs"]
 
 
 def _on_each(function: Callable[[Stage | None], T], stages: Stage | None) -> T:

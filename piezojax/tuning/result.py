@@ -9,10 +9,10 @@ from pydantic import BaseModel, ConfigDict
 
 from ..core.files import read_model
 from ..core.metrics import TrackingFigures
-from .constraints import CONSTRAINTS, TOLERANCE, Seen, by_stage
+from ..solve.problem import TOLERANCE
+from ..solve.search_state import Status
+from .constraints import CONSTRAINTS, Seen, by_stage
 from .objective import RAILED
-
-Status = Literal["converged", "step limit", "interrupted"]
 
 RESULT_FILE = "result.json"
 GAINS_FILE = "gains.toml"
@@ -38,7 +38,7 @@ class Scores(BaseModel):
 class Kept(BaseModel):
     """A limit and what became of it: the ``value`` nearest to it, over all plants.
 
-    ``kept`` allows for ``constraints.TOLERANCE``; ``active`` is a limit that is kept,
+    ``kept`` allows for ``solve.problem.TOLERANCE``; ``active`` is a limit that is kept,
     but by less than 2 %: it costs something.
     """
 

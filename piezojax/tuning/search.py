@@ -1,57 +1,78 @@
-"""The search: screen the box, then descend from the best starts, all at once."""
+"""The search of tuning: screen the box, then descend from the best starts."""
 
 import numpy as np
 import scipy
 
 from ..core.progress import Progress
+from ..core.rollout import BLOCK
 from ..solve.clock import Clock
+from ..solve.descent import spacing
+from ..solve.lockstep import LockstepDescent
+from ..solve.multi_start import Strategy, minimise
 from ..solve.optimisers import GAUSS_NEWTON
+from ..solve.problem import HOPELESS
+from ..solve.search_state import SearchState
+from ..solve.successive_halving import SuccessiveHalving
 from ..study import Case
-from .lockstep import Together
-from .objective import HOPELESS, Objective
-from .search_state import Search
-from .successive_halving import Race
+from .objective import Objective
 
-Way = Together | Race
+FORWARD_BELOW, FORWARD_BELOW_WITH_AXES = 5, 64
+"""Fewer parameters than this are differentiated in forward mode: with several axes the
+reverse pass takes minutes to compile, three times as long."""
 
 
-def way_of(objective: Objective, case: Case, clock: Clock) -> Way:
-    """Return the way in which the study's method searches."""
-    method = case.study.optimiser.method
-    return (Race if method == GAUSS_NEWTON else Together)(objective, case, clock)
+def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:
+    """Return the strategy of the study's method, compiled for its objective."""
+    table, size = case.study.optimiser, len(case.space.paths)
+    if table.method == GAUSS_NEWTON:
+        counted = objective.signals.references.shape[1] - objective.start
+        every = spacing(objective.lanes, counted)
+        return SuccessiveHalving(
+            objective, size, clock, tolerance=table.tolerance, every=every
+        )
+    below = FORWARD_BELOW_WITH_AXES if case.study.axes else FORWARD_BELOW
+    return LockstepDescent(
+        objective,
+        size,
+        clock,
+        method=table.method,
+        tolerance=table.tolerance,
+        forward=size < below,
+        at_once=max(1, BLOCK // objective.lanes),
+    )
 
 
 def search_box(
     objective: Objective, case: Case, clock: Clock, progress: Progress
-) -> tuple[Search, Way | None]:
-    """Return the best point of the case's box, and the way, with all it compiled.
+) -> tuple[SearchState, Strategy | None]:
+    """Return the best point of the case's box, and the strategy with its programs.
 
-    ``Ctrl-C`` ends the search with the best point so far; there is no way if it came
-    before there was one. Raises ValueError when the loop diverges at every point tried.
+    ``Ctrl-C`` ends the search with the best point so far; the strategy is None if there
+    was none yet. Raises ValueError when the loop diverges at every point tried.
     """
     own, table = np.asarray(case.space.start(case.loop)), case.study.optimiser
-    search = Search(own, starts=own[None])
-    inner, way = search.course.clock, None
+    search = SearchState(own, starts=own[None])
+    inner, strategy = search.history.clock, None
     try:
         points = candidates(case)
         progress.stage(f"screening {len(points)} points of the box")
-        way = way_of(objective, case, inner)
+        strategy = make_strategy(objective, case, inner)
         try:
-            losses, verdict = way.losses(points)
+            losses, verdict = strategy.screen(points)
             chosen = _starts(losses, table.starts, search)
-            search.offer(points, verdict)
+            search.update_best(points, verdict)
             search.starts = points[chosen]
         finally:
-            way.wait()
-        way.descend(objective, search.starts, search, table.steps, progress)
+            strategy.wait()
+        minimise(strategy, objective, search.starts, search, table.steps, progress)
     except KeyboardInterrupt:
         search.status = "interrupted"
     clock.compile_s += inner.compile_s
-    return search, way
+    return search, strategy
 
 
 def candidates(case: Case) -> np.ndarray:
-    """Return the points to be screened: the study's own start, then others."""
+    """Return the points to screen: the study's own start, then Sobol points."""
     own = np.asarray(case.space.start(case.loop))
     table, size = case.study.optimiser, len(case.space.paths)
     count = max(table.candidates, table.starts - 1)
@@ -61,8 +82,8 @@ def candidates(case: Case) -> np.ndarray:
     return np.concatenate([own[None], others])
 
 
-def _starts(losses: np.ndarray, count: int, search: Search) -> np.ndarray:
-    """Choose the study's own start and the best candidates, none that diverges."""
+def _starts(losses: np.ndarray, count: int, search: SearchState) -> np.ndarray:
+    """Return the places of the study's own start and the best stable candidates."""
     stable = losses < HOPELESS
     if not stable.any():
         raise ValueError(

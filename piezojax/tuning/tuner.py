@@ -13,6 +13,7 @@ from ..core.metrics import TrackingFigures
 from ..core.progress import Progress, Silent
 from ..core.system import Feedback
 from ..solve.clock import Clock
+from ..solve.search_state import SearchState
 from ..study import Case, Stage, read, shipped
 from ..study.ensemble import Part
 from .baselines import Baselines, Budget, contest
@@ -24,7 +25,6 @@ from .objective import RAILED, Objective
 from .result import FrontPoint, Kept, Perturbed, Result, Scores, scores
 from .runs import Signals
 from .search import search_box
-from .search_state import Search
 
 
 @dataclass
@@ -97,13 +97,13 @@ def tune(
         highest=as_array(table.highest),
         dt=table.dt,
     ).with_limits(table.constraints.limits)
-    search, way = search_box(objective, case, clock, progress)
+    search, strategy = search_box(objective, case, clock, progress)
 
     after = space.put(case.loop, as_array(search.unit))
     try:
         front, kept = None, _kept(objective, search, clock)
-        if table.pareto is not None and way and search.status != "interrupted":
-            front = trace_front(objective, case, search, way, clock, progress)
+        if table.pareto is not None and strategy and search.status != "interrupted":
+            front = trace_front(objective, case, search, strategy, clock, progress)
         progress.stage("judging on held-out noise")
         result = _report(case, data, judge, before, after, search, clock, kept, front)
     except KeyboardInterrupt:
@@ -176,7 +176,7 @@ def _perturbed(
     return Perturbed.of(seen[0], seen[1], driven, case.study.constraints.limits)
 
 
-def _kept(objective: Objective, search: Search, clock: Clock) -> dict[str, Kept]:
+def _kept(objective: Objective, search: SearchState, clock: Clock) -> dict[str, Kept]:
     """Return the limits and what became of them, on the plants of the tuning."""
     if not objective.limits:
         return {}
@@ -195,7 +195,7 @@ def _report(
     judge: Judge,
     before: TrackingFigures,
     after: Feedback,
-    search: Search,
+    search: SearchState,
     clock: Clock,
     kept: dict[str, Kept],
     front: list[FrontPoint] | None,
@@ -247,7 +247,7 @@ def _report(
         perturbed=_perturbed(case, data, judge, case.loop, after),
         units={trace.name: trace.unit for trace in data.traces},
         warnings=[*search.warnings, *_warnings(case, at_bound, after_scores, holdout)],
-        history=search.history,
+        history=search.losses_by_start,
         times_s=search.times_s,
         evaluations=search.evaluations,
         compile_s=clock.compile_s,

@@ -22,9 +22,9 @@ def loop(gains):
     """The loop with these gains [8]; its noise is given in um."""
     controller = eqx.tree_at(
         lambda c: (
-            c.feedback.proportional,
-            c.feedback.integral,
-            c.feedback.derivative,
+            c.feedback.law.proportional,
+            c.feedback.law.integral,
+            c.feedback.law.derivative,
             c.feedback.surface,
             c.feedback.control_weight,
             c.feedback.filter.alpha,
@@ -44,9 +44,9 @@ def three_dof(gains, base, stage):
         lambda c: [
             matrix[axis][axis]
             for matrix in (
-                c.controller.proportional,
-                c.controller.integral,
-                c.controller.derivative,
+                c.controller.law.proportional,
+                c.controller.law.integral,
+                c.controller.law.derivative,
             )
             for axis in range(3)
         ],

@@ -80,12 +80,12 @@ def changed(**values):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: BoundaryLayer(-1.0, 1.0), "gain K is -1; .* at least 0"),
-        (lambda: BoundaryLayer(1.0, 0.0), "width of the layer .* is 0; .* above 0"),
-        (lambda: BoundaryLayer(np.nan, 1.0), "gain K is nan"),
+        (lambda: BoundaryLayer(-1.0, 1.0), "gain .* is -1; .* at least 0"),
+        (lambda: BoundaryLayer(1.0, 0.0), "width .* is 0; .* above 0"),
+        (lambda: BoundaryLayer(np.nan, 1.0), "gain .* is nan"),
         (lambda: changed(surface=np.inf), "surface in 1/s is inf"),
-        (lambda: changed(error_weight=0.0), "Q is 0; .* above 0"),
-        (lambda: changed(control_weight=-1.0), "R is -1; .* at least 0"),
+        (lambda: changed(error_weight=0.0), "error_weight is 0; .* above 0"),
+        (lambda: changed(control_weight=-1.0), "control_weight is -1; .* at least 0"),
         (lambda: changed(inversion="none"), "inversion 'none'; it must be one of"),
         (
             lambda: changed(model=ARMA((0.5,), (0.5,))),

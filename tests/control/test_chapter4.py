@@ -23,7 +23,8 @@ from piezojax.catalog import p753_chapter4 as catalog
 from piezojax.control import (
     AlphaBeta,
     Anticipation,
-    ModelReferencePID,
+    ModelReferenceSlidingMode,
+    SwitchingPID,
 )
 from piezojax.control.output_tracking import INVERSIONS
 from piezojax.core.metrics import (
@@ -109,10 +110,8 @@ def gains_of(a, b, m, inversion):
 
 def controller_of(gains, rate=20_000):
     """Return the package's model-reference controller with the oracle's gains."""
-    controller = ModelReferencePID(
-        proportional=gains["P"],
-        integral=gains["I"],
-        derivative=gains["D"],
+    controller = ModelReferenceSlidingMode(
+        SwitchingPID(gains["P"], gains["I"], gains["D"], dt=1 / rate),
         surface=gains["m"],
         error_weight=gains["Q"],
         control_weight=gains["R"],
@@ -351,23 +350,29 @@ def changed(controller, **values):
             lambda: changed(PRINTED, model=ARMA((0.5, 0.1), (0.0, 1.0))),
             "b_0 of the model is 0",
         ),
-        (lambda: changed(PRINTED, error_weight=0.0), "Q is 0; .* above 0"),
-        (lambda: changed(PRINTED, control_weight=-1.0), "R is -1; .* at least 0"),
+        (lambda: changed(PRINTED, error_weight=0.0), "error_weight is 0; .* above 0"),
+        (
+            lambda: changed(PRINTED, control_weight=-1.0),
+            "control_weight is -1",
+        ),
         (lambda: changed(PRINTED, surface=(np.nan,)), "surface is nan"),
-        (lambda: changed(PRINTED, integral=np.inf), "integral in .* is inf"),
-        (lambda: changed(SWITCHED.law, gain=-1.0), "gain K is -1; .* at least 0"),
+        (lambda: changed(PRINTED.law, integral=np.inf), "integral in .* is inf"),
+        (lambda: changed(SWITCHED.law, gain=-1.0), "gain .* is -1; .* at least 0"),
         (
             lambda: changed(SWITCHED, model=LONGER),
             "the model has 3 a and 1 b coefficients; it must have 2 and 3",
         ),
-        (lambda: changed(SWITCHED, control_weight=-1.0), "R is -1; .* at least 0"),
+        (
+            lambda: changed(SWITCHED, control_weight=-1.0),
+            "control_weight is -1",
+        ),
         (
             lambda: changed(catalog.traditional(), inversion="none"),
             "inversion 'none'; it must be one of",
         ),
         (
-            lambda: changed(catalog.continuous(), proportional=np.nan),
-            "proportional in V s/um is nan; it must be finite",
+            lambda: changed(catalog.continuous().law, proportional=np.nan),
+            "proportional .* is nan; it must be finite",
         ),
         (
             lambda: catalog.model_reference(3_000),
@@ -388,5 +393,5 @@ def test_bad_parameters_are_refused(make, message):
 
 
 def test_bad_weights_of_the_traditional_design_are_refused():
-    with pytest.raises(ValueError, match="error_weight Q is -1"):
+    with pytest.raises(ValueError, match="error_weight is -1"):
         changed(catalog.traditional(), error_weight=-1.0)

@@ -17,7 +17,8 @@ from piezojax.control import (
     PID,
     AlphaBeta,
     DisturbanceObserverControl,
-    SlidingModePID,
+    SlidingMode,
+    SwitchingPID,
 )
 from piezojax.core.system import (
     Delay,
@@ -284,16 +285,14 @@ FIRST_ORDER = ARMA((0.5,), (0.5,))
 
 def sliding_mode(**changes):
     parameters = {
-        "proportional": 0.01,
-        "integral": 30.0,
-        "derivative": 1e-6,
+        "law": SwitchingPID(0.01, 30.0, 1e-6, dt=DT),
         "surface": 18e3,
         "error_weight": 1.0,
         "control_weight": 100.0,
         "model": SECOND_ORDER,
         "filter": AlphaBeta(0.1, 1e-4, DT),
     }
-    return SlidingModePID(**{**parameters, **changes})
+    return SlidingMode(**{**parameters, **changes})
 
 
 def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
@@ -326,16 +325,16 @@ def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
         ),
         (
             lambda: sliding_mode(error_weight=0.0),
-            "error_weight Q is 0; it must be finite and above 0",
+            "error_weight is 0; it must be finite and above 0",
         ),
         (
             lambda: sliding_mode(control_weight=-1.0),
-            "control_weight R is -1; it must be finite and at least 0",
+            "control_weight is -1; it must be finite and at least 0",
         ),
         (lambda: AlphaBeta(0.0, 0.1, DT), "alpha is 0; it must be finite and above 0"),
         (lambda: AlphaBeta(1.1, 0.1, DT), r"alpha is 1\.1; .* at most 1"),
         (lambda: AlphaBeta(0.1, 2.0, DT), "beta is 2; it must be finite and at least"),
-        (lambda: AlphaBeta(0.1, 0.1, -DT), "sample time in s is -5e-05"),
+        (lambda: AlphaBeta(0.1, 0.1, -DT), "dt in s is -5e-05"),
         (
             lambda: observer(FIRST_ORDER),
             "the model has 1 a and 1 b coefficients; it must have 2 and 3",

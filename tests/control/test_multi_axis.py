@@ -211,8 +211,8 @@ LEAVES = {
     "multi-axis": (
         catalog.loop(catalog.multi_axis(filtered=False)),
         {
-            "controller.proportional.0.0": 1e-4,
-            "controller.integral.1.1": 1e-2,
+            "controller.law.proportional.0.0": 1e-4,
+            "controller.law.integral.1.1": 1e-2,
             "controller.reaching.2.2": 1e-5,
             "controller.decoupling.1.0": 1e-5,
             "controller.surface.0.0.0": 1e-5,
@@ -225,7 +225,7 @@ LEAVES = {
         catalog.loop(catalog.disturbance_observer()),
         {
             "controller.Z.controller.feedback.surface": 1e-4,
-            "controller.Rx.controller.feedback.proportional": 1e-5,
+            "controller.Rx.controller.feedback.law.proportional": 1e-5,
             "controller.Ry.controller.feedback.model.moving.1": 1e-6,
             "controller.Z.controller.cutoff": 1e-2,
             "controller.Rx.filter.alpha": 1e-5,
@@ -376,7 +376,11 @@ REFUSED = [
     (lambda: observability_form(state_space(4, 2, 2, 0.1)), "D is not zero"),
     (lambda: observability_form(state_space(4, 2, 2)), r"\(7.4\) is singular"),
     (lambda: changed(MULTI, decoupling=np.eye(2)), "decoupling is 2 x 2; .* 3 x 3"),
-    (lambda: changed(MULTI, integral=EYE * np.nan), "integral is nan"),
+    (lambda: changed(MULTI.law, integral=EYE * np.nan), "integral .* is nan"),
+    (
+        lambda: changed(MULTI, law=changed(MULTI.law, derivative=np.eye(2))),
+        "law.derivative is 2 x 2; .* 3 x 3",
+    ),
     (lambda: changed(MULTI, surface=[EYE]), "surface holds 1 matrices; .* hold 3"),
     (
         lambda: changed(MULTI, surface=[EYE, EYE, np.eye(2)]),
@@ -386,10 +390,10 @@ REFUSED = [
         lambda: changed(NOMINAL, model=ARMA((0.5,), (1.0, 0.0, 0.0))),
         "the model has 1 a and 3 b coefficients; it must have 2 and 3",
     ),
-    (lambda: changed(NOMINAL, error_weight=0.0), "error_weight Q is 0; .* above 0"),
-    (lambda: changed(NOMINAL, control_weight=-1.0), "control_weight R is -1"),
-    (lambda: changed(NOMINAL, proportional=np.nan), "proportional is nan"),
-    (lambda: changed(NOMINAL, dt=0.0), "sample time in s is 0; .* above 0"),
+    (lambda: changed(NOMINAL, error_weight=0.0), "error_weight is 0; .* above 0"),
+    (lambda: changed(NOMINAL, control_weight=-1.0), "control_weight is -1"),
+    (lambda: changed(NOMINAL.law, proportional=np.nan), "proportional .* is nan"),
+    (lambda: changed(NOMINAL.law, dt=0.0), "dt in s is 0; .* above 0"),
     (
         lambda: changed(NOMINAL, reading="true_state"),
         r"reading 'true_state'; it must be one of \['nominal_state', 'measured_state'",

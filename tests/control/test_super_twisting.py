@@ -76,11 +76,11 @@ def test_at_rest_it_rests_and_its_slopes_are_those_of_differences():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((-1.0, 1.0, 1.0, DT), "root gain .* is -1; .* at least 0"),
-        ((1.0, -1.0, 1.0, DT), "sign gain in V/s is -1; .* at least 0"),
-        ((1.0, 1.0, 0.0, DT), "layer in um/s is 0; .* above 0"),
-        ((1.0, 1.0, 1.0, 0.0), "sample time in s is 0; .* above 0"),
-        ((1.0, np.inf, 1.0, DT), "sign gain in V/s is inf"),
+        ((-1.0, 1.0, 1.0, DT), "root_gain .* is -1; .* at least 0"),
+        ((1.0, -1.0, 1.0, DT), "sign_gain .* is -1; .* at least 0"),
+        ((1.0, 1.0, 0.0, DT), "layer .* is 0; .* above 0"),
+        ((1.0, 1.0, 1.0, 0.0), "dt in s is 0; .* above 0"),
+        ((1.0, np.inf, 1.0, DT), "sign_gain .* is inf"),
     ],
 )
 def test_bad_parameters_are_refused(arguments, message):

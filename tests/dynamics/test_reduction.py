@@ -123,10 +123,8 @@ def test_as_many_states_as_rows_are_the_printed_form(chapter, lags):
 def test_a_controller_on_such_a_model_stabilises_it(order):
     model = observability_form(balanced_reduction(WHOLE, order).model)
     unit = np.eye(3)
-    controller = pj.control.MultiAxisSlidingModePID(
-        proportional=0.5 * unit,
-        integral=20.0 * unit,
-        derivative=0.0 * unit,
+    controller = pj.control.MultiAxisSlidingMode(
+        pj.control.SwitchingPID(0.5 * unit, 20.0 * unit, 0.0 * unit, dt=p558.DT),
         reaching=0.9 * unit,
         decoupling=-0.3 * unit,
         surface=(unit, unit, unit),

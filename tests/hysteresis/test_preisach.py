@@ -239,7 +239,7 @@ def test_gradients_at_rest_and_on_edges_are_those_of_one_side():
 def test_eager_is_jitted_is_a_lane_of_a_batch():
     system = model()
     jitted = response(system, PATH)
-    stepping, state = system.law(), system.init(PATH[0])
+    stepping, state = system.resolved(), system.init(PATH[0])
     for input, expected in zip(PATH[:3], jitted, strict=False):
         state, output = stepping.step(state, input)
         np.testing.assert_allclose(output, expected, rtol=0, atol=1e-13)

@@ -18,7 +18,7 @@ from piezojax.identification import (
     steady_response,
 )
 from piezojax.identification.estimators.model_bouc_wen import linear_oscillator
-from piezojax.identification.records import resample
+from piezojax.identification.records.resample import resample
 
 RATE = 750.0
 SHARED = Path(__file__).parents[2].parent / "shared/data/bouc_wen/train.h5"

@@ -5,7 +5,7 @@ from piezojax import (
     Record,
 )
 from piezojax.identification import average_periods
-from piezojax.identification.records import resample
+from piezojax.identification.records.resample import resample
 
 DT = 2e-3
 SAMPLES = 64

@@ -162,31 +162,24 @@ MUTATIONS = (
     ),
     # Controllers
     Mutation(
-        "sign of D, multi-axis",
-        "control/multi_axis.py",
-        "                product(self.derivative, slope),",
-        "                product(self.derivative, tuple(-x for x in slope)),",
-        _MULTI_AXIS,
-    ),
-    Mutation(
-        "sign of D, nominal",
-        "control/nominal.py",
-        "- self.derivative * (sliding",
-        "+ self.derivative * (sliding",
+        "sign of D of the sliding variable",
+        "control/switching.py",
+        "i - p - d / self.dt",
+        "i - p + d / self.dt",
         _MULTI_AXIS,
     ),
     Mutation(
         "integral used one sample late",
-        "control/sliding_mode.py",
-        "            integral\n            - self.proportional * s",
-        "            state.integral\n            - self.proportional * s",
+        "control/switching.py",
+        "            integral,\n            _times(self.proportional, input)",
+        "            state.integral,\n            _times(self.proportional, input)",
         (_LOOPS,),
     ),
     Mutation(
         "start with a bump of 2 %",
         "control/sliding_mode.py",
-        "needed = input.applied *",
-        "needed = 1.02 * input.applied *",
+        "needed = applied *",
+        "needed = 1.02 * applied *",
         (_LOOPS, "-k", "away_from_zero"),
     ),
     Mutation(
@@ -247,9 +240,9 @@ MUTATIONS = (
     ),
     Mutation(
         "half the width",
-        "control/boundary_layer.py",
-        "jnp.clip(input / self.width",
-        "jnp.clip(2.0 * input / self.width",
+        "control/switching.py",
+        "jnp.clip(sliding / self.width",
+        "jnp.clip(2.0 * sliding / self.width",
         ("tests/control/test_boundary_layer.py",),
     ),
     # Models

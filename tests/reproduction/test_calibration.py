@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from piezojax.catalog import p753
-from piezojax.control import ModelReferencePID
+from piezojax.control import ModelReferenceSlidingMode
 from piezojax.core.paths import parameters
 from piezojax.core.rollout import simulate
 from piezojax.core.system import Feedback, loop_inputs
@@ -174,8 +174,8 @@ def test_the_number_of_candidates():
 @pytest.mark.parametrize(
     ("doubt", "column", "expected"),
     [
-        ("proportional, Table 5-4, observer", "dob", {"feedback.proportional": 1}),
-        ("proportional, Table 5-2", "pid_smc", {"proportional": 0}),
+        ("proportional, Table 5-4, observer", "dob", {"feedback.law.proportional": 1}),
+        ("proportional, Table 5-2", "pid_smc", {"law.proportional": 0}),
         ("K_e", "dob", {"gain": None}),
         (
             "DC gain of (5.33)",
@@ -233,7 +233,7 @@ def test_sw_of_another_size_is_followed_by_all_that_follow_it():
         controller = jax.tree.map(lambda leaf: leaf[0], made.controller)
         follow = (
             chapter4.COLUMNS["4-5"]["model_reference"].target
-            if isinstance(controller, ModelReferencePID)
+            if isinstance(controller, ModelReferenceSlidingMode)
             else lambda _, reference: reference
         )
         np.testing.assert_allclose(

@@ -33,7 +33,8 @@ LOOPS = {
     "PID": pid_loop,
     "PID-SMC": lambda: p753.loop(p753.sliding_mode()),
     "observer": lambda: replace(
-        p753.loop(p753.disturbance_observer()), {"controller.feedback.integral": 10.0}
+        p753.loop(p753.disturbance_observer()),
+        {"controller.feedback.law.integral": 10.0},
     ),
     "stage with a mode": lambda: pj.Feedback(
         pj.control.PID(0.3, 1500.0, dt=p753.DT),

@@ -130,7 +130,7 @@ def test_sensitivity_is_that_of_the_stability_report(case_of):
         "plants": ["p753", "p753_chapter4"],
         "parameters": {
             "controller.cutoff": {"values": [300.0, 3000.0]},
-            "controller.feedback.integral": {"values": [5.0, 1000.0]},
+            "controller.feedback.law.integral": {"values": [5.0, 1000.0]},
         },
     }
     case = case_of(
@@ -144,7 +144,10 @@ def test_sensitivity_is_that_of_the_stability_report(case_of):
     assert found.sensitivity_peak.dims[-1] == "plant"
     for name, plant in case.plants.items():
         for cutoff in (300.0, 3000.0):
-            values = {"controller.cutoff": cutoff, "controller.feedback.integral": 5.0}
+            values = {
+                "controller.cutoff": cutoff,
+                "controller.feedback.law.integral": 5.0,
+            }
             loop = replace(case.loop, values)
             loop = pj.Feedback(loop.controller, plant, loop.actuator, loop.sensor)
             reports = [
@@ -155,9 +158,9 @@ def test_sensitivity_is_that_of_the_stability_report(case_of):
             peak = float(found.sensitivity_peak.sel(values).sel(plant=name))
             # The report refines what the sweep looks up on a grid of frequencies.
             assert peak == pytest.approx(max(peaks), rel=2e-3)
-    at_five = found.sensitivity_peak.sel({"controller.feedback.integral": 5.0})
+    at_five = found.sensitivity_peak.sel({"controller.feedback.law.integral": 5.0})
     assert np.isfinite(at_five).sum() == 3  # one of them is not stable
-    lost = found.sensitivity_peak.sel({"controller.feedback.integral": 1000.0})
+    lost = found.sensitivity_peak.sel({"controller.feedback.law.integral": 1000.0})
     assert np.isinf(lost).all()
 
 

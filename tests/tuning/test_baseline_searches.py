@@ -17,7 +17,7 @@ from piezojax.report.baseline_curves import (
 )
 from piezojax.report.console import console
 from piezojax.solve.clock import Clock
-from piezojax.solve.history import Course
+from piezojax.solve.history import History
 from piezojax.study import Study, build
 from piezojax.tuning.baselines import Budget, cma_es, load_baselines, nelder_mead
 from piezojax.tuning.baselines.contest import holdout_geomean
@@ -62,12 +62,12 @@ def test_the_minimum_inside_the_box(name, minimum, expected):
     found = METHODS[name](objective, STARTS, TIGHT, Silent())
     np.testing.assert_allclose(found.unit, expected, atol=2e-4)
     assert np.all((found.unit >= 0.0) & (found.unit <= 1.0))
-    course = found.course
-    assert course.loss == pytest.approx(float(objective.loss(found.unit)), rel=1e-12)
-    assert course.evaluations[-1] <= TIGHT.evaluations
-    assert np.all(np.diff(course.losses) <= 0.0)
-    assert np.all(np.diff(course.times_s) >= 0.0)
-    assert 0.0 < course.compile_s[-1] < course.times_s[-1]
+    history = found.history
+    assert history.loss == pytest.approx(float(objective.loss(found.unit)), rel=1e-12)
+    assert history.evaluations[-1] <= TIGHT.evaluations
+    assert np.all(np.diff(history.losses) <= 0.0)
+    assert np.all(np.diff(history.times_s) >= 0.0)
+    assert 0.0 < history.compile_s[-1] < history.times_s[-1]
     assert found.stop != "evaluations"
     assert "maxfevals" not in found.stop
 
@@ -76,7 +76,7 @@ def test_the_minimum_inside_the_box(name, minimum, expected):
 def test_the_budget_ends_a_search(name):
     few = Budget(evaluations=28, tolerance=1e-12)
     found = METHODS[name](Bowl(jnp.array([0.3, 0.7, 0.5])), STARTS, few, Silent())
-    assert 28 <= found.course.evaluations[-1] <= 28 + 14
+    assert 28 <= found.history.evaluations[-1] <= 28 + 14
     assert found.stop in ("evaluations", "maxfevals")
 
 
@@ -97,13 +97,13 @@ def test_nelder_and_mead_take_every_start():
     np.testing.assert_allclose(both, 0.1, atol=1e-3)
 
 
-def test_a_course_says_when_a_loss_was_reached():
-    course = Course(Clock())
+def test_a_history_says_when_a_loss_was_reached():
+    history = History(Clock())
     for loss in (3.0, 5.0, 1.0):
-        course.add(4, loss)
-    assert course.losses == [3.0, 3.0, 1.0]
-    assert course.evaluations == [4, 8, 12]
-    assert [course.reached(x) for x in (4.0, 3.0, 2.0, 0.5)] == [0, 0, 2, None]
+        history.add(4, loss)
+    assert history.losses == [3.0, 3.0, 1.0]
+    assert history.evaluations == [4, 8, 12]
+    assert [history.reached(x) for x in (4.0, 3.0, 2.0, 0.5)] == [0, 0, 2, None]
 
 
 def entry(**changes):

@@ -47,7 +47,7 @@ FILE = {
             "catalog": "p753_continuous",
             "printed": [5000.0],
             "rates": [5000.0],
-            "tune": ["integral", "surface"],
+            "tune": ["law.integral", "surface"],
             "bounds": {"surface": {"lower": 0.1, "upper": 5.0, "per_sample": True}},
         },
     },
@@ -266,7 +266,7 @@ def test_the_shipped_comparison_is_valid():
     assert len(found) == len(comparison.controllers)
     tuned = found["model-reference PID-SMC"].case.loop.controller
     printed = p753_chapter4.MODEL_REFERENCE_GAINS["4-4"][2000]
-    assert float(tuned.controller.integral) == printed["integral"]
+    assert float(tuned.controller.law.integral) == printed["integral"]
     assert found["model-reference PID-SMC"].start == "printed"
     assert found["traditional PID-SMC"].start == "scaled"
     assert found["PID"].start == "rule"

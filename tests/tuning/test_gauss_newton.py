@@ -2,7 +2,6 @@
 
 import copy
 from functools import cache
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -17,19 +16,23 @@ from piezojax import (
 from piezojax.core.arrays import as_array
 from piezojax.core.system import loop_inputs
 from piezojax.solve.clock import Clock
+from piezojax.solve.descent import (
+    PARALLEL,
+    Descent,
+    LocalModel,
+    Patience,
+    derivatives_at,
+    spacing,
+    trials_at,
+)
+from piezojax.solve.gauss_newton import Quadratic, boxed_step
+from piezojax.solve.multi_start import InThreads, descend
+from piezojax.solve.problem import Errors, Verdict
+from piezojax.solve.successive_halving import POINTS, better_half
 from piezojax.study import Study, build
 from piezojax.tuning.data import make_data
-from piezojax.tuning.gauss_newton import (
-    LANES,
-    RUNS,
-    Descent,
-    boxed_step,
-    lanes_of,
-    slopes_of,
-    spacing,
-)
-from piezojax.tuning.objective import Errors, Objective, Verdict
-from piezojax.tuning.successive_halving import Race, halved
+from piezojax.tuning.objective import Objective
+from piezojax.tuning.search import make_strategy
 
 
 class Problem(eqx.Module):
@@ -68,21 +71,21 @@ PROBLEMS = {
 def programs_of(kind):
     problem = Problem(kind)
     return (
-        jax.jit(lambda u: slopes_of(problem, u, 1)),
-        jax.jit(lambda u: lanes_of(problem, u, 1)),
+        jax.jit(lambda u: derivatives_at(problem, u, 1)),
+        jax.jit(lambda u: trials_at(problem, u, 1)),
     )
 
 
 def descent_on(kind, unit, tolerance=1e-14):
     problem, unit = Problem(kind), np.array(unit)
-    slopes, lanes = programs_of(kind)
+    derivatives, trials = programs_of(kind)
     return Descent(
         unit,
         float(problem.loss(unit)),
         problem.errors(unit, 1).verdict,
-        lambda u: slopes(as_array(u)),
-        lambda u: lanes(as_array(u)),
-        tolerance,
+        lambda u: LocalModel.of(derivatives(as_array(u))),
+        lambda u: trials(as_array(u)),
+        Patience(5, gain=tolerance),
     )
 
 
@@ -112,8 +115,9 @@ def test_a_bent_valley_takes_few_steps():
 
 def test_a_point_without_slopes_ends_its_descent():
     descent = descent_on("valley", (0.2, 0.5))
-    good = descent.slopes(descent.unit)
-    descent.slopes = lambda unit: good._replace(jacobian=good.jacobian * jnp.nan)
+    good = programs_of("valley")[0](as_array(descent.unit))
+    bad = good._replace(jacobian=good.jacobian * jnp.nan)
+    descent.linearise = lambda unit: LocalModel.of(bad)
     assert descent.step() == 1
     assert descent.done
     np.testing.assert_array_equal(descent.unit, (0.2, 0.5))
@@ -123,17 +127,15 @@ def test_steps_stop_at_the_sides_of_the_box():
     curvature = np.array([[2.0, 1.9], [1.9, 2.0]])
     target = np.array([-0.5, 0.9])
     unit = np.array([0.2, 0.5])
-    model = SimpleNamespace(gradient=curvature @ (unit - target), curvature=curvature)
+    model = Quadratic(gradient=curvature @ (unit - target), curvature=curvature)
     step = boxed_step(model, unit, 0.0)
     # At x = 0 the best y solves 1.9 (0 + 0.5) + 2 (y - 0.9) = 0.
     np.testing.assert_allclose(unit + step, [0.0, 0.9 - 0.5 * 0.95], atol=1e-12)
-    inside = SimpleNamespace(
-        gradient=curvature @ (unit - [0.3, 0.6]), curvature=curvature
-    )
+    inside = Quadratic(gradient=curvature @ (unit - [0.3, 0.6]), curvature=curvature)
     np.testing.assert_allclose(unit + boxed_step(inside, unit, 0.0), [0.3, 0.6])
     # On the side, pushed outwards, it stays there.
     edge = np.array([0.0, 0.5])
-    model = SimpleNamespace(gradient=np.array([3.0, 0.0]), curvature=curvature)
+    model = Quadratic(gradient=np.array([3.0, 0.0]), curvature=curvature)
     assert boxed_step(model, edge, 0.1)[0] == 0.0
 
 
@@ -146,11 +148,21 @@ def test_spacing_is_prime_and_leaves_samples(runs, counted):
 
 
 def test_the_better_half_goes_on():
-    descents = [descent_on("valley", (0.1, 0.1)) for _ in range(3)]
-    for descent, loss in zip(descents, (3.0, 1.0, 2.0), strict=True):
-        descent.loss = loss
-    assert [d.loss for d in halved(descents)] == [1.0, 2.0]
-    assert [d.loss for d in halved(descents[:1])] == [3.0]
+    """Of nine descents five, then three; the best ones are never dropped."""
+    places = np.random.default_rng(1).uniform(0.1, 0.9, (9, 2))
+    seen = []
+    standing, ended = descend(
+        InThreads([descent_on("valley", place) for place in places]),
+        7,
+        seen.append,
+        cut=better_half,
+    )
+    assert not ended
+    assert [len(s.losses) for s in seen] == 3 * [9] + 3 * [5] + [3]
+    for before, after in zip(seen[2:-1:3], seen[3::3], strict=True):
+        best = np.argsort(before.losses)[: len(after.losses)]
+        np.testing.assert_array_equal(after.places, before.places[best])
+    assert standing.losses[0] <= min(s.losses.min() for s in seen)
 
 
 STUDY = {
@@ -218,7 +230,7 @@ def test_weighted_errors_have_the_gradient_of_the_objective():
     both = jax.jacfwd(lambda u: (errors(u),) * 2, has_aux=True)
     slopes, dense = jax.jit(both)(unit)
     # The gradient of the objective goes the other way: through its figures.
-    here = jax.jit(lambda u: slopes_of(objective, u, every))(unit)
+    here = jax.jit(lambda u: derivatives_at(objective, u, every))(unit)
     found = jnp.einsum("r,rt,rti->i", weights, dense, slopes) / dense.shape[1]
     np.testing.assert_allclose(found, here.gradient, rtol=1e-8)
     np.testing.assert_allclose(loss, here.loss, rtol=1e-12)
@@ -240,15 +252,15 @@ def objective():
 @pytest.fixture(scope="module")
 def programs(objective):
     clock = Clock()
-    found = Race(objective, case_of(), clock)
+    found = make_strategy(objective, case_of(), clock)
     found.wait()
     assert clock.compile_s > 0.0
     return found
 
 
 def test_screening_any_number_of_points(objective, programs):
-    points = np.random.default_rng(0).uniform(0.1, 0.9, (LANES + 1, 2))
-    found, verdict = programs.losses(points)
+    points = np.random.default_rng(0).uniform(0.1, 0.9, (POINTS + 1, 2))
+    found, verdict = programs.screen(points)
     np.testing.assert_array_equal(found, verdict.loss)
     expected = jax.jit(jax.vmap(lambda u: objective.loss(u)))(jnp.asarray(points))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
@@ -269,7 +281,7 @@ def test_a_study_is_tuned(outcome):
     assert np.all(np.diff(history, axis=0) <= 0.0)
     assert len(result.times_s) == len(history)
     # Each step of each descent: its derivatives, as many probes and trials as lanes.
-    steps = (result.evaluations - 9 - 3) / RUNS
+    steps = (result.evaluations - 9 - 3) / PARALLEL.evaluations
     assert steps == int(steps)
     assert len(history) < steps <= 3 * len(history)
 
@@ -284,8 +296,8 @@ def test_no_point_around_is_better(outcome, programs):
     around = np.clip(
         np.concatenate([unit + scale * grid for scale in (1e-3, 0.03, 1.0)]), 0.0, 1.0
     )
-    here = programs.losses(unit[None])[0][0]
-    assert np.all(programs.losses(around)[0] >= here - 1e-5)
+    here = programs.screen(unit[None])[0][0]
+    assert np.all(programs.screen(around)[0] >= here - 1e-5)
 
 
 class Stopping:

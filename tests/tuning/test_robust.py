@@ -17,9 +17,10 @@ from piezojax.catalog import p753, p753_stage
 from piezojax.core.metrics import TrackingFigures
 from piezojax.core.paths import replace
 from piezojax.core.system import rest_output
+from piezojax.solve.augmented_lagrangian import augmented, updated
 from piezojax.study import Stage, read, shipped
 from piezojax.study.schema import ConstraintsTable
-from piezojax.tuning.constraints import CONSTRAINTS, augmented, updated
+from piezojax.tuning.constraints import CONSTRAINTS
 from piezojax.tuning.data import make_data
 from piezojax.tuning.objective import Objective
 

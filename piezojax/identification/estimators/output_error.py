@@ -13,10 +13,14 @@ from jaxtyping import Array, Float, Int
 from ...core.arrays import ScalarLike, as_array
 from ...core.progress import Progress, Silent
 from ...core.rollout import simulate
-from ...core.space import Space, squash
+from ...core.space import Space
 from ...core.system import System, rest_output
 from ...hysteresis.model import input_before
-from ...solve.optimisers import Optimiser, damped_gauss_newton
+from ...solve.descent import Patience
+from ...solve.gauss_newton import damped_gauss_newton
+from ...solve.multi_start import InStep, descend
+from ...solve.optimisers import Optimiser, View
+from ...solve.problem import Verdict, linearised
 from ..records.record import Record
 from .structure import Structure
 
@@ -29,8 +33,9 @@ TRIAL_STEPS = 12
 TOLERANCE = 1e-10
 """Relative change of the loss and of the point at which a start is done."""
 
-STALL_STEPS, STALL = 15, 1e-6
-"""Steps in which the best mean square must fall by this share, or the fit has ended."""
+STALLED = Patience(14, share=1e-6)
+"""Steps in which the best mean square must fall by this share, or the fit has ended:
+where a parameter runs to its bound the point itself never comes to rest."""
 
 HOPELESS = 1e11
 """A mean square this large stands for a simulation that is not finite."""
@@ -158,23 +163,24 @@ def output_error(
     starts = _for_every_record(structure, problem)
     width = min(AT_ONCE, len(starts))
     progress.stage(f"compiling the fit of {len(names)} parameters")
-    carries = [
-        _begin(problem, as_array(np.resize(starts[i : i + width], (width, len(names)))))
-        for i in range(0, len(starts), width)
-    ]
-    trial = min(TRIAL_STEPS, steps)
-    progress.stage(f"trying {len(starts)} starts", trial * len(carries))
-    carries = [_descended(problem, carry, trial, progress)[0] for carry in carries]
-    every = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *carries)
-    best = np.argsort(np.asarray(every.loss))[:width]
-    carry = jax.tree.map(lambda leaf: leaf[best], every)
-    progress.stage(f"fitting from the best {width}", steps - trial)
-    carry, finished = _descended(problem, carry, steps - trial, progress)
-    order = np.argsort(np.asarray(carry.loss))
-    losses = np.asarray(carry.loss)[order]
+    descents = InStep(
+        lambda units: _begin(problem, units),
+        lambda carry: _advance(problem, carry),
+        starts,
+        width,
+    )
+    progress.stage(f"fitting from {len(starts)} starts", steps)
+    standing, finished = descend(
+        descents,
+        steps,
+        lambda standing: progress.advance(float(np.sqrt(np.min(standing.losses)))),
+        cut=lambda step, running: width if step == TRIAL_STEPS else None,
+        patience=STALLED,
+    )
+    order = np.argsort(standing.losses)[:width]
+    losses, units = standing.losses[order], standing.units[order]
     if losses[0] >= HOPELESS:
         raise ValueError("no start led to a finite simulation of the record")
-    units = np.asarray(squash(carry.point))[order]
     values, deviations = _with_errors(problem, as_array(units[0]), losses[0])
     return Optimum(problem, names, units, losses, values, deviations, finished)
 
@@ -190,7 +196,7 @@ def _for_every_record(structure: Structure, problem: Problem) -> np.ndarray:
 
 def _optimiser(problem: Problem) -> Optimiser:
     # A lambda, because a bound method would be hashed with its arrays.
-    residuals = lambda unknown: problem.residuals(unknown)  # noqa: E731
+    residuals = linearised(lambda unknown: problem.residuals(unknown))
     return damped_gauss_newton(residuals, TOLERANCE)
 
 
@@ -200,27 +206,11 @@ def _begin(problem: Problem, starts: Float[Array, "starts unknowns"]) -> Any:
 
 
 @eqx.filter_jit
-def _advance(problem: Problem, carry: Any) -> Any:
-    return jax.vmap(_optimiser(problem).step)(carry)
-
-
-def _descended(
-    problem: Problem, carry: Any, steps: int, progress: Progress
-) -> tuple[Any, bool]:
-    """Step until all starts are done or the best gets no better."""
-    bests = [np.inf]
-    for _ in range(steps):
-        carry = _advance(problem, carry)
-        bests.append(float(np.min(carry.loss)))
-        progress.advance(float(np.sqrt(bests[-1])))
-        if np.all(carry.done) or _stalled(bests):
-            break
-    return carry, bool(np.any(carry.done)) or _stalled(bests)
-
-
-def _stalled(bests: Sequence[float]) -> bool:
-    # Where a parameter runs to its bound the point itself never comes to rest.
-    return len(bests) > STALL_STEPS and bests[-1] > bests[-STALL_STEPS] * (1 - STALL)
+def _advance(problem: Problem, carry: Any) -> tuple[Any, View, Verdict]:
+    optimiser = _optimiser(problem)
+    carry = jax.vmap(optimiser.step)(carry)
+    view = jax.vmap(optimiser.view)(carry)
+    return carry, view, Verdict(view.loss, jnp.zeros_like(view.loss))
 
 
 @eqx.filter_jit

@@ -176,7 +176,7 @@ class _Memory(System):
 
 @jax.jit
 def _levels(shape: Preisach, input: Any) -> Any:
-    memory = _Memory(shape.law())
+    memory = _Memory(shape.resolved())
     return simulate(memory, input, memory.init(input[0]))[1]
 
 

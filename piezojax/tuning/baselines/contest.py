@@ -6,12 +6,12 @@ import numpy as np
 from ...core.arrays import as_array
 from ...core.progress import Progress
 from ...core.system import Feedback
+from ...solve.search_state import SearchState
 from ...study import Case
 from ..data import Data
 from ..objective import Objective
 from ..result import scores
 from ..runs import evaluate
-from ..search import Search
 from .entries import Baselines, Contestant, against, contestant
 from .pids import by_rules
 from .searches import Budget, Method, cma_es, nelder_mead
@@ -34,7 +34,7 @@ def contest(
     objective: Objective,
     case: Case,
     data: Data,
-    search: Search,
+    search: SearchState,
     budget: Budget,
     progress: Progress,
 ) -> Baselines:
@@ -44,29 +44,29 @@ def contest(
     contest with the methods that have finished.
     """
 
-    def entry_of(name, course, stop, unit):
+    def entry_of(name, history, stop, unit):
         place = as_array(unit)
         loop = case.space.put(case.loop, place)
         gains = {path: float(x) for path, x in case.space.named(place).items()}
         held = holdout_geomean(loop, data, objective.start)
-        return contestant(name, course, stop, held, gains, unit)
+        return contestant(name, history, stop, held, gains, unit)
 
     name = f"piezojax ({case.study.optimiser.method})"
-    ours = entry_of(name, search.course, search.status, search.unit)
+    ours = entry_of(name, search.history, search.status, search.unit)
     rivals: list[Contestant] = []
     notes: list[str] = []
     try:
         progress.stage("baselines: ultimate gain and relay")
         found, skipped = by_rules(objective, case)
         notes += skipped
-        for name, course, loop, gains in found:
+        for name, history, loop, gains in found:
             held = holdout_geomean(loop, data, objective.start)
-            rivals.append(contestant(name, course, "rule", held, gains, None))
+            rivals.append(contestant(name, history, "rule", held, gains, None))
         size = len(case.space.paths)
         for name, method in methods(case.study.seed, size).items():
             progress.stage(f"baseline: {name}")
             end = method(objective, search.starts, budget, progress)
-            rivals.append(entry_of(name, end.course, end.stop, end.unit))
+            rivals.append(entry_of(name, end.history, end.stop, end.unit))
     except KeyboardInterrupt:
         notes.append("interrupted: baselines after the last one shown were not run")
     stable = {r.method: r.loss for r in rivals if r.loss is not None}

@@ -6,8 +6,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from ...core.files import read_model
-from ...solve.history import Course
-from ..objective import HOPELESS
+from ...solve.history import History
+from ...solve.problem import HOPELESS
 
 BASELINES_FILE = "baselines.json"
 
@@ -23,7 +23,7 @@ class Contestant(BaseModel):
     is from the method's begin to its end, ``compile_s`` the part of it spent waiting
     for the compiler, ``cpu_s`` the processor's seconds of all threads, ``best_s`` when
     it had come within ``NEAR`` of its ``loss``. ``times_s``, ``compiled_s``, ``used_s``
-    (of the processor), ``evaluated`` and ``losses`` are its course; ``unit`` is the
+    (of the processor), ``evaluated`` and ``losses`` are its history; ``unit`` is the
     point in the study's box, None for a rule, whose controller is a PID.
 
     ``reached_s`` is the time at which the search of ``piezojax.tune`` had a loss as
@@ -89,32 +89,32 @@ def load_baselines(path: str | Path) -> Baselines:
 
 def contestant(
     method: str,
-    course: Course,
+    history: History,
     stop: str,
     holdout_um: float | None,
     gains: dict[str, float],
     unit: np.ndarray | None,
 ) -> Contestant:
-    """Return a method's entry from its course."""
-    near = course.reached(course.loss + NEAR)
+    """Return a method's entry from its history."""
+    near = history.reached(history.loss + NEAR)
     assert near is not None
     return Contestant(
         method=method,
-        loss=course.loss if course.loss < HOPELESS else None,
+        loss=history.loss if history.loss < HOPELESS else None,
         holdout_geomean_um=holdout_um,
-        evaluations=course.evaluations[-1],
-        wall_s=course.times_s[-1],
-        compile_s=course.compile_s[-1],
-        cpu_s=course.cpu_s[-1],
-        best_s=course.times_s[near],
+        evaluations=history.evaluations[-1],
+        wall_s=history.times_s[-1],
+        compile_s=history.compile_s[-1],
+        cpu_s=history.cpu_s[-1],
+        best_s=history.times_s[near],
         stop=stop,
         gains=gains,
         unit=None if unit is None else [float(x) for x in unit],
-        times_s=course.times_s,
-        compiled_s=course.compile_s,
-        used_s=course.cpu_s,
-        evaluated=course.evaluations,
-        losses=course.losses,
+        times_s=history.times_s,
+        compiled_s=history.compile_s,
+        used_s=history.cpu_s,
+        evaluated=history.evaluations,
+        losses=history.losses,
     )
 
 

@@ -12,7 +12,7 @@ from ...core.paths import get
 from ...core.space import Range, space_of
 from ...core.system import Feedback
 from ...solve.clock import Clock
-from ...solve.history import Course, batch_loss
+from ...solve.history import History, batch_loss
 from ...study import Case
 from ..objective import Objective
 from .experiments import RELAY, SIGMAS, STEP, ultimate_by_gain, ultimate_by_relay
@@ -31,10 +31,10 @@ PATHS = tuple(
 
 
 class ByRule(NamedTuple):
-    """A PID's name, its course, the loop around it, and its numbers by path."""
+    """A PID's name, its history, the loop around it, and its numbers by path."""
 
     name: str
-    course: Course
+    history: History
     loop: Feedback
     gains: dict[str, float]
 
@@ -121,10 +121,10 @@ def judged(
     losses = np.asarray(batch_loss(mine, units, clock)(units))
     found = []
     for (name, loop), row, loss in zip(loops.items(), values, losses, strict=True):
-        course = Course(clock)
-        course.add(1, float(loss))
+        history = History(clock)
+        history.add(1, float(loss))
         gains = dict(zip(PATHS, map(float, row), strict=True))
-        found.append(ByRule(name, course, loop, gains))
+        found.append(ByRule(name, history, loop, gains))
     return found
 
 

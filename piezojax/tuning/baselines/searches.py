@@ -9,7 +9,7 @@ from scipy import optimize
 
 from ...core.arrays import as_array
 from ...core.progress import Progress
-from ...solve.history import Course, batch_loss
+from ...solve.history import History, batch_loss
 
 SPREAD = 0.2
 """First standard deviation of CMA-ES, as a share of the box."""
@@ -32,7 +32,7 @@ class Found(NamedTuple):
     """The best point in [0, 1]^n, how the search went, and why it ended."""
 
     unit: np.ndarray
-    course: Course
+    history: History
     stop: str
 
 
@@ -53,18 +53,18 @@ def nelder_mead(
     A start after the first takes what is left of the budget. One point at a time: the
     method gives no two that could be simulated at once.
     """
-    course = Course()
+    history = History()
     size = starts.shape[1]
-    program = batch_loss(objective, as_array(starts[:1]), course.clock)
+    program = batch_loss(objective, as_array(starts[:1]), history.clock)
     best = [np.inf, starts[0]]
 
     def loss(unit):
-        if course.evaluations and course.evaluations[-1] >= budget.evaluations:
+        if history.evaluations and history.evaluations[-1] >= budget.evaluations:
             raise _SpentError
         value = float(program(as_array(unit)[None])[0])
         if value < best[0]:
             best[:] = value, np.array(unit)
-        course.add(1, value)
+        history.add(1, value)
         progress.advance(best[0])
         return value
 
@@ -90,7 +90,7 @@ def nelder_mead(
         except _SpentError:
             stop = "evaluations"
             break
-    return Found(best[1], course, stop)
+    return Found(best[1], history, stop)
 
 
 def cma_es(population: int | None = None, seed: int = 1) -> Method:
@@ -103,18 +103,18 @@ def cma_es(population: int | None = None, seed: int = 1) -> Method:
     def search(
         objective: Any, starts: np.ndarray, budget: Budget, progress: Progress
     ) -> Found:
-        course = Course()
+        history = History()
         strategy = _strategy(starts[0], population, seed, budget)
         some = as_array(np.zeros((strategy.popsize, starts.shape[1])))
-        program = batch_loss(objective, some, course.clock)
+        program = batch_loss(objective, some, history.clock)
         while not strategy.stop():
             units = strategy.ask()
             losses = np.asarray(program(as_array(np.array(units))))
             strategy.tell(units, [float(loss) for loss in losses])
-            course.add(len(units), float(losses.min()))
-            progress.advance(course.loss)
+            history.add(len(units), float(losses.min()))
+            progress.advance(history.loss)
         stop = ", ".join(strategy.stop() or ())
-        return Found(np.asarray(strategy.result.xbest), course, stop)
+        return Found(np.asarray(strategy.result.xbest), history, stop)
 
     return search
 

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.solve.optimisers import METHODS, damped_gauss_newton
-from piezojax.tuning.gradient import with_finite_gradient
-from piezojax.tuning.objective import HOPELESS
+from piezojax.solve.gauss_newton import damped_gauss_newton
+from piezojax.solve.gradient import with_finite_gradient
+from piezojax.solve.optimisers import METHODS
+from piezojax.solve.problem import HOPELESS, linearised
 
 STEPS = 160
 TOLERANCE = 1e-8
@@ -241,7 +242,7 @@ def test_an_infinite_slope_is_no_slope(forward):
     np.testing.assert_array_equal(slope, 0.0)
 
 
-def _course(optimiser, unit, steps):
+def _views(optimiser, unit, steps):
     step = jax.jit(optimiser.step)
     carry, found = optimiser.start(jnp.array(unit)), []
     for _ in range(steps):
@@ -251,13 +252,17 @@ def _course(optimiser, unit, steps):
     return np.array(found), bool(view.done)
 
 
+def solver_of(residuals):
+    return damped_gauss_newton(linearised(residuals), TOLERANCE)
+
+
 @pytest.mark.parametrize(
     ("residuals", "unit"), [(_rosenbrock, (0.2, 0.8)), (_quadratic, (0.9, 0.1, 0.2))]
 )
 def test_damped_gauss_newton_takes_the_steps_of_optimistix(residuals, unit):
-    ours, done = _course(damped_gauss_newton(residuals, TOLERANCE), unit, 60)
+    ours, done = _views(solver_of(residuals), unit, 60)
     optimistix = METHODS["levenberg_marquardt"](residuals, residuals, TOLERANCE)
-    theirs, _ = _course(optimistix, unit, 60)
+    theirs, _ = _views(optimistix, unit, 60)
     np.testing.assert_allclose(ours[:25], theirs[:25], rtol=1e-6, atol=1e-12)
     assert done
     np.testing.assert_array_equal(ours[-1], ours[-2])
@@ -266,6 +271,24 @@ def test_damped_gauss_newton_takes_the_steps_of_optimistix(residuals, unit):
 
 def test_a_parameter_that_does_nothing_stays_where_it_is():
     blind = lambda unit: _quadratic(unit.at[0].set(0.3))  # noqa: E731
-    course, done = _course(damped_gauss_newton(blind, TOLERANCE), (0.9, 0.1, 0.2), 80)
+    found, done = _views(solver_of(blind), (0.9, 0.1, 0.2), 80)
     assert done
-    np.testing.assert_allclose(course[-1], [0.9, 0.7, 0.55, 0.0], atol=1e-6)
+    np.testing.assert_allclose(found[-1], [0.9, 0.7, 0.55, 0.0], atol=1e-6)
+
+
+def test_a_start_without_finite_slopes_is_done():
+    blown = lambda unit: jnp.sqrt(unit - 0.5)  # noqa: E731
+    found, done = _views(solver_of(blown), (0.2, 0.3), 2)
+    assert done
+    np.testing.assert_allclose(found[-1][:2], (0.2, 0.3))
+
+
+def test_without_bounds_the_step_of_a_line_is_the_minimum():
+    """Linear residuals, almost no damping: one step leads to lstsq's solution."""
+    matrix = np.random.default_rng(2).standard_normal((9, 3))
+    target = 50.0 * np.random.default_rng(3).standard_normal(9)
+    residuals = linearised(lambda point: 1e6 * (matrix @ point - target))
+    solver = damped_gauss_newton(residuals, TOLERANCE, bounded=False)
+    found, _ = _views(solver, (0.0, 0.0, 0.0), 2)
+    expected, *_ = np.linalg.lstsq(matrix, target)
+    np.testing.assert_allclose(found[-1][:3], expected, rtol=1e-9)

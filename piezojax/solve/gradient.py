@@ -1,10 +1,10 @@
-"""Gradients that an optimiser can live with: finite, and computed at once."""
+"""Replace non-finite gradients; return them together with the value."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .objective import HOPELESS
+from .problem import HOPELESS
 
 
 @jax.custom_vjp
@@ -24,17 +24,17 @@ _guarded.defvjp(_guarded_forward, _guarded_backward)
 
 
 def with_finite_gradient(loss, *, forward: bool):
-    """Return ``loss`` of a vector with its gradient made finite and computed at once.
+    """Return ``loss`` of a vector, its gradient finite and computed with the value.
 
-    The derivative of a diverged run is NaN and would spoil the optimiser's memory; it
-    becomes zero. ``forward`` picks forward mode, which wins for few parameters and few
-    lanes; reverse mode wins beyond.
+    The derivative of a diverged run is NaN and would spoil the memory of the optimiser;
+    it becomes zero. ``forward`` selects forward mode, faster for few parameters and few
+    lanes, else reverse mode.
     """
 
     def guarded(unit):
         fixed = jax.lax.stop_gradient(unit)
         if forward:
-            # Not linearize: that would keep what every sample leaves behind.
+            # Not linearize: it would store intermediate values of every sample.
             value, gradient = jax.vmap(
                 lambda direction: jax.jvp(loss, (fixed,), (direction,)),
                 out_axes=(None, 0),

@@ -1,0 +1,185 @@
+"""Switching laws of sliding mode control, which act on the sliding variable s."""
+
+import abc
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+
+from ..core.arrays import Scalar, ScalarLike, Signal, State, as_array
+from ..core.axes import Rows, as_rows, product
+from ..core.parameter import parameter, sample_time
+from ..core.system import System
+
+Gain: TypeAlias = Scalar | Rows
+"""A gain of one axis, or a matrix of gains as rows of scalars."""
+
+
+def as_gain(value: Any) -> Any:
+    """Return a number as a scalar, a matrix as rows of scalars."""
+    if isinstance(value, tuple | list) or jnp.ndim(value) == 2:
+        return as_rows(value)
+    return as_array(value)
+
+
+class SwitchingLaw(System):
+    """A System from the sliding variable s to the switching part of a control.
+
+    The unit of s is [s], that of the output [v]; both are the controller's.
+    """
+
+    @abc.abstractmethod
+    def start(self, sliding: Signal, output: Signal) -> State:
+        """Return the state in which the law gives ``output`` at a resting ``sliding``.
+
+        A law without an integral holds what is missing as a constant bias, so that
+        every start at rest is bumpless.
+        """
+
+    def init(self, input: Signal = 0.0) -> State:
+        return self.start(input, jax.tree.map(jnp.zeros_like, input))
+
+
+class SwitchingPIDState(NamedTuple):
+    """Integral part in [v] and the last s in [s]."""
+
+    integral: Signal
+    sliding: Signal
+
+
+class SwitchingPID(SwitchingLaw):
+    """``v = -(P s + I int s dt + D ds/dt)``, a PID in place of a switching term.
+
+    The law of (4.43), (5.18), (7.33) and (8.34). With several axes s and v
+    are tuples of one scalar an axis, and the gains matrices or scalars for all axes.
+    """
+
+    proportional: Gain = parameter(
+        "[v]/[s]",
+        "proportional gain of the sliding variable",
+        scale="log",
+        typical=(1e-7, 1e2),
+        converter=as_gain,
+    )
+    integral: Gain = parameter(
+        "[v]/([s] s)",
+        "integral gain of the sliding variable",
+        scale="log",
+        typical=(1e-1, 1e4),
+        converter=as_gain,
+    )
+    derivative: Gain = parameter(
+        "[v] s/[s]",
+        "derivative gain of the sliding variable",
+        scale="log",
+        typical=(1e-9, 1e-2),
+        converter=as_gain,
+    )
+    dt: float = sample_time()
+
+    def start(self, sliding: Signal, output: Signal) -> SwitchingPIDState:
+        sliding = jax.tree.map(as_array, sliding)
+        integral = jax.tree.map(jnp.add, output, _times(self.proportional, sliding))
+        return SwitchingPIDState(integral, sliding)
+
+    def step(
+        self, state: SwitchingPIDState, input: Signal
+    ) -> tuple[SwitchingPIDState, Signal]:
+        # A gain times dt does not change from sample to sample.
+        rate = jax.tree.map(lambda gain: gain * self.dt, self.integral)
+        integral = jax.tree.map(jnp.subtract, state.integral, _times(rate, input))
+        change = jax.tree.map(jnp.subtract, input, state.sliding)
+        output = jax.tree.map(
+            lambda i, p, d: i - p - d / self.dt,
+            integral,
+            _times(self.proportional, input),
+            _times(self.derivative, change),
+        )
+        return SwitchingPIDState(integral, input), output
+
+
+def _times(gain: Gain, signal: Signal) -> Any:
+    if isinstance(gain, tuple):
+        return product(gain, signal)
+    return jax.tree.map(lambda value: gain * value, signal)
+
+
+class BangBang(SwitchingLaw):
+    """``v = -gain sign(s)``: it chatters, the baseline of sliding mode controllers.
+
+    The law of the nominal sliding mode control of section 4.5.4.1. Without an integral
+    an offset remains. The slope of sign is taken as zero.
+    """
+
+    gain: Scalar = parameter(
+        "[v]", "switching gain K", least=0.0, scale="log", typical=(1e-2, 1e5)
+    )
+
+    def start(self, sliding: ScalarLike, output: ScalarLike) -> Scalar:
+        return as_array(output) + self.gain * jnp.sign(as_array(sliding))
+
+    def step(self, state: Scalar, input: ScalarLike) -> tuple[Scalar, Scalar]:
+        return state, state - self.gain * jnp.sign(as_array(input))
+
+
+class BoundaryLayer(SwitchingLaw):
+    """``v = -gain sat(s / width)``: proportional within the layer, ``gain`` outside.
+
+    The law of section 2.6.1.2, reference [94] there. A width near zero is bang-bang
+    switching. Without an integral an offset remains, which is smaller for a steeper
+    layer. The slope is -gain / width inside, zero outside and between the two on the
+    edge.
+    """
+
+    gain: Scalar = parameter(
+        "[v]", "switching gain K", least=0.0, scale="log", typical=(1e-2, 1e5)
+    )
+    width: Scalar = parameter(
+        "[s]", "width of the boundary layer", above=0.0, scale="log", typical=(1.0, 1e5)
+    )
+
+    def start(self, sliding: ScalarLike, output: ScalarLike) -> Scalar:
+        return as_array(output) - self._switched(sliding)
+
+    def _switched(self, sliding: ScalarLike) -> Scalar:
+        return -self.gain * jnp.clip(sliding / self.width, -1.0, 1.0)
+
+    def step(self, state: Scalar, input: ScalarLike) -> tuple[Scalar, Scalar]:
+        return state, state + self._switched(input)
+
+
+class SuperTwisting(SwitchingLaw):
+    """``v = w - root_gain |s|^(1/2) sign(s)``, ``dw/dt = -sign_gain sign(s)``, smooth.
+
+    The second-order sliding mode that needs only s (A. Levant, Int. J. Control 58,
+    1993; section 2.6.1.2). Sampled, the sign chatters by ``sign_gain dt`` about s = 0,
+    and the slope of the root is infinite there. Both are therefore smoothed over
+    ``layer`` d: s / (s^2 + d^2)^(1/4) and s / (s^2 + d^2)^(1/2) equal the root and the
+    sign far outside the layer, and form a proportional-integral law of s inside. The
+    law rests at s = 0 with any w, its state.
+    """
+
+    root_gain: Scalar = parameter(
+        "[v]/[s]^(1/2)", "gain of the root", least=0.0, scale="log", typical=(1e-2, 1e3)
+    )
+    sign_gain: Scalar = parameter(
+        "[v]/s", "gain of the sign", least=0.0, scale="log", typical=(1.0, 1e8)
+    )
+    layer: Scalar = parameter(
+        "[s]", "width of the smooth layer", above=0.0, scale="log", typical=(1.0, 1e5)
+    )
+    dt: float = sample_time()
+
+    def start(self, sliding: ScalarLike, output: ScalarLike) -> Scalar:
+        return as_array(output) + self._root(as_array(sliding))
+
+    def _root(self, sliding: Scalar) -> Scalar:
+        return self.root_gain * sliding / jnp.sqrt(self._distance(sliding))
+
+    def _distance(self, sliding: Scalar) -> Scalar:
+        return jnp.sqrt(sliding**2 + self.layer**2)
+
+    def step(self, state: Scalar, input: ScalarLike) -> tuple[Scalar, Scalar]:
+        sliding = as_array(input)
+        rate = self.sign_gain * self.dt * sliding / self._distance(sliding)
+        return state - rate, state - rate - self._root(sliding)

@@ -1,0 +1,62 @@
+"""Augmented Lagrangian: constraints as squares, and rounds that raise the multipliers.
+
+Source: Nocedal and Wright, Numerical Optimization, 2006, section 17.4.
+"""
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .problem import Problem
+
+PENALTY = 10.0
+"""Penalty of the first round, for losses and violations of order 1."""
+
+ROUNDS = 5
+"""Minimisations, the multipliers raised between them."""
+
+GROWTH = 3.0
+"""Factor of the penalty from one round to the next."""
+
+
+def augmented(
+    violation: Float[Array, " constraints"],
+    multipliers: Float[Array, " constraints"],
+    penalty: Array,
+) -> Float[Array, " constraints"]:
+    """Return the terms of the augmented Lagrangian, each as a number to be squared.
+
+    The squares sum to ``penalty``/2 max(0, g + multiplier/penalty)^2 over all g.
+    """
+    shifted = violation + multipliers / penalty
+    return jnp.sqrt(0.5 * penalty) * jnp.maximum(shifted, 0.0)
+
+
+def updated(
+    violation: Float[Array, "*starts constraints"],
+    multipliers: Float[Array, "*starts constraints"],
+    penalty: Array,
+) -> Float[Array, "*starts constraints"]:
+    """Return the multipliers after a round of minimisation."""
+    return jnp.maximum(multipliers + penalty * violation, 0.0)
+
+
+def with_zero_multipliers(problem: Problem, size: int) -> Problem:
+    """Return ``problem``, of ``size`` unknowns, with multipliers 0 of its limits."""
+    if not problem.limits:
+        return problem
+    middle = jnp.full(size, 0.5)
+    count = jax.eval_shape(lambda p: p.violated(middle), problem).shape[0]
+    return problem.with_multipliers(jnp.zeros(count))
+
+
+def rounds(problem: Problem, steps: int) -> Iterator[tuple[float, int, bool]]:
+    """Yield penalty and step limit of each round, and whether it is the last.
+
+    A problem without limits takes one round.
+    """
+    count = ROUNDS if problem.limits else 1
+    for number in range(count):
+        yield PENALTY * GROWTH**number, -(-steps // count), number + 1 == count

@@ -1,0 +1,137 @@
+"""Lockstep descent: one of ``optimisers.METHODS`` from all starts at once."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..core.arrays import as_array
+from ..core.progress import Progress
+from ..core.rollout import in_blocks
+from .augmented_lagrangian import with_zero_multipliers
+from .clock import Clock
+from .descent import Patience
+from .gradient import with_finite_gradient
+from .multi_start import InStep
+from .optimisers import METHODS
+from .problem import Problem, Verdict
+
+STALLED = Patience(20, gain=1e-3)
+"""A search ends when its best start gained less than this in so many steps."""
+
+
+class LockstepDescent:
+    """Descents of the optimiser ``method`` on ``problem``, vmapped over the starts.
+
+    ``size`` is the number of unknowns; ``tolerance`` is that of the optimiser,
+    ``forward`` selects forward-mode gradients. Screening evaluates ``at_once`` points
+    together.
+    """
+
+    cut = None
+    patience = STALLED
+    finalists = None
+
+    def __init__(
+        self,
+        problem: Problem,
+        size: int,
+        clock: Clock,
+        *,
+        method: str,
+        tolerance: float,
+        forward: bool,
+        at_once: int,
+    ):
+        self._problem = with_zero_multipliers(problem, size)
+        self._size, self._clock, self._at_once = size, clock, at_once
+        self._method, self._tolerance = METHODS[method], tolerance
+        self._forward = forward
+        self._programs: dict[int, tuple[Any, Any, Any]] = {}
+
+    @property
+    def constraints(self) -> int:
+        """Number of constraints, each with a multiplier."""
+        return self._problem.multipliers.size
+
+    def screen(self, units: np.ndarray) -> tuple[np.ndarray, Verdict]:
+        """Return loss and verdict of any number of points."""
+        program = self._clock.compiled(
+            lambda problem, units: in_blocks(
+                lambda unit: problem.both(unit), units, size=self._at_once
+            ),
+            self._problem,
+            as_array(units),
+        )
+        return jax.tree.map(np.asarray, program(self._problem, as_array(units)))
+
+    def wait(self) -> None:
+        """Do nothing: nothing compiles in the background."""
+
+    def prepare(self, starts: int, progress: Progress) -> None:
+        """Compile the programs that begin, advance and return violations."""
+        progress.stage("compiling the gradient")
+        if starts in self._programs:
+            return
+
+        def optimiser(problem, multipliers):
+            problem = problem.with_multipliers(multipliers)
+            # A lambda, because a bound method would be hashed with its arrays.
+            loss = with_finite_gradient(
+                lambda unit: problem.loss(unit), forward=self._forward
+            )
+            return self._method(
+                loss, lambda unit: problem.residuals(unit), self._tolerance
+            )
+
+        def begin(problem, units, multipliers):
+            return jax.vmap(lambda u, m: optimiser(problem, m).start(u))(
+                units, multipliers
+            )
+
+        def advance(problem, carry, multipliers):
+            def one(carry, multipliers):
+                solver = optimiser(problem, multipliers)
+                carry = solver.step(carry)
+                view = solver.view(carry)
+                if problem.limits:
+                    return carry, view, problem.verdict(view.unit)
+                return carry, view, Verdict(view.loss, jnp.zeros(()))
+
+            return jax.vmap(one)(carry, multipliers)
+
+        def violated(problem, units):
+            return jax.vmap(lambda unit: problem.violated(unit))(units)
+
+        problem = self._problem
+        units = jnp.full((starts, self._size), 0.5)
+        multipliers = jnp.zeros((starts, self.constraints))
+        carry = jax.eval_shape(begin, problem, units, multipliers)
+        compiled = self._clock.compiled
+        self._programs[starts] = (
+            compiled(begin, problem, units, multipliers),
+            compiled(advance, problem, carry, multipliers),
+            compiled(violated, problem, units) if problem.limits else None,
+        )
+
+    def begin(
+        self, problem: Problem, units: np.ndarray, multipliers: Array
+    ) -> tuple[InStep, int]:
+        """Return descents from ``units``, and the evaluations that took."""
+        begin, advance, _ = self._programs[len(units)]
+        problem = problem.with_multipliers(self._problem.multipliers)
+        descents = InStep(
+            lambda units: begin(problem, units, multipliers),
+            lambda carry: advance(problem, carry, multipliers),
+            units,
+            len(units),
+        )
+        return descents, 0
+
+    def violated(self, problem: Problem, units: np.ndarray) -> Array:
+        """Return the violations [starts, constraints] at ``units``."""
+        violated = self._programs[len(units)][2]
+        problem = problem.with_multipliers(self._problem.multipliers)
+        return violated(problem, as_array(units))

@@ -1,0 +1,105 @@
+"""The bounded problem that the solvers minimise: loss, residuals, constraints."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+from jaxtyping import Array, Float
+
+Unit = Float[Array, " n"]
+"""A point of the unit box [0, 1]^n."""
+
+HOPELESS = 1e6
+"""Loss where it has no finite value: finite, so that a line search can step back."""
+
+TOLERANCE = 1e-3
+"""A constraint violated by less than this counts as satisfied."""
+
+
+class Verdict(NamedTuple):
+    """Objective and largest constraint violation at a point."""
+
+    loss: Any
+    violation: Any
+
+
+class Errors(NamedTuple):
+    """A point as a problem of least squares.
+
+    ``loss`` is minimised; ``errors`` are a sample of those of each run, ``added`` are
+    the terms of the augmented Lagrangian. A weight is the slope of the loss over half
+    the mean square of a run's errors: with these weights, and 2 on the added terms, the
+    squares have the gradient of the loss as far as it depends on them.
+    """
+
+    loss: Float[Array, ""]
+    verdict: Verdict
+    errors: Float[Array, "runs samples"]
+    added: Float[Array, " constraints"]
+    weights: Float[Array, " runs"]
+
+
+@runtime_checkable
+class Problem(Protocol):
+    """A loss over the unit box under constraints: an immutable pytree of arrays.
+
+    The constraints enter the loss through an augmented Lagrangian with ``multipliers``
+    and a penalty.
+    """
+
+    @property
+    def limits(self) -> Mapping[str, Array]:
+        """Limits of the constraints by name; empty for an unconstrained problem."""
+        ...
+
+    @property
+    def multipliers(self) -> Array:
+        """Multipliers of the augmented Lagrangian, one a constraint."""
+        ...
+
+    def with_multipliers(self, multipliers: Array) -> "Problem":
+        """Return the problem with these multipliers."""
+        ...
+
+    def with_penalty(self, penalty: float) -> "Problem":
+        """Return the problem with this penalty on violated constraints."""
+        ...
+
+    def loss(self, unit: Unit) -> Float[Array, ""]:
+        """Return the augmented Lagrangian; ``HOPELESS`` where it is not finite."""
+        ...
+
+    def both(self, unit: Unit) -> tuple[Float[Array, ""], Verdict]:
+        """Return ``loss`` and ``verdict`` of one evaluation."""
+        ...
+
+    def verdict(self, unit: Unit) -> Verdict:
+        """Return the objective without constraints, and the largest violation."""
+        ...
+
+    def violated(self, unit: Unit) -> Float[Array, " constraints"]:
+        """Return the violation of every constraint, positive where it is violated."""
+        ...
+
+    def errors(self, unit: Unit, every: int) -> Errors:
+        """Return the point as least squares, with one of ``every`` errors."""
+        ...
+
+    def residuals(self, unit: Unit) -> Float[Array, " residuals"]:
+        """Return residuals whose squares sum to the loss, if it is such a sum."""
+        ...
+
+
+def linearised(
+    residuals: Callable[[Array], Array],
+) -> Callable[[Array], tuple[Array, Array]]:
+    """Return the function of a point that returns Jacobian and residuals.
+
+    The Jacobian [residuals, n] comes from forward mode, in one pass with the residuals.
+    """
+
+    def twice(point):
+        value = residuals(point)
+        return value, value
+
+    return jax.jacfwd(twice, has_aux=True)

@@ -1,0 +1,79 @@
+"""The state of a search: its best point so far, and how points are ranked."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from .history import History
+from .problem import HOPELESS, TOLERANCE, Verdict
+
+Status = Literal["converged", "step limit", "interrupted"]
+
+VIOLATED = 0.5 * HOPELESS
+"""Least rank of a point that violates a constraint."""
+
+
+@dataclass
+class SearchState:
+    """The best point found so far, in [0, 1]^n, and the way to it.
+
+    ``loss`` is its objective, ``violation`` its largest violation of a constraint.
+    ``losses_by_start`` holds the lowest loss of each of the ``starts`` after each step,
+    None while it diverges or violates a constraint; ``history`` the best of all against
+    time.
+    """
+
+    unit: np.ndarray
+    loss: float = np.inf
+    violation: float = 0.0
+    status: Status = "step limit"
+    evaluations: int = 0
+    losses_by_start: list[list[float | None]] = field(default_factory=list)
+    history: History = field(default_factory=History)
+    starts: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def times_s(self) -> list[float]:
+        """Seconds from the start of the search to the end of each step."""
+        times = self.history.times_s
+        return times[len(times) - len(self.losses_by_start) :]
+
+    def update_best(
+        self, units: np.ndarray, verdict: Verdict, evaluations: int | None = None
+    ) -> None:
+        """Take the best of ``units`` if it is better than the present one.
+
+        A point that satisfies the constraints is better than any that does not; of
+        those that do not, the one with the least violation is the best. The points took
+        so many ``evaluations``, one each if not given.
+        """
+        ranks = rank(verdict)
+        leader = int(np.argmin(ranks))
+        taken = len(ranks) if evaluations is None else evaluations
+        self.evaluations += taken
+        best = float(ranks[leader])
+        self.history.add(taken, best if best < VIOLATED else np.inf)
+        if best < rank(Verdict(self.loss, self.violation)):
+            self.loss = float(verdict.loss[leader])
+            self.violation = float(verdict.violation[leader])
+            self.unit = units[leader]
+
+    def add_step(self, verdict: Verdict, places: np.ndarray) -> None:
+        """Append a step to ``losses_by_start``, for the starts at ``places``."""
+        last = self.losses_by_start[-1:] or [[None] * len(self.starts)]
+        row = list(last[0])
+        for place, value in zip(places, rank(verdict), strict=True):
+            before = row[place]
+            if value < VIOLATED and (before is None or value < before):
+                row[place] = float(value)
+        self.losses_by_start.append(row)
+
+
+def rank(verdict: Verdict) -> np.ndarray:
+    """Return the loss, or a larger number if a constraint is violated."""
+    loss, violation = np.asarray(verdict.loss), np.asarray(verdict.violation)
+    loss = np.where(np.isfinite(loss), loss, np.inf)
+    violated = VIOLATED + np.minimum(violation, VIOLATED - 1.0)
+    return np.where((violation <= TOLERANCE) | (loss >= HOPELESS), loss, violated)

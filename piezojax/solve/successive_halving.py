@@ -1,0 +1,135 @@
+"""Successive halving: every few steps the worse half of the descents is dropped."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..core.arrays import as_array
+from ..core.progress import Progress
+from .augmented_lagrangian import with_zero_multipliers
+from .clock import Clock
+from .descent import (
+    PARALLEL,
+    Descent,
+    LocalModel,
+    Patience,
+    derivatives_at,
+    trials_at,
+)
+from .multi_start import InThreads
+from .problem import Problem, Verdict
+
+LAP = 3
+"""Steps after which the worse half of the descents is dropped."""
+
+PATIENCE = 5
+"""Steps in which a descent must gain its tolerance."""
+
+POINTS = len(PARALLEL.multiples)
+"""Points evaluated at once."""
+
+
+def better_half(step: int, running: int) -> int | None:
+    """Return how many descents go on: half, rounded up, at the end of each lap."""
+    return (running + 1) // 2 if step % LAP == 0 else None
+
+
+class SuccessiveHalving:
+    """Gauss-Newton descents on the errors of ``problem``, of which half go on.
+
+    The curvature is taken from one of ``every`` errors; a descent ends when it gains
+    less than ``tolerance`` in PATIENCE steps. ``size`` is the number of unknowns. After
+    the first round of an augmented Lagrangian only the best descent goes on.
+    """
+
+    cut = staticmethod(better_half)
+    patience = None
+    finalists = 1
+
+    def __init__(
+        self, problem: Problem, size: int, clock: Clock, *, tolerance: float, every: int
+    ):
+        self._problem = problem = with_zero_multipliers(problem, size)
+        self._clock, self._patience = clock, Patience(PATIENCE, gain=tolerance)
+        units = as_array(np.zeros((POINTS, size)))
+        # The derivatives take longer to compile: meanwhile the box is screened.
+        self._pool = ThreadPoolExecutor(1)
+        self._derivatives = self._pool.submit(
+            lambda: (
+                jax.jit(lambda p, unit: derivatives_at(p, unit, every))
+                .lower(problem, units[0])
+                .compile()
+            )
+        )
+        self._trials = clock.compiled(
+            lambda p, units: trials_at(p, units, every), problem, units
+        )
+        # Without limits there is one round, which needs no violations.
+        self._violated: Callable = (
+            clock.compiled(lambda p, unit: p.violated(unit), problem, units[0])
+            if problem.limits
+            else problem.violated
+        )
+
+    @property
+    def constraints(self) -> int:
+        """Number of constraints, each with a multiplier."""
+        return self._problem.multipliers.size
+
+    def screen(self, units: np.ndarray) -> tuple[np.ndarray, Verdict]:
+        """Return loss and verdict of any number of points."""
+        return self._screened(self._problem, units)
+
+    def _screened(
+        self, problem: Problem, units: np.ndarray
+    ) -> tuple[np.ndarray, Verdict]:
+        filler = np.repeat(units[-1:], -len(units) % POINTS, axis=0)
+        batches = np.concatenate([units, filler]).reshape(-1, POINTS, units.shape[1])
+        found = [self._trials(problem, as_array(batch))[:2] for batch in batches]
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(units)], *found)
+
+    def wait(self) -> None:
+        """Wait until the derivatives are compiled."""
+        self._clock.wait_for(self._derivatives)
+        self._pool.shutdown()
+
+    def prepare(self, starts: int, progress: Progress) -> None:
+        """Do nothing: no program depends on the number of starts."""
+        del starts, progress
+
+    def begin(
+        self, problem: Problem, units: np.ndarray, multipliers: Array
+    ) -> tuple[InThreads, int]:
+        """Return descents from ``units``, and the evaluations that took."""
+        # All 0 in the first round; later there is only one descent.
+        problem = problem.with_multipliers(multipliers[0])
+        losses, verdicts = self._screened(problem, units)
+
+        def linearise(unit):
+            derivatives = self._derivatives.result()(problem, as_array(unit))
+            return LocalModel.of(derivatives)
+
+        def evaluate(units):
+            return self._trials(problem, as_array(units))
+
+        descents = [
+            Descent(
+                unit,
+                float(losses[i]),
+                jax.tree.map(lambda x, i=i: x[i], verdicts),
+                linearise,
+                evaluate,
+                self._patience,
+            )
+            for i, unit in enumerate(units)
+        ]
+        return InThreads(descents), len(descents)
+
+    def violated(self, problem: Problem, units: np.ndarray) -> Array:
+        """Return the violations [starts, constraints] at ``units``."""
+        problem = problem.with_multipliers(self._problem.multipliers)
+        return jnp.stack([self._violated(problem, as_array(unit)) for unit in units])
