@@ -296,6 +296,10 @@ def test_units_are_those_of_the_declarations(study):
     case = read(study({}))
     assert case.unit(PROPORTIONAL) == "V/um"
     assert case.unit("controller.nothing") == ""
+    # On a stage with several axes lengths and commands are in units of the axis.
+    axes = case.study.model_copy(update={"axes": "any"})
+    assert replace(case, study=axes).unit(PROPORTIONAL) == ""
+    assert replace(case, study=axes).unit("controller.anti_windup") == "1/s"
 
 
 def test_converters_and_slew_limit(study):

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.parameter import parameter, sample_time
 from ..core.system import Designed, System
 from .arma import ARMA
 
@@ -15,8 +16,8 @@ class FirstOrderLag(System):
     unless both are positive.
     """
 
-    time_constant: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
+    time_constant: Scalar = parameter("s", "time constant")
+    dt: float = sample_time()
 
     def __check_init__(self):
         check("time constant in s", self.time_constant, above=0.0)

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from swept_studies import GRID, PARAMETERS
 
+from piezojax import control
+from piezojax.core.parameter import declarations
+from piezojax.core.space import Range
 from piezojax.sweeping import read_swept
 from piezojax.sweeping.dataset import boxes
 from piezojax.sweeping.plan import Plan
@@ -72,6 +75,24 @@ def test_samples_of_the_own_box_need_no_table(write):
     assert [axis.path for axis in plan.axes] == list(PARAMETERS)
 
 
+def test_what_a_table_leaves_out_is_declared(case_of):
+    known = dict(declarations(control.PID))["integral"]
+    tables = {"controller.integral": {"count": 3}, LAG: {"values": [1e-3, 2e-3]}}
+    integral, lag = Plan(case_of({"parameters": tables})).axes
+    assert integral.range == Range(*known.typical, known.scale, unit="V/(um s)")
+    low, high = known.typical
+    np.testing.assert_allclose(integral.values, [low, (low * high) ** 0.5, high])
+    assert lag.range == Range(1e-3, 2e-3, unit="s")
+
+
+def test_the_own_box_keeps_bounds_scale_and_unit(write):
+    axes = Plan(read_swept(write(None), samples=10)).axes
+    assert {axis.path: axis.range for axis in axes} == {
+        "controller.proportional": Range(0.1, 5.0, "log", unit="V/um"),
+        "controller.integral": Range(100.0, 2e4, "log", unit="V/(um s)"),
+    }
+
+
 def test_chunks_and_shards_share_out_every_point_once(case_of):
     plan = Plan(case_of({"method": "sobol", "samples": 1000}))
     spans = [plan.span(chunk) for chunk in range(plan.chunks)]
@@ -114,6 +135,7 @@ LAG = "plant.time_constant"
         (["parameters", "gain"], {"values": [1.0]}, "must start with one of"),
         (["parameters", LAG, "count"], None, "a grid needs a count"),
         (["parameters", LAG, "steps"], 3, "steps is unknown; allowed are lower, upper"),
+        (["parameters", LAG, "unit"], "s", "unit is unknown; allowed are lower, upper"),
         (["parameters", LAG, "values"], [1.0], "either values, or lower and upper"),
         (["parameters", LAG, "lower"], 3e-3, "the lower below the upper"),
         (["parameters", LAG, "lower"], -1.0, "scale 'log' it must be above 0"),
