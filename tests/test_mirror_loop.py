@@ -17,7 +17,7 @@ REST = (0.0, 0.0, 0.0)
 
 @pytest.mark.parametrize("order", mirror.ORDERS)
 def test_the_stage_is_the_model_a_sample_late(order):
-    model, stage = mirror.model(order), mirror.stage(order)
+    model, stage = mirror.model(order), mirror.stage(order=order)
     drive = np.random.default_rng(0).standard_normal((200, 3))
     A, B, C, D = (np.asarray(getattr(model, name)) for name in "ABCD")
     x, expected = np.zeros(order), []

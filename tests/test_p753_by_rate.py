@@ -119,7 +119,7 @@ SERIES = tuple(mantissa * 10.0**power for power in range(4) for mantissa in (1, 
 def test_the_weight_of_bang_bang_is_the_first_of_its_series_off_the_limits(rate):
     loop = Feedback(
         p753_by_rate.bang_bang(rate),
-        p753_by_rate.chapter4_plant(rate),
+        p753_by_rate.chapter4_plant(rate=rate),
         p753.actuator(),
         Sensor(p753.NOISE_RMS),
     )

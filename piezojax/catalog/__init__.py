@@ -20,15 +20,9 @@ PLANTS: dict[str, Callable[..., System]] = {
     "p558": p558_stage.plant,
     "mirror": mirror.stage,
 }
-"""Plants a study can name."""
-
-VARIATIONS: dict[str, Callable[..., System]] = {
-    "p558": p558_stage.varied,
-    "p753_stage": p753_stage.stage,
-}
-"""Plants off their nominal values, by the name of the nominal one. What an argument
-means, a relative deviation or a value, the function says; on several axes each takes
-one an axis."""
+"""Plants by the name that a study uses. Arguments of a plant that need no keyword are
+the deviations that an ensemble may draw; the function says whether one is relative or a
+value. On several axes each takes one value an axis."""
 
 CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_pid": p753.pid,
@@ -63,6 +57,20 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
 }
 """Controllers a study can name, with printed gains except where they say "ours";
 those that take a ``rate`` (Hz) come at the study's."""
+
+
+def deviations_of(plant: str) -> tuple[str, ...]:
+    """Return the deviations that an ensemble may draw of a catalogued plant.
+
+    They are the arguments that need no keyword; an unknown plant has none.
+    """
+    if plant not in PLANTS:
+        return ()
+    return tuple(
+        name
+        for name, argument in inspect.signature(PLANTS[plant]).parameters.items()
+        if argument.kind is argument.POSITIONAL_OR_KEYWORD
+    )
 
 
 def at_rate(

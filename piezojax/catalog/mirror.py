@@ -78,7 +78,7 @@ def model(order: int = 12) -> StateSpace:
     return StateSpace(A, B, C, D, DT)
 
 
-def stage(order: int = 12) -> MatrixARMA:
+def stage(*, order: int = 12) -> MatrixARMA:
     """Return the mirror as the plant of a loop that needs a sample to compute."""
     return observability_form(model(order).delayed())
 
@@ -94,7 +94,7 @@ def multi_axis() -> MultiAxisSlidingMode:
     pole 1.25): the prediction of chapter 7 relies on a model of every resonance, so the
     mirror itself must be expected to need other gains, or a better model.
     """
-    plant = stage(12)
+    plant = stage(order=12)
     scale = _surface_scale(plant)
     unit = np.eye(3)
     lags = FREQUENCY, DAMPING, DT

@@ -19,34 +19,31 @@ from .p558 import OUTPUTS
 HYSTERESIS = 0.02
 """Share of the stroke that passes through the play operator."""
 
+Deviations = Float[Array, " axes"] | tuple[float, ...]
+
 PLAY = 4.0
 """Half-width of the play in um, urad, urad."""
 
 
-def plant(chapter: str = "7", hysteresis: float = HYSTERESIS, delay: int = 0) -> Series:
-    """Return the stage: ``hysteresis`` of each axis, then (7.53) or (6.23)-(6.25).
-
-    ``delay`` in samples, beyond the one that every model has, lies between. Raises
-    ValueError for a chapter that prints no model, or a negative delay.
-    """
-    loops = tuple(_play(hysteresis) for _ in OUTPUTS)
-    parts: dict[str, System] = {"hysteresis": PerAxis(loops, OUTPUTS)}
-    if delay:
-        parts["delay"] = PerAxis((Delay(delay),) * len(OUTPUTS), OUTPUTS)
-    return series(**parts, dynamics=channels_of(p558.channels(chapter)))
+NOMINAL = (0.0, 0.0, 0.0)
+"""No deviation of any axis."""
 
 
-def varied(
-    gain: Float[Array, " axes"],
-    speed: Float[Array, " axes"],
-    hysteresis: Float[Array, " axes"],
-    coupling: Float[Array, " axes"],
-) -> System:
-    """Return the stage with relative deviations by axis, 0 for none.
+def plant(
+    gain: Deviations = NOMINAL,
+    speed: Deviations = NOMINAL,
+    hysteresis: Deviations = NOMINAL,
+    coupling: Deviations = NOMINAL,
+    *,
+    delay: int = 0,
+) -> Series:
+    """Return the stage: hysteresis of each axis, then the dynamics of (7.53).
 
-    ``gain`` of the axis' channel; ``speed``, the time scale of its poles and zeros
-    (A becomes I + (1 + speed)(A - I), B is scaled alike: same gain at rest);
-    ``hysteresis``, the share of play; ``coupling``, what it adds to the other axes.
+    Relative deviations by axis: ``gain`` of the axis' channel; ``speed``, the time
+    scale of its poles and zeros (A becomes I + (1 + speed)(A - I), B is scaled alike:
+    same gain at rest); ``hysteresis``, the share of play; ``coupling``, the gain to the
+    other axes. ``delay`` in samples lies between hysteresis and dynamics, beyond the
+    one that every model has. Raises ValueError for a negative delay.
     """
     channels: list[Channel] = []
     for axis, part in enumerate(channels_of(p558.channels("7")).parts):
@@ -64,9 +61,10 @@ def varied(
         B = tuple(faster * gain_of * b for b in part.B)
         channels.append(Channel(A, B, C, part.dt))
     loops = tuple(_play(HYSTERESIS * (1.0 + h)) for h in hysteresis)
-    return series(
-        hysteresis=PerAxis(loops, OUTPUTS), dynamics=Channels(tuple(channels))
-    )
+    parts: dict[str, System] = {"hysteresis": PerAxis(loops, OUTPUTS)}
+    if delay:
+        parts["delay"] = PerAxis((Delay(delay),) * len(OUTPUTS), OUTPUTS)
+    return series(**parts, dynamics=Channels(tuple(channels)))
 
 
 def _play(share: float | jax.Array) -> PrandtlIshlinskii:

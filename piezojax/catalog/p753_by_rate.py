@@ -59,12 +59,12 @@ by trial: with the printed K and surface the first of 1, 2, 5, 10, 20, 50, ... a
 the voltage keeps off its limits on sines of 5 um, and of that series the best."""
 
 
-def plant(rate: int = 20_000) -> System:
+def plant(*, rate: int = 20_000) -> System:
     """Return the stage of chapter 5, V to um, its input held between samples."""
     return _resampled(p753.plant(), rate)
 
 
-def chapter4_plant(rate: int = 20_000) -> System:
+def chapter4_plant(*, rate: int = 20_000) -> System:
     """Return the stage of chapter 4, V to um, its input held between samples."""
     return _resampled(p753_chapter4.plant(), rate)
 

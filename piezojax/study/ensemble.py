@@ -1,6 +1,5 @@
 """Stages off their nominal values: drawn as a study's ensemble says."""
 
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 from pydantic import BaseModel
 
-from ..catalog import VARIATIONS
+from ..catalog import PLANTS, deviations_of
 from ..core.arrays import as_array
 from ..core.files import read_model
 from ..core.paths import get, replace
@@ -116,13 +115,14 @@ def ensemble_of(study: Study, nominal: Stage, folder: Path) -> Ensemble | None:
     make, arguments = None, ()
     if len(paths) < len(wanted):
         name = str(study.plant.get("catalog", ""))
-        if name not in VARIATIONS:
+        known = deviations_of(name)
+        if not known:
+            varied = ", ".join(plant for plant in PLANTS if deviations_of(plant))
             raise ValueError(
                 "ensemble: plant.catalog must be one whose variations are known: "
-                f"{', '.join(VARIATIONS)}; for others name paths, as plant.0.a"
+                f"{varied}; for others name paths, as plant.0.a"
             )
-        make = VARIATIONS[name]
-        known = inspect.signature(make).parameters
+        make = PLANTS[name]
         for deviation in wanted:
             if "." not in deviation and deviation not in known:
                 key = "spread" if deviation in table.spread else "range"
@@ -130,11 +130,7 @@ def ensemble_of(study: Study, nominal: Stage, folder: Path) -> Ensemble | None:
                     f"ensemble.{key}.{deviation} is unknown; {name} varies in "
                     f"{', '.join(known)}"
                 )
-        arguments = tuple(
-            argument
-            for argument, parameter in known.items()
-            if argument in wanted or parameter.default is inspect.Parameter.empty
-        )
+        arguments = tuple(argument for argument in known if argument in wanted)
     for path in paths:
         key = "spread" if path in table.spread else "range"
         _check_path(nominal, path, f"ensemble.{key}")

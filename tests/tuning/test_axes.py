@@ -11,7 +11,7 @@ import pytest
 import tomli_w
 
 import piezojax as pj
-from piezojax.catalog import VARIATIONS, p558_stage
+from piezojax.catalog import PLANTS, p558_stage
 from piezojax.core.axes import packed
 from piezojax.study import load, read, shipped
 from piezojax.tuning.traces import traces_of
@@ -148,23 +148,12 @@ def test_gains_and_result_load_back(outcome, tmp_path):
     assert pj.load_result(tmp_path) == outcome.result
 
 
-def test_without_deviation_the_varied_stage_is_the_stage():
-    none = jnp.zeros(3)
-    found = p558_stage.varied(none, none, none, none)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12),
-        found,
-        p558_stage.plant(),
-    )
-
-
 def test_deviations_do_what_they_are_called():
-    none, tenth = jnp.zeros(3), jnp.full(3, 0.1)
+    tenth = jnp.full(3, 0.1)
     ones = (jnp.asarray(1.0),) * 3
 
     def at_rest(**deviations):
-        zero = dict.fromkeys(("gain", "speed", "hysteresis", "coupling"), none)
-        stage = VARIATIONS["p558"](**(zero | deviations)).parts[1]
+        stage = PLANTS["p558"](**deviations).parts[1]
         return np.array(stage.step(stage.init(ones), ones)[1])
 
     nominal = at_rest()
