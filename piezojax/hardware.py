@@ -1,23 +1,26 @@
-"""What lies between a controller and its stage: limits, converters, the sensor."""
+"""Hardware between a controller and its stage: limits, converters, sensor, drive."""
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .core.arrays import Scalar, ScalarLike, State, as_array, check, check_order
+from .core.arrays import Scalar, ScalarLike, State, as_array, check_order
+from .core.parameter import parameter, sample_time
 from .core.system import System, holding_input, rest_output
 
 
 class Saturation(System):
-    """Clips its input to ``[lower, upper]``, V."""
+    """Clips its input to ``[lower, upper]``.
 
-    lower: Scalar = eqx.field(converter=as_array)
-    upper: Scalar = eqx.field(converter=as_array)
+    Raises ValueError unless ``lower`` is below ``upper``.
+    """
+
+    lower: Scalar = parameter("V", "lower limit of the voltage")
+    upper: Scalar = parameter("V", "upper limit of the voltage")
 
     def __check_init__(self):
-        check_order("lower limit", self.lower, "upper limit", self.upper)
+        check_order("lower", self.lower, "upper", self.upper)
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return ()
@@ -27,17 +30,10 @@ class Saturation(System):
 
 
 class SlewLimit(System):
-    """Limits how fast its output follows its input.
+    """Limits the rate at which its output follows its input."""
 
-    ``rate`` in V/s, ``dt`` in s. Raises ValueError unless both are positive.
-    """
-
-    rate: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
-
-    def __check_init__(self):
-        check("slew rate in V/s", self.rate, above=0.0)
-        check("sample time in s", self.dt, above=0.0)
+    rate: Scalar = parameter("V/s", "slew rate", above=0.0, scale="log")
+    dt: float = sample_time()
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return as_array(input)
@@ -55,10 +51,9 @@ class Quantiser(System):
     tuned; the value is the rounded one.
     """
 
-    resolution: Scalar = eqx.field(converter=as_array)
-
-    def __check_init__(self):
-        check("resolution", self.resolution, above=0.0)
+    resolution: Scalar = parameter(
+        "[input]", "step of the converter", above=0.0, scale="log"
+    )
 
     def init(self, input: ScalarLike = 0.0) -> State:
         return ()
@@ -76,10 +71,7 @@ class Sensor(System):
     um: displacement + ``noise_rms`` * draw. Follow it with a Quantiser for a converter.
     """
 
-    noise_rms: Scalar = eqx.field(converter=as_array)
-
-    def __check_init__(self):
-        check("sensor noise in um rms", self.noise_rms, least=0.0)
+    noise_rms: Scalar = parameter("um", "rms noise of the sensor", least=0.0)
 
     def init(self, input: Any = (0.0, 0.0)) -> State:
         return ()
@@ -101,7 +93,7 @@ class ChargeDriveState(NamedTuple):
 class ChargeDrive(System):
     """A grounded-load charge amplifier: an actuator from a command v to a voltage.
 
-    What the amplifier's network C_s, R_s takes up, the load C_L, R_L takes too:
+    The amplifier's network C_s, R_s and the load C_L, R_L take up the same charge:
 
     ``C_s dv/dt + v / R_s = dq/dt + u / R_L``
 
@@ -109,30 +101,26 @@ class ChargeDrive(System):
     this is (2.12) with its leakage, ``q / v = C_s (s + 1/(C_s R_s)) / (s +
     1/(C_L R_L))``: charge is followed above 1 / (C_L R_L), voltage below.
 
-    ``gain`` C_s / C_L without unit; ``source_time`` C_s R_s and ``load_time`` C_L R_L
-    in s; ``load``, a System from q / C_L in V to u in V. A linear load is ``Affine()``.
-    In a piezo the hysteresis lies between voltage and charge, and the displacement goes
-    with the charge: ``Affine(K) >> InverseColemanHodgdon(model)``, K in um/V, is the
-    load of a stage with that hysteresis, the inverse standing for the material and not
-    for a compensation. ``dt`` in s; the leakage is summed by Euler's rule, whose error
-    is of the order dt / load_time.
+    ``load`` is a System from q / C_L in V to u in V; a linear load is ``Affine()``. In
+    a piezo the hysteresis lies between voltage and charge, and the displacement is
+    proportional to the charge: ``Affine(K) >> InverseColemanHodgdon(model)``, K in
+    um/V, is the load of a stage with that hysteresis. The inverse describes the
+    material here, not a compensation. The leakage is integrated by Euler's rule, with
+    an error of the order dt / load_time.
 
     As the actuator of a loop its static gain, gain * load_time / source_time, should be
     1, or the start is a jump. Limits of the command are a ``Saturation`` before it.
-    Raises ValueError unless gain, both times and ``dt`` are positive.
     """
 
-    gain: Scalar = eqx.field(converter=as_array)
-    source_time: Scalar = eqx.field(converter=as_array)
-    load_time: Scalar = eqx.field(converter=as_array)
     load: System
-    dt: float = eqx.field(static=True)
-
-    def __check_init__(self):
-        check("gain C_s / C_L", self.gain, above=0.0)
-        check("source time in s", self.source_time, above=0.0)
-        check("load time in s", self.load_time, above=0.0)
-        check("sample time in s", self.dt, above=0.0)
+    gain: Scalar = parameter("1", "capacitance ratio C_s / C_L", above=0.0, scale="log")
+    source_time: Scalar = parameter(
+        "s", "time constant C_s R_s of the source", above=0.0, scale="log"
+    )
+    load_time: Scalar = parameter(
+        "s", "time constant C_L R_L of the load", above=0.0, scale="log"
+    )
+    dt: float = sample_time()
 
     def init(self, input: ScalarLike = 0.0) -> ChargeDriveState:
         command = as_array(input)

@@ -46,7 +46,7 @@ def after(state, drive, inputs):
 
 @pytest.mark.parametrize("frequency", [0.05, 0.5, 5.0, 50.0])
 def test_a_linear_load_is_that_of_the_printed_transfer_function(frequency):
-    drive = ChargeDrive(0.8, 0.2, 0.5, Affine(), 1e-3)
+    drive = ChargeDrive(Affine(), 0.8, 0.2, 0.5, 1e-3)
     w = 2.0 * np.pi * frequency
     period = round(1e3 / frequency)
     samples = period * max(1, round(10e3 / period))
@@ -62,14 +62,14 @@ def test_a_linear_load_is_that_of_the_printed_transfer_function(frequency):
 
 def test_matched_times_make_it_a_gain():
     inputs = np.cumsum(np.random.default_rng(1).normal(size=2_000))
-    drive = ChargeDrive(0.7, 0.1, 0.1, Affine(), DT)
+    drive = ChargeDrive(Affine(), 0.7, 0.1, 0.1, DT)
     np.testing.assert_allclose(
         response(drive, jnp.asarray(inputs)), 0.7 * inputs, rtol=0.0, atol=1e-9
     )
 
 
 def test_a_hysteretic_load_is_the_loop_of_the_equations():
-    drive = ChargeDrive(1.1, 0.02, 0.025, LOAD, DT)
+    drive = ChargeDrive(LOAD, 1.1, 0.02, 0.025, DT)
     time = DT * np.arange(20_000)
     inputs = 25.0 * (1.0 - np.cos(2 * np.pi * 7.0 * time)) + 5.0 * np.sin(200.0 * time)
     found = after(rest(), drive, jnp.asarray(inputs))
@@ -86,7 +86,7 @@ def test_a_hysteretic_load_is_the_loop_of_the_equations():
 
 def loop_width(corner_time):
     """Widest gap between the branches of the loop at 10 Hz, in % of its stroke."""
-    drive = ChargeDrive(1.0, corner_time, corner_time, LOAD, DT)
+    drive = ChargeDrive(LOAD, 1.0, corner_time, corner_time, DT)
     command = signals.sine(signals.time_grid(0.3, p753.RATE), 10.0, 30.0)
     y = response(p753.hysteresis(), after(rest(), drive, command))[-2_000:]
     rising, falling = y[:1_000], y[1_000:][::-1]
@@ -117,7 +117,7 @@ def test_gradients_are_those_of_differences_and_finite_at_rest():
     start = rest()
 
     def loss(times, command):
-        return simulate(ChargeDrive(*times, LOAD, DT), command, start)[1][-1]
+        return simulate(ChargeDrive(LOAD, *times, DT), command, start)[1][-1]
 
     slopes = jax.jit(jax.value_and_grad(loss))
     times = jnp.asarray([1.0, 0.9, 1.2])
@@ -132,7 +132,7 @@ def test_gradients_are_those_of_differences_and_finite_at_rest():
 
 
 def test_at_rest_its_output_is_its_static_gain():
-    drive = ChargeDrive(0.8, 0.2, 0.5, LOAD, DT)
+    drive = ChargeDrive(LOAD, 0.8, 0.2, 0.5, DT)
     held = response(drive, jnp.full(100, 10.0))
     np.testing.assert_allclose(held, 0.8 * 0.5 / 0.2 * 10.0, rtol=0.0, atol=1e-9)
 
@@ -140,13 +140,13 @@ def test_at_rest_its_output_is_its_static_gain():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((0.0, 1.0, 1.0, DT), "gain C_s / C_L is 0; .* above 0"),
-        ((1.0, -1.0, 1.0, DT), "source time in s is -1; .* above 0"),
-        ((1.0, 1.0, np.inf, DT), "load time in s is inf"),
-        ((1.0, 1.0, 1.0, 0.0), "sample time in s is 0; .* above 0"),
+        ((0.0, 1.0, 1.0, DT), "gain is 0; .* above 0"),
+        ((1.0, -1.0, 1.0, DT), "source_time in s is -1; .* above 0"),
+        ((1.0, 1.0, np.inf, DT), "load_time in s is inf"),
+        ((1.0, 1.0, 1.0, 0.0), "dt in s is 0; .* above 0"),
     ],
 )
 def test_bad_parameters_are_refused(arguments, message):
     *values, dt = arguments
     with pytest.raises(ValueError, match=message):
-        ChargeDrive(*values, Affine(), dt)
+        ChargeDrive(Affine(), *values, dt)

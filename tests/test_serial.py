@@ -312,7 +312,7 @@ def test_missing_key():
     [
         (
             {"type": "Saturation", "lower": 3.0, "upper": 2.0},
-            "system: lower limit is 3 and upper limit is 2; lower limit must be below",
+            "system: lower is 3 and upper is 2; lower must be below upper",
         ),
         (
             {"type": "FirstOrderLag", "time_constant": -1.0, "dt": 1e-3},
@@ -320,7 +320,7 @@ def test_missing_key():
         ),
         (
             {"type": "Quantiser", "resolution": 0.0},
-            "system: resolution is 0; it must be finite and above 0",
+            "system: resolution in [input] is 0; it must be finite and above 0",
         ),
         (
             {"type": "ColemanHodgdon", "a": 1.0, "b": 1.0, "c": 1.0},

@@ -8,6 +8,7 @@ that fits their elongations best.
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -39,7 +40,7 @@ def geometry() -> Float[np.ndarray, "3 4"]:
 
 def allocation(method: str = "bounded") -> Allocation:
     """Return the allocation of a pose to the four, um."""
-    lower, upper = (np.full(len(POSITIONS), bound) for bound in TRAVEL)
+    lower, upper = (jnp.full(len(POSITIONS), bound) for bound in TRAVEL)
     return Allocation(geometry(), lower, upper, method)
 
 

@@ -91,4 +91,4 @@ def learning() -> LearningLaw:
 def charge_drive() -> ChargeDrive:
     """Return a charge amplifier on the stage's own hysteresis, V to V; times ours."""
     load = Affine(p753.GAIN) >> _inverse()
-    return ChargeDrive(1.0, CHARGE_TIME, CHARGE_TIME, load, p753.DT)
+    return ChargeDrive(load, 1.0, CHARGE_TIME, CHARGE_TIME, p753.DT)

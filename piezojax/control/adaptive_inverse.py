@@ -1,12 +1,11 @@
 """An inverse of the stage, learned while the loop runs and fed forward."""
 
-import math
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, State, as_array, as_scalars, check
+from ..core.arrays import Scalar, ScalarLike, State, as_array, as_scalars
+from ..core.parameter import parameter, sample_time
 from ..core.system import Observation, Series, System
 from ..dynamics.lag import FirstOrderLag
 from .recursive_weights import RecursiveWeights
@@ -22,15 +21,17 @@ class TermsState(NamedTuple):
 
 
 class MotionTerms(System):
-    """What a position needs of the voltage: y, dy/dt, d2y/dt2 and stop operators of y.
+    """Terms of the voltage that holds a position: y, dy/dt, d2y/dt2 and stops of y.
 
     Input um; output um, um/s, um/s^2, and um for each of ``thresholds`` (um). A stop
     operator follows the position and saturates at its threshold: the dual of the play
     of a Prandtl-Ishlinskii model, whose inverse is a sum of both.
     """
 
-    thresholds: Row = eqx.field(converter=as_scalars)
-    dt: float = eqx.field(static=True)
+    thresholds: Row = parameter(
+        "um", "thresholds of the stop operators", above=0.0, converter=as_scalars
+    )
+    dt: float = sample_time()
 
     def init(self, input: ScalarLike = 0.0) -> TermsState:
         position = as_array(input)
@@ -76,41 +77,72 @@ class AdaptiveInverse(System):
     control, Widrow and Walach 1996; stop operators for the inverse of a hysteresis,
     Kuhnen and Krejci 2007.
 
-    ``share`` of the reference is carried by the inverse, 0 being ``controller`` alone:
-    that sees the rest of the reference, and measurement and voltage without the part
-    that was fed forward. Only changes of the motion are fed forward, so a weight that
-    is learned moves nothing at rest, and the margins there are those of ``controller``;
-    while the stage moves, learning is a slow loop of its own, which they do not show.
+    With a ``share`` of 0 only ``controller`` acts. It sees the rest of the reference,
+    and measurement and voltage without the part that was fed forward. Only changes of
+    the motion are fed forward, so a learned weight moves nothing at rest, and the
+    margins there are those of ``controller``. While the stage moves, learning is a slow
+    loop of its own that the margins do not show.
 
-    ``weights`` (V/um, V s/um, V s^2/um, then V/um a stop) are those at the start,
-    ``deviations`` how far off they may be, ``thresholds`` of the stops in um,
-    ``offset_deviation`` in V that of the voltage at zero, which the start settles.
-    ``cutoff`` in rad/s, ``equation_error`` in V and ``memory`` in s as in
-    RecursiveWeights, ``dt`` in s. Input an Observation, output V, one axis.
+    ``weights`` are in V/um, V s/um and V s^2/um, then V/um for each stop. The start
+    settles the voltage at zero. Input an Observation, output V, one axis.
 
-    Raises ValueError for counts that do not match, thresholds or an offset deviation
-    that are not positive, a cut-off that is not between 0 and pi/dt, and as
-    RecursiveWeights.
+    Raises ValueError for counts that do not match.
     """
 
     controller: System
-    weights: Row = eqx.field(converter=as_scalars)
-    deviations: Row = eqx.field(converter=as_scalars)
-    thresholds: Row = eqx.field(converter=as_scalars)
-    cutoff: Scalar = eqx.field(converter=as_array)
-    equation_error: Scalar = eqx.field(converter=as_array)
-    memory: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
-    share: Scalar = eqx.field(converter=as_array, default=1.0)
-    offset_deviation: Scalar = eqx.field(converter=as_array, default=10.0)
+    weights: Row = parameter("V per term", "weights at the start", converter=as_scalars)
+    deviations: Row = parameter(
+        "V per term",
+        "standard deviations of the weights at the start",
+        least=0.0,
+        converter=as_scalars,
+    )
+    thresholds: Row = parameter(
+        "um", "thresholds of the stop operators", above=0.0, converter=as_scalars
+    )
+    cutoff: Scalar = parameter(
+        "rad/s",
+        "cut-off frequency of the filters",
+        above=0.0,
+        below_nyquist=True,
+        scale="log",
+        typical=(1e2, 1e4),
+    )
+    equation_error: Scalar = parameter(
+        "V",
+        "standard deviation of the rest of the relation",
+        above=0.0,
+        scale="log",
+        typical=(1e-2, 1e2),
+    )
+    memory: Scalar = parameter(
+        "s",
+        "time constant of forgetting",
+        above=0.0,
+        scale="log",
+        typical=(1e-2, 1e2),
+    )
+    dt: float = sample_time()
+    share: Scalar = parameter(
+        "1",
+        "share of the reference that the inverse carries",
+        typical=(0.0, 1.0),
+        default=1.0,
+    )
+    offset_deviation: Scalar = parameter(
+        "V",
+        "standard deviation of the voltage at zero",
+        above=0.0,
+        scale="log",
+        default=10.0,
+    )
 
     def __check_init__(self):
-        check("thresholds in um", self.thresholds, above=0.0)
-        check("share", self.share)
-        check("offset deviation in V", self.offset_deviation, above=0.0)
-        check("sample time in s", self.dt, above=0.0)
-        check("cut-off in rad/s", self.cutoff, above=0.0, below=math.pi / self.dt)
-        self._learning(as_array(0.0))
+        if len(self.deviations) != len(self.weights):
+            raise ValueError(
+                f"{len(self.weights)} weights and {len(self.deviations)} deviations; "
+                "each weight needs one"
+            )
         if len(self.weights) != 3 + len(self.thresholds):
             raise ValueError(
                 f"{len(self.weights)} weights for {len(self.thresholds)} thresholds; "

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.arrays import ScalarLike, State, as_array, check, check_order
+from ..core.parameter import parameter
 from ..core.system import System
 from .box import MOST_ACTUATORS, Numbers, Problem, clipped, null_space, within
 
@@ -78,8 +79,8 @@ class Allocation(System):
     """
 
     geometry: tuple[Numbers, ...] = eqx.field(static=True, converter=_rows)
-    lower: Float[Array, " actuators"] = eqx.field(converter=as_array)
-    upper: Float[Array, " actuators"] = eqx.field(converter=as_array)
+    lower: Float[Array, " actuators"] = parameter("[q]", "lower bounds of the commands")
+    upper: Float[Array, " actuators"] = parameter("[q]", "upper bounds of the commands")
     method: str = eqx.field(static=True, default="bounded")
     weights: Numbers = eqx.field(static=True, converter=_numbers, default=())
     axis_weights: Numbers = eqx.field(static=True, converter=_numbers, default=())
@@ -104,9 +105,7 @@ class Allocation(System):
                     f"{geometry.shape} it must be {(count,)}"
                 )
         check("geometry", geometry)
-        check("lower bound", self.lower)
-        check("upper bound", self.upper)
-        check_order("lower bound", self.lower, "upper bound", self.upper, equal=True)
+        check_order("lower", self.lower, "upper", self.upper, equal=True)
         check("weights", self.weights, above=0.0)
         check("axis_weights", self.axis_weights, above=0.0)
         rank = np.linalg.matrix_rank(geometry)

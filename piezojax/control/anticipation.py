@@ -2,29 +2,29 @@
 
 from typing import Any
 
-import equinox as eqx
-
-from ..core.arrays import Scalar, State, as_scalars, check
+from ..core.arrays import Scalar, State, as_scalars
 from ..core.axes import Axes
+from ..core.parameter import parameter
 from ..core.system import Observation, System
 
 
 class Anticipation(System):
     """``controller``, shown the reference ``lead`` samples ahead.
 
-    A closed loop follows late by a time that its tuning fixes; a reference shown
-    earlier by as much takes that away without touching the feedback, its noise or its
-    margins. 1 is r(k+1), which is known; beyond, the line through r(k) and r(k+1) goes
-    on, so a signal is foreseen as well as a straight line serves. One value for each
-    axis; 0 changes nothing. Input an Observation, output the controller's. Raises
-    ValueError for a lead that is not finite.
+    A closed loop lags its reference by a time that its tuning fixes. A reference shown
+    earlier by the same time removes the lag and leaves the feedback, its noise and its
+    margins unchanged. A lead of 1 is r(k+1), which is known; a larger one extrapolates
+    the line through r(k) and r(k+1). 0 changes nothing. Input an Observation, output
+    the controller's.
     """
 
     controller: System
-    lead: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-
-    def __check_init__(self):
-        check("lead in samples", self.lead)
+    lead: tuple[Scalar, ...] = parameter(
+        "samples",
+        "how far ahead the reference is shown, an axis each",
+        typical=(-5.0, 30.0),
+        converter=as_scalars,
+    )
 
     def _ahead(self, input: Observation) -> Observation:
         now, following = input.reference, input.next_reference

@@ -48,7 +48,6 @@ class DisturbanceObserverControl(System):
         "linear gain K_e of the hysteresis",
         above=0.0,
         scale="log",
-        typical=(1e-3, 1e2),
     )
     cutoff: Scalar = parameter(
         "rad/s",

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import Scalar, as_array, as_scalars, check
 from ..core.metrics import root
+from ..core.parameter import check_declared, parameter
 from ..core.rollout import simulate
 from ..core.system import Feedback, System, loop_inputs
 
@@ -43,20 +44,29 @@ class LearningLaw(eqx.Module):
     point ``(I - Q (I - L G))^-1 Q L r`` if ``Q (I - L G)`` has norm below 1; for trials
     that are long against the transients, if ``|Q (1 - gain z^lead G)| < 1`` at all
     frequencies. The error that stays is zero only where Q = 1.
-
-    Raises ValueError for values that are not finite or a lead that is not whole.
     """
 
-    gain: Scalar = eqx.field(converter=as_array)
-    smoothing: tuple[Scalar, ...] = eqx.field(converter=as_scalars, default=())
-    lead: int = eqx.field(static=True, default=0)
+    gain: Scalar = parameter(
+        "[u]/um", "learning gain, [u] the unit of the feedforward", typical=(0.0, 1.0)
+    )
+    smoothing: tuple[Scalar, ...] = parameter(
+        "1",
+        "weights of the neighbours in the Q-filter",
+        typical=(0.0, 0.25),
+        converter=as_scalars,
+        default=(),
+    )
+    lead: int = parameter(
+        "samples",
+        "lag of what the feedforward drives",
+        least=0.0,
+        whole=True,
+        static=True,
+        default=0,
+    )
 
     def __check_init__(self):
-        check("learning gain", self.gain)
-        check("smoothing", self.smoothing)
-        if not isinstance(self.lead, int):
-            raise ValueError(f"lead in samples is {self.lead!r}; it must be whole")
-        check("lead in samples", self.lead, least=0.0)
+        check_declared(self)
 
     def next(self, feedforward: Signal, error: Signal) -> Signal:
         """Return the next trial's feedforward. Both signals have one length."""

@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from scipy import linalg
 
 from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.parameter import parameter, sample_time
 from ..core.system import Observation
 from ..dynamics.arma import ARMA
 from .observer import Motion, Observer
@@ -33,19 +33,22 @@ class KalmanFilter(Observer):
     The model (a_1, ..., a_n | b_0, ...) answers u(k) with
     ``y(k+1) = a_1 y(k) + a_2 y(k-1) + ... + b_0 u(k) + b_1 u(k-1) + ... + d(k)``, where
     the drift d in um stands for all that it leaves out: hysteresis, creep, a wrong gain
-    at rest. u is what was applied. ``gain`` corrects y(k), y(k-1), ..., as many as the
-    model has a coefficients and two at least, and then d, by so much of the innovation;
-    no unit. ``dt`` in s. The velocity of the Motion is (y(k) - y(k-1)) / dt with both
-    estimated, the state of chapter 4's second-order models; with a gain of zero the
-    model runs on its own.
+    at rest. u is the applied input. ``gain`` corrects y(k), y(k-1), ..., as many as the
+    model has a coefficients and two at least, and then d. The velocity of the Motion is
+    (y(k) - y(k-1)) / dt with both estimated, the state of chapter 4's second-order
+    models; with a gain of zero the model runs on its own.
 
-    Raises ValueError for a model without a_1, a gain of another length, numbers that
-    are not finite or ``dt <= 0``.
+    Raises ValueError for a model without a_1 or a gain of another length.
     """
 
     model: ARMA
-    gain: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    dt: float = eqx.field(static=True)
+    gain: tuple[Scalar, ...] = parameter(
+        "1",
+        "share of the innovation that corrects each estimate, the drift last",
+        typical=(-0.5, 0.99),
+        converter=as_scalars,
+    )
+    dt: float = sample_time()
 
     def __check_init__(self):
         if not self.model.autoregressive:
@@ -56,8 +59,6 @@ class KalmanFilter(Observer):
                 f"gain holds {len(self.gain)} numbers; it must hold {needed} for this "
                 "model, the last for the drift"
             )
-        check("gain", self.gain)
-        check("sample time in s", self.dt, above=0.0)
 
     def init(self, input: Observation) -> KalmanState:
         measured, applied = as_array(input.measured), as_array(input.applied)

@@ -53,7 +53,7 @@ class ModelReferenceSlidingMode(System):
         "1", "weights of older errors in s", typical=(-0.99, 0.99), converter=as_scalars
     )
     error_weight: Scalar = parameter(
-        "1", "weight Q of the inversion", above=0.0, scale="log", typical=(1e-2, 1e2)
+        "1", "weight Q of the inversion; only Q / R counts", above=0.0, scale="log"
     )
     control_weight: Scalar = parameter(
         "1", "weight R of the inversion", least=0.0, scale="log", typical=(1e-4, 1e3)

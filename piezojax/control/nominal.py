@@ -56,7 +56,7 @@ class NominalSlidingMode(System):
         "1", "weight m of the older error in s", typical=(-0.98, 0.98)
     )
     error_weight: Scalar = parameter(
-        "1", "weight Q of the inversion", above=0.0, scale="log", typical=(1e-2, 1e2)
+        "1", "weight Q of the inversion; only Q / R counts", above=0.0, scale="log"
     )
     control_weight: Scalar = parameter(
         "1", "weight R of the inversion", least=0.0, scale="log", typical=(1e-4, 1e3)

@@ -2,11 +2,11 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..core.arrays import Scalar, State, as_array, check
+from ..core.arrays import Scalar, State, as_array
+from ..core.parameter import parameter
 from ..core.system import Observation, System
 
 
@@ -25,42 +25,50 @@ class RepetitiveState(NamedTuple):
 
 
 class RepetitiveControl(System):
-    """``feedback`` with its reference corrected by what the last periods left over.
+    """``feedback`` with its reference corrected by the errors of the last periods.
 
     Plugged in as in section 2.6.3, Figure 2.17: ``feedback``, any controller, sees
     r + w in place of r, with
 
     ``w = Q z^-period (w + gain z^lead e)``, e = r - z in um.
 
-    ``gain`` without unit; ``period`` in samples, that of the reference; ``lead`` in
-    samples, about the lag of the inner loop; ``filter`` Q, any low pass from um to um
-    with unit gain at zero, 0 at rest; ``advance`` in samples, Q's own delay, taken off
-    the line. A ``FirstOrderLag`` of tau has about tau / dt; ``ARMA`` coefficients that
-    are symmetric about the middle make Q exactly zero-phase.
+    ``filter`` Q is any low pass from um to um with unit gain at zero, 0 at rest, whose
+    own delay ``advance`` is taken off the delay line. A ``FirstOrderLag`` of tau has
+    about tau / dt; ``ARMA`` coefficients that are symmetric about the middle make Q
+    exactly zero-phase.
 
     With T the inner loop from r to z and Q with its delay taken off, the error of a
     linear loop dies out from period to period if ``|Q (1 - gain z^lead T)| < 1`` at all
-    frequencies. Limits are not known to it: a reference out of reach winds it up.
+    frequencies. A reference out of reach winds it up, because it knows no limits.
 
     Input an Observation, output that of ``feedback``. At rest without error it does
-    nothing. Raises ValueError for a negative gain, counts that are not whole and
-    ``lead + advance >= period``.
+    nothing. Raises ValueError for ``lead + advance >= period``.
     """
 
     feedback: System
     filter: System
-    gain: Scalar = eqx.field(converter=as_array)
-    period: int = eqx.field(static=True)
-    lead: int = eqx.field(static=True, default=0)
-    advance: int = eqx.field(static=True, default=0)
+    gain: Scalar = parameter("1", "learning gain", least=0.0, typical=(0.0, 1.0))
+    period: int = parameter(
+        "samples", "period of the reference", least=2.0, whole=True, static=True
+    )
+    lead: int = parameter(
+        "samples",
+        "lag of the inner loop, about",
+        least=0.0,
+        whole=True,
+        static=True,
+        default=0,
+    )
+    advance: int = parameter(
+        "samples",
+        "delay of the Q-filter",
+        least=0.0,
+        whole=True,
+        static=True,
+        default=0,
+    )
 
     def __check_init__(self):
-        check("learning gain", self.gain, least=0.0)
-        for name in ("period", "lead", "advance"):
-            value, least = getattr(self, name), 2.0 if name == "period" else 0.0
-            if not isinstance(value, int):
-                raise ValueError(f"{name} in samples is {value!r}; it must be whole")
-            check(f"{name} in samples", value, least=least)
         if self.lead + self.advance >= self.period:
             raise ValueError(
                 f"lead is {self.lead} and advance {self.advance} samples; "

@@ -57,7 +57,7 @@ class SlidingMode(System):
         "1/s", "slope m of the sliding surface", scale="log", typical=(10.0, 1e5)
     )
     error_weight: Scalar = parameter(
-        "1", "weight Q of the inversion", above=0.0, scale="log", typical=(1e-2, 1e2)
+        "1", "weight Q of the inversion; only Q / R counts", above=0.0, scale="log"
     )
     control_weight: Scalar = parameter(
         "1", "weight R of the inversion", least=0.0, scale="log", typical=(1e-4, 1e3)

@@ -179,19 +179,22 @@ def test_what_was_learned_is_forgotten_and_a_certain_weight_is_held():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"weights": (1.0, 2.0)}, "3 weights and 6 deviations"),
+        ({"weights": (1.0, 2.0)}, "2 weights and 5 deviations; each weight needs one"),
         (
             {"weights": (1.0,) * 6, "deviations": (1.0,) * 6},
             "6 weights for 2 thresholds; it must be three and one for each",
         ),
         ({"thresholds": (0.4, 0.0)}, "thresholds in um is 0; it must be finite and ab"),
-        ({"deviations": (-1.0,) + (1.0,) * 4}, "deviations is -1; .* at least 0"),
-        ({"cutoff": 7e4}, "cut-off in rad/s is 70000; .* above 0 and below 62831.9"),
-        ({"equation_error": 0.0}, "equation error is 0; it must be finite and above 0"),
+        ({"deviations": (-1.0,) + (1.0,) * 4}, "deviations .* is -1; .* at least 0"),
+        ({"cutoff": 7e4}, "cutoff in rad/s is 70000; .* above 0 and below 62831.9"),
+        (
+            {"equation_error": 0.0},
+            "equation_error .* is 0; it must be finite and above 0",
+        ),
         ({"memory": -1.0}, "memory in s is -1; it must be finite and above 0"),
-        ({"offset_deviation": 0.0}, "offset deviation in V is 0"),
+        ({"offset_deviation": 0.0}, "offset_deviation in V is 0"),
         ({"share": np.nan}, "share is nan; it must be finite"),
-        ({"dt": 0.0}, "sample time in s is 0"),
+        ({"dt": 0.0}, "dt in s is 0"),
     ],
 )
 def test_what_cannot_be_is_refused(changes, message):

@@ -445,11 +445,11 @@ def made(geometry=oracle.PLATE, lower=(0.0,) * 4, upper=(50.0,) * 4, **options):
         ),
         (lambda: made(weights=(1.0, 2.0)), r"weights has shape \(2,\); .* \(4,\)"),
         (lambda: made(axis_weights=(1.0,) * 4), r"axis_weights has shape \(4,\)"),
-        (lambda: made(lower=(np.nan,) * 4), "lower bound is .*nan.* must be finite"),
-        (lambda: made(upper=(np.inf,) * 4), "upper bound is .*inf.* must be finite"),
+        (lambda: made(lower=(np.nan,) * 4), "lower is .*nan"),
+        (lambda: made(upper=(np.inf,) * 4), "upper in .* is .*inf.* must be finite"),
         (
             lambda: made(lower=(0.0, 51.0, 0.0, 0.0)),
-            "lower bound must be at most upper bound",
+            "lower must be at most upper",
         ),
         (lambda: made(weights=(1.0, 0.0, 1.0, 1.0)), "weights is 0; .* above 0"),
         (lambda: made(axis_weights=(1.0, -1.0, 1.0)), "axis_weights is -1; .* above 0"),
@@ -463,7 +463,7 @@ def made(geometry=oracle.PLATE, lower=(0.0,) * 4, upper=(50.0,) * 4, **options):
         ),
         (lambda: made().locked(4, 0.0), "actuator is 4; it must be 0 to 3"),
         (lambda: made().locked(-1, 0.0), "actuator is -1; it must be 0 to 3"),
-        (lambda: made().locked(0, np.nan), "lower bound is .*nan"),
+        (lambda: made().locked(0, np.nan), "lower is .*nan"),
         (
             lambda: p558_actuators.stage(p558.channels("7")[0]),
             "actuator has 1 inputs and 3 outputs; it must have one of each",

@@ -296,7 +296,7 @@ def test_the_studies_differ_in_the_observer_only(name):
             "the model has no a coefficient; it must have at least 1",
         ),
         (lambda: KalmanFilter(STAGE, (np.nan, 0.1, 0.1), DT), "gain is nan"),
-        (lambda: KalmanFilter(STAGE, GAIN, 0.0), "sample time in s is 0; .* above 0"),
+        (lambda: KalmanFilter(STAGE, GAIN, 0.0), "dt in s is 0; .* above 0"),
         (lambda: model_kalman(STAGE, 0.0, 1.0, 1.0, DT), "noise_rms in um is 0"),
         (lambda: model_kalman(STAGE, 1.0, -1.0, 1.0, DT), "process_rms in um is -1"),
         (lambda: model_kalman(STAGE, 1.0, 1.0, 0.0, DT), "drift_rms in um is 0"),

@@ -109,7 +109,7 @@ def test_without_gain_it_is_the_feedback_alone():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"gain": -0.1}, "learning gain is -0.1; .* at least 0"),
+        ({"gain": -0.1}, "gain is -0.1; .* at least 0"),
         ({"period": 1}, "period in samples is 1; .* at least 2"),
         ({"lead": -1}, "lead in samples is -1; .* at least 0"),
         ({"advance": -1}, "advance in samples is -1; .* at least 0"),

@@ -149,7 +149,7 @@ LAG = "plant.time_constant"
         (
             ["parameters", "sensor.noise.noise_rms"],
             {"values": [-1.0, 1.0]},
-            "sensor noise in um rms is -1; it must be finite and at least 0",
+            "noise_rms in um is -1; it must be finite and at least 0",
         ),
         (["parameters", "plant", "time_constant"], {"count": 2}, "stand in quotes"),
     ],
