@@ -137,11 +137,12 @@ def _split(
 ) -> tuple[Matrices, Matrices]:
     """Return the modes faster than ``rate``, and those that are not, in parallel."""
 
+    above = 1.000001 * rate + 1e-9  # rounding moves poles, those at z = 1 among them
     # A lambda: SciPy counts the arguments, which a decorator would hide.
     ordered: Any = linalg.schur(
         A,
         output="real",
-        sort=lambda x, y: bool(natural_rates([complex(x, y)])[0] > 1.000001 * rate),
+        sort=lambda x, y: bool(natural_rates([complex(x, y)])[0] > above),
     )
     schur, basis, count = ordered
     fast, slow = slice(0, count), slice(count, None)
