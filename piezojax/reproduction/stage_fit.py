@@ -1,7 +1,7 @@
 """Cells to be explained by one stage: residuals, their Jacobian, and the fit."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,9 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
 from ..core.space import Space
-from ..solve.optimisers import Optimiser, View, levenberg_marquardt
+from ..solve.gauss_newton import damped_gauss_newton
+from ..solve.multi_start import InStep, descend
+from ..solve.optimisers import Optimiser, View
+from ..solve.problem import Verdict
 from .lanes import Lanes, mean_squares
 from .stage_parameters import sensor_of, stage_of
 
@@ -20,6 +24,9 @@ STEPS = 20
 
 CORNER = 0.1
 """|ln(sim/print)| at which the cost turns from square into linear."""
+
+TOLERANCE = 1e-4
+"""Relative change of cost and point at which a start is done."""
 
 STEEPEST = 1e4
 """Slope of a residual over its box that is not believed: the loop is unstable, and its
@@ -81,30 +88,37 @@ class Problem(eqx.Module):
         return jnp.where(jnp.abs(slope) < STEEPEST, slope, 0.0), value
 
     def optimiser(self, point: Point, free: Free) -> Optimiser:
-        """Return Levenberg-Marquardt on the quantities ``free``, the others held.
+        """Return damped Gauss-Newton on the quantities ``free``, the others held."""
+        return damped_gauss_newton(
+            lambda part: self.jacobian(point.at[free].set(part), free), TOLERANCE
+        )
 
-        The optimiser linearises what it is given, which through a loop over time would
-        store every sample; here it finds the finished Jacobian.
-        """
 
-        def tangent(part):
-            here = jax.lax.stop_gradient(part)
-            slope, value = self.jacobian(point.at[free].set(here), free)
-            return value + slope @ (part - here)
-
-        return levenberg_marquardt(lambda part: jnp.zeros(()), tangent, 1e-4)
+class _Carry(NamedTuple):
+    start: Point
+    state: Any
 
 
 @eqx.filter_jit
-def _start(problem: Problem, point: Point, free: Free) -> Any:
-    return problem.optimiser(point, free).start(point[free])
+def _begin(problem: Problem, starts: Float[Array, "starts n"], free: Free) -> _Carry:
+    def one(start):
+        return _Carry(start, problem.optimiser(start, free).start(start[free]))
+
+    return jax.vmap(one)(starts)
 
 
 @eqx.filter_jit
-def _step(problem: Problem, point: Point, free: Free, carry: Any) -> tuple[Any, View]:
-    optimiser = problem.optimiser(point, free)
-    carry = optimiser.step(carry)
-    return carry, optimiser.view(carry)
+def _advance(
+    problem: Problem, free: Free, carry: _Carry
+) -> tuple[_Carry, View, Verdict]:
+    def one(carry):
+        optimiser = problem.optimiser(carry.start, free)
+        carry = carry._replace(state=optimiser.step(carry.state))
+        part, loss, done = optimiser.view(carry.state)
+        view = View(carry.start.at[free].set(part), loss, done)
+        return carry, view, Verdict(loss, jnp.zeros_like(loss))
+
+    return jax.vmap(one)(carry)
 
 
 @eqx.filter_jit
@@ -133,14 +147,15 @@ def fit(
     """
     progress = Silent() if progress is None else progress
     places = jnp.asarray(free)
-    best, least = starts[0], np.inf
-    for start in starts:
-        carry = _start(problem, start, places)
-        for _ in range(steps):
-            carry, view = _step(problem, start, places, carry)
-            if float(view.loss) < least:
-                best, least = start.at[places].set(view.unit), float(view.loss)
-            progress.advance(least)
-            if bool(view.done):
-                break
-    return best, least
+    # One start a program: a batch of all cells keeps the processor busy by itself.
+    descents = InStep(
+        lambda starts: _begin(problem, starts, places),
+        lambda carry: _advance(problem, places, carry),
+        np.stack([np.asarray(start) for start in starts]),
+        width=1,
+    )
+    standing, _ = descend(
+        descents, steps, lambda standing: progress.advance(float(standing.losses.min()))
+    )
+    best = int(np.argmin(standing.losses))
+    return as_array(standing.units[best]), float(standing.losses[best])

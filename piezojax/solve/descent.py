@@ -101,14 +101,15 @@ class Patience(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """Losses of some points and, for corrections, the terms that are squared in them:
-    a sample of the errors of their runs, and those of the augmented Lagrangian.
+    """Losses and Verdicts of some points and, for corrections, the terms squared in
+    them: a sample of the ``errors`` [points, runs, samples], and those ``added`` by the
+    augmented Lagrangian [points, constraints].
     """
 
-    losses: Float[Array, " points"]
+    losses: Any
     verdicts: Verdict
-    errors: Float[Array, "points runs samples"]
-    added: Float[Array, "points constraints"]
+    errors: Any = None
+    added: Any = None
 
 
 class Derivatives(NamedTuple):

@@ -10,12 +10,16 @@ from jaxtyping import Array, Complex, Float
 from scipy import linalg, special
 
 from ...dynamics import StateSpace, reflected
+from ...solve.descent import SEQUENTIAL, Descent, LocalModel, Patience, Trials
+from ...solve.gauss_newton import Quadratic
+from ...solve.multi_start import InThreads, descend
+from ...solve.problem import Verdict
 from .frequency import EmpiricalResponse
 
 STEPS = 20
 """Most steps of the descent."""
 
-ENOUGH = 1e-4
+ENOUGH = Patience(1, share=1e-4)
 """A step that lowers the cost by less than this share is the last."""
 
 
@@ -253,30 +257,37 @@ def _moved(modes: _Modes, change: np.ndarray) -> _Modes:
 
 
 def _descend(modes: _Modes, data: _Data, steps: int) -> tuple[_Modes, list[float]]:
-    """Levenberg-Marquardt on the normal equations: far more residuals than unknowns."""
-    costs, damping = [float(_cost(modes, data))], 1e-3
-    for _ in range(steps):
-        gradient, curvature = map(np.asarray, _normal_equations(modes, data))
+    """Damped Gauss-Newton from the normal equations, over the change of the modes."""
+
+    def linearise(change: np.ndarray) -> LocalModel:
+        equations = _normal_equations(_moved(modes, change), data)
+        gradient, curvature = map(np.asarray, equations)
         # Unit diagonal, but for unknowns of next to no effect, which then stay put.
         size = np.sqrt(np.diag(curvature))
         size = np.maximum(size, 1e-6 * size.max())
-        curvature, gradient = curvature / np.outer(size, size), gradient / size
-        while damping < 1e6:
-            damped = curvature + damping * np.eye(len(size))
-            trial = _moved(
-                modes, -linalg.solve(damped, gradient, assume_a="pos") / size
-            )
-            cost = float(_cost(trial, data))
-            if cost < costs[-1]:
-                break
-            damping *= 10.0
-        else:
-            break
-        modes, damping = trial, max(damping / 10.0, 1e-9)
-        costs.append(cost)
-        if costs[-1] > (1.0 - ENOUGH) * costs[-2]:
-            break
-    return modes, costs
+        return LocalModel(Quadratic(gradient, curvature, size**2))
+
+    def evaluate(changes: np.ndarray) -> Trials:
+        losses = np.array([float(_cost(_moved(modes, c), data)) for c in changes])
+        return Trials(losses, Verdict(losses, np.zeros_like(losses)))
+
+    start = np.zeros(sum(part.size for part in modes) - modes.signs.size)
+    losses = [float(_cost(modes, data))]
+    descent = Descent(
+        start,
+        losses[0],
+        Verdict(losses[0], 0.0),
+        linearise,
+        evaluate,
+        ENOUGH,
+        rule=SEQUENTIAL,
+        box=(-np.inf, np.inf),
+        losses=losses,
+    )
+    descend(InThreads([descent]), steps, lambda standing: None)
+    # A last step without a gain is none.
+    costs = losses[:-1] if len(losses) > 1 and losses[-1] == losses[-2] else losses
+    return _moved(modes, descent.unit), costs
 
 
 def _model_of(modes: _Modes, dt: float) -> StateSpace:

@@ -1,23 +1,30 @@
 """Fitting a System to one period of its steady response to a periodic input."""
 
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
+from ...core.arrays import as_array
 from ...core.rollout import simulate
 from ...core.space import INSIDE, Space, squash, unsquash
 from ...core.system import System
+from ...solve.gauss_newton import TrustRegion, damped_gauss_newton
+from ...solve.multi_start import InStep, descend
+from ...solve.optimisers import Optimiser, View
+from ...solve.problem import Verdict, linearised
 from ..records.record import Record
 from .structure import Structure
 
 DIVERGED = 1e6
-"""What counts as the error of a sample where the simulation is not finite."""
+"""Error of a sample where the simulation is not finite."""
+
+TOLERANCE = 1e-9
+"""Relative change of the loss and of the parameters at which a start is done."""
 
 
 @eqx.filter_jit
@@ -69,12 +76,20 @@ def fit_steady_state(
         jnp.asarray(columns[:, 0] if columns.shape[1] == 1 else columns)
         for columns in (record.inputs, record.outputs)
     )
-    found, errors = _levenberg_marquardt(put, starts, input, output, settle, steps)
+    problem = _Problem(put, input, output, settle)
+    descents = InStep(
+        lambda starts: _begin(problem, starts),
+        lambda carry: _advance(problem, carry),
+        np.asarray(starts),
+        len(starts),
+    )
+    standing, _ = descend(descents, steps, lambda standing: None)
+    errors = np.sqrt(standing.losses / output.size)
     errors = np.where(np.isfinite(errors), errors, np.inf)
     best = int(np.argmin(errors))
     if errors[best] >= DIVERGED:
         raise ValueError(f"{record.source}: no start led to a finite simulation")
-    return found[best], errors
+    return as_array(standing.units[best]), errors
 
 
 def fit_structure(
@@ -101,46 +116,66 @@ def _inside(space: Space, system: System, free: Float[Array, " n"]) -> System:
     return space.put(system, squash(free))
 
 
-@eqx.filter_jit
-def _levenberg_marquardt(
-    put: Callable[[Array], System],
-    starts: Array,
-    input: Array,
-    output: Array,
-    settle: int,
-    steps: int,
-) -> tuple[Array, Array]:
-    scale = jnp.std(output, axis=0)
+class _Problem(eqx.Module):
+    """Parameters of ``put`` against one steady period of a record."""
 
-    def residuals(parameters, _):
-        error = (steady_response(put(parameters), input, settle) - output) / scale
+    put: Callable[[Array], System]
+    input: Array
+    output: Array
+    settle: int = eqx.field(static=True)
+
+    def residuals(self, parameters: Array) -> Array:
+        """Return the errors, each channel as a share of its deviation."""
+        found = steady_response(self.put(parameters), self.input, self.settle)
+        error = (found - self.output) / jnp.std(self.output, axis=0)
         return jnp.where(jnp.isfinite(error), error, DIVERGED).ravel()
 
-    # The normal equations: the QR of so tall a Jacobian takes ten times as long as the
-    # Jacobian. A step that does 3/4 of what its linear model promised may grow; the
-    # solver's own threshold, 0.99, keeps the steps through a curved valley short.
-    solver = eqx.tree_at(
-        lambda solver: solver.search,
-        optx.LevenbergMarquardt(
-            rtol=1e-9, atol=1e-9, linear_solver=lx.Normal(lx.Cholesky())
-        ),
-        optx.ClassicalTrustRegion(high_cutoff=0.75),
-    )
+    def unit(self, start: Array) -> Array:
+        """Return the change of each parameter that changes the output by its deviation.
 
+        Marquardt's scaling: in raw parameters most starts stall half way.
+        """
+        residuals = lambda parameters: self.residuals(parameters)  # noqa: E731
+        reach = jnp.linalg.norm(jax.jacfwd(residuals)(start), axis=0)
+        return jnp.where(reach > 0.0, jnp.sqrt(self.output.size) / reach, 1.0)
+
+    def optimiser(self, start: Array, unit: Array) -> Optimiser:
+        """Return the optimiser of the change from ``start`` in multiples of ``unit``.
+
+        A step with 3/4 of the predicted decrease may grow; the default 0.99 keeps the
+        steps through a curved valley short.
+        """
+        return damped_gauss_newton(
+            linearised(lambda by: self.residuals(start + unit * by)),
+            TOLERANCE,
+            TrustRegion(good=0.75),
+            bounded=False,
+        )
+
+
+class _Carry(NamedTuple):
+    start: Array
+    unit: Array
+    state: Any
+
+
+@eqx.filter_jit
+def _begin(problem: _Problem, starts: Array) -> _Carry:
     def one(start):
-        # Steps are measured by what each parameter does to the output at the start
-        # (Marquardt's scaling): in raw parameters most starts stall half way.
-        reach = jnp.linalg.norm(jax.jacfwd(residuals)(start, None), axis=0)
-        unit = jnp.where(reach > 0.0, jnp.sqrt(output.size) / reach, 1.0)
-        moved = optx.least_squares(
-            lambda by, _: residuals(start + unit * by, None),
-            solver,
-            jnp.zeros_like(start),
-            options={"jac": "fwd"},
-            max_steps=steps,
-            throw=False,
-        ).value
-        found = start + unit * moved
-        return found, jnp.sqrt(jnp.mean(residuals(found, None) ** 2))
+        unit = problem.unit(start)
+        state = problem.optimiser(start, unit).start(jnp.zeros_like(start))
+        return _Carry(start, unit, state)
 
     return jax.vmap(one)(starts)
+
+
+@eqx.filter_jit
+def _advance(problem: _Problem, carry: _Carry) -> tuple[_Carry, View, Verdict]:
+    def one(carry):
+        optimiser = problem.optimiser(carry.start, carry.unit)
+        carry = carry._replace(state=optimiser.step(carry.state))
+        by, loss, done = optimiser.view(carry.state)
+        view = View(carry.start + carry.unit * by, loss, done)
+        return carry, view, Verdict(loss, jnp.zeros_like(loss))
+
+    return jax.vmap(one)(carry)
