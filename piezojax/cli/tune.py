@@ -54,7 +54,7 @@ def main(
 
     def body(console: Console) -> None:
         paths = [_path_of(name) for name in study] or [studies.shipped()]
-        if len(paths) > 1 or studies.is_comparison(paths[0]):
+        if len(paths) > 1 or studies.is_comparison_study(paths[0]):
             if baselines:
                 raise ValueError("--baselines takes one study, not a comparison")
             _compare(paths, out, seed, console)
@@ -132,7 +132,7 @@ def _compare(
 ) -> None:
     with Bar(console) as bar:
         bar.stage(f"reading {', '.join(path.name for path in paths)}")
-        title, entries = studies.read_entries(paths, seed)
+        title, entries = studies.read_compared(paths, seed)
         with results_folder(out, "comparison") as folder:
 
             def keep(outcome: Outcome) -> None:

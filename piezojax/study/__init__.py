@@ -1,15 +1,16 @@
-"""The study file: what to tune, on what, how."""
+"""Study files: the controller to tune, its stage, references and objective."""
 
 from pathlib import Path
 
 from .case import Case as Case
 from .case import build as build
 from .case import read as read
-from .contenders import Entry as Entry
-from .contenders import entries_of as entries_of
-from .contenders import is_comparison as is_comparison
-from .contenders import load_comparison as load_comparison
-from .contenders import read_entries as read_entries
+from .comparison_study import ComparedCase as ComparedCase
+from .comparison_study import ComparisonStudy as ComparisonStudy
+from .comparison_study import compared_cases as compared_cases
+from .comparison_study import is_comparison_study as is_comparison_study
+from .comparison_study import load_comparison_study as load_comparison_study
+from .comparison_study import read_compared as read_compared
 from .ensemble import Ensemble as Ensemble
 from .ensemble import Stage as Stage
 from .schema import Study as Study

@@ -7,8 +7,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from ..core.progress import Progress, Silent
-from ..study import Entry
-from ..study.contenders import Start
+from ..study import ComparedCase
+from ..study.comparison_study import Start
 from .result import Result, Status
 from .tuner import Outcome, tune
 
@@ -68,7 +68,7 @@ class Comparison(BaseModel):
 
 def compare(
     title: str,
-    entries: Sequence[Entry],
+    entries: Sequence[ComparedCase],
     *,
     progress: Progress | None = None,
     done: Callable[[Outcome], None] = lambda outcome: None,
@@ -109,7 +109,7 @@ def compare(
     )
 
 
-def _row(entry: Entry, status: str, **rest) -> Row:
+def _row(entry: ComparedCase, status: str, **rest) -> Row:
     return Row(
         study=entry.name,
         controller=entry.controller,
@@ -120,7 +120,7 @@ def _row(entry: Entry, status: str, **rest) -> Row:
     )
 
 
-def _row_of(entry: Entry, result: Result) -> Row:
+def _row_of(entry: ComparedCase, result: Result) -> Row:
     def geomean(scores):
         return scores.geomean_rms_um if scores is not None and scores.stable else None
 

@@ -13,8 +13,13 @@ from piezojax.catalog import p753_chapter4
 from piezojax.cli.tune import main
 from piezojax.core.paths import get
 from piezojax.report.comparison_map import comparison_table
-from piezojax.study import entries_of, load_comparison, read_entries, shipped
-from piezojax.study.contenders import Comparison as ComparisonFile
+from piezojax.study import (
+    ComparisonStudy,
+    compared_cases,
+    load_comparison_study,
+    read_compared,
+    shipped,
+)
 from piezojax.tuning import compare, load_result
 from piezojax.tuning import comparison as comparing
 from piezojax.tuning.comparison import Comparison
@@ -35,20 +40,20 @@ FILE = {
         "settle": 0.01,
     },
     "optimiser": {"starts": 1, "candidates": 2, "steps": 2},
-    "bounds": {"default": {"factor": 10.0}, "integral": {"factor": 30.0}},
+    "bounds": {"*": {"factor": 10.0}, "*.integral": {"factor": 30.0}},
     "controllers": {
         "pid": {
             "label": "PID",
             "catalog": "p753_ziegler_nichols",
             "elsewhere": "rule",
-            "tune": ["proportional", "integral"],
+            "tune": ["controller.proportional", "controller.integral"],
         },
         "continuous": {
             "catalog": "p753_continuous",
             "printed": [5000.0],
             "rates": [5000.0],
-            "tune": ["law.integral", "surface"],
-            "bounds": {"surface": {"lower": 0.1, "upper": 5.0, "per_sample": True}},
+            "tune": ["controller.law.integral", "controller.surface"],
+            "bounds": {"*.surface": {"lower": 0.1, "upper": 5.0, "per_sample": True}},
         },
     },
 }
@@ -59,7 +64,7 @@ KEYS = {
 
 
 def entries(file):
-    return entries_of(file, "both.toml")
+    return compared_cases(file, "both.toml")
 
 
 def hopeless(case, progress):
@@ -67,7 +72,7 @@ def hopeless(case, progress):
 
 
 def file_with(**tables):
-    return ComparisonFile.model_validate(FILE | tables)
+    return ComparisonStudy.model_validate(FILE | tables)
 
 
 def with_controller(**changes):
@@ -155,7 +160,7 @@ def test_a_start_that_diverges_has_no_ratio(compared, monkeypatch):
 def test_its_studies_can_be_tuned_alone(compared):
     _, out, data = compared
     study = out / data["rows"][0]["study"] / "study.toml"
-    (entry,) = read_entries([study])[1]
+    (entry,) = read_compared([study])[1]
     assert entry.case.study.rate == 5000.0
     assert tomllib.loads(study.read_text())["controller"] == {
         "catalog": "p753_ziegler_nichols"
@@ -192,7 +197,7 @@ def test_two_studies_of_one_name_are_refused(compared, tmp_path):
     _, out, data = compared
     path = out / data["rows"][0]["study"] / "study.toml"
     with pytest.raises(ValueError, match="two studies are named study"):
-        read_entries([path, path])
+        read_compared([path, path])
 
 
 def test_bounds_by_factor_and_by_sample():
@@ -205,7 +210,7 @@ def test_bounds_by_factor_and_by_sample():
 
 
 def test_a_bound_gives_way_to_the_start():
-    narrow = {"proportional": {"lower": 1e-6, "upper": 1e-5}}
+    narrow = {"controller.proportional": {"lower": 1e-6, "upper": 1e-5}}
     (entry, _) = entries(with_controller(bounds=narrow))
     bounds = entry.case.study.parameters["controller.proportional"]
     assert bounds.lower == 1e-6
@@ -218,7 +223,10 @@ def test_a_bound_gives_way_to_the_start():
         ({"catalog": "p753_pdi"}, "pid at 5000 Hz: 'p753_pdi' is unknown; there are "),
         ({"rates": [3000.0]}, "pid at 3000 Hz: rate in Hz is 3000; it must be one of"),
         ({"tune": ["gain"]}, "pid at 5000 Hz: no parameter 'gain'; the nearest are"),
-        ({"tune": ["derivative"]}, "derivative starts at 0; a factor takes a start ab"),
+        (
+            {"tune": ["controller.derivative"]},
+            "derivative starts at 0; a factor takes a start ab",
+        ),
     ],
 )
 def test_bad_controllers(changes, message):
@@ -259,10 +267,10 @@ def test_a_study_that_cannot_be_tuned_is_a_row(monkeypatch):
 
 
 def test_the_shipped_comparison_is_valid():
-    comparison = load_comparison(shipped("comparison/p753"))
+    comparison = load_comparison_study(shipped("comparison/p753"))
     assert set(comparison.rates) == {1e3, 2e3, 5e3, 1e4, 2e4}
     one = comparison.model_copy(update={"rates": (2e3,)})
-    found = {entry.controller: entry for entry in entries_of(one, "p753.toml")}
+    found = {entry.controller: entry for entry in compared_cases(one, "p753.toml")}
     assert len(found) == len(comparison.controllers)
     tuned = found["model-reference PID-SMC"].case.loop.controller
     printed = p753_chapter4.MODEL_REFERENCE_GAINS["4-4"][2000]

@@ -1,42 +1,40 @@
-"""Several studies that end in one comparison: from one file, or from a file each."""
+"""Comparison studies: controllers and sampling rates that are tuned alike."""
 
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from ..catalog import CONTROLLERS, at_rate
-from ..core.parameter import Scale
 from ..core.paths import get
+from ..core.system import Affine, Feedback
 from .case import Case, build, read
 from .schema import ObjectiveTable, OptimiserTable, References, Study
 from .stage_tables import SensorTable
-from .tables import Finite, Positive, Table, one_of, validated
+from .tables import Positive, RangeTable, Table, one_of, validated
 
 Start = Literal["printed", "scaled", "rule", "own"]
-"""Where the gains before tuning come from: a publication, a publication at another
-rate, a published rule of tuning by hand, or the study itself."""
+"""Source of the gains before tuning: a publication, a publication at another rate, a
+published tuning rule, or the study itself."""
 
 
-class Range(Table):
-    """Bounds of a parameter at every rate.
+class RateRange(RangeTable):
+    """Bounds of a parameter at every rate, on a logarithmic scale if none is given.
 
-    Either ``lower`` and ``upper``, with ``per_sample`` in units of the rate (so that
-    0.5 is half of it in 1/s), or a ``factor`` to either side of the start, which must
-    not be zero; a factor's scale is always logarithmic.
+    Either ``lower`` and ``upper``, with ``per_sample`` in units of the rate (0.5 is
+    half of it in 1/s), or a ``factor`` to either side of the start, which must be
+    positive.
     """
 
-    lower: Finite | None = None
-    upper: Finite | None = None
-    scale: Scale = "log"
     per_sample: bool = False
     factor: Annotated[float, Field(gt=1, allow_inf_nan=False)] | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> "Range":
+    def _one_way(self) -> "RateRange":
         both = self.lower is not None and self.upper is not None
         if both == (self.factor is not None):
             raise ValueError("it takes lower and upper, or a factor")
@@ -49,7 +47,7 @@ class Range(Table):
             lower, upper = self.lower * unit, self.upper * unit
             # Bounds hold the starts of all rates: they are wide, not judged.
             lower, upper = min(lower, start), max(upper, start)
-            return {"lower": lower, "upper": upper, "scale": self.scale}
+            return {"lower": lower, "upper": upper, "scale": self.scale or "log"}
         assert self.factor is not None
         if start <= 0.0:
             raise ValueError(
@@ -63,12 +61,12 @@ class Range(Table):
         }
 
 
-class Contender(Table):
+class ControllerTable(Table):
     """A controller by its ``catalog`` name, tuned at ``rates`` (those of the file).
 
-    ``tune`` are paths in the controller; ``bounds`` go before the file's. ``printed``
-    are the rates (Hz) whose gains are published, ``elsewhere`` is where those of the
-    others come from; ``label`` is its name in the table.
+    ``tune`` holds paths in the loop; ``bounds`` precede those of the file. ``printed``
+    are the rates (Hz) with published gains, ``elsewhere`` is the source of the gains at
+    other rates; ``label`` is the name of the controller in the table.
     """
 
     catalog: str
@@ -77,14 +75,14 @@ class Contender(Table):
     printed: tuple[Positive, ...] = ()
     elsewhere: Start = "scaled"
     rates: tuple[Positive, ...] | None = None
-    bounds: dict[str, Range] = Field(default_factory=dict)
+    bounds: dict[str, RateRange] = Field(default_factory=dict)
 
 
-class Comparison(Table):
+class ComparisonStudy(Table):
     """Controllers and rates (Hz) that are tuned alike, each pair a study of its own.
 
-    ``bounds`` go by the end of a parameter's path, the longest that fits; ``default``
-    is for all others. The other tables are those of a study.
+    The keys of ``bounds`` are paths or patterns such as ``*.cutoff``; of several that
+    match a path the longest counts. The other tables are those of a study.
     """
 
     title: str
@@ -97,21 +95,21 @@ class Comparison(Table):
     objective: ObjectiveTable = ObjectiveTable()
     optimiser: OptimiserTable = OptimiserTable()
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
-    bounds: dict[str, Range] = Field(default_factory=dict)
-    controllers: dict[str, Contender] = Field(min_length=1)
+    bounds: dict[str, RateRange] = Field(default_factory=dict)
+    controllers: dict[str, ControllerTable] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _rates_once(self) -> "Comparison":
-        for name, contender in self.controllers.items():
-            for rates in (self.rates, contender.rates or ()):
+    def _rates_once(self) -> "ComparisonStudy":
+        for name, table in self.controllers.items():
+            for rates in (self.rates, table.rates or ()):
                 if len(set(rates)) < len(rates):
                     raise ValueError(f"the rates of {name} hold one of them twice")
         return self
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A case of a comparison: who it is, and where its gains before tuning are from."""
+class ComparedCase:
+    """A Case of a comparison: its controller, and the source of its first gains."""
 
     controller: str
     case: Case
@@ -123,86 +121,86 @@ class Entry:
         return self.case.name
 
 
-def read_entries(
+def read_compared(
     paths: Sequence[str | Path], seed: int | None = None
-) -> tuple[str, list[Entry]]:
-    """Return the title and the entries of studies and comparisons in files.
+) -> tuple[str, list[ComparedCase]]:
+    """Return the title and the cases of studies and comparison studies in files.
 
     Raises ValueError, one line naming the key, the value and what is allowed, and for
-    two entries of one name.
+    two cases of one name.
     """
-    titles, entries = [], []
+    titles, cases = [], []
     for path in map(Path, paths):
-        if is_comparison(path):
-            comparison = load_comparison(path)
+        if is_comparison_study(path):
+            comparison = load_comparison_study(path)
             titles.append(comparison.title)
-            entries += entries_of(comparison, path, seed)
+            cases += compared_cases(comparison, path, seed)
         else:
             case = read(path, seed)
-            entries.append(Entry(case.study.title, case, "own"))
-    names = [entry.name for entry in entries]
+            cases.append(ComparedCase(case.study.title, case, "own"))
+    names = [one.name for one in cases]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"two studies are named {name}; each takes its own name")
-    return ", ".join(titles) or "Comparison of studies", entries
+    return ", ".join(titles) or "Comparison of studies", cases
 
 
-def is_comparison(path: Path) -> bool:
-    """Return whether the file ``path`` is a comparison; a damaged one is none."""
+def is_comparison_study(path: Path) -> bool:
+    """Return whether ``path`` holds a readable comparison study."""
     try:
         return "controllers" in tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
 
 
-def load_comparison(path: str | Path) -> Comparison:
-    """Read and validate a comparison. Raises ValueError as ``load`` of a study does."""
+def load_comparison_study(path: str | Path) -> ComparisonStudy:
+    """Read and validate a comparison study. Raises ValueError as ``load``."""
     data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    return validated(Comparison, data, "")
+    return validated(ComparisonStudy, data, "")
 
 
-def entries_of(
-    comparison: Comparison, path: str | Path, seed: int | None = None
-) -> list[Entry]:
-    """Return an Entry for each controller and rate; files in it lie beside ``path``."""
-    entries = []
-    for name, contender in comparison.controllers.items():
-        for rate in contender.rates or comparison.rates:
+def compared_cases(
+    comparison: ComparisonStudy, path: str | Path, seed: int | None = None
+) -> list[ComparedCase]:
+    """Return the case of each controller and rate; files in it lie beside ``path``."""
+    cases = []
+    for name, table in comparison.controllers.items():
+        for rate in table.rates or comparison.rates:
             try:
-                study = _study(comparison, contender, rate, contender.label or name)
+                study = _study(comparison, table, rate, table.label or name)
                 file = Path(path).with_name(f"{name}_{rate:g}Hz.toml")
                 case = build(study, file, seed)
             except ValueError as error:
                 raise ValueError(f"{name} at {rate:g} Hz: {error}") from None
-            printed = rate in contender.printed
-            start = "printed" if printed else contender.elsewhere
-            entries.append(Entry(contender.label or name, case, start))
-    return entries
+            printed = rate in table.printed
+            start = "printed" if printed else table.elsewhere
+            cases.append(ComparedCase(table.label or name, case, start))
+    return cases
 
 
 def _study(
-    comparison: Comparison, contender: Contender, rate: float, label: str
+    comparison: ComparisonStudy, table: ControllerTable, rate: float, label: str
 ) -> Study:
-    controller = at_rate(CONTROLLERS, one_of(contender.catalog, CONTROLLERS), rate)
+    controller = at_rate(CONTROLLERS, one_of(table.catalog, CONTROLLERS), rate)
+    loop = Feedback(controller, Affine(), Affine(), Affine())
     parameters = {}
-    for path in contender.tune:
-        bounds = _bounds(path, contender.bounds) or _bounds(path, comparison.bounds)
-        if bounds is None:
-            bounds = comparison.bounds.get("default", Range(factor=100.0))
-        start = float(get(controller, path))
-        parameters[f"controller.{path}"] = bounds.at(start, rate, path)
+    for path in table.tune:
+        bounds = _bounds(path, table.bounds) or _bounds(path, comparison.bounds)
+        bounds = bounds or RateRange(factor=100.0)
+        start = float(get(loop, path))
+        parameters[path] = bounds.at(start, rate, path)
     shared = comparison.model_dump(
         mode="json", exclude={"rates", "bounds", "controllers"}, exclude_none=True
     )
     data = shared | {
         "title": f"{label} at {rate / 1000.0:g} kHz",
         "rate": rate,
-        "controller": {"catalog": contender.catalog},
+        "controller": {"catalog": table.catalog},
         "parameters": parameters,
     }
     return validated(Study, data, "")
 
 
-def _bounds(path: str, bounds: Mapping[str, Range]) -> Range | None:
-    fits = [end for end in bounds if f".{path}".endswith(f".{end}")]
+def _bounds(path: str, bounds: Mapping[str, RateRange]) -> RateRange | None:
+    fits = [pattern for pattern in bounds if fnmatchcase(path, pattern)]
     return bounds[max(fits, key=len)] if fits else None
