@@ -29,6 +29,19 @@ def pytest_configure(config):
     os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 
 
+def pytest_collection_modifyitems(items):
+    """Begin with the files that take long: the workers then end at the same time.
+
+    Those are the files that hold a slow test, and those that compile whole studies.
+    """
+    long = {
+        item.path
+        for item in items
+        if item.get_closest_marker("slow") or item.path.parent.name == "tuning"
+    }
+    items.sort(key=lambda item: item.path not in long)
+
+
 def pytest_sessionfinish():
     """Look for leaks once: pytest would five times, in gigabytes of traced programs."""
     gc.collect()
