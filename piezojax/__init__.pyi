@@ -15,6 +15,7 @@ from . import tuning as tuning
 from .analysis.stability import stability_report as stability_report
 from .core.axes import PerAxis as PerAxis
 from .core.metrics import Tracking as Tracking
+from .core.registry import register as register
 from .core.rollout import Metric as Metric
 from .core.rollout import simulate as simulate
 from .core.serial import load as load

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from rich.console import Console
 
 import piezojax as pj
-from piezojax.identification import PARTS
+from piezojax.core.registry import parts
 from piezojax.report.console import Bar, console, tuning_table
 from piezojax.reproduction import TABLES
 from piezojax.reproduction.cell import Cell
@@ -462,7 +462,7 @@ def test_identify_ends_with_a_table(identified):
 
 def test_model_help_lists_the_models(record):
     result = succeeded(call("identify", record, "--model", "help"))
-    assert all(name in result.stdout.split() for name in PARTS)
+    assert all(name in result.stdout.split() for name in parts())
 
 
 def test_identify_bad_input(record, tmp_path):

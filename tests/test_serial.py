@@ -316,7 +316,7 @@ def test_missing_key():
         ),
         (
             {"type": "FirstOrderLag", "time_constant": -1.0, "dt": 1e-3},
-            "system: time constant in s is -1; it must be finite and above 0",
+            "system: time_constant in s is -1; it must be finite and above 0",
         ),
         (
             {"type": "Quantiser", "resolution": 0.0},

@@ -733,7 +733,7 @@ def test_limits_of_the_actuator(refusal):
 
 def test_a_bad_plant_names_its_table(refusal):
     assert refusal({"plant/time_constant": -1.0}) == (
-        "plant: time constant in s is -1; it must be finite and above 0"
+        "plant: time_constant in s is -1; it must be finite and above 0"
     )
 
 

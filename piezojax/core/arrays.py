@@ -13,10 +13,13 @@ if TYPE_CHECKING:
     # Constructors convert numbers to arrays, which a checker sees only where the
     # converter is spelled out at the field.
     Scalar = Any
+    Scalars = Any
+    Matrix = Any
 else:
     Scalar = Float[Array, ""]
+    Scalars = tuple[Scalar, ...]
+    Matrix = Float[Array, "rows columns"]
 ScalarLike = Float[Array, ""] | float | int
-Matrix = Float[Array, "rows columns"]
 Signal = Any  # a Scalar, or a tuple of one Scalar an axis
 State = Any  # a pytree of arrays; every System defines its own
 
@@ -118,4 +121,6 @@ def check_order(
 
 
 def _shown(number: np.ndarray) -> str:
-    return f"{number:g}" if number.ndim == 0 else np.array2string(number, threshold=6)
+    if number.ndim == 0:
+        return f"{number:g}"
+    return " ".join(np.array2string(number, threshold=6).split())

@@ -5,10 +5,11 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import TypeVar
 
+from .recipe import PLACES, Fittable
 from .system import System
 
 ENTRY_POINTS = "piezojax.systems"
-"""Group of the entry points that name modules whose exported Systems are known; the
+"""Group of the entry points that name Systems, or modules that export Systems; the
 models and controllers of piezojax come in by it, too."""
 
 S = TypeVar("S", bound=System)
@@ -19,25 +20,62 @@ _registered: dict[str, type[System]] = {}
 def register(kind: type[S]) -> type[S]:
     """Make ``kind`` known by its class name, to files as to fits; a class decorator.
 
-    Raises TypeError for what is no System, ValueError for a name that another has.
+    A registered System can be saved and loaded; a Fittable is also listed and fitted by
+    the name that it declares. Raises TypeError for a class that is not a System,
+    ValueError for a name that another class has or for an unknown place in a chain.
     """
+    _discover()
+    return _add(kind)
+
+
+def _add(kind: type[S]) -> type[S]:
     if not (isinstance(kind, type) and issubclass(kind, System)):
         raise TypeError(f"{kind!r} is no System; only a System can be registered")
-    other = _registered.setdefault(kind.__name__, kind)
-    if (other.__module__, other.__qualname__) != (kind.__module__, kind.__qualname__):
+    other = _registered.get(kind.__name__, kind)
+    if not _same(other, kind):
         raise ValueError(
             f"the name {kind.__name__} is taken by {other.__module__}; choose another"
         )
+    if issubclass(kind, Fittable) and not inspect.isabstract(kind):
+        _check_part(kind)
     _registered[kind.__name__] = kind
     return kind
+
+
+def _same(one: type, other: type) -> bool:
+    return (one.__module__, one.__qualname__) == (other.__module__, other.__qualname__)
+
+
+def _check_part(kind: type[Fittable]) -> None:
+    part = kind.part
+    if part.place not in PLACES:
+        raise ValueError(
+            f"{kind.__name__}.part.place is {part.place!r}; it must be one of "
+            f"{', '.join(PLACES)}"
+        )
+    for other in _fittable():
+        if other.part.name == part.name and not _same(other, kind):
+            raise ValueError(
+                f"{kind.__name__}.part.name is {part.name!r}, the name of "
+                f"{other.__name__}; choose another"
+            )
 
 
 @cache
 def _discover() -> None:
     for point in entry_points(group=ENTRY_POINTS):
-        for value in vars(point.load()).values():
+        found = point.load()
+        for value in [found] if isinstance(found, type) else vars(found).values():
             if isinstance(value, type) and issubclass(value, System):
-                register(value)
+                _add(value)
+
+
+def _fittable() -> list[type[Fittable]]:
+    return [
+        kind
+        for kind in _registered.values()
+        if issubclass(kind, Fittable) and not inspect.isabstract(kind)
+    ]
 
 
 def kinds() -> dict[str, type[System]]:
@@ -48,3 +86,13 @@ def kinds() -> dict[str, type[System]]:
         for name, kind in sorted(_registered.items())
         if not inspect.isabstract(kind)
     }
+
+
+def parts() -> dict[str, type[Fittable]]:
+    """Return every known part of chains by its name.
+
+    Parts are ordered by their place, then as their packages export them.
+    """
+    _discover()
+    ordered = sorted(_fittable(), key=lambda kind: PLACES.index(kind.part.place))
+    return {kind.part.name: kind for kind in ordered}

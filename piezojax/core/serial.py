@@ -18,8 +18,16 @@ from .system import System
 
 
 def to_data(system: System) -> dict[str, Any]:
-    """Return ``system`` as nested tables of numbers and strings."""
-    data: dict[str, Any] = {"type": type(system).__name__}
+    """Return ``system`` as nested tables of numbers and strings.
+
+    Raises ValueError for a System of a class that is not registered.
+    """
+    name = type(system).__name__
+    if kinds().get(name) is not type(system):
+        raise ValueError(
+            f"{name} is not known to files; register its class with piezojax.register"
+        )
+    data: dict[str, Any] = {"type": name}
     for field in dataclasses.fields(system):
         data[field.name] = _value_to_data(getattr(system, field.name))
     return data
@@ -124,8 +132,13 @@ _PLAIN: dict[Any, tuple[Any, str]] = {
 
 
 def save(system: System, path: str | Path) -> None:
-    """Write ``system`` to ``path`` (``.toml`` or ``.json``), whole or not at all."""
+    """Write ``system`` to ``path`` (``.toml`` or ``.json``), whole or not at all.
+
+    Raises ValueError for a System that ``load`` would refuse: one of a class that is
+    not registered, or with a parameter outside its limits.
+    """
     path, data = Path(path), to_data(system)
+    from_data(data, path.name)
     if _format(path) == "toml":
         write_text(path, tomli_w.dumps(data))
     else:

@@ -1,15 +1,17 @@
 """Autoregressive moving-average dynamics of any order."""
 
 import itertools
+from typing import ClassVar
 
-import equinox as eqx
 import numpy as np
 
-from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
-from ..core.system import System
+from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
+from ..core.parameter import parameter
+from ..core.recipe import Extent, Fittable, Part, Recipe
+from ..core.space import Range
 
 
-class ARMA(System):
+class ARMA(Fittable):
     """``y(k) = sum_i autoregressive[i] y(k-1-i) + sum_i moving[i] x(k-i)``, (3.30).
 
     ``autoregressive`` holds a_1, a_2, ... with the sign of the thesis (on the
@@ -19,14 +21,35 @@ class ARMA(System):
     ahead. Raises ValueError for empty ``moving`` or non-finite coefficients.
     """
 
-    autoregressive: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    moving: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
+    part: ClassVar[Part] = Part(
+        "arma", "dynamics", "Second-order dynamics (3.30) with two zeros"
+    )
+
+    autoregressive: Scalars = parameter(
+        "1", "coefficients of past outputs", converter=as_scalars
+    )
+    moving: Scalars = parameter("1", "coefficients of the input", converter=as_scalars)
 
     def __check_init__(self):
         if not self.moving:
             raise ValueError("moving is empty; it must hold at least b_0")
-        check("autoregressive", self.autoregressive)
-        check("moving", self.moving)
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        del extent
+        return Recipe(
+            cls((0.9, -0.2), (0.3, 0.0, 0.0)),
+            {
+                "autoregressive.0": Range(-2.0, 2.0),
+                "autoregressive.1": Range(-1.0, 1.0),
+                **{f"moving.{i}": Range(-3.0, 3.0) for i in range(3)},
+            },
+            [
+                {"autoregressive.0": 2.0 * p, "autoregressive.1": -p * p, "moving.0": q}
+                for p, q in ((0.3, 0.49), (0.8, 0.04))
+            ],
+            gain="moving.0",
+        )
 
     def dc_gain(self) -> Scalar:
         """Return output over input at rest."""

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from functools import reduce
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..core.arrays import Scalar, ScalarLike, as_scalars, check
+from ..core.arrays import Scalar, ScalarLike, as_scalars
 from ..core.axes import Axes, Rows, as_matrix_of, as_rows, check_square, plus, product
+from ..core.parameter import parameter, sample_time
 from ..core.system import System
 from .state_space import StateSpace
 
@@ -16,15 +16,15 @@ from .state_space import StateSpace
 class Channel(System):
     """What one input does to all outputs: ``x(k+1) = A x + B u``, ``y(k) = C x(k)``.
 
-    ``A`` [n, n], ``B`` [n], ``C`` [outputs, n] in the units of the input and outputs;
-    ``dt`` in s. Input the scalar u(k), output y(k+1), one scalar an output. Raises
-    ValueError for sizes that do not fit, numbers that are not finite or ``dt <= 0``.
+    ``A`` [n, n], ``B`` [n], ``C`` [outputs, n] in the units of the input and outputs.
+    Input the scalar u(k), output y(k+1), one scalar an output. Raises
+    ValueError for sizes that do not fit or numbers that are not finite.
     """
 
-    A: Rows = eqx.field(converter=as_rows)
-    B: Axes = eqx.field(converter=as_scalars)
-    C: Rows = eqx.field(converter=as_rows)
-    dt: float = eqx.field(static=True)
+    A: Rows = parameter("1", "state matrix", converter=as_rows)
+    B: Axes = parameter("1", "input matrix", converter=as_scalars)
+    C: Rows = parameter("1", "output matrix", converter=as_rows)
+    dt: float = sample_time()
 
     def __check_init__(self):
         check_square("A", self.A, len(self.B))
@@ -33,8 +33,6 @@ class Channel(System):
                 f"C has {len(self.C[0])} columns; it must have one for each of "
                 f"{len(self.B)} states"
             )
-        check("B", self.B)
-        check("sample time in s", self.dt, above=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> Axes:
         A = as_matrix_of(self.A)

@@ -1,11 +1,23 @@
 """Creep: the slow drift of a piezo after a step, as linear dynamics."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check, check_order
-from ..core.system import System
+from ..core.arrays import (
+    Scalar,
+    ScalarLike,
+    Scalars,
+    as_array,
+    as_scalars,
+    check,
+    check_order,
+)
+from ..core.parameter import parameter, sample_time
+from ..core.recipe import Extent, Fittable, Part, Recipe
+from ..core.space import Range
 
 Lags = tuple[Scalar, ...]
 
@@ -18,11 +30,17 @@ def _relaxed(input: Scalar, lags: Lags, time_constants: tuple, dt: float) -> Lag
     )
 
 
-class ExponentialCreep(System):
+def _creep_times(extent: Extent) -> tuple[float, float]:
+    """Return the fastest and slowest creep (s) that a record can show."""
+    longest = 2.0 * extent.duration
+    return max(10.0 * extent.dt, 1e-3 * longest), longest
+
+
+class ExponentialCreep(Fittable):
     """``y = x + sum_i gains[i] lag_i(x)``: creep as a sum of exponentials.
 
     After a step of x, y goes on by ``gains[i]`` (a share of the step) with the time
-    constant ``time_constants[i]`` (s); ``dt`` in s, y in the unit of x. The linear
+    constant ``time_constants[i]``; y in the unit of x. The linear
     creep model of section 2.4.1 (springs and dampers in series). At rest all of it has
     crept: the gain is 1 + sum of gains. ``direct`` is the share of x that passes at
     once: 0 leaves what creeps, to be added to a hysteresis of the same input, as in
@@ -31,21 +49,33 @@ class ExponentialCreep(System):
     count of both.
     """
 
-    gains: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    time_constants: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    dt: float = eqx.field(static=True)
-    direct: float = eqx.field(static=True, default=1.0)
+    part: ClassVar[Part] = Part(
+        "exponential_creep", "creep", "Creep as four exponentials"
+    )
+
+    gains: Scalars = parameter("1", "creep of each exponential", converter=as_scalars)
+    time_constants: Scalars = parameter(
+        "s", "time constant of each exponential", above=0.0, converter=as_scalars
+    )
+    dt: float = sample_time()
+    direct: float = parameter(
+        "1", "share of the input that passes at once", static=True, default=1.0
+    )
 
     def __check_init__(self):
-        check("gains", self.gains)
-        check("share that passes at once", self.direct)
-        check("time constants in s", self.time_constants, above=0.0)
-        check("sample time in s", self.dt, above=0.0)
         if len(self.gains) != len(self.time_constants):
             raise ValueError(
                 f"{len(self.gains)} gains and {len(self.time_constants)} time "
                 "constants; each exponential needs one of both"
             )
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        times = np.geomspace(*_creep_times(extent), 4)
+        return Recipe(
+            cls((0.01,) * 4, times, extent.dt),
+            {f"gains.{i}": Range(-0.5, 0.5) for i in range(4)},
+        )
 
     def init(self, input: ScalarLike = 0.0) -> Lags:
         return (as_array(input),) * len(self.gains)
@@ -59,29 +89,39 @@ class ExponentialCreep(System):
         return state, output
 
 
-class LogarithmicCreep(System):
+class LogarithmicCreep(Fittable):
     """Creep by ``gain_per_decade`` of a step with each decade of time.
 
     After a step of x at t = 0, y grows in proportion to log10(t) from t = ``shortest``
     to ``longest``: the logarithmic law of section 2.4.1, carried over to any input by
     equally strong exponentials, two a decade from a decade before to a decade after,
-    which follow it within 3 % of a decade's creep. ``shortest``, ``longest``, ``dt``
-    in s, y in the unit of x; ``direct`` as in ``ExponentialCreep``. Raises ValueError
-    unless dt > 0, 0 < shortest < longest.
+    which follow it within 3 % of a decade's creep. y in the unit of x; ``direct`` as in
+    ``ExponentialCreep``. Raises ValueError unless 0 < shortest < longest.
     """
 
-    gain_per_decade: Scalar = eqx.field(converter=as_array)
-    shortest: float = eqx.field(static=True)
-    longest: float = eqx.field(static=True)
-    dt: float = eqx.field(static=True)
-    direct: float = eqx.field(static=True, default=1.0)
+    part: ClassVar[Part] = Part(
+        "logarithmic_creep", "creep", "Creep with the logarithm of time"
+    )
+
+    gain_per_decade: Scalar = parameter(
+        "1", "creep in each decade of time", typical=(0.0, 0.1)
+    )
+    shortest: float = parameter("s", "begin of the creep", above=0.0, static=True)
+    longest: float = parameter("s", "end of the creep", above=0.0, static=True)
+    dt: float = sample_time()
+    direct: float = parameter(
+        "1", "share of the input that passes at once", static=True, default=1.0
+    )
 
     def __check_init__(self):
-        check("gain per decade", self.gain_per_decade)
-        check("share that passes at once", self.direct)
-        check("shortest time in s", self.shortest, above=0.0)
         check_order("shortest", self.shortest, "longest", self.longest)
-        check("sample time in s", self.dt, above=0.0)
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        return Recipe(
+            cls(0.01, *_creep_times(extent), extent.dt),
+            {"gain_per_decade": Range(-0.2, 0.2)},
+        )
 
     def _time_constants(self) -> np.ndarray:
         ends = self.shortest / 10.0, self.longest * 10.0
@@ -101,36 +141,61 @@ class LogarithmicCreep(System):
         return state, output
 
 
-class SpringDamperCreep(System):
+class SpringDamperCreep(Fittable):
     """A spring and damped springs in series under one force: creep of section 2.4.1.
 
     ``y = F / spring + sum_i y_i`` with ``damping[i] y_i' + stiffness[i] y_i = F`` and
     ``F = force_per_volt u``: the cascade of Croft, Shed and Devasia (2001, reference
-    [6]). Input u in V, output y in um; ``stiffness`` and ``spring`` in N/um,
-    ``damping`` in N s/um, ``force_per_volt`` in N/V, ``dt`` in s. The force is held
-    between samples, for which the discretisation is exact. A ``spring`` of infinite
+    [6]). Input u in V, output y in um; ``spring`` in N/um. The force is held between
+    samples, for which the discretisation is exact. A ``spring`` of infinite
     stiffness leaves what creeps, to be added to a hysteresis of the same input. Raises
     ValueError for a stiffness, damping or sample time that is not positive, or a
     different count of damped springs and dampers.
     """
 
-    stiffness: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    damping: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    spring: Scalar = eqx.field(converter=as_array)
-    force_per_volt: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
+    part: ClassVar[Part] = Part(
+        "spring_damper_creep", "creep", "Creep of three damped springs behind a spring"
+    )
+
+    stiffness: Scalars = parameter(
+        "N/um", "stiffness of each damped spring", above=0.0, converter=as_scalars
+    )
+    damping: Scalars = parameter(
+        "N s/um", "damping of each damped spring", above=0.0, converter=as_scalars
+    )
+    # Not declared: it may be infinite.
+    spring: Scalar = eqx.field(  # pyright: ignore[reportGeneralTypeIssues]
+        converter=as_array
+    )
+    force_per_volt: Scalar = parameter("N/V", "force of the actuator")
+    dt: float = sample_time()
 
     def __check_init__(self):
-        check("stiffness in N/um", self.stiffness, above=0.0)
-        check("damping in N s/um", self.damping, above=0.0)
         check("compliance of the spring in um/N", 1.0 / self.spring, least=0.0)
-        check("force in N/V", self.force_per_volt)
-        check("sample time in s", self.dt, above=0.0)
         if len(self.stiffness) != len(self.damping):
             raise ValueError(
                 f"{len(self.stiffness)} springs and {len(self.damping)} dampers; each "
                 "element of the cascade needs one of both"
             )
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        times = np.geomspace(*_creep_times(extent), 3)
+        # Only ratios show in a record: force and spring are those of a unit gain, and
+        # the stiffness is counted in that spring's.
+        stiffness = 50.0
+        return Recipe(
+            cls((stiffness,) * 3, stiffness * times, 1.0, 1.0, extent.dt),
+            {
+                **{f"stiffness.{i}": Range(2.0, 1e4, "log") for i in range(3)},
+                **{
+                    f"damping.{i}": Range(
+                        0.02 * stiffness * t, 50.0 * stiffness * t, "log"
+                    )
+                    for i, t in enumerate(times)
+                },
+            },
+        )
 
     def init(self, input: ScalarLike = 0.0) -> Lags:
         force = self.force_per_volt * as_array(input)

@@ -1,29 +1,41 @@
 """A delay that need not be a whole number of samples, and can be fitted."""
 
-import equinox as eqx
+from typing import ClassVar
+
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, check
-from ..core.system import System
+from ..core.parameter import parameter, sample_time
+from ..core.recipe import Extent, Fittable, Part, Recipe
+from ..core.space import Range
 
 
-class FractionalDelay(System):
+class FractionalDelay(Fittable):
     """``y(t) = x(t - delay)``, interpolated linearly between samples.
 
-    ``delay`` in s from 0 to ``longest`` samples of ``dt`` (s); y in the unit of x. The
-    output depends on the delay through the weights of the samples it lies between, so
-    its gradient exists. For a whole number of samples it is Delay. Raises ValueError
-    for a delay outside 0 to longest * dt.
+    ``delay`` runs from 0 to ``longest`` samples; y in the unit of x. The output depends
+    on the delay through the weights of the samples it lies between, so its gradient
+    exists. For a whole number of samples it is Delay. Raises ValueError for a delay
+    outside 0 to longest * dt.
     """
 
-    delay: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
-    longest: int = eqx.field(static=True)
+    part: ClassVar[Part] = Part("delay", "delay", "Delay of up to five samples")
+
+    delay: Scalar = parameter("s", "delay", least=0.0, typical=(0.0, 1e-2))
+    dt: float = sample_time()
+    longest: int = parameter("samples", "longest delay", least=1.0, static=True)
 
     def __check_init__(self):
-        check("sample time in s", self.dt, above=0.0)
-        check("longest delay in samples", self.longest, least=1.0)
-        check("delay in s", self.delay, least=0.0, most=self.longest * self.dt)
+        check("delay in s", self.delay, most=self.longest * self.dt)
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        dt = extent.dt
+        return Recipe(
+            cls(0.5 * dt, dt, 5),
+            {"delay": Range(0.0, 5.0 * dt)},
+            [{"delay": n * dt} for n in (0.5, 2.5)],
+        )
 
     def init(self, input: ScalarLike = 0.0) -> tuple[Scalar, ...]:
         return (as_array(input),) * self.longest

@@ -1,9 +1,9 @@
 """Drift of a stage with its temperature."""
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.arrays import Scalar, ScalarLike, as_array
+from ..core.parameter import parameter, sample_time
 from ..core.system import System
 
 
@@ -11,23 +11,22 @@ class ThermalDrift(System):
     """``y = expansion (T_stage - reference)``, where T_stage follows the room's T.
 
     Input T in degrees Celsius (or any other scale of which ``reference`` is part),
-    output y in um; ``expansion`` in um/K, ``time_constant`` in s: how slowly the stage
-    takes the temperature of the room; ``dt`` in s, T held between samples. Beside a
-    stage the two read their own of a pair (V, degrees), ``Select(0) >> stage`` plus
-    ``Select(1) >> drift``; in a closed loop what it gives is a disturbance in um.
-    Raises ValueError for a time constant or sample time that is not positive.
+    output y in um; T is held between samples. Beside a stage the two read their own of
+    a pair (V, degrees), ``Select(0) >> stage`` plus ``Select(1) >> drift``; in a closed
+    loop the drift is a disturbance in um. Raises ValueError for a time constant or
+    sample time that is not positive.
     """
 
-    expansion: Scalar = eqx.field(converter=as_array)
-    time_constant: Scalar = eqx.field(converter=as_array)
-    reference: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
-
-    def __check_init__(self):
-        check("expansion in um/K", self.expansion)
-        check("time constant in s", self.time_constant, above=0.0)
-        check("reference temperature", self.reference)
-        check("sample time in s", self.dt, above=0.0)
+    expansion: Scalar = parameter("um/K", "thermal expansion")
+    time_constant: Scalar = parameter(
+        "s",
+        "time the stage takes to follow the room",
+        above=0.0,
+        scale="log",
+        typical=(1.0, 1e5),
+    )
+    reference: Scalar = parameter("degC", "temperature without drift")
+    dt: float = sample_time()
 
     def init(self, input: ScalarLike = 0.0) -> Scalar:
         """Return the stage as warm as the room."""

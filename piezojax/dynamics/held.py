@@ -2,9 +2,8 @@
 
 from typing import Any
 
-import equinox as eqx
-
-from ..core.arrays import State, check
+from ..core.arrays import State
+from ..core.parameter import parameter
 from ..core.system import System
 
 
@@ -16,12 +15,11 @@ class Held(System):
     """
 
     system: System
-    samples: int = eqx.field(static=True)
+    samples: int = parameter("1", "samples held", least=1.0, static=True)
 
     def __check_init__(self):
         if not isinstance(self.samples, int):
-            raise ValueError(f"samples held is {self.samples!r}; it must be whole")
-        check("samples held", self.samples, least=1.0)
+            raise ValueError(f"samples is {self.samples!r}; it must be whole")
 
     def init(self, input: Any = 0.0) -> State:
         return self.system.init(input)

@@ -1,27 +1,38 @@
 """Lags of first and second order: an amplifier, a filter, a reference model."""
 
-import equinox as eqx
+from typing import ClassVar
+
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.arrays import Scalar, ScalarLike, as_array
 from ..core.parameter import parameter, sample_time
+from ..core.recipe import Extent, Fittable, Part, Recipe
+from ..core.space import Range
 from ..core.system import Designed, System
 from .arma import ARMA
 
 
-class FirstOrderLag(System):
+class FirstOrderLag(Fittable):
     """``tau dy/dt + y = x`` for an input held between samples, unit DC gain.
 
-    ``time_constant`` tau in s, ``dt`` in s; y in the unit of x. Raises ValueError
-    unless both are positive.
+    y in the unit of x. Raises ValueError unless both parameters are positive.
     """
 
-    time_constant: Scalar = parameter("s", "time constant")
+    part: ClassVar[Part] = Part(
+        "lag", "lag", "First-order lag: amplifier, sensor filter"
+    )
+
+    time_constant: Scalar = parameter(
+        "s", "time constant", above=0.0, scale="log", typical=(1e-5, 1.0)
+    )
     dt: float = sample_time()
 
-    def __check_init__(self):
-        check("time constant in s", self.time_constant, above=0.0)
-        check("sample time in s", self.dt, above=0.0)
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        dt = extent.dt
+        return Recipe(
+            cls(dt, dt), {"time_constant": Range(0.05 * dt, 50.0 * dt, "log")}
+        )
 
     def pole(self) -> Scalar:
         """Return the pole in the z plane."""
@@ -44,20 +55,22 @@ class FirstOrderLag(System):
 class SecondOrderLag(Designed):
     """``y'' + 2 zeta w y' + w^2 y = w^2 x``, unit DC gain: the reference model (4.47).
 
-    ``frequency`` w in rad/s, ``damping`` zeta without unit (any, above 1 too), ``dt``
-    in s; y in the unit of x. Exact for an input held between samples: the output
-    belongs to the end of the sample. The state is y and dy/dt. Raises ValueError for
-    w <= 0, zeta < 0 or ``dt <= 0``.
+    y in the unit of x; zeta may be above 1. Exact for an input held between samples:
+    the output belongs to the end of the sample. The state is y and dy/dt. Raises
+    ValueError for parameters outside their limits.
     """
 
-    frequency: Scalar = eqx.field(converter=as_array)
-    damping: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
-
-    def __check_init__(self):
-        check("frequency in rad/s", self.frequency, above=0.0)
-        check("damping", self.damping, least=0.0)
-        check("sample time in s", self.dt, above=0.0)
+    frequency: Scalar = parameter(
+        "rad/s",
+        "undamped natural frequency w",
+        above=0.0,
+        scale="log",
+        typical=(1e1, 1e5),
+    )
+    damping: Scalar = parameter(
+        "1", "damping ratio zeta", least=0.0, typical=(0.0, 2.0)
+    )
+    dt: float = sample_time()
 
     def resolved(self) -> "LinearOscillator":
         """Return the lag with its coefficients for one sample."""

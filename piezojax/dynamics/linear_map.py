@@ -1,9 +1,9 @@
 """A constant matrix: what several actuators make of a stage, or sensors of its pose."""
 
-import equinox as eqx
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.arrays import Matrix, State, as_array, as_matrix, check
+from ..core.arrays import Matrix, State, as_array, as_matrix
+from ..core.parameter import parameter
 from ..core.system import System
 
 
@@ -14,10 +14,9 @@ class LinearMap(System):
     output are vectors. Raises ValueError for numbers that are not finite or no matrix.
     """
 
-    matrix: Matrix = eqx.field(converter=as_matrix)
-
-    def __check_init__(self):
-        check("matrix", self.matrix)
+    matrix: Matrix = parameter(
+        "1", "output by input, in the units of the neighbours", converter=as_matrix
+    )
 
     def init(self, input: ArrayLike = 0.0) -> State:
         return ()

@@ -1,11 +1,9 @@
 """Square linear models in observability form: an ARMA model with matrices."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..core.arrays import check
 from ..core.axes import (
     Axes,
     Rows,
@@ -16,6 +14,7 @@ from ..core.axes import (
     plus,
     product,
 )
+from ..core.parameter import parameter, sample_time
 from ..core.system import System
 from .state_space import StateSpace
 
@@ -27,13 +26,16 @@ class MatrixARMA(System):
     holds A_(p-1), ..., A_0 and ``moving`` B_(p-1), ..., B_0 (the last q rows of B_c1,
     Gamma_1, Gamma_0). Answers u(k) with y(k+1). Inputs and outputs are tuples of q
     scalars; the state is what the past adds to the outputs 1, 2, ... samples ahead.
-    ``dt`` in s. Raises ValueError for different numbers of matrices, other sizes or
-    ``dt <= 0``.
+    Raises ValueError for different numbers of matrices or other sizes.
     """
 
-    autoregressive: tuple[Rows, ...] = eqx.field(converter=as_matrices)
-    moving: tuple[Rows, ...] = eqx.field(converter=as_matrices)
-    dt: float = eqx.field(static=True)
+    autoregressive: tuple[Rows, ...] = parameter(
+        "1", "matrices of past outputs", converter=as_matrices
+    )
+    moving: tuple[Rows, ...] = parameter(
+        "1", "matrices of the inputs", converter=as_matrices
+    )
+    dt: float = sample_time()
 
     def __check_init__(self):
         if not self.moving or len(self.autoregressive) != len(self.moving):
@@ -44,7 +46,6 @@ class MatrixARMA(System):
         for name in ("autoregressive", "moving"):
             for index, matrix in enumerate(getattr(self, name)):
                 check_square(f"{name}[{index}]", matrix, self.axes)
-        check("sample time in s", self.dt, above=0.0)
 
     @property
     def axes(self) -> int:
@@ -135,7 +136,7 @@ def observability_form(model: StateSpace, lags: int | None = None) -> MatrixARMA
         h[j] - sum((newest_first[i] @ h[j - 1 - i] for i in range(j)), np.zeros((q, q)))
         for j in range(p)
     ]
-    return MatrixARMA(newest_first, moving, model.dt)
+    return MatrixARMA(as_matrices(newest_first), as_matrices(moving), model.dt)
 
 
 def _check_added(model: StateSpace, autoregressive: list[np.ndarray]) -> None:

@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..core.arrays import as_array, check
+from ..core.arrays import as_array
+from ..core.parameter import parameter
 from ..core.system import System
 
 
@@ -25,15 +25,15 @@ class NeuralStateSpace(System):
     Raises ValueError for shapes that do not belong together or non-finite numbers.
     """
 
-    state_matrix: Float[Array, "n n"] = eqx.field(converter=as_array)
-    input_matrix: Float[Array, "n m"] = eqx.field(converter=as_array)
-    output_matrix: Float[Array, "p n"] = eqx.field(converter=as_array)
-    neuron_output: Float[Array, "n h"] = eqx.field(converter=as_array)
-    neuron_state: Float[Array, "h n"] = eqx.field(converter=as_array)
-    neuron_input: Float[Array, "h m"] = eqx.field(converter=as_array)
-    neuron_bias: Float[Array, " h"] = eqx.field(converter=as_array)
-    input_offset: Float[Array, " m"] = eqx.field(converter=as_array)
-    output_offset: Float[Array, " p"] = eqx.field(converter=as_array)
+    state_matrix: Float[Array, "n n"] = parameter("1", "A")
+    input_matrix: Float[Array, "n m"] = parameter("1", "B")
+    output_matrix: Float[Array, "p n"] = parameter("1", "C")
+    neuron_output: Float[Array, "n h"] = parameter("1", "F")
+    neuron_state: Float[Array, "h n"] = parameter("1", "G")
+    neuron_input: Float[Array, "h m"] = parameter("1", "H")
+    neuron_bias: Float[Array, " h"] = parameter("1", "b")
+    input_offset: Float[Array, " m"] = parameter("1", "u_0")
+    output_offset: Float[Array, " p"] = parameter("1", "y_0")
 
     def __check_init__(self):
         n, m, p = (
@@ -59,7 +59,6 @@ class NeuralStateSpace(System):
                     f"{name} has shape {value.shape}; with {n} states, {h} neurons, "
                     f"{m} inputs and {p} outputs it must be {shape}"
                 )
-            check(name, value.ravel())
 
     def init(self, input: Any = 0.0) -> Float[Array, " n"]:
         """Return the state that ``input`` holds, found by Newton's method from zero."""

@@ -1,11 +1,11 @@
 """Dynamics that change with the amplitude they are driven at."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.arrays import Scalar, as_array, as_scalars, check, check_order
+from ..core.arrays import Scalar, Scalars, as_array, as_scalars, check, check_order
+from ..core.parameter import parameter
 from ..core.system import System
 from .state_space import StateSpace
 
@@ -26,8 +26,10 @@ class AmplitudeScheduled(System):
     """
 
     models: tuple[StateSpace, ...]
-    levels: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    time_constant: Scalar = eqx.field(converter=as_array)
+    levels: Scalars = parameter(
+        "V", "rms of the input at each model", least=0.0, converter=as_scalars
+    )
+    time_constant: Scalar = parameter("s", "time constant of the mean square")
 
     def __check_init__(self):
         if not 2 <= len(self.models) == len(self.levels):
@@ -41,7 +43,6 @@ class AmplitudeScheduled(System):
                 f"models differ in (states, outputs, inputs, sample time): "
                 f"{sorted(kinds)}; they must be the same"
             )
-        check("levels", self.levels, least=0.0)
         for low, high in zip(self.levels[:-1], self.levels[1:], strict=True):
             check_order("a level", low, "the next", high)
         check("time constant in s", self.time_constant, least=self.models[0].dt)

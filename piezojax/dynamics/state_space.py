@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Complex, Float
 from scipy import linalg
 
-from ..core.arrays import Matrix, as_array, as_matrix, check
+from ..core.arrays import Matrix, as_array, as_matrix
+from ..core.parameter import parameter, sample_time
 from ..core.system import System
 from .arma import ARMA
 
@@ -21,19 +21,19 @@ class StateSpace(System):
     """``x(k+1) = A x(k) + B u(k)``, ``y(k) = C x(k) + D u(k)``, (6.1).
 
     ``A`` [n, n], ``B`` [n, m], ``C`` [p, n], ``D`` [p, m] for n states, m inputs and p
-    outputs in the units of the neighbours in the chain; ``dt`` in s. Inputs and outputs
-    are vectors, also where there is only one.
+    outputs in the units of the neighbours in the chain. Inputs and outputs are vectors,
+    also where there is only one.
 
     A loop and ``free_run`` expect a plant that answers u(k) with y(k+1): see ``ahead``.
-    Raises ValueError for matrices that do not fit together, numbers that are not finite
-    or a sample time that is not positive.
+    Raises ValueError for matrices that do not fit together or numbers that are not
+    finite.
     """
 
-    A: Matrix = eqx.field(converter=as_matrix)
-    B: Matrix = eqx.field(converter=as_matrix)
-    C: Matrix = eqx.field(converter=as_matrix)
-    D: Matrix = eqx.field(converter=as_matrix)
-    dt: float = eqx.field(static=True)
+    A: Matrix = parameter("1", "state matrix", converter=as_matrix)
+    B: Matrix = parameter("1", "input matrix", converter=as_matrix)
+    C: Matrix = parameter("1", "output matrix", converter=as_matrix)
+    D: Matrix = parameter("1", "direct transmission", converter=as_matrix)
+    dt: float = sample_time()
 
     def __check_init__(self):
         (n, m), p = self.B.shape, len(self.C)
@@ -44,9 +44,6 @@ class StateSpace(System):
                     f"{name} has shape {matrix.shape}; with B of shape {self.B.shape} "
                     f"and {p} outputs it must be {shape}"
                 )
-        for name in "ABCD":
-            check(name, getattr(self, name))
-        check("sample time in s", self.dt, above=0.0)
 
     @property
     def order(self) -> int:

@@ -2,43 +2,58 @@
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
+from ..core.parameter import parameter
+from ..core.recipe import Extent, Fittable, Part, Recipe, around, rests
 from .inverse import Inverse, InverseHysteresis
-from .model import Hysteresis
-from .plays import Memory, check_plays, memoryless, played, weighted
+from .model import Hysteresis, Laws, remembers
+from .plays import (
+    PLAYS,
+    Memory,
+    check_plays,
+    memoryless,
+    played,
+    plays_recipe,
+    weighted,
+)
 
 
-class AsymmetricPrandtlIshlinskii(Hysteresis):
+class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     """A Prandtl-Ishlinskii model with loops that are wider on one side.
 
     ``y = P(x) + sum_i weights[i] play_i(x) + sum_i skew[i] play_i(q(x))``, where q is
     the one-sided square (x - origin)^2 / (2 scale) for x above ``origin`` and 0 below:
     plays of q have a width in x that shrinks as x grows, which is how the envelope
     functions of a generalised play skew a loop (Al Janaideh, Rakheja and Su 2009,
-    Mechatronics 19(5)), here with the weights still linear. ``origin`` and ``scale`` in
-    V: where the loop is widest, and the span of the input. Everything else as in
-    PrandtlIshlinskii; ``skew`` in um/V. Raises ValueError as there, and for
-    ``scale <= 0``.
+    Mechatronics 19(5)), here with the weights still linear. Everything else as in
+    PrandtlIshlinskii. Raises ValueError as there.
     """
 
     before: ClassVar[str | None] = "rest_input"
+    laws: ClassVar[Laws] = remembers()
+    part: ClassVar[Part] = Part(
+        "asymmetric_prandtl_ishlinskii",
+        "hysteresis",
+        "Prandtl-Ishlinskii with ten more plays that skew the loop",
+    )
 
-    polynomial: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    thresholds: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    weights: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    skew: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    origin: Scalar = eqx.field(converter=as_array)
-    scale: Scalar = eqx.field(converter=as_array)
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+    polynomial: Scalars = parameter(
+        "um/V^(i+1)", "coefficient i of the memoryless part", converter=as_scalars
+    )
+    thresholds: Scalars = parameter(
+        "V", "half-widths of the plays", above=0.0, converter=as_scalars
+    )
+    weights: Scalars = parameter("um/V", "slopes of the plays", converter=as_scalars)
+    skew: Scalars = parameter("um/V", "slopes of the plays of q", converter=as_scalars)
+    origin: Scalar = parameter("V", "input at which the loop is widest")
+    scale: Scalar = parameter("V", "span of the input", above=0.0)
+    rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
 
     def __check_init__(self):
-        check("polynomial", self.polynomial)
         check_plays(self.thresholds, self.weights)
         check_plays(self.thresholds, self.skew, "skew weights")
-        check("scale in V", self.scale, above=0.0)
 
     def _square(self, x: Scalar) -> Scalar:
         return 0.5 * jnp.maximum(x - self.origin, 0.0) ** 2 / self.scale
@@ -62,6 +77,18 @@ class AsymmetricPrandtlIshlinskii(Hysteresis):
         output = memoryless(self.polynomial, input)
         output = output + weighted(self.weights, plain) + weighted(self.skew, skewed)
         return (plain, skewed), output
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        fields, bounds = plays_recipe(extent)
+        skews = {f"skew.{i}": around(extent.slope, -2.0, 2.0) for i in range(PLAYS)}
+        return Recipe(
+            cls(**fields, skew=(0.0,) * PLAYS, origin=extent.low, scale=extent.width),
+            {**bounds, **skews},
+            rests(extent),
+            gain="polynomial.0",
+            own=("rest_input",),
+        )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         return InverseHysteresis(self, lower, upper)

@@ -1,13 +1,15 @@
 """The memory rule of Bashash and Jalili: exponential curves between stored extrema."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, check, check_order
+from ..core.arrays import Scalar, ScalarLike, as_array, check_order
+from ..core.parameter import parameter
+from ..core.recipe import Extent, Fittable, Part, Recipe
+from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
-from .model import Hysteresis
+from .model import Hysteresis, Laws, remembers
 
 Points = tuple[Scalar, ...]
 
@@ -28,7 +30,7 @@ class ExtremaState(NamedTuple):
     outputs: Points
 
 
-class BashashJalili(Hysteresis):
+class BashashJalili(Hysteresis, Fittable):
     """Hysteresis by a rule: every branch is a curve between two remembered extrema.
 
     Input v in V, output x in um. The curve from a turning point (v1, x1) towards the
@@ -45,9 +47,8 @@ class BashashJalili(Hysteresis):
     and ``upper_input``, ``upper_output``; beyond them its branches are continued. It
     starts on the rising one (below ``lower_input`` on the falling one).
 
-    ``rising_alpha``, ``falling_alpha`` above -1 and below e^2, so that every curve
-    rises with v, and ``rising_tau``, ``falling_tau`` in 1/V, at least 0, shape the
-    branches. Negative alphas give a branch that starts flat: loops run
+    The alphas lie above -1 and below e^2, so that every curve rises with v. Negative
+    alphas give a branch that starts flat: loops run
     counter-clockwise, as a piezo's do; positive ones run clockwise.
 
     ``depth`` turning points inside the reference loop are remembered. Where a further
@@ -60,34 +61,39 @@ class BashashJalili(Hysteresis):
     (2.8) outside and inside the exponential. Source: Bashash and Jalili 2007, J.
     Micromech. Microeng. 17.
 
-    Raises ValueError for numbers outside these bounds, a reference loop whose upper
-    extreme is not above the lower one, or ``depth < 1``.
+    Raises ValueError for numbers outside their limits, or a reference loop whose upper
+    extreme is not above the lower one.
     """
 
-    lower_input: Scalar = eqx.field(converter=as_array)
-    lower_output: Scalar = eqx.field(converter=as_array)
-    upper_input: Scalar = eqx.field(converter=as_array)
-    upper_output: Scalar = eqx.field(converter=as_array)
-    rising_alpha: Scalar = eqx.field(converter=as_array)
-    rising_tau: Scalar = eqx.field(converter=as_array)
-    falling_alpha: Scalar = eqx.field(converter=as_array)
-    falling_tau: Scalar = eqx.field(converter=as_array)
-    depth: int = eqx.field(static=True, default=8)
+    laws: ClassVar[Laws] = remembers(but=("congruency",))
+    part: ClassVar[Part] = Part(
+        "bashash_jalili",
+        "hysteresis",
+        "Bashash-Jalili: exponential curves between stored extrema",
+    )
+
+    lower_input: Scalar = parameter("V", "lower input of the reference loop")
+    lower_output: Scalar = parameter("um", "output at the lower input")
+    upper_input: Scalar = parameter("V", "upper input of the reference loop")
+    upper_output: Scalar = parameter("um", "output at the upper input")
+    # (1 + alpha exp(-z)) z is flat first at z = 2, where alpha = e^2.
+    rising_alpha: Scalar = parameter(
+        "1", "bend of rising branches", above=-1.0, below=7.389056
+    )
+    rising_tau: Scalar = parameter("1/V", "decay of that bend", least=0.0)
+    falling_alpha: Scalar = parameter(
+        "1", "bend of falling branches", above=-1.0, below=7.389056
+    )
+    falling_tau: Scalar = parameter("1/V", "decay of that bend", least=0.0)
+    depth: int = parameter(
+        "1", "turning points remembered", least=1.0, static=True, default=8
+    )
 
     def __check_init__(self):
-        for end in ("lower", "upper"):
-            check(f"{end}_input in V", getattr(self, f"{end}_input"))
-            check(f"{end}_output in um", getattr(self, f"{end}_output"))
         check_order("lower_input", self.lower_input, "upper_input", self.upper_input)
         check_order(
             "lower_output", self.lower_output, "upper_output", self.upper_output
         )
-        for branch in ("rising", "falling"):
-            alpha, tau = f"{branch}_alpha", f"{branch}_tau"
-            # (1 + alpha exp(-z)) z is flat first at z = 2, where alpha = e^2.
-            check(alpha, getattr(self, alpha), above=-1.0, below=7.389056)
-            check(f"{tau} in 1/V", getattr(self, tau), least=0.0)
-        check("depth", self.depth, least=1.0)
 
     def init(self, input: ScalarLike = 0.0) -> ExtremaState:
         input = as_array(input)
@@ -165,6 +171,41 @@ class BashashJalili(Hysteresis):
         )
         after = ExtremaState(input, output, count, direction, inputs, outputs)
         return after, output
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        width, slope = extent.width, extent.slope
+        if slope <= 0.0:
+            raise ValueError(
+                "the output falls while the input rises; the curves of bashash_jalili "
+                "rise"
+            )
+        # The reference loop is that over the record's range; beside an offset of the
+        # output only one of its two ends is free.
+        lower, upper = slope * extent.low, slope * extent.high
+        ends = lower + 0.3 * extent.span, lower + 3.0 * extent.span
+        bounds = {"upper_output": Range(*ends)}
+        for branch in ("rising", "falling"):
+            bounds[f"{branch}_alpha"] = Range(-0.99, 3.0)
+            bounds[f"{branch}_tau"] = Range(0.2 / width, 100.0 / width, "log")
+        return Recipe(
+            cls(
+                lower_input=extent.low,
+                lower_output=lower,
+                upper_input=extent.high,
+                upper_output=upper,
+                rising_alpha=-0.4,
+                rising_tau=4.0 / width,
+                falling_alpha=-0.4,
+                falling_tau=4.0 / width,
+            ),
+            bounds,
+            [
+                {"rising_tau": steep / width, "falling_tau": steep / width}
+                for steep in (1.5, 4.0, 12.0)
+            ],
+            gain="upper_output",
+        )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         return InverseHysteresis(self, lower, upper)

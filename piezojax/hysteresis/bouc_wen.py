@@ -1,14 +1,14 @@
 """Bouc-Wen hysteresis: a restoring force that remembers the displacement."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.arrays import Scalar, ScalarLike, as_array
+from ..core.parameter import parameter
 from ..core.runge_kutta import runge_kutta
 from .inverse import Inverse, InverseHysteresis
-from .model import Hysteresis
+from .model import Hysteresis, Laws, fades
 
 
 class BoucWenState(NamedTuple):
@@ -23,10 +23,8 @@ class BoucWen(Hysteresis):
 
     ``z' = alpha y' - beta_gamma |y'| |z|^(nu - 1) z - beta_delta y' |z|^nu``
 
-    ``alpha``, the slope from z = 0, in N/m; ``beta_gamma`` and ``beta_delta`` in
-    N^(1 - nu)/m shape the loop; ``nu``, above 0, is how sharply it bends. Of the usual
-    factors beta, gamma, delta only these two products act on the force. ``substeps``
-    parts a step, fourth order except in those where y or z changes its sign; the force
+    Of the usual factors beta, gamma, delta only two products act on the force. The
+    step is of fourth order except in parts where y or z changes its sign; the force
     is followed as long as ``nu (|beta_gamma| + |beta_delta|) |z|^(nu - 1)`` times the
     displacement in a part stays well below 1. Sources: Bouc 1967, Wen 1976.
 
@@ -36,21 +34,16 @@ class BoucWen(Hysteresis):
     counter-clockwise as a piezo's displacement over its voltage. Inverse:
     InverseHysteresis, below the force where z' = 0, which no displacement exceeds.
 
-    Raises ValueError for non-finite parameters, ``nu <= 0`` or ``substeps < 1``.
+    Raises ValueError for parameters outside their limits.
     """
 
-    alpha: Scalar = eqx.field(converter=as_array)
-    beta_gamma: Scalar = eqx.field(converter=as_array)
-    beta_delta: Scalar = eqx.field(converter=as_array)
-    nu: Scalar = eqx.field(converter=as_array, default=1.0)
-    substeps: int = eqx.field(static=True, default=1)
+    laws: ClassVar[Laws] = fades(but=("counter-clockwise",))
 
-    def __check_init__(self):
-        check("alpha in N/m", self.alpha)
-        check("beta_gamma in N^(1 - nu)/m", self.beta_gamma)
-        check("beta_delta in N^(1 - nu)/m", self.beta_delta)
-        check("nu", self.nu, above=0.0)
-        check("substeps", self.substeps, least=1.0)
+    alpha: Scalar = parameter("N/m", "slope from z = 0")
+    beta_gamma: Scalar = parameter("N^(1 - nu)/m", "bend against the velocity's sign")
+    beta_delta: Scalar = parameter("N^(1 - nu)/m", "bend with the velocity")
+    nu: Scalar = parameter("1", "sharpness of the bend", above=0.0, default=1.0)
+    substeps: int = parameter("1", "parts of a step", least=1.0, static=True, default=1)
 
     def rate(self, force: Scalar, velocity: Scalar) -> Scalar:
         """Return z' at force z and velocity y'; along a path, dz from dy."""

@@ -6,10 +6,13 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.arrays import Scalar, ScalarLike, as_array
+from ..core.parameter import parameter
+from ..core.recipe import Extent, Fittable, Part, Recipe, around, rest_bounds, rests
+from ..core.space import Range
 from ..core.system import holding_input
 from .inverse import Inverse, InverseHysteresis, check_rising
-from .model import Hysteresis
+from .model import Hysteresis, Laws, fades
 
 
 class HysteresisState(NamedTuple):
@@ -20,11 +23,11 @@ class HysteresisState(NamedTuple):
     older: tuple[Scalar, Scalar] | None = None
 
 
-class ColemanHodgdon(Hysteresis):
+class ColemanHodgdon(Hysteresis, Fittable):
     """Rate-independent hysteresis ``y' = |x'| (a x + c y) + b x'``.
 
-    Input x in V, output y in um. ``a`` in um/V^2, ``b`` in um/V, ``c`` in 1/V (negative
-    for a loop that closes). The material starts on its virgin loading curve from
+    Input x in V, output y in um; c is negative for a loop that closes. The material
+    starts on its virgin loading curve from
     ``rest_input`` (V) and ``rest_output`` (um).
 
     ``scheme`` is one of
@@ -40,22 +43,25 @@ class ColemanHodgdon(Hysteresis):
     runs counter-clockwise, as a piezo's, if a > |c| b. Speed does not matter, exactly
     in the scheme "exact", else to the order of the scheme.
 
-    Raises ValueError for non-finite parameters, ``c >= 0`` or an unknown scheme.
+    Raises ValueError for parameters outside their limits or an unknown scheme.
     """
 
     before: ClassVar[str | None] = "rest_input"
+    laws: ClassVar[Laws] = fades()
+    part: ClassVar[Part] = Part(
+        "coleman_hodgdon",
+        "hysteresis",
+        "Coleman-Hodgdon: y' = |x'| (a x + c y) + b x'",
+    )
 
-    a: Scalar = eqx.field(converter=as_array)
-    b: Scalar = eqx.field(converter=as_array)
-    c: Scalar = eqx.field(converter=as_array)
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
-    rest_output: Scalar = eqx.field(converter=as_array, default=0.0)
+    a: Scalar = parameter("um/V^2", "pull by the input")
+    b: Scalar = parameter("um/V", "slope just after a turn at the origin")
+    c: Scalar = parameter("1/V", "decay with the input's path", below=0.0)
+    rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
+    rest_output: Scalar = parameter("um", "output of the virgin state", default=0.0)
     scheme: str = eqx.field(static=True, default="trapezoid")
 
     def __check_init__(self):
-        check("a in um/V^2", self.a)
-        check("b in um/V", self.b)
-        check("c in 1/V", self.c, below=0.0)
         if self.scheme not in SCHEMES:
             raise ValueError(
                 f"scheme {self.scheme!r}; it must be one of {list(SCHEMES)}"
@@ -76,6 +82,36 @@ class ColemanHodgdon(Hysteresis):
         output = SCHEMES[self.scheme](self, state, input)
         older = None if state.older is None else (state.input, state.output)
         return HysteresisState(input, output, older), output
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        width, slope = extent.width, extent.slope
+        rest = extent.first[1] - extent.centre
+        reach = 2.0 * extent.span
+        return Recipe(
+            cls(
+                a=slope / width,
+                b=0.7 * slope,
+                c=-1.0 / width,
+                rest_input=extent.first[0],
+                rest_output=rest,
+            ),
+            {
+                "a": around(slope / width, 0.0, 20.0),
+                "b": around(slope, 0.0, 3.0),
+                "c": Range(-20.0 / width, -0.01 / width),
+                **rest_bounds(extent),
+                "rest_output": Range(rest - reach, rest + reach),
+            },
+            # Keep the slope -a/c of the loop's axis while its decay c changes.
+            [
+                {"c": -steep / width, "a": steep * slope / width, **before}
+                for steep in (0.3, 1.0, 3.0, 8.0)
+                for before in rests(extent)
+            ],
+            gain="b",
+            own=("rest_input", "rest_output"),
+        )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         if self.scheme != "trapezoid":

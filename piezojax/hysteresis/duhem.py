@@ -4,15 +4,17 @@ from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars
+from ..core.parameter import parameter
+from ..core.recipe import Extent, Fittable, Part, Recipe, around, rest_bounds, rests
 from ..core.runge_kutta import runge_kutta
+from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
 from .loading import loaded
-from .model import Hysteresis
+from .model import Hysteresis, Laws, fades
 
 Surface: TypeAlias = tuple[tuple[Scalar, ...], ...]
 
@@ -28,7 +30,7 @@ class DuhemState(NamedTuple):
     memory: Scalar
 
 
-class Duhem(Hysteresis):
+class Duhem(Hysteresis, Fittable):
     """``x' = F(x, u) u' + G(x, u) |u'|``, ``y = h(x, u)``: rate-independent hysteresis.
 
     The generalised Duhem model, (2.4), with g(u') = (u', |u'|) and f = (F, G); in the
@@ -52,36 +54,42 @@ class Duhem(Hysteresis):
 
     Inverse: InverseHysteresis, where y rises with u on every branch.
 
-    Raises ValueError for numbers that are not finite, an empty ``output`` or
-    ``substeps < 1``.
+    Raises ValueError for parameters outside their limits or an empty ``output``.
     """
 
     before: ClassVar[str | None] = "rest_input"
+    laws: ClassVar[Laws] = fades()
+    part: ClassVar[Part] = Part(
+        "duhem",
+        "hysteresis",
+        "Semilinear Duhem: each branch its own linear law, y' = (F + G sign x') x'",
+    )
 
-    reversible: Surface = eqx.field(converter=_as_surface)
-    irreversible: Surface = eqx.field(converter=_as_surface)
-    output: Surface = eqx.field(converter=_as_surface, default=((0.0,), (1.0,)))
-    reversible_modulus: Surface = eqx.field(converter=_as_surface, default=())
-    irreversible_modulus: Surface = eqx.field(converter=_as_surface, default=())
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
-    rest_memory: Scalar = eqx.field(converter=as_array, default=0.0)
-    substeps: int = eqx.field(static=True, default=1)
+    reversible: Surface = parameter(
+        "1/V^(j+1)", "coefficients of F, row i for x^i", converter=_as_surface
+    )
+    irreversible: Surface = parameter(
+        "1/V^(j+1)", "coefficients of G, row i for x^i", converter=_as_surface
+    )
+    output: Surface = parameter(
+        "um/V^j",
+        "coefficients of h, row i for x^i",
+        converter=_as_surface,
+        default=((0.0,), (1.0,)),
+    )
+    reversible_modulus: Surface = parameter(
+        "1/V^(j+1)", "coefficients of |x| in F", converter=_as_surface, default=()
+    )
+    irreversible_modulus: Surface = parameter(
+        "1/V^(j+1)", "coefficients of |x| in G", converter=_as_surface, default=()
+    )
+    rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
+    rest_memory: Scalar = parameter("1", "x in the virgin state", default=0.0)
+    substeps: int = parameter("1", "parts of a step", least=1.0, static=True, default=1)
 
     def __check_init__(self):
-        for name in (
-            "reversible",
-            "irreversible",
-            "output",
-            "reversible_modulus",
-            "irreversible_modulus",
-        ):
-            for index, row in enumerate(getattr(self, name)):
-                check(f"{name}[{index}]", row)
         if not any(self.output):
             raise ValueError("output is empty; it must hold a coefficient")
-        check("rest_input in V", self.rest_input)
-        check("rest_memory", self.rest_memory)
-        check("substeps", self.substeps, least=1.0)
 
     def rate(self, memory: Scalar, input: Scalar, change: Scalar) -> Scalar:
         """Return dx along a ``change`` (V) of the input, at x and u."""
@@ -98,6 +106,41 @@ class Duhem(Hysteresis):
     def init(self, input: ScalarLike = 0.0) -> DuhemState:
         virgin = DuhemState(self.rest_input, self.rest_memory)
         return loaded(self, virgin, as_array(input))
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        # Oh and Bernstein 2005, with one state; rising and falling each have a slope, a
+        # pull and a decay of their own. A constant pull that changes its sign with the
+        # branch and an offset of the output are the same.
+        width, slope = extent.width, extent.slope
+        rest = extent.first[1] - extent.centre
+        reach = 2.0 * extent.span
+        pull, size = slope / width, abs(slope)
+        return Recipe(
+            cls(
+                reversible=((0.7 * slope, 0.0), (0.0,)),
+                irreversible=((0.0, pull), (-1.0 / width,)),
+                rest_input=extent.first[0],
+                rest_memory=rest,
+            ),
+            {
+                "reversible.0.0": Range(-10.0 * size, 10.0 * size),
+                "reversible.0.1": Range(-20.0 * size / width, 20.0 * size / width),
+                "reversible.1.0": Range(-10.0 / width, 10.0 / width),
+                "irreversible.0.1": around(pull, -1.0, 50.0),
+                "irreversible.1.0": Range(-50.0 / width, -0.01 / width),
+                **rest_bounds(extent),
+                "rest_memory": Range(rest - reach, rest + reach),
+            },
+            [
+                {"irreversible.1.0": -steep / width, "irreversible.0.1": steep * pull}
+                | before
+                for steep in (1.0, 3.0, 10.0)
+                for before in rests(extent)
+            ],
+            gain="reversible.0.0",
+            own=("rest_input", "rest_memory"),
+        )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         return InverseHysteresis(self, lower, upper)

@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..core.arrays import Scalar, ScalarLike, State, as_array, as_scalars
+from ..core.arrays import Scalar, ScalarLike, Scalars, State, as_array, as_scalars
+from ..core.parameter import parameter
 from ..core.system import Affine, Series, series
 from ..dynamics import ARMA
 from .coleman_hodgdon import ColemanHodgdon
@@ -21,22 +22,24 @@ class HystereticARMA(Hysteresis):
     sum_i moving_2[i] y_2(k-i)``, and ``offset`` (um) added to z. y_1 (V^2) and y_2 (V)
     are the hysteresis with (a, b) = (1, 0) and (0, 1); they depend on ``c`` (1/V) and
     on nothing else, so for a given c the model is linear in what is left.
-    ``moving_1`` in um/V^2, ``moving_2`` in um/V, of one length. ``rest_input`` (V) and
-    ``scheme`` as in ``ColemanHodgdon``; with the scheme "voros" this is the earlier
+    ``moving_1`` and ``moving_2`` are of one length. ``rest_input`` and ``scheme`` as in
+    ``ColemanHodgdon``; with the scheme "voros" this is the earlier
     model (2.11) that the thesis compares with.
 
-    Raises ValueError for ``c >= 0``, non-finite coefficients, numerators of different
+    Raises ValueError for parameters outside their limits, numerators of different
     length or an unknown scheme.
     """
 
     dynamic: ClassVar[bool] = True
 
-    c: Scalar = eqx.field(converter=as_array)
-    autoregressive: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    moving_1: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    moving_2: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    offset: Scalar = eqx.field(converter=as_array, default=0.0)
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+    c: Scalar = parameter("1/V", "decay with the input's path", below=0.0)
+    autoregressive: Scalars = parameter(
+        "1", "coefficients of past outputs", converter=as_scalars
+    )
+    moving_1: Scalars = parameter("um/V^2", "coefficients of y_1", converter=as_scalars)
+    moving_2: Scalars = parameter("um/V", "coefficients of y_2", converter=as_scalars)
+    offset: Scalar = parameter("um", "offset of the output", default=0.0)
+    rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
     scheme: str = eqx.field(static=True, default="trapezoid")
 
     def __check_init__(self):

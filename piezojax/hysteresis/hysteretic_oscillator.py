@@ -2,10 +2,10 @@
 
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.arrays import Scalar, ScalarLike, as_array
+from ..core.parameter import parameter, sample_time
 from ..core.runge_kutta import Point, runge_kutta
 from .bouc_wen import BoucWen
 from .inverse import Inverse
@@ -23,27 +23,20 @@ class OscillatorState(NamedTuple):
 class HystereticOscillator(Hysteresis):
     """``mass y'' + damping y' + stiffness y + z = u``, z the Bouc-Wen force of y.
 
-    Input u in N, held during the step; output y in m, at its end. ``mass`` in kg,
-    ``damping`` in N s/m, ``stiffness`` in N/m, ``dt`` in s, integrated by the
+    Input u in N, held during the step; output y in m, at its end, integrated by the
     Runge-Kutta rule in the substeps of ``hysteresis``. Source: Noel & Schoukens,
     Hysteretic benchmark with a dynamic nonlinearity, 2016.
 
-    Raises ValueError unless mass, stiffness and dt are positive and damping is finite.
+    Raises ValueError for parameters outside their limits.
     """
 
     dynamic: ClassVar[bool] = True
 
-    mass: Scalar = eqx.field(converter=as_array)
-    damping: Scalar = eqx.field(converter=as_array)
-    stiffness: Scalar = eqx.field(converter=as_array)
-    hysteresis: BoucWen
-    dt: float = eqx.field(static=True)
-
-    def __check_init__(self):
-        check("mass in kg", self.mass, above=0.0)
-        check("damping in N s/m", self.damping)
-        check("stiffness in N/m", self.stiffness, above=0.0)
-        check("sample time in s", self.dt, above=0.0)
+    mass: Scalar = parameter("kg", "mass", above=0.0, scale="log")
+    damping: Scalar = parameter("N s/m", "damping")
+    stiffness: Scalar = parameter("N/m", "stiffness of the spring", above=0.0)
+    hysteresis: BoucWen  # pyright: ignore[reportGeneralTypeIssues]
+    dt: float = sample_time()
 
     def init(self, input: ScalarLike = 0.0) -> OscillatorState:
         """Return the state at rest under ``input`` (N), the element without force."""

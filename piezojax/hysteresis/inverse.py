@@ -10,7 +10,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..core.arrays import Scalar, ScalarLike, State, as_array, check, check_order
+from ..core.arrays import Scalar, ScalarLike, State, as_array, check_order
+from ..core.parameter import parameter
 from ..core.rollout import simulate
 from ..core.system import System, holding_input
 
@@ -58,19 +59,17 @@ class InverseHysteresis(Inverse):
     range, raises ValueError where it finds the output not to rise, and says where. It
     is a probe, not a proof.
 
-    Raises ValueError for that, for ``lower >= upper`` or ``iterations < 1``.
+    Raises ValueError for that, for parameters outside their limits or ``lower >=
+    upper``.
     """
 
     model: System
-    lower: Scalar = eqx.field(converter=as_array)
-    upper: Scalar = eqx.field(converter=as_array)
-    iterations: int = eqx.field(static=True, default=8)
+    lower: Scalar = parameter("V", "lowest voltage")
+    upper: Scalar = parameter("V", "highest voltage")
+    iterations: int = parameter("1", "Newton steps", least=1.0, static=True, default=8)
 
     def __check_init__(self):
-        check("lower in V", self.lower)
-        check("upper in V", self.upper)
         check_order("lower", self.lower, "upper", self.upper)
-        check("iterations", self.iterations, least=1.0)
         check_rising(self.model, self.lower, self.upper)
 
     def init(self, input: ScalarLike = 0.0) -> State:

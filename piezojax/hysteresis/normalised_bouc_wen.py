@@ -6,10 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, check
+from ..core.parameter import parameter
+from ..core.recipe import Extent, Fittable, Part, Recipe, around, rest_bounds, rests
+from ..core.space import Range
 from .bouc_wen import BoucWen, BoucWenState
 from .inverse import Inverse, InverseHysteresis
 from .loading import loaded
-from .model import Hysteresis
+from .model import Hysteresis, Laws, fades
 
 SCHEMES = ("runge_kutta", "exact")
 
@@ -21,16 +24,15 @@ class NormalisedBoucWenState(NamedTuple):
     memory: Scalar
 
 
-class NormalisedBoucWen(Hysteresis):
+class NormalisedBoucWen(Hysteresis, Fittable):
     """``y = k_x x + k_w w``: a straight line and a bounded part with hysteresis.
 
     ``w' = rho (x' - sigma |x'| |w|^(n-1) w + (sigma - 1) x' |w|^n)``, (2.5) with its
     symbols set right: as printed w is called the input and the second line is headed by
     x'. Here x is the input in V, w the internal state without unit, which stays within
-    -1 and 1, and y the output Phi in um. ``k_x`` in um/V, ``k_w`` in um, ``rho`` in
-    1/V, above 0; ``sigma`` above 0.5; ``n``, at least 1 and not only whole, is how
-    sharply the loop bends. w is the force of a classical Bouc-Wen model,
-    ``classical()``. Source: Ikhouane and Rodellar, Systems with Hysteresis, 2007.
+    -1 and 1, and y the output Phi in um; n need not be whole. w is the force of a
+    classical Bouc-Wen model, ``classical()``. Source: Ikhouane and Rodellar, Systems
+    with Hysteresis, 2007.
 
     With ``k_w > 0``, which (2.5) asks for, loops run clockwise, as a force over a
     displacement does: the sign of a spring that dissipates. A piezo's displacement lags
@@ -47,29 +49,28 @@ class NormalisedBoucWen(Hysteresis):
     and only if ``k_x > 0`` and ``k_x + 2 sigma rho k_w > 0``, the slope that is left
     just after a turn at w = 1 or -1.
 
-    Raises ValueError for numbers outside these bounds, an unknown scheme, or "exact"
-    with another n.
+    Raises ValueError for parameters outside their limits, an unknown scheme, or "exact"
+    with another n than 1.
     """
 
     before: ClassVar[str | None] = "rest_input"
+    laws: ClassVar[Laws] = fades()
+    part: ClassVar[Part] = Part(
+        "normalised_bouc_wen",
+        "hysteresis",
+        "Normalised Bouc-Wen: a line and a bounded part, y = k_x x + k_w w",
+    )
 
-    k_x: Scalar = eqx.field(converter=as_array)
-    k_w: Scalar = eqx.field(converter=as_array)
-    rho: Scalar = eqx.field(converter=as_array)
-    sigma: Scalar = eqx.field(converter=as_array)
-    n: Scalar = eqx.field(converter=as_array, default=1.0)
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+    k_x: Scalar = parameter("um/V", "slope of the line")
+    k_w: Scalar = parameter("um", "height of the hysteretic part")
+    rho: Scalar = parameter("1/V", "slope of w from w = 0", above=0.0)
+    sigma: Scalar = parameter("1", "share of loading in the bend", above=0.5)
+    n: Scalar = parameter("1", "sharpness of the bend", least=1.0, default=1.0)
+    rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
     scheme: str = eqx.field(static=True, default="runge_kutta")
-    substeps: int = eqx.field(static=True, default=1)
+    substeps: int = parameter("1", "parts of a step", least=1.0, static=True, default=1)
 
     def __check_init__(self):
-        check("k_x in um/V", self.k_x)
-        check("k_w in um", self.k_w)
-        check("rho in 1/V", self.rho, above=0.0)
-        check("sigma", self.sigma, above=0.5)
-        check("n", self.n, least=1.0)
-        check("rest_input in V", self.rest_input)
-        check("substeps", self.substeps, least=1.0)
         if self.scheme not in SCHEMES:
             raise ValueError(
                 f"scheme {self.scheme!r}; it must be one of {list(SCHEMES)}"
@@ -102,6 +103,37 @@ class NormalisedBoucWen(Hysteresis):
             memory = self.classical().step(before, input)[1]
         output = self.k_x * input + self.k_w * memory
         return NormalisedBoucWenState(input, memory), output
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        width, slope = extent.width, extent.slope
+        return Recipe(
+            # A displacement lags behind its voltage for k_w of the other sign than k_x.
+            cls(
+                k_x=1.1 * slope,
+                k_w=-0.1 * slope * width,
+                rho=5.0 / width,
+                sigma=1.0,
+                n=1.5,
+                rest_input=extent.first[0],
+            ),
+            {
+                "k_x": around(slope, 0.0, 3.0),
+                "k_w": around(slope * width, -1.0, 1.0),
+                "rho": Range(0.3 / width, 100.0 / width, "log"),
+                "sigma": Range(0.51, 20.0, "log"),
+                "n": Range(1.0, 5.0),
+                **rest_bounds(extent),
+            },
+            [
+                {"rho": steep / width, "n": bend, **before}
+                for steep in (2.0, 8.0)
+                for bend in (1.2, 2.0)
+                for before in rests(extent)
+            ],
+            gain="k_x",
+            own=("rest_input",),
+        )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         return InverseHysteresis(self, lower, upper)

@@ -1,16 +1,23 @@
 """Play and stop operators, their weighted sums and the inverse of such a sum."""
 
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..core.arrays import Scalar, as_array, check, check_order
+from ..core.recipe import Extent, around, rest_bounds
+from ..core.space import Range
 
 Memory = tuple[Scalar, ...]
 
 ITERATIONS = 20
 """Newton steps, halving where one leaves the bracket, for a polynomial P."""
+
+PLAYS = 10
+"""Operators of a fitted Prandtl-Ishlinskii model."""
 
 
 def played(input: Scalar, memory: Memory, thresholds: Memory) -> Memory:
@@ -41,14 +48,33 @@ def _limited(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
 
 
 def check_plays(thresholds: Memory, weights: Memory, name: str = "weights") -> None:
-    """Raise ValueError unless each operator has a positive threshold and a weight."""
-    check("thresholds", thresholds, above=0.0)
-    check(name, weights)
+    """Raise ValueError unless each operator has a threshold and a weight."""
     if len(thresholds) != len(weights):
         raise ValueError(
             f"{len(thresholds)} thresholds and {len(weights)} {name}; "
             "each play operator needs one of both"
         )
+
+
+def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
+    """Return fields and bounds that the Prandtl-Ishlinskii models share."""
+    width, slope = extent.width, extent.slope
+    # A play wider than half the range of the input never moves.
+    thresholds = 0.5 * width * np.arange(1, PLAYS + 1) / (PLAYS + 1)
+    scales = [slope / width**i for i in range(3)]
+    return (
+        {
+            "polynomial": (0.7 * slope, 0.0, 0.0),
+            "thresholds": thresholds,
+            "weights": (0.3 * slope / PLAYS,) * PLAYS,
+            "rest_input": extent.first[0],
+        },
+        {
+            **{f"polynomial.{i}": around(s, -10.0, 10.0) for i, s in enumerate(scales)},
+            **{f"weights.{i}": around(slope, 0.0, 1.0) for i in range(PLAYS)},
+            **rest_bounds(extent),
+        },
+    )
 
 
 def memoryless(polynomial: Memory, x: Scalar) -> Scalar:

@@ -2,45 +2,54 @@
 
 from typing import ClassVar
 
-import equinox as eqx
-
-from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
+from ..core.parameter import parameter
+from ..core.recipe import Extent, Fittable, Part, Recipe, rests
 from .inverse import Inverse, check_rising
-from .model import Hysteresis
+from .model import Hysteresis, Laws, remembers
 from .plays import (
     Memory,
     check_invertible,
     check_plays,
     memoryless,
     played,
+    plays_recipe,
     solved,
     weighted,
 )
 
 
-class PrandtlIshlinskii(Hysteresis):
+class PrandtlIshlinskii(Hysteresis, Fittable):
     """``y = P(x) + sum_i weights[i] play_i(x)``: rate-independent, symmetric loops.
 
     Input x in V, output y in um. Each play operator is a backlash of half-width
-    ``thresholds[i]`` (V) with the slope ``weights[i]`` (um/V). ``polynomial`` holds the
-    memoryless part P(x) = polynomial[0] x + polynomial[1] x^2 + ... (um/V, um/V^2,
-    ...): with terms above the first this is the model of Gu, Zhu and Su (2014, IEEE
-    Trans. Ind. Electron. 61(3)). The material starts without memory at ``rest_input``
-    (V). Loops close for weights >= 0.
+    ``thresholds[i]``. The memoryless part is P(x) = polynomial[0] x + polynomial[1] x^2
+    + ...: with terms above the first this is the model of Gu, Zhu and Su (2014, IEEE
+    Trans. Ind. Electron. 61(3)). The material starts without memory at ``rest_input``.
+    Loops close for weights >= 0.
 
-    Raises ValueError for thresholds that are not positive, numbers that are not finite,
-    or a different count of thresholds and weights.
+    Raises ValueError for parameters outside their limits, or a different count of
+    thresholds and weights.
     """
 
     before: ClassVar[str | None] = "rest_input"
+    laws: ClassVar[Laws] = remembers()
+    part: ClassVar[Part] = Part(
+        "prandtl_ishlinskii",
+        "hysteresis",
+        "Prandtl-Ishlinskii: ten play operators and a cubic polynomial",
+    )
 
-    polynomial: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    thresholds: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    weights: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+    polynomial: Scalars = parameter(
+        "um/V^(i+1)", "coefficient i of the memoryless part", converter=as_scalars
+    )
+    thresholds: Scalars = parameter(
+        "V", "half-widths of the plays", above=0.0, converter=as_scalars
+    )
+    weights: Scalars = parameter("um/V", "slopes of the plays", converter=as_scalars)
+    rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
 
     def __check_init__(self):
-        check("polynomial", self.polynomial)
         check_plays(self.thresholds, self.weights)
 
     def init(self, input: ScalarLike = 0.0) -> Memory:
@@ -51,6 +60,17 @@ class PrandtlIshlinskii(Hysteresis):
         input = as_array(input)
         state = played(input, state, self.thresholds)
         return state, memoryless(self.polynomial, input) + weighted(self.weights, state)
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        fields, bounds = plays_recipe(extent)
+        return Recipe(
+            cls(**fields),
+            bounds,
+            rests(extent),
+            gain="polynomial.0",
+            own=("rest_input",),
+        )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         if len(self.polynomial) > 1:

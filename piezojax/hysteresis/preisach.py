@@ -18,9 +18,10 @@ from ..core.arrays import (
     check,
     check_order,
 )
+from ..core.parameter import parameter
 from ..core.system import Designed, System
 from .inverse import Inverse
-from .model import Hysteresis
+from .model import Hysteresis, Laws, remembers
 
 Levels = Float[Array, " cells"]
 Rows = tuple[Float[Array, " cells"], ...]
@@ -57,26 +58,23 @@ class Preisach(Hysteresis, Designed):
     ``start``: ``"virgin"``, demagnetised about ``rest_input`` (V), or ``"saturated"``,
     after an input at or below ``low``.
 
-    Raises ValueError for weights that are not square, negative or above the diagonal,
-    ``low >= high``, numbers that are not finite or an unknown start.
+    Raises ValueError for parameters outside their limits, weights that are not square
+    or lie above the diagonal, ``low >= high`` or an unknown start.
     """
 
     before: ClassVar[str | None] = "rest_input"
+    laws: ClassVar[Laws] = remembers()
 
-    weights: Matrix = eqx.field(converter=as_matrix)
-    low: Scalar = eqx.field(converter=as_array)
-    high: Scalar = eqx.field(converter=as_array)
-    lowest: Scalar = eqx.field(converter=as_array, default=0.0)
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+    weights: Matrix = parameter("um", "weights", least=0.0, converter=as_matrix)
+    low: Scalar = parameter("V", "lowest input")
+    high: Scalar = parameter("V", "highest input")
+    lowest: Scalar = parameter("um", "output with all relays down", default=0.0)
+    rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
     start: str = eqx.field(static=True, default="virgin")
 
     def __check_init__(self):
-        check("lowest input in V", self.low)
-        check("highest input in V", self.high)
-        check_order("lowest input in V", self.low, "highest input in V", self.high)
-        check("lowest output in um", self.lowest)
-        check("rest input in V", self.rest_input)
-        check_weights("weights in um", self.weights)
+        check_order("low", self.low, "high", self.high)
+        check_weights("weights", self.weights)
         if self.start not in STARTS:
             raise ValueError(f"start {self.start!r}; it must be one of {list(STARTS)}")
 
@@ -108,7 +106,6 @@ def check_weights(name: str, weights: Matrix) -> None:
     rows, columns = weights.shape
     if rows != columns or not rows:
         raise ValueError(f"{name} are {rows} x {columns}; they must be n x n, n >= 1")
-    check(name, weights, least=0.0)
     above = weights[np.triu_indices(rows, 1)]
     check(f"{name} where beta is above alpha", above, least=0.0, most=0.0)
 

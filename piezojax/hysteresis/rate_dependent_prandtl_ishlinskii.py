@@ -2,18 +2,21 @@
 
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
+from ..core.parameter import parameter, sample_time
+from ..core.recipe import Extent, Fittable, Part, Recipe, rests
+from ..core.space import Range
 from .inverse import Inverse, check_rising
-from .model import Hysteresis
+from .model import STEP, Hysteresis, Laws
 from .plays import (
     Memory,
     check_invertible,
     check_plays,
     memoryless,
     played,
+    plays_recipe,
     solved,
     weighted,
 )
@@ -28,35 +31,42 @@ class RateState(NamedTuple):
     rate: Scalar
 
 
-class RateDependentPrandtlIshlinskii(Hysteresis):
+class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
     """A Prandtl-Ishlinskii model whose thresholds grow with the rate of the input.
 
     ``y = P(x) + sum_i weights[i] play_i(x)`` with plays of the half-width
-    ``thresholds[i] + growth |dx/dt|`` (V), ``growth`` in s, everything else as in
-    ``PrandtlIshlinskii``; ``dt`` in s. Source: Al Janaideh and Krejci, Inverse
+    ``thresholds[i] + growth |dx/dt|`` (V), everything else as in
+    ``PrandtlIshlinskii``. Source: Al Janaideh and Krejci, Inverse
     rate-dependent Prandtl-Ishlinskii model for feedforward compensation of hysteresis
     in a piezomicropositioning actuator, 2013 (IEEE/ASME Trans. Mechatronics 18(5)),
     with one growth for all plays: they keep their order and distance at every rate. The
     rate is that between the two samples before: at the one to come it would hang on the
     input that the inverse looks for, and a play could run away from a fast step.
 
-    Raises ValueError as ``PrandtlIshlinskii``, for ``growth < 0`` and ``dt <= 0``.
+    Raises ValueError as ``PrandtlIshlinskii``.
     """
 
     before: ClassVar[str | None] = "rest_input"
+    laws: ClassVar[Laws] = {"counter-clockwise": STEP}
+    part: ClassVar[Part] = Part(
+        "rate_dependent_prandtl_ishlinskii",
+        "hysteresis",
+        "Prandtl-Ishlinskii with plays that widen with the rate of the input",
+    )
 
-    polynomial: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    thresholds: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    weights: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    growth: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+    polynomial: Scalars = parameter(
+        "um/V^(i+1)", "coefficient i of the memoryless part", converter=as_scalars
+    )
+    thresholds: Scalars = parameter(
+        "V", "half-widths of the plays", above=0.0, converter=as_scalars
+    )
+    weights: Scalars = parameter("um/V", "slopes of the plays", converter=as_scalars)
+    growth: Scalar = parameter("s", "growth of half-widths with the rate", least=0.0)
+    dt: float = sample_time()
+    rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
 
     def __check_init__(self):
-        check("polynomial", self.polynomial)
         check_plays(self.thresholds, self.weights)
-        check("growth in s", self.growth, least=0.0)
-        check("sample time in s", self.dt, above=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> RateState:
         input = as_array(input)
@@ -75,6 +85,20 @@ class RateDependentPrandtlIshlinskii(Hysteresis):
         """Return the half-widths (V) of the plays in the next step."""
         wider = self.growth * jnp.abs(state.rate)
         return tuple(r + wider for r in self.thresholds)
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        fields, bounds = plays_recipe(extent)
+        # A sine over the whole range needs some periods in the record; at the growth of
+        # a sixth of its period no play moves any more.
+        most = 0.05 * extent.duration
+        return Recipe(
+            cls(**fields, growth=0.01 * most, dt=extent.dt),
+            {**bounds, "growth": Range(0.0, most)},
+            rests(extent),
+            gain="polynomial.0",
+            own=("rest_input",),
+        )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         if len(self.polynomial) > 1:

@@ -1,10 +1,10 @@
 """Preisach hysteresis whose density depends on how fast the input moves."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..core.arrays import Matrix, Scalar, ScalarLike, as_array, as_matrix, check
+from ..core.arrays import Matrix, Scalar, ScalarLike, as_matrix
+from ..core.parameter import parameter, sample_time
 from ..core.system import Designed, System
 from .inverse import Inverse, InverseHysteresis
 from .model import Hysteresis
@@ -16,29 +16,29 @@ class RateDependentPreisach(Hysteresis, Designed):
 
     mu goes from the density of ``slow`` to that of ``fast_weights`` (um, n x n as in
     Preisach), cell by cell, with the share r^2 / (1 + r^2), r = (du/dt) / ``rate``:
-    half way at ``rate`` (V/s), smooth where the input turns. du/dt is that over the
-    last sample, ``dt`` in s. The relays themselves, and what they remember, are those
+    half way at ``rate``, smooth where the input turns. du/dt is that over the last
+    sample. The relays themselves, and what they remember, are those
     of ``slow``. Input in V, output in um. The thesis leaves mu to a neural network;
     this form of it is ours.
 
-    Raises ValueError for weights that Preisach refuses, another number of cells than
-    ``slow`` has, ``rate <= 0`` or ``dt <= 0``.
+    Raises ValueError for parameters outside their limits, weights that Preisach refuses
+    or another number of cells than ``slow`` has.
     """
 
     slow: Preisach
-    fast_weights: Matrix = eqx.field(converter=as_matrix)
-    rate: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
+    fast_weights: Matrix = parameter(
+        "um", "weights of fast inputs", least=0.0, converter=as_matrix
+    )
+    rate: Scalar = parameter("V/s", "rate at which both densities count", above=0.0)
+    dt: float = sample_time()
 
     def __check_init__(self):
-        check_weights("fast weights in um", self.fast_weights)
+        check_weights("fast_weights", self.fast_weights)
         if self.fast_weights.shape[0] != self.slow.cells:
             raise ValueError(
-                f"fast weights have {self.fast_weights.shape[0]} cells a side; "
+                f"fast_weights have {self.fast_weights.shape[0]} cells a side; "
                 f"the slow ones have {self.slow.cells}"
             )
-        check("rate in V/s", self.rate, above=0.0)
-        check("sample time in s", self.dt, above=0.0)
 
     def resolved(self) -> System:
         slow = self.slow.resolved()

@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
+from ..core.parameter import parameter
+from ..core.recipe import Extent, Fittable, Part, Recipe, rest_bounds, rests
+from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
-from .model import Hysteresis
+from .model import Hysteresis, Laws, fades
 
 
 class LastPoint(NamedTuple):
@@ -18,37 +20,44 @@ class LastPoint(NamedTuple):
     output: Scalar
 
 
-class ShapedColemanHodgdon(Hysteresis):
+class ShapedColemanHodgdon(Hysteresis, Fittable):
     """``y' = |x'| (p(x) + c y) + g(x) x'`` with polynomials p and g.
 
     The general model of Coleman and Hodgdon, alpha |x'| (f(x) - y) + g(x) x', with
     c = -alpha and p = alpha f, of which the thesis takes f and g linear (section
-    3.1, its first limitation). Input x in V, output y in um; ``pull`` holds p(x) =
-    pull[0] + pull[1] x + ... (um/V, um/V^2, ...), ``slope`` g(x) = slope[0] + slope[1]
-    x + ... (um/V, ...), ``c`` in 1/V is negative. Trapezoid step: the polynomials are
+    3.1, its first limitation). Input x in V, output y in um; p(x) = pull[0] + pull[1] x
+    + ..., g(x) = slope[0] + slope[1] x + .... Trapezoid step: the polynomials are
     integrated exactly, y by the trapezoid rule. ``pull = (0, a)``, ``slope = (b,)`` is
-    ColemanHodgdon. The virgin curve starts at ``rest_input`` (V), ``rest_output`` (um).
-    As there no return-point memory, no wiping-out and no congruency. Inverse:
-    InverseHysteresis, where y rises on every branch. Loops run
-    counter-clockwise, as a piezo's, where p'(x) > |c| g(x), and clockwise below that.
+    ColemanHodgdon. As there the virgin curve starts at ``rest_input``; no return-point
+    memory, no wiping-out and no congruency. Inverse: InverseHysteresis, where y rises
+    on every branch. Loops run counter-clockwise, as a piezo's, where p'(x) > |c| g(x),
+    and clockwise below that.
 
-    Raises ValueError for numbers that are not finite, empty polynomials or ``c >= 0``.
+    Raises ValueError for parameters outside their limits or empty polynomials.
     """
 
     before: ClassVar[str | None] = "rest_input"
+    laws: ClassVar[Laws] = fades()
+    part: ClassVar[Part] = Part(
+        "shaped_coleman_hodgdon",
+        "hysteresis",
+        "Coleman-Hodgdon with cubic shape functions: y' = |x'| (p(x) + c y) + g(x) x'",
+    )
 
-    pull: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    slope: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    c: Scalar = eqx.field(converter=as_array)
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
-    rest_output: Scalar = eqx.field(converter=as_array, default=0.0)
+    pull: Scalars = parameter(
+        "um/V^(i+1)", "coefficient i of the polynomial p", converter=as_scalars
+    )
+    slope: Scalars = parameter(
+        "um/V^(i+1)", "coefficient i of the polynomial g", converter=as_scalars
+    )
+    c: Scalar = parameter("1/V", "decay with the input's path", below=0.0)
+    rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
+    rest_output: Scalar = parameter("um", "output of the virgin state", default=0.0)
 
     def __check_init__(self):
-        for name, polynomial in (("pull", self.pull), ("slope", self.slope)):
-            if not polynomial:
+        for name in ("pull", "slope"):
+            if not getattr(self, name):
                 raise ValueError(f"{name} is empty; it must hold a coefficient")
-            check(name, polynomial)
-        check("c in 1/V", self.c, below=0.0)
 
     def init(self, input: ScalarLike = 0.0) -> LastPoint:
         # In closed form, because a single trapezoid over the range is a poor one:
@@ -75,6 +84,44 @@ class ShapedColemanHodgdon(Hysteresis):
         force = sign * _integral(self.pull, last, x) + _integral(self.slope, last, x)
         output = (force + (1.0 + half) * state.output) / (1.0 - half)
         return LastPoint(x, output), output
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        width, slope = extent.width, extent.slope
+        rest = extent.first[1] - extent.centre
+        reach = 2.0 * extent.span
+        scales = [abs(slope) / width**i for i in range(4)]
+        return Recipe(
+            cls(
+                pull=(0.0, slope / width, 0.0, 0.0),
+                slope=(0.7 * slope, 0.0, 0.0),
+                c=-1.0 / width,
+                rest_input=extent.first[0],
+                rest_output=rest,
+            ),
+            {
+                # A constant pull and an offset of the output are the same thing.
+                **{
+                    f"pull.{i}": Range(-50 * s, 50 * s)
+                    for i, s in enumerate(scales)
+                    if i > 0
+                },
+                **{
+                    f"slope.{i}": Range(-10 * s, 10 * s)
+                    for i, s in enumerate(scales[:3])
+                },
+                "c": Range(-50.0 / width, -0.01 / width),
+                **rest_bounds(extent),
+                "rest_output": Range(rest - reach, rest + reach),
+            },
+            [
+                {"c": -steep / width, "pull.1": steep * slope / width, **before}
+                for steep in (1.0, 3.0, 10.0)
+                for before in rests(extent)
+            ],
+            gain="slope.0",
+            own=("rest_input", "rest_output"),
+        )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         return InverseHysteresis(self, lower, upper)

@@ -2,13 +2,14 @@
 
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
+from ..core.parameter import parameter
+from ..core.recipe import Extent, Fittable, Part, Recipe, rests
 from .inverse import Inverse
-from .model import Hysteresis
-from .plays import Memory, check_plays, memoryless, stopped, weighted
+from .model import Hysteresis, Laws, remembers
+from .plays import Memory, check_plays, memoryless, plays_recipe, stopped, weighted
 from .prandtl_ishlinskii import PrandtlIshlinskii
 
 
@@ -19,29 +20,38 @@ class StopState(NamedTuple):
     stops: Memory
 
 
-class StopPrandtlIshlinskii(Hysteresis):
+class StopPrandtlIshlinskii(Hysteresis, Fittable):
     """``y = P(x) - sum_i weights[i] stop_i(x)``: what the stops hold back.
 
-    Input x in V, output y in um. A stop of half-width ``thresholds[i]`` (V) follows x
-    until it yields; ``weights[i]`` in um/V. ``polynomial`` and ``rest_input`` as in
-    ``PrandtlIshlinskii``: P is the slope of the loop's axis, where with plays it is the
+    Input x in V, output y in um. A stop of half-width ``thresholds[i]`` follows x
+    until it yields. ``polynomial`` and ``rest_input`` as in ``PrandtlIshlinskii``: P is
+    the slope of the loop's axis, where with plays it is the
     slope right after a turning point. Since play and stop add up to x the same model
     can be had of plays, ``as_plays``, and with it the inverse. Source: Brokate and
     Sprekels, Hysteresis and Phase Transitions, 1996, section 2.1.
 
-    Raises ValueError for thresholds that are not positive, numbers that are not finite,
-    or a different count of thresholds and weights.
+    Raises ValueError for parameters outside their limits, or a different count of
+    thresholds and weights.
     """
 
     before: ClassVar[str | None] = "rest_input"
+    laws: ClassVar[Laws] = remembers()
+    part: ClassVar[Part] = Part(
+        "stop_prandtl_ishlinskii",
+        "hysteresis",
+        "Prandtl-Ishlinskii by ten stop operators and a cubic polynomial",
+    )
 
-    polynomial: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    thresholds: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    weights: tuple[Scalar, ...] = eqx.field(converter=as_scalars)
-    rest_input: Scalar = eqx.field(converter=as_array, default=0.0)
+    polynomial: Scalars = parameter(
+        "um/V^(i+1)", "coefficient i of the loop's axis", converter=as_scalars
+    )
+    thresholds: Scalars = parameter(
+        "V", "half-widths of the stops", above=0.0, converter=as_scalars
+    )
+    weights: Scalars = parameter("um/V", "slopes of the stops", converter=as_scalars)
+    rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
 
     def __check_init__(self):
-        check("polynomial", self.polynomial)
         check_plays(self.thresholds, self.weights)
 
     def init(self, input: ScalarLike = 0.0) -> StopState:
@@ -63,6 +73,19 @@ class StopPrandtlIshlinskii(Hysteresis):
         first = first - sum(self.weights, as_array(0.0))
         return PrandtlIshlinskii(
             (first, *others), self.thresholds, self.weights, self.rest_input
+        )
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        fields, bounds = plays_recipe(extent)
+        # The polynomial is the axis of the loop, above the slope at its turning points.
+        fields["polynomial"] = (1.3 * extent.slope, 0.0, 0.0)
+        return Recipe(
+            cls(**fields),
+            bounds,
+            rests(extent),
+            gain="polynomial.0",
+            own=("rest_input",),
         )
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:

@@ -26,7 +26,6 @@ from .fit import Fit as Fit
 from .fit import FitReport as FitReport
 from .fit import identify as identify
 from .methods import METHODS as METHODS
-from .parts import PARTS as PARTS
 from .ranking import Comparison as Comparison
 from .records.record import Record as Record
 from .records.record import read_record as read_record

@@ -9,10 +9,12 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
+from ..core.recipe import Extent
+from ..core.registry import parts as known_parts
+from .chain import extent_of, is_dynamic
 from .estimators.estimate import Options
 from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, TOO_FEW, cells_told_apart
 from .methods import METHODS
-from .parts import OWN_DYNAMICS, PARTS, extent_of
 from .records.checks import lines
 from .records.record import Record
 
@@ -57,7 +59,7 @@ class Companions(NamedTuple):
 
 def at(place: str) -> list[str]:
     """Return the parts that have ``place`` in a chain."""
-    return [name for name, (where, _) in PARTS.items() if where == place]
+    return [name for name, kind in known_parts().items() if kind.part.place == place]
 
 
 def companions(
@@ -80,12 +82,17 @@ def companions(
     found, extent = excitation(records, train), extent_of(records[0])
     dynamics = []
     for name in DYNAMICS:
-        needed = len(PARTS[name][1](extent).bounds)
+        needed = _unknowns(name, extent)
         if 2 * found >= needed or name == DYNAMICS[-1]:
             dynamics.append(name)
         else:
             untried.append(Untried(name, _too_few(found, needed)))
     return Companions(tuple(creeps), tuple(dynamics)), untried
+
+
+def _unknowns(part: str, extent: Extent) -> int:
+    """Return how many parameters of a part are fitted."""
+    return len(known_parts()[part].recipe(extent).bounds)
 
 
 def excitation(records: Sequence[Record], train: slice) -> int:
@@ -106,7 +113,8 @@ def _seen(record: Record, train: slice) -> float:
 
 def chained(hysteresis: str, creep: str, dynamics: str) -> str:
     """Return the chain of the parts, of which some may be empty."""
-    parts = [hysteresis, creep, "" if hysteresis in OWN_DYNAMICS else dynamics]
+    alone = hysteresis != "" and is_dynamic(hysteresis)
+    parts = [hysteresis, creep, "" if alone else dynamics]
     return "+".join(part for part in parts if part)
 
 
@@ -228,7 +236,7 @@ def _against_regression(
     if against := _against_all_but_one(records):
         return against
     found = excitation(records, train)
-    needed = len(PARTS["arma"][1](extent_of(records[0])).bounds)
+    needed = _unknowns("arma", extent_of(records[0]))
     return _too_few(found, needed) if 2 * found < needed else None
 
 

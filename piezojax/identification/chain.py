@@ -7,11 +7,12 @@ import numpy as np
 
 from ..core.arrays import as_array
 from ..core.paths import get, replace
+from ..core.recipe import Extent, Recipe, around
+from ..core.registry import parts as known_parts
 from ..core.space import INSIDE, Range, Space, space_of
 from ..core.system import Affine, Series, series
+from ..hysteresis.model import Hysteresis
 from .estimators.structure import Structure
-from .part import around
-from .parts import OWN_DYNAMICS, PARTS, Part, extent_of
 from .records.record import Record
 
 LINEAR = ("dynamics", "lag", "delay")
@@ -24,22 +25,45 @@ DEFAULT = "shaped_coleman_hodgdon+exponential_creep+lag"
 def chain(name: str) -> list[str]:
     """Return the parts of a model such as ``"coleman_hodgdon+logarithmic_creep+lag"``.
 
-    A hysteresis by itself is followed by a lag, unless it has past outputs. Raises
-    ValueError for a part that is not in PARTS, or for two in one place.
+    A hysteresis by itself is followed by a lag, unless it contains dynamics. Raises
+    ValueError for a part that is not known, or for two in one place.
     """
+    known = known_parts()
     parts = [part.strip() for part in name.split("+")]
     for part in parts:
-        if part not in PARTS:
+        if part not in known:
             raise ValueError(
-                f"a model has no part {part!r}; there are {', '.join(PARTS)}, "
+                f"a model has no part {part!r}; there are {', '.join(known)}, "
                 "joined by '+'; whole models stand by themselves (--model help)"
             )
-    places = [PARTS[part][0] for part in parts]
+    places = [known[part].part.place for part in parts]
     for place in places:
         if places.count(place) > 1:
             raise ValueError(f"model {name!r} has two parts for its {place}")
-    lagged = places == ["hysteresis"] and parts[0] not in OWN_DYNAMICS
+    lagged = places == ["hysteresis"] and not is_dynamic(parts[0])
     return [*parts, "lag"] if lagged else parts
+
+
+def is_dynamic(part: str) -> bool:
+    """Return whether a part is a hysteresis that contains dynamics."""
+    kind = known_parts()[part]
+    return issubclass(kind, Hysteresis) and kind.dynamic
+
+
+def extent_of(record: Record) -> Extent:
+    """Return the ranges of a record with one input and one output."""
+    x, y = record.input, record.output
+    slope = record.span / float(np.ptp(x)) * float(np.sign(np.cov(x, y)[0, 1]) or 1.0)
+    return Extent(
+        low=float(x.min()),
+        high=float(x.max()),
+        first=(float(x[0]), float(y[0])),
+        slope=slope,
+        centre=float(np.mean(y) - slope * np.mean(x)),
+        span=record.span,
+        dt=record.dt,
+        duration=record.dt * record.samples,
+    )
 
 
 def structure(name: str, record: Record) -> Structure:
@@ -48,12 +72,14 @@ def structure(name: str, record: Record) -> Structure:
     An offset of the output is always added. Raises ValueError as ``chain``.
     """
     extent = extent_of(record)
-    parts = {PARTS[part][0]: PARTS[part][1](extent) for part in chain(name)}
+    known = known_parts()
+    kinds = [known[part] for part in chain(name)]
+    parts = {kind.part.place: kind.recipe(extent) for kind in kinds}
     reach = 2.0 * extent.span
     # Without a hysteresis nothing else turns volts into the output's unit.
     slope = 1.0 if "hysteresis" in parts else extent.slope
     scaled = "hysteresis" in parts or any(part.gain for part in parts.values())
-    parts["calibration"] = Part(
+    parts["calibration"] = Recipe(
         Affine(slope, extent.centre),
         {
             **({} if scaled else {"gain": around(slope, 0.0, 3.0)}),
@@ -79,10 +105,13 @@ def structure(name: str, record: Record) -> Structure:
     )
 
 
-def _starts(system: Series, space: Space, parts: Mapping[str, Part]) -> np.ndarray:
+def _starts(system: Series, space: Space, parts: Mapping[str, Recipe]) -> np.ndarray:
     """Return every combination of the parts' alternatives, in the unit box."""
     choices = [
-        [{f"{place}.{path}": value for path, value in one.items()} for one in part[2]]
+        [
+            {f"{place}.{path}": value for path, value in one.items()}
+            for one in part.alternatives
+        ]
         for place, part in parts.items()
     ]
     found = []

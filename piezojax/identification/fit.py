@@ -101,7 +101,7 @@ def identify(
     """Fit ``model`` to one record or to several with the same sample time.
 
     ``model`` is a chain of parts such as ``"prandtl_ishlinskii+logarithmic_creep+lag"``
-    (see ``identify.PARTS``) or one of the models of ``identify.METHODS``, ``method`` a
+    (see ``--model help``) or one of the models of ``identify.METHODS``, ``method`` a
     name there (left out, the first that can fit the model). Fitted over the samples
     ``train`` of each record (its first half if left out), judged by its free run on
     ``validate`` (the rest). Raises ValueError for an unknown model or method, an empty

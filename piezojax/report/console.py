@@ -22,9 +22,9 @@ from rich.table import Table
 from rich.text import Text
 
 from ..analysis.stability import StabilityReport
+from ..core.registry import parts
 from ..identification.fit import FitReport
 from ..identification.methods import METHODS
-from ..identification.parts import PARTS
 from ..reproduction.cell import Cell, title_of
 from ..reproduction.summary import GroupedAgreement, TableAgreement
 from ..tuning.result import Perturbed, Result, Scores
@@ -118,8 +118,8 @@ def models_table() -> Table:
     table = Table(title="models; parts are joined by '+', as in coleman_hodgdon+lag")
     for column in ("model", "kind", "what it is, or how it is fitted"):
         table.add_column(column, no_wrap=column == "model", overflow="fold")
-    for name, (place, build) in PARTS.items():
-        table.add_row(name, f"part: {place}", (build.__doc__ or "").strip())
+    for name, kind in parts().items():
+        table.add_row(name, f"part: {kind.part.place}", kind.part.summary)
     for name, method in METHODS.items():
         for model in method.models:
             table.add_row(model, f"method: {name}", method.summary)

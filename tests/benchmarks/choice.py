@@ -35,10 +35,10 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import linear_sum_assignment
 
+from piezojax.hysteresis.learned import LEARNED_PLAYS, NEURONS
 from piezojax.identification import (
     identify_all,
 )
-from piezojax.identification.parts_plays import LEARNED_PLAYS, NEURONS
 
 
 def as_numbered(values, found):

@@ -8,8 +8,8 @@ each lane. The gradient is exact here (in reverse, or in forward mode where that
 faster: `mode` in the rows), in C that of one-sided differences, a run for each
 parameter and one more. A bar is the most that `ratio_to_c` may be.
 
-A model takes part by its name in piezojax.identify.PARTS, or OTHERS here, and a C
-function of that name in hysteresis.c.
+A model takes part by its name in `--model help`, or OTHERS here, and a C function of
+that name in hysteresis.c.
 """
 
 import argparse
@@ -31,8 +31,8 @@ from rich.table import Table
 
 import piezojax
 from piezojax.core.paths import parameters, replace
-from piezojax.identification import PARTS
-from piezojax.identification.parts import Extent
+from piezojax.core.recipe import Extent
+from piezojax.core.registry import parts
 
 BAR = 2.0
 BARS = {"preisach": 5.0}
@@ -82,7 +82,7 @@ OTHERS = {
 """Models timed with other numbers than those a fit starts from, if one does: no term is
 zero."""
 
-MODELS = [name for name, (place, _) in PARTS.items() if place == "hysteresis"]
+MODELS = [name for name, kind in parts().items() if kind.part.place == "hysteresis"]
 MODELS += [name for name in OTHERS if name not in MODELS]
 
 
@@ -113,7 +113,7 @@ class Problem:
         if name in OTHERS:
             self.system = OTHERS[name]()
         else:
-            self.system, bounds, *_ = PARTS[name][1](EXTENT)
+            self.system, bounds, *_ = parts()[name].recipe(EXTENT)
         self.name = name
         leaves = {path: np.asarray(v) for path, v in parameters(self.system).items()}
         self.shapes = {path: leaf.shape for path, leaf in leaves.items()}

@@ -354,7 +354,7 @@ REFUSED = [
         "C has 2 columns; it must have one for each of 1 states",
     ),
     (lambda: changed(CHANNEL, B=[np.inf]), "B is inf; it must be finite"),
-    (lambda: changed(CHANNEL, dt=0.0), "sample time in s is 0; .* above 0"),
+    (lambda: changed(CHANNEL, dt=0.0), "dt in s is 0; .* above 0"),
     (
         lambda: Channels((CHANNEL, changed(CHANNEL, dt=1e-3))),
         r"channels differ in \(outputs, sample time\): \[\(3, 0.001\), \(3, 0.002\)\]",
@@ -371,7 +371,7 @@ REFUSED = [
         lambda: MatrixARMA([np.eye(2)], [EYE], 2e-3),
         r"autoregressive\[0\] is 2 x 2; it must be 3 x 3",
     ),
-    (lambda: MatrixARMA([EYE], [EYE], -1.0), "sample time in s is -1; .* above 0"),
+    (lambda: MatrixARMA([EYE], [EYE], -1.0), "dt in s is -1; .* above 0"),
     (lambda: observability_form(state_space(4, 1, 2)), "1 inputs and 2 outputs"),
     (lambda: observability_form(state_space(4, 2, 2, 0.1)), "D is not zero"),
     (lambda: observability_form(state_space(4, 2, 2)), r"\(7.4\) is singular"),

@@ -41,8 +41,8 @@ def test_its_gradient_is_a_central_difference():
     [
         ((-1e-3, DT, 4), "delay in s is -0.001; it must be finite and at least 0"),
         ((5e-3, DT, 4), "at most 0.004"),
-        ((0.0, 0.0, 4), "sample time in s is 0"),
-        ((0.0, DT, 0), "longest delay in samples is 0"),
+        ((0.0, 0.0, 4), "dt in s is 0"),
+        ((0.0, DT, 0), "longest in samples is 0"),
     ],
 )
 def test_bad_parameters(arguments, message):

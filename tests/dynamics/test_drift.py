@@ -56,9 +56,9 @@ def test_in_an_even_temperature_nothing_drifts():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: ThermalDrift(1.0, 0.0, 22.0, DT), "time constant in s is 0"),
+        (lambda: ThermalDrift(1.0, 0.0, 22.0, DT), "time_constant in s is 0"),
         (lambda: ThermalDrift(np.nan, 1.0, 22.0, DT), "expansion in um/K is nan"),
-        (lambda: ThermalDrift(1.0, 1.0, 22.0, -1.0), "sample time in s is -1"),
+        (lambda: ThermalDrift(1.0, 1.0, 22.0, -1.0), "dt in s is -1"),
         (lambda: Select(-1), "index is -1; it must be whole and at least 0"),
     ],
 )

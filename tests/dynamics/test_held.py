@@ -33,7 +33,7 @@ def test_rest_stays_at_rest():
 @pytest.mark.parametrize(
     ("samples", "message"),
     [
-        (0, "samples held is 0; it must be finite and at least 1"),
+        (0, "samples is 0; it must be finite and at least 1"),
     ],
 )
 def test_bad_numbers_of_samples_are_refused(samples, message):

@@ -146,7 +146,7 @@ def test_compiled_and_eager_agree():
         ({"mass": 0.0}, "mass in kg is 0; it must be finite and above 0"),
         ({"damping": np.nan}, "damping in N s/m is nan; it must be finite"),
         ({"stiffness": -1.0}, "stiffness in N/m is -1; it must be finite and above 0"),
-        ({"dt": 0.0}, "sample time in s is 0; it must be finite and above 0"),
+        ({"dt": 0.0}, "dt in s is 0; it must be finite and above 0"),
     ],
 )
 def test_bad_parameters_are_refused(changed, message):

@@ -70,10 +70,10 @@ def test_pole_and_its_gradient_are_the_closed_form():
 @pytest.mark.parametrize(
     ("tau", "dt", "message"),
     [
-        (0.0, DT, "time constant in s is 0; it must be finite and above 0"),
-        (-1.0, DT, "time constant in s is -1"),
-        (np.nan, DT, "time constant in s is nan"),
-        (1e-3, 0.0, "sample time in s is 0; it must be finite and above 0"),
+        (0.0, DT, "time_constant in s is 0; it must be finite and above 0"),
+        (-1.0, DT, "time_constant in s is -1"),
+        (np.nan, DT, "time_constant in s is nan"),
+        (1e-3, 0.0, "dt in s is 0; it must be finite and above 0"),
     ],
 )
 def test_bad_times_are_refused(tau, dt, message):
@@ -114,7 +114,7 @@ def test_second_order_rests_at_its_input():
     [
         ((0.0, 0.7, DT), "frequency in rad/s is 0; it must be finite and above 0"),
         ((1e3, -0.1, DT), "damping is -0.1; it must be finite and at least 0"),
-        ((1e3, 0.7, 0.0), "sample time in s is 0; it must be finite and above 0"),
+        ((1e3, 0.7, 0.0), "dt in s is 0; it must be finite and above 0"),
     ],
 )
 def test_bad_second_order_lags_are_refused(parameters, message):

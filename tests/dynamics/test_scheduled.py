@@ -135,7 +135,7 @@ OTHER = StateSpace(*MATRICES[0], 2.0 * DT)
         ((ONE, ONE), (1.0,), 0.1, "2 models for 1 levels"),
         ((ONE, OTHER), (1.0, 2.0), 0.1, "models differ in .states, outputs"),
         ((ONE, ONE), (2.0, 1.0), 0.1, "a level is 2 and the next is 1"),
-        ((ONE, ONE), (-1.0, 1.0), 0.1, "levels is -1; it must be .* at least 0"),
+        ((ONE, ONE), (-1.0, 1.0), 0.1, "levels in V is -1; it must be .* at least 0"),
         ((ONE, ONE), (1.0, 2.0), 1e-4, "time constant in s is 0.0001; .* least 0.001"),
     ],
 )

@@ -201,7 +201,7 @@ EYE, ONE = np.eye(2), np.ones((2, 1))
             DT,
             r"C is \[\[nan nan\][^;]*; it must be finite",
         ),
-        ((EYE, ONE, EYE, ONE), 0.0, "sample time in s is 0; it must be .* above 0"),
+        ((EYE, ONE, EYE, ONE), 0.0, "dt in s is 0; it must be .* above 0"),
     ],
 )
 def test_bad_models_are_refused(matrices, dt, message):

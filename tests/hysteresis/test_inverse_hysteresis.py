@@ -183,7 +183,7 @@ def test_a_model_that_is_not_monotone_has_no_inverse(model):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"lower": np.nan}, "lower in V is nan"),
+        ({"lower": np.nan}, "lower is nan"),
         ({"lower": 120.0}, "lower must be below upper"),
         ({"iterations": 0}, "iterations is 0; it must be finite and at least 1"),
     ],

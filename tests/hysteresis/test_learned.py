@@ -151,7 +151,7 @@ def test_it_learns_a_loop_that_no_linear_model_follows(record):
         ({"bias": (0.1, np.nan, 0.0)}, "bias is nan"),
         ({"thresholds": (0.0, 1.0)}, "thresholds is 0"),
         ({"scale": 0.0}, "scale in V is 0; it must be finite and above 0"),
-        ({"pace": -1.0}, "pace in V a sample is -1"),
+        ({"pace": -1.0}, "pace in V is -1"),
         ({"autoregressive": (1.2, -0.2)}, "autoregressive part is 1; .* below 1"),
     ],
 )

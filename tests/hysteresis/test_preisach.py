@@ -262,15 +262,15 @@ def test_it_is_saved_and_read_back():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"weights": np.ones((2, 3))}, "weights in um are 2 x 3; they must be n x n"),
-        ({"weights": np.ones((0, 0))}, "weights in um are 0 x 0"),
+        ({"weights": np.ones((2, 3))}, "weights are 2 x 3; they must be n x n"),
+        ({"weights": np.ones((0, 0))}, "weights are 0 x 0"),
         ({"weights": np.ones(3)}, r"shape \(3,\); it must be 2-dimensional"),
         ({"weights": [[1.0, 0.0], [-1.0, 1.0]]}, "it must be finite and at least 0"),
         ({"weights": [[1.0, 1.0], [1.0, 1.0]]}, "where beta is above alpha is"),
-        ({"low": 100.0}, "lowest input in V must be below highest input in V"),
-        ({"high": np.inf}, "highest input in V is inf"),
-        ({"lowest": np.nan}, "lowest output in um is nan"),
-        ({"rest_input": np.nan}, "rest input in V is nan"),
+        ({"low": 100.0}, "low must be below high"),
+        ({"high": np.inf}, "high in V is inf"),
+        ({"lowest": np.nan}, "lowest in um is nan"),
+        ({"rest_input": np.nan}, "rest_input in V is nan"),
         ({"start": "warm"}, "start 'warm'; it must be one of"),
     ],
 )

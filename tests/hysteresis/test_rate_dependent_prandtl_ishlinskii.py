@@ -93,7 +93,7 @@ def test_gradients_are_central_differences():
     ("growth", "dt", "message"),
     [
         (-1e-3, DT, "growth in s is -0.001; it must be finite and at least 0"),
-        (0.0, 0.0, "sample time in s is 0; it must be finite and above 0"),
+        (0.0, 0.0, "dt in s is 0; it must be finite and above 0"),
     ],
 )
 def test_bad_parameters(growth, dt, message):

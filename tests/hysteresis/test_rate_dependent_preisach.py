@@ -83,10 +83,10 @@ def test_gradients_are_central_differences():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fast_weights": np.eye(3)}, "fast weights have 3 cells a side; .* have 4"),
-        ({"fast_weights": -np.eye(4)}, "fast weights in um is"),
+        ({"fast_weights": np.eye(3)}, "fast_weights have 3 cells a side; .* have 4"),
+        ({"fast_weights": -np.eye(4)}, "fast_weights in um is"),
         ({"rate": 0.0}, "rate in V/s is 0; it must be finite and above 0"),
-        ({"dt": 0.0}, "sample time in s is 0"),
+        ({"dt": 0.0}, "dt in s is 0"),
     ],
 )
 def test_bad_parameters(changes, message):

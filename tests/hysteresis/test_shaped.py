@@ -94,7 +94,7 @@ def test_gradients_are_central_differences():
         (lambda: ShapedColemanHodgdon((), (1.0,), -1.0), "pull is empty"),
         (lambda: ShapedColemanHodgdon((1.0,), (), -1.0), "slope is empty"),
         (lambda: ShapedColemanHodgdon((1.0,), (1.0,), 0.0), "c in 1/V is 0"),
-        (lambda: ShapedColemanHodgdon((np.inf,), (1.0,), -1.0), "pull is inf"),
+        (lambda: ShapedColemanHodgdon((np.inf,), (1.0,), -1.0), "pull in .* is inf"),
     ],
 )
 def test_bad_parameters(build, message):

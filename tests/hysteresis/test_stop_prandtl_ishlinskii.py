@@ -85,9 +85,9 @@ def test_gradients_are_central_differences():
 @pytest.mark.parametrize(
     ("thresholds", "weights", "message"),
     [
-        ((0.0,), (1.0,), "thresholds is 0; it must be finite and above 0"),
+        ((0.0,), (1.0,), "thresholds in V is 0; it must be finite and above 0"),
         ((1.0, 2.0), (1.0,), "2 thresholds and 1 weights"),
-        ((1.0,), (np.inf,), "weights is inf"),
+        ((1.0,), (np.inf,), "weights in um/V is inf"),
     ],
 )
 def test_bad_parameters(thresholds, weights, message):

@@ -6,12 +6,14 @@ import pytest
 from piezojax import (
     Record,
 )
-from piezojax.identification import METHODS, PARTS
+from piezojax.core.recipe import PLACES
+from piezojax.core.registry import parts
+from piezojax.identification import METHODS
 from piezojax.identification.candidates import at, companions, first_round, later_rounds
 from piezojax.identification.estimators.estimate import Options
-from piezojax.identification.parts import OWN_DYNAMICS
 
 HYSTERESIS = at("hysteresis")
+OWN_DYNAMICS = [name for name in HYSTERESIS if parts()[name].dynamic]
 OPTIONS = Options()
 HALF = slice(0, 1000)
 
@@ -126,11 +128,7 @@ def test_several_records_of_one_stage_are_fitted_together():
     assert "2 records" in reasons(untried)["hysteretic_arma"]
 
 
-def test_every_part_has_a_place_that_is_known():
-    assert {place for place, _ in PARTS.values()} <= {
-        "hysteresis",
-        "creep",
-        "dynamics",
-        "lag",
-        "delay",
-    }
+def test_parts_are_listed_by_place():
+    places = [kind.part.place for kind in parts().values()]
+    assert list(dict.fromkeys(places)) == list(PLACES)
+    assert places == sorted(places, key=PLACES.index)

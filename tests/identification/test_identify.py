@@ -15,6 +15,7 @@ from piezojax import (
     save,
     series,
 )
+from piezojax.core.registry import parts
 from piezojax.core.system import (
     Affine,
 )
@@ -24,7 +25,7 @@ from piezojax.dynamics import (
 from piezojax.hysteresis import (
     ColemanHodgdon,
 )
-from piezojax.identification import PARTS, Options, free_run
+from piezojax.identification import Options, free_run
 from piezojax.study import shipped
 
 DT = 1e-3
@@ -253,7 +254,7 @@ def test_unknown_model(record, name):
     message = f"a model has no part {part!r}; there are "
     with pytest.raises(ValueError, match=re.escape(message)) as e:
         identify(record, name)
-    assert all(model in str(e.value) for model in PARTS)
+    assert all(model in str(e.value) for model in parts())
 
 
 def test_two_parts_in_one_place(record):

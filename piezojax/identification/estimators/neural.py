@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ...core.arrays import as_array
 from ...dynamics import NeuralStateSpace
 from ..records.record import Record
 from .steady_state import fit_steady_state
@@ -75,13 +76,13 @@ def neural_start(
     )
     draw = np.random.default_rng(seed)
     return NeuralStateSpace(
-        state_matrix=A,
+        state_matrix=as_array(A),
         input_matrix=B / input_scale,
         output_matrix=output_scale[:, None] * C,
-        neuron_output=np.zeros((order, neurons)),
-        neuron_state=draw.standard_normal((neurons, order)),
+        neuron_output=as_array(np.zeros((order, neurons))),
+        neuron_state=as_array(draw.standard_normal((neurons, order))),
         neuron_input=draw.standard_normal((neurons, inputs)) / input_scale,
-        neuron_bias=draw.standard_normal(neurons),
+        neuron_bias=as_array(draw.standard_normal(neurons)),
         input_offset=input_offset,
         output_offset=output_offset,
     )
