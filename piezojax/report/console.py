@@ -216,9 +216,11 @@ def gains_table(result: Result) -> Table:
     table.add_column("parameter")
     table.add_column("before", justify="right", no_wrap=True)
     table.add_column("tuned", justify="right", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
     for path, value in result.gains.items():
-        name = path.removeprefix(f"{shared}.")
-        table.add_row(name, f"{result.start[path]:.4g}", f"{value:.4g}")
+        name, unit = path.removeprefix(f"{shared}."), result.gain_units.get(path, "")
+        shown = "" if unit == "1" else unit
+        table.add_row(name, f"{result.start[path]:.4g}", f"{value:.4g}", shown)
     return table
 
 

@@ -194,6 +194,8 @@ class Result(BaseModel):
     front: list[FrontPoint] | None = None
     perturbed: Perturbed | None = None
     units: dict[str, str] = {}
+    gain_units: dict[str, str] = {}
+    """Declared units of ``gains``; "" without a declaration."""
     warnings: list[str]
     history: list[list[float | None]]
     times_s: list[float] = []

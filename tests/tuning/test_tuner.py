@@ -40,6 +40,7 @@ BASE = {
     "optimiser": {"starts": 2, "candidates": 4, "steps": 6},
 }
 RESULT_KEYS = {
+    "gain_units",
     *("study", "status", "gains", "before", "after", "holdout"),
     *("evaluations", "compile_s", "wall_s", "versions", "seed"),
 }
