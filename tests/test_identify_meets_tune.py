@@ -9,6 +9,7 @@ import tomli_w
 
 import piezojax as pj
 from piezojax.control.design import DESIGNS
+from piezojax.core.registry import parts
 from piezojax.core.system import rest_output
 from piezojax.dynamics import ARMA, FirstOrderLag
 from piezojax.hysteresis import (
@@ -19,7 +20,7 @@ from piezojax.hysteresis import (
     Preisach,
     RateDependentPreisach,
 )
-from piezojax.identification import METHODS, PARTS
+from piezojax.identification import METHODS
 from piezojax.identification.chain import DEFAULT, structure
 from piezojax.identification.estimators.neural import neural_start
 from piezojax.study import read
@@ -103,7 +104,7 @@ def plant(model):
 
 def models():
     whole = {model for method in METHODS.values() for model in method.models}
-    return [DEFAULT, *PARTS, *sorted(whole)]
+    return [DEFAULT, *parts(), *sorted(whole)]
 
 
 def loop_around(controller, system):

@@ -16,11 +16,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import piezojax.core.registry
 import piezojax.hysteresis
 from piezojax import (
     System,
     simulate,
 )
+from piezojax.core.recipe import Extent
 from piezojax.hysteresis import (
     AsymmetricPrandtlIshlinskii,
     BashashJalili,
@@ -264,3 +266,20 @@ def test_every_model_has_a_row():
         RateDependentPreisach,
     }
     assert exported - by_rate == {type(row.system) for row in ROWS.values()}
+
+
+CLAIMED = [
+    (kind, law)
+    for kind in piezojax.core.registry.parts().values()
+    if issubclass(kind, Hysteresis)
+    for law in kind.laws
+]
+
+
+@pytest.mark.parametrize(("kind", "law"), CLAIMED)
+def test_a_registered_model_keeps_the_laws_it_claims(kind, law):
+    extent = Extent(*SPAN, (0.0, 0.0), 0.12, 0.0, 12.0, 1e-3, 2.0)
+    system = kind.recipe(extent).system
+    # A loop gives V um, everything else um.
+    size = 12.0 * (100.0 if law == "counter-clockwise" else 1.0)
+    assert LAWS[law](system, LOOP) <= kind.laws[law] * size
