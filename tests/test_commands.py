@@ -15,8 +15,10 @@ from click.testing import CliRunner
 from rich.console import Console
 
 import piezojax as pj
+from piezojax.analysis.stability import OperatingPoint
+from piezojax.cli.terminal import Bar, console
 from piezojax.core.registry import parts
-from piezojax.report.console import Bar, console, tuning_table
+from piezojax.report.summary_tables import tuning_table
 from piezojax.reproduction import TABLES
 from piezojax.reproduction.cell import Cell
 from piezojax.reproduction.rates import FIGURE, RateError
@@ -211,7 +213,9 @@ def test_tune_reports_margins_before_and_after(tuned):
     for branch in ("ascending", "descending"):
         report = found["after"][branch]
         assert report["stable"]
-        expected = pj.stability_report(loop, report["reference_um"], branch)
+        expected = pj.stability_report(
+            loop, OperatingPoint(report["reference_um"], branch)
+        )
         assert report["sensitivity_peak"] == pytest.approx(expected.sensitivity_peak)
     assert "delay margin" in printed.stdout
 

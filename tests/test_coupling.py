@@ -6,16 +6,17 @@ import pytest
 
 from piezojax.core.system import LoopSample
 from piezojax.report import tuning_pictures as tuning
-from piezojax.report.contour_path import contour_figure, contours_in
+from piezojax.report.contour_path import contour_figure
 from piezojax.report.coupling_map import coupling_figure
 from piezojax.report.figures import styled
 from piezojax.signals import waveforms as signals
 from piezojax.study import Study, build
 from piezojax.tuning import coupling_matrix
+from piezojax.tuning.contouring import contour_errors, contours_in
+from piezojax.tuning.outcome import Outcome
 from piezojax.tuning.result import Result, Scores
 from piezojax.tuning.runs import Signals
 from piezojax.tuning.traces import traces_of
-from piezojax.tuning.tuner import Outcome
 
 TUNE = ["Z:SIN5", "Rx:SIN5", "Ry:SIN5", "Ry:SIN10", "Z+Rx:CIRCLE5"]
 BASE = {
@@ -80,8 +81,10 @@ def test_one_axis_has_no_coupling():
     with pytest.raises(ValueError, match="the study has one axis; coupling takes sev"):
         coupling_matrix(study, {})
     assert contours_in(study) == []
-    assert coupling_figure(study, result_of(study)) is None
-    assert contour_figure(study, "", {}) is None
+    assert outcome_of(study).coupling is None
+    assert coupling_figure(None, "") is None
+    assert contour_errors(study, {}) == []
+    assert contour_figure(study, "", []) is None
 
 
 def test_frequencies_of_contours_are_checked_as_others():
@@ -125,6 +128,12 @@ def result_of(study):
     )
 
 
+def outcome_of(study):
+    case = build(study, "small.toml", seed=None)
+    nothing = Signals(jnp.zeros((1, 1)), jnp.zeros((1, 1, 1)))
+    return Outcome(result_of(study), case.loop, case.loop, case, nothing)
+
+
 def texts(ax):
     return [text.get_text() for text in ax.texts]
 
@@ -132,7 +141,7 @@ def texts(ax):
 def test_coupling_picture_says_shares_and_amounts_with_units():
     study = study_of()
     with styled():
-        picture = coupling_figure(study, result_of(study))
+        picture = coupling_figure(outcome_of(study).coupling, study.title)
     before, tuned = picture.axes[:2]
     expected = [
         *("10 %\n500 nm", "2 nrad/µm\n10 nrad", "4 nrad/µm\n20 nrad"),
@@ -163,7 +172,8 @@ def test_contour_picture_magnifies_the_distance_not_the_lag():
         return LoopSample(points, points, points, points, points)
 
     with styled():
-        picture = contour_figure(study, "t", {5: (log(0.0, 0.3), log(0.1, 0.0))})
+        found = contour_errors(study, {5: (log(0.0, 0.3), log(0.1, 0.0))})
+        picture = contour_figure(study, "t", found)
     left, right = picture.axes
     assert "magnified 100 times" in left.get_title()
     _, before, tuned = (line.get_xydata() for line in left.lines)
@@ -178,7 +188,8 @@ def test_contour_picture_magnifies_the_distance_not_the_lag():
     lost = log(1e8, 0.0)
     lost.displacement[1][60:] = np.nan  # as a run beyond all bounds is drawn
     with styled():
-        picture = contour_figure(study, "t", {5: (lost, log(0.1, 0.0))})
+        found = contour_errors(study, {5: (lost, log(0.1, 0.0))})
+        picture = contour_figure(study, "t", found)
     assert "magnified 100 times" in picture.axes[0].get_title()
     assert np.abs(picture.axes[0].get_xlim()).max() < 120.0
     labels = picture.axes[1].get_legend_handles_labels()[1]

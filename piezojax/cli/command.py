@@ -1,4 +1,4 @@
-"""What all commands share: options, the results folder, errors in one line."""
+"""Common parts of all commands: options, the results folder, one-line errors."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,10 +9,10 @@ import click
 from rich.console import Console
 
 from ..core.files import fresh_folder, numbered_folder
-from ..report.console import console
+from .terminal import console
 
 RESULTS = Path("results")
-"""Where results go if no folder is named."""
+"""Folder of the results if none is named."""
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it."""

@@ -9,10 +9,11 @@ from ..identification.compare import identify_all
 from ..identification.estimators.estimate import Options
 from ..identification.fit import identify
 from ..identification.records.record import read_record
-from ..report.console import Bar, fit_table, models_table
 from ..report.fit_pictures import write_fit
 from ..report.model_ranking import comparison_notes, comparison_table, write_comparison
+from ..report.summary_tables import fit_table, models_table
 from .command import Command, common, results_folder, run
+from .terminal import Bar
 
 ALL = "all"
 """The model that stands for every one that the records support."""

@@ -10,7 +10,7 @@ from ..report.calibrated_cells import (
     together_table,
     write_calibration,
 )
-from ..report.console import Bar, reproduction_table
+from ..report.summary_tables import reproduction_table
 from ..report.table_pictures import write_picture, write_rates
 from ..reproduction import TABLES, reproduce
 from ..reproduction.calibration import EXPERIMENTS
@@ -19,6 +19,7 @@ from ..reproduction.judged import as_plain, together
 from ..reproduction.rates import FIGURE, errors_by_rate, rates_as_csv
 from ..reproduction.summary import as_csv, summarise
 from .command import Command, common, results_folder, run
+from .terminal import Bar
 
 
 @click.command(cls=Command)

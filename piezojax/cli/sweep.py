@@ -10,11 +10,11 @@ from rich.console import Console
 from .. import study as studies
 from ..core.files import numbered_folder
 from ..core.runtime import simulate_side_by_side
-from ..report.console import Bar
 from ..report.sweep_maps import best_table, write_pictures
 from ..sweeping.cluster import client_of
 from ..sweeping.sweeper import DEFAULT, Swept, read_swept, run_sweep
 from .command import INTERRUPTED, RESULTS, Command, common, run
+from .terminal import Bar
 
 
 def _shard(context: click.Context, option: click.Parameter, text: str) -> tuple:

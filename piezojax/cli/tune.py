@@ -10,23 +10,24 @@ from rich.console import Console
 from .. import study as studies
 from ..core.files import write_text
 from ..report.baseline_curves import baselines_table, baselines_text, write_baselines
-from ..report.bode import compared, write_stability
+from ..report.bode import write_stability
 from ..report.comparison_map import comparison_table, write_comparison
-from ..report.console import (
-    Bar,
+from ..report.fit_pictures import write_fit
+from ..report.limit_bars import limit_text, write_limit
+from ..report.robustness import constraints_table, front_table
+from ..report.summary_tables import (
     gains_table,
     perturbed_text,
     stability_table,
     tuning_table,
 )
-from ..report.fit_pictures import write_fit
-from ..report.limit_bars import limit_of, limit_text, write_limit
-from ..report.robustness import constraints_table, front_table
 from ..report.tuning_pictures import write_numbers, write_results
 from ..tuning.baselines import Budget
 from ..tuning.comparison import compare
-from ..tuning.tuner import Outcome, tune
+from ..tuning.outcome import Outcome
+from ..tuning.tuner import tune
 from .command import INTERRUPTED, Command, common, results_folder, run
+from .terminal import Bar
 
 
 @click.command(cls=Command)
@@ -84,28 +85,19 @@ def _tune(
             write_results(outcome, folder)
             if case.fit is not None:
                 write_fit(case.fit, folder)
-            bar.stage("working out margins")
-            # At the top of the references the branches differ most.
-            stability = compared(
-                case.study.highest,
-                case.study.dt,
-                case.study.axes.names if case.study.axes else (),
-                before=outcome.before,
-                after=outcome.after,
-            )
-            write_stability(stability, folder, outcome.result.title)
-            bar.stage("working out the limit of linear control")
-            limit = limit_of(outcome)
-            write_limit(limit, folder, outcome.result.title)
+            bar.stage("computing margins")
+            write_stability(outcome.stability, folder, outcome.result.title)
+            bar.stage("computing the limit of linear control")
+            write_limit(outcome.limit, folder, outcome.result.title)
     result = outcome.result
     console.print(tuning_table(result))
     console.print(gains_table(result))
-    console.print(stability_table(stability))
+    console.print(stability_table(outcome.stability))
     if result.constraints:
         console.print(constraints_table(result))
     if result.front and case.study.pareto:
         console.print(front_table(result.front, case.study.pareto.constraint))
-    console.print(limit_text(limit), soft_wrap=True)
+    console.print(limit_text(outcome.limit), soft_wrap=True)
     if result.perturbed is not None:
         console.print(perturbed_text(result.perturbed), soft_wrap=True)
     if outcome.baselines is not None:
@@ -113,7 +105,7 @@ def _tune(
         console.print(baselines_text(outcome.baselines), soft_wrap=True)
         for note in outcome.baselines.notes:
             console.print(f"note: {note}", soft_wrap=True)
-    for name, why in stability.problems.items():
+    for name, why in outcome.stability.problems.items():
         console.print(f"note: no margins {name} tuning: {why}", soft_wrap=True)
     for warning in result.warnings:
         console.print(f"note: {warning}", soft_wrap=True)

@@ -1,7 +1,7 @@
 """Pictures and files of a stability report."""
 
 import json
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from ..analysis.stability.broken_loop import BRANCHES
-from ..analysis.stability.conserved import LinearLoop
-from ..analysis.stability.crossings import angle_grid
-from ..analysis.stability.margins import StabilityReport, linear_loop, located_report
+from ..analysis.stability import AxesStability, StabilityReport, StabilityReports
+from ..analysis.stability.assess import LoopCurves
 from ..core.files import write_text
-from ..core.system import Feedback
-from .axes_bode import AxesStability, axes_figure, worse_branch
 from .figures import COLOURS, MEASURED, REFERENCE, figure, headed, styled, write
 
 STABILITY_FILE, STABILITY_PICTURE = "stability.json", "stability.png"
@@ -26,104 +22,44 @@ _DECADES = 4.5  # below the Nyquist frequency
 _REACH = 2.5  # half the side of the Nyquist plot
 
 
-@dataclass
-class Comparison:
-    """Reports and linear loops by their name, then by branch.
-
-    ``axes`` holds loops of several axes, whose names are ``axis_names``. ``problems``
-    says, by name, why a loop has none.
-    """
-
-    reports: dict[str, dict[str, StabilityReport]] = field(default_factory=dict)
-    loops: dict[str, dict[str, LinearLoop]] = field(default_factory=dict)
-    problems: dict[str, str] = field(default_factory=dict)
-    axes: dict[str, AxesStability] = field(default_factory=dict)
-    axis_names: tuple[str, ...] = ()
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON: by name, then by branch, or ``problem``."""
-        found: dict[str, Any] = {
-            name: {branch: report.as_dict() for branch, report in reports.items()}
-            for name, reports in self.reports.items()
-        }
-        found |= {n: one.report.as_dict() for n, one in self.axes.items()}
-        return found | {n: {"problem": why} for n, why in self.problems.items()}
-
-
-def compared(
-    reference: Any = 0.0,
-    dt: float | None = None,
-    axis_names: tuple[str, ...] = (),
-    **loops: Feedback,
-) -> Comparison:
-    """Return the stability of the named loops at ``reference`` (um), both branches.
-
-    With several axes a reference for each of ``axis_names``, and the worse branch. A
-    loop that cannot be linearised is among the problems; none is raised.
-    """
-    result = Comparison(axis_names=axis_names)
-    for name, loop in loops.items():
-        try:
-            if axis_names:
-                result.axes[name] = worse_branch(loop, reference, dt)
-                continue
-            found = {
-                branch: linear_loop(loop, reference, branch, dt=dt)
-                for branch in BRANCHES
-            }
-            result.reports[name] = {
-                branch: located_report(model, float(reference), start, branch)
-                for branch, (model, start) in found.items()
-            }
-            result.loops[name] = {b: model for b, (model, _) in found.items()}
-        # Whatever goes wrong here, the gains that were found stay worth having.
-        except Exception as error:
-            why = str(error).partition("\n")[0] or type(error).__name__
-            result.problems[name] = why
-    return result
-
-
-def write_stability(comparison: Comparison, folder: Path, title: str = "") -> None:
+def write_stability(found: StabilityReports, folder: Path, title: str = "") -> None:
     """Write stability.json and stability.png into ``folder``."""
-    text = json.dumps(comparison.as_dict(), indent=2, allow_nan=False)
+    text = json.dumps(found.as_dict(), indent=2, allow_nan=False)
     write_text(folder / STABILITY_FILE, text + "\n")
-    if comparison.loops:
-        with styled():
-            picture = stability_figure(comparison, title)
-            write(picture, folder / STABILITY_PICTURE)
-    if comparison.axes:
-        with styled():
-            picture = axes_figure(comparison.axes, comparison.axis_names, title)
+    with styled():
+        if found.loops:
+            write(stability_figure(found, title), folder / STABILITY_PICTURE)
+        if found.axes:
+            picture = axes_figure(found.axes, found.axis_names, title)
             write(picture, folder / STABILITY_PICTURE)
 
 
-def stability_figure(comparison: Comparison, title: str = "") -> Figure:
-    """Bode and Nyquist plots of L, and the sensitivities |S| and |T|.
+def stability_figure(found: StabilityReports, title: str = "") -> Figure:
+    """Draw Bode and Nyquist plots of L, and the sensitivities |S| and |T|.
 
     The branches of a hysteresis are drawn full (ascending) and dashed (descending),
     where they differ.
     """
     picture = figure(9.0, 6.6)
     (gain, nyquist), (phase, sensitivity) = picture.subplots(2, 2)
-    for name, loops in comparison.loops.items():
-        for branch, loop in _different(loops).items():
+    for name in found.loops:
+        branches = found.curves(name, _DECADES)
+        for branch, curves in branches.items():
             style: dict[str, Any] = {
                 "color": COLOURS.get(name, REFERENCE),
                 "ls": LINES[branch],
             }
-            angle = angle_grid(loop)
-            angle = angle[angle > np.pi * 10.0**-_DECADES]
-            hertz = angle / (2.0 * np.pi * loop.dt)
-            response = loop.response(angle)
-            report = comparison.reports[name][branch]
-            label = _label(name, branch, loops)
-            gain.loglog(hertz, np.abs(response), label=label, **style)
-            degrees = np.degrees(np.unwrap(np.angle(response)))
+            report = found.reports[name][branch]
+            shown = _shown(name)
+            label = f"{shown}, {branch}" if len(branches) > 1 else shown
+            hertz, L = curves.frequency, curves.L
+            gain.loglog(hertz, np.abs(L), label=label, **style)
+            degrees = np.degrees(np.unwrap(np.angle(L)))
             # Drawn in the turn in which it starts between -360 and 0.
             degrees -= 360.0 * np.ceil(degrees[0] / 360.0 - 1e-6)
             phase.semilogx(hertz, degrees, **style)
-            nyquist.plot(np.real(response), np.imag(response), label=label, **style)
-            _sensitivities(sensitivity, hertz, response, report, label, style)
+            nyquist.plot(np.real(L), np.imag(L), label=label, **style)
+            _sensitivities(sensitivity, curves, report, label, style)
     gain.axhline(1.0, color=REFERENCE, lw=0.8)
     gain.set(ylabel="|L| (-)", title="Loop transfer function, cut at the plant's input")
     gain.legend(fontsize=7.5)
@@ -147,41 +83,22 @@ def stability_figure(comparison: Comparison, title: str = "") -> Figure:
     return picture
 
 
+def _shown(name: str) -> str:
+    return "tuned" if name == "after" else name
+
+
 def _sensitivities(
     ax: Axes,
-    hertz: np.ndarray,
-    response: np.ndarray,
+    curves: LoopCurves,
     report: StabilityReport,
     label: str,
     style: dict[str, Any],
 ) -> None:
-    if report.sensitivity_peak is None:  # unstable: S and T say nothing
+    if report.sensitivity_peak is None:  # unstable: S and T mean nothing
         return
-    ax.loglog(
-        hertz,
-        np.abs(1.0 / (1.0 + response)),
-        label=f"{label}: Ms = {report.sensitivity_peak:.2f}",
-        **style,
-    )
-    ax.loglog(hertz, np.abs(response / (1.0 + response)), lw=0.6, **style)
-
-
-def _different(loops: dict[str, LinearLoop]) -> dict[str, LinearLoop]:
-    """Leave out a branch that is the same as the first."""
-    first, *others = loops.items()
-    probe = np.array([1e-3, 0.1, 1.0, np.pi])
-    return dict([first]) | {
-        branch: loop
-        for branch, loop in others
-        if not np.allclose(
-            loop.response(probe), first[1].response(probe), rtol=1e-5, atol=0.0
-        )
-    }
-
-
-def _label(name: str, branch: str, loops: dict[str, LinearLoop]) -> str:
-    shown = "tuned" if name == "after" else name
-    return f"{shown}, {branch}" if len(_different(loops)) > 1 else shown
+    label = f"{label}: Ms = {report.sensitivity_peak:.2f}"
+    ax.loglog(curves.frequency, np.abs(curves.S), label=label, **style)
+    ax.loglog(curves.frequency, np.abs(curves.T), lw=0.6, **style)
 
 
 def _critical_point(ax: Axes) -> None:
@@ -197,3 +114,46 @@ def _critical_point(ax: Axes) -> None:
         ylabel="imaginary part of L",
         title="Nyquist plot; inside the dots |S| > 2",
     )
+
+
+def axes_figure(
+    stabilities: dict[str, AxesStability], names: Sequence[str], title: str
+) -> Figure:
+    """Draw |S| of each axis, the others closed, and the largest singular value of S."""
+    picture = figure(9.0, 3.6)
+    left, right = picture.subplots(1, 2)
+    lines = ("-", "--", "-.", ":")
+    for name, found in stabilities.items():
+        if not found.report.stable:
+            continue
+        colour, curves = COLOURS.get(name, REFERENCE), found.curves()
+        for axis, (axis_name, size) in enumerate(zip(names, curves.each, strict=True)):
+            left.loglog(
+                curves.frequency,
+                size,
+                color=colour,
+                ls=lines[axis % len(lines)],
+                label=f"{axis_name}, {_shown(name)}",
+            )
+        right.loglog(
+            curves.frequency,
+            curves.largest,
+            color=colour,
+            label=f"{_shown(name)}: disk margin {found.report.disk_margin:.2f}",
+        )
+    left.set(
+        xlabel="frequency (Hz)",
+        ylabel="|S| of one axis (-)",
+        title="Each axis, all others closed",
+    )
+    right.set(
+        xlabel="frequency (Hz)",
+        ylabel="largest singular value of S (-)",
+        title="All axes at once",
+    )
+    for ax in (left, right):
+        ax.set_ylim(bottom=1e-3)
+        if ax.get_legend_handles_labels()[1]:
+            ax.legend(fontsize=7.5, loc="lower right")
+    headed(picture, title)
+    return picture

@@ -1,4 +1,4 @@
-"""The picture of what each axis does to the others, before and after tuning."""
+"""Picture of the coupling of axes before and after tuning."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -6,28 +6,23 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from ..study import Study
-from ..tuning.coupling import Coupling, coupling_matrix
-from ..tuning.result import Result, Scores
+from ..tuning.coupling import Coupling
 from .figures import UNITS, figure, headed
 
 _LEAST = 1e-6  # %; a smaller share has no colour of its own
 
 
-def coupling_figure(study: Study, result: Result) -> Figure | None:
-    """Heat maps of the errors on the hold-out while one axis alone is driven.
+def coupling_figure(
+    coupling: tuple[Coupling, Coupling] | None, title: str
+) -> Figure | None:
+    """Draw heat maps of the errors on the hold-out while one axis alone is driven.
 
-    None if there is nothing to show: one axis, or none driven alone.
+    ``coupling`` is that before and after tuning. None if there is nothing to show: one
+    axis, or none driven alone.
     """
-    if study.axes is None:
+    if coupling is None:
         return None
-    before, after = (
-        coupling_matrix(study, _errors(*scores))
-        for scores in (
-            (result.holdout_before, result.unseen_before, result.coupling_before),
-            (result.holdout, result.unseen, result.coupling),
-        )
-    )
+    before, after = coupling
     shares = np.stack([before.percent, after.percent])
     shown = shares[np.isfinite(shares)]
     if not shown.size:
@@ -37,8 +32,8 @@ def coupling_figure(study: Study, result: Result) -> Figure | None:
     picture = figure(10.0, 1.1 + 0.95 * len(before.names))
     panels = picture.subplots(1, 2)
     images = [
-        _map(ax, found, norm, title)
-        for ax, found, title in zip(
+        _map(ax, found, norm, heading)
+        for ax, found, heading in zip(
             panels, (before, after), ("before", "tuned"), strict=True
         )
     ]
@@ -48,15 +43,8 @@ def coupling_figure(study: Study, result: Result) -> Figure | None:
         label="rms error, % of the driven amplitude\n"
         "(of unlike units: µm per 100 µrad, µrad per 100 µm)",
     )
-    headed(picture, f"{result.title}: rms errors with one axis driven, hold-out")
+    headed(picture, f"{title}: rms errors with one axis driven, hold-out")
     return picture
-
-
-def _errors(*parts: Scores | None) -> dict[str, float | None]:
-    found: dict[str, float | None] = {}
-    for part in parts:
-        found |= part.per_reference_rms_um if part else {}
-    return found
 
 
 def _map(ax: Axes, found: Coupling, norm: LogNorm, title: str) -> AxesImage:

@@ -7,9 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..analysis.limit import NEAR, LimitReport, performance_limit
+from ..analysis.limit import NEAR, LimitReport
 from ..core.files import write_text
-from ..tuning.tuner import Outcome
 from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, headed, styled, write
 
 LIMIT_FILE, LIMIT_PICTURE = "limit.json", "limit.png"
@@ -20,32 +19,7 @@ CAUSES: dict[str | None, str] = {
     "foreseen": "leaves what a linear filter of the reference would cancel",
     None: "is too far from linear to say why",
 }
-"""What a loop does where a share of its error exceeds the limit's."""
-
-
-def limit_of(outcome: Outcome) -> LimitReport | str:
-    """Return the limit for the tuned loop on its held-out noise, or why there is none.
-
-    The references are those it was tuned on.
-    """
-    study = outcome.case.study
-    if study.axes is not None:
-        return "the limit is known for one axis only"
-    names, signals = study.references.tune, outcome.holdout
-    moved = signals.disturbance
-    try:
-        return performance_limit(
-            outcome.after,
-            names,
-            signals.references[: len(names)],
-            signals.noise[: len(names)],
-            None if moved is None else moved[: len(names)],
-            start=round(study.references.settle * study.rate),
-            dt=study.dt,
-        )
-    # Whatever goes wrong here, the gains that were found stay worth having.
-    except Exception as error:
-        return str(error).partition("\n")[0] or type(error).__name__
+"""Explanation of the share of an error that exceeds the limit's most."""
 
 
 def write_limit(found: LimitReport | str, folder: Path, title: str = "") -> None:
@@ -59,7 +33,7 @@ def write_limit(found: LimitReport | str, folder: Path, title: str = "") -> None
 
 
 def limit_text(found: LimitReport | str) -> str:
-    """Return a few lines: how near, and where not, what exceeds the limit."""
+    """Return lines on the distance from the limit, and on the causes of a large one."""
     if isinstance(found, str):
         return f"note: no limit of linear control: {found}"
     count = len(found.references)
@@ -124,19 +98,19 @@ def _errors(ax: Axes, found: LimitReport) -> None:
 
 def _spectra(ax: Axes, found: LimitReport) -> None:
     """Draw the spectra of the reference that is furthest above its limit."""
-    names = list(found.references)
-    worst = max(names, key=lambda name: found.references[name].over)
-    i, curves = names.index(worst), found.curves
-    density = 2e6 * found.dt  # um^2 over the circle to nm^2/Hz, one-sided
-    for values, colour, width, label in (
-        (curves.unforeseen[i], MEASURED, 0.9, "disturbance, not foretold"),
-        (np.full_like(curves.frequency, curves.noise), BEFORE, 0.9, "sensor noise"),
-        (curves.limit[i], REFERENCE, 1.2, "error at the limit"),
-        (curves.tuned[i], AFTER, 1.2, "error, tuned"),
+    worst = found.worst
+    densities = found.densities(worst)
+    for name, colour, width, label in (
+        ("unforeseen", MEASURED, 0.9, "disturbance, not foretold"),
+        ("noise", BEFORE, 0.9, "sensor noise"),
+        ("limit", REFERENCE, 1.2, "error at the limit"),
+        ("tuned", AFTER, 1.2, "error, tuned"),
     ):
-        root = np.sqrt(density * values)
-        ax.loglog(curves.frequency, root, color=colour, lw=width, label=label)
-    top = np.sqrt(density * np.max(curves.unforeseen[i]))
+        nanometres = 1e3 * densities[name]
+        ax.loglog(
+            found.curves.frequency, nanometres, color=colour, lw=width, label=label
+        )
+    top = 1e3 * np.max(densities["unforeseen"])
     ax.set(
         xlim=(found.resolution / 2.0, None),
         ylim=(1e-5 * top, 30.0 * top),

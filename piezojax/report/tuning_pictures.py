@@ -2,21 +2,19 @@
 
 from pathlib import Path
 
-import jax
 import numpy as np
 from matplotlib.figure import Figure
 
 from ..core.axes import axis_of
 from ..core.files import write_text
-from ..core.rollout import simulate
 from ..core.serial import save
-from ..core.system import LoopSample, loop_inputs
 from ..signals.waveforms import parse
 from ..study import Study
+from ..tuning.contouring import contour_errors, contours_in
+from ..tuning.outcome import Logs, Outcome
 from ..tuning.result import GAINS_FILE, RESULT_FILE
 from ..tuning.traces import Trace, traces_of
-from ..tuning.tuner import Outcome
-from .contour_path import contour_figure, contours_in
+from .contour_path import contour_figure
 from .coupling_map import coupling_figure
 from .figures import (
     AFTER,
@@ -32,7 +30,6 @@ from .figures import (
 from .robustness import front_figure, perturbed_figure
 
 _SHOWN = 3  # references in the tracking picture
-_BEYOND = 1e9  # um or V
 _PERIODS = 4.0  # of the reference, at the end of the run
 
 
@@ -46,15 +43,15 @@ def write_results(outcome: Outcome, folder: Path) -> None:
     study, result = outcome.case.study, outcome.result
     shown = _shown(outcome)
     chosen = {trace.run for trace in shown} | {c.run for c in contours_in(study)}
-    runs = _runs(outcome, chosen)
+    runs = outcome.logs(chosen)
     logs = {trace: _of_axis(study, trace, runs[trace.run]) for trace in shown}
     with styled():
         pictures = {
             "tracking": tracking_figure(outcome, logs),
             "hysteresis": hysteresis_figure(outcome, logs),
             "convergence": convergence_figure(outcome) if result.history else None,
-            "coupling": coupling_figure(study, result),
-            "contour": contour_figure(study, result.title, runs),
+            "coupling": coupling_figure(outcome.coupling, result.title),
+            "contour": contour_figure(study, result.title, contour_errors(study, runs)),
             "robustness": perturbed_figure(result.perturbed, result.title),
             "pareto": front_figure(
                 result.front,
@@ -73,48 +70,15 @@ def write_numbers(outcome: Outcome, folder: Path) -> None:
     save(outcome.controller, folder / GAINS_FILE)
 
 
-Both = tuple[LoopSample, LoopSample]
-"""What the loop logs before and after tuning."""
-
-Logs = dict[Trace, Both]
-
-
 def _moved(trace: Trace) -> str:
     return "rotation" if trace.unit == "urad" else "displacement"
 
 
-def _runs(outcome: Outcome, chosen: set[int]) -> dict[int, Both]:
-    """Run both loops over the chosen references, as in the hold-out."""
-
-    signals = outcome.holdout
-
-    @jax.jit
-    def run(loop, index):
-        reference, noise = signals.references[index], signals.noise[index, 0]
-        moved = signals.disturbance
-        inputs = loop_inputs(
-            reference, noise, None if moved is None else moved[index, 0]
-        )
-        return simulate(loop, inputs, loop.init(reference[0]))[1]
-
-    runs = {}
-    for index in sorted(chosen):
-        before, after = (run(loop, index) for loop in (outcome.before, outcome.after))
-        runs[index] = jax.tree.map(_drawable, (before, after))
-    return runs
-
-
-def _of_axis(study: Study, trace: Trace, both: Both) -> Both:
+def _of_axis(study: Study, trace: Trace, both: Logs) -> Logs:
     if not study.axes:
         return both
     before, after = (axis_of(log, trace.axis) for log in both)
     return before, after
-
-
-def _drawable(values: jax.Array) -> np.ndarray:
-    # A run that diverges ends at the edge of the picture, not in an overflow.
-    array = np.asarray(values)
-    return np.where(np.abs(array) < _BEYOND, array, np.nan)
 
 
 def _shown(outcome: Outcome) -> list[Trace]:
@@ -149,7 +113,7 @@ def _window(study: Study, trace: Trace) -> float:
     return max(table.settle, table.duration - _PERIODS / frequency)
 
 
-def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
+def tracking_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
     """Displacement and error against time, before and after."""
     study = outcome.case.study
     table, dt = study.references, study.dt
@@ -188,7 +152,7 @@ def tracking_figure(outcome: Outcome, logs: Logs) -> Figure:
     return picture
 
 
-def hysteresis_figure(outcome: Outcome, logs: Logs) -> Figure:
+def hysteresis_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
     """The stage's own loop, and what control leaves of it."""
     table, dt = outcome.case.study.references, outcome.case.study.dt
     trace = next(iter(logs))

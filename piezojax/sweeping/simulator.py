@@ -1,5 +1,6 @@
-"""The one program that simulates a block of points, called for block after block."""
+"""Simulation of a sweep: one program, called for block after block of points."""
 
+import dataclasses
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..analysis.stability.broken_loop import BRANCHES, open_loop
+from ..analysis.stability import OperatingPoint, open_loop
+from ..analysis.stability.differentiable import peak_of, sensitivities
+from ..analysis.stability.operating_point import BRANCHES
 from ..core.arrays import State
 from ..core.axes import PerAxisMetric, packed
 from ..core.metrics import Tracking
@@ -22,10 +25,6 @@ from ..study.sweep_table import SENSITIVITY
 from ..tuning.data import make_data
 from .plan import TRAJECTORIES, Plan, plants_of, references_of, swept
 
-LINES = 400
-"""Frequencies, evenly on a logarithmic scale, at which sensitivity is looked at."""
-
-LOWEST = 1.0  # Hz
 _OUTSIDE = 1e-6  # of the unit circle: hysteresis remembers at 1, to rounding
 
 
@@ -109,9 +108,9 @@ class Simulator:
         noise: Float[Array, "runs samples *axes"],
         disturbance: Float[Array, "runs samples *axes"] | None,
     ) -> dict[str, Any]:
-        """Return what is kept of each run: arrays [runs, width, ...].
+        """Return the kept results of each run: arrays [runs, width, ...].
 
-        Of the sensitivity what it is worked out from, [width, branches, order, order].
+        Of the sensitivity those of ``_peaks``, [width, branches, ...].
         """
         paths = [axis.path for axis in self.plan.axes]
         metric = self._metric()
@@ -144,20 +143,19 @@ class Simulator:
 
         found = jax.lax.map(run, (reference, noise, disturbance))
         if SENSITIVITY in self.metrics:
-            found[SENSITIVITY] = jax.vmap(lambda v: self._open_loops(of_point(v)))(
-                values
-            )
+            found[SENSITIVITY] = jax.vmap(lambda v: self._peaks(of_point(v)))(values)
         names = (*self.metrics, *(TRAJECTORIES if self.every else ()))
         return {name: found[name] for name in names}
 
-    def _open_loops(self, loop: Feedback) -> tuple[Array, Array]:
-        """Return A and A - B C of the open loop, on both branches."""
-        study = self.case.study
+    def _peaks(self, loop: Feedback) -> tuple[Array, Array]:
+        """Return Ms and the matrix of the closed loop, both on every branch."""
+        point = OperatingPoint(self.case.study.highest, dt=self.case.study.dt)
         models = [
-            open_loop(loop, study.highest, branch, dt=study.dt) for branch in BRANCHES
+            open_loop(loop, dataclasses.replace(point, branch=name))
+            for name in BRANCHES
         ]
         return (
-            jnp.stack([model.A for model in models]),
+            jax.vmap(peak_of)(sensitivities(loop, point)),
             jnp.stack([model.A - model.B @ model.C for model in models]),
         )
 
@@ -213,7 +211,7 @@ class Simulator:
                 places = np.minimum(np.arange(first, first + width), stop - start - 1)
                 found = program(jax.device_put(values[places], device))
                 if SENSITIVITY in found:
-                    found[SENSITIVITY] = self._peaks(*found[SENSITIVITY])
+                    found[SENSITIVITY] = _worse(*found[SENSITIVITY])
                 parts[-1].append({name: np.asarray(x) for name, x in found.items()})
         return {
             name: self._joined(name, [[b[name] for b in p] for p in parts])[
@@ -221,28 +219,6 @@ class Simulator:
             ]
             for name in parts[0][0]
         }
-
-    def _peaks(self, opened: Any, closed: Any) -> np.ndarray:
-        """Return the peak of |1/(1+L)| of the worse branch; inf if that is unstable.
-
-        1 + L = det(z - A + B C) / det(z - A), so poles are all it takes. In NumPy: XLA
-        may wait for ever for LAPACK on a CPU.
-        """
-        opened, closed = np.asarray(opened), np.asarray(closed)
-        finite = np.isfinite(opened).all((-3, -2, -1))
-        finite &= np.isfinite(closed).all((-3, -2, -1))
-        zeros, poles = (
-            np.linalg.eigvals(np.where(finite[:, None, None, None], x, 0.0))
-            for x in (opened, closed)
-        )
-        study = self.case.study
-        lines = np.geomspace(LOWEST, 0.5 * study.rate, LINES)
-        z = np.exp(2j * np.pi * lines * study.dt)[:, None]
-        ratio = (z - zeros[..., None, :]) / (z - poles[..., None, :])
-        peaks = np.abs(np.prod(ratio, axis=-1)).max(axis=-1)
-        stable = (np.abs(poles) <= 1.0 + _OUTSIDE).all(axis=-1)
-        worse = np.where(stable, peaks, np.inf).max(axis=-1)
-        return np.where(finite, worse, np.nan)
 
     def _joined(self, name: str, parts: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
         if name == SENSITIVITY:
@@ -252,3 +228,18 @@ class Simulator:
         whole = np.moveaxis(whole, 2, 0)
         shape = (*whole.shape[:2], len(self.references), self.draws, *whole.shape[3:])
         return np.ascontiguousarray(whole.reshape(shape))
+
+
+def _worse(peaks: Any, closed: Any) -> np.ndarray:
+    """Return Ms [points] of the worse branch from ``peaks`` [points, branches].
+
+    It is infinite where ``closed`` [points, branches, order, order] has a pole outside
+    the unit circle, NaN where that is not finite. In NumPy: XLA may wait for LAPACK
+    without end on a CPU.
+    """
+    peaks, closed = np.asarray(peaks), np.asarray(closed)
+    finite = np.isfinite(closed).all((-3, -2, -1))
+    poles = np.linalg.eigvals(np.where(finite[:, None, None, None], closed, 0.0))
+    stable = (np.abs(poles) <= 1.0 + _OUTSIDE).all(axis=-1)
+    worse = np.where(stable, peaks, np.inf).max(axis=-1)
+    return np.where(finite, worse, np.nan)

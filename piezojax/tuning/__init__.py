@@ -4,7 +4,7 @@ from .comparison import Comparison as Comparison
 from .comparison import compare as compare
 from .coupling import Coupling as Coupling
 from .coupling import coupling_matrix as coupling_matrix
+from .outcome import Outcome as Outcome
 from .result import Result as Result
 from .result import load_result as load_result
-from .tuner import Outcome as Outcome
 from .tuner import tune as tune

@@ -9,8 +9,9 @@ from pydantic import BaseModel
 from ..core.progress import Progress, Silent
 from ..study import ComparedCase
 from ..study.comparison_study import Start
+from .outcome import Outcome
 from .result import Result, Status
-from .tuner import Outcome, tune
+from .tuner import tune
 
 COMPARISON_FILE = "comparison.json"
 

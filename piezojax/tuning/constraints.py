@@ -1,4 +1,4 @@
-"""What tuned gains must keep: limits with a meaning, measured and pulled in."""
+"""Constraints on tuned gains: how they are measured, and how much is violated."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple
@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..analysis.stability.impulse import (
+from ..analysis.stability.differentiable import (
     Sensitivity,
     delay_margin_of,
     disk_margin_of,
@@ -17,15 +17,16 @@ from ..core.metrics import ExtremeFigures, TrackingFigures
 
 CAP = 3.0
 """Logarithm of value over limit beyond which a violation grows slowly: the loop is
-unstable then, and how much so has no meaning."""
+unstable there, and the size of the violation has no meaning."""
 
 
-class Seen(NamedTuple):
-    """What constraints look at.
+class LoopFigures(NamedTuple):
+    """Figures of a loop from which constraints are evaluated.
 
-    Figures of every plant, reference and draw; ``sensitivity`` S of every plant on
-    which margins are kept, and branch. ``extremes`` and ``sensitivity`` are None unless
-    a limit needs them. ``dt`` in s.
+    ``figures`` and ``extremes`` hold arrays [plants, references, draws];
+    ``sensitivity`` is S [plants, branches, lines] on the plants on which margins are
+    constrained. ``extremes`` and ``sensitivity`` are None unless a limit needs them.
+    ``dt`` in s.
     """
 
     figures: TrackingFigures
@@ -34,28 +35,29 @@ class Seen(NamedTuple):
     dt: float
 
 
-Need = Literal["figures", "extremes", "sensitivity"]
+Source = Literal["figures", "extremes", "sensitivity"]
+"""Field of ``LoopFigures`` from which a constraint is evaluated."""
 
 
 class Constraint(NamedTuple):
-    """A limit: what it bounds, in which unit and direction, and how it is read off.
+    """Definition of a constraint: unit, direction, and the figure that is limited.
 
-    ``values`` is given the part of what is seen that it ``needs``, and dt, and returns
-    values with the plants on the first axis.
+    ``values`` maps the field ``source`` of the LoopFigures, and dt, to values with the
+    plants on the first axis.
     """
 
     unit: str
     sense: Literal["at most", "at least"]
-    needs: Need
+    source: Source
     values: Callable[[Any, float], Array]
 
-    def read(self, seen: Seen) -> Array:
+    def read(self, loop: LoopFigures) -> Array:
         """Return the values in the unit, of shape [plants] or [plants, branches]."""
-        return self.values(getattr(seen, self.needs), seen.dt)
+        return self.values(getattr(loop, self.source), loop.dt)
 
 
 def _largest(runs: Array) -> Array:
-    """Return the largest of the runs of each plant."""
+    """Return the largest value [plants] of ``runs`` [plants, references, draws]."""
     return jnp.max(runs, axis=(1, 2))
 
 
@@ -85,24 +87,24 @@ CONSTRAINTS: dict[str, Constraint] = {
 """Constraints by the name a study uses."""
 
 
-def needs(names: Iterable[str], what: Need) -> bool:
-    """Return whether one of the constraints ``names`` needs ``what``."""
-    return any(CONSTRAINTS[name].needs == what for name in names)
+def uses(names: Iterable[str], source: Source) -> bool:
+    """Return whether one of the constraints ``names`` is evaluated from ``source``."""
+    return any(CONSTRAINTS[name].source == source for name in names)
 
 
 def violations(
-    limits: Mapping[str, Array | float], seen: Seen
+    limits: Mapping[str, Array | float], loop: LoopFigures
 ) -> Float[Array, " constraints"]:
-    """Return ln(value/limit), or its negative, of all limits: above 0 is violated.
+    """Return ln(value/limit), or its negative for a lower limit, of all ``limits``.
 
-    One for each plant and branch, in the order of ``limits``; an infinite or undefined
-    value counts as badly violated.
+    A number above 0 is a violation. One number for each plant and branch, in the order
+    of ``limits``; an infinite or undefined value counts as a large violation.
     """
     found = []
     for name, limit in limits.items():
         kind = CONSTRAINTS[name]
         sign = 1.0 if kind.sense == "at most" else -1.0
-        value = jnp.maximum(kind.read(seen).ravel(), 1e-12)
+        value = jnp.maximum(kind.read(loop).ravel(), 1e-12)
         by = sign * (jnp.log(value) - jnp.log(limit))
         by = jnp.where(jnp.isfinite(by), by, 100.0 * CAP)
         far = by > CAP
@@ -111,12 +113,12 @@ def violations(
     return jnp.concatenate(found) if found else jnp.zeros(0)
 
 
-def by_stage(limits: Iterable[str], seen: Seen) -> dict[str, Array]:
-    """Return the value of each stage nearest to, or farthest beyond, each limit."""
+def worst_by_plant(limits: Iterable[str], loop: LoopFigures) -> dict[str, Array]:
+    """Return the value [plants] nearest to, or farthest beyond, each limit."""
     pick = {"at most": jnp.max, "at least": jnp.min}
     found = {}
     for name in limits:
-        values = CONSTRAINTS[name].read(seen)
+        values = CONSTRAINTS[name].read(loop)
         values = values.reshape(values.shape[0], -1)
         found[name] = pick[CONSTRAINTS[name].sense](values, axis=1)
     return found

@@ -1,4 +1,4 @@
-"""Loops simulated on signals and stages, compiled once for each shape of them."""
+"""Evaluation of loops on signals and stages, compiled once for each shape."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,17 +6,21 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from ..analysis.stability.impulse import sensitivities
+from ..analysis.stability.differentiable import sensitivities
+from ..analysis.stability.operating_point import OperatingPoint
 from ..core.metrics import Extremes, TrackingFigures
 from ..core.system import Feedback
 from ..solve.clock import Clock
 from ..study import Case, Stage
-from .constraints import Seen, needs
+from .constraints import LoopFigures, uses
 from .runs import Signals, evaluate
 
 
-class Judge:
-    """Simulates loops on signals; compiled once for each shape of them."""
+class Evaluator:
+    """Simulates loops on signals; each shape of signals is compiled once.
+
+    ``start`` is the first sample that counts; ``clock`` measures compilation.
+    """
 
     def __init__(self, clock: Clock, case: Case, start: int):
         self._clock, self._case, self._start = clock, case, start
@@ -28,7 +32,7 @@ class Judge:
         return self._programs[key]
 
     def figures(self, loop: Feedback, signals: Signals) -> TrackingFigures:
-        """Return the figures by reference and draw."""
+        """Return the figures [references, draws] of ``loop``."""
         program = self._compiled(
             f"figures {signals.noise.shape}",
             lambda loop, signals: evaluate(lambda x: x, loop, signals, self._start),
@@ -37,12 +41,12 @@ class Judge:
         )
         return program(loop, signals)
 
-    def on_stages(self, loop: Feedback, stages: Stage, signals: Signals) -> Seen:
-        """Return what is seen of ``loop`` on ``stages``, stacked on a leading axis."""
+    def on_stages(self, loop: Feedback, stages: Stage, signals: Signals) -> LoopFigures:
+        """Return the figures of ``loop`` on ``stages``, stacked on a leading axis."""
         dynamic, static = eqx.partition(stages, eqx.is_array)
         signals = signals.for_another_plant()
         limits = self._case.study.constraints.limits
-        beside = Extremes() if needs(limits, "extremes") else None
+        beside = Extremes() if uses(limits, "extremes") else None
 
         def run(loop, dynamic, signals):
             def around(part):
@@ -54,15 +58,16 @@ class Judge:
             figures = jax.lax.map(one, dynamic)
             figures, extremes = figures if beside else (figures, None)
             margins = None
-            if needs(limits, "sensitivity"):
+            if uses(limits, "sensitivity"):
                 study = self._case.study
-                margins = jax.vmap(
-                    lambda part: sensitivities(around(part), study.highest, study.dt)
-                )(dynamic)
+                point = OperatingPoint(study.highest, dt=study.dt)
+                margins = jax.vmap(lambda part: sensitivities(around(part), point))(
+                    dynamic
+                )
             return figures, extremes, margins
 
         count = jax.tree.leaves(dynamic)[0].shape[0]
         program = self._compiled(
             f"{count} stages {signals.noise.shape}", run, loop, dynamic, signals
         )
-        return Seen(*program(loop, dynamic, signals), dt=self._case.study.dt)
+        return LoopFigures(*program(loop, dynamic, signals), dt=self._case.study.dt)

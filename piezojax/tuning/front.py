@@ -13,12 +13,12 @@ from ..solve.multi_start import Strategy, minimise
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import SearchState
 from ..study import Case
-from .constraints import CONSTRAINTS, by_stage
+from .constraints import CONSTRAINTS, worst_by_plant
 from .objective import Objective
-from .result import FrontPoint, Kept
+from .result import ConstraintOutcome, FrontPoint
 
 Place = tuple[np.ndarray, FrontPoint]
-"""A point of the unit box, and what it is on the front."""
+"""A point of the unit box, and the same point on the front."""
 
 
 def trace_front(
@@ -41,8 +41,8 @@ def trace_front(
     limits = case.study.constraints.limits
 
     def look(objective: Objective, unit: Array) -> tuple[dict[str, Array], Array]:
-        seen = objective.seen(unit)
-        return by_stage(objective.limits, seen), seen.figures.rms_error[0]
+        loop = objective.figures(unit)
+        return worst_by_plant(objective.limits, loop), loop.figures.rms_error[0]
 
     program = clock.compiled(look, objective, as_array(search.unit))
     loosest_first = sorted(
@@ -56,7 +56,9 @@ def trace_front(
         unit = here.unit
         values, rms = jax.tree.map(np.asarray, program(asked, as_array(unit)))
         rms = np.sqrt(np.mean(rms**2, axis=1))
-        reached = Kept.of_values(table.constraint, limit, values[table.constraint])
+        reached = ConstraintOutcome.of_values(
+            table.constraint, limit, values[table.constraint]
+        )
         return unit, FrontPoint(
             limit=limit,
             value=reached.value,

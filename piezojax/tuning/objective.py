@@ -1,4 +1,4 @@
-"""What tuning minimises: normalised tracking errors over references and noise draws."""
+"""Objective of tuning: normalised tracking errors over references and noise draws."""
 
 import dataclasses
 import math
@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..analysis.stability.impulse import sensitivities
+from ..analysis.stability.differentiable import sensitivities
+from ..analysis.stability.operating_point import OperatingPoint
 from ..core.arrays import as_array
 from ..core.metrics import Extremes, TrackingFigures
 from ..core.space import Space
@@ -18,7 +19,7 @@ from ..core.system import Feedback
 from ..solve.augmented_lagrangian import PENALTY, augmented
 from ..solve.problem import HOPELESS, Errors, Verdict
 from ..study import Stage
-from .constraints import Seen, needs, violations
+from .constraints import LoopFigures, uses, violations
 from .runs import Signals, sampled
 
 T = TypeVar("T")
@@ -47,11 +48,11 @@ class Objective(eqx.Module):
     for each stage and reference. ``aggregate`` joins them: ``geometric_mean`` (mean of
     logarithms: a tenfold gain counts the same on every reference), ``mean_square``, or
     ``worst`` (a smooth maximum of the logarithms). ``weights`` says how much each
-    counts (alike if left out); what is ``resting``, an axis that should not move,
+    counts (alike if left out); a ``resting`` trace, of an axis that should not move,
     counts only as far as its error exceeds its scale.
 
     ``stages``, stacked on a leading axis, take the place of the loop's own; ``over``
-    joins them: their mean, the worst, or the mean of the worst ``tail`` of them.
+    joins them: their mean, the worst, or the mean of the worst share ``tail``.
     ``effort_weight`` and ``slew_weight`` add the mean RMS voltage and RMS voltage
     change a sample, both as a share of ``voltage_span``.
 
@@ -103,17 +104,14 @@ class Objective(eqx.Module):
         arrays = {name: as_array(limit) for name, limit in limits.items()}
         return dataclasses.replace(self, limits=arrays)
 
-    def seen(self, unit: Float[Array, " n"]) -> Seen:
-        """Return what errors and constraints are read from.
-
-        Figures of shape [stages, references, draws].
-        """
+    def figures(self, unit: Float[Array, " n"]) -> LoopFigures:
+        """Return the figures [stages, references, draws] of errors and constraints."""
         return self._sampled(unit)[0]
 
     def _sampled(
         self, unit: Float[Array, " n"], every: int = 1
-    ) -> tuple[Seen, Array | None]:
-        beside = Extremes() if needs(self.limits, "extremes") else None
+    ) -> tuple[LoopFigures, Array | None]:
+        beside = Extremes() if uses(self.limits, "extremes") else None
         signals = self.signals
         if self.stages is not None:
             signals = signals.for_another_plant()
@@ -133,13 +131,14 @@ class Objective(eqx.Module):
             )
 
         def margins(stage):
-            return sensitivities(loop_of(unit, stage), self.highest, self.dt)
+            point = OperatingPoint(self.highest, dt=self.dt)
+            return sensitivities(loop_of(unit, stage), point)
 
         figures, errors = _on_each(run, self.stages)
         figures, extremes = figures if beside else (figures, None)
-        known = needs(self.limits, "sensitivity")
+        known = uses(self.limits, "sensitivity")
         found = _on_each(margins, self.margin_stages) if known else None
-        return Seen(figures, extremes, found, dt=self.dt), errors
+        return LoopFigures(figures, extremes, found, dt=self.dt), errors
 
     def _normalised(self, figures: TrackingFigures) -> Array:
         square = jnp.mean(figures.rms_error**2, axis=2)
@@ -183,9 +182,9 @@ class Objective(eqx.Module):
             return jnp.mean(jnp.sort(joined)[-worst:])
         return jnp.mean(joined)
 
-    def _judged(self, seen: Seen) -> tuple[Array, Array]:
-        prices = [weight * value for weight, value in self._prices(seen.figures)]
-        return self._error(seen.figures) + sum(prices), violations(self.limits, seen)
+    def _judged(self, loop: LoopFigures) -> tuple[Array, Array]:
+        prices = [weight * value for weight, value in self._prices(loop.figures)]
+        return self._error(loop.figures) + sum(prices), violations(self.limits, loop)
 
     def _added(self, violation: Array) -> Array:
         multipliers = self.multipliers
@@ -194,16 +193,16 @@ class Objective(eqx.Module):
         return augmented(violation, multipliers, self.penalty)
 
     def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
-        """Return what is minimised; ``HOPELESS`` where the loop diverges or rails."""
+        """Return the loss; ``HOPELESS`` where the loop diverges or rails."""
         return self.both(unit)[0]
 
     def both(self, unit: Float[Array, " n"]) -> tuple[Float[Array, ""], Verdict]:
         """Return ``loss`` and ``verdict`` of one simulation."""
-        return self._whole(self.seen(unit))[:2]
+        return self._whole(self.figures(unit))[:2]
 
-    def _whole(self, seen: Seen) -> tuple[Array, Verdict, Array]:
-        """Return loss, verdict, and what the augmented Lagrangian adds."""
-        total, violation = self._judged(seen)
+    def _whole(self, figures: LoopFigures) -> tuple[Array, Verdict, Array]:
+        """Return the loss, the verdict, and the roots of the added terms."""
+        total, violation = self._judged(figures)
         added = self._added(violation)
         loss, alone = (
             jnp.where(jnp.isfinite(x), x, HOPELESS)
@@ -213,13 +212,14 @@ class Objective(eqx.Module):
 
     def errors(self, unit: Float[Array, " n"], every: int) -> Errors:
         """Return the objective and one of ``every`` errors of each run."""
-        seen, errors = self._sampled(unit, every)
+        loop, errors = self._sampled(unit, every)
         assert errors is not None
-        slope = jax.grad(lambda rms: self._error(seen.figures._replace(rms_error=rms)))(
-            seen.figures.rms_error
+        tracking = loop.figures
+        slope = jax.grad(lambda rms: self._error(tracking._replace(rms_error=rms)))(
+            tracking.rms_error
         )
-        weights = slope / jnp.maximum(seen.figures.rms_error, _FLOOR)
-        loss, verdict, added = self._whole(seen)
+        weights = slope / jnp.maximum(tracking.rms_error, _FLOOR)
+        loss, verdict, added = self._whole(loop)
         flat = errors.reshape(-1, errors.shape[-1])
         return Errors(loss, verdict, flat, added, weights.ravel())
 
@@ -229,23 +229,23 @@ class Objective(eqx.Module):
 
     def violated(self, unit: Float[Array, " n"]) -> Float[Array, " constraints"]:
         """Return every violation, as ``constraints.violations``."""
-        return self._judged(self.seen(unit))[1]
+        return self._judged(self.figures(unit))[1]
 
     def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " residuals"]:
-        """Return what least squares minimises: the squares sum to a mean-square loss.
+        """Return residuals whose squares sum to the loss, a mean square.
 
         Raises ValueError for another aggregate.
         """
         if self.aggregate != "mean_square":
             raise ValueError(f"least squares cannot minimise {self.aggregate!r}")
-        seen = self.seen(unit)
-        normalised = self._normalised(seen.figures)
+        loop = self.figures(unit)
+        normalised = self._normalised(loop.figures)
         shares = self._shares() / normalised.shape[0]
         parts = [(normalised * jnp.sqrt(shares)).ravel()]
-        for weight, value in self._prices(seen.figures):
+        for weight, value in self._prices(loop.figures):
             if weight > 0.0:
                 parts.append(jnp.sqrt(weight * value)[None])
-        parts.append(self._added(violations(self.limits, seen)))
+        parts.append(self._added(violations(self.limits, loop)))
         every = jnp.concatenate(parts)
         finite = jnp.all(jnp.isfinite(every))
         return jnp.where(finite, every, jnp.sqrt(HOPELESS / every.size))

@@ -1,4 +1,4 @@
-"""The outcome of tuning: what ``result.json`` holds, and how it is written and read."""
+"""Result of tuning: the content of ``result.json``, and how it is read."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +11,7 @@ from ..core.files import read_model
 from ..core.metrics import TrackingFigures
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import Status
-from .constraints import CONSTRAINTS, Seen, by_stage
+from .constraints import CONSTRAINTS, LoopFigures, worst_by_plant
 from .objective import RAILED
 
 RESULT_FILE = "result.json"
@@ -35,11 +35,11 @@ class Scores(BaseModel):
         return self.geomean_rms_um is not None and not railed
 
 
-class Kept(BaseModel):
-    """A limit and what became of it: the ``value`` nearest to it, over all plants.
+class ConstraintOutcome(BaseModel):
+    """Outcome of a constraint: its limit, and the ``value`` nearest to it on any plant.
 
-    ``kept`` allows for ``solve.problem.TOLERANCE``; ``active`` is a limit that is kept,
-    but by less than 2 %: it costs something.
+    ``kept`` allows for ``solve.problem.TOLERANCE``; an ``active`` limit is kept by less
+    than 2 %. It is kept on ``on`` of ``of`` plants.
     """
 
     limit: float
@@ -49,12 +49,13 @@ class Kept(BaseModel):
     kept: bool
     active: bool
     on: int
-    """Plants on which it is kept."""
     of: int
 
     @classmethod
-    def of_values(cls, name: str, limit: float, values: np.ndarray) -> "Kept":
-        """Return what became of constraint ``name``, given its value on each plant."""
+    def of_values(
+        cls, name: str, limit: float, values: np.ndarray
+    ) -> "ConstraintOutcome":
+        """Return the outcome of constraint ``name`` from its values [plants]."""
         kind = CONSTRAINTS[name]
         at_most = kind.sense == "at most"
         values = np.where(np.isfinite(values), values, np.inf if at_most else -np.inf)
@@ -76,10 +77,10 @@ class Kept(BaseModel):
 
 
 class FrontPoint(BaseModel):
-    """One point of a Pareto front: a limit, and the best gains found that keep it.
+    """Point of a Pareto front: a limit, and the best gains found that keep it.
 
-    ``value`` is what the limited figure came to on the plants of the objective,
-    ``loss`` the objective, ``geomean_rms_um`` the error on the nominal plant.
+    ``value`` is the limited figure on the plants of the objective, ``loss`` the
+    objective, ``geomean_rms_um`` the error on the nominal plant.
     """
 
     limit: float
@@ -91,15 +92,15 @@ class FrontPoint(BaseModel):
 
 
 class Perturbed(BaseModel):
-    """The same gains on ``plants`` off their nominal values, drawn for the hold-out.
+    """Figures of the tuned gains on perturbed plants, drawn for the hold-out.
 
     ``unstable`` counts plants on which a run diverges or rails. ``geomeans_um`` and
     ``geomeans_before_um`` hold the geometric mean of the errors of the driven axes by
     plant, None where a loop is unstable. ``median_better`` and ``worst_better`` are how
     many times smaller it is than before, on the plant in the middle and on the worst
     one of those on which both are stable; ``coupling_better`` is the median of the axes
-    at rest. ``constraints`` say what became of the limits there, ``values`` holds what
-    they limit by plant.
+    at rest. ``constraints`` holds the outcome of the limits there, ``values`` the
+    limited figures by plant.
     """
 
     plants: int
@@ -112,18 +113,18 @@ class Perturbed(BaseModel):
     coupling_better: float | None
     geomeans_before_um: list[float | None] = []
     geomeans_um: list[float | None] = []
-    constraints: dict[str, Kept] = {}
+    constraints: dict[str, ConstraintOutcome] = {}
     values: dict[str, list[float | None]] = {}
 
     @classmethod
     def of(
         cls,
-        before: Seen,
-        after: Seen,
+        before: LoopFigures,
+        after: LoopFigures,
         driven: np.ndarray,
         limits: Mapping[str, float],
     ) -> "Perturbed":
-        """Return what is seen [plant, trace, draw] before and after tuning comes to."""
+        """Return the summary of figures [plants, traces, draws] before and after."""
         means, lost = [], []
         for figures in (before.figures, after.figures):
             rms = np.sqrt(np.mean(np.asarray(figures.rms_error) ** 2, axis=2))
@@ -136,7 +137,7 @@ class Perturbed(BaseModel):
         rest = (means[0] - means[1])[usable][:, ~driven]
         every = [np.exp(np.mean(mean[:, driven], axis=1)) for mean in means]
         errors = every[1][~lost[1]]
-        values = by_stage(limits, after)
+        values = worst_by_plant(limits, after)
         return cls(
             plants=len(usable),
             unstable_before=int(lost[0].sum()),
@@ -151,7 +152,7 @@ class Perturbed(BaseModel):
             geomeans_before_um=_numbers(np.where(lost[0], np.nan, every[0])),
             geomeans_um=_numbers(np.where(lost[1], np.nan, every[1])),
             constraints={
-                name: Kept.of_values(name, limits[name], np.asarray(found))
+                name: ConstraintOutcome.of_values(name, limits[name], np.asarray(found))
                 for name, found in values.items()
             },
             values={name: _numbers(found) for name, found in values.items()},
@@ -159,7 +160,7 @@ class Perturbed(BaseModel):
 
 
 class Result(BaseModel):
-    """Everything a tuning run found; ``result.json`` is this as JSON.
+    """Result of a tuning run, as it is written to ``result.json``.
 
     ``before`` and ``after`` are the study's own gains and the tuned ones on the tuning
     references and draws; ``holdout_before`` and ``holdout`` are the same two on noise
@@ -167,10 +168,10 @@ class Result(BaseModel):
     has not seen, with that noise too. On a stage with several axes these are the driven
     ones, each error in its own unit of ``units``; ``coupling_before`` and ``coupling``
     are the axes that should rest, under all references of the hold-out.
-    ``constraints`` says what became of the study's limits, ``front`` is its Pareto
-    front, and ``perturbed`` how the gains do on the held-out plants of its ensemble.
+    ``constraints`` holds the outcome of the study's limits, ``front`` its Pareto front,
+    and ``perturbed`` the figures of the gains on the held-out plants of its ensemble.
     ``history`` holds the lowest loss of each start after each step, ``times_s`` the
-    seconds from the begin of the search to the end of that step.
+    seconds from the start of the search to the end of that step.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -190,7 +191,7 @@ class Result(BaseModel):
     unseen: Scores | None
     coupling_before: Scores | None = None
     coupling: Scores | None = None
-    constraints: dict[str, Kept] = {}
+    constraints: dict[str, ConstraintOutcome] = {}
     front: list[FrontPoint] | None = None
     perturbed: Perturbed | None = None
     units: dict[str, str] = {}

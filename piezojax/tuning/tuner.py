@@ -1,6 +1,5 @@
-"""Tuning: screen the box, descend from the best starts, judge on what was held out."""
+"""Tuning: screen the box, descend from the best starts, evaluate on the hold-out."""
 
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,35 +15,22 @@ from ..solve.clock import Clock
 from ..solve.search_state import SearchState
 from ..study import Case, Stage, read, shipped
 from ..study.ensemble import Part
-from .baselines import Baselines, Budget, contest
-from .constraints import by_stage
+from .baselines import Budget, contest
+from .constraints import worst_by_plant
 from .data import Data, make_data
-from .evaluator import Judge
+from .evaluator import Evaluator
 from .front import trace_front
 from .objective import RAILED, Objective
-from .result import FrontPoint, Kept, Perturbed, Result, Scores, scores
-from .runs import Signals
+from .outcome import Outcome
+from .result import (
+    ConstraintOutcome,
+    FrontPoint,
+    Perturbed,
+    Result,
+    Scores,
+    scores,
+)
 from .search import search_box
-
-
-@dataclass
-class Outcome:
-    """A Result with the loops and signals behind it, for pictures and further use.
-
-    ``baselines`` are there if they were asked for.
-    """
-
-    result: Result
-    before: Feedback
-    after: Feedback
-    case: Case
-    holdout: Signals
-    baselines: Baselines | None = None
-
-    @property
-    def controller(self):
-        """The tuned controller."""
-        return self.after.controller
 
 
 def tune(
@@ -53,10 +39,10 @@ def tune(
     baselines: Budget | None = None,
     progress: Progress | None = None,
 ) -> Outcome:
-    """Tune the controller of a study and judge it on held-out noise and references.
+    """Tune the controller of a study and evaluate it on held-out noise and references.
 
     ``study`` is a Case, the path of a study file, or None for the default study.
-    With a budget the ``baselines`` are run on the same objective once that is done.
+    With a budget the ``baselines`` are run on the same objective afterwards.
     ``Ctrl-C`` ends the search and keeps the best gains found so far. A start that
     diverges is replaced by the best of the candidates. Raises ValueError when no point
     of the box, the start included, gives a stable loop.
@@ -69,12 +55,12 @@ def tune(
     first = round(table.references.settle * table.rate)
 
     progress.stage("simulating the start")
-    judge = Judge(clock, case, first)
-    before = judge.figures(case.loop, data.tuning)
+    evaluator = Evaluator(clock, case, first)
+    before = evaluator.figures(case.loop, data.tuning)
     stages = _stages(case, "tune")
     scale = _scale(before, data)[None]
     if stages is not None:
-        found = judge.on_stages(case.loop, stages, data.tuning).figures
+        found = evaluator.on_stages(case.loop, stages, data.tuning).figures
         scale = jax.vmap(lambda one: _scale(one, data, scale[0]))(found)
     objective = Objective(
         loop=case.loop,
@@ -105,11 +91,13 @@ def tune(
         if table.pareto is not None and strategy and search.status != "interrupted":
             front = trace_front(objective, case, search, strategy, clock, progress)
         progress.stage("judging on held-out noise")
-        result = _report(case, data, judge, before, after, search, clock, kept, front)
+        result = _report(
+            case, data, evaluator, before, after, search, clock, kept, front
+        )
     except KeyboardInterrupt:
         # What was found is kept; only a second interrupt ends this too.
         search.status = "interrupted"
-        result = _report(case, data, judge, before, after, search, clock, {}, None)
+        result = _report(case, data, evaluator, before, after, search, clock, {}, None)
     rivals = (
         contest(objective, case, data, search, baselines, progress)
         if baselines and search.status != "interrupted"
@@ -166,25 +154,29 @@ def _stages(case: Case, part: Part) -> Stage | None:
 
 
 def _perturbed(
-    case: Case, data: Data, judge: Judge, before: Feedback, after: Feedback
+    case: Case, data: Data, evaluator: Evaluator, before: Feedback, after: Feedback
 ) -> Perturbed | None:
     stages = case.ensemble.stages("holdout") if case.ensemble else None
     if stages is None:
         return None
     driven = np.array([trace.driven for trace in data.traces])
-    seen = [judge.on_stages(loop, stages, data.holdout) for loop in (before, after)]
+    seen = [evaluator.on_stages(loop, stages, data.holdout) for loop in (before, after)]
     return Perturbed.of(seen[0], seen[1], driven, case.study.constraints.limits)
 
 
-def _kept(objective: Objective, search: SearchState, clock: Clock) -> dict[str, Kept]:
-    """Return the limits and what became of them, on the plants of the tuning."""
+def _kept(
+    objective: Objective, search: SearchState, clock: Clock
+) -> dict[str, ConstraintOutcome]:
+    """Return the outcome of the limits on the plants of the tuning."""
     if not objective.limits:
         return {}
     unit = as_array(search.unit)
-    look = clock.compiled(lambda o, u: by_stage(o.limits, o.seen(u)), objective, unit)
+    look = clock.compiled(
+        lambda o, u: worst_by_plant(o.limits, o.figures(u)), objective, unit
+    )
     values = jax.tree.map(np.asarray, look(objective, unit))
     return {
-        name: Kept.of_values(name, float(limit), values[name])
+        name: ConstraintOutcome.of_values(name, float(limit), values[name])
         for name, limit in objective.limits.items()
     }
 
@@ -192,12 +184,12 @@ def _kept(objective: Objective, search: SearchState, clock: Clock) -> dict[str, 
 def _report(
     case: Case,
     data: Data,
-    judge: Judge,
+    evaluator: Evaluator,
     before: TrackingFigures,
     after: Feedback,
     search: SearchState,
     clock: Clock,
-    kept: dict[str, Kept],
+    kept: dict[str, ConstraintOutcome],
     front: list[FrontPoint] | None,
 ) -> Result:
     driven = np.array([trace.driven for trace in data.traces])
@@ -213,12 +205,12 @@ def _report(
             held(figures, ~driven),
         )
 
-    on_holdout = [judge.figures(loop, data.holdout) for loop in (case.loop, after)]
+    on_holdout = [evaluator.figures(loop, data.holdout) for loop in (case.loop, after)]
     holdout_before, unseen_before, coupling_before = both(on_holdout[0])
     holdout, unseen_after, coupling = both(on_holdout[1])
     tuned = driven[: data.tuned]
     names = data.names[: data.tuned]
-    after_scores = _chosen(judge.figures(after, data.tuning), names, tuned)
+    after_scores = _chosen(evaluator.figures(after, data.tuning), names, tuned)
     unit = np.asarray(search.unit)
     values = case.space.from_unit(as_array(unit))
     at_bound = [
@@ -244,7 +236,7 @@ def _report(
         coupling=coupling,
         constraints=kept,
         front=front,
-        perturbed=_perturbed(case, data, judge, case.loop, after),
+        perturbed=_perturbed(case, data, evaluator, case.loop, after),
         units={trace.name: trace.unit for trace in data.traces},
         gain_units={path: case.unit(path) for path in case.space.paths},
         warnings=[*search.warnings, *_warnings(case, at_bound, after_scores, holdout)],

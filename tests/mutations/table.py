@@ -112,31 +112,31 @@ MUTATIONS = (
     # Stability and limit
     Mutation(
         "Ms on one branch",
-        "analysis/stability/impulse.py",
+        "analysis/stability/differentiable.py",
         "jnp.asarray(list(BRANCHES.values()))",
         "jnp.asarray([*BRANCHES.values()][:1] * 2)",
-        ("tests/stability/test_impulse.py", "-k", "every_branch"),
+        ("tests/analysis/test_differentiable_margins.py", "-k", "every_branch"),
     ),
     Mutation(
         "delay margin without crossings with phase lead",
         "analysis/stability/margins.py",
         "samples = float((lag / places).min())",
         "samples = float(np.where(lag < np.pi, lag / places, np.inf).min())",
-        ("tests/stability/test_impulse.py", "-k", "lead"),
+        ("tests/analysis/test_differentiable_margins.py", "-k", "lead"),
     ),
     Mutation(
         "delay margin of a response without crossings with phase lead",
-        "analysis/stability/impulse.py",
+        "analysis/stability/differentiable.py",
         "jnp.min(jnp.where(crosses, there",
         "jnp.min(jnp.where(crosses & (there < jnp.pi), there",
-        ("tests/stability/test_impulse.py", "-k", "lead"),
+        ("tests/analysis/test_differentiable_margins.py", "-k", "lead"),
     ),
     Mutation(
         "delay not counted by the limit",
         "analysis/limit/wiener.py",
         "response = w**delay",
         "response = w**0",
-        ("tests/limit/test_wiener.py",),
+        ("tests/analysis/test_wiener.py",),
     ),
     # The loop and its hardware
     Mutation(

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from swept_studies import GRID
 
 import piezojax as pj
+from piezojax.analysis.stability import OperatingPoint
 from piezojax.cli.sweep import main
 from piezojax.core.paths import replace
 from piezojax.core.system import loop_inputs
@@ -151,12 +152,11 @@ def test_sensitivity_is_that_of_the_stability_report(case_of):
             loop = replace(case.loop, values)
             loop = pj.Feedback(loop.controller, plant, loop.actuator, loop.sensor)
             reports = [
-                pj.stability_report(loop, 5.0, branch)
+                pj.stability_report(loop, OperatingPoint(5.0, branch))
                 for branch in ("ascending", "descending")
             ]
             peaks = [r.sensitivity_peak if r.stable else np.inf for r in reports]
             peak = float(found.sensitivity_peak.sel(values).sel(plant=name))
-            # The report refines what the sweep looks up on a grid of frequencies.
             assert peak == pytest.approx(max(peaks), rel=2e-3)
     at_five = found.sensitivity_peak.sel({"controller.feedback.law.integral": 5.0})
     assert np.isfinite(at_five).sum() == 3  # one of them is not stable

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import piezojax as pj
+from piezojax.cli.terminal import console
 from piezojax.report.baseline_curves import (
     baselines_table,
     baselines_text,
     write_baselines,
 )
-from piezojax.report.console import console
 from piezojax.solve.clock import Clock
 from piezojax.solve.history import History
 from piezojax.study import Study, build

@@ -11,7 +11,7 @@ from piezojax.identification.records.record import Record
 from piezojax.solve.clock import Clock
 from piezojax.study import Study, build
 from piezojax.tuning.data import make_data
-from piezojax.tuning.evaluator import Judge
+from piezojax.tuning.evaluator import Evaluator
 from piezojax.tuning.objective import HOPELESS, Objective
 from piezojax.tuning.runs import Signals
 
@@ -130,7 +130,7 @@ def still():
 
 def test_a_perturbed_plant_starts_at_rest_where_it_is_judged(still):
     case, stages, data = still
-    seen = Judge(Clock(), case, 0).on_stages(case.loop, stages, data.holdout)
+    seen = Evaluator(Clock(), case, 0).on_stages(case.loop, stages, data.holdout)
     np.testing.assert_allclose(seen.figures.rms_error, 0.0, atol=1e-12)
 
 

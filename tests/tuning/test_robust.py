@@ -12,7 +12,7 @@ import pytest
 import tomli_w
 
 import piezojax as pj
-from piezojax.analysis.stability import stability_report
+from piezojax.analysis.stability import OperatingPoint, stability_report
 from piezojax.catalog import p753, p753_stage
 from piezojax.core.metrics import TrackingFigures
 from piezojax.core.paths import replace
@@ -95,7 +95,10 @@ def outcome(tmp_path_factory):
 def exact_peak(loop, stage):
     """Return Ms on the worse branch at the top of the references, by poles and QR."""
     other = stage.around(loop)
-    reports = [stability_report(other, 2.0, b) for b in ("ascending", "descending")]
+    reports = [
+        stability_report(other, OperatingPoint(2.0, b))
+        for b in ("ascending", "descending")
+    ]
     return max(report.sensitivity_peak for report in reports)
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from ...core.arrays import Scalar, State, as_array
 from ...core.rollout import simulate
 from ...core.system import Feedback, LoopSample, System
-from ..stability.broken_loop import loop_sample_time
+from ..stability.operating_point import loop_sample_time
 from .linear_plant import LinearPlant
 from .linear_problem import Problem, problem_of
 from .loop_runs import simulated

@@ -26,7 +26,7 @@ import numpy as np
 
 from ...core.arrays import as_array
 from ...core.system import Feedback
-from ..stability.broken_loop import loop_sample_time
+from ..stability.operating_point import loop_sample_time
 from .linear_problem import problem_of
 from .loop_runs import quiet_error, simulated
 from .reached import Curves, LimitReport, Reached, Shares

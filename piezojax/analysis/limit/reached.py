@@ -1,4 +1,4 @@
-"""What there is to say of a loop and the limit of linear control, by reference."""
+"""Comparison of a loop with the linear-control limit, by reference."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -61,7 +61,7 @@ class Reached:
 
 @dataclass(frozen=True)
 class Curves:
-    """What is drawn, by frequency (Hz): spectra, in um^2, whose mean is a variance.
+    """Spectra by frequency (Hz), in um^2; the mean of a spectrum is a variance.
 
     ``unforeseen`` [references, lines]; ``noise`` is flat. ``tuned`` and ``limit``
     [references, lines] are of the errors.
@@ -76,12 +76,12 @@ class Curves:
 
 @dataclass(frozen=True)
 class LimitReport:
-    """How near a loop comes to what linear control can do, by reference.
+    """Distance of a loop from the limit of linear control, by reference.
 
     ``noise_rms`` in um; ``resolution`` of the spectra in Hz; ``gain`` of the linear
     plant at rest in um/V and ``delay``, that of the plant's inner part for slow
-    motion, in samples. ``sensitivity_peak`` is that of the one controller: how little
-    the limit cares for robustness. ``dt`` in s.
+    motion, in samples. ``sensitivity_peak`` is that of the one controller, which the
+    limit does not bound. ``dt`` in s.
     """
 
     references: dict[str, Reached]
@@ -92,6 +92,26 @@ class LimitReport:
     delay: float
     sensitivity_peak: float
     curves: Curves
+
+    @property
+    def worst(self) -> str:
+        """Name of the reference whose error is the most times its limit."""
+        return max(self.references, key=lambda name: self.references[name].over)
+
+    def densities(self, name: str) -> dict[str, np.ndarray]:
+        """Return one-sided amplitude densities [lines] of a reference, um per root Hz.
+
+        Of the "unforeseen" disturbance, of the sensor's "noise", of the error at the
+        "limit", and of the error of the "tuned" loop.
+        """
+        i, curves = list(self.references).index(name), self.curves
+        spectra = {
+            "unforeseen": curves.unforeseen[i],
+            "noise": np.full_like(curves.frequency, curves.noise),
+            "limit": curves.limit[i],
+            "tuned": curves.tuned[i],
+        }
+        return {key: np.sqrt(2.0 * self.dt * s) for key, s in spectra.items()}
 
     @property
     def near(self) -> int:

@@ -1,64 +1,226 @@
-"""The stability of any loop at an operating point."""
+"""Stability of any loop at an operating point, and of several loops side by side."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, overload
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, overload
 
 import jax
 import numpy as np
 
-from ...core.arrays import ScalarLike, as_signal
+from ...core.arrays import ScalarLike
 from ...core.system import Feedback, LoopState
-from .margins import StabilityReport, linear_axes, linear_loop, located_report
-from .multi_axis import MultiAxisReport, axes_report_of
+from .axes_margins import MultiAxisReport, axes_report_of
+from .conserved import LinearAxes, LinearLoop
+from .crossings import angle_grid
+from .margins import (
+    StabilityReport,
+    largest_singular,
+    linear_axes,
+    linear_loop,
+    located_report,
+)
+from .operating_point import BRANCHES, OperatingPoint
+
+_SAME = 1e-5
+"""Relative difference of L below which two branches count as one."""
+
+
+@overload
+def stability_report(loop: Feedback, at: ScalarLike = 0.0) -> StabilityReport: ...
 
 
 @overload
 def stability_report(
-    loop: Feedback,
-    reference: ScalarLike = 0.0,
-    branch: str = "ascending",
-    state: LoopState | None = None,
-    dt: float | None = None,
-) -> StabilityReport: ...
-
-
-@overload
-def stability_report(
-    loop: Feedback,
-    reference: Sequence[ScalarLike] | np.ndarray,
-    branch: str = "ascending",
-    state: LoopState | None = None,
-    dt: float | None = None,
+    loop: Feedback, at: Sequence[ScalarLike] | np.ndarray
 ) -> MultiAxisReport: ...
 
 
+@overload
+def stability_report(loop: Feedback, at: OperatingPoint) -> Any: ...
+
+
 def stability_report(
-    loop: Feedback,
-    reference: Any = 0.0,
-    branch: str = "ascending",
-    state: LoopState | None = None,
-    dt: float | None = None,
+    loop: Feedback, at: Any = 0.0
 ) -> StabilityReport | MultiAxisReport:
-    """Return the stability of ``loop`` for small motions around ``reference`` (um).
+    """Return the stability of ``loop`` for small motions around an operating point.
 
-    With a vector or tuple as ``reference``, a number an axis in its unit, a
-    MultiAxisReport. ``branch`` is "ascending" or "descending": the side from which the
-    slope of a hysteresis is taken, see ``broken_loop``. ``state`` is an operating point
-    other than rest on the virgin curve, such as the last state of a simulation; ``dt``
-    (s) is needed only if the loop names no sample time.
+    ``at`` is an ``OperatingPoint``, or the reference (um) at which the loop rests, on
+    the ascending branch of its hysteresis. With a vector or a tuple as reference, one
+    number an axis in its unit, the report is a MultiAxisReport.
 
-    Raises ValueError if the loop cannot rest at ``reference``, its derivatives are not
-    finite, the sample time is not known or the branch is none.
+    Raises ValueError if the loop cannot rest at the reference, its derivatives are not
+    finite, or its sample time is not known.
     """
-    signal = as_signal(reference)
-    if not isinstance(signal, tuple):
-        model, start = linear_loop(loop, reference, branch, state, dt)
-        return located_report(model, float(reference), start, branch)
-    axes, start = linear_axes(loop, signal, branch, state, dt)
+    point = OperatingPoint.at(at)
+    if not isinstance(point.signal, tuple):
+        return located_report(*linear_loop(loop, point), point)
+    return _located_axes_report(*linear_axes(loop, point), point)
+
+
+def _located_axes_report(
+    model: LinearAxes, start: LoopState, point: OperatingPoint
+) -> MultiAxisReport:
     return dataclasses.replace(
-        axes_report_of(axes),
-        reference=tuple(float(r) for r in signal),
+        axes_report_of(model),
+        reference=tuple(float(r) for r in jax.tree.leaves(point.signal)),
         command=tuple(float(u) for u in jax.tree.leaves(start.voltage)),
-        branch=branch,
+        branch=point.branch,
     )
+
+
+class LoopCurves(NamedTuple):
+    """Frequency responses of a loop of one axis, all arrays [lines].
+
+    ``frequency`` in Hz; L, S = 1/(1+L) and T = L/(1+L) are complex.
+    """
+
+    frequency: np.ndarray
+    L: np.ndarray
+    S: np.ndarray
+    T: np.ndarray
+
+
+class AxesCurves(NamedTuple):
+    """Sizes of the sensitivities of a loop of several axes.
+
+    ``frequency`` [lines] in Hz; ``each`` [axes, lines] is |S| of one axis with all
+    others closed, ``largest`` [lines] the largest singular value of S.
+    """
+
+    frequency: np.ndarray
+    each: np.ndarray
+    largest: np.ndarray
+
+
+@dataclass(frozen=True)
+class AxesStability:
+    """Report and linear loop of several axes, on the branch with the smaller margin."""
+
+    report: MultiAxisReport
+    loop: LinearAxes
+
+    def curves(self) -> AxesCurves:
+        """Return the sizes of the sensitivities over frequency."""
+        angle = angle_grid(self.loop)
+        alone = [self.loop.one_cut(axis) for axis in range(len(self.loop.C))]
+        return AxesCurves(
+            angle / (2.0 * np.pi * self.loop.dt),
+            np.array([np.abs(1.0 / (1.0 + one.response(angle))) for one in alone]),
+            largest_singular(self.loop.sensitivity(angle)),
+        )
+
+
+class WorstMargins(NamedTuple):
+    """Largest Ms and smallest margins of several reports of stable loops."""
+
+    sensitivity_peak: float
+    gain_margin_dB: float  # noqa: N815
+    phase_margin_deg: float
+    delay_margin_samples: float
+
+
+def worst_margins(reports: Sequence[StabilityReport]) -> WorstMargins | None:
+    """Return the worst figures of ``reports``, None if one loop is unstable."""
+    if not all(report.stable for report in reports):
+        return None
+
+    def each(name: str) -> list[float]:
+        return [getattr(report, name) for report in reports]
+
+    return WorstMargins(
+        max(each("sensitivity_peak")),
+        min(each("gain_margin_dB")),
+        min(each("phase_margin_deg")),
+        min(each("delay_margin_samples")),
+    )
+
+
+@dataclass
+class StabilityReports:
+    """Stability of several loops at one reference: the content of ``stability.json``.
+
+    ``reports`` and ``loops`` hold the reports and linear loops of one axis by name and
+    branch, ``axes`` those of several axes, named ``axis_names``. ``problems`` holds
+    the reason for each loop that has no report.
+    """
+
+    reports: dict[str, dict[str, StabilityReport]] = field(default_factory=dict)
+    loops: dict[str, dict[str, LinearLoop]] = field(default_factory=dict)
+    problems: dict[str, str] = field(default_factory=dict)
+    axes: dict[str, AxesStability] = field(default_factory=dict)
+    axis_names: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON: by name, then by branch, or ``problem``."""
+        found: dict[str, Any] = {
+            name: {branch: report.as_dict() for branch, report in reports.items()}
+            for name, reports in self.reports.items()
+        }
+        found |= {n: one.report.as_dict() for n, one in self.axes.items()}
+        return found | {n: {"problem": why} for n, why in self.problems.items()}
+
+    def curves(self, name: str, decades: float) -> dict[str, LoopCurves]:
+        """Return the responses of a loop of one axis by branch.
+
+        From ``decades`` below the Nyquist frequency up to it; a branch equal to the
+        first one is left out.
+        """
+        first, *others = self.loops[name].items()
+        probe = np.array([1e-3, 0.1, 1.0, np.pi])
+        expected = first[1].response(probe)
+        distinct = dict([first]) | {
+            branch: loop
+            for branch, loop in others
+            if not np.allclose(loop.response(probe), expected, rtol=_SAME, atol=0.0)
+        }
+        return {branch: _curves(loop, decades) for branch, loop in distinct.items()}
+
+
+def _curves(loop: LinearLoop, decades: float) -> LoopCurves:
+    angle = angle_grid(loop)
+    angle = angle[angle > np.pi * 10.0**-decades]
+    L = loop.response(angle)
+    return LoopCurves(
+        angle / (2.0 * np.pi * loop.dt), L, 1.0 / (1.0 + L), L / (1.0 + L)
+    )
+
+
+def stability_reports(
+    loops: dict[str, Feedback],
+    reference: Any = 0.0,
+    dt: float | None = None,
+    axis_names: tuple[str, ...] = (),
+) -> StabilityReports:
+    """Return the stability of ``loops``, by name, on both branches at ``reference``.
+
+    ``reference`` in um; with ``axis_names`` one number an axis, and the branch with the
+    smaller margin alone. ``dt`` in s. A loop that cannot be linearised is listed among
+    the problems; its error is not raised.
+    """
+    result = StabilityReports(axis_names=axis_names)
+    points = [OperatingPoint(reference, branch, dt=dt) for branch in BRANCHES]
+    for name, loop in loops.items():
+        try:
+            if axis_names:
+                result.axes[name] = _worse_branch(loop, points)
+                continue
+            found = {point.branch: linear_loop(loop, point) for point in points}
+            result.reports[name] = {
+                point.branch: located_report(*found[point.branch], point)
+                for point in points
+            }
+            result.loops[name] = {b: model for b, (model, _) in found.items()}
+        # Whatever goes wrong here, tuned gains stay worth having.
+        except Exception as error:
+            why = str(error).partition("\n")[0] or type(error).__name__
+            result.problems[name] = why
+    return result
+
+
+def _worse_branch(loop: Feedback, points: Sequence[OperatingPoint]) -> AxesStability:
+    found = []
+    for point in points:
+        model, start = linear_axes(loop, point)
+        found.append(AxesStability(_located_axes_report(model, start, point), model))
+    return min(found, key=lambda one: one.report.disk_margin or 0.0)

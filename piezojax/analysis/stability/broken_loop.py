@@ -1,20 +1,17 @@
-"""A loop cut at the input of its plant: what margins are about."""
+"""Loop cut at the input of its plant, of which margins are taken."""
 
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ...core.arrays import ScalarLike, Signal, State, as_signal
 from ...core.system import Affine, Feedback, LoopState, Observation, System
 from ...dynamics import StateSpace
-from ...dynamics.linearise import linearise, sample_time
+from ...dynamics.linearise import linearise
 from ...hardware import Saturation
-
-BRANCHES = {"ascending": 1.0, "descending": -1.0}
-"""Ways in which the plant's input may be about to move, by name."""
+from .operating_point import OperatingPoint
 
 VOLTAGE_PUSH = 2.0**-40
 """Push on voltages, over 1 + |u|: enough to pick a branch, too little to move on it."""
@@ -92,39 +89,24 @@ def _pushed(signal: Signal, push: Signal | None) -> Signal:
     return signal if push is None else jax.tree.map(jnp.add, signal, push)
 
 
-def broken_loop(
-    loop: Feedback,
-    reference: Any = 0.0,
-    branch: str = "ascending",
-    state: LoopState | None = None,
-) -> BrokenLoop:
-    """Return ``loop`` cut at the plant's input, at rest at ``reference`` (um).
+def broken_loop(loop: Feedback, at: Any = 0.0) -> BrokenLoop:
+    """Return ``loop`` cut at the plant's input.
 
-    With several axes ``reference`` is a vector or a tuple, in the units of the axes.
+    ``at`` is an ``OperatingPoint``, or the reference (um) at which the loop rests. At
+    rest the plant is on the virgin loading curve of its hysteresis. There the local
+    gain depends on the direction in which the voltage moves next, which the point's
+    ``branch`` names: "ascending" on, "descending" back. All kinks, those of an inverse
+    hysteresis in the controller too, are taken on the same side, by a push of about
+    1e-12 V. For a Coleman-Hodgdon model at (x, y) the two slopes are b + h and b - h,
+    h = a x + c y: b is their mean, and -a/c, the axis of the loop, the limit of b + h
+    far along a branch. For a plant without kinks both branches are the same.
 
-    ``state`` is the operating point, by default ``loop.init(reference)``: on the virgin
-    loading curve of a plant with hysteresis. There the local gain depends on where the
-    voltage goes next, and ``branch`` says where: "ascending" on, "descending" back. All
-    kinks, those of an inverse hysteresis in the controller too, are taken on the same
-    side, by a push of about 1e-12 V. For a Coleman-Hodgdon model at (x, y) the two
-    slopes are b + h and b - h, h = a x + c y: b is their mean, and -a/c, the axis of
-    the loop, the limit of b + h far along a branch. For a plant without kinks both
-    branches are the same.
-
-    Limits of the voltage (Saturation) are taken out of the actuator, since margins are
-    about small motions; slew limits and converters count with their slope at rest, 1. A
-    switching term (``BangBang``) has no slope and is left out.
-
-    Raises ValueError for an unknown branch.
+    Limits of the voltage (Saturation) are removed from the actuator, because margins
+    hold for small motions; slew limits and converters count with their slope at rest,
+    1. A switching term (``BangBang``) has no slope and is left out.
     """
-    return cut(loop, as_signal(reference), side_of(branch), state)
-
-
-def side_of(branch: str) -> float:
-    """Return +1 or -1. Raises ValueError for an unknown branch."""
-    if branch not in BRANCHES:
-        raise ValueError(f"branch {branch!r}; it must be one of {list(BRANCHES)}")
-    return BRANCHES[branch]
+    point = OperatingPoint.at(at)
+    return cut(loop, point.signal, point.side, point.state)
 
 
 def cut(
@@ -164,53 +146,14 @@ def _without_limits(loop: Feedback) -> Feedback:
     return Feedback(loop.controller, loop.plant, actuator, loop.sensor)
 
 
-def open_loop(
-    loop: Feedback,
-    reference: Any = 0.0,
-    branch: str = "ascending",
-    state: LoopState | None = None,
-    dt: float | None = None,
-) -> StateSpace:
+def open_loop(loop: Feedback, at: Any = 0.0) -> StateSpace:
     """Return L of ``loop`` cut at the plant's input: an input and an output an axis.
 
     The closed loop is ``A - B C``, since D = 0: a plant answers one sample later.
-    ``dt`` in s is looked for in the controller, then in the rest of the loop. Other
-    arguments as for ``broken_loop``; usable inside ``jax.jit`` with ``dt`` or without.
-    Raises ValueError as ``broken_loop`` and ``linearise``.
+    ``at`` as for ``broken_loop``; usable inside ``jax.jit``. Raises ValueError as
+    ``loop_sample_time`` and ``linearise``.
     """
-    dt = loop_sample_time(loop) if dt is None else dt
-    broken = broken_loop(loop, reference, branch, state)
+    point = OperatingPoint.at(at)
+    dt = point.sample_time(loop)
+    broken = broken_loop(loop, point)
     return linearise(broken, broken.start.voltage, broken.init(), dt)
-
-
-def loop_sample_time(loop: Feedback) -> float:
-    """Return the controller's sample time (s), or that of the rest of the loop.
-
-    A plant may be stepped faster inside (``Held``). Raises ValueError if it is nowhere,
-    or not unique.
-    """
-    try:
-        return sample_time(loop.controller)
-    except ValueError:
-        return sample_time(loop)
-
-
-def check_operating_point(start: LoopState, reference: Any) -> None:
-    """Raise ValueError unless ``start`` is finite and rests at ``reference`` (um)."""
-    wanted, reached, held = (
-        np.ravel(np.asarray(jax.tree.leaves(signal), float))
-        for signal in (as_signal(reference), start.displacement, start.voltage)
-    )
-    far = np.abs(reached - wanted) > 1e-6 * (1.0 + np.abs(wanted))
-    wrong = far | ~np.isfinite(reached) | ~np.isfinite(held)
-    if not wrong.any():
-        return
-    shown = [
-        ", ".join(f"{number:{form}}" for number in values)
-        for values, form in ((wanted, "g"), (reached, ".6g"), (held, ".6g"))
-    ]
-    raise ValueError(
-        f"the loop cannot rest at {shown[0]} um: within the actuator's limits "
-        f"the stage rests at {shown[1]} um under {shown[2]} V; "
-        "choose another reference"
-    )

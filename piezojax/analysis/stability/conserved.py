@@ -39,6 +39,11 @@ class LinearLoop(NamedTuple):
         states = np.linalg.solve(resolvent, self.B[:, None] + 0j)
         return states[..., 0] @ self.C
 
+    def closed_responses(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return S = 1/(1+L) and T = L/(1+L) at exp(i angle), both [m, 1, 1]."""
+        L = self.response(angle)[:, None, None]
+        return 1.0 / (1.0 + L), L / (1.0 + L)
+
 
 class LinearAxes(NamedTuple):
     """L of several axes as NumPy matrices: A [n, n], B [n, q], C [q, n]; ``dt`` in s.
@@ -61,6 +66,11 @@ class LinearAxes(NamedTuple):
         z = np.exp(1j * np.atleast_1d(angle))
         resolvent = z[:, None, None] * np.eye(len(self.A)) - self.closed()
         return np.eye(len(self.C)) - self.C @ np.linalg.solve(resolvent, self.B + 0j)
+
+    def closed_responses(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return S and T = I - S at exp(i angle), both [m, q, q]."""
+        S = self.sensitivity(angle)
+        return S, np.eye(len(self.C)) - S
 
     def one_cut(self, axis: int) -> LinearLoop:
         """Return the loop of one axis, all others closed."""

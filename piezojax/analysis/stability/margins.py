@@ -9,13 +9,14 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ...core.arrays import Scalar, ScalarLike, Signal, as_array, as_signal
+from ...core.arrays import Scalar, Signal, as_array
 from ...core.system import Feedback, LoopState
 from ...dynamics import StateSpace
 from ...dynamics.linearise import linearise
-from .broken_loop import check_operating_point, cut, loop_sample_time, side_of
+from .broken_loop import cut
 from .conserved import LinearAxes, LinearLoop, balanced, without_conserved
 from .crossings import angle_grid, peak, roots
+from .operating_point import OperatingPoint
 
 
 @dataclass(frozen=True)
@@ -103,62 +104,42 @@ def _linearised(
 
 
 def located_report(
-    model: LinearLoop, reference: float, start: LoopState, branch: str
+    model: LinearLoop, start: LoopState, point: OperatingPoint
 ) -> StabilityReport:
     """Return the report on ``model`` with the operating point it was made for."""
     return dataclasses.replace(
         report_of(model),
-        reference_um=reference,
+        reference_um=float(point.reference),
         voltage_V=float(start.voltage),
-        branch=branch,
+        branch=point.branch,
     )
 
 
-def linear_loop(
-    loop: Feedback,
-    reference: ScalarLike = 0.0,
-    branch: str = "ascending",
-    state: LoopState | None = None,
-    dt: float | None = None,
-) -> tuple[LinearLoop, LoopState]:
-    """Return L in matrices, for ``report_of`` and pictures, and the operating point.
+def linear_loop(loop: Feedback, at: Any = 0.0) -> tuple[LinearLoop, LoopState]:
+    """Return L as matrices, for ``report_of`` and pictures, and the operating state.
 
     Arguments and errors as for ``stability_report``; ``linear_axes`` is for several
     axes.
     """
-    model, start = _model(loop, as_array(reference), branch, state, dt)
+    model, start = _model(loop, OperatingPoint.at(at))
     return without_conserved(
         balanced(LinearLoop(model.A, model.B[:, 0], model.C[0], model.dt))
     ), start
 
 
-def linear_axes(
-    loop: Feedback,
-    reference: Any,
-    branch: str = "ascending",
-    state: LoopState | None = None,
-    dt: float | None = None,
-) -> tuple[LinearAxes, LoopState]:
-    """Return L of a loop of several axes, cut in all, and the operating point.
+def linear_axes(loop: Feedback, at: Any) -> tuple[LinearAxes, LoopState]:
+    """Return L of a loop of several axes, cut in all, and the operating state.
 
     Arguments and errors as for ``stability_report``.
     """
-    model, start = _model(loop, as_signal(reference), branch, state, dt)
+    model, start = _model(loop, OperatingPoint.at(at))
     return without_conserved(balanced(model)), start
 
 
-def _model(
-    loop: Feedback,
-    reference: Signal,
-    branch: str,
-    state: LoopState | None,
-    dt: float | None,
-) -> tuple[LinearAxes, LoopState]:
-    side = as_array(side_of(branch))
-    dt = loop_sample_time(loop) if dt is None else dt
-    model, start = _linearised(loop, reference, side, state, dt)
-    if state is None:
-        check_operating_point(start, reference)
+def _model(loop: Feedback, point: OperatingPoint) -> tuple[LinearAxes, LoopState]:
+    reference, dt = point.signal, point.sample_time(loop)
+    model, start = _linearised(loop, reference, as_array(point.side), point.state, dt)
+    point.check(start)
     A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
     if not all(np.isfinite(m).all() for m in (A, B, C)):
         shown = ", ".join(f"{float(r):g}" for r in jax.tree.leaves(reference))
@@ -213,24 +194,46 @@ _FIGURES = [
 ]
 
 
+def sensitivity_figures(
+    loop: LinearLoop | LinearAxes, grid: np.ndarray
+) -> dict[str, float | None]:
+    """Return Ms and Mt of a stable linear loop, and their frequencies in Hz.
+
+    They are the largest singular values of S and T over frequency, with one axis |S|
+    and |T|: sampled on ``grid`` (rad a sample, see ``angle_grid``) and refined by
+    bounded minimisation between neighbours of the highest points. This is the exact
+    source of a sensitivity peak; ``differentiable.sensitivity_peak`` is the cheap one.
+    """
+    figures: dict[str, float | None] = {}
+    sampled = loop.closed_responses(grid)
+    for i, name in enumerate(("sensitivity_peak", "complementary_peak")):
+
+        def largest(x: np.ndarray, i: int = i) -> np.ndarray:
+            return largest_singular(loop.closed_responses(x)[i])
+
+        figures[name], angle = peak(largest, grid, largest_singular(sampled[i]))
+        figures[f"{name}_Hz"] = hertz(angle, loop.dt)
+    return figures
+
+
+def largest_singular(matrices: np.ndarray) -> np.ndarray:
+    """Return the largest singular value [m] of each of ``matrices`` [m, q, q]."""
+    if matrices.shape[-1] == 1:
+        return np.abs(matrices[:, 0, 0])
+    return np.linalg.norm(matrices, 2, axis=(-2, -1))
+
+
 def _figures(loop: LinearLoop) -> dict[str, float | None]:
     grid = angle_grid(loop)
     response = loop.response(grid)
-    peaks = {
-        name: peak(lambda x, f=f: f(loop.response(x)), grid, f(response))
-        for name, f in (
-            ("sensitivity_peak", lambda L: np.abs(1.0 / (1.0 + L))),
-            ("complementary_peak", lambda L: np.abs(L / (1.0 + L))),
-            ("disk", lambda L: np.abs(0.5 * (1.0 - L) / (1.0 + L))),
-        )
-    }
-    figures: dict[str, float | None] = {}
-    for name in ("sensitivity_peak", "complementary_peak"):
-        figures[name] = peaks[name][0]
-        figures[f"{name}_Hz"] = hertz(peaks[name][1], loop.dt)
+
+    def disk(L: np.ndarray) -> np.ndarray:
+        return np.abs(0.5 * (1.0 - L) / (1.0 + L))
+
+    worst, _ = peak(lambda x: disk(loop.response(x)), grid, disk(response))
     return (
-        figures
-        | disk_figures(peaks["disk"][0])
+        sensitivity_figures(loop, grid)
+        | disk_figures(worst)
         | _gain_margins(loop, grid, response)
         | _phase_margins(loop, grid, response)
     )

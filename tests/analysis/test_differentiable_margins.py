@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 import piezojax as pj
-from piezojax.analysis.stability import sensitivity, stability_report
+from piezojax.analysis.stability import (
+    OperatingPoint,
+    sensitivity,
+    sensitivity_peak,
+    stability_report,
+)
 from piezojax.analysis.stability.conserved import LinearLoop
-from piezojax.analysis.stability.impulse import (
+from piezojax.analysis.stability.differentiable import (
     UNREACHED,
     delay_margin_of,
     disk_margin_of,
@@ -49,8 +54,9 @@ LOOPS = {
 @pytest.mark.parametrize("name", LOOPS)
 def test_figures_are_those_of_the_exact_report(name, branch):
     loop = LOOPS[name]()
-    exact = stability_report(loop, 5.0, branch)
-    found = jax.jit(lambda loop: sensitivity(loop, 5.0, branch))(loop)
+    point = OperatingPoint(5.0, branch)
+    exact = stability_report(loop, point)
+    found = jax.jit(lambda loop: sensitivity(loop, point))(loop)
     # A peak between two lines, 5 Hz apart, is missed by little.
     assert peak_of(found) == pytest.approx(exact.sensitivity_peak, rel=5e-3)
     assert disk_margin_of(found) == pytest.approx(exact.disk_margin, rel=5e-3)
@@ -59,7 +65,8 @@ def test_figures_are_those_of_the_exact_report(name, branch):
 
 def test_every_branch_is_the_exact_report_s():
     # The branches differ: one of them cannot stand for both.
-    exact = [stability_report(pid_loop(), 5.0, b).sensitivity_peak for b in BRANCHES]
+    reports = [stability_report(pid_loop(), OperatingPoint(5.0, b)) for b in BRANCHES]
+    exact = [report.sensitivity_peak for report in reports]
     assert max(exact) > 1.02 * min(exact)
     found = jax.jit(lambda loop: sensitivities(loop, 5.0))(pid_loop())
     np.testing.assert_allclose(jax.vmap(peak_of)(found), exact, rtol=5e-3)
@@ -90,6 +97,21 @@ def test_a_crossing_with_phase_lead_limits_the_delay_too():
     )
     assert math.floor(report_of(system).delay_margin_samples) == whole
     assert math.floor(delay_margin_of(jnp.asarray(1.0 / (1.0 + loop)))) == whole
+
+
+@pytest.mark.parametrize("integral", [6000.0, 20_000.0, 30_000.0])
+def test_the_two_sources_of_a_peak_agree_within_the_stated_error(integral):
+    loop, duration = pid_loop(integral), 0.05
+    exact = stability_report(loop, 5.0)
+    # The quality of the resonance at the peak is that of the pole nearest to it.
+    poles = np.log(np.array(exact.poles))
+    place = 2.0 * np.pi * exact.sensitivity_peak_Hz * p753.DT
+    pole = poles[np.argmin(np.abs(poles - 1j * place))]
+    lines = duration * exact.sensitivity_peak_Hz
+    share = 0.5 * (0.5 * abs(pole) / abs(pole.real) / lines) ** 2
+    found = float(sensitivity_peak(loop, 5.0, duration))
+    assert exact.sensitivity_peak * (1.0 - share) < found
+    assert found < exact.sensitivity_peak * (1.0 + 1e-6)
 
 
 def test_a_loop_that_is_never_as_strong_as_1_has_no_delay_margin():
@@ -124,4 +146,4 @@ def test_an_unstable_loop_is_a_barrier_with_a_slope():
 
 def test_an_unknown_branch_is_refused():
     with pytest.raises(ValueError, match=r"branch 'up'; it must be one of"):
-        sensitivity(pid_loop(), 0.0, "up")
+        sensitivity(pid_loop(), OperatingPoint(branch="up"))

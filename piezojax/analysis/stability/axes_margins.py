@@ -8,8 +8,17 @@ import numpy as np
 from scipy import optimize
 
 from .conserved import LinearAxes
-from .crossings import angle_grid, peak
-from .margins import StabilityReport, disk_figures, hertz, plain, poles_of, report_of
+from .crossings import angle_grid
+from .margins import (
+    StabilityReport,
+    disk_figures,
+    hertz,
+    largest_singular,
+    plain,
+    poles_of,
+    report_of,
+    sensitivity_figures,
+)
 
 _SWEEPS = 12
 """Of the balancing: a start only."""
@@ -77,34 +86,19 @@ def axes_report_of(loop: LinearAxes) -> MultiAxisReport:
 
 
 def _figures(loop: LinearAxes) -> dict[str, Any]:
-    grid, eye = angle_grid(loop), np.eye(len(loop.C))
-    sampled = loop.sensitivity(grid)
-    figures: dict[str, Any] = {}
-    for name, of_sensitivity in (
-        ("sensitivity_peak", lambda S: S),
-        ("complementary_peak", lambda S: eye - S),
-    ):
-
-        def largest(x: np.ndarray, f: Any = of_sensitivity) -> np.ndarray:
-            return _largest(f(loop.sensitivity(x)))
-
-        values = _largest(of_sensitivity(sampled))
-        figures[name], angle = peak(largest, grid, values)
-        figures[f"{name}_Hz"] = hertz(angle, loop.dt)
-    worst, angle = _structured_peak(loop, grid, sampled - 0.5 * eye)
+    grid = angle_grid(loop)
+    figures: dict[str, Any] = sensitivity_figures(loop, grid)
+    half = 0.5 * np.eye(len(loop.C))
+    worst, angle = _structured_peak(loop, grid, loop.sensitivity(grid) - half)
     figures["disk_margin_Hz"] = hertz(angle, loop.dt)
     return figures | disk_figures(worst)
-
-
-def _largest(matrices: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(matrices, 2, axis=(-2, -1))
 
 
 def _structured_peak(
     loop: LinearAxes, grid: np.ndarray, sampled: np.ndarray
 ) -> tuple[float, float]:
     """Return the largest structured singular value of (S - T)/2, and where it lies."""
-    bounds = _largest(balancing(sampled)[1])
+    bounds = largest_singular(balancing(sampled)[1])
     best, at = 0.0, 0
     while True:
         index = int(np.argmax(bounds))
@@ -115,7 +109,7 @@ def _structured_peak(
         if value > best:
             best, at = value, index
         # What suits one frequency suits its neighbours, and bounds them too.
-        others = _largest(d[:, None] * sampled / d)
+        others = largest_singular(d[:, None] * sampled / d)
         bounds = np.minimum(bounds, others)
         bounds[index] = value
     low, high = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]

@@ -21,11 +21,11 @@ from scipy.optimize import linear_sum_assignment, minimize
 
 import piezojax as pj
 from piezojax.analysis.stability import axes_report_of, broken_loop, report_of
+from piezojax.analysis.stability.axes_margins import structured_bound
 from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
 from piezojax.analysis.stability.margins import _model, linear_axes
-from piezojax.analysis.stability.multi_axis import structured_bound
+from piezojax.analysis.stability.operating_point import OperatingPoint
 from piezojax.catalog import p558_control
-from piezojax.core.arrays import as_signal
 from piezojax.core.system import LoopInput
 
 REST = (0.0, 0.0, 0.0)
@@ -212,7 +212,7 @@ def loop():
 
 def test_a_free_run_is_what_the_matrices_predict(loop):
     # As the reports have it, before its states are balanced.
-    model, _ = _model(loop, as_signal(REST), "ascending", None, None)
+    model, _ = _model(loop, OperatingPoint(REST))
     rest = eqx.filter_jit(broken_loop)(loop, REST)
     kicked = tuple(jnp.array(x) for x in (1.0, -2.0, 0.5))
     state = rest.init()._replace(displacement=kicked)

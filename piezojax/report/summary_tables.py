@@ -1,116 +1,19 @@
-"""What the commands print: progress while they work, one table at the end."""
+"""Tables that the commands print at their end."""
 
 import math
-import signal
-import sys
-import threading
-import time
 from collections.abc import Sequence
 from itertools import takewhile
-from typing import Any
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-)
 from rich.table import Table
 from rich.text import Text
 
-from ..analysis.stability import StabilityReport
+from ..analysis.stability import StabilityReport, StabilityReports, worst_margins
 from ..core.registry import parts
 from ..identification.fit import FitReport
 from ..identification.methods import METHODS
 from ..reproduction.cell import Cell, title_of
 from ..reproduction.summary import GroupedAgreement, TableAgreement
 from ..tuning.result import Perturbed, Result, Scores
-from .bode import Comparison
-
-NOTE_EVERY = 30.0
-"""Seconds between two notes where there is no terminal."""
-
-
-class Bar:
-    """Progress of tuning on a terminal; plain lines where there is none.
-
-    While it runs, the first ``Ctrl-C`` waits for the next word of progress, because an
-    exception in the midst of JAX's compiler can be lost or crash it; the second acts at
-    once.
-    """
-
-    def __init__(self, console: Console):
-        self._console = console
-        self._live = console.is_terminal
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=30),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}"),
-            TimeElapsedColumn(),
-            console=console,
-            disable=not self._live,
-        )
-        self._task = None
-        self._interrupted = False
-        self._finishing = False
-        self._handler: Any = None
-        self._noted = time.monotonic()
-
-    def __enter__(self) -> "Bar":
-        # Only the main thread may handle signals.
-        if threading.current_thread() is threading.main_thread():
-            self._handler = signal.signal(signal.SIGINT, self._interrupt)
-        self._progress.start()
-        return self
-
-    def __exit__(self, *exception) -> None:
-        self._progress.stop()
-        if self._handler is not None:
-            signal.signal(signal.SIGINT, self._handler)
-
-    def _interrupt(self, number: int, frame: object) -> None:
-        if self._interrupted:
-            raise KeyboardInterrupt
-        self._interrupted = True
-        if self._task is not None:
-            self._progress.update(self._task, note="stopping; Ctrl-C again: at once")
-
-    def finish(self) -> None:
-        """From here on let the first ``Ctrl-C`` pass: what was found is being written.
-
-        One that waits already has come too late to stop anything.
-        """
-        self._finishing = True
-
-    def _stop_if_asked(self) -> None:
-        if self._interrupted and not self._finishing:
-            self._interrupted = False
-            raise KeyboardInterrupt
-
-    def stage(self, text: str, steps: int = 0) -> None:
-        """Show a new stage; without ``steps`` its length is unknown."""
-        self._stop_if_asked()
-        if not self._live:
-            self._console.print(text)
-        if self._task is not None:
-            self._progress.update(self._task, total=1, completed=1)
-        self._task = self._progress.add_task(text, total=steps or None, note="")
-
-    def advance(self, best: float, note: str = "") -> None:
-        """Move the bar by one step; where there is none, print a note now and then."""
-        self._stop_if_asked()
-        if self._task is not None:
-            shown = note or f"objective {best:.3f}"
-            self._progress.update(self._task, advance=1, note=shown)
-        now = time.monotonic()
-        if note and not self._live and now - self._noted > NOTE_EVERY:
-            self._console.print(note)
-            self._noted = now
 
 
 def models_table() -> Table:
@@ -124,12 +27,6 @@ def models_table() -> Table:
         for model in method.models:
             table.add_row(model, f"method: {name}", method.summary)
     return table
-
-
-def console(quiet: bool) -> Console:
-    """Return where a command prints: standard output, or nowhere."""
-    # Titles and paths may hold brackets: nothing printed is markup.
-    return Console(quiet=quiet, file=sys.stdout, highlight=False, markup=False)
 
 
 def _nanometres(value: float | None) -> str:
@@ -224,60 +121,46 @@ def gains_table(result: Result) -> Table:
     return table
 
 
-def stability_table(comparison: Comparison) -> Table:
-    """Return the margins of each loop, those of the worse branch of a hysteresis."""
+def stability_table(found: StabilityReports) -> Table:
+    """Return the margins of each loop, on the worse branch of a hysteresis."""
     table = Table(title="stability for small motions, worse branch of the hysteresis")
     table.add_column("loop")
     for title in ("Ms", "gain margin", "phase margin", "delay margin"):
         table.add_column(title, justify="right")
-    for name, branches in comparison.reports.items():
+    for name, branches in found.reports.items():
         shown = "tuned" if name == "after" else name
-        if not all(report.stable for report in branches.values()):
-            table.add_row(shown, "unstable", "-", "-", "-")
-            continue
-        peak, gain, phase, delay = _worst(list(branches.values()))
-        table.add_row(
-            shown,
-            f"{peak:.2f}",
-            f"{gain:.1f} dB",
-            f"{phase:.1f}°",
-            f"{delay:.2f} samples",
-        )
-    for name, found in comparison.axes.items():
+        table.add_row(shown, *_margins(list(branches.values())))
+    for name, axes in found.axes.items():
         shown = "tuned" if name == "after" else name
-        if not found.report.stable:
-            table.add_row(shown, "unstable", "-", "-", "-")
-        for axis, report in zip(comparison.axis_names, found.report.axes, strict=False):
-            peak, gain, phase, delay = _worst([report])
-            table.add_row(
-                f"{shown}, {axis}",
-                f"{peak:.2f}",
-                f"{gain:.1f} dB",
-                f"{phase:.1f}°",
-                f"{delay:.2f} samples",
-            )
-        if found.report.disk_margin is not None:
+        if not axes.report.stable:
+            table.add_row(shown, *_UNSTABLE)
+        for axis, report in zip(found.axis_names, axes.report.axes, strict=False):
+            table.add_row(f"{shown}, {axis}", *_margins([report]))
+        if axes.report.disk_margin is not None:
             table.add_row(
                 f"{shown}, all axes at once",
-                f"{found.report.sensitivity_peak:.2f}",
-                f"{20.0 * math.log10(found.report.disk_gain_margin or 1.0):.1f} dB",
-                f"{found.report.disk_phase_margin_deg:.1f}°",
+                f"{axes.report.sensitivity_peak:.2f}",
+                f"{20.0 * math.log10(axes.report.disk_gain_margin or 1.0):.1f} dB",
+                f"{axes.report.disk_phase_margin_deg:.1f}°",
                 "-",
             )
-    for name in comparison.problems:
+    for name in found.problems:
         table.add_row("tuned" if name == "after" else name, "-", "-", "-", "-")
     return table
 
 
-def _worst(reports: Sequence[StabilityReport]) -> tuple[float, float, float, float]:
-    def every(name: str) -> list[float]:
-        return [getattr(report, name) for report in reports]
+_UNSTABLE = ("unstable", "-", "-", "-")
 
+
+def _margins(reports: Sequence[StabilityReport]) -> tuple[str, ...]:
+    worst = worst_margins(reports)
+    if worst is None:
+        return _UNSTABLE
     return (
-        max(every("sensitivity_peak")),
-        min(every("gain_margin_dB")),
-        min(every("phase_margin_deg")),
-        min(every("delay_margin_samples")),
+        f"{worst.sensitivity_peak:.2f}",
+        f"{worst.gain_margin_dB:.1f} dB",
+        f"{worst.phase_margin_deg:.1f}°",
+        f"{worst.delay_margin_samples:.2f} samples",
     )
 
 

@@ -1,0 +1,104 @@
+"""Terminal of a command: where it prints, and its progress while it works."""
+
+import signal
+import sys
+import threading
+import time
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
+
+NOTE_EVERY = 30.0
+"""Seconds between two notes where there is no terminal."""
+
+
+class Bar:
+    """Progress bar on a terminal; plain lines where there is none.
+
+    While it runs, the first ``Ctrl-C`` waits for the next report of progress, because
+    an exception inside JAX's compiler can be lost or crash it; the second acts at once.
+    """
+
+    def __init__(self, console: Console):
+        self._console = console
+        self._live = console.is_terminal
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            console=console,
+            disable=not self._live,
+        )
+        self._task = None
+        self._interrupted = False
+        self._finishing = False
+        self._handler: Any = None
+        self._noted = time.monotonic()
+
+    def __enter__(self) -> "Bar":
+        # Only the main thread may handle signals.
+        if threading.current_thread() is threading.main_thread():
+            self._handler = signal.signal(signal.SIGINT, self._interrupt)
+        self._progress.start()
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self._progress.stop()
+        if self._handler is not None:
+            signal.signal(signal.SIGINT, self._handler)
+
+    def _interrupt(self, number: int, frame: object) -> None:
+        if self._interrupted:
+            raise KeyboardInterrupt
+        self._interrupted = True
+        if self._task is not None:
+            self._progress.update(self._task, note="stopping; Ctrl-C again: at once")
+
+    def finish(self) -> None:
+        """Ignore the first ``Ctrl-C`` from here on, while results are written.
+
+        One that is pending already comes too late to stop anything.
+        """
+        self._finishing = True
+
+    def _stop_if_asked(self) -> None:
+        if self._interrupted and not self._finishing:
+            self._interrupted = False
+            raise KeyboardInterrupt
+
+    def stage(self, text: str, steps: int = 0) -> None:
+        """Show a new stage; without ``steps`` its length is unknown."""
+        self._stop_if_asked()
+        if not self._live:
+            self._console.print(text)
+        if self._task is not None:
+            self._progress.update(self._task, total=1, completed=1)
+        self._task = self._progress.add_task(text, total=steps or None, note="")
+
+    def advance(self, best: float, note: str = "") -> None:
+        """Move the bar by one step; where there is none, print a note now and then."""
+        self._stop_if_asked()
+        if self._task is not None:
+            shown = note or f"objective {best:.3f}"
+            self._progress.update(self._task, advance=1, note=shown)
+        now = time.monotonic()
+        if note and not self._live and now - self._noted > NOTE_EVERY:
+            self._console.print(note)
+            self._noted = now
+
+
+def console(quiet: bool) -> Console:
+    """Return the console on which a command prints: standard output, or none."""
+    # Titles and paths may hold brackets: nothing printed is markup.
+    return Console(quiet=quiet, file=sys.stdout, highlight=False, markup=False)

@@ -1,0 +1,132 @@
+"""Outcome of tuning: the result with its loops, their stability and their limit."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import numpy as np
+
+from ..analysis.limit import LimitReport, performance_limit
+from ..analysis.stability import StabilityReports, stability_reports
+from ..core.rollout import simulate
+from ..core.system import Feedback, LoopSample, System, loop_inputs
+from ..study import Case
+from .baselines import Baselines
+from .coupling import Coupling, coupling_matrix
+from .result import Result
+from .runs import Signals
+
+_BEYOND = 1e9  # um or V
+
+Logs = tuple[LoopSample, LoopSample]
+"""Samples of a run, of NumPy arrays, before and after tuning."""
+
+
+@dataclass
+class Outcome:
+    """Result of tuning with the loops and signals behind it.
+
+    ``before`` and ``after`` are the loops with the study's own gains and the tuned
+    ones, ``holdout`` the signals that the search has not seen. ``baselines`` are there
+    if they were asked for. ``stability``, ``limit`` and ``coupling`` are computed when
+    they are first read, so that many studies can be tuned without them.
+    """
+
+    result: Result
+    before: Feedback
+    after: Feedback
+    case: Case
+    holdout: Signals
+    baselines: Baselines | None = None
+
+    @property
+    def controller(self) -> System:
+        """The tuned controller."""
+        return self.after.controller
+
+    @cached_property
+    def stability(self) -> StabilityReports:
+        """Stability of the loops "before" and "after" at the highest reference.
+
+        The branches of a hysteresis differ most there. A loop that cannot be linearised
+        is listed with the reason.
+        """
+        study = self.case.study
+        return stability_reports(
+            {"before": self.before, "after": self.after},
+            study.highest,
+            study.dt,
+            study.axes.names if study.axes else (),
+        )
+
+    @cached_property
+    def limit(self) -> LimitReport | str:
+        """Limit of linear control for the tuned loop, or the reason why there is none.
+
+        On the references that were tuned on, with the noise of the hold-out.
+        """
+        study = self.case.study
+        if study.axes is not None:
+            return "the limit is known for one axis only"
+        names, signals = study.references.tune, self.holdout
+        count, disturbance = len(names), signals.disturbance
+        try:
+            return performance_limit(
+                self.after,
+                names,
+                signals.references[:count],
+                signals.noise[:count],
+                None if disturbance is None else disturbance[:count],
+                start=round(study.references.settle * study.rate),
+                dt=study.dt,
+            )
+        # Whatever goes wrong here, the tuned gains stay worth having.
+        except Exception as error:
+            return str(error).partition("\n")[0] or type(error).__name__
+
+    @cached_property
+    def coupling(self) -> tuple[Coupling, Coupling] | None:
+        """Coupling of the axes before and after, on the hold-out; None for one axis."""
+        study, result = self.case.study, self.result
+        if study.axes is None:
+            return None
+        before = (result.holdout_before, result.unseen_before, result.coupling_before)
+        after = (result.holdout, result.unseen, result.coupling)
+
+        def matrix(parts: Sequence) -> Coupling:
+            errors: dict[str, float | None] = {}
+            for part in parts:
+                errors |= part.per_reference_rms_um if part else {}
+            return coupling_matrix(study, errors)
+
+        return matrix(before), matrix(after)
+
+    def logs(self, runs: Iterable[int]) -> dict[int, Logs]:
+        """Return the samples of both loops under references number ``runs``.
+
+        With the first draw of noise of the hold-out. Samples beyond 1e9 um or V, of a
+        run that diverges, are NaN.
+        """
+        signals = self.holdout
+
+        @jax.jit
+        def run(loop: Feedback, index: int) -> LoopSample:
+            reference, noise = signals.references[index], signals.noise[index, 0]
+            moved = signals.disturbance
+            inputs = loop_inputs(
+                reference, noise, None if moved is None else moved[index, 0]
+            )
+            return simulate(loop, inputs, loop.init(reference[0]))[1]
+
+        return {
+            index: jax.tree.map(
+                _finite, (run(self.before, index), run(self.after, index))
+            )
+            for index in sorted(set(runs))
+        }
+
+
+def _finite(values: jax.Array) -> np.ndarray:
+    array = np.asarray(values)
+    return np.where(np.abs(array) < _BEYOND, array, np.nan)
