@@ -84,12 +84,13 @@ def main(tables, calibrate, out, seed, quiet):
             with Bar(console) as bar:
                 found = {n: calibrated(n, progress=bar) for n in EXPERIMENTS}
             plain = {n: as_plain(n, swaps) for n, swaps in found.items()}
-            plain |= {"together": together(found)}
-            write_text(folder / "calibration.json", json.dumps(plain, indent=2) + "\n")
-            write_calibration(found, folder)
+            both = together(found)
+            text = json.dumps(plain | {"together": both}, indent=2)
+            write_text(folder / "calibration.json", text + "\n")
+            write_calibration(found, plain, folder)
         for name, swaps in found.items():
-            console.print(calibration_table(name, swaps))
-        console.print(together_table(found))
+            console.print(calibration_table(name, swaps, plain[name]))
+        console.print(together_table(both))
         console.print(f"results in {folder}", soft_wrap=True)
 
     run(quiet, calibration if calibrate else body)

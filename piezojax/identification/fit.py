@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import AliasChoices, BaseModel, Field
@@ -45,6 +46,18 @@ class FitReport(BaseModel):
     wall_s: float
 
 
+class Spectra(NamedTuple):
+    """Amplitudes [lines] of an output's sinusoids, without the mean.
+
+    ``frequency`` in Hz; ``measured`` and ``residual``, the free run less the record, in
+    the output's unit.
+    """
+
+    frequency: np.ndarray
+    measured: np.ndarray
+    residual: np.ndarray
+
+
 @dataclass(frozen=True)
 class Fit:
     """A fitted plant, its report, the records and the simulated outputs (their unit).
@@ -68,6 +81,19 @@ class Fit:
             (run - record.outputs)[part]
             for record, run in zip(self.records, self.simulations, strict=True)
         ]
+
+    def spectra(self, part: slice, output: int) -> Spectra:
+        """Return the spectra of an output of the first record over ``part``."""
+        measured = self.record.outputs[part, output]
+
+        def amplitude(signal: np.ndarray) -> np.ndarray:
+            return np.abs(np.fft.rfft(signal))[1:] * 2.0 / signal.size
+
+        return Spectra(
+            np.fft.rfftfreq(measured.size, self.record.dt)[1:],
+            amplitude(measured - measured.mean()),
+            amplitude(self.errors(part)[0][:, output]),
+        )
 
     def error_over(self, part: slice) -> FitError:
         """Return the RMS of the errors over ``part``."""

@@ -2,25 +2,32 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 from rich.table import Table
 
 from ..reproduction.calibration import EXPERIMENTS, Swap
-from ..reproduction.judged import BAR, together
+from ..reproduction.judged import BAR
 from ..reproduction.selection import Round
-from ..reproduction.summary import ratio_of
 from .figures import AFTER, BEFORE, REFERENCE, figure, styled, write
 
+Judged = Mapping[str, Mapping[str, Any]]
+"""Figures of an experiment by its fitted half, as ``judged.as_plain`` returns them."""
 
-def write_calibration(found: Mapping[str, Sequence[Swap]], folder: Path) -> None:
+
+def write_calibration(
+    found: Mapping[str, Sequence[Swap]], judged: Mapping[str, Judged], folder: Path
+) -> None:
     """Write calibration.png into ``folder``."""
     with styled():
-        write(calibration_figure(found), folder / "calibration.png")
+        write(calibration_figure(found, judged), folder / "calibration.png")
 
 
-def calibration_figure(found: Mapping[str, Sequence[Swap]]) -> Figure:
-    """Simulation against print: a row an experiment, a panel a fitted half."""
+def calibration_figure(
+    found: Mapping[str, Sequence[Swap]], judged: Mapping[str, Judged]
+) -> Figure:
+    """Draw simulation against print: a row an experiment, a panel a fitted half."""
     picture = figure(8.4, 4.2 * len(found))
     panels = picture.subplots(len(found), 2, squeeze=False)
     for row, (name, swaps) in zip(panels, found.items(), strict=True):
@@ -29,9 +36,10 @@ def calibration_figure(found: Mapping[str, Sequence[Swap]]) -> Figure:
             low = 0.8 * min(min(c.paper, c.sim) for c in both)
             high = 1.25 * max(max(c.paper, c.sim) for c in both)
             ax.plot([low, high], [low, high], color=REFERENCE, lw=0.8)
-            for label, cells, marker, colour in (
-                ("fitted", swap.train, "o", BEFORE),
-                ("held out", swap.held_out, "s", AFTER),
+            half = judged[name][swap.half]
+            for label, ratios, cells, marker, colour in (
+                ("fitted", half["fitted"], swap.train, "o", BEFORE),
+                ("held out", half["held_out"], swap.held_out, "s", AFTER),
             ):
                 ax.loglog(
                     [c.paper for c in cells],
@@ -39,7 +47,7 @@ def calibration_figure(found: Mapping[str, Sequence[Swap]]) -> Figure:
                     marker,
                     ms=4,
                     color=colour,
-                    label=f"{label}: {ratio_of(cells):.3f}",
+                    label=f"{label}: {ratios['geomean_ratio']:.3f}",
                 )
             ax.set(
                 title=f"{name}\nfitted to the {swap.half} cells",
@@ -50,8 +58,8 @@ def calibration_figure(found: Mapping[str, Sequence[Swap]]) -> Figure:
     return picture
 
 
-def calibration_table(name: str, swaps: Sequence[Swap]) -> Table:
-    """Return ratios, fitted values and how the doubts were chosen, a column a half.
+def calibration_table(name: str, swaps: Sequence[Swap], judged: Judged) -> Table:
+    """Return ratios, fitted values and the choice of the doubts, a column a half.
 
     A print that one half alone puts in doubt has no value in the other's column.
     """
@@ -59,24 +67,22 @@ def calibration_table(name: str, swaps: Sequence[Swap]) -> Table:
     table.add_column("")
     for swap in swaps:
         table.add_column(f"fitted: {swap.half}", justify="right")
-    train = (f"{ratio_of(swap.train):.3f}" for swap in swaps)
-    table.add_row("geometric-mean ratio, fitted", *train)
-    held_out = [ratio_of(swap.held_out) for swap in swaps]
-    table.add_row(
-        "geometric-mean ratio, held out", *(f"{x:.3f}" for x in held_out), style="bold"
-    )
-    alone = (f"{ratio_of(swap.alone):.3f}" for swap in swaps)
+    halves = [judged[swap.half] for swap in swaps]
+
+    def ratios(part: str) -> list[str]:
+        return [f"{half[part]['geomean_ratio']:.3f}" for half in halves]
+
+    table.add_row("geometric-mean ratio, fitted", *ratios("fitted"))
+    table.add_row("geometric-mean ratio, held out", *ratios("held_out"), style="bold")
+    alone = ratios("held_out_without_doubts")
     table.add_row("the same, the stage alone, no print in doubt", *alone)
-    judged = ("met" if x <= BAR else "missed" for x in held_out)
-    table.add_row(f"bar of {BAR:g}", *judged)
+    met = ("met" if half["met"] else "missed" for half in halves)
+    table.add_row(f"bar of {BAR:g}", *met)
     table.add_section()
-    places = sorted({(c.table, c.column) for swap in swaps for c in swap.held_out})
-    for place in places:
-        inside = (
-            [c for c in swap.held_out if (c.table, c.column) == place] for swap in swaps
-        )
+    places = [half["held_out"]["columns"] for half in halves]
+    for place in sorted({name for columns in places for name in columns}):
         table.add_row(
-            f"held out, {' '.join(place)}", *(f"{ratio_of(c):.3f}" for c in inside)
+            f"held out, {place}", *(f"{columns[place]:.3f}" for columns in places)
         )
     table.add_section()
     every = [name for swap in swaps for name in swap.values]
@@ -95,9 +101,11 @@ def calibration_table(name: str, swaps: Sequence[Swap]) -> Table:
     return table
 
 
-def together_table(found: Mapping[str, Sequence[Swap]]) -> Table:
-    """Return the ratio of all held-out cells, a column a half."""
-    halves = together(found)
+def together_table(halves: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return the ratio of all held-out cells, a column a half.
+
+    ``halves`` is the result of ``judged.together``.
+    """
     table = Table(title="all held-out cells of Tables 5-3, 5-5 and 4-5")
     table.add_column("")
     for half in halves:

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -61,7 +60,7 @@ def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> None:
         ]
         unit = f"{record.output_unit}/{record.input_unit}"
         picture = response_figure(
-            linear.measured, linear.model, names[0], names[1], unit
+            linear.measured, linear.fitted(), names[0], names[1], unit
         )
         write(picture, folder / "response.png")
 
@@ -69,7 +68,6 @@ def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> None:
 def outputs_figure(fit: Fit) -> Figure:
     """Every output of the first record: the end of it, and the residual's spectrum."""
     record, run, part = fit.record, fit.simulations[0], fit.validate
-    error = run - record.outputs
     shown = slice(max(part.start, part.stop - SHOWN), part.stop)
     picture = figure(9.0, 2.4 * run.shape[1] + 0.8)
     panels = picture.subplots(run.shape[1], 2, squeeze=False)
@@ -80,13 +78,12 @@ def outputs_figure(fit: Fit) -> Figure:
         course.plot(time, run[shown, i], color=AFTER, lw=0.9, label="simulated")
         course.set(ylabel=f"output {i} ({unit})")
         course.locator_params(axis="x", nbins=5)
-        frequency = np.fft.rfftfreq(error[part].shape[0], record.dt)[1:]
-        for signal, colour, label in (
-            (record.outputs[part, i], MEASURED, "measured"),
-            (error[part, i], BEFORE, "residual"),
+        sizes = fit.spectra(part, i)
+        for size, colour, label in (
+            (sizes.measured, MEASURED, "measured"),
+            (sizes.residual, BEFORE, "residual"),
         ):
-            size = np.abs(np.fft.rfft(signal - signal.mean()))[1:] * 2.0 / signal.size
-            spectrum.loglog(frequency, size, color=colour, lw=0.7, label=label)
+            spectrum.loglog(sizes.frequency, size, color=colour, lw=0.7, label=label)
         rmse = fit.report.validation.each[i]
         spectrum.set(
             ylabel=f"amplitude ({unit})",
@@ -142,9 +139,8 @@ def fit_figure(fit: Fit) -> Figure:
         title=f"Residual, {unit} rms: {report.train.rmse:.3g} training, "
         f"{report.validation.rmse:.3g} validation",
     )
-    density = np.abs(np.fft.rfft(error[part])) * 2.0 / error[part].size
-    frequency = np.fft.rfftfreq(error[part].size, record.dt)
-    spectrum.loglog(frequency[1:], density[1:], color=BEFORE, lw=0.7)
+    sizes = fit.spectra(part, 0)
+    spectrum.loglog(sizes.frequency, sizes.residual, color=BEFORE, lw=0.7)
     spectrum.set(
         xlabel="frequency (Hz)",
         ylabel=f"amplitude ({unit})",

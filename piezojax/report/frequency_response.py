@@ -5,12 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..dynamics import StateSpace
 from ..identification.estimators.frequency import EmpiricalResponse
 from .figures import AFTER, BEFORE, MEASURED, figure
-
-CONFIDENCE = 1.96
-"""Deviations on either side that hold 95 % of normal errors."""
 
 SHOWN = 60
 """Most singular values drawn."""
@@ -43,14 +39,16 @@ def singular_values_figure(
 
 def response_figure(
     measured: EmpiricalResponse,
-    model: StateSpace,
+    fitted: np.ndarray,
     inputs: Sequence[str],
     outputs: Sequence[str],
     unit: str = "um/V",
 ) -> Figure:
-    """Bode plot, a column an input: measured with its 95 % band, and the model."""
-    fitted = np.asarray(model.frequency_response(measured.frequency))
-    spread = CONFIDENCE * np.sqrt(0.5 * measured.variance)
+    """Draw a Bode plot, a column an input: measured with its 95 % band, and ``fitted``.
+
+    Both are [lines, p, m]; ``fitted`` is the response of the model.
+    """
+    spread = measured.band()
     picture = figure(3.4 * len(inputs) + 0.6, 3.0 * len(outputs))
     panels = picture.subplots(
         2 * len(outputs),

@@ -8,21 +8,22 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
+from ..sweeping.metric_maps import MetricMap
 from .figures import figure, headed
-from .sweep_scale import COLOUR_MAP, LOST, Panel, Parameter, colour_bar, kept, scale_of
+from .sweep_scale import COLOUR_MAP, LOST, Parameter, colour_bar, scale_of
 
 MOST_LINES = 1500
 """In a picture of parallel coordinates: the best, and an even choice of the others."""
 
 
 def parallel_coordinates(
-    shown: list[Panel], axes: list[Parameter], title: str
+    shown: list[MetricMap], axes: list[Parameter], title: str
 ) -> Figure:
     """A line for each point, across one upright axis for each parameter."""
     picture = figure(max(5.5, 1.6 * len(axes) + 2.0), 0.7 + 3.4 * len(shown))
     places = picture.subplots(len(shown), 1, squeeze=False)[:, 0]
     for panel, ax in zip(shown, places, strict=True):
-        values = kept(panel.values.ravel())
+        values = panel.kept().ravel()
         norm = scale_of(values)
         chosen = _chosen(values)
         heights = [

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,10 +10,16 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ..study.sweep_table import METRICS
+from ..sweeping.metric_maps import (
+    MetricMap,
+    averaging,
+    metric_maps,
+    metrics_in,
+    opened,
+)
 from .figures import AFTER, UNITS, figure, headed, styled, write
 from .parallel_coordinates import parallel_coordinates
-from .sweep_scale import COLOUR_MAP, LOST, Panel, Parameter, colour_bar, kept, scale_of
+from .sweep_scale import COLOUR_MAP, LOST, Parameter, colour_bar, scale_of
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -23,15 +29,9 @@ MOST_PANELS = 12
 
 def write_pictures(path: Path, folder: Path) -> None:
     """Draw each metric of the data set ``path`` into ``folder``."""
-    with _opened(path) as dataset, styled():
-        for name in (name for name in METRICS if name in dataset):
+    with opened(path) as dataset, styled():
+        for name in metrics_in(dataset):
             write(metric_figure(dataset, name), folder / f"{name}.png")
-
-
-def _opened(path: Path) -> "Dataset":
-    import xarray as xr
-
-    return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
 
 
 def metric_figure(dataset: "Dataset", name: str) -> Figure:
@@ -66,27 +66,19 @@ def metric_figure(dataset: "Dataset", name: str) -> Figure:
 
 
 def label_of(dataset: "Dataset", name: str) -> str:
-    """Return what a picture of a metric shows."""
+    """Return the label of a metric with the mean that is taken of it."""
     label = str(dataset[name].attrs["long_name"])
     if "reference" not in dataset[name].dims:
         return label
-    kind = "mean" if name == "saturated" else "geometric mean"
-    return f"{label}, {kind} over {dataset.sizes['reference']} references"
+    return f"{label}, {averaging(name)} over {dataset.sizes['reference']} references"
 
 
-def panels(dataset: "Dataset", name: str) -> list[Panel]:
-    """Return a metric, by point, of each plant and axis."""
-    variable = dataset[name]
-    others = [d for d in ("plant", "axis") if d in variable.dims]
+def panels(dataset: "Dataset", name: str) -> list[MetricMap]:
+    """Return a metric, by point, of each plant and axis, in the units of pictures."""
     found = []
-    for place in np.ndindex(*(variable.sizes[d] for d in others)):
-        chosen = dict(zip(others, place, strict=True))
-        unit = str(variable.attrs["units"])
-        if "axis" in chosen:
-            unit = str(dataset["axis_unit"].values[chosen["axis"]])
-        shown, factor = _shown_unit(name, unit)
-        title = ", ".join(str(dataset[d].values[i]) for d, i in chosen.items())
-        found.append(Panel(title, factor * _mean(variable.isel(chosen), name), shown))
+    for one in metric_maps(dataset, name):
+        unit, factor = _shown_unit(name, one.unit)
+        found.append(MetricMap(one.title, factor * one.values, unit))
     return found
 
 
@@ -96,23 +88,6 @@ def _shown_unit(name: str, unit: str) -> tuple[str, float]:
     if name == "saturated":
         return "%", 100.0
     return ("" if unit == "1" else UNITS[unit][0] if unit in UNITS else unit), 1.0
-
-
-def _mean(variable: Any, name: str) -> np.ndarray:
-    """Return the mean over references and draws: of logarithms, unless of a share."""
-    over = [d for d in ("reference", "draw") if d in variable.dims]
-    if not over:
-        return np.asarray(variable.values)
-    total, count = None, 0
-    # One run after the other: a large data set is not held in memory.
-    for place in np.ndindex(*(variable.sizes[d] for d in over)):
-        values = variable.isel(dict(zip(over, place, strict=True))).values
-        with np.errstate(divide="ignore"):
-            values = values if name == "saturated" else np.log(values)
-        total = values if total is None else total + values
-        count += 1
-    mean = np.asarray(total) / count
-    return mean if name == "saturated" else np.exp(mean)
 
 
 def parameters(dataset: "Dataset") -> list[Parameter]:
@@ -143,8 +118,10 @@ def _flattened(dataset: "Dataset", axes: list[Parameter]) -> list[Parameter]:
     ]
 
 
-def _heat_map(picture: Figure, ax: Axes, panel: Panel, axes: list[Parameter]) -> None:
-    values = kept(panel.values)
+def _heat_map(
+    picture: Figure, ax: Axes, panel: MetricMap, axes: list[Parameter]
+) -> None:
+    values = panel.kept()
     across, up = axes[1], axes[0]
     ax.set_facecolor(LOST)  # what is lost
     mesh = ax.pcolormesh(
@@ -162,8 +139,9 @@ def _heat_map(picture: Figure, ax: Axes, panel: Panel, axes: list[Parameter]) ->
     ax.set(xlabel=across.label, ylabel=up.label)
     ax.grid(False)
     colour_bar(picture, ax, mesh, panel.unit)
-    if np.sum(values == np.nanmin(values, initial=np.inf)) == 1:
-        row, column = np.unravel_index(np.nanargmin(values), values.shape)
+    least = panel.least()
+    if least is not None and np.sum(values == values[least]) == 1:
+        row, column = least
         ax.plot(
             across.values[column],
             up.values[row],
@@ -185,8 +163,8 @@ def _heat_map(picture: Figure, ax: Axes, panel: Panel, axes: list[Parameter]) ->
         )
 
 
-def _curve(ax: Axes, panel: Panel, axis: Parameter) -> None:
-    values = kept(panel.values)
+def _curve(ax: Axes, panel: MetricMap, axis: Parameter) -> None:
+    values = panel.kept()
     ax.plot(axis.values, values, "o-", ms=3, color=AFTER)
     if axis.logarithmic:
         ax.set_xscale("log")
@@ -196,9 +174,9 @@ def _curve(ax: Axes, panel: Panel, axis: Parameter) -> None:
 
 
 def best_table(path: Path) -> Table:
-    """Return where the first metric is least, for each plant and axis."""
-    with _opened(path) as dataset:
-        name = next(name for name in METRICS if name in dataset)
+    """Return the point with the least first metric, for each plant and axis."""
+    with opened(path) as dataset:
+        name = metrics_in(dataset)[0]
         axes = parameters(dataset)
         grid = dataset.attrs["method"] == "grid"
         table = Table(
@@ -210,13 +188,13 @@ def best_table(path: Path) -> Table:
         table.add_column("least", justify="right")
         table.add_column("diverged", justify="right")
         for panel in panels(dataset, name):
-            values = kept(panel.values)
+            values = panel.kept()
             lost = int(np.isnan(values).sum())
             share = f"{lost} of {values.size}"
-            if lost == values.size:
+            place = panel.least()
+            if place is None:
                 table.add_row(panel.title, *("-" for _ in axes), "-", share)
                 continue
-            place = np.unravel_index(np.nanargmin(values), values.shape)
             where = place if grid else place * len(axes)
             shown = (
                 f"{axis.values[i]:.4g}" for axis, i in zip(axes, where, strict=True)

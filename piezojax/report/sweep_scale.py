@@ -1,4 +1,4 @@
-"""What all pictures of a sweep share: what is drawn, how it is scaled and coloured."""
+"""Scales and colours of all pictures of a sweep."""
 
 from typing import NamedTuple
 
@@ -13,33 +13,14 @@ from .figures import ticks_in_full
 LOST = "#d9d9d9"  # the colour of points that are lost
 COLOUR_MAP = "viridis_r"  # dark is large: what is bad stands out
 _DECADE = 10.0  # values that span more are shown on a logarithmic scale
-_BEYOND = 1e3  # times the median of what can be shown: a loop that is lost
-
-
-class Panel(NamedTuple):
-    """A metric by point, for one plant and axis: the mean over the references."""
-
-    title: str
-    values: np.ndarray
-    unit: str
 
 
 class Parameter(NamedTuple):
-    """A swept parameter: its points, and how to write and scale it."""
+    """A swept parameter: its points, its label and its scale."""
 
     label: str
     values: np.ndarray
     logarithmic: bool
-
-
-def kept(values: np.ndarray) -> np.ndarray:
-    """Return ``values`` with NaN for what is lost: not finite, or far beyond."""
-    finite = np.where(np.isfinite(values), values, np.nan)
-    if not np.isfinite(finite).any():
-        return finite
-    middle = np.nanmedian(finite)
-    far = (finite > _BEYOND * middle) if middle > 0.0 else False
-    return np.where(far, np.nan, finite)
 
 
 def scale_of(values: np.ndarray) -> Normalize:

@@ -11,7 +11,7 @@ from ..core.serial import save
 from ..signals.waveforms import parse
 from ..study import Study
 from ..tuning.contouring import contour_errors, contours_in
-from ..tuning.outcome import Logs, Outcome
+from ..tuning.outcome import Logs, Outcome, tracking_rms
 from ..tuning.result import GAINS_FILE, RESULT_FILE
 from ..tuning.traces import Trace, traces_of
 from .contour_path import contour_figure
@@ -125,7 +125,7 @@ def tracking_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
         shown = time >= _window(study, trace)
         for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
             error = 1e3 * (log.displacement - log.reference)
-            rms = np.sqrt(np.mean(error[time >= table.settle] ** 2))
+            rms = 1e3 * tracking_rms(log, round(table.settle / dt))
             left.plot(time[shown], log.displacement[shown], color=colour, label=label)
             right.plot(
                 time[shown],

@@ -23,19 +23,19 @@ unstable there, and the size of the violation has no meaning."""
 class LoopFigures(NamedTuple):
     """Figures of a loop from which constraints are evaluated.
 
-    ``figures`` and ``extremes`` hold arrays [plants, references, draws];
+    ``tracking`` and ``extremes`` hold arrays [plants, references, draws];
     ``sensitivity`` is S [plants, branches, lines] on the plants on which margins are
     constrained. ``extremes`` and ``sensitivity`` are None unless a limit needs them.
     ``dt`` in s.
     """
 
-    figures: TrackingFigures
+    tracking: TrackingFigures
     extremes: ExtremeFigures | None
     sensitivity: Sensitivity | None
     dt: float
 
 
-Source = Literal["figures", "extremes", "sensitivity"]
+Source = Literal["tracking", "extremes", "sensitivity"]
 """Field of ``LoopFigures`` from which a constraint is evaluated."""
 
 
@@ -72,13 +72,13 @@ CONSTRAINTS: dict[str, Constraint] = {
         "samples", "at least", "sensitivity", _margin(delay_margin_of)
     ),
     "peak_voltage": Constraint(
-        "V", "at most", "figures", lambda figures, dt: _largest(figures.peak_voltage)
+        "V", "at most", "tracking", lambda figures, dt: _largest(figures.peak_voltage)
     ),
     "peak_slew": Constraint(
         "V/s", "at most", "extremes", lambda found, dt: _largest(found.peak_slew) / dt
     ),
     "effort": Constraint(
-        "V rms", "at most", "figures", lambda figures, dt: _largest(figures.rms_effort)
+        "V rms", "at most", "tracking", lambda figures, dt: _largest(figures.rms_effort)
     ),
     "overshoot": Constraint(
         "1", "at most", "extremes", lambda found, dt: _largest(found.overshoot)

@@ -42,7 +42,7 @@ def trace_front(
 
     def look(objective: Objective, unit: Array) -> tuple[dict[str, Array], Array]:
         loop = objective.figures(unit)
-        return worst_by_plant(objective.limits, loop), loop.figures.rms_error[0]
+        return worst_by_plant(objective.limits, loop), loop.tracking.rms_error[0]
 
     program = clock.compiled(look, objective, as_array(search.unit))
     loosest_first = sorted(

@@ -183,8 +183,8 @@ class Objective(eqx.Module):
         return jnp.mean(joined)
 
     def _judged(self, loop: LoopFigures) -> tuple[Array, Array]:
-        prices = [weight * value for weight, value in self._prices(loop.figures)]
-        return self._error(loop.figures) + sum(prices), violations(self.limits, loop)
+        prices = [weight * value for weight, value in self._prices(loop.tracking)]
+        return self._error(loop.tracking) + sum(prices), violations(self.limits, loop)
 
     def _added(self, violation: Array) -> Array:
         multipliers = self.multipliers
@@ -214,7 +214,7 @@ class Objective(eqx.Module):
         """Return the objective and one of ``every`` errors of each run."""
         loop, errors = self._sampled(unit, every)
         assert errors is not None
-        tracking = loop.figures
+        tracking = loop.tracking
         slope = jax.grad(lambda rms: self._error(tracking._replace(rms_error=rms)))(
             tracking.rms_error
         )
@@ -239,10 +239,10 @@ class Objective(eqx.Module):
         if self.aggregate != "mean_square":
             raise ValueError(f"least squares cannot minimise {self.aggregate!r}")
         loop = self.figures(unit)
-        normalised = self._normalised(loop.figures)
+        normalised = self._normalised(loop.tracking)
         shares = self._shares() / normalised.shape[0]
         parts = [(normalised * jnp.sqrt(shares)).ravel()]
-        for weight, value in self._prices(loop.figures):
+        for weight, value in self._prices(loop.tracking):
             if weight > 0.0:
                 parts.append(jnp.sqrt(weight * value)[None])
         parts.append(self._added(violations(self.limits, loop)))

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
@@ -111,7 +112,7 @@ class Outcome:
         signals = self.holdout
 
         @jax.jit
-        def run(loop: Feedback, index: int) -> LoopSample:
+        def run(loop: Feedback, index: Any) -> LoopSample:
             reference, noise = signals.references[index], signals.noise[index, 0]
             moved = signals.disturbance
             inputs = loop_inputs(
@@ -125,6 +126,15 @@ class Outcome:
             )
             for index in sorted(set(runs))
         }
+
+
+def tracking_rms(log: LoopSample, start: int) -> float:
+    """Return the RMS tracking error from sample ``start`` on, NaN if the run diverged.
+
+    In the unit of the displacement, for samples of one axis.
+    """
+    error = np.asarray(log.displacement - log.reference)[start:]
+    return float(np.sqrt(np.mean(error**2)))
 
 
 def _finite(values: jax.Array) -> np.ndarray:

@@ -126,7 +126,7 @@ class Perturbed(BaseModel):
     ) -> "Perturbed":
         """Return the summary of figures [plants, traces, draws] before and after."""
         means, lost = [], []
-        for figures in (before.figures, after.figures):
+        for figures in (before.tracking, after.tracking):
             rms = np.sqrt(np.mean(np.asarray(figures.rms_error) ** 2, axis=2))
             railed = np.max(np.asarray(figures.saturated), axis=(1, 2)) > RAILED
             lost.append(railed | ~np.all(np.isfinite(rms), axis=1))

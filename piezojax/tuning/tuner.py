@@ -60,7 +60,7 @@ def tune(
     stages = _stages(case, "tune")
     scale = _scale(before, data)[None]
     if stages is not None:
-        found = evaluator.on_stages(case.loop, stages, data.tuning).figures
+        found = evaluator.on_stages(case.loop, stages, data.tuning).tracking
         scale = jax.vmap(lambda one: _scale(one, data, scale[0]))(found)
     objective = Objective(
         loop=case.loop,

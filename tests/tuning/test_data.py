@@ -131,13 +131,13 @@ def still():
 def test_a_perturbed_plant_starts_at_rest_where_it_is_judged(still):
     case, stages, data = still
     seen = Evaluator(Clock(), case, 0).on_stages(case.loop, stages, data.holdout)
-    np.testing.assert_allclose(seen.figures.rms_error, 0.0, atol=1e-12)
+    np.testing.assert_allclose(seen.tracking.rms_error, 0.0, atol=1e-12)
 
 
 def test_a_perturbed_plant_starts_at_rest_where_it_is_tuned(still):
     case, stages, data = still
     objective = objective_of(case, data.tuning, stages=stages)
-    figures = objective.seen(case.space.start(case.loop)).figures
+    figures = objective.figures(case.space.start(case.loop)).tracking
     np.testing.assert_allclose(figures.rms_error, 0.0, atol=1e-12)
 
 

@@ -55,6 +55,15 @@ class LinearDetail(NamedTuple):
     singular_values: dict[str, np.ndarray]
     measured: EmpiricalResponse | None = None
 
+    def fitted(self) -> np.ndarray:
+        """Return the response of ``model`` [lines, p, m] at the measured frequencies.
+
+        Raises ValueError if no response was measured.
+        """
+        if self.measured is None:
+            raise ValueError("no frequency response was measured")
+        return np.asarray(self.model.frequency_response(self.measured.frequency))
+
 
 class Estimate(NamedTuple):
     """A fitted system, its free run over every record [samples, p], what to say.

@@ -19,6 +19,10 @@ INDEPENDENT = 1e-6
 """Least ratio of the eigenvalues of the inputs' power at a line that can be solved."""
 
 
+CONFIDENCE = 1.96
+"""Deviations on either side that hold 95 % of normal errors."""
+
+
 @dataclass(frozen=True)
 class EmpiricalResponse:
     """A measured transfer matrix, line by line.
@@ -35,6 +39,10 @@ class EmpiricalResponse:
     variance: np.ndarray
     power: np.ndarray
     dt: float
+
+    def band(self) -> np.ndarray:
+        """Return half the 95 % band [lines, p, m] of the magnitude of ``response``."""
+        return CONFIDENCE * np.sqrt(0.5 * self.variance)
 
 
 def empirical_response(
