@@ -10,7 +10,7 @@ from ..identification.estimators.estimate import Options
 from ..identification.fit import identify
 from ..identification.records.record import read_record
 from ..report.fit_pictures import write_fit
-from ..report.model_ranking import comparison_notes, comparison_table, write_comparison
+from ..report.model_ranking import ranking_notes, ranking_table, write_ranking
 from ..report.summary_tables import fit_table, models_table
 from .command import Command, common, results_folder, run
 from .terminal import Bar
@@ -138,7 +138,7 @@ def main(
 
     def compare(console, loaded, options):
         with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
-            comparison = identify_all(
+            ranking = identify_all(
                 loaded,
                 hysteresis=None if among is None else among.split(","),
                 train=train,
@@ -149,13 +149,13 @@ def main(
             )
             bar.finish()
             bar.stage("drawing")
-            write_comparison(comparison, folder)
-        report = comparison.report
-        console.print(comparison_table(report))
-        notes = comparison_notes(report)
+            write_ranking(ranking, folder)
+        report = ranking.report
+        console.print(ranking_table(report))
+        notes = ranking_notes(report)
         for note in [
             *notes,
-            *(f"note: {text}" for text in comparison.best.report.warnings),
+            *(f"note: {text}" for text in ranking.best.report.warnings),
         ]:
             console.print(note, soft_wrap=True)
         console.print(f"{report.wall_s:.1f} s; results in {folder}", soft_wrap=True)

@@ -26,7 +26,7 @@ from .fit import Fit as Fit
 from .fit import FitReport as FitReport
 from .fit import identify as identify
 from .methods import METHODS as METHODS
-from .ranking import Comparison as Comparison
+from .ranking import ModelRanking as ModelRanking
 from .records.record import Record as Record
 from .records.record import read_record as read_record
 from .records.resample import average_periods as average_periods

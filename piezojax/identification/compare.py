@@ -10,7 +10,7 @@ from .candidates import Candidate, Untried, at, first_round, later_rounds
 from .criteria import Criteria, criteria, effective_samples, first_alike, ranking
 from .estimators.estimate import Options
 from .fit import Fit, check_together, identify, parts_of
-from .ranking import RULE, Comparison, ComparisonReport, Row, file_name
+from .ranking import RULE, ModelRanking, RankedModel, RankingReport, file_name
 from .records.record import Record
 
 KEPT = 2
@@ -26,7 +26,7 @@ def identify_all(
     test: slice | None = None,
     options: Options | None = None,
     progress: Progress | None = None,
-) -> Comparison:
+) -> ModelRanking:
     """Fit every model that ``records`` support, and choose one by RULE.
 
     First each hysteresis (of those named, if any) with the richest creep and dynamics
@@ -130,7 +130,7 @@ class _Search:
         self.records, self.train, self.validate = records, train, validate
         self._options, self._progress = options, progress
         self.fits: dict[str, Fit] = {}
-        self.failed: list[Row] = []
+        self.failed: list[RankedModel] = []
         self.waiting: list[Candidate] = []
 
     def fit(self, candidates: Sequence[Candidate], total: int) -> None:
@@ -157,7 +157,7 @@ class _Search:
                 kind = "" if isinstance(error, ValueError) else type(error).__name__
                 note = ": ".join(text for text in (kind, str(error)) if text)
                 self.failed.append(
-                    Row(
+                    RankedModel(
                         model=candidate.model,
                         status="failed",
                         note=" ".join(note.split()),
@@ -231,12 +231,12 @@ def _judged(
     test: slice | None,
     interrupted: bool,
     wall_s: float,
-) -> Comparison:
+) -> ModelRanking:
     ranked, worth = search.ranked(), search.criteria()
     fits = {model: search.fits[model] for model in ranked}
     best, twins = next(iter(ranked)), search.twins()
     rows = [
-        Row(
+        RankedModel(
             model=model,
             status="fitted",
             note=f"another way to write {twins[model]}" if model in twins else "",
@@ -253,8 +253,10 @@ def _judged(
         )
         for model, fit in fits.items()
     ]
-    left = [Row(model=u.model, status="not tried", note=u.reason) for u in untried]
-    report = ComparisonReport(
+    left = [
+        RankedModel(model=u.model, status="not tried", note=u.reason) for u in untried
+    ]
+    report = RankingReport(
         best=best,
         rule=RULE,
         unit=fits[best].report.validation.unit,
@@ -268,4 +270,4 @@ def _judged(
         rows=[*rows, *search.failed, *left],
         wall_s=wall_s,
     )
-    return Comparison(fits, report)
+    return ModelRanking(fits, report)

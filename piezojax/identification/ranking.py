@@ -1,4 +1,4 @@
-"""What a comparison of models found."""
+"""Ranking of the models fitted to the same records."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -17,8 +17,8 @@ RULE = (
 """How the best model is chosen."""
 
 
-class Row(BaseModel):
-    """A model of the comparison: what it reached, or why it is not there.
+class RankedModel(BaseModel):
+    """Errors of a model of the ranking, or the reason why it has none.
 
     ``parameters`` counts what was fitted; ``as_good``: validates as well as the best;
     ``folder``: where its model.json and fit.json are.
@@ -39,8 +39,8 @@ class Row(BaseModel):
     folder: str | None = None
 
 
-class ComparisonReport(BaseModel):
-    """The content of ``comparison.json``; ``rows`` best first, then what failed.
+class RankingReport(BaseModel):
+    """Content of ``comparison.json``; ``rows`` best first, then the failed models.
 
     ``test`` is the error of the best model on samples that neither a fit nor the choice
     has seen, None if no such part was named. ``effective_samples`` (of ``samples``, for
@@ -57,16 +57,16 @@ class ComparisonReport(BaseModel):
     samples: int
     effective_samples: list[float]
     interrupted: bool
-    rows: list[Row]
+    rows: list[RankedModel]
     wall_s: float
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ModelRanking:
     """Fits by model, best first, and the report on them."""
 
     fits: dict[str, Fit]
-    report: ComparisonReport
+    report: RankingReport
 
     @property
     def best(self) -> Fit:

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..core.files import write_text
-from ..tuning.comparison import COMPARISON_FILE, Comparison, Row
+from ..tuning.comparison import COMPARISON_FILE, ComparisonResult, TunedStudy
 from .figures import AFTER, BEFORE, MEASURED, figure, styled, write
 
 MARKERS = "osD^vPX*<>hp"
@@ -28,7 +28,7 @@ COLOURS = (
 _COLUMNS = 4
 
 
-def comparison_table(comparison: Comparison) -> Table:
+def comparison_table(comparison: ComparisonResult) -> Table:
     """Return before beside tuned by controller and rate, in nm rms."""
     table = Table(
         title=Text(
@@ -63,7 +63,7 @@ def comparison_table(comparison: Comparison) -> Table:
     return table
 
 
-def write_comparison(comparison: Comparison, folder: Path) -> None:
+def write_comparison(comparison: ComparisonResult, folder: Path) -> None:
     """Write comparison.json and comparison.png into ``folder``."""
     text = comparison.model_dump_json(indent=2)
     write_text(folder / COMPARISON_FILE, text + "\n")
@@ -72,7 +72,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
             write(comparison_figure(comparison), folder / "comparison.png")
 
 
-def comparison_figure(comparison: Comparison) -> Figure:
+def comparison_figure(comparison: ComparisonResult) -> Figure:
     """Error against sampling rate: before and tuned by controller, all tuned in one."""
     controllers = list(comparison.better)
     columns = min(_COLUMNS, len(controllers) + 1)
@@ -121,7 +121,7 @@ def comparison_figure(comparison: Comparison) -> Figure:
 
 
 def _before_and_tuned(
-    ax: Axes, rows: Sequence[Row], lowest: dict[float, float]
+    ax: Axes, rows: Sequence[TunedStudy], lowest: dict[float, float]
 ) -> None:
     ax.plot(
         [rate / 1000 for rate in lowest],
@@ -153,7 +153,7 @@ def _before_and_tuned(
     ax.plot(*_line(tuned, "after_um"), color=AFTER, marker="s", ms=4.0, label="tuned")
 
 
-def _line(rows: Sequence[Row], field: str) -> tuple[list[float], list[float]]:
+def _line(rows: Sequence[TunedStudy], field: str) -> tuple[list[float], list[float]]:
     rows = sorted(rows, key=lambda row: row.rate_Hz)
     return [row.rate_Hz / 1000 for row in rows], [
         1e3 * getattr(row, field) for row in rows
@@ -168,7 +168,7 @@ def _legend_of(axes) -> dict:
     return found
 
 
-def _lowest(comparison: Comparison) -> dict[float, float]:
+def _lowest(comparison: ComparisonResult) -> dict[float, float]:
     found: dict[float, float] = {}
     for row in sorted(comparison.rows, key=lambda row: row.rate_Hz):
         if row.after_um:
@@ -176,7 +176,7 @@ def _lowest(comparison: Comparison) -> dict[float, float]:
     return found
 
 
-def _of(comparison: Comparison, controller: str) -> list[Row]:
+def _of(comparison: ComparisonResult, controller: str) -> list[TunedStudy]:
     return [row for row in comparison.rows if row.controller == controller]
 
 

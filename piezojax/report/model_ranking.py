@@ -1,4 +1,4 @@
-"""What ``identify --model all`` leaves: files, a picture, a table."""
+"""Files, picture and table of ``identify --model all``."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ from rich.table import Table
 
 from ..core.files import write_text
 from ..identification.fit import Fit
-from ..identification.ranking import Comparison, ComparisonReport, Row
+from ..identification.ranking import ModelRanking, RankedModel, RankingReport
 from .figures import (
     AFTER,
     BEFORE,
@@ -26,8 +26,8 @@ from .figures import (
 )
 from .fit_pictures import loop_panel, shown_unit, write_fit, write_model
 
-COMPARISON_FILE, TABLE_FILE = "comparison.json", "comparison.csv"
-COMPARISON_PICTURE = "comparison.png"
+RANKING_FILE, TABLE_FILE = "comparison.json", "comparison.csv"
+RANKING_PICTURE = "comparison.png"
 
 SHOWN = 3
 """Models whose residuals are drawn."""
@@ -35,28 +35,28 @@ SHOWN = 3
 SHADES = (AFTER, BEFORE, REFERENCE)
 
 
-def write_comparison(comparison: Comparison, folder: Path) -> None:
-    """Write the comparison, the best fit as a single one, the others under models/."""
-    report = comparison.report
+def write_ranking(ranking: ModelRanking, folder: Path) -> None:
+    """Write the ranking, the best fit as a single one, the others under models/."""
+    report = ranking.report
     for row in report.rows:
         if row.folder is None or row.model == report.best:
             continue
         place = folder / row.folder
         place.mkdir(parents=True)
-        write_model(comparison.fits[row.model], place)
-    write_text(folder / COMPARISON_FILE, report.model_dump_json(indent=2) + "\n")
+        write_model(ranking.fits[row.model], place)
+    write_text(folder / RANKING_FILE, report.model_dump_json(indent=2) + "\n")
     write_text(folder / TABLE_FILE, _csv(report))
     with styled():
-        write(comparison_figure(comparison), folder / COMPARISON_PICTURE)
-    write_fit(comparison.best, folder)
+        write(ranking_figure(ranking), folder / RANKING_PICTURE)
+    write_fit(ranking.best, folder)
 
 
-def _csv(report: ComparisonReport) -> str:
+def _csv(report: RankingReport) -> str:
     text = io.StringIO()
     rows = [row.model_dump() for row in report.rows]
     for row in rows:
         row["warnings"] = " | ".join(row["warnings"])
-    writer = csv.DictWriter(text, list(Row.model_fields), lineterminator="\n")
+    writer = csv.DictWriter(text, list(RankedModel.model_fields), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
@@ -67,7 +67,7 @@ def _broken(model: str) -> str:
     return model.replace("+", "\n+", 1)
 
 
-def comparison_table(report: ComparisonReport) -> Table:
+def ranking_table(report: RankingReport) -> Table:
     """Return the fitted models, best first, and those that failed."""
     table = Table(title=f"free-run rms error on the validation part, {report.unit}")
     table.add_column("model", no_wrap=True)
@@ -95,8 +95,8 @@ def comparison_table(report: ComparisonReport) -> Table:
     return table
 
 
-def comparison_notes(report: ComparisonReport) -> list[str]:
-    """Return what must be said beside the table, a line each."""
+def ranking_notes(report: RankingReport) -> list[str]:
+    """Return the notes beside the table, a line each."""
     found = [f"{row.model} failed: {row.note}" for row in _with(report, "failed")]
     for reason, rows in groupby(_with(report, "not tried"), key=lambda row: row.note):
         found.append(f"not tried: {', '.join(row.model for row in rows)}: {reason}")
@@ -125,17 +125,17 @@ def comparison_notes(report: ComparisonReport) -> list[str]:
     return found
 
 
-def _with(report: ComparisonReport, status: str) -> list[Row]:
+def _with(report: RankingReport, status: str) -> list[RankedModel]:
     return [row for row in report.rows if row.status == status]
 
 
-def comparison_figure(comparison: Comparison) -> Figure:
+def ranking_figure(ranking: ModelRanking) -> Figure:
     """Validation error by model with its parameters; loop and residuals of the best."""
-    report = comparison.report
-    picture = figure(10.0, max(4.5, 0.9 + 0.36 * len(comparison.fits)))
+    report = ranking.report
+    picture = figure(10.0, max(4.5, 0.9 + 0.36 * len(ranking.fits)))
     grid = picture.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
     _errors_panel(picture.add_subplot(grid[:, 0]), report)
-    best = list(comparison.fits.values())[:SHOWN]
+    best = list(ranking.fits.values())[:SHOWN]
     record, outputs = best[0].record, best[0].simulations[0].shape[1]
     single = (record.inputs.shape[1], outputs) == (1, 1)
     if single:
@@ -145,7 +145,7 @@ def comparison_figure(comparison: Comparison) -> Figure:
     return picture
 
 
-def _errors_panel(ax: Axes, report: ComparisonReport) -> None:
+def _errors_panel(ax: Axes, report: RankingReport) -> None:
     rows = [row for row in report.rows if row.validation_rmse is not None]
     rows.sort(key=lambda row: row.validation_rmse or 0.0, reverse=True)
     errors = np.array([row.validation_rmse for row in rows], dtype=float)

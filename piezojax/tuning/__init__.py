@@ -1,6 +1,6 @@
 """From a study to gains."""
 
-from .comparison import Comparison as Comparison
+from .comparison import ComparisonResult as ComparisonResult
 from .comparison import compare as compare
 from .coupling import Coupling as Coupling
 from .coupling import coupling_matrix as coupling_matrix

@@ -1,4 +1,4 @@
-"""Several studies tuned one after another, and what came of them side by side."""
+"""Comparison of several studies that are tuned one after another."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -16,13 +16,13 @@ from .tuner import tune
 COMPARISON_FILE = "comparison.json"
 
 
-class Row(BaseModel):
-    """A study of the comparison: geometric means of rms errors over references, um.
+class TunedStudy(BaseModel):
+    """Study of a comparison: geometric means of rms errors over references, um.
 
     ``before`` and ``after`` are on noise the optimiser has not seen,
     ``unseen_before`` and ``unseen`` on references it has not seen either; None where a
     run diverges or rails. A study that could not be tuned has the status "failed" and
-    says why in ``notes``.
+    the reason in ``notes``.
     """
 
     study: str
@@ -39,17 +39,17 @@ class Row(BaseModel):
 
     @property
     def ratio(self) -> float | None:
-        """How many times better on held-out noise."""
+        """Factor by which the error on held-out noise became smaller."""
         return _ratio(self.before_um, self.after_um)
 
     @property
     def unseen_ratio(self) -> float | None:
-        """How many times better on references not tuned on."""
+        """Factor by which the error on references not tuned on became smaller."""
         return _ratio(self.unseen_before_um, self.unseen_um)
 
 
-class Comparison(BaseModel):
-    """``comparison.json``: the rows, and what they come to by controller and rate.
+class ComparisonResult(BaseModel):
+    """Content of ``comparison.json``: the rows, with means by controller and rate.
 
     ``better`` and ``unseen_better`` are geometric means over the rates of a controller,
     and None where one of its starts diverges or rails or one of its rows failed.
@@ -58,7 +58,7 @@ class Comparison(BaseModel):
 
     title: str
     status: str
-    rows: list[Row]
+    rows: list[TunedStudy]
     better: dict[str, float | None]
     unseen_better: dict[str, float | None]
     best: dict[str, str]
@@ -73,15 +73,15 @@ def compare(
     *,
     progress: Progress | None = None,
     done: Callable[[Outcome], None] = lambda outcome: None,
-) -> Comparison:
-    """Tune every entry and return how they compare.
+) -> ComparisonResult:
+    """Tune every entry and return the comparison.
 
     ``done`` is called with each Outcome. A study without a stable point becomes a row
-    that says so; ``Ctrl-C`` ends the one that runs, keeps it, and leaves out the rest.
+    with the reason; ``Ctrl-C`` ends the current one, keeps it, and leaves out the rest.
     """
     progress = progress or Silent()
     began = time.perf_counter()
-    rows: list[Row] = []
+    rows: list[TunedStudy] = []
     versions: dict[str, str] = {}
     status = "complete"
     for number, entry in enumerate(entries, 1):
@@ -97,7 +97,7 @@ def compare(
         if outcome.result.status == "interrupted":
             status = "interrupted"
             break
-    return Comparison(
+    return ComparisonResult(
         title=title,
         status=status,
         rows=rows,
@@ -110,8 +110,8 @@ def compare(
     )
 
 
-def _row(entry: ComparedCase, status: str, **rest) -> Row:
-    return Row(
+def _row(entry: ComparedCase, status: str, **rest) -> TunedStudy:
+    return TunedStudy(
         study=entry.name,
         controller=entry.controller,
         rate_Hz=entry.case.study.rate,
@@ -121,7 +121,7 @@ def _row(entry: ComparedCase, status: str, **rest) -> Row:
     )
 
 
-def _row_of(entry: ComparedCase, result: Result) -> Row:
+def _row_of(entry: ComparedCase, result: Result) -> TunedStudy:
     def geomean(scores):
         return scores.geomean_rms_um if scores is not None and scores.stable else None
 
@@ -141,7 +141,7 @@ def _ratio(before: float | None, after: float | None) -> float | None:
     return before / after if before and after else None
 
 
-def _by_controller(rows: Sequence[Row], figure: str) -> dict[str, float | None]:
+def _by_controller(rows: Sequence[TunedStudy], figure: str) -> dict[str, float | None]:
     found: dict[str, float | None] = {}
     for controller in dict.fromkeys(row.controller for row in rows):
         ratios = [getattr(row, figure) for row in rows if row.controller == controller]
@@ -151,8 +151,8 @@ def _by_controller(rows: Sequence[Row], figure: str) -> dict[str, float | None]:
     return found
 
 
-def _best(rows: Sequence[Row]) -> dict[str, str]:
-    best: dict[float, Row] = {}
+def _best(rows: Sequence[TunedStudy]) -> dict[str, str]:
+    best: dict[float, TunedStudy] = {}
     for row in rows:
         leader = best.get(row.rate_Hz)
         error = row.after_um

@@ -21,9 +21,9 @@ from piezojax.identification import (
 from piezojax.identification.candidates import at
 from piezojax.identification.fit import Fit, FitError, FitReport
 from piezojax.report.model_ranking import (
-    comparison_notes,
-    comparison_table,
-    write_comparison,
+    ranking_notes,
+    ranking_table,
+    write_ranking,
 )
 
 HYSTERESIS = at("hysteresis")
@@ -89,7 +89,7 @@ def test_of_two_ways_to_write_one_model_the_first_is_chosen(made, monkeypatch):
     assert stop.bic < rows[plays].bic
     assert found.report.best.split("+")[0] == "prandtl_ishlinskii"
     assert stop.note == f"another way to write {plays}"
-    assert f"{stop.model} is {stop.note}" in comparison_notes(found.report)
+    assert f"{stop.model} is {stop.note}" in ranking_notes(found.report)
     # Another model has its place in the further rounds.
     assert not any(
         "stop_" in model and "exponential" not in model for model in found.fits
@@ -148,7 +148,7 @@ def test_ctrl_c_keeps_what_is_fitted(made):
     assert report.best.startswith("coleman_hodgdon")
     left = [row.model for row in report.rows if row.note == "interrupted before"]
     assert any(model.startswith("prandtl_ishlinskii") for model in left)
-    assert "interrupted" in " ".join(comparison_notes(report))
+    assert "interrupted" in " ".join(ranking_notes(report))
 
 
 def test_ctrl_c_before_anything_is_fitted(made):
@@ -187,14 +187,14 @@ def test_the_test_part_is_kept_from_fits_and_choice(made):
     assert report.test_part == (1600, 2000)
     off = 0.01 * (NOISE[:, 0] + 1e-4 * np.sin(np.arange(2000)))[1600:]
     assert report.test.rmse == pytest.approx(np.sqrt(np.mean(off**2)))
-    notes = " ".join(comparison_notes(report))
+    notes = " ".join(ranking_notes(report))
     assert "neither fits nor choice have seen" in notes
     assert "no hold-out" not in notes
 
 
 def test_without_a_test_part_the_choice_is_said_to_have_seen_it_all(made):
     made()
-    notes = " ".join(comparison_notes(identify_all(RICH).report))
+    notes = " ".join(ranking_notes(identify_all(RICH).report))
     assert "--test START:STOP keeps samples" in notes
 
 
@@ -221,7 +221,7 @@ def test_bad_test_parts(parts, message):
 def test_the_files(made, tmp_path):
     made({"shaped": ValueError("no start")})
     found = identify_all(RICH)
-    write_comparison(found, tmp_path)
+    write_ranking(found, tmp_path)
     for name in ("comparison.png", "fit.png"):
         assert (tmp_path / name).stat().st_size > 5000
     report = json.loads((tmp_path / "comparison.json").read_text())
@@ -237,7 +237,7 @@ def test_the_files(made, tmp_path):
             assert fit["model"] == row["model"]
         else:
             assert row["note"]
-    assert comparison_table(found.report).row_count == len(found.fits) + 1
+    assert ranking_table(found.report).row_count == len(found.fits) + 1
 
 
 # The command

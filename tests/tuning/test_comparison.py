@@ -22,7 +22,7 @@ from piezojax.study import (
 )
 from piezojax.tuning import compare, load_result
 from piezojax.tuning import comparison as comparing
-from piezojax.tuning.comparison import Comparison
+from piezojax.tuning.comparison import ComparisonResult
 
 # The lag is given no sample time of its own (an ARMA has none), so any rate fits it.
 LAG = {"type": "ARMA", "autoregressive": [0.5], "moving": [0.0, 0.067]}
@@ -185,7 +185,7 @@ def test_several_studies_are_compared(compared, tmp_path, monkeypatch):
     monkeypatch.setattr(comparing, "tune", hopeless)
     done = CliRunner().invoke(main, [*map(str, paths), "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
-    comparison = Comparison.model_validate_json(
+    comparison = ComparisonResult.model_validate_json(
         (tmp_path / "out" / "comparison.json").read_text(encoding="utf-8")
     )
     assert [row.study for row in comparison.rows] == ["PID", "continuous"]
