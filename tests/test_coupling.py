@@ -37,7 +37,10 @@ BASE = {
 }
 ONE_AXIS = BASE | {
     "axes": None,
+    "rate": 20_000.0,
     "plant": {"catalog": "p753"},
+    "controller": {"catalog": "p753_pid"},
+    "parameters": {"controller.integral": {"lower": 100.0, "upper": 2e4}},
     "references": {"tune": ["SIN5"], "duration": 1.0},
 }
 
