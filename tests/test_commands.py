@@ -1,6 +1,7 @@
 """The commands, as they are typed."""
 
 import csv
+import dataclasses
 import importlib
 import io
 import json
@@ -16,8 +17,11 @@ from rich.console import Console
 
 import piezojax as pj
 from piezojax.analysis.stability import OperatingPoint
+from piezojax.cli.reproduce import NAMES
 from piezojax.cli.terminal import Bar, console
 from piezojax.core.registry import parts
+from piezojax.identification.chain import DEFAULT
+from piezojax.identification.estimators.estimate import Options
 from piezojax.report.summary_tables import tuning_table
 from piezojax.reproduction import TABLES
 from piezojax.reproduction.cell import Cell
@@ -127,6 +131,15 @@ def test_help_names_what_can_be_chosen():
     text = call("identify", "--help").stdout
     options = ("--time", "--input", "--output", "--rate", "--train", "--validate")
     assert all(option in text for option in (*options, "--model"))
+
+
+def test_defaults_are_those_of_the_functions():
+    """Written out in the commands, so that --help need not import them."""
+    defaults = {option.name: option.default for option in COMMANDS["identify"].params}
+    assert defaults["model"] == DEFAULT
+    for field in dataclasses.fields(Options):
+        assert defaults[field.name] == field.default
+    assert (*TABLES, FIGURE) == NAMES
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -514,10 +527,9 @@ def made_up(monkeypatch):
             for column in ("pid_smc", "dob")
         ]
 
-    module = sys.modules["piezojax.cli.reproduce"]
-    monkeypatch.setattr(module, "reproduce", reproduce)
+    monkeypatch.setattr("piezojax.reproduction.reproduce", reproduce)
     errors = [RateError(20_000, "continuous", row, 0.1) for row in ("SIN1", "SW10")]
-    monkeypatch.setattr(module, "errors_by_rate", lambda: errors)
+    monkeypatch.setattr("piezojax.reproduction.rates.errors_by_rate", lambda: errors)
     return asked
 
 

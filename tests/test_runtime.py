@@ -191,3 +191,17 @@ def test_names_that_are_used_take_along_what_they_need():
     every = imported_by("import piezojax\nfor n in dir(piezojax): getattr(piezojax, n)")
     assert {"piezojax.tuning.tuner", "piezojax.sweeping.sweeper"} < every
     assert every.isdisjoint(LATER)
+
+
+@pytest.mark.parametrize("command", ["tune", "identify", "sweep", "reproduce"])
+def test_help_does_not_wait_for_jax(command):
+    modules = imported_by(
+        "import runpy\n"
+        f"sys.argv = ['piezojax.{command}', '--help']\n"
+        "try:\n"
+        f"    runpy.run_module('piezojax.{command}', run_name='__main__')\n"
+        "except SystemExit as stop:\n"
+        "    assert stop.code == 0"
+    )
+    assert f"piezojax.cli.{command}" in modules
+    assert modules.isdisjoint({"jax", "numpy", "scipy", "matplotlib"})

@@ -4,14 +4,6 @@ from pathlib import Path
 
 import click
 
-from ..identification.chain import DEFAULT
-from ..identification.compare import identify_all
-from ..identification.estimators.estimate import Options
-from ..identification.fit import identify
-from ..identification.records.record import read_record
-from ..report.fit_pictures import write_fit
-from ..report.model_ranking import ranking_notes, ranking_table, write_ranking
-from ..report.summary_tables import fit_table, models_table
 from .command import Command, common, results_folder, run
 from .terminal import Bar
 
@@ -36,7 +28,7 @@ class _Part(click.ParamType):
 )
 @click.option(
     "--model",
-    default=DEFAULT,
+    default="shaped_coleman_hodgdon+exponential_creep+lag",
     show_default=True,
     help="Model to fit, parts joined by '+'; 'help' lists them, 'all' tries all.",
 )
@@ -51,28 +43,28 @@ class _Part(click.ParamType):
 @click.option(
     "--order",
     type=click.IntRange(min=1),
-    default=Options.order,
+    default=4,
     show_default=True,
     help="States of a linear or neural model.",
 )
 @click.option(
     "--window",
     type=click.IntRange(min=1),
-    default=Options.window,
+    default=20,
     show_default=True,
     help="p of the Hankel-Toeplitz regression, samples.",
 )
 @click.option(
     "--oversample",
     type=click.IntRange(min=1),
-    default=Options.oversample,
+    default=8,
     show_default=True,
     help="Steps of bouc_wen in a sample.",
 )
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
-    default=Options.steps,
+    default=200,
     show_default=True,
     help="Most steps of a descent.",
 )
@@ -104,7 +96,14 @@ def main(
     """
     del seed  # this fit draws nothing
 
+    # JAX and what needs it are imported here: --help waits for none of it.
     def body(console):
+        from ..identification.estimators.estimate import Options
+        from ..identification.fit import identify
+        from ..identification.records.record import read_record
+        from ..report.fit_pictures import write_fit
+        from ..report.summary_tables import fit_table, models_table
+
         if model == "help":
             console.print(models_table())
             return
@@ -137,6 +136,13 @@ def main(
         console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
 
     def compare(console, loaded, options):
+        from ..identification.compare import identify_all
+        from ..report.model_ranking import (
+            ranking_notes,
+            ranking_table,
+            write_ranking,
+        )
+
         with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
             ranking = identify_all(
                 loaded,

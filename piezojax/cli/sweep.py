@@ -3,18 +3,19 @@
 import re
 from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
 
-from .. import study as studies
 from ..core.files import numbered_folder
 from ..core.runtime import simulate_side_by_side
-from ..report.sweep_maps import best_table, write_pictures
-from ..sweeping.cluster import client_of
-from ..sweeping.sweeper import DEFAULT, Swept, read_swept, run_sweep
 from .command import INTERRUPTED, RESULTS, Command, common, run
 from .terminal import Bar
+
+# JAX and what needs it are imported by the bodies: --help waits for none of it.
+if TYPE_CHECKING:
+    from ..sweeping.sweeper import Swept
 
 
 def _shard(context: click.Context, option: click.Parameter, text: str) -> tuple:
@@ -64,6 +65,10 @@ def main(
     simulate_side_by_side()
 
     def body(console: Console) -> None:
+        from ..report.sweep_maps import write_pictures
+        from ..sweeping.cluster import client_of
+        from ..sweeping.sweeper import read_swept, run_sweep
+
         if shard != (1, 1) and out is None:
             raise ValueError("--shard needs --out, the folder that all shards share")
         path = _path_of(study)
@@ -96,8 +101,10 @@ def main(
 
 
 def _report(
-    swept: Swept, folder: Path, shard: tuple[int, int], console: Console
+    swept: "Swept", folder: Path, shard: tuple[int, int], console: Console
 ) -> None:
+    from ..report.sweep_maps import best_table
+
     if swept.finished:
         console.print(best_table(swept.path))
     if swept.simulated:
@@ -119,6 +126,9 @@ def _report(
 
 
 def _path_of(study: Path | None) -> Path:
+    from .. import study as studies
+    from ..sweeping.sweeper import DEFAULT
+
     if study is None:
         return studies.shipped(DEFAULT)
     if study.suffix or study.exists():

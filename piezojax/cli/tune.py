@@ -2,32 +2,19 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
-import tomli_w
 from rich.console import Console
 
-from .. import study as studies
 from ..core.files import write_text
-from ..report.baseline_curves import baselines_table, baselines_text, write_baselines
-from ..report.bode import write_stability
-from ..report.comparison_map import comparison_table, write_comparison
-from ..report.fit_pictures import write_fit
-from ..report.limit_bars import limit_text, write_limit
-from ..report.robustness import constraints_table, front_table
-from ..report.summary_tables import (
-    gains_table,
-    perturbed_text,
-    stability_table,
-    tuning_table,
-)
-from ..report.tuning_pictures import write_numbers, write_results
-from ..tuning.baselines import Budget
-from ..tuning.comparison import compare
-from ..tuning.outcome import Outcome
-from ..tuning.tuner import tune
 from .command import INTERRUPTED, Command, common, results_folder, run
 from .terminal import Bar
+
+# JAX and what needs it are imported by the bodies: --help waits for none of it.
+if TYPE_CHECKING:
+    from ..tuning.baselines import Budget
+    from ..tuning.outcome import Outcome
 
 
 @click.command(cls=Command)
@@ -54,6 +41,9 @@ def main(
     """
 
     def body(console: Console) -> None:
+        from .. import study as studies
+        from ..tuning.baselines import Budget
+
         paths = [_path_of(name) for name in study] or [studies.shipped()]
         if len(paths) > 1 or studies.is_comparison_study(paths[0]):
             if baselines:
@@ -69,9 +59,28 @@ def _tune(
     path: Path,
     out: Path | None,
     seed: int | None,
-    baselines: Budget | None,
+    baselines: "Budget | None",
     console: Console,
 ) -> None:
+    from .. import study as studies
+    from ..report.baseline_curves import (
+        baselines_table,
+        baselines_text,
+        write_baselines,
+    )
+    from ..report.bode import write_stability
+    from ..report.fit_pictures import write_fit
+    from ..report.limit_bars import limit_text, write_limit
+    from ..report.robustness import constraints_table, front_table
+    from ..report.summary_tables import (
+        gains_table,
+        perturbed_text,
+        stability_table,
+        tuning_table,
+    )
+    from ..report.tuning_pictures import write_results
+    from ..tuning.tuner import tune
+
     with Bar(console) as bar:
         bar.stage(f"reading {path.name}")
         description = studies.load(path)
@@ -122,12 +131,19 @@ def _tune(
 def _compare(
     paths: Sequence[Path], out: Path | None, seed: int | None, console: Console
 ) -> None:
+    import tomli_w
+
+    from .. import study as studies
+    from ..report.comparison_map import comparison_table, write_comparison
+    from ..report.tuning_pictures import write_numbers
+    from ..tuning.comparison import compare
+
     with Bar(console) as bar:
         bar.stage(f"reading {', '.join(path.name for path in paths)}")
         title, entries = studies.read_compared(paths, seed)
         with results_folder(out, "comparison") as folder:
 
-            def keep(outcome: Outcome) -> None:
+            def keep(outcome: "Outcome") -> None:
                 own = folder / outcome.case.name
                 own.mkdir()
                 write_numbers(outcome, own)
@@ -154,6 +170,8 @@ def _compare(
 
 
 def _path_of(study: Path) -> Path:
+    from .. import study as studies
+
     if study.suffix or study.exists():
         return study
     return studies.shipped(str(study))
