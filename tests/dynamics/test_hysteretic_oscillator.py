@@ -1,5 +1,4 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import bouc_wen as oracle
@@ -99,45 +98,6 @@ def test_rest_stays_at_rest(held):
     after, output = system.step(state, held)
     np.testing.assert_allclose(after, state, rtol=0.0, atol=1e-15)
     np.testing.assert_allclose(output, state.displacement, rtol=1e-15)
-
-
-@jax.jit
-@jax.value_and_grad
-def weighted(system_and_force):
-    system, force = system_and_force
-    outputs = simulate(system, force, system.init(0.0))[1]
-    return jnp.sin(jnp.arange(outputs.size)) @ outputs
-
-
-@pytest.mark.parametrize("name", ["mass", "damping", "stiffness", "alpha", "nu"])
-def test_gradient_is_that_of_differences(name):
-    found = weighted((model(substeps=1), force()))[1][0]
-    found = getattr(found if hasattr(found, name) else found.hysteresis, name)
-    step = 1e-5 * TRUE[name]
-    above, below = (
-        float(weighted((model(substeps=1, **{name: TRUE[name] + by}), force()))[0])
-        for by in (step, -step)
-    )
-    np.testing.assert_allclose(found, (above - below) / (2.0 * step), rtol=1e-4)
-
-
-def test_gradient_at_rest_is_finite():
-    found = weighted((model(substeps=1), np.zeros(60)))[1]
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
-
-
-def test_a_batch_is_a_loop():
-    forces = np.stack([force(seed=seed) for seed in range(3)])
-    batch = jax.vmap(displacement, in_axes=(None, 0))(model(), forces)
-    for row, one in zip(batch, forces, strict=True):
-        np.testing.assert_allclose(row, displacement(model(), one), rtol=1e-12)
-
-
-def test_compiled_and_eager_agree():
-    with jax.disable_jit():
-        eager = displacement(model(substeps=1), force(3))
-    compiled = displacement(model(substeps=1), force(3))
-    np.testing.assert_allclose(compiled, eager, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

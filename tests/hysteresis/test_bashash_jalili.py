@@ -1,5 +1,4 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -100,59 +99,6 @@ def test_rest_is_rest_and_every_way_from_it_is_continuous(input):
     )
     for by in (-1e-7, 1e-7):
         assert abs(step(state, input + by)[1] - output) < 1e-7
-
-
-@jax.jit
-@jax.value_and_grad
-def weighted(system_and_path):
-    system, path = system_and_path
-    outputs = simulate(system, path, system.init(path[0]))[1]
-    return jnp.sin(jnp.arange(outputs.size)) @ outputs
-
-
-def test_gradients_are_those_of_differences():
-    # Turns, pauses, wiped loops, both ends passed.
-    path = np.repeat([10.0, 60.0, 30.0, 45.0, 20.0, 110.0, 70.0, 90.0, -5.0, 40.0], 2)
-    leaves, tree = jax.tree.flatten((model(), path))
-    found = jax.tree.leaves(weighted((model(), path))[1])
-    for i, leaf in enumerate(leaves[:-1]):
-        step = 1e-5 * max(1.0, abs(float(leaf)))
-        above, below = (
-            float(
-                weighted(
-                    jax.tree.unflatten(tree, [*leaves[:i], leaf + by, *leaves[i + 1 :]])
-                )[0]
-            )
-            for by in (step, -step)
-        )
-        slope = (above - below) / (2.0 * step)
-        np.testing.assert_allclose(found[i], slope, rtol=1e-5, atol=1e-7)
-    for k in range(1, path.size, 2):  # the pause moves with its turn
-        step = np.zeros(path.size)
-        step[k - 1 : k + 1] = 1e-5
-        above, below = (
-            float(weighted((model(), path + by * step))[0]) for by in (1, -1)
-        )
-        slope = (above - below) / 2e-5
-        np.testing.assert_allclose(found[-1][k - 1 : k + 1].sum(), slope, rtol=1e-5)
-
-
-@pytest.mark.parametrize("start", [0.0, 30.0, 100.0])
-def test_gradient_at_rest_is_finite(start):
-    found = weighted((model(), np.full(20, start)))[1]
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
-
-
-def test_eager_is_jitted_is_a_lane_of_a_batch():
-    paths = np.random.default_rng(1).uniform(-10.0, 110.0, (2, SAMPLES))
-    state, eager = model().init(paths[0, 0]), []
-    for v in paths[0, :8]:
-        state, output = model().step(state, v)
-        eager.append(output)
-    alone = response(model(), paths[0])
-    np.testing.assert_allclose(alone[:8], eager, atol=1e-12)
-    batch = jax.vmap(padded, in_axes=(None, 0))(model(), paths)
-    np.testing.assert_allclose(batch[0], alone, atol=1e-12)
 
 
 @pytest.mark.parametrize(

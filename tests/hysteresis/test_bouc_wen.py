@@ -1,5 +1,4 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -142,50 +141,6 @@ def test_rest_is_without_force(displacement):
     after, found = model().step(state, displacement)
     assert float(found) == float(state.force) == 0.0
     assert float(after.displacement) == displacement
-
-
-@jax.jit
-@jax.value_and_grad
-def weighted(system_and_path):
-    system, path = system_and_path
-    outputs = simulate(system, path, system.init(0.0))[1]
-    return jnp.sin(jnp.arange(outputs.size)) @ outputs
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_gradient_is_that_of_differences(shape):
-    path = walk(8)  # with pauses and turning points
-    values = dict(
-        zip(
-            ("alpha", "beta_gamma", "beta_delta", "nu"),
-            (ALPHA, *SHAPES[shape]),
-            strict=True,
-        )
-    )
-    found = weighted((BoucWen(**values), path))[1][0]
-    for name, value in values.items():
-        step = 1e-5 * abs(value)
-        above, below = (
-            float(weighted((BoucWen(**{**values, name: value + by}), path))[0])
-            for by in (step, -step)
-        )
-        np.testing.assert_allclose(
-            getattr(found, name), (above - below) / (2.0 * step), rtol=1e-5
-        )
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_gradient_at_rest_is_finite(shape):
-    found = weighted((model(shape), np.zeros(5)))[1]
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
-
-
-def test_a_batch_is_a_loop():
-    systems = [model(shape) for shape in ("benchmark", "saturating", "sharp")]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *systems)
-    batch = jax.vmap(force, in_axes=(0, None))(stacked, walk(30))
-    for row, system in zip(batch, systems, strict=True):
-        np.testing.assert_allclose(row, force(system, walk(30)), rtol=1e-12, atol=1e-9)
 
 
 @pytest.mark.parametrize(

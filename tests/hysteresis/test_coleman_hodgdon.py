@@ -142,53 +142,6 @@ def test_rest_is_on_the_loading_curve(scheme, rest):
         assert jax.tree.structure(after) == jax.tree.structure(state)
 
 
-PAUSES_AND_TURNS = np.repeat(draws(8), 2)
-WEIGHTS = np.random.default_rng(3).normal(size=16)
-
-
-@jax.jit
-@jax.value_and_grad
-def weighted(stage_and_inputs):
-    stage, inputs = stage_and_inputs
-    return WEIGHTS @ simulate(stage, inputs, stage.init(5.0))[1]
-
-
-def slope(along, step):
-    # Fourth-order central difference of `weighted` along a direction.
-    def value(t):
-        return float(weighted(along(t * step))[0])
-
-    near, far = value(1) - value(-1), value(2) - value(-2)
-    return (8.0 * near - far) / (12.0 * step)
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_gradient_with_pauses_and_turns_is_that_of_differences(scheme):
-    names = ("a", "b", "c", "rest_input", "rest_output")
-    values = dict(zip(names, (*HYSTERESIS, 1.0, 0.5), strict=True))
-
-    def changed(name, by):
-        changed = {**values, name: values[name] + by}
-        return ColemanHodgdon(**changed, scheme=scheme), PAUSES_AND_TURNS
-
-    stage, inputs = weighted(changed("a", 0.0))[1]
-    for name in names:
-        expected = slope(
-            lambda by, name=name: changed(name, by), 1e-3 * abs(values[name])
-        )
-        np.testing.assert_allclose(getattr(stage, name), expected, rtol=1e-7)
-    assert np.all(np.isfinite(inputs))
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_gradient_of_the_input_is_that_of_differences(scheme):
-    stage, inputs = model(scheme), draws(16)
-    found = weighted((stage, inputs))[1][1]
-    for k, unit in enumerate(np.eye(16)):
-        expected = slope(lambda by, u=unit: (stage, inputs + by * u), 1e-3)
-        np.testing.assert_allclose(found[k], expected, rtol=1e-7, atol=1e-8)
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_slope_at_rest_is_that_of_the_rising_branch(scheme):
     a, b, c = HYSTERESIS
@@ -196,16 +149,6 @@ def test_slope_at_rest_is_that_of_the_rising_branch(scheme):
     state = stage.init(40.0)
     found = jax.grad(lambda x: stage.step(state, x)[1])(40.0)
     np.testing.assert_allclose(found, a * 40.0 + b + c * state.output, rtol=1e-12)
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_batch_of_stages_is_a_loop_over_them(scheme):
-    scales = jnp.array([0.5, 1.0, 1.5])
-    stages = jax.vmap(lambda s: model(scheme, [s * p for p in HYSTERESIS]))(scales)
-    batch = jax.vmap(response, in_axes=(0, None))(stages, draws(50))
-    for scale, row in zip(scales, batch, strict=True):
-        alone = response(model(scheme, [scale * p for p in HYSTERESIS]), draws(50))
-        np.testing.assert_allclose(row, alone, rtol=0.0, atol=1e-10)
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,9 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import duhem as oracle
 
 from piezojax import (
-    load,
-    save,
     simulate,
 )
 from piezojax.hysteresis import (
@@ -15,7 +12,6 @@ from piezojax.hysteresis import (
     Duhem,
     ShapedColemanHodgdon,
 )
-from piezojax.hysteresis.duhem import DuhemState
 
 A, B, C = 0.0077, 0.1167, -0.0487
 PULL, SLOPE = (0.02, 0.006, -2e-5, 1e-7), (0.11, -3e-4, 2e-6)
@@ -151,59 +147,11 @@ def test_rest_is_on_the_virgin_curve(input):
     assert jax.tree.all(jax.tree.map(lambda a, b: bool(a == b), state, after))
 
 
-@jax.jit
-@jax.value_and_grad
-def weighted(system_and_path):
-    system, path = system_and_path
-    outputs = simulate(system, path, system.init(5.0))[1]
-    return jnp.sin(jnp.arange(outputs.size)) @ outputs
-
-
-def test_gradients_are_those_of_differences():
-    arguments = (curved(), walk(8, 20.0))
-    leaves, tree = jax.tree.flatten(arguments)
-    found = jax.tree.leaves(weighted(arguments)[1])
-
-    def value(i, change):
-        changed = [*leaves[:i], leaves[i] + change, *leaves[i + 1 :]]
-        return float(weighted(jax.tree.unflatten(tree, changed))[0])
-
-    for i, leaf in enumerate(leaves[:-1]):
-        step = 1e-5 * max(1e-2, abs(float(leaf)))
-        slope = (value(i, step) - value(i, -step)) / (2.0 * step)
-        np.testing.assert_allclose(found[i], slope, rtol=1e-5, atol=1e-7)
-    for k in range(1, leaves[-1].size, 2):  # a pause moves with its turn
-        unit = np.zeros(leaves[-1].size)
-        unit[k - 1 : k + 1] = 1e-5
-        last = len(leaves) - 1
-        slope = (value(last, unit) - value(last, -unit)) / 2e-5
-        np.testing.assert_allclose(found[-1][k - 1 : k + 1].sum(), slope, rtol=1e-5)
-
-
 def test_slope_at_rest_is_that_of_the_rising_branch():
     system = coleman_hodgdon()
     state = system.init(40.0)
     found = jax.grad(lambda u: system.step(state, u)[1])(40.0)
     np.testing.assert_allclose(found, A * 40.0 + B + C * state.memory, rtol=1e-12)
-
-
-def test_eager_is_jitted_is_a_lane_of_a_batch():
-    paths = np.random.default_rng(1).uniform(-20.0, 20.0, (2, 256))
-    alone = response(curved(), paths[0], 3.0)
-    state, eager = DuhemState(jnp.array(3.0), jnp.array(0.5)), []
-    for u in paths[0, :4]:
-        state, output = curved().step(state, u)
-        eager.append(output)
-    np.testing.assert_allclose(alone[:4], eager, atol=1e-13)
-    batch = jax.vmap(padded, in_axes=(None, 0, None))(curved(), paths, 3.0)
-    np.testing.assert_allclose(batch[0], alone, atol=1e-13)
-
-
-def test_it_can_be_saved(tmp_path):
-    save(curved(substeps=2), tmp_path / "model.toml")
-    back = load(tmp_path / "model.toml")
-    assert jax.tree.structure(back) == jax.tree.structure(curved(substeps=2))
-    assert jax.tree.leaves(back) == jax.tree.leaves(curved(substeps=2))
 
 
 @pytest.mark.parametrize(

@@ -179,19 +179,6 @@ def test_the_output_rises_with_the_input(inputs):
     assert np.all(rise * change >= -1e-12)
 
 
-@jax.jit
-def stepped_at_rest(system, input):
-    state = system.init(input)
-    return state, system.step(state, input)[0]
-
-
-@pytest.mark.parametrize("start", ["virgin", "saturated"])
-@pytest.mark.parametrize("input", [-3.0, 17.0, 60.0, 104.0])
-def test_a_step_under_the_same_input_changes_nothing(start, input):
-    before, after = stepped_at_rest(model(start), input)
-    np.testing.assert_array_equal(before, after)
-
-
 def test_all_down_and_all_up_are_the_least_and_the_largest_output():
     ends = response(model(), [-10.0, 110.0, -10.0])
     total = LOWEST + WEIGHTS.sum()
@@ -210,22 +197,6 @@ def loss(system, path):
 gradients = jax.jit(jax.grad(loss, argnums=(0, 1)))
 
 
-def test_gradients_are_central_differences():
-    # No level on an edge of a cell, where the slope jumps.
-    arguments = model(rest=31.7), jnp.asarray(PATH)
-    values, tree = jax.tree.flatten(arguments)
-    found = jax.tree.leaves(gradients(*arguments))
-    for at, (leaf, gradient) in enumerate(zip(values, found, strict=True)):
-        for index in np.ndindex(leaf.shape):
-            ends = []
-            for by in (1e-6, -1e-6):
-                moved = list(values)
-                moved[at] = leaf.at[index].add(by)
-                ends.append(float(loss(*jax.tree.unflatten(tree, moved))))
-            slope = (ends[0] - ends[1]) / 2e-6
-            np.testing.assert_allclose(gradient[index], slope, rtol=1e-5, atol=1e-7)
-
-
 def test_gradients_at_rest_and_on_edges_are_those_of_one_side():
     for input in (LOW, LOW + SIZE, HIGH):
         found = gradients(model(rest=input), jnp.full(PATH.size, input))
@@ -234,21 +205,6 @@ def test_gradients_at_rest_and_on_edges_are_those_of_one_side():
     found = gradients(model(rest=LOW + SIZE), jnp.full(PATH.size, LOW + SIZE))[1]
     slope = WEIGHTS[1, 1] / SIZE * np.cos(np.arange(PATH.size))
     np.testing.assert_allclose(found[1:], slope[1:], rtol=1e-12)
-
-
-def test_eager_is_jitted_is_a_lane_of_a_batch():
-    system = model()
-    jitted = response(system, PATH)
-    stepping, state = system.resolved(), system.init(PATH[0])
-    for input, expected in zip(PATH[:3], jitted, strict=False):
-        state, output = stepping.step(state, input)
-        np.testing.assert_allclose(output, expected, rtol=0, atol=1e-13)
-    systems = jax.vmap(lambda s: model(weights=s * WEIGHTS))(jnp.array([1.0, 0.5]))
-    padded = jnp.asarray(np.pad(PATH, (0, LENGTH - PATH.size), "edge"))
-    batch = jax.vmap(_run, (0, None))(systems, padded)[:, : PATH.size]
-    np.testing.assert_allclose(batch[0], jitted, rtol=0, atol=1e-13)
-    half = LOWEST + 0.5 * (jitted - LOWEST)
-    np.testing.assert_allclose(batch[1], half, rtol=0, atol=1e-13)
 
 
 def test_it_is_saved_and_read_back():

@@ -1,5 +1,4 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import preisach as oracle
@@ -56,28 +55,6 @@ def test_at_rest_it_is_the_slow_one_and_stays():
     after, output = system.step(state, 33.0)
     np.testing.assert_array_equal(after, state)
     np.testing.assert_allclose(output, system.slow.step(state, 33.0)[1], rtol=0)
-
-
-def test_gradients_are_central_differences():
-    path = jnp.array([10.0, 24.0, 61.0, 35.0, 47.0])
-
-    @jax.jit
-    def loss(system):
-        outputs = simulate(system, path, system.init(path[0]))[1]
-        return jnp.sum(jnp.cos(jnp.arange(path.size)) * outputs)
-
-    values, tree = jax.tree.flatten(model(rest=21.3))
-    found = jax.tree.leaves(jax.jit(jax.grad(loss))(model(rest=21.3)))
-    for at, (leaf, gradient) in enumerate(zip(values, found, strict=True)):
-        for index in np.ndindex(leaf.shape):
-            ends = []
-            size = 1e-6 * max(1.0, abs(float(leaf[index])))
-            for by in (size, -size):
-                moved = list(values)
-                moved[at] = leaf.at[index].add(by)
-                ends.append(float(loss(jax.tree.unflatten(tree, moved))))
-            slope = (ends[0] - ends[1]) / (2.0 * size)
-            np.testing.assert_allclose(gradient[index], slope, rtol=1e-5, atol=1e-8)
 
 
 @pytest.mark.parametrize(
