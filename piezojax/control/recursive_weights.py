@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Matrix, Scalar, as_array, as_scalars, check
+from ..core.recursive import update
 from ..core.system import Learned, System
 
 Row = tuple[Scalar, ...]
@@ -66,11 +67,14 @@ class RecursiveWeights(System):
         self, state: RecursiveWeightsState, input: tuple[Row, Scalar]
     ) -> tuple[RecursiveWeightsState, Row]:
         row, target = jnp.stack(input[0]), input[1]
-        weights = jnp.stack(state.weights)
-        along = state.covariance @ row
-        spread = self.equation_error**2 + row @ along
-        weights = as_scalars(weights + along * ((target - row @ weights) / spread))
+        weights, covariance = update(
+            jnp.stack(state.weights),
+            state.covariance,
+            row,
+            target,
+            self.equation_error**2,
+        )
+        weights = as_scalars(weights)
         kept = jnp.exp(-self.dt / self.memory)
-        covariance = state.covariance - jnp.outer(along, along / spread)
         covariance = kept * covariance + (1.0 - kept) * self._prior()
         return RecursiveWeightsState(weights, covariance), weights

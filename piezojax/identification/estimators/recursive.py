@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...core.arrays import Scalar, ScalarLike, as_array, check
+from ...core.recursive import update_root
 from ...core.rollout import simulate
 from ...core.system import System
 from ...hysteresis import HystereticARMA
@@ -91,12 +92,9 @@ class RecursiveLeastSquares(System):
         row = jnp.concatenate([state.outputs, operated.ravel(), jnp.ones(1)])
         measured = as_array(input.displacement)
 
-        along = state.root.T @ row
-        spread = self.forgetting + along @ along
-        gain = state.root @ along
-        theta = state.theta + gain / spread * (measured - row @ state.theta)
-        share = 1.0 / (spread + jnp.sqrt(self.forgetting * spread))
-        root = state.root - share * jnp.outer(gain, along)
+        theta, root = update_root(
+            state.theta, state.root, row, measured, self.forgetting
+        )
         root = root / jnp.sqrt(self.forgetting)
 
         outputs = jnp.concatenate([measured[None], state.outputs[:-1]])

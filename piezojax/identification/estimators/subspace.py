@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import linalg
 
+from ...core.recursive import update
 from ...core.rollout import simulate
 from ...dynamics import StateSpace, stabilised
 from ..records.record import Record
@@ -57,10 +58,7 @@ def recursive(
     theta = np.zeros((Y.shape[1], X.shape[1]))
     P = prior * np.eye(X.shape[1])
     for x, y in zip(X, Y, strict=True):
-        direction = P @ x
-        gain = direction / (variance + x @ direction)
-        theta += np.outer(y - theta @ x, gain)
-        P -= np.outer(gain, direction)
+        theta, P = update(theta, P, x, y, variance)
     return theta, P
 
 
