@@ -1,1 +1,1 @@
-"""The one protocol, the one loop over time, and what every other package shares."""
+"""The System protocol, the loop over time, and declarations that all packages use."""

@@ -1,4 +1,4 @@
-"""Array types and the conversions and checks every constructor shares."""
+"""Array types, and the conversions and checks of constructors."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -10,8 +10,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 if TYPE_CHECKING:
-    # Constructors convert numbers to arrays, which a checker sees only where the
-    # converter is spelled out at the field.
+    # Constructors convert numbers to arrays. A type checker knows of this conversion
+    # only where the field names its converter.
     Scalar = Any
     Scalars = Any
     Matrix = Any
@@ -20,7 +20,7 @@ else:
     Scalars = tuple[Scalar, ...]
     Matrix = Float[Array, "rows columns"]
 ScalarLike = Float[Array, ""] | float | int
-Signal = Any  # a Scalar, or a tuple of one Scalar an axis
+Signal = Any  # a Scalar, or a tuple with one Scalar per axis
 State = Any  # a pytree of arrays; every System defines its own
 
 
@@ -32,13 +32,13 @@ def as_array(value: Any) -> Array:
 def as_scalars(values: Iterable[Any]) -> tuple[Array, ...]:
     """Return ``values`` as a tuple of float64 scalars.
 
-    Scalars, not one packed array: XLA keeps them in registers inside the loop.
+    XLA keeps scalars in registers inside the loop; a packed array would not stay there.
     """
     return tuple(as_array(value) for value in values)
 
 
 def as_signal(value: Any) -> Any:
-    """Return a number as a scalar, a vector or sequence as a tuple of one an axis."""
+    """Return a number as a scalar, and a vector or sequence as a tuple of scalars."""
     if isinstance(value, tuple | list) or jnp.ndim(value) == 1:
         return as_scalars(value)
     return as_array(value)
@@ -47,7 +47,7 @@ def as_signal(value: Any) -> Any:
 def as_matrix(value: Any) -> Array:
     """Return ``value`` as a float64 matrix.
 
-    Raises ValueError unless it holds rows of numbers, all of one length.
+    Raises ValueError unless ``value`` holds rows of numbers of one length.
     """
     try:
         matrix = as_array(value)
@@ -58,8 +58,8 @@ def as_matrix(value: Any) -> Array:
     return matrix
 
 
-def _known(value: Any) -> np.ndarray | None:
-    """Return the numbers in ``value``, or None while it is being traced."""
+def _concrete(value: Any) -> np.ndarray | None:
+    """Return ``value`` as a NumPy array, or None for a JAX tracer."""
     return None if isinstance(value, Tracer) else np.asarray(value)
 
 
@@ -74,11 +74,12 @@ def check(
 ) -> None:
     """Raise ValueError unless ``value`` is finite and inside the stated bounds.
 
-    ``value`` is a number, an array or nested sequences of them. Values that are being
-    traced have no number to check and pass.
+    ``value`` is a number, an array or a nested sequence of them. ``above`` and
+    ``below`` are exclusive, ``least`` and ``most`` inclusive. Traced values are not
+    checked, because their numbers are not known yet.
     """
     for element in jax.tree.leaves(value):
-        number = _known(element)
+        number = _concrete(element)
         if number is None:
             continue
         inside = (
@@ -96,12 +97,12 @@ def check(
                 if np.isfinite(bound)
             ]
             allowed = " and ".join(["finite", *bounds])
-            raise ValueError(f"{name} is {_shown(number)}; it must be {allowed}")
+            raise ValueError(f"{name} is {_formatted(number)}; it must be {allowed}")
 
 
 def check_not_zero(name: str, value: Any) -> None:
-    """Raise ValueError if ``value`` is known to be zero."""
-    number = _known(value)
+    """Raise ValueError if ``value`` is zero; traced values are not checked."""
+    number = _concrete(value)
     if number is not None and np.any(number == 0.0):
         raise ValueError(f"{name} is 0; it must be another number")
 
@@ -109,18 +110,22 @@ def check_not_zero(name: str, value: Any) -> None:
 def check_order(
     low_name: str, low: Any, high_name: str, high: Any, *, equal: bool = False
 ) -> None:
-    """Raise ValueError unless ``low < high``, or <=, wherever both are known."""
-    lower, upper = _known(low), _known(high)
+    """Raise ValueError unless ``low < high``; with ``equal``, unless ``low <= high``.
+
+    Traced values are not checked.
+    """
+    lower, upper = _concrete(low), _concrete(high)
     if lower is None or upper is None:
         return
     if not np.all(lower <= upper if equal else lower < upper):
         raise ValueError(
-            f"{low_name} is {_shown(lower)} and {high_name} is {_shown(upper)}; "
+            f"{low_name} is {_formatted(lower)} and "
+            f"{high_name} is {_formatted(upper)}; "
             f"{low_name} must be {'at most' if equal else 'below'} {high_name}"
         )
 
 
-def _shown(number: np.ndarray) -> str:
+def _formatted(number: np.ndarray) -> str:
     if number.ndim == 0:
         return f"{number:g}"
     return " ".join(np.array2string(number, threshold=6).split())

@@ -1,7 +1,8 @@
-"""Signals of several axes: tuples of scalars, an axis each.
+"""Signals of several axes: tuples with one scalar per axis.
 
-A packed array would be two to seven times slower in batches: XLA keeps scalars in
-registers, lanes side by side. Matrices are therefore rows of scalars, multiplied out.
+In batches a packed array would be two to seven times slower, because XLA keeps scalars
+in registers, with the lanes side by side. Matrices are therefore rows of scalars, and
+their products are written out.
 """
 
 from collections.abc import Iterable
@@ -18,16 +19,16 @@ from .system import System
 Axes: TypeAlias = tuple[Scalar, ...]
 Rows: TypeAlias = tuple[tuple[Scalar, ...], ...]
 Plain: TypeAlias = tuple[Any, ...]
-"""Either of them where they are multiplied out: checking every scalar of every product
-for its type would take most of the time of a traced test."""
+"""Axes or Rows in a product. The type says less than they do, because checking the type
+of every scalar in every product would take most of the time of a traced test."""
 
 T = TypeVar("T")
 
 
 def as_rows(values: Any) -> Rows:
-    """Return a matrix, an array or nested sequences, as rows of scalars.
+    """Return a matrix, given as an array or nested sequence, as rows of scalars.
 
-    Raises ValueError unless all rows are of one length.
+    Raises ValueError unless all rows have one length.
     """
     rows = tuple(as_scalars(row) for row in values)
     if len({len(row) for row in rows}) != 1:
@@ -86,7 +87,8 @@ def minus(left: T, right: T) -> T:
 def inverse(matrix: Plain) -> Plain:
     """Return the inverse of a square matrix.
 
-    Closed form up to 3 rows; beyond, a linear solve, which is slow inside a loop.
+    Up to 3 rows the closed form is used, beyond that a linear solve, which is slow
+    inside a loop over time.
     """
     size = len(matrix)
     if size > 3:
@@ -115,22 +117,22 @@ def _minor(matrix: Plain, row: int, column: int) -> Any:
 
 
 def _is_axes(node: Any) -> bool:
-    """Whether ``node`` is a signal of several axes: an innermost plain tuple."""
+    """Return whether ``node`` is a signal of several axes: an innermost plain tuple."""
     return type(node) is tuple and not any(isinstance(part, tuple) for part in node)
 
 
 def axis_of(signals: Any, axis: int) -> Any:
-    """Return ``signals``, such as an Observation of several axes, for one of them."""
+    """Return the component of ``signals``, such as an Observation, on one axis."""
     return jax.tree.map(lambda node: node[axis], signals, is_leaf=_is_axes)
 
 
 class PerAxis(System):
-    """A system of its own on each axis: nothing passes from one to another.
+    """Independent systems, one per axis.
 
-    Every signal in its input, a tuple of scalars, is taken apart; the outputs make up a
-    tuple again. ``names``, if given, are those of the axes in paths
-    (``controller.Rx.integral``); without them axes count from 0. Raises ValueError for
-    names that are not as many as the parts.
+    ``parts[i]`` receives component i of every signal in the input; the outputs form a
+    tuple with one component per axis. ``names`` are the names of the axes in paths
+    (``controller.Rx.integral``); without names, paths contain the index of the axis.
+    Raises ValueError if ``names`` and ``parts`` differ in length.
     """
 
     parts: tuple[System, ...]
@@ -152,10 +154,10 @@ class PerAxis(System):
 
 
 class Packed(System):
-    """``system``, which works on vectors, among systems of tuples of scalars.
+    """Adapter of a ``system`` with vectors to systems with tuples of scalars.
 
-    Input and output are tuples, an axis or actuator each. Meant for a few: an
-    allocation, a geometry.
+    Input and output are tuples with one scalar per axis or actuator. It suits a few
+    parts of a loop, such as an allocation or a geometry.
     """
 
     system: System
@@ -169,7 +171,7 @@ class Packed(System):
 
 
 class PerAxisMetric(Metric):
-    """``metric`` of each axis; figures of shape [axes]."""
+    """``metric`` on each axis; its figures have the shape [axes]."""
 
     metric: Metric
     axes: int = eqx.field(static=True)
@@ -179,17 +181,17 @@ class PerAxisMetric(Metric):
 
     def update(self, total: State, index: jax.Array, output: Any) -> State:
         return tuple(
-            self.metric.update(one, index, axis_of(output, axis))
-            for axis, one in enumerate(total)
+            self.metric.update(part, index, axis_of(output, axis))
+            for axis, part in enumerate(total)
         )
 
     def result(self, total: State) -> Any:
-        figures = [self.metric.result(one) for one in total]
+        figures = [self.metric.result(part) for part in total]
         return jax.tree.map(lambda *values: jnp.stack(values), *figures)
 
 
 def packed(signals: Any) -> Any:
-    """Return ``signals``, such as a log of several axes, with arrays [..., axes]."""
+    """Return ``signals``, such as a log, with arrays [..., axes] for tuples."""
     return jax.tree.map(
         lambda node: jnp.stack(node, axis=-1) if _is_axes(node) else node,
         signals,

@@ -1,4 +1,4 @@
-"""Writing results: never over older ones, never half a file."""
+"""Atomic writing of files, reading of models, and new folders for results."""
 
 import os
 import tempfile
@@ -13,15 +13,16 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write ``text`` to ``path`` in one move: a killed run leaves the old file."""
+    """Write ``text`` to ``path`` atomically: a killed run leaves the old file."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
-    """Write ``content`` to ``path`` in one move.
+    """Write ``content`` to ``path`` atomically.
 
-    With ``durable`` it is on the disk when this returns, power cuts included. Raises
-    ValueError if its folder is missing or cannot be written.
+    With ``durable`` the file is synced to the disk before the function returns, so that
+    it survives a power cut. Raises ValueError if the folder of ``path`` is missing or
+    cannot be written.
     """
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -33,18 +34,18 @@ def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
             if durable:
                 file.flush()
                 os.fsync(file.fileno())
-        os.chmod(name, 0o644)  # mkstemp makes it private
+        os.chmod(name, 0o644)  # mkstemp allows only the owner
         os.replace(name, path)
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
     if durable:
-        _keep_names(path.parent)
+        _sync_folder(path.parent)
 
 
 @contextmanager
 def written_elsewhere(path: Path) -> Iterator[Path]:
-    """Give a file beside ``path`` to write to, moved there, on the disk, at the end."""
+    """Yield a temporary file; at the end, sync it and move it to ``path``."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     os.close(handle)
     try:
@@ -56,27 +57,28 @@ def written_elsewhere(path: Path) -> Iterator[Path]:
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
-    _keep_names(path.parent)
+    _sync_folder(path.parent)
 
 
-def _keep_names(folder: Path) -> None:
-    """Put the folder's list of names on the disk, where the system can."""
+def _sync_folder(folder: Path) -> None:
+    """Sync the list of names in ``folder`` to the disk, where the system can."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:
-        return  # Windows opens no folders
+        return  # Windows cannot open a folder
     try:
         os.fsync(handle)
     except OSError:
-        pass  # nor do some network file systems sync them
+        pass  # some network file systems cannot sync a folder
     finally:
         os.close(handle)
 
 
 def read_model(kind: type[Model], path: Path, wrong: str) -> Model:
-    """Read a JSON file as ``kind``.
+    """Read a JSON file as a model of class ``kind``.
 
-    Raises ValueError, with ``wrong`` said of a file that holds something else.
+    Raises ValueError for a file that cannot be read, and for a file with other content;
+    the message then contains ``wrong``.
     """
     try:
         return kind.model_validate_json(path.read_text(encoding="utf-8"))
@@ -87,9 +89,9 @@ def read_model(kind: type[Model], path: Path, wrong: str) -> Model:
 
 
 def fresh_folder(path: Path) -> Path:
-    """Make ``path`` for new results and return it.
+    """Create the folder ``path`` for new results and return it.
 
-    Raises ValueError if it already holds something or cannot be written.
+    Raises ValueError if the folder is not empty or cannot be written.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -105,7 +107,8 @@ def fresh_folder(path: Path) -> Path:
 
 
 def numbered_folder(stem: Path) -> Path:
-    """Return ``stem``, or ``stem-2``, ``stem-3``, ...: the first that is still free."""
+    """Return the first empty or missing folder of ``stem``, ``stem-2``, ``stem-3``,
+    ..."""
     number = 1
     while True:
         path = stem if number == 1 else stem.with_name(f"{stem.name}-{number}")

@@ -1,4 +1,4 @@
-"""Figures of a loop, accumulated while it runs."""
+"""Metrics of a loop, accumulated while it runs."""
 
 from typing import Any, NamedTuple
 
@@ -12,13 +12,14 @@ from .system import LoopSample
 
 
 class TrackingFigures(NamedTuple):
-    """What a run of a loop came to.
+    """Tracking error, effort and saturation of one run of a loop.
 
-    Over the window of its Tracking metric: ``rms_error`` and ``peak_error`` of the true
+    Over the window of the Tracking metric: ``rms_error`` and ``peak_error`` of the true
     displacement against the reference in um; ``rms_effort`` of the voltage in V;
-    ``rms_slew`` of its change a sample in V. Over the whole run, because an actuator
-    that rails at the start has railed: ``saturated``, the share of samples at which it
-    did not give what was asked for (0 to 1), and ``peak_voltage`` in V.
+    ``rms_slew`` of the change of the voltage per sample in V. Over the whole run,
+    because saturation during the start-up counts too: ``saturated``, the share of
+    samples (0 to 1) at which the voltage differs from the command, and ``peak_voltage``
+    in V.
     """
 
     rms_error: Scalar
@@ -30,12 +31,12 @@ class TrackingFigures(NamedTuple):
 
 
 class Tracking(Metric):
-    """Tracking error, effort and saturation of a Feedback loop from a sample on.
+    """Metric of the tracking error, effort and saturation of a Feedback loop.
 
-    ``start`` is the first sample counted: the thesis leaves the start-up transient out.
-    A voltage that differs from the command by more than ``tolerance`` (V) counts as
-    saturated, so that a converter's rounding does not. The figures of a run that ends
-    before ``start`` are NaN: it was not perfect, nothing of it was counted.
+    ``start`` is the first sample of the window: the thesis excludes the start-up
+    transient. A sample counts as saturated if the voltage differs from the command by
+    more than ``tolerance`` (V), so that the rounding of a converter does not count. If
+    a run ends before ``start``, the figures over the window are NaN.
     """
 
     start: int = eqx.field(static=True, default=0)
@@ -87,9 +88,11 @@ class Tracking(Metric):
 
 
 class ExtremeFigures(NamedTuple):
-    """Extremes of a run of a loop: ``peak_slew``, the largest change of the voltage
-    from one sample to the next, V; ``overshoot``, how far the displacement goes beyond
-    the highest reference, as a share of the reference's range (0 where it rests).
+    """Extremes of one run of a loop.
+
+    ``peak_slew`` is the largest change of the voltage between two samples, V.
+    ``overshoot`` is the excess of the displacement over the highest reference, as a
+    share of the range of the reference; it is 0 for a constant reference.
     """
 
     peak_slew: Scalar
@@ -97,7 +100,7 @@ class ExtremeFigures(NamedTuple):
 
 
 class Extremes(Metric):
-    """Largest step of the voltage and overshoot, over the whole run."""
+    """Metric of the largest voltage change and the overshoot over the whole run."""
 
     def init(self) -> State:
         zero, least = jnp.zeros(()), jnp.asarray(-jnp.inf)
@@ -129,7 +132,7 @@ class Extremes(Metric):
 
 
 class Both(Metric):
-    """Two metrics of one run; their figures in a tuple."""
+    """Two metrics of one run; the result is the tuple of their figures."""
 
     first: Metric
     second: Metric
@@ -148,9 +151,9 @@ class Both(Metric):
 
 
 def root(square: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the square root with the slope 0 at 0, NaN of NaN.
+    """Return the square root with slope 0 at 0; NaN gives NaN.
 
-    The slope of sqrt there is infinite; a perfect run must have the gradient 0.
+    The slope of sqrt at 0 is infinite, but a run without error must have gradient 0.
     """
     positive = square > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0 * square)

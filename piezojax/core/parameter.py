@@ -1,4 +1,4 @@
-"""Parameters of systems, each declared once, beside its field."""
+"""Declarations of parameters: unit, meaning, limits and search range, at the field."""
 
 import dataclasses
 import math
@@ -19,12 +19,12 @@ _KEY = "parameter"
 class Parameter:
     """Declaration of a parameter: its unit, meaning, limits and search range.
 
-    ``above`` and ``below`` are limits that the value must not reach, ``least`` and
-    ``most`` limits that it may. ``typical`` is the range that a search takes if a study
-    gives none, on ``scale``: "log" for positive values that span decades, "logit" for
-    values between 0 and 1. ``unit`` "1" is a pure number. A frequency with
-    ``below_nyquist`` must stay below pi / dt of the System that declares it; a count
-    is ``whole``.
+    ``above`` and ``below`` are exclusive limits, ``least`` and ``most`` inclusive ones.
+    ``typical`` is the range of a search for which the study gives no range, on
+    ``scale``: "log" for positive values that span decades, "logit" for values between 0
+    and 1. The ``unit`` of a pure number is "1". A frequency with ``below_nyquist`` must
+    be below pi / dt, with the sample time dt of the declaring System. A ``whole``
+    parameter is an integer, such as a count.
     """
 
     unit: str
@@ -77,13 +77,13 @@ def parameter(
 ) -> Any:
     """Return a field of a System together with its declaration.
 
-    The first arguments are those of ``Parameter``. ``static`` fields, such as a sample
-    time or a count, are plain numbers that cannot be tuned; others go through
-    ``converter``. ``options`` are those of ``dataclasses.field``: ``default``,
-    ``kw_only``.
+    The first arguments are those of ``Parameter``. A ``static`` field, such as a sample
+    time or a count, is a plain number that cannot be tuned; ``converter`` converts the
+    value of any other field. ``options`` are those of ``dataclasses.field``:
+    ``default``, ``kw_only``.
 
-    The constructor of the System checks the declared limits; tables, pictures, bounds
-    of a search and the API page read unit, meaning and range from here.
+    The constructor of the System checks the declared limits; tables, pictures, search
+    bounds and the API page read unit, meaning and range from the declaration.
     """
     declared = Parameter(
         unit, meaning, above, least, most, below, scale, typical, below_nyquist, whole
@@ -108,9 +108,9 @@ def declarations(kind: Any) -> Iterator[tuple[str, Parameter]]:
 def check_declared(system: Any) -> None:
     """Check every declared field of ``system``.
 
-    Raises ValueError naming the field, its unit, the value and what is allowed.
+    Raises ValueError, naming the field, its unit, the value and the allowed range.
     """
-    # The sample time first: other limits may follow from it.
+    # The sample time comes first, because other limits may depend on it.
     for name, declared in sorted(declarations(system), key=lambda d: d[0] != "dt"):
         value = getattr(system, name)
         if value is not None:

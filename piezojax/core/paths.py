@@ -1,4 +1,4 @@
-"""Parameters by name: ``"controller.feedback.surface"`` in a tree of systems."""
+"""Paths of parameters in a tree of systems, as ``"controller.feedback.surface"``."""
 
 import dataclasses
 import difflib
@@ -31,15 +31,15 @@ def _children(node: Any) -> dict[str, Any]:
 
 
 def parameters(system: Any, prefix: str = "") -> dict[str, Any]:
-    """Return every array leaf of ``system`` by its path."""
-    found = {}
+    """Return the array leaves of ``system`` by path."""
+    leaves = {}
     for name, child in _children(system).items():
         path = f"{prefix}{name}"
         if eqx.is_array(child):
-            found[path] = child
+            leaves[path] = child
         else:
-            found.update(parameters(child, f"{path}."))
-    return found
+            leaves.update(parameters(child, f"{path}."))
+    return leaves
 
 
 def matching(system: Any, pattern: str) -> list[str]:
@@ -52,32 +52,31 @@ def matching(system: Any, pattern: str) -> list[str]:
 
 
 def declared(system: Any, path: str) -> Parameter | None:
-    """Return the declaration of the parameter at ``path``; None without one.
+    """Return the declaration of the parameter at ``path``, or None if it has none.
 
     The elements of a tuple, such as coefficients, share the declaration of their field.
-    A limit below the Nyquist frequency is that at the sample time of the declaring
-    System.
+    A limit at the Nyquist frequency uses the sample time of the declaring System.
     """
     node: Any = system
-    found = None
+    declaration = None
     for name in path.split("."):
         children = _children(node)
         if name not in children:
             return None
         if isinstance(node, eqx.Module):
-            found = dict(declarations(type(node))).get(name)
-            if found is not None and found.below_nyquist:
-                found = found.at(children["dt"])
+            declaration = dict(declarations(type(node))).get(name)
+            if declaration is not None and declaration.below_nyquist:
+                declaration = declaration.at(children["dt"])
         node = children[name]
-    return found
+    return declaration
 
 
 def static_fields(system: Any, name: str) -> list[Any]:
-    """Return the values of every field called ``name`` in the tree of ``system``."""
-    found = []
+    """Return the values of all fields called ``name`` in the tree of ``system``."""
+    values = []
     for key, child in _children(system).items():
-        found += [child] if key == name else static_fields(child, name)
-    return found
+        values += [child] if key == name else static_fields(child, name)
+    return values
 
 
 def _walk(node: Any, path: str) -> Any:
@@ -89,7 +88,7 @@ def _walk(node: Any, path: str) -> Any:
 def get(system: eqx.Module, path: str) -> Any:
     """Return the array leaf at ``path``.
 
-    Raises ValueError, with the nearest names, where there is none.
+    Raises ValueError, listing the most similar paths, if there is none.
     """
     try:
         node = _walk(system, path)

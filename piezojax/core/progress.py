@@ -1,24 +1,24 @@
-"""How long work says where it stands; report.console shows it."""
+"""Progress reporting interface; ``cli.terminal`` displays it."""
 
 from typing import Protocol, runtime_checkable
 
 
 @runtime_checkable
 class Progress(Protocol):
-    """What long work tells while it runs."""
+    """Receiver of progress reports from a long computation."""
 
     def stage(self, text: str, steps: int = 0) -> None:
-        """Announce a stage that takes ``steps`` advances, or an unknown time."""
+        """Begin the stage ``text`` of ``steps`` steps; 0 if their number is unknown."""
 
     def advance(self, best: float, note: str = "") -> None:
-        """Tell that a step is done, and how good the best start is or a note."""
+        """Report that a step is done, with the best loss so far or a note."""
 
 
 class Silent:
-    """No progress."""
+    """Receiver that ignores progress reports."""
 
     def stage(self, text: str, steps: int = 0) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
     def advance(self, best: float, note: str = "") -> None:
-        """Say nothing."""
+        """Do nothing."""

@@ -1,4 +1,4 @@
-"""What a model declares of itself to be fitted: its place in a chain and its recipe."""
+"""Declarations of models that can be fitted: place in a chain, first guess, bounds."""
 
 import abc
 from collections.abc import Mapping, Sequence
@@ -12,13 +12,13 @@ PLACES = ("hysteresis", "creep", "dynamics", "lag", "delay")
 
 
 class Extent(NamedTuple):
-    """Ranges of a record's signals, from which a recipe takes its bounds."""
+    """Ranges of the signals of a record, from which a recipe computes bounds."""
 
     low: float  # V
     high: float  # V
     first: tuple[float, float]  # V, um: the first sample
     slope: float  # um/V, mean
-    centre: float  # um, the output for no input
+    centre: float  # um, the output at zero input
     span: float  # um
     dt: float  # s
     duration: float  # s
@@ -30,10 +30,13 @@ class Extent(NamedTuple):
 
 
 class Recipe(NamedTuple):
-    """A System to fit: its first guess, bounds by path in it, other starts to try.
+    """First guess, bounds and starting values for fitting a System.
 
-    ``gain`` is the path of a parameter that only scales the output, ``own`` holds the
-    paths of which each record has its own value: the state before it began.
+    ``system`` holds the first guess, ``bounds`` the Range of each fitted parameter by
+    its path in ``system``, ``alternatives`` the values of each further start by path.
+    ``gain`` is the path of a parameter that only scales the output. ``own`` holds the
+    paths of parameters with a separate value for each record: the state before it
+    began.
     """
 
     system: System
@@ -54,8 +57,8 @@ class Part(NamedTuple):
 class Fittable(System):
     """A System that ``identify`` fits as a part of a chain.
 
-    Once registered, it is listed by ``--model help`` and, if a hysteresis or a creep,
-    tried by ``--model all``.
+    ``--model help`` lists it once it is registered; ``--model all`` tries it if it is a
+    hysteresis or a creep.
     """
 
     part: ClassVar[Part]
@@ -65,22 +68,22 @@ class Fittable(System):
     def recipe(cls, extent: Extent) -> Recipe:
         """Return the first guess and the bounds for a record of this extent.
 
-        Raises ValueError where the model cannot describe such a record.
+        Raises ValueError if the model cannot describe such a record.
         """
 
 
 def around(value: float, below: float, above: float) -> Range:
-    """Return the range between multiples of ``value``, which may be negative."""
+    """Return the Range from ``below`` to ``above`` times ``value``, in rising order."""
     low, high = sorted((below * value, above * value))
     return Range(low, high)
 
 
 def rest_bounds(extent: Extent) -> dict[str, Range]:
-    """Return the range of ``rest_input``, the input in force before the record."""
+    """Return the Range of ``rest_input``, the input (V) before the record."""
     margin = 0.5 * extent.width
     return {"rest_input": Range(extent.low - margin, extent.high + margin)}
 
 
 def rests(extent: Extent) -> list[dict[str, float]]:
-    """Return starts of ``rest_input``: the record's first input and its lowest."""
+    """Return starting values of ``rest_input``: the first and the lowest input (V)."""
     return [{"rest_input": extent.first[0]}, {"rest_input": extent.low}]

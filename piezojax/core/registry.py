@@ -1,4 +1,4 @@
-"""Systems by name: those of installed packages, and those that a user registers."""
+"""Registry of Systems by name, from installed packages and from the user."""
 
 import inspect
 from functools import cache
@@ -9,8 +9,8 @@ from .recipe import PLACES, Fittable
 from .system import System
 
 ENTRY_POINTS = "piezojax.systems"
-"""Group of the entry points that name Systems, or modules that export Systems; the
-models and controllers of piezojax come in by it, too."""
+"""Group of entry points that name Systems or modules that export Systems. piezojax
+registers its own models and controllers through it."""
 
 S = TypeVar("S", bound=System)
 
@@ -18,11 +18,11 @@ _registered: dict[str, type[System]] = {}
 
 
 def register(kind: type[S]) -> type[S]:
-    """Make ``kind`` known by its class name, to files as to fits; a class decorator.
+    """Register the class ``kind`` by its name and return it; usable as a decorator.
 
-    A registered System can be saved and loaded; a Fittable is also listed and fitted by
-    the name that it declares. Raises TypeError for a class that is not a System,
-    ValueError for a name that another class has or for an unknown place in a chain.
+    A registered System can be saved and loaded; a Fittable can also be listed and
+    fitted, by the name in its Part. Raises TypeError for a class that is not a System,
+    and ValueError for a name that another class has or an unknown place in a chain.
     """
     _discover()
     return _add(kind)
@@ -42,8 +42,9 @@ def _add(kind: type[S]) -> type[S]:
     return kind
 
 
-def _same(one: type, other: type) -> bool:
-    return (one.__module__, one.__qualname__) == (other.__module__, other.__qualname__)
+def _same(kind: type, other: type) -> bool:
+    names = kind.__module__, kind.__qualname__
+    return names == (other.__module__, other.__qualname__)
 
 
 def _check_part(kind: type[Fittable]) -> None:
@@ -64,8 +65,8 @@ def _check_part(kind: type[Fittable]) -> None:
 @cache
 def _discover() -> None:
     for point in entry_points(group=ENTRY_POINTS):
-        found = point.load()
-        for value in [found] if isinstance(found, type) else vars(found).values():
+        loaded = point.load()
+        for value in [loaded] if isinstance(loaded, type) else vars(loaded).values():
             if isinstance(value, type) and issubclass(value, System):
                 _add(value)
 
@@ -79,7 +80,7 @@ def _fittable() -> list[type[Fittable]]:
 
 
 def kinds() -> dict[str, type[System]]:
-    """Return every known System class by its name."""
+    """Return the registered System classes that are not abstract, by class name."""
     _discover()
     return {
         name: kind
@@ -89,9 +90,9 @@ def kinds() -> dict[str, type[System]]:
 
 
 def parts() -> dict[str, type[Fittable]]:
-    """Return every known part of chains by its name.
+    """Return the registered Fittable classes by the names in their Parts.
 
-    Parts are ordered by their place, then as their packages export them.
+    They are ordered by place in a chain, then as their packages export them.
     """
     _discover()
     ordered = sorted(_fittable(), key=lambda kind: PLACES.index(kind.part.place))

@@ -1,4 +1,4 @@
-"""The one loop over time: everything that runs goes through it."""
+"""The loop over time that simulates every System, and the Metric interface."""
 
 import abc
 from collections.abc import Callable
@@ -16,14 +16,15 @@ from .system import System, resolve
 T = TypeVar("T")
 
 SEGMENT = 100
-"""Samples between two stored states in reverse mode; 100 was the fastest measured."""
+"""Samples between two stored states in reverse mode; 100 was measured as the
+fastest."""
 
 BLOCK = 64
-"""Lanes simulated at a time: their state then stays in the nearest cache."""
+"""Lanes simulated together, few enough for their state to stay in the nearest cache."""
 
 
 class Metric(eqx.Module):
-    """Something accumulated along a run, so that no trajectory has to be stored."""
+    """Quantity accumulated during a run, so that no trajectory has to be stored."""
 
     @abc.abstractmethod
     def init(self) -> State:
@@ -47,23 +48,25 @@ def simulate(
     metric: Metric | None = None,
     segment: int = SEGMENT,
 ) -> tuple[State, Any]:
-    """Run ``system`` over ``inputs``, a pytree of arrays with time first.
+    """Simulate ``system`` over ``inputs``, a pytree of arrays with time as first axis.
 
-    Starts at ``state``, or at rest. Returns the last state and
+    The run starts from ``state``, or from rest without one. Returns the last state and
 
-    - every ``every``-th output, stacked in time (a dense log costs about twice the run,
-      every 20th sample a tenth); or
-    - with ``metric``, its result, accumulated on the way: memory does not grow with
+    - without ``metric``, every ``every``-th output from the first on, stacked in time
+      (a dense log costs about twice the run, every 20th sample a tenth); or
+    - with ``metric``, its result, accumulated during the run: memory does not grow with
       time; or
-    - with both, the pair of the result and the last output of each whole stretch of
-      ``every`` samples, stacked in time: not for reverse mode.
+    - with ``metric`` and ``every`` above 1, the pair of the result and the last output
+      of each whole block of ``every`` samples, stacked in time; not for reverse mode.
 
-    Reverse-mode differentiation stores one state each ``segment`` samples and runs the
-    samples between again, so its memory is flat too. A ``segment`` as long as the run
-    is one plain loop: for runs that are not differentiated in reverse, and a third
-    faster where a batch of inputs lies time first (``in_axes=1``). Batches:
-    ``jax.vmap``, or ``in_blocks`` for many lanes. Raises ValueError for empty or
-    ragged inputs, and for a stretch longer than the run.
+    With ``metric``, reverse-mode differentiation stores one state per ``segment``
+    samples and repeats the samples between them, so that its memory stays small too. A
+    ``segment`` as long as the run makes one plain loop, for runs without reverse mode;
+    it is a third faster for a batch of inputs with time first (``in_axes=1``). Use
+    ``jax.vmap`` for batches, or ``in_blocks`` for many lanes.
+
+    Raises ValueError for empty or ragged inputs, ``every`` or ``segment`` below 1, or,
+    with ``metric``, ``every`` longer than the run.
     """
     for name, value in (("every", every), ("segment", segment)):
         if value < 1:
@@ -79,7 +82,7 @@ def simulate(
         return _accumulate(system, inputs, state, metric, segment, samples)
     if every > 1:
         return _decimated(system, inputs, state, every, samples)
-    # A bound method would be hashed, and its arrays cannot be.
+    # A lambda, because scan would hash a bound method, and arrays have no hash.
     return jax.lax.scan(lambda s, u: system.step(s, u), state, inputs)
 
 
@@ -135,7 +138,7 @@ def _sampled(
         carry, _ = jax.lax.scan(sample, carry, inputs)
         return carry, carry[-1]
 
-    # The last output goes round with the state: one copy of the step to compile.
+    # The carry holds the last output, so that the step is compiled only once.
     first = jax.tree.map(lambda x: x[0], inputs)
     empty = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
@@ -159,8 +162,8 @@ def _in_segments(
 ) -> Any:
     @partial(jax.checkpoint, static_argnums=2)
     def stretch(carry, start, size):
-        # Cut out here, in cache: scanning over the inputs cut up beforehand would lay
-        # a whole batch of them out anew.
+        # Slicing here stays in cache: a scan over inputs sliced beforehand would copy a
+        # whole batch of them.
         cut = jax.tree.map(
             lambda x: jax.lax.dynamic_slice_in_dim(x, start, size), inputs
         )
@@ -192,7 +195,7 @@ def _decimated(
     if samples % every:
         state, last = stretch(state, tail)
         outputs = jax.tree.map(
-            lambda log, one: jnp.concatenate([log, one[None]]), outputs, last
+            lambda log, end: jnp.concatenate([log, end[None]]), outputs, last
         )
     return state, outputs
 
@@ -200,7 +203,7 @@ def _decimated(
 def in_blocks(function: Callable[..., T], *batches: Any, size: int = BLOCK) -> T:
     """Map ``function`` over the leading axis of ``batches``, ``size`` lanes at a time.
 
-    The same as ``jax.vmap(function)(*batches)``, faster beyond ``size`` lanes.
+    Equivalent to ``jax.vmap(function)(*batches)``, but faster beyond ``size`` lanes.
     """
     lanes = jax.tree.leaves(batches)[0].shape[0]
     if lanes <= size:
@@ -209,7 +212,7 @@ def in_blocks(function: Callable[..., T], *batches: Any, size: int = BLOCK) -> T
     filler = blocks * size - lanes
 
     def block(x):
-        # The last block is filled up with copies of its last lane: one compilation.
+        # Copies of the last lane fill the last block: one compilation serves all.
         x = jnp.concatenate([x, jnp.repeat(x[-1:], filler, axis=0)]) if filler else x
         return x.reshape(blocks, size, *x.shape[1:])
 

@@ -1,4 +1,4 @@
-"""The classical Runge-Kutta step, for Systems that are given as a rate of change."""
+"""Classical Runge-Kutta step for Systems given by a differential equation."""
 
 from collections.abc import Callable
 
@@ -10,12 +10,12 @@ Point = tuple[Scalar, ...]
 def runge_kutta(
     rate: Callable[[Point], Point], point: Point, step: ScalarLike, substeps: int
 ) -> Point:
-    """Return ``point`` after ``step`` along ``rate``, in ``substeps`` equal parts.
+    """Integrate ``rate`` from ``point`` over ``step``, in ``substeps`` equal parts.
 
     Fourth order where ``rate`` is smooth. Source: Kutta 1901.
     """
     step = step / substeps
-    # Unrolled: a loop inside the loop over time would be dispatched piece by piece.
+    # Unrolled: XLA would dispatch a loop inside the loop over time kernel by kernel.
     for _ in range(substeps):
         first = rate(point)
         second = rate(_moved(point, 0.5 * step, first))
@@ -28,5 +28,5 @@ def runge_kutta(
     return point
 
 
-def _moved(point: Point, by: ScalarLike, along: Point) -> Point:
-    return tuple(x + by * slope for x, slope in zip(point, along, strict=True))
+def _moved(point: Point, step: ScalarLike, slopes: Point) -> Point:
+    return tuple(x + step * slope for x, slope in zip(point, slopes, strict=True))

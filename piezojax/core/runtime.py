@@ -6,12 +6,12 @@ import warnings
 from importlib.metadata import version
 from typing import Any
 
-# Internal options: an unknown one aborts the process, so each is only set for the
-# jaxlib versions, from the one here to _BEFORE, on which it was seen to parse.
+# An unknown internal option aborts the process. Each is therefore set only for the
+# jaxlib versions known to accept it: from the version given here up to _BEFORE.
 _CPU_FLAGS = {
-    # A scan whose carry exceeds about 1 kB is otherwise run kernel by kernel,
-    # which costs microseconds a step; with this the loop is one function.
-    # Given beside a user's own extra options, it is added to them.
+    # Without this option a scan with a carry above about 1 kB runs kernel by kernel,
+    # which costs microseconds per step; with it the loop is one function. It is added
+    # to extra options that the user gives.
     "xla_cpu_small_while_loop_byte_threshold": (
         "--xla_backend_extra_options="
         "xla_cpu_small_while_loop_byte_threshold=1000000000",
@@ -22,7 +22,7 @@ _CPU_FLAGS = {
         "--xla_cpu_copy_insertion_use_region_analysis=true",
         (0, 9, 2),
     ),
-    # The newer code generator takes up to twice as long, and loops run no faster.
+    # The newer code generator compiles up to twice as long, and loops run no faster.
     "xla_cpu_use_fusion_emitters": ("--xla_cpu_use_fusion_emitters=false", (0, 10)),
 }
 _BEFORE = (0, 13)
@@ -31,8 +31,8 @@ CACHE_VARIABLE = "PIEZOJAX_COMPILATION_CACHE"
 
 
 def _set(option: str, value: Any) -> None:
-    # Importing JAX takes a second, which `--help` need not wait for: an option that is
-    # set in the environment is read when JAX is imported.
+    # Importing JAX takes a second, and `--help` should not wait for it. JAX reads
+    # options from the environment when it is imported.
     if jax := sys.modules.get("jax"):
         jax.config.update(option, value)
     else:
@@ -40,7 +40,7 @@ def _set(option: str, value: Any) -> None:
 
 
 def _backend_is_running() -> bool:
-    # JAX has no public question for this that does not itself start the backend.
+    # Every public function of JAX that tells this starts the backend.
     if "jax" not in sys.modules:
         return False
     try:
@@ -62,11 +62,11 @@ def _missing_flags(current: str, jaxlib: tuple[int, ...]) -> list[str]:
 def configure() -> None:
     """Prepare JAX for closed-loop simulation; called once by ``import piezojax``.
 
-    Switches JAX to float64 (float32 loses 14 nm in the controller's slow filters),
-    appends the CPU flags above to the user's own ``XLA_FLAGS`` without replacing any,
-    and, if the environment names a folder in ``PIEZOJAX_COMPILATION_CACHE``, keeps
-    compiled programs there. Warns when a backend is already running, because XLA then
-    ignores the flags and loops run 3 to 75 times slower.
+    Switches JAX to float64, because float32 loses 14 nm in the slow filters of the
+    controller. Appends the CPU flags above to the ``XLA_FLAGS`` of the user without
+    replacing any. Stores compiled programs in the folder that the environment variable
+    ``PIEZOJAX_COMPILATION_CACHE`` names, if any. Warns if a backend is already running,
+    because XLA then ignores the flags and loops run 3 to 75 times slower.
     """
     _set("jax_enable_x64", True)
     jaxlib = tuple(
@@ -88,10 +88,10 @@ def configure() -> None:
 
 
 def simulate_side_by_side() -> bool:
-    """Let threads of this process simulate at the same time; says whether they can.
+    """Let threads simulate at the same time; return whether they can.
 
-    Where JAX queues its calls on the CPU, they wait for each other, on one core. Takes
-    effect only before the backend starts, as it does in a command.
+    By default JAX queues calls on the CPU, so that threads wait for each other on one
+    core. The setting takes effect only before the backend starts, as in a command.
     """
     if not _backend_is_running():
         _set("jax_cpu_enable_async_dispatch", False)
@@ -103,7 +103,8 @@ _side_by_side: list[bool] = []
 
 
 def _use_cache(folder: str, jaxlib: tuple[int, ...]) -> None:
-    # Compiled code of another version or CPU has crashed when loaded: key the folder.
+    # Code compiled by another version or for another CPU has crashed when loaded: the
+    # name of the folder contains both.
     import hashlib
     import platform
 

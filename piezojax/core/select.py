@@ -1,4 +1,4 @@
-"""One of several inputs: what lets systems of one input share a tuple of them."""
+"""Selection of one input from a tuple, for systems with a single input."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ from .system import System
 
 
 class Select(System):
-    """``output = input[index]`` of an input that is a tuple.
+    """Selection of one element of a tuple: ``output = input[index]``.
 
-    With a voltage and a temperature: ``(Select(0) >> stage) + (Select(1) >> drift)``.
+    For a voltage and a temperature: ``(Select(0) >> stage) + (Select(1) >> drift)``.
     Raises ValueError for a negative or fractional ``index``.
     """
 

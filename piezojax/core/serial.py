@@ -1,4 +1,4 @@
-"""Systems as plain data: TOML or JSON files that load back, and nothing executable."""
+"""Conversion of Systems to plain data in TOML or JSON files, without code, and back."""
 
 import dataclasses
 import json
@@ -44,9 +44,10 @@ def _value_to_data(value: Any) -> Any:
 
 
 def from_data(data: Any, where: str = "system") -> System:
-    """Return the System that ``data``, as made by ``to_data``, describes.
+    """Return the System that ``data`` from ``to_data`` describes.
 
-    Raises ValueError naming the key, the value and what is allowed.
+    ``where`` is the name of ``data`` in errors. Raises ValueError, naming the key, the
+    value and the allowed values.
     """
     known = kinds()
     allowed = ", ".join(known)
@@ -82,11 +83,11 @@ def from_data(data: Any, where: str = "system") -> System:
 
 
 def _value_from_data(value: Any, kind: Any, where: str) -> Any:
-    """Return ``value`` as a field of type ``kind`` takes it."""
+    """Return ``value`` converted for a field of type ``kind``."""
     if isinstance(kind, UnionType):
         listed = isinstance(value, list | tuple)
         kind = next(
-            (one for one in get_args(kind) if (get_origin(one) is tuple) == listed),
+            (arm for arm in get_args(kind) if (get_origin(arm) is tuple) == listed),
             kind,
         )
     if get_origin(kind) is tuple:
@@ -128,14 +129,14 @@ _PLAIN: dict[Any, tuple[Any, str]] = {
     str: (str, "a text"),
     int: (int, "a whole number"),
 }
-"""What fields that are not parameters take; every other field takes a number."""
+"""Accepted types, and their names in errors; any other field takes a number."""
 
 
 def save(system: System, path: str | Path) -> None:
-    """Write ``system`` to ``path`` (``.toml`` or ``.json``), whole or not at all.
+    """Write ``system`` to ``path`` (``.toml`` or ``.json``) atomically.
 
-    Raises ValueError for a System that ``load`` would refuse: one of a class that is
-    not registered, or with a parameter outside its limits.
+    Raises ValueError for a System that ``load`` would reject: its class is not
+    registered, or a parameter is outside its limits.
     """
     path, data = Path(path), to_data(system)
     from_data(data, path.name)
@@ -146,9 +147,9 @@ def save(system: System, path: str | Path) -> None:
 
 
 def load(path: str | Path) -> System:
-    """Read back what ``save`` wrote.
+    """Return the System in the file ``path``, written by ``save``.
 
-    Raises ValueError for a file that is missing, is no TOML or JSON, or describes no
+    Raises ValueError for a file that is missing, is not TOML or JSON, or describes no
     System.
     """
     path = Path(path)

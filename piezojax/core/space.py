@@ -1,4 +1,4 @@
-"""The box that tuning and identification search: paths, bounds, scales."""
+"""Search box of tuning and identification: paths, bounds and scales of parameters."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,20 +22,19 @@ SCALES: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]] = {
     "log": (jnp.log, jnp.exp),
     "logit": (lambda x: jnp.log(x) - jnp.log1p(-x), jax.nn.sigmoid),
 }
-"""Maps of each scale, forth and back: ``log`` for positive values that span decades,
+"""Map and inverse map of each scale: ``log`` for positive values that span decades,
 ``logit`` for values between 0 and 1."""
 
 INSIDE = 1e-6
-"""Distance to its bound, as a share of the box, to which a start on a bound is moved:
-the smooth map to the whole line has no slope on the bound itself."""
+"""Least distance of a start from a bound, as a share of the box. On the bound itself
+the smooth map to the real line has no slope."""
 
 
 @dataclass(frozen=True)
 class Range:
     """Bounds of a parameter in its ``unit``, and the scale on which it is searched.
 
-    ``start`` is the value that a search begins with; None leaves the value that the
-    System has.
+    ``start`` is the starting value of a search; None keeps the value in the System.
     """
 
     lower: float
@@ -46,9 +45,9 @@ class Range:
 
     @classmethod
     def of(cls, declared: Parameter) -> "Range | None":
-        """Return the typical range of a declared parameter; None without one.
+        """Return the typical Range of a declared parameter, or None if it has none.
 
-        It ends 1 % below a limit that the parameter must not reach.
+        Its upper end is at least 1 % below an exclusive upper limit.
         """
         if declared.typical is None:
             return None
@@ -79,8 +78,8 @@ class Range:
 class Space(eqx.Module):
     """A box of parameters, each mapped through its scale onto [0, 1].
 
-    ``space_of`` makes one from Ranges. The bounds are arrays, so that programs compiled
-    for a Space serve any other bounds of the same parameters.
+    ``space_of`` builds it from Ranges. The bounds are arrays, so that a program
+    compiled for one Space serves other bounds of the same parameters too.
     """
 
     paths: tuple[str, ...] = eqx.field(static=True)
@@ -91,13 +90,14 @@ class Space(eqx.Module):
     def ranges(self) -> dict[str, Range]:
         """Return the Range of each parameter by path."""
         rows = zip(self.lower, self.upper, self.scales, strict=True)
-        found = [Range(float(low), float(high), scale) for low, high, scale in rows]
-        return dict(zip(self.paths, found, strict=True))
+        ranges = [Range(float(low), float(high), scale) for low, high, scale in rows]
+        return dict(zip(self.paths, ranges, strict=True))
 
     def start(self, system: System) -> Float[Array, " n"]:
-        """Return the place of ``system`` in the box, in [0, 1]^n.
+        """Return the parameters of ``system`` as a point of [0, 1]^n.
 
-        Raises ValueError for a parameter outside its bounds.
+        A parameter on a bound is moved inside by ``INSIDE``. Raises ValueError for a
+        parameter outside its bounds.
         """
         values = jnp.stack([as_array(get(system, path)) for path in self.paths])
         for path, value, low, high in zip(
@@ -126,7 +126,7 @@ class Space(eqx.Module):
         """Map [0, 1]^n to parameter values, never outside the bounds."""
         low, high = self._map(self.lower, 0), self._map(self.upper, 0)
         values = self._map(low + unit * (high - low), 1)
-        # exp(log(x)) may miss x by a rounding.
+        # exp(log(x)) may differ from x by a rounding error.
         return jnp.clip(values, self.lower, self.upper)
 
     def put(self, system: S, unit: Float[Array, " n"]) -> S:
@@ -139,26 +139,26 @@ class Space(eqx.Module):
 
 
 def space_of(ranges: Mapping[str, Range]) -> Space:
-    """Return the Space of Ranges by path.
+    """Return the Space with the given Ranges by path.
 
     Raises ValueError, naming the path, for bounds that are not in order or do not suit
     their scale.
     """
-    for path, one in ranges.items():
-        one.check(path)
+    for path, bounds in ranges.items():
+        bounds.check(path)
     return Space(
         paths=tuple(ranges),
-        scales=tuple(one.scale for one in ranges.values()),
-        lower=as_array([one.lower for one in ranges.values()]),
-        upper=as_array([one.upper for one in ranges.values()]),
+        scales=tuple(bounds.scale for bounds in ranges.values()),
+        lower=as_array([bounds.lower for bounds in ranges.values()]),
+        upper=as_array([bounds.upper for bounds in ranges.values()]),
     )
 
 
 def squash(free: Array) -> Array:
-    """Map the whole line into (0, 1), for optimisers that know no bounds."""
+    """Map the real line into (0, 1), for optimisers without bounds."""
     return jax.nn.sigmoid(free)
 
 
 def unsquash(unit: Array) -> Array:
-    """Undo ``squash``."""
+    """Map (0, 1) onto the real line, the inverse of ``squash``."""
     return jnp.log(unit) - jnp.log1p(-unit)

@@ -1,4 +1,4 @@
-"""The one protocol, System, and its compositions."""
+"""The System protocol, its compositions and the feedback loop."""
 
 import abc
 import dataclasses
@@ -18,10 +18,10 @@ from .parameter import check_declared, parameter, sample_time
     field_specifiers=(dataclasses.field, eqx.field, parameter, sample_time)
 )
 class System(eqx.Module):
-    """Anything that runs in time: a plant, a filter, an observer, a controller, a loop.
+    """Discrete-time system: a plant, a filter, an observer, a controller or a loop.
 
-    Array fields are its parameters: they can be differentiated, batched with
-    ``jax.vmap``, tuned by their path or perturbed without knowing what the system is.
+    Its array fields are its parameters. They can be differentiated, batched with
+    ``jax.vmap``, and tuned or perturbed by path in any System.
     """
 
     def __check_init__(self):
@@ -31,14 +31,15 @@ class System(eqx.Module):
     def init(self, input: Any = 0.0) -> State:
         """Return the state at rest under the constant ``input``.
 
-        A step with that same input leaves the state where it is.
+        A step with the same input does not change this state.
         """
 
     @abc.abstractmethod
     def step(self, state: State, input: Any) -> tuple[State, Any]:
         """Advance one sample: ``(state, input) -> (next state, output)``.
 
-        Pure, free of branches, for one signal; batches are ``jax.vmap``'s job.
+        The function is pure and free of branches and takes one signal; batch it with
+        ``jax.vmap``.
         """
 
     def __rshift__(self, other: "System") -> "Series":
@@ -46,16 +47,17 @@ class System(eqx.Module):
         return Series((*_series_parts(self), *_series_parts(other)))
 
     def __add__(self, other: "System") -> "Parallel":
-        """Return the sum of both systems' outputs for the same input."""
+        """Return the System that sums the outputs of both for the same input."""
         return Parallel((*_parallel_parts(self), *_parallel_parts(other)))
 
 
 class Designed(System):
-    """A system whose parameters are not the numbers that it steps with.
+    """System that steps with numbers computed from its parameters.
 
-    ``resolved`` computes those, such as a gain matrix from a model, and returns a
-    system with the same state, input and output. ``simulate`` does so once, before the
-    loop over time; in the step it would be done, and differentiated, at every sample.
+    ``resolved`` computes these numbers, such as a gain matrix from a model, and returns
+    a System with the same state, input and output. ``simulate`` calls it once, before
+    the loop over time; in the step they would be computed and differentiated at every
+    sample.
     """
 
     @abc.abstractmethod
@@ -83,20 +85,24 @@ def resolve(system: Any) -> Any:
 
 
 class Learned(eqx.Module):
-    """State that is learned while a system runs: a loop taken for small motions holds
-    it, because what it has learned changes slowly and acts only on larger ones."""
+    """State that a system learns while it runs.
+
+    ``linearise`` holds it constant, because it changes slowly and acts only on larger
+    motions.
+    """
 
 
 def rest_output(system: System, input: Any) -> Any:
-    """Return what ``system`` puts out at rest under the constant ``input``."""
+    """Return the output of ``system`` at rest under the constant ``input``."""
     return system.step(system.init(input), input)[1]
 
 
 class Series(System):
-    """Systems one after the other; ``a >> b >> c`` makes one.
+    """Systems in series; ``a >> b >> c`` creates one.
 
-    Parts are reached by their position (``plant.0.a``) or, if ``names`` are given, by
-    name (``plant.hysteresis.a``).
+    Paths contain the position of a part (``plant.0.a``) or, if ``names`` are given, its
+    name (``plant.hysteresis.a``). Raises ValueError if ``names`` and ``parts`` differ
+    in length.
     """
 
     parts: tuple[System, ...]
@@ -122,7 +128,7 @@ class Series(System):
 
 
 class Parallel(System):
-    """The sum of several systems' outputs for one input; ``a + b`` makes one."""
+    """Sum of the outputs of several systems for one input; ``a + b`` creates one."""
 
     parts: tuple[System, ...]
 
@@ -155,7 +161,7 @@ def _parallel_parts(system: System) -> tuple[System, ...]:
 
 
 class Affine(System):
-    """``output = gain * input + offset``: a calibration, a sensor's zero."""
+    """``output = gain * input + offset``: a calibration or the offset of a sensor."""
 
     gain: Scalar = parameter("1", "gain", default=1.0)
     offset: Scalar = parameter("1", "offset", default=0.0)
@@ -168,7 +174,7 @@ class Affine(System):
 
 
 class Delay(System):
-    """A pure delay by a whole number of samples."""
+    """Delay by a whole number of samples."""
 
     samples: int = parameter(
         "1", "number of samples", least=0.0, whole=True, static=True
@@ -183,10 +189,10 @@ class Delay(System):
 
 
 class Observation(NamedTuple):
-    """What a controller sees at sample k: scalars, or tuples of one scalar an axis.
+    """Input of a controller at sample k: scalars, or tuples with one scalar per axis.
 
-    ``reference`` r(k) and ``next_reference`` r(k+1) in um; ``measured`` z(k) in um;
-    ``applied``, the voltage that the actuator was given at k-1, after its limits, in V.
+    ``reference`` r(k), ``next_reference`` r(k+1) and ``measured`` z(k) are in um;
+    ``applied`` is the voltage of the actuator at k-1, after its limits, in V.
     """
 
     reference: Signal
@@ -196,10 +202,10 @@ class Observation(NamedTuple):
 
 
 class LoopInput(NamedTuple):
-    """What drives a loop at sample k.
+    """Input of a loop at sample k.
 
-    ``next_reference`` r(k+1) in um; ``noise``, a unit-variance draw that the sensor
-    scales; ``disturbance`` in um, if any, moves the displacement itself at k+1.
+    ``next_reference`` is r(k+1) in um, ``noise`` a unit-variance draw that the sensor
+    scales, ``disturbance`` an optional addition in um to the displacement at k+1.
     """
 
     next_reference: Signal
@@ -208,9 +214,9 @@ class LoopInput(NamedTuple):
 
 
 class LoopSample(NamedTuple):
-    """What a loop logs at sample k, um and V.
+    """Output of a loop at sample k, in um and V.
 
-    ``command`` is what the controller asked for, ``voltage`` what the actuator gave.
+    ``command`` is the output of the controller, ``voltage`` that of the actuator.
     """
 
     reference: Signal
@@ -233,14 +239,14 @@ class LoopState(NamedTuple):
 
 
 class Feedback(System):
-    """A controller around an actuator, a plant and a sensor.
+    """Feedback loop of a controller, an actuator, a plant and a sensor.
 
-    At sample k the sensor measures y(k), the controller sees r(k), r(k+1) and the
-    measurement, the actuator turns its command into u(k), and u(k) moves the plant to
-    y(k+1): one sample of delay from input to measured output, so no algebraic loop.
+    At sample k the sensor measures y(k), the controller receives r(k), r(k+1) and the
+    measurement, the actuator turns the command into u(k), and u(k) moves the plant to
+    y(k+1). The measured output lags the input by one sample, so no loop is algebraic.
 
-    With several axes every signal is a tuple of scalars, one an axis, in the units of
-    its axis; nothing else changes.
+    With several axes every signal is a tuple with one scalar per axis, in the unit of
+    the axis.
     """
 
     controller: System
@@ -249,11 +255,11 @@ class Feedback(System):
     sensor: System
 
     def init(self, input: Any = 0.0, holding: Any = None) -> LoopState:
-        """Return the loop at rest at the reference ``input`` (um): a bumpless start.
+        """Return the state at rest at the reference ``input`` (um): a bumpless start.
 
-        With several axes ``input`` is a vector or a tuple. ``holding`` is what
-        ``holding_input`` gives for it, if known: solving for it takes longer to compile
-        than the rest.
+        With several axes ``input`` is a vector or a tuple. ``holding`` is the result of
+        ``holding_input`` for it, if known; the solver takes longer to compile than the
+        rest.
         """
         reference = as_signal(input)
         if holding is None:
@@ -262,9 +268,9 @@ class Feedback(System):
         displacement = rest_output(self.plant, voltage)
         quiet = (displacement, jax.tree.map(jnp.zeros_like, displacement))
         measured = rest_output(self.sensor, quiet)
-        seen = Observation(reference, reference, measured, voltage)
+        observation = Observation(reference, reference, measured, voltage)
         return LoopState(
-            controller=self.controller.init(seen),
+            controller=self.controller.init(observation),
             actuator=self.actuator.init(voltage),
             plant=self.plant.init(voltage),
             sensor=self.sensor.init(quiet),
@@ -277,10 +283,10 @@ class Feedback(System):
         sensor, measured = self.sensor.step(
             state.sensor, (state.displacement, input.noise)
         )
-        seen = Observation(
+        observation = Observation(
             state.reference, input.next_reference, measured, state.voltage
         )
-        controller, command = self.controller.step(state.controller, seen)
+        controller, command = self.controller.step(state.controller, observation)
         actuator, voltage = self.actuator.step(state.actuator, command)
         plant, displacement = self.plant.step(state.plant, voltage)
         if input.disturbance is not None:
@@ -305,12 +311,12 @@ def loop_inputs(
     noise: Float[Array, " samples"] | Float[Array, "samples axes"] | None = None,
     disturbance: Float[Array, " samples"] | Float[Array, "samples axes"] | None = None,
 ) -> LoopInput:
-    """Return the inputs that make a loop follow ``reference`` (um).
+    """Return the inputs of a loop that follows ``reference`` (um).
 
     ``noise`` holds unit-variance draws, zero if left out; ``disturbance`` (um) is added
-    to what the plant does. The last sample is repeated
-    as its own successor; what it influences lies after the end of the record. Several
-    axes: a column each, in the units of the axis.
+    to the output of the plant. The last reference is repeated as its own successor,
+    which acts only after the end of the record. Several axes are columns, each in the
+    unit of its axis.
     """
     reference = as_array(reference)
     following = jnp.concatenate([reference[1:], reference[-1:]])
@@ -331,12 +337,12 @@ def _columns(signal: Array) -> Any:
 def holding_input(plant: System, output: Signal) -> Signal:
     """Return the constant input under which ``plant`` rests at ``output``.
 
-    Solved by Newton's method on the loading curve from the plant's own rest point;
-    where no input reaches ``output`` the last iterate is returned and the loop starts
-    with an error. Limits belong in the loop's actuator, not in the plant: the curve is
-    flat behind them. The search starts at 0; with several axes at ``output`` itself,
-    because commands are in its unit and a stage with an allocation inside may not reach
-    the pose 0, or be on the edge of its reach there.
+    Newton's method is applied to the loading curve from the rest point of the plant. If
+    no input reaches ``output``, the last iterate is returned and the loop starts with
+    an error. Limits belong in the actuator of the loop, not in the plant, because the
+    curve is flat beyond them. The iteration starts at 0. With several axes it starts at
+    ``output``, because commands have its unit and the pose 0 may be outside, or on the
+    edge of, the range of a stage with an allocation.
     """
     output = jax.tree.map(as_array, output)
 
