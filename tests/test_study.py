@@ -566,7 +566,7 @@ def test_cut_off_beyond_nyquist(refusal, upper):
         "parameters": {"controller.cutoff": {"lower": 100.0, "upper": upper}},
     }
     assert refusal(changes) == (
-        f"parameters.controller.cutoff.upper: system: cutoff in rad/s is {upper:g}; "
+        f"parameters.controller.cutoff.upper: cutoff in rad/s is {upper:g}; "
         "it must be finite and above 0 and below 62831.9"
     )
 

@@ -1,4 +1,4 @@
-"""Study files: the controller to tune, its stage, references and objective."""
+"""Study files: the controller to tune, the stage, the references, the objective."""
 
 from pathlib import Path
 
@@ -17,16 +17,16 @@ from .schema import Study as Study
 from .schema import load as load
 
 DEFAULT = "p753_dob"
-"""Name of the study that runs when none is given."""
+"""Name of the default study."""
 
 
 def shipped(name: str = DEFAULT) -> Path:
-    """Return the path of a study, or of a comparison, that comes with piezojax.
+    """Return the path of a study or comparison study shipped with piezojax.
 
-    Raises ValueError, listing them, for a name that is none.
+    Raises ValueError, listing the known names, for an unknown name.
     """
     here = Path(__file__).parents[1]
-    # In an installed package the studies lie inside it, in a checkout beside it.
+    # An installed package contains the studies; in a checkout they lie beside it.
     folder = here / "studies" if (here / "studies").is_dir() else here.parent / "tuning"
     known = {
         file.relative_to(folder).with_suffix("").as_posix(): file

@@ -1,4 +1,4 @@
-"""A study made ready to run: files read, plant fitted, loop and search space built."""
+"""Case of a study: the files read, the plant fitted, the loop and space built."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -29,10 +29,10 @@ from .tables import one_of, validated
 
 @dataclass(frozen=True)
 class Case:
-    """A study with its files read, its plant fitted, its loop and search space built.
+    """A study with its loop and its search space.
 
-    ``fit`` is there if the plant was fitted to a record. ``plants`` are those that a
-    sweep puts in the place of the loop's own, by name.
+    ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
+    names to the plants of a sweep, which replace the plant of the loop.
     """
 
     study: Study
@@ -46,8 +46,8 @@ class Case:
     def unit(self, path: str) -> str:
         """Return the declared unit of the parameter at ``path`` in the loop.
 
-        It is "" without a declaration, and on a stage with several axes for a unit with
-        um or V in it: there each axis has units of its own.
+        The unit is "" if none is declared. On a stage with several axes it is also ""
+        for units that contain um or V, because each axis has its own units.
         """
         known = declared(self.loop, path)
         if known is None:
@@ -57,16 +57,16 @@ class Case:
 
 
 def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
-    """Return ``study`` made ready to run.
+    """Build the Case of ``study``; ``seed`` replaces the seed of the study.
 
-    Files named in it lie beside ``path``. Raises ValueError, one line naming the key,
-    the value and what is allowed.
+    The files that the study names lie beside ``path``. Raises ValueError: one line with
+    the key, the value and the allowed values.
     """
     path = Path(path)
     if seed is not None:
         study = study.model_copy(update={"seed": seed})
     plant, fit = _plant(study, path.parent)
-    controller = _choice(
+    controller = _from_source(
         study.controller,
         "controller",
         path.parent,
@@ -76,8 +76,8 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     )
     zero = _per_axis(study, lambda axis: as_array(0.0))
     _check_role(plant, zero, "plant", "a voltage to a displacement")
-    seen = Observation(zero, zero, zero, zero)
-    _check_role(controller, seen, "controller", "an Observation to a command")
+    observation = Observation(zero, zero, zero, zero)
+    _check_role(controller, observation, "controller", "an Observation to a command")
     loop = Feedback(controller, plant, _actuator(study), _sensor(study))
     loop, space = search_space(study, loop)
     _check_rates(study, loop, "the controller or plant")
@@ -88,41 +88,45 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
 
 
 def read(path: str | Path, seed: int | None = None) -> Case:
-    """Load and build the study in the file ``path``. Raises ValueError as ``build``."""
+    """Load the study file ``path`` and build its Case.
+
+    Raises ValueError as ``build`` does.
+    """
     return build(load(path), path, seed)
 
 
 def _plant(study: Study, folder: Path) -> tuple[System, Fit | None]:
     table = study.plant
     if "record" not in table:
-        return _choice(table, "plant", folder, PLANTS, study.rate), None
+        return _from_source(table, "plant", folder, PLANTS, study.rate), None
     if set(table) & {"catalog", "file", "type"}:
-        raise _not_one_way(table, "plant", ("catalog", "file", "type", "record"))
-    wanted = validated(RecordPlant, table, "plant")
+        raise _source_error(table, "plant", ("catalog", "file", "type", "record"))
+    description = validated(RecordPlant, table, "plant")
     record = read_record(
-        folder / wanted.record,
-        time=wanted.time,
-        input=wanted.input,
-        output=wanted.output,
-        rate=wanted.record_rate,
+        folder / description.record,
+        time=description.time,
+        input=description.input,
+        output=description.output,
+        rate=description.record_rate,
     )
-    train = slice(*wanted.train) if wanted.train else None
-    fit = identify(record, wanted.model, train=train)
+    train = slice(*description.train) if description.train else None
+    fit = identify(record, description.model, train=train)
     return fit.system, fit
 
 
 def _swept_plants(study: Study, zero: Any) -> dict[str, System]:
-    found = {}
+    plants = {}
     for name in study.sweep.plants if study.sweep else ():
         where = f"sweep.plants.{name}"
-        found[name] = _choice({"catalog": name}, where, Path(), PLANTS, study.rate)
-        _check_role(found[name], zero, where, "a voltage to a displacement")
-        _check_rates(study, found[name], where)
-    return found
+        plant = _from_source({"catalog": name}, where, Path(), PLANTS, study.rate)
+        _check_role(plant, zero, where, "a voltage to a displacement")
+        _check_rates(study, plant, where)
+        plants[name] = plant
+    return plants
 
 
 def _per_axis(study: Study, make: Callable[[int], Any]) -> Any:
-    """Return what ``make`` gives for the one axis, or a tuple with that of each."""
+    """Return ``make(0)`` on a stage with one axis, else ``make(axis)`` of each axis."""
     if study.axes is None:
         return make(0)
     return tuple(make(axis) for axis in range(study.axis_count))
@@ -141,7 +145,7 @@ def _designed(study: Study, name: str, plant: System) -> System:
     return design(plant, study.dt, (lower, upper))
 
 
-def _systems(study: Study, make: Callable[[int], System]) -> System:
+def _per_axis_system(study: Study, make: Callable[[int], System]) -> System:
     parts = _per_axis(study, make)
     return PerAxis(parts, study.axes.names) if study.axes else parts
 
@@ -150,7 +154,7 @@ def _actuator(study: Study) -> System:
     table = study.actuator
     lower, upper = study.by_axis(table.lower), study.by_axis(table.upper)
 
-    def one(axis: int) -> System:
+    def axis_actuator(axis: int) -> System:
         parts: dict[str, System] = {"limits": Saturation(lower[axis], upper[axis])}
         if table.slew_rate is not None:
             parts["slew"] = SlewLimit(table.slew_rate, study.dt)
@@ -158,23 +162,23 @@ def _actuator(study: Study) -> System:
             parts["converter"] = Quantiser(table.resolution)
         return series(**parts)
 
-    return _systems(study, one)
+    return _per_axis_system(study, axis_actuator)
 
 
 def _sensor(study: Study) -> System:
     noise = study.by_axis(study.sensor.noise_rms)
 
-    def one(axis: int) -> System:
+    def axis_sensor(axis: int) -> System:
         parts: dict[str, System] = {"noise": Sensor(noise[axis])}
         if study.sensor.resolution is not None:
             parts["converter"] = Quantiser(study.sensor.resolution)
         return series(**parts)
 
-    return _systems(study, one)
+    return _per_axis_system(study, axis_sensor)
 
 
 def _check_role(system: System, example: Any, where: str, role: str) -> None:
-    """Raise ValueError unless ``system`` can start at and step on ``example``."""
+    """Raise ValueError unless ``system`` accepts ``example`` as its input."""
     try:
         eqx.filter_eval_shape(rest_output, system, example)
     except (AttributeError, TypeError, ValueError, IndexError):
@@ -183,15 +187,15 @@ def _check_role(system: System, example: Any, where: str, role: str) -> None:
         ) from None
 
 
-def _check_rates(study: Study, system: System, what: str) -> None:
+def _check_rates(study: Study, system: System, name: str) -> None:
     for dt in static_fields(system, "dt"):
         if not np.isclose(dt, study.dt, rtol=1e-9, atol=0.0):
             raise ValueError(
-                f"rate is {study.rate:g} Hz, but {what} was made for {1.0 / dt:g} Hz"
+                f"rate is {study.rate:g} Hz, but {name} was made for {1.0 / dt:g} Hz"
             )
 
 
-def _not_one_way(
+def _source_error(
     table: Mapping[str, Any], where: str, allowed: Iterable[str]
 ) -> ValueError:
     return ValueError(
@@ -200,7 +204,7 @@ def _not_one_way(
     )
 
 
-def _choice(
+def _from_source(
     table: dict[str, Any],
     where: str,
     folder: Path,
@@ -208,21 +212,25 @@ def _choice(
     rate: float,
     design: Callable[[str], System] | None = None,
 ) -> System:
-    """Build the System that exactly one of catalog, file, type (and design) names."""
-    ways = {
+    """Build the System of a table with one source: catalog, file, type or design.
+
+    Only a controller has a design. Raises ValueError for a table with no source,
+    several sources, or other keys.
+    """
+    sources = {
         "catalog": lambda: at_rate(catalog, one_of(table["catalog"], catalog), rate),
         "file": lambda: load_system(folder / str(table["file"])),
         "type": lambda: from_data(table, where),
     }
     if design is not None:
-        ways["design"] = lambda: design(table["design"])
-    given = [way for way in ways if way in table]
-    extra = [key for key in table if key not in ways] if "type" not in table else []
+        sources["design"] = lambda: design(table["design"])
+    given = [source for source in sources if source in table]
+    extra = [key for key in table if key not in sources] if "type" not in table else []
     if len(given) != 1 or extra:
-        allowed = (*ways, *(["record"] if where == "plant" else []))
-        raise _not_one_way(table, where, allowed)
+        allowed = (*sources, *(["record"] if where == "plant" else []))
+        raise _source_error(table, where, allowed)
     try:
-        return ways[given[0]]()
+        return sources[given[0]]()
     except ValueError as error:
         prefix = "" if str(error).startswith(where) else f"{where}.{given[0]}: "
         raise ValueError(f"{prefix}{error}") from None

@@ -1,4 +1,4 @@
-"""Comparison studies: controllers and sampling rates that are tuned alike."""
+"""Comparison studies: several controllers and sampling rates, tuned alike."""
 
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -18,34 +18,40 @@ from .stage_tables import SensorTable
 from .tables import Positive, RangeTable, Table, one_of, validated
 
 Start = Literal["printed", "scaled", "rule", "own"]
-"""Source of the gains before tuning: a publication, a publication at another rate, a
-published tuning rule, or the study itself."""
+"""Source of the gains before tuning.
+
+"printed": a publication; "scaled": a publication at another rate; "rule": a published
+tuning rule; "own": the study itself.
+"""
 
 
 class RateRange(RangeTable):
-    """Bounds of a parameter at every rate, on a logarithmic scale if none is given.
+    """Bounds of a parameter at every rate; the default scale is logarithmic.
 
-    Either ``lower`` and ``upper``, with ``per_sample`` in units of the rate (0.5 is
-    half of it in 1/s), or a ``factor`` to either side of the start, which must be
-    positive.
+    The bounds are either ``lower`` and ``upper``, or the start divided and multiplied
+    by ``factor``; a factor needs a positive start. ``per_sample`` multiplies
+    ``lower`` and ``upper`` by the rate: 0.5 means half the rate, in 1/s.
     """
 
     per_sample: bool = False
     factor: Annotated[float, Field(gt=1, allow_inf_nan=False)] | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> "RateRange":
+    def _consistent(self) -> "RateRange":
         both = self.lower is not None and self.upper is not None
         if both == (self.factor is not None):
             raise ValueError("it takes lower and upper, or a factor")
         return self
 
     def at(self, start: float, rate: float, path: str) -> dict[str, Any]:
-        """Return the bounds of a study at ``rate`` (Hz) for a ``start`` value."""
+        """Return the bounds at ``rate`` (Hz) for a ``start`` value.
+
+        Raises ValueError if ``factor`` meets a start that is not positive.
+        """
         if self.lower is not None and self.upper is not None:
             unit = rate if self.per_sample else 1.0
             lower, upper = self.lower * unit, self.upper * unit
-            # Bounds hold the starts of all rates: they are wide, not judged.
+            # The bounds are widened to contain the start of every rate.
             lower, upper = min(lower, start), max(upper, start)
             return {"lower": lower, "upper": upper, "scale": self.scale or "log"}
         assert self.factor is not None
@@ -62,11 +68,13 @@ class RateRange(RangeTable):
 
 
 class ControllerTable(Table):
-    """A controller by its ``catalog`` name, tuned at ``rates`` (those of the file).
+    """A controller of a comparison, by its ``catalog`` name.
 
-    ``tune`` holds paths in the loop; ``bounds`` precede those of the file. ``printed``
-    are the rates (Hz) with published gains, ``elsewhere`` is the source of the gains at
-    other rates; ``label`` is the name of the controller in the table.
+    ``rates`` are its sampling rates (Hz), by default those of the file. ``tune`` holds
+    paths in the loop. ``bounds`` take precedence over the bounds of the file.
+    ``printed`` are the rates (Hz) with published gains; ``elsewhere`` is the source of
+    the gains at other rates. ``label`` is the name of the controller in the table of
+    results.
     """
 
     catalog: str
@@ -79,10 +87,10 @@ class ControllerTable(Table):
 
 
 class ComparisonStudy(Table):
-    """Controllers and rates (Hz) that are tuned alike, each pair a study of its own.
+    """Controllers and rates (Hz) that are tuned alike; each pair is a study.
 
-    The keys of ``bounds`` are paths or patterns such as ``*.cutoff``; of several that
-    match a path the longest counts. The other tables are those of a study.
+    The keys of ``bounds`` are paths or patterns such as ``*.cutoff``. If several match
+    a path, the longest one applies. The other tables are those of a study.
     """
 
     title: str
@@ -99,7 +107,7 @@ class ComparisonStudy(Table):
     controllers: dict[str, ControllerTable] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _rates_once(self) -> "ComparisonStudy":
+    def _distinct_rates(self) -> "ComparisonStudy":
         for name, table in self.controllers.items():
             for rates in (self.rates, table.rates or ()):
                 if len(set(rates)) < len(rates):
@@ -109,7 +117,7 @@ class ComparisonStudy(Table):
 
 @dataclass(frozen=True)
 class ComparedCase:
-    """A Case of a comparison: its controller, and the source of its first gains."""
+    """A Case of a comparison, its controller and the source of its starting gains."""
 
     controller: str
     case: Case
@@ -117,17 +125,17 @@ class ComparedCase:
 
     @property
     def name(self) -> str:
-        """Name of its folder."""
+        """Name of the case, which is also the name of its results folder."""
         return self.case.name
 
 
 def read_compared(
     paths: Sequence[str | Path], seed: int | None = None
 ) -> tuple[str, list[ComparedCase]]:
-    """Return the title and the cases of studies and comparison studies in files.
+    """Read study files and comparison study files; return their title and cases.
 
-    Raises ValueError, one line naming the key, the value and what is allowed, and for
-    two cases of one name.
+    Raises ValueError: one line with the key, the value and the allowed values. It is
+    also raised if two cases have the same name.
     """
     titles, cases = [], []
     for path in map(Path, paths):
@@ -138,7 +146,7 @@ def read_compared(
         else:
             case = read(path, seed)
             cases.append(ComparedCase(case.study.title, case, "own"))
-    names = [one.name for one in cases]
+    names = [compared.name for compared in cases]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"two studies are named {name}; each takes its own name")
@@ -146,7 +154,7 @@ def read_compared(
 
 
 def is_comparison_study(path: Path) -> bool:
-    """Return whether ``path`` holds a readable comparison study."""
+    """Return whether ``path`` is a readable file with a comparison study."""
     try:
         return "controllers" in tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -154,7 +162,10 @@ def is_comparison_study(path: Path) -> bool:
 
 
 def load_comparison_study(path: str | Path) -> ComparisonStudy:
-    """Read and validate a comparison study. Raises ValueError as ``load``."""
+    """Read and validate a comparison study.
+
+    Raises ValueError: one line with the key, the value and the allowed values.
+    """
     data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     return validated(ComparisonStudy, data, "")
 
@@ -162,7 +173,11 @@ def load_comparison_study(path: str | Path) -> ComparisonStudy:
 def compared_cases(
     comparison: ComparisonStudy, path: str | Path, seed: int | None = None
 ) -> list[ComparedCase]:
-    """Return the case of each controller and rate; files in it lie beside ``path``."""
+    """Return the case of each controller and rate.
+
+    The files that the comparison names lie beside ``path``. Raises ValueError, naming
+    the controller and the rate.
+    """
     cases = []
     for name, table in comparison.controllers.items():
         for rate in table.rates or comparison.rates:
@@ -202,5 +217,5 @@ def _study(
 
 
 def _bounds(path: str, bounds: Mapping[str, RateRange]) -> RateRange | None:
-    fits = [pattern for pattern in bounds if fnmatchcase(path, pattern)]
-    return bounds[max(fits, key=len)] if fits else None
+    matches = [pattern for pattern in bounds if fnmatchcase(path, pattern)]
+    return bounds[max(matches, key=len)] if matches else None

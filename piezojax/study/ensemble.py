@@ -1,4 +1,4 @@
-"""Stages off their nominal values: drawn as a study's ensemble says."""
+"""Ensembles: random stages around the nominal stage of a study."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,22 +23,23 @@ Part = Literal["tune", "margins", "holdout"]
 
 
 class Stage(eqx.Module):
-    """What a controller meets and an ensemble varies: the plant and its sensor."""
+    """Plant and sensor of a loop; an ensemble varies both."""
 
     plant: System
     sensor: System
 
     def around(self, loop: Feedback) -> Feedback:
-        """Return ``loop`` with this stage in the place of its own."""
+        """Return ``loop`` with its plant and sensor replaced by those of this stage."""
         return Feedback(loop.controller, self.plant, loop.actuator, self.sensor)
 
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Stages off their nominal values: how they are made, and how far off.
+    """Random stages around a nominal stage.
 
-    ``arguments`` are those of ``make``, the plant's own variations, and ``paths`` lead
-    into the Stage. ``errors`` holds standard errors by path.
+    ``make`` builds a catalogued plant from its deviations, whose names are
+    ``arguments``; it is None if no deviation is varied. ``paths`` are the varied
+    parameters of the Stage. ``errors`` maps paths in the Stage to standard errors.
     """
 
     study: Study
@@ -49,10 +50,10 @@ class Ensemble:
     errors: Mapping[str, float]
 
     def stages(self, part: Part) -> Stage | None:
-        """Return the drawn stages of a part, stacked on a leading axis.
+        """Return the drawn stages of ``part``, stacked along a leading axis.
 
-        ``margins`` begins with the stages of ``tune``; the hold-out has a stream of its
-        own. None if there are none.
+        The first stages of "margins" are those of "tune". "holdout" has its own random
+        stream. Returns None if the part has no stages.
         """
         table = self.study.ensemble
         assert table is not None
@@ -78,7 +79,7 @@ class Ensemble:
         return jax.vmap(self._stage)(as_array(draws), as_array(normal))
 
     def _interval(self, name: str) -> tuple[float, float]:
-        """Return the middle and half the width of what ``name`` is drawn from."""
+        """Return the centre and the half width of the interval of ``name``."""
         table = self.study.ensemble
         assert table is not None
         if name in table.range:
@@ -103,40 +104,41 @@ class Ensemble:
 
 
 def ensemble_of(study: Study, nominal: Stage, folder: Path) -> Ensemble | None:
-    """Return the ensemble of ``study``, None if it has none; files are in ``folder``.
+    """Return the ensemble of ``study``, or None if the study has none.
 
-    Raises ValueError, one line, for a deviation that the plant does not know.
+    The files that the study names lie in ``folder``. Raises ValueError for an unknown
+    deviation or path, and for a file without standard errors.
     """
     table = study.ensemble
     if table is None:
         return None
-    wanted = (*table.spread, *table.range)
-    paths = tuple(name for name in wanted if "." in name)
+    varied = (*table.spread, *table.range)
+    paths = tuple(name for name in varied if "." in name)
     make, arguments = None, ()
-    if len(paths) < len(wanted):
+    if len(paths) < len(varied):
         name = str(study.plant.get("catalog", ""))
         known = deviations_of(name)
         if not known:
-            varied = ", ".join(plant for plant in PLANTS if deviations_of(plant))
+            plants = ", ".join(plant for plant in PLANTS if deviations_of(plant))
             raise ValueError(
                 "ensemble: plant.catalog must be one whose variations are known: "
-                f"{varied}; for others name paths, as plant.0.a"
+                f"{plants}; for others name paths, as plant.0.a"
             )
         make = PLANTS[name]
-        for deviation in wanted:
+        for deviation in varied:
             if "." not in deviation and deviation not in known:
                 key = "spread" if deviation in table.spread else "range"
                 raise ValueError(
                     f"ensemble.{key}.{deviation} is unknown; {name} varies in "
                     f"{', '.join(known)}"
                 )
-        arguments = tuple(argument for argument in known if argument in wanted)
+        arguments = tuple(argument for argument in known if argument in varied)
     for path in paths:
         key = "spread" if path in table.spread else "range"
         _check_path(nominal, path, f"ensemble.{key}")
     errors = (
         _standard_errors(folder / table.standard_errors, nominal)
-        if (table.standard_errors)
+        if table.standard_errors
         else {}
     )
     return Ensemble(study, nominal, make, arguments, paths, errors)
@@ -161,14 +163,14 @@ class _Estimates(BaseModel):
 
 
 def _standard_errors(path: Path, nominal: Stage) -> dict[str, float]:
-    """Return the standard errors that identification wrote, by path in the Stage."""
+    """Read the standard errors of a fit file; return them by path in the Stage."""
     try:
-        found = read_model(_Estimates, path, "is no fit")
+        estimates = read_model(_Estimates, path, "is no fit")
     except ValueError as error:
         raise ValueError(f"ensemble.standard_errors: {error}") from None
     errors = {
         f"plant.{name}": estimate.standard_error
-        for name, estimate in found.parameters.items()
+        for name, estimate in estimates.parameters.items()
         if estimate.standard_error is not None and np.isfinite(estimate.standard_error)
     }
     if not errors:

@@ -1,4 +1,4 @@
-"""The table of a study that says how its plants deviate."""
+"""Table ``[ensemble]`` of a study: the deviations of the stage."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,18 +9,19 @@ from .tables import Finite, Positive, Table
 
 
 class EnsembleTable(Table):
-    """Plants off their nominal values: relative deviations, ranges, standard errors.
+    """Random stages: relative deviations, ranges and standard errors of parameters.
 
-    ``spread`` draws relative deviations evenly to both sides, ``range`` values evenly
-    between two ends, both by the names that the catalogued plant gives them, or by path
-    (``plant.hysteresis.a``, ``sensor.noise.noise_rms``). ``standard_errors`` draws the
-    parameters of an identified plant around their values, with the standard errors in
-    the named ``fit.json``.
+    ``spread`` holds the largest relative deviations, drawn uniformly to both sides.
+    ``range`` holds intervals, from which values are drawn uniformly. The keys of both
+    are deviations of the catalogued plant or paths (``plant.hysteresis.a``,
+    ``sensor.noise.noise_rms``). ``standard_errors`` names a ``fit.json``, whose
+    parameters are drawn from normal distributions around their values.
 
-    ``tune`` draws take part in the objective beside the nominal plant; margins are
-    kept on these and on as many more as make ``margins``, which is cheap; on
-    ``holdout`` others the gains are judged. ``aggregate`` joins the plants of the
-    objective: their mean, the worst, or the mean of the worst ``tail`` of them (CVaR).
+    The objective includes the nominal stage and ``tune`` drawn stages. Margins are
+    constrained on these and on further stages, ``margins`` in all, because margins are
+    cheap. The tuned gains are evaluated on ``holdout`` other stages. ``aggregate``
+    combines the objectives of the stages: their mean, the worst, or the mean of the
+    worst share ``tail`` (CVaR).
     """
 
     spread: dict[str, Positive] = Field(default_factory=dict)

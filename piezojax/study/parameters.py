@@ -1,4 +1,4 @@
-"""Parameters of a study that are tuned: their paths, ranges and starts."""
+"""Tuned parameters of a study: their paths, ranges and starts."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -8,37 +8,44 @@ import jax.numpy as jnp
 from ..core.paths import declared, get, matching, replace
 from ..core.serial import from_data, to_data
 from ..core.space import Range, Space, space_of
-from ..core.system import Feedback
+from ..core.system import Feedback, System
 from .schema import Study, TunedTable
 
 PART = "controller."
-"""Start of the paths that may be tuned; the stage is not for tuning."""
+"""Prefix of every tuned path; parameters of the stage are not tuned."""
 
 
 def search_space(study: Study, loop: Feedback) -> tuple[Feedback, Space]:
-    """Return ``loop`` with the starts of the study, and the Space of what is tuned.
+    """Return ``loop`` with the starts of the study, and the Space of its parameters.
 
-    Raises ValueError, one line naming the path, for one that is no number of the
-    controller, has no range, or starts outside it, and for a start or a bound that the
-    controller refuses.
+    Raises ValueError, naming the path, for a path that is not a scalar of the
+    controller, for a parameter without a range or with a start outside it, and for a
+    start or a bound that the controller refuses.
     """
     ranges = _ranges(study, loop)
     starts = {path: r.start for path, r in ranges.items() if r.start is not None}
     loop, space = replace(loop, starts), space_of(ranges)
     space.start(loop)
-    for path, one in ranges.items():
-        _check_values(loop, path, one)
+    for path, bounds in ranges.items():
+        for name in ("start", "lower", "upper"):
+            value = getattr(bounds, name)
+            if value is not None:
+                inner, where = path.removeprefix(PART), f"parameters.{path}.{name}"
+                check_value(loop.controller, inner, value, where)
     return loop, space
 
 
 def _ranges(study: Study, loop: Feedback) -> dict[str, Range]:
-    """Return the Range of each tuned parameter: those of ``[parameters]``, then those
-    that ``tune`` alone names, in the order of the loop."""
+    """Return the Range of each tuned parameter by path.
+
+    The parameters of ``[parameters]`` come first. Those that only ``tune`` names
+    follow; the matches of a pattern are in the order of the loop.
+    """
     tables = dict(study.parameters)
     for path in study.parameters:
         _check_path(loop, path, f"parameters.{path}")
     for pattern in study.tune:
-        for path in _named(loop, pattern):
+        for path in _tuned_paths(loop, pattern):
             tables.setdefault(path, TunedTable())
     return {
         path: dataclasses.replace(
@@ -48,41 +55,46 @@ def _ranges(study: Study, loop: Feedback) -> dict[str, Range]:
     }
 
 
-def _check_values(loop: Feedback, path: str, wanted: Range) -> None:
-    """Build the controller at the start and the bounds, to run its own checks."""
-    for name in ("start", "lower", "upper"):
-        value = getattr(wanted, name)
-        if value is None:
-            continue
-        try:
-            from_data(to_data(replace(loop, {path: value}).controller))
-        except ValueError as error:
-            raise ValueError(f"parameters.{path}.{name}: {error}") from None
+def check_value(system: System, path: str, value: float, where: str) -> None:
+    """Rebuild ``system`` with ``value`` at ``path``, so that its constructors check it.
+
+    Raises ValueError, starting with ``where``, if a constructor refuses the value.
+    """
+    changed = to_data(replace(system, {path: value}))
+    try:
+        from_data(changed)
+    except ValueError as error:
+        # from_data starts with the place in the System, which ``where`` already names.
+        reason = str(error).split(": ", 1)[-1]
+        raise ValueError(f"{where}: {reason}") from None
 
 
-def _named(loop: Feedback, pattern: str) -> Iterable[str]:
-    """Return the paths that one entry of ``tune`` names."""
+def _tuned_paths(loop: Feedback, pattern: str) -> Iterable[str]:
+    """Return the paths that match one entry of ``tune``.
+
+    A pattern matches only scalars with a declared range.
+    """
     if not set("*?[") & set(pattern):
         _check_path(loop, pattern, f"tune: {pattern}")
         return [pattern]
-    found = [
+    scalars = [
         path
         for path in matching(loop, pattern)
         if path.startswith(PART) and jnp.ndim(get(loop, path)) == 0
     ]
-    known = [path for path in found if _has_range(loop, path)]
-    if not known:
-        what = "no declared range" if found else "no match in the controller"
+    tunable = [path for path in scalars if _has_range(loop, path)]
+    if not tunable:
+        lack = "no declared range" if scalars else "no match in the controller"
         raise ValueError(
-            f"tune: {pattern} has {what}; name paths under [parameters], as in "
+            f"tune: {pattern} has {lack}; name paths under [parameters], as in "
             '"controller.cutoff" = { lower = 100.0, upper = 2e4 }'
         )
-    return known
+    return tunable
 
 
 def _has_range(loop: Feedback, path: str) -> bool:
-    found = declared(loop, path)
-    return found is not None and found.typical is not None
+    declaration = declared(loop, path)
+    return declaration is not None and declaration.typical is not None
 
 
 def _check_path(loop: Feedback, path: str, where: str) -> None:

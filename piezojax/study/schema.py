@@ -1,4 +1,4 @@
-"""The tables of a study file, validated before anything is built."""
+"""Tables of a study file, and their validation."""
 
 import tomllib
 from pathlib import Path
@@ -11,7 +11,7 @@ from ..signals import waveforms as signals
 from ..solve.optimisers import GAUSS_NEWTON, METHODS
 from .ensemble_table import EnsembleTable
 from .stage_tables import Actuator, DisturbanceTable, SensorTable
-from .sweep_table import SweepTable, quoted
+from .sweep_table import SweepTable, require_quoted_paths
 from .tables import (
     ByAxis,
     Finite,
@@ -25,7 +25,7 @@ from .tables import (
 
 
 class AxesTable(Table):
-    """Names and units of the axes of a stage with several."""
+    """Names and units of the axes of a multi-axis stage."""
 
     names: tuple[str, ...] = Field(min_length=2)
     units: tuple[str, ...]
@@ -43,7 +43,13 @@ class AxesTable(Table):
 
 
 class References(Table):
-    """Signals to follow: names, um, s. ``unseen`` are kept from the optimiser."""
+    """References of the runs, by the names of their signals.
+
+    ``tune`` are the references of the objective; ``unseen`` are used only to evaluate
+    the tuned gains. ``amplitude`` and ``offset`` are in the unit of the axis (um on a
+    stage with one axis), ``duration`` and ``settle`` in s. Errors count after
+    ``settle``.
+    """
 
     tune: tuple[str, ...] = Field(min_length=1)
     unseen: tuple[str, ...] = ()
@@ -80,12 +86,13 @@ class TunedTable(RangeTable):
 
 
 class ConstraintsTable(Table):
-    """What tuned gains must keep, on every plant and reference of the objective.
+    """Constraints on the tuned gains, for every plant and reference of the objective.
 
-    Of the loop linearised at the top of the references, on both branches of the
-    hysteresis: ``sensitivity_peak`` at most, ``disk_margin`` and ``delay_margin``
-    (samples) at least. Of the runs: ``peak_voltage`` (V), ``peak_slew`` (V/s),
-    ``effort`` (V rms) and ``overshoot`` (share of the reference's range) at most.
+    Three limits concern the loop, linearised at the highest reference on both branches
+    of the hysteresis: the largest ``sensitivity_peak``, and the smallest
+    ``disk_margin`` and ``delay_margin`` (samples). The others are largest
+    values in the runs: ``peak_voltage`` (V), ``peak_slew`` (V/s), ``effort`` (V rms)
+    and ``overshoot`` (share of the reference's range).
     """
 
     sensitivity_peak: Annotated[float, Field(gt=1.0, allow_inf_nan=False)] | None = None
@@ -98,12 +105,15 @@ class ConstraintsTable(Table):
 
     @property
     def limits(self) -> dict[str, float]:
-        """What is set, by name."""
+        """Limits of the constraints that are set, by name."""
         return self.model_dump(exclude_none=True)
 
 
 class ParetoTable(Table):
-    """A front: the study solved for each limit in ``limits`` of one constraint."""
+    """Pareto front: the study is solved for each of ``limits`` of one constraint.
+
+    ``steps`` is the largest number of optimiser steps at each limit.
+    """
 
     constraint: str
     limits: tuple[Positive, ...] = Field(min_length=2)
@@ -116,7 +126,7 @@ class ParetoTable(Table):
 
 
 class ObjectiveTable(Table):
-    """What is minimised; see piezojax.tuning.objective.Objective."""
+    """Objective of the tuning; see piezojax.tuning.objective.Objective."""
 
     aggregate: Literal["geometric_mean", "mean_square", "worst"] = "geometric_mean"
     coupling_weight: NotNegative = 1.0
@@ -126,10 +136,11 @@ class ObjectiveTable(Table):
 
 
 class OptimiserTable(Table):
-    """How it is minimised.
+    """Optimiser of the objective.
 
-    ``candidates`` points of the box are simulated, the best become ``starts`` together
-    with the study's own start, and each takes up to ``steps`` steps.
+    First, ``candidates`` points of the box are simulated. The best of them and the
+    start of the study form the ``starts``. From each start the optimiser takes at most
+    ``steps`` steps.
     """
 
     method: str = "bfgs"
@@ -145,11 +156,11 @@ class OptimiserTable(Table):
 
 
 class Study(Table):
-    """A whole study; README and tuning/ show examples.
+    """A study; the README and tuning/ contain examples.
 
-    ``tune`` names the parameters to tune: paths in the loop, or patterns such as
-    ``controller.feedback.*``. ``parameters`` names more of them, and holds the bounds,
-    scales and starts that differ from those declared beside the parameter.
+    ``rate`` is the sampling rate, Hz. ``tune`` names parameters to tune: paths in the
+    loop, or patterns such as ``controller.feedback.*``. ``parameters`` names further
+    ones. It also overrides the declared bounds, scales and starts.
     """
 
     title: str
@@ -175,7 +186,7 @@ class Study(Table):
     @field_validator("parameters", mode="before")
     @classmethod
     def _quoted(cls, tables: Any) -> Any:
-        return quoted(tables)
+        return require_quoted_paths(tables)
 
     @model_validator(mode="after")
     def _tuned(self) -> "Study":
@@ -286,22 +297,23 @@ class Study(Table):
 
     @property
     def highest(self) -> float | tuple[float, ...]:
-        """Offset and amplitude together, of each axis."""
+        """Highest reference, offset plus amplitude; a tuple on a stage with axes."""
         table = self.references
         values = zip(
             self.by_axis(table.offset), self.by_axis(table.amplitude), strict=True
         )
-        tops = tuple(offset + amplitude for offset, amplitude in values)
-        return tops if self.axes else tops[0]
+        peaks = tuple(offset + amplitude for offset, amplitude in values)
+        return peaks if self.axes else peaks[0]
 
     def by_axis(self, value: float | tuple[float, ...]) -> tuple[float, ...]:
-        """Return one value for each axis."""
+        """Return the value of each axis; a single value applies to all axes."""
         return value if isinstance(value, tuple) else (value,) * self.axis_count
 
     def driven(self, reference: str) -> dict[str, str]:
-        """Return the signal on each driven axis of a reference, by the axis' name.
+        """Return the signals of a reference by the name of the driven axis.
 
-        The name is "" on a stage with one axis. Raises ValueError for an unknown one.
+        The name is "" on a stage with one axis. Raises ValueError for an unknown
+        reference.
         """
         if self.axes:
             return motions.parse(reference, self.axes.names)
@@ -310,9 +322,9 @@ class Study(Table):
 
 
 def load(path: str | Path) -> Study:
-    """Read and validate a study file, without building anything.
+    """Read and validate a study file; build nothing.
 
-    Raises ValueError, one line naming the key, the value and what is allowed.
+    Raises ValueError: one line with the key, the value and the allowed values.
     """
     path = Path(path)
     try:

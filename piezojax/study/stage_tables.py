@@ -1,4 +1,4 @@
-"""The tables of a study that describe its stage: plant, drive, sensor, disturbance."""
+"""Tables of a study that describe the stage: plant, drive, sensor, disturbance."""
 
 from pathlib import Path
 
@@ -10,7 +10,12 @@ from .tables import ByAxis, Finite, NotNegative, Positive, Table
 
 
 class RecordPlant(Table):
-    """A plant fitted to a record: columns by name or number, parts in samples."""
+    """A plant fitted to a record.
+
+    ``time``, ``input`` and ``output`` are columns, by name or number; ``train`` is the
+    first sample of the fitted part and the sample after its last. ``record_rate`` is
+    the sampling rate of the record, Hz.
+    """
 
     record: Path
     model: str
@@ -28,7 +33,10 @@ class RecordPlant(Table):
 
 
 class Actuator(Table):
-    """Limits of the drive, V and V/s; ``resolution`` of its converter, V."""
+    """Drive: its limits ``lower`` and ``upper``, V, and optional properties.
+
+    ``slew_rate`` is in V/s; ``resolution`` is that of the converter, V.
+    """
 
     lower: ByAxis[Finite]
     upper: ByAxis[Finite]
@@ -57,8 +65,9 @@ class SensorTable(Table):
 
 
 class DisturbanceTable(Table):
-    """What moves the stage beside the drive: ``drift_rms``, a random walk, um rms after
-    one second.
+    """Disturbance of the displacement.
+
+    ``drift_rms`` is the rms value of a random walk after one second, um.
     """
 
     drift_rms: ByAxis[NotNegative] = 0.0

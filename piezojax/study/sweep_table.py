@@ -1,4 +1,4 @@
-"""The table ``[sweep]`` of a study: its parameters, and the metrics that are kept."""
+"""Table ``[sweep]`` of a study: swept parameters and recorded metrics."""
 
 from typing import Annotated, Any, Literal
 
@@ -9,11 +9,11 @@ from .tables import Finite, RangeTable, Table, one_of
 
 SENSITIVITY = "sensitivity_peak"
 METRICS = (*TrackingFigures._fields, SENSITIVITY)
-"""Metrics of a run: figures of the simulation, and the peak of |1/(1+L)| of the
-linearised loop."""
+"""Metrics of a run: tracking figures, and the peak of |1/(1+L)| of the linearised
+loop."""
 
 PARTS = ("controller", "plant", "actuator", "sensor")
-"""Parts of a loop; the path of a parameter starts with one of them."""
+"""Parts of a loop; every path of a parameter starts with one of them."""
 
 Count = Annotated[int, Field(strict=True, ge=1)]
 
@@ -21,14 +21,15 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 class SweptTable(RangeTable):
     """Range of a swept parameter, or its ``values``.
 
-    A grid has ``count`` points, evenly spaced on the scale; samples need none.
+    In a grid, ``count`` points are evenly spaced on the scale. Random samples need no
+    count.
     """
 
     count: Annotated[int, Field(strict=True, ge=2)] | None = None
     values: tuple[Finite, ...] | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> "SweptTable":
+    def _consistent(self) -> "SweptTable":
         if self.values is not None:
             if not (self.lower is None and self.upper is None and self.count is None):
                 raise ValueError("it takes either values, or lower and upper")
@@ -40,14 +41,14 @@ class SweptTable(RangeTable):
 
 
 class SweepTable(Table):
-    """Points that a sweep simulates, and the metrics that it keeps.
+    """Points of a sweep, and the recorded metrics.
 
-    ``method`` "grid" tries every combination of the parameters; "latin_hypercube" and
-    "sobol" draw ``samples`` points of their box. Without ``parameters`` the box is that
-    of the study's own ``[parameters]``. ``plants`` are of the catalogue, ``references``
-    among the study's; left out: the study's own plant, all its references. ``every``
-    N-th sample of displacement and voltage is kept if given. ``chunk`` points are
-    simulated and kept at a time.
+    ``method`` "grid" simulates every combination of the parameters; "latin_hypercube"
+    and "sobol" draw ``samples`` points of their box. Without ``parameters`` the box is
+    that of the tuned parameters. ``plants`` are names in the catalogue, by default the
+    plant of the study. ``references`` are among those of the study, by default all of
+    them. ``every`` records each N-th sample of displacement and voltage. ``chunk`` is
+    the number of points that are simulated and stored at a time.
     """
 
     method: Literal["grid", "latin_hypercube", "sobol"] = "grid"
@@ -77,7 +78,7 @@ class SweepTable(Table):
     @field_validator("parameters", mode="before")
     @classmethod
     def _quoted(cls, tables: Any) -> Any:
-        return quoted(tables)
+        return require_quoted_paths(tables)
 
     @model_validator(mode="after")
     def _consistent(self) -> "SweepTable":
@@ -107,8 +108,11 @@ class SweepTable(Table):
         return self
 
 
-def quoted(tables: Any) -> Any:
-    """Return ``tables`` by path; raise ValueError for a path that was not in quotes."""
+def require_quoted_paths(tables: Any) -> Any:
+    """Return ``tables``, whose keys are paths.
+
+    Raises ValueError for a path without quotes, which TOML splits into nested tables.
+    """
     for key, table in tables.items() if isinstance(tables, dict) else ():
         if isinstance(table, dict) and any(
             isinstance(value, dict) for value in table.values()

@@ -1,4 +1,4 @@
-"""Strict validation of the tables of a file, with errors in one line."""
+"""Strict validation of the tables of a file, with one-line errors."""
 
 import difflib
 import re
@@ -22,9 +22,9 @@ class Table(BaseModel):
 
 
 class RangeTable(Table):
-    """Bounds of a parameter in its unit, and its scale.
+    """Bounds and scale of a parameter; the bounds are in its unit.
 
-    A key that is left out comes from the parameter's declaration.
+    The declaration of the parameter supplies missing keys.
     """
 
     lower: Finite | None = None
@@ -32,9 +32,9 @@ class RangeTable(Table):
     scale: Scale | None = None
 
     def range(self, declared: Parameter | None, where: str) -> Range:
-        """Return the Range, completed from the declaration of the parameter.
+        """Return the Range, with missing keys taken from ``declared``.
 
-        Raises ValueError, naming the key, for a bound that neither gives.
+        Raises ValueError, naming the key, for a bound that is missing in both.
         """
         typical = Range.of(declared) if declared else None
         for key in ("lower", "upper"):
@@ -56,37 +56,40 @@ class RangeTable(Table):
 
 Each = TypeVar("Each")
 ByAxis = Each | tuple[Each, ...]
-"""One value for all axes, or a list with one for each."""
+"""One value for all axes, or a list with one value for each axis."""
 
 
 def one_of(name: str, allowed: Any) -> str:
-    """Return ``name``; raise ValueError, listing ``allowed``, if it is not in there."""
+    """Return ``name``; raise ValueError, listing ``allowed``, if it is not in it."""
     if not isinstance(name, str) or name not in allowed:
         raise ValueError(f"{name!r} is unknown; there are {', '.join(allowed)}")
     return name
 
 
 def validated(kind: type[Any], data: Any, where: str) -> Any:
-    """Return ``data`` as ``kind``; one line naming key, value and what is allowed."""
+    """Return ``data`` validated as ``kind``.
+
+    Raises ValueError: one line with the key, the value and the allowed values.
+    """
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        raise ValueError(_first_line(error, kind, where)) from None
+        raise ValueError(_message(error, kind, where)) from None
 
 
 def _table_in(annotation: Any) -> Any:
-    """Return the Table in an annotation: itself, an optional one, a dict's values."""
+    """Return the Table type of an annotation: plain, optional, or values of a dict."""
     inner = [part for part in get_args(annotation) if part is not type(None)]
     return _table_in(inner[-1]) if inner else annotation
 
 
 _UNION = re.compile(r"(constrained-)?(float|tuple\[.*)$")
-"""What pydantic adds to a place where a field takes one of several kinds."""
+"""Names that pydantic inserts into the location of an error in a union."""
 
 
-def _first_line(error: ValidationError, kind: type[BaseModel], where: str) -> str:
-    # Of a field that takes a number or a list, the error that fits what was given.
-    first = min(error.errors(), key=lambda found: isinstance(found["input"], list))
+def _message(error: ValidationError, kind: type[BaseModel], where: str) -> str:
+    # A field that takes a number or a list has one error for each; lists come last.
+    first = min(error.errors(), key=lambda entry: isinstance(entry["input"], list))
     place = [str(part) for part in first["loc"] if not _UNION.match(str(part))]
     key = ".".join([where, *place]).strip(".")
     if first["type"] == "extra_forbidden":

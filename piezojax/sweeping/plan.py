@@ -10,12 +10,11 @@ import numpy as np
 
 from ..core.arrays import as_array
 from ..core.paths import declared, get
-from ..core.paths import replace as put
 from ..core.rollout import BLOCK
-from ..core.serial import from_data, to_data
 from ..core.space import Range, space_of
 from ..core.system import System
 from ..study import Case, Study
+from ..study.parameters import check_value
 from ..study.sweep_table import SweepTable, SweptTable
 
 CHUNK_LANE_STEPS = 5e7
@@ -214,9 +213,7 @@ def _check_paths(case: Case, axes: Sequence[Axis]) -> None:
                 where = f"{where}, plant {name}"
             try:
                 get(parts[part], inner)
-                for value in (axis.range.lower, axis.range.upper):
-                    # Built anew, so that the constructor's own checks speak.
-                    changed = put(parts[part], {inner: value})
-                    from_data(to_data(changed))
             except ValueError as error:
                 raise ValueError(f"{where}: {error}") from None
+            for value in (axis.range.lower, axis.range.upper):
+                check_value(parts[part], inner, value, where)
