@@ -110,7 +110,7 @@ def test_an_entry_point_makes_its_classes_known(tmp_path):
     info.mkdir()
     (info / "METADATA").write_text("Name: outside\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
-        "[piezojax.systems]\nall = outside\none = outside:Another\n"
+        "[piezojax.extensions]\nall = outside\none = outside:Another\n"
     )
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"

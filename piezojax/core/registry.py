@@ -8,9 +8,10 @@ from typing import TypeVar
 from .recipe import PLACES, Fittable
 from .system import System
 
-ENTRY_POINTS = "piezojax.systems"
-"""Group of entry points that name Systems or modules that export Systems. piezojax
-registers its own models and controllers through it."""
+ENTRY_POINTS = "piezojax.extensions"
+"""Group of entry points that name Systems, modules that export Systems, or modules that
+add to a table of piezojax such as its constraints. piezojax registers its own models
+and controllers through it."""
 
 S = TypeVar("S", bound=System)
 
@@ -24,7 +25,7 @@ def register(kind: type[S]) -> type[S]:
     fitted, by the name in its Part. Raises TypeError for a class that is not a System,
     and ValueError for a name that another class has or an unknown place in a chain.
     """
-    _discover()
+    discover()
     return _add(kind)
 
 
@@ -63,7 +64,8 @@ def _check_part(kind: type[Fittable]) -> None:
 
 
 @cache
-def _discover() -> None:
+def discover() -> None:
+    """Load what installed packages add, once: their modules, and with them tables."""
     for point in entry_points(group=ENTRY_POINTS):
         loaded = point.load()
         for value in [loaded] if isinstance(loaded, type) else vars(loaded).values():
@@ -81,7 +83,7 @@ def _fittable() -> list[type[Fittable]]:
 
 def kinds() -> dict[str, type[System]]:
     """Return the registered System classes that are not abstract, by class name."""
-    _discover()
+    discover()
     return {
         name: kind
         for name, kind in sorted(_registered.items())
@@ -94,6 +96,6 @@ def parts() -> dict[str, type[Fittable]]:
 
     They are ordered by place in a chain, then as their packages export them.
     """
-    _discover()
+    discover()
     ordered = sorted(_fittable(), key=lambda kind: PLACES.index(kind.part.place))
     return {kind.part.name: kind for kind in ordered}

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ..tuning.constraints import CONSTRAINTS
+from ..analysis.constraints import CONSTRAINTS
 from ..tuning.result import FrontPoint, Perturbed, Result
 from .figures import AFTER, BEFORE, figure, headed, ticks_in_full
 

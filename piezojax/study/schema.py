@@ -1,11 +1,15 @@
 """Tables of a study file, and their validation."""
 
+import difflib
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
+from ..analysis.constraints import CONSTRAINTS
+from ..core.registry import discover
 from ..signals import motions
 from ..signals import waveforms as signals
 from ..solve.optimisers import GAUSS_NEWTON, METHODS
@@ -85,28 +89,25 @@ class TunedTable(RangeTable):
     start: Finite | None = None
 
 
-class ConstraintsTable(Table):
-    """Constraints on the tuned gains, for every plant and reference of the objective.
+def _checked_limits(limits: Any) -> dict[str, float]:
+    """Return the limits by the name of their constraint.
 
-    Three limits concern the loop, linearised at the highest reference on both branches
-    of the hysteresis: the largest ``sensitivity_peak``, and the smallest
-    ``disk_margin`` and ``delay_margin`` (samples). The others are largest
-    values in the runs: ``peak_voltage`` (V), ``peak_slew`` (V/s), ``effort`` (V rms)
-    and ``overshoot`` (share of the reference's range).
+    Raises ValueError for an unknown constraint or a limit outside its bounds.
     """
+    if not isinstance(limits, Mapping):
+        raise ValueError("it must be a table of limits")
+    for name in limits:
+        if name not in CONSTRAINTS:
+            near = difflib.get_close_matches(name, CONSTRAINTS, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(
+                f"{name} is unknown; allowed are {', '.join(CONSTRAINTS)}{hint}"
+            )
+    return {name: CONSTRAINTS[name].check(name, limits[name]) for name in limits}
 
-    sensitivity_peak: Annotated[float, Field(gt=1.0, allow_inf_nan=False)] | None = None
-    disk_margin: Annotated[float, Field(gt=0.0, lt=2.0)] | None = None
-    delay_margin: Positive | None = None
-    peak_voltage: Positive | None = None
-    peak_slew: Positive | None = None
-    effort: Positive | None = None
-    overshoot: Positive | None = None
 
-    @property
-    def limits(self) -> dict[str, float]:
-        """Limits of the constraints that are set, by name."""
-        return self.model_dump(exclude_none=True)
+Limits = Annotated[dict[str, float], BeforeValidator(_checked_limits)]
+"""Limits by the name of a constraint, one of ``analysis.constraints.CONSTRAINTS``."""
 
 
 class ParetoTable(Table):
@@ -122,7 +123,7 @@ class ParetoTable(Table):
     @field_validator("constraint")
     @classmethod
     def _known(cls, name: str) -> str:
-        return one_of(name, ConstraintsTable.model_fields)
+        return one_of(name, CONSTRAINTS)
 
 
 class ObjectiveTable(Table):
@@ -178,7 +179,7 @@ class Study(Table):
     optimiser: OptimiserTable = OptimiserTable()
     disturbance: DisturbanceTable = DisturbanceTable()
     ensemble: EnsembleTable | None = None
-    constraints: ConstraintsTable = ConstraintsTable()
+    constraints: Limits = Field(default_factory=dict)
     pareto: ParetoTable | None = None
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
     sweep: SweepTable | None = None
@@ -243,7 +244,7 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _constrained(self) -> "Study":
-        limits = self.constraints.limits
+        limits = self.constraints
         if self.axes and limits:
             raise ValueError(
                 f"constraints.{next(iter(limits))}: constraints are for one axis; "
@@ -327,6 +328,7 @@ def load(path: str | Path) -> Study:
     Raises ValueError: one line with the key, the value and the allowed values.
     """
     path = Path(path)
+    discover()  # constraints and stages of other packages
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

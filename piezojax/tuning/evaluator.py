@@ -6,13 +6,13 @@ from typing import Any
 import equinox as eqx
 import jax
 
+from ..analysis.constraints import LoopFigures, uses
 from ..analysis.stability.differentiable import sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
 from ..core.metrics import Extremes, TrackingFigures
 from ..core.system import Feedback
 from ..solve.clock import Clock
 from ..study import Case, Stage
-from .constraints import LoopFigures, uses
 from .runs import Signals, evaluate
 
 
@@ -45,7 +45,7 @@ class Evaluator:
         """Return the figures of ``loop`` on ``stages``, stacked on a leading axis."""
         dynamic, static = eqx.partition(stages, eqx.is_array)
         signals = signals.for_another_plant()
-        limits = self._case.study.constraints.limits
+        limits = self._case.study.constraints
         beside = Extremes() if uses(limits, "extremes") else None
 
         def run(loop, dynamic, signals):

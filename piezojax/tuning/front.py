@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from jax import Array
 
+from ..analysis.constraints import CONSTRAINTS, worst_by_plant
 from ..core.arrays import as_array
 from ..core.progress import Progress
 from ..solve.clock import Clock
@@ -13,7 +14,6 @@ from ..solve.multi_start import Strategy, minimise
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import SearchState
 from ..study import Case
-from .constraints import CONSTRAINTS, worst_by_plant
 from .objective import Objective
 from .result import ConstraintOutcome, FrontPoint
 
@@ -38,7 +38,7 @@ def trace_front(
     """
     table = case.study.pareto
     assert table is not None
-    limits = case.study.constraints.limits
+    limits = case.study.constraints
 
     def look(objective: Objective, unit: Array) -> tuple[dict[str, Array], Array]:
         loop = objective.figures(unit)

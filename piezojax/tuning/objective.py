@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..analysis.constraints import LoopFigures, uses, violations
 from ..analysis.stability.differentiable import sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
 from ..core.arrays import as_array
@@ -19,7 +20,6 @@ from ..core.system import Feedback
 from ..solve.augmented_lagrangian import PENALTY, augmented
 from ..solve.problem import HOPELESS, Errors, Verdict
 from ..study import Stage
-from .constraints import LoopFigures, uses, violations
 from .runs import Signals, sampled
 
 T = TypeVar("T")

@@ -7,11 +7,11 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from ..analysis.constraints import CONSTRAINTS, LoopFigures, worst_by_plant
 from ..core.files import read_model
 from ..core.metrics import TrackingFigures
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import Status
-from .constraints import CONSTRAINTS, LoopFigures, worst_by_plant
 from .objective import RAILED
 
 RESULT_FILE = "result.json"

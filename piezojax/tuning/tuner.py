@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..analysis.constraints import worst_by_plant
 from ..core.arrays import as_array
 from ..core.metrics import TrackingFigures
 from ..core.progress import Progress, Silent
@@ -16,7 +17,6 @@ from ..solve.search_state import SearchState
 from ..study import Case, Stage, read, shipped
 from ..study.ensemble import Part
 from .baselines import Budget, contest
-from .constraints import worst_by_plant
 from .data import Data, make_data
 from .evaluator import Evaluator
 from .front import trace_front
@@ -82,7 +82,7 @@ def tune(
         tail=table.ensemble.tail if table.ensemble else 1.0,
         highest=as_array(table.highest),
         dt=table.dt,
-    ).with_limits(table.constraints.limits)
+    ).with_limits(table.constraints)
     search, strategy = search_box(objective, case, clock, progress)
 
     after = space.put(case.loop, as_array(search.unit))
@@ -161,7 +161,7 @@ def _perturbed(
         return None
     driven = np.array([trace.driven for trace in data.traces])
     seen = [evaluator.on_stages(loop, stages, data.holdout) for loop in (before, after)]
-    return Perturbed.of(seen[0], seen[1], driven, case.study.constraints.limits)
+    return Perturbed.of(seen[0], seen[1], driven, case.study.constraints)
 
 
 def _kept(

@@ -1,5 +1,6 @@
 """Constraints on tuned gains: how they are measured, and how much is violated."""
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -7,13 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..analysis.stability.differentiable import (
+from ..core.metrics import ExtremeFigures, TrackingFigures
+from .stability.differentiable import (
     Sensitivity,
     delay_margin_of,
     disk_margin_of,
     peak_of,
 )
-from ..core.metrics import ExtremeFigures, TrackingFigures
 
 CAP = 3.0
 """Logarithm of value over limit beyond which a violation grows slowly: the loop is
@@ -43,13 +44,28 @@ class Constraint(NamedTuple):
     """Definition of a constraint: unit, direction, and the figure that is limited.
 
     ``values`` maps the field ``source`` of the LoopFigures, and dt, to values with the
-    plants on the first axis.
+    plants on the first axis. A limit must lie above ``above`` and below ``below``.
     """
 
     unit: str
     sense: Literal["at most", "at least"]
     source: Source
     values: Callable[[Any, float], Array]
+    above: float = 0.0
+    below: float = math.inf
+
+    def check(self, name: str, limit: Any) -> float:
+        """Return ``limit`` as a number.
+
+        Raises ValueError unless it is a finite number within the allowed limits.
+        """
+        number = isinstance(limit, int | float) and not isinstance(limit, bool)
+        if not (number and self.above < limit < self.below):
+            bound = f" and below {self.below:g}" if math.isfinite(self.below) else ""
+            raise ValueError(
+                f"{name} is {limit!r}; it must be a number above {self.above:g}{bound}"
+            )
+        return float(limit)
 
     def read(self, loop: LoopFigures) -> Array:
         """Return the values in the unit, of shape [plants] or [plants, branches]."""
@@ -66,8 +82,12 @@ def _margin(figure: Callable[[Array], Array]) -> Callable[[Array, float], Array]
 
 
 CONSTRAINTS: dict[str, Constraint] = {
-    "sensitivity_peak": Constraint("1", "at most", "sensitivity", _margin(peak_of)),
-    "disk_margin": Constraint("1", "at least", "sensitivity", _margin(disk_margin_of)),
+    "sensitivity_peak": Constraint(
+        "1", "at most", "sensitivity", _margin(peak_of), above=1.0
+    ),
+    "disk_margin": Constraint(
+        "1", "at least", "sensitivity", _margin(disk_margin_of), below=2.0
+    ),
     "delay_margin": Constraint(
         "samples", "at least", "sensitivity", _margin(delay_margin_of)
     ),
@@ -84,7 +104,10 @@ CONSTRAINTS: dict[str, Constraint] = {
         "1", "at most", "extremes", lambda found, dt: _largest(found.overshoot)
     ),
 }
-"""Constraints by the name a study uses."""
+"""Constraints by the name that a study uses, for every plant and reference of the
+objective. Sensitivity peak, disk margin and delay margin (samples) concern the loop,
+linearised at the highest reference on both branches of the hysteresis. The others are
+largest values in the runs, ``overshoot`` as a share of the reference's range."""
 
 
 def uses(names: Iterable[str], source: Source) -> bool:

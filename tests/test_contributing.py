@@ -1,0 +1,198 @@
+"""CONTRIBUTING.md followed to the letter, in a package outside piezojax."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+PAGE = Path(__file__).parents[1] / "CONTRIBUTING.md"
+FILE = re.compile(r"^`(\w+\.py)`:\n\n```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+TABLE = re.compile(r"^```toml\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+STUDY = """
+title = "a stage of another package"
+rate = 10_000.0
+
+[plant]
+catalog = "my_stage"
+
+[actuator]
+lower = -20.0
+upper = 120.0
+
+[sensor]
+noise_rms = 0.002
+
+{controller}
+[references]
+tune = ["SIN10"]
+amplitude = 2.0
+duration = 0.2
+settle = 0.1
+
+[parameters]
+"controller.gain" = {{ lower = 1.0, upper = 200.0 }}
+
+[ensemble]
+tune = 1
+margins = 1
+holdout = 1
+spread = {{ gain = 0.1 }}
+
+[constraints]
+rms_slew = {limit}
+
+[optimiser]
+starts = 1
+candidates = 4
+steps = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def page():
+    text = PAGE.read_text(encoding="utf-8")
+    tables = [tomllib.loads(table) for table in TABLE.findall(text)]
+    return dict(FILE.findall(text)), tables
+
+
+@pytest.fixture(scope="module")
+def lab(page, tmp_path_factory):
+    """Install the page's package: its modules, and the entry points that it names."""
+    files, tables = page
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "my_lab").mkdir()
+    (folder / "my_lab" / "__init__.py").touch()
+    for name, code in files.items():
+        (folder / "my_lab" / name).write_text(code)
+    (project,) = (table["project"] for table in tables if "project" in table)
+    metadata = folder / f"my_lab-{project['version']}.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Name: {project['name']}\nVersion: 0.1\n")
+    lines = []
+    for group, points in project["entry-points"].items():
+        lines += [f"[{group}]", *(f"{key} = {value}" for key, value in points.items())]
+    (metadata / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def python(lab, *arguments, cwd):
+    paths = [str(lab), os.environ.get("PYTHONPATH", ""), *sys.path]
+    search = os.pathsep.join(filter(None, paths))
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": search, "COLUMNS": "200"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+SCRIPT = """
+import numpy as np, jax, piezojax as pj
+from my_lab.dahl import Dahl
+model = Dahl(0.1, 0.2, 0.2)
+plant = pj.series(hysteresis=model, lag=pj.dynamics.FirstOrderLag(2e-3, 1e-3))
+time = np.arange(3000) * 1e-3
+swing = 25 * (1 - np.cos(2 * np.pi * 1.7 * time))
+voltage = swing + 25 * (1 - np.cos(2 * np.pi * 0.4 * time))
+_, output = pj.simulate(plant, voltage, plant.init(voltage[0]))
+noise = 0.005 * np.random.default_rng(0).standard_normal(time.size)
+np.savez("record.npz", time=time, input=voltage, output=np.asarray(output) + noise)
+pj.save(model, "dahl.json")
+inverse = pj.load("dahl.json").inverse(0.0, 120.0)
+_, wanted = pj.simulate(model, voltage, model.init(voltage[0]))
+_, found = pj.simulate(inverse, wanted, inverse.init(wanted[0]))
+print(float(np.max(np.abs(found[1:] - voltage[1:]))))
+"""
+
+
+def test_the_page_has_every_recipe(page):
+    assert set(page[0]) == {"dahl.py", "lead_lag.py", "rms_slew.py", "my_stage.py"}
+
+
+def test_a_model_is_saved_inverted_listed_fitted_tried_and_drawn(lab, tmp_path):
+    done = python(lab, "-c", SCRIPT, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) < 1e-6
+
+    identify = ("-m", "piezojax.identify")
+    listed = python(lab, *identify, "--model", "help", cwd=tmp_path)
+    assert "Dahl: a line less a bounded part" in listed.stdout
+
+    columns = ("--time", "time", "--input", "input", "--output", "output")
+    record = ("record.npz", *columns, "--train", "0:2000", "--validate", "2000:3000")
+    fit = python(
+        lab, *identify, *record, "--model", "dahl+lag", "--out", "fit", cwd=tmp_path
+    )
+    assert fit.returncode == 0, fit.stderr
+    report = json.loads((tmp_path / "fit" / "fit.json").read_text())
+    assert report["validate"]["rmse"] < 0.006
+    for name, true in (("slope", 0.1), ("height", 0.2), ("rate", 0.2)):
+        found = report["parameters"][f"hysteresis.{name}"]
+        assert abs(found["value"] - true) < 5.0 * found["standard_error"]
+    assert (tmp_path / "fit" / "fit.png").stat().st_size > 10_000
+
+    among = ("--among", "dahl,coleman_hodgdon")
+    tried = python(
+        lab, *identify, *record, "--model", "all", *among, "--out", "all", cwd=tmp_path
+    )
+    assert tried.returncode == 0, tried.stderr
+    assert "dahl" in tried.stdout
+
+
+def study(page, limit):
+    (table,) = (table for table in page[1] if "controller" in table)
+    keys = [
+        f"{key} = {json.dumps(value)}" for key, value in table["controller"].items()
+    ]
+    return STUDY.format(controller="\n".join(["[controller]", *keys, ""]), limit=limit)
+
+
+def test_a_controller_a_constraint_and_a_stage_meet_in_a_study(page, lab, tmp_path):
+    (tmp_path / "study.toml").write_text(study(page, 1e6))
+    tune = ("-m", "piezojax.tune", "study.toml", "--out")
+    done = python(lab, *tune, "results", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "results" / "result.json").read_text())
+    assert set(result["gains"]) == {"controller.gain"}
+    kept = result["constraints"]["rms_slew"]
+    assert kept["unit"] == "V/s"
+    assert 0.0 < kept["value"] < kept["limit"]
+    assert result["perturbed"]["plants"] == 1
+    gains = tomllib.loads((tmp_path / "results" / "gains.toml").read_text())
+    assert gains["type"] == "LeadLag"
+
+    (tmp_path / "study.toml").write_text(study(page, -1.0))
+    refused = python(lab, *tune, "refused", cwd=tmp_path)
+    assert refused.returncode == 1
+    assert "rms_slew is -1.0; it must be a number above 0" in refused.stderr
+
+
+def test_the_lead_lag_is_that_of_the_bilinear_transform(page, tmp_path, monkeypatch):
+    from scipy import signal
+
+    import piezojax as pj
+
+    (tmp_path / "page_lead_lag.py").write_text(page[0]["lead_lag.py"])
+    monkeypatch.syspath_prepend(tmp_path)
+    from page_lead_lag import LeadLag  # pyright: ignore[reportMissingImports]
+
+    gain, zero, pole, dt = 2.0, 300.0, 20.0, 1e-4
+    error = np.random.default_rng(1).standard_normal(200)
+    numbers = signal.bilinear([gain, gain * zero], [1.0, pole], 1.0 / dt)
+    rest = np.zeros(200)
+    controller = LeadLag(gain, zero, pole, dt)
+    seen = pj.Observation(*map(jax.numpy.asarray, (error, rest, rest, rest)))
+    start = controller.init(pj.Observation(0.0, 0.0, 0.0, 0.0))
+    _, found = pj.simulate(controller, seen, start)
+    np.testing.assert_allclose(found, signal.lfilter(*numbers, error), atol=1e-12)
