@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from piezojax.core.recursive import update, update_root
+from piezojax.core.recursive_update import update, update_root
 
 TRUE = np.array([1.6, -0.7, 30.0, 0.02])
 SCALES = np.array([1.0, 1.0, 1e-3, 10.0])

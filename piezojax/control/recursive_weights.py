@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Matrix, Scalar, as_array, as_scalars, check
-from ..core.recursive import update
+from ..core.recursive_update import update
 from ..core.system import Learned, System
 
 Row = tuple[Scalar, ...]

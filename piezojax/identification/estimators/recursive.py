@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...core.arrays import Scalar, ScalarLike, as_array, check
-from ...core.recursive import update_root
+from ...core.recursive_update import update_root
 from ...core.rollout import simulate
 from ...core.system import System
 from ...hysteresis import HystereticARMA

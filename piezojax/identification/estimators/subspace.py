@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import linalg
 
-from ...core.recursive import update
+from ...core.recursive_update import update
 from ...core.rollout import simulate
 from ...dynamics import StateSpace, stabilised
 from ..records.record import Record
