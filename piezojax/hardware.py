@@ -47,8 +47,7 @@ class SlewLimit(System):
 class Quantiser(System):
     """Rounds its input to whole multiples of ``resolution`` (a DAC or ADC step).
 
-    Its gradient is that of the identity, so that a loop with converters can still be
-    tuned; the value is the rounded one.
+    The gradient is that of the identity, so that a loop with converters can be tuned.
     """
 
     resolution: Scalar = parameter(
@@ -67,8 +66,9 @@ class Quantiser(System):
 class Sensor(System):
     """Adds noise to the displacement.
 
-    Input ``(displacement, draw)`` in um and unit variance; output the measurement in
-    um: displacement + ``noise_rms`` * draw. Follow it with a Quantiser for a converter.
+    The input is ``(displacement, draw)`` in um and of unit variance; the output is the
+    measurement ``displacement + noise_rms * draw`` in um. A Quantiser after it models
+    the converter.
     """
 
     noise_rms: Scalar = parameter("um", "rms noise of the sensor", least=0.0)
@@ -82,7 +82,7 @@ class Sensor(System):
 
 
 class ChargeDriveState(NamedTuple):
-    """Last command, load voltage and charge over C_L, all in V; the load's state."""
+    """Last command, load voltage and charge over C_L, all in V; state of the load."""
 
     command: Scalar
     voltage: Scalar
@@ -91,25 +91,25 @@ class ChargeDriveState(NamedTuple):
 
 
 class ChargeDrive(System):
-    """A grounded-load charge amplifier: an actuator from a command v to a voltage.
+    """Charge amplifier with grounded load: an actuator from a command v to a voltage u.
 
-    The amplifier's network C_s, R_s and the load C_L, R_L take up the same charge:
+    The network C_s, R_s of the amplifier and the load C_L, R_L take up the same charge:
 
     ``C_s dv/dt + v / R_s = dq/dt + u / R_L``
 
-    with q the load's own charge and u the voltage across it. On a linear load u = q/C_L
-    this is (2.12) with its leakage, ``q / v = C_s (s + 1/(C_s R_s)) / (s +
-    1/(C_L R_L))``: charge is followed above 1 / (C_L R_L), voltage below.
+    where q is the charge of the load and u its voltage. For a linear load u = q/C_L
+    this is (2.12) with leakage, ``q / v = C_s (s + 1/(C_s R_s)) / (s + 1/(C_L R_L))``:
+    the charge follows the command above 1 / (C_L R_L), the voltage follows it below.
 
     ``load`` is a System from q / C_L in V to u in V; a linear load is ``Affine()``. In
     a piezo the hysteresis lies between voltage and charge, and the displacement is
     proportional to the charge: ``Affine(K) >> InverseColemanHodgdon(model)``, K in
-    um/V, is the load of a stage with that hysteresis. The inverse describes the
-    material here, not a compensation. The leakage is integrated by Euler's rule, with
-    an error of the order dt / load_time.
+    um/V, is the load of a stage with that hysteresis. Here the inverse describes the
+    material, not a compensation. The leakage is integrated by Euler's rule, with an
+    error of order dt / load_time.
 
-    As the actuator of a loop its static gain, gain * load_time / source_time, should be
-    1, or the start is a jump. Limits of the command are a ``Saturation`` before it.
+    In a loop the static gain, gain * load_time / source_time, should be 1; otherwise
+    the loop starts with a jump. Put a ``Saturation`` before it to limit the command.
     """
 
     load: System

@@ -1,4 +1,4 @@
-"""Dynamics: linear ones that follow the hysteresis, and those that contain it."""
+"""Dynamics of a stage: linear and scheduled models, creep, lags, delays and drift."""
 
 from .arma import ARMA as ARMA
 from .arma import scaled_to_dc as scaled_to_dc

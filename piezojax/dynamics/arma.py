@@ -15,10 +15,10 @@ class ARMA(Fittable):
     """``y(k) = sum_i autoregressive[i] y(k-1-i) + sum_i moving[i] x(k-i)``, (3.30).
 
     ``autoregressive`` holds a_1, a_2, ... with the sign of the thesis (on the
-    right-hand side), ``moving`` holds b_0, b_1, ...; x and y in the units of the
-    neighbours in the chain. The state is that of the transposed direct form, with the
-    fewest numbers to carry: element i is what the past adds to the output i + 1 samples
-    ahead. Raises ValueError for empty ``moving`` or non-finite coefficients.
+    right-hand side), ``moving`` holds b_0, b_1, ...; x and y have the units of the
+    neighbours in the chain. The state is that of the transposed direct form, which is
+    the smallest: element i is the contribution of past samples to the output i + 1
+    samples ahead. Raises ValueError for empty ``moving`` or non-finite coefficients.
     """
 
     part: ClassVar[Part] = Part(
@@ -81,7 +81,8 @@ class ARMA(Fittable):
         return (*later, last), output
 
     def _past(self, input: Scalar, output: Scalar) -> list[Scalar]:
-        """What one sample adds to the outputs 1, 2, ... samples later."""
+        """Return the contributions of one sample to the outputs 1, 2, ... samples
+        later."""
         fed_back = [a * output for a in self.autoregressive]
         fed_forward = [b * input for b in self.moving[1:]]
         longer, shorter = sorted((fed_back, fed_forward), key=len, reverse=True)

@@ -14,11 +14,11 @@ from .state_space import StateSpace
 
 
 class Channel(System):
-    """What one input does to all outputs: ``x(k+1) = A x + B u``, ``y(k) = C x(k)``.
+    """Response of all outputs to one input: ``x(k+1) = A x + B u``, ``y(k) = C x(k)``.
 
     ``A`` [n, n], ``B`` [n], ``C`` [outputs, n] in the units of the input and outputs.
-    Input the scalar u(k), output y(k+1), one scalar an output. Raises
-    ValueError for sizes that do not fit or numbers that are not finite.
+    The input is the scalar u(k), the output y(k+1) a tuple with one scalar per output.
+    Raises ValueError for sizes that do not match or numbers that are not finite.
     """
 
     A: Rows = parameter("1", "state matrix", converter=as_rows)
@@ -46,11 +46,11 @@ class Channel(System):
 
 
 class Channels(System):
-    """The sum of what each input does to all outputs, (6.19)-(6.22).
+    """Sum of the responses to several inputs, one Channel per input, (6.19)-(6.22).
 
-    Answers u(k) with y(k+1), as a loop expects of its plant. Inputs and outputs are
-    tuples of scalars. Raises ValueError for parts that differ in their outputs or
-    sample time, or for none.
+    A step maps u(k) to y(k+1), as a loop expects of its plant. Inputs and outputs are
+    tuples of scalars. Raises ValueError if there are no parts, or if they differ in the
+    number of outputs or the sample time.
     """
 
     parts: tuple[Channel, ...]
@@ -77,10 +77,10 @@ class Channels(System):
 
 
 def channels_of(models: Sequence[StateSpace]) -> Channels:
-    """Return models of one input each as the plant of a loop.
+    """Return the plant of a loop from ``models`` with one input each.
 
-    Raises ValueError for a model with more inputs, or one whose input reaches its own
-    sample (D not zero).
+    Raises ValueError for a model with more inputs, or with D other than zero, where an
+    input acts on the output of its own sample.
     """
     for model in models:
         if model.B.shape[1] != 1:

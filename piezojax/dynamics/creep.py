@@ -1,4 +1,4 @@
-"""Creep: the slow drift of a piezo after a step, as linear dynamics."""
+"""Linear models of creep, the slow drift of a piezo after a step."""
 
 from typing import ClassVar
 
@@ -23,7 +23,7 @@ Lags = tuple[Scalar, ...]
 
 
 def _relaxed(input: Scalar, lags: Lags, time_constants: tuple, dt: float) -> Lags:
-    """Advance first-order lags of the input, held between samples."""
+    """Advance first-order lags of an input that is held between samples."""
     return tuple(
         input + jnp.exp(-dt / tau) * (lag - input)
         for tau, lag in zip(time_constants, lags, strict=True)
@@ -31,7 +31,7 @@ def _relaxed(input: Scalar, lags: Lags, time_constants: tuple, dt: float) -> Lag
 
 
 def _creep_times(extent: Extent) -> tuple[float, float]:
-    """Return the fastest and slowest creep (s) that a record can show."""
+    """Return the shortest and longest time constant (s) that a record can show."""
     longest = 2.0 * extent.duration
     return max(10.0 * extent.dt, 1e-3 * longest), longest
 
@@ -39,14 +39,14 @@ def _creep_times(extent: Extent) -> tuple[float, float]:
 class ExponentialCreep(Fittable):
     """``y = x + sum_i gains[i] lag_i(x)``: creep as a sum of exponentials.
 
-    After a step of x, y goes on by ``gains[i]`` (a share of the step) with the time
-    constant ``time_constants[i]``; y in the unit of x. The linear
-    creep model of section 2.4.1 (springs and dampers in series). At rest all of it has
-    crept: the gain is 1 + sum of gains. ``direct`` is the share of x that passes at
-    once: 0 leaves what creeps, to be added to a hysteresis of the same input, as in
-    ``hysteresis + creep >> dynamics``; the gains are then in um/V. Raises ValueError
-    for time constants that are not positive, gains that are not finite, or a different
-    count of both.
+    After a step of x, y grows further by ``gains[i]`` (a share of the step) with the
+    time constant ``time_constants[i]``; y has the unit of x. This is the linear creep
+    model of section 2.4.1 (springs and dampers in series). At rest the creep is
+    complete: the gain is ``direct`` + sum of gains. ``direct`` is the share of x that
+    passes at once. With 0 the output is the creep alone, to be added to a hysteresis of
+    the same input, as in ``hysteresis + creep >> dynamics``; the gains are then in
+    um/V. Raises ValueError for time constants that are not positive, gains that are not
+    finite, or a different number of both.
     """
 
     part: ClassVar[Part] = Part(
@@ -93,10 +93,11 @@ class LogarithmicCreep(Fittable):
     """Creep by ``gain_per_decade`` of a step with each decade of time.
 
     After a step of x at t = 0, y grows in proportion to log10(t) from t = ``shortest``
-    to ``longest``: the logarithmic law of section 2.4.1, carried over to any input by
-    equally strong exponentials, two a decade from a decade before to a decade after,
-    which follow it within 3 % of a decade's creep. y in the unit of x; ``direct`` as in
-    ``ExponentialCreep``. Raises ValueError unless 0 < shortest < longest.
+    to ``longest``: the logarithmic law of section 2.4.1. Equal exponentials extend it
+    to any input: two per decade, from a decade before ``shortest`` to a decade after
+    ``longest``. They follow the law within 3 % of the creep in a decade. y has the unit
+    of x; ``direct`` as in ``ExponentialCreep``. Raises ValueError unless 0 < shortest <
+    longest.
     """
 
     part: ClassVar[Part] = Part(
@@ -142,15 +143,15 @@ class LogarithmicCreep(Fittable):
 
 
 class SpringDamperCreep(Fittable):
-    """A spring and damped springs in series under one force: creep of section 2.4.1.
+    """Creep of section 2.4.1: a spring and damped springs in series under one force.
 
     ``y = F / spring + sum_i y_i`` with ``damping[i] y_i' + stiffness[i] y_i = F`` and
     ``F = force_per_volt u``: the cascade of Croft, Shed and Devasia (2001, reference
     [6]). Input u in V, output y in um; ``spring`` in N/um. The force is held between
-    samples, for which the discretisation is exact. A ``spring`` of infinite
-    stiffness leaves what creeps, to be added to a hysteresis of the same input. Raises
-    ValueError for a stiffness, damping or sample time that is not positive, or a
-    different count of damped springs and dampers.
+    samples, for which the discretisation is exact. With a ``spring`` of infinite
+    stiffness the output is the creep alone, to be added to a hysteresis of the same
+    input. Raises ValueError for a stiffness, damping or sample time that is not
+    positive, or a different number of damped springs and dampers.
     """
 
     part: ClassVar[Part] = Part(
@@ -181,8 +182,8 @@ class SpringDamperCreep(Fittable):
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
         times = np.geomspace(*_creep_times(extent), 3)
-        # Only ratios show in a record: force and spring are those of a unit gain, and
-        # the stiffness is counted in that spring's.
+        # A record determines only ratios. Force and spring are therefore set for a unit
+        # gain, and the stiffness is relative to that of the spring.
         stiffness = 50.0
         return Recipe(
             cls((stiffness,) * 3, stiffness * times, 1.0, 1.0, extent.dt),

@@ -1,4 +1,4 @@
-"""A delay that need not be a whole number of samples, and can be fitted."""
+"""Fractional delay, which can be fitted."""
 
 from typing import ClassVar
 
@@ -13,10 +13,10 @@ from ..core.space import Range
 class FractionalDelay(Fittable):
     """``y(t) = x(t - delay)``, interpolated linearly between samples.
 
-    ``delay`` runs from 0 to ``longest`` samples; y in the unit of x. The output depends
-    on the delay through the weights of the samples it lies between, so its gradient
-    exists. For a whole number of samples it is Delay. Raises ValueError for a delay
-    outside 0 to longest * dt.
+    ``delay`` lies between 0 and ``longest`` samples; y has the unit of x. The output is
+    differentiable with respect to the delay, through the weights of the two adjacent
+    samples. For a whole number of samples it equals Delay. Raises ValueError for a
+    delay outside 0 to longest * dt.
     """
 
     part: ClassVar[Part] = Part("delay", "delay", "Delay of up to five samples")

@@ -1,4 +1,4 @@
-"""Drift of a stage with its temperature."""
+"""Thermal drift of a stage."""
 
 import jax.numpy as jnp
 
@@ -8,13 +8,13 @@ from ..core.system import System
 
 
 class ThermalDrift(System):
-    """``y = expansion (T_stage - reference)``, where T_stage follows the room's T.
+    """``y = expansion (T_stage - reference)``, where T_stage follows the room.
 
-    Input T in degrees Celsius (or any other scale of which ``reference`` is part),
-    output y in um; T is held between samples. Beside a stage the two read their own of
-    a pair (V, degrees), ``Select(0) >> stage`` plus ``Select(1) >> drift``; in a closed
-    loop the drift is a disturbance in um. Raises ValueError for a time constant or
-    sample time that is not positive.
+    The input is the room temperature T in degrees Celsius (or on another scale, shared
+    with ``reference``), held between samples; the output is y in um. Combine stage and
+    drift as ``(Select(0) >> stage) + (Select(1) >> drift)`` for an input (V, degrees).
+    In a closed loop the drift is a disturbance in um. Raises ValueError for a time
+    constant or sample time that is not positive.
     """
 
     expansion: Scalar = parameter("um/K", "thermal expansion")
@@ -29,7 +29,7 @@ class ThermalDrift(System):
     dt: float = sample_time()
 
     def init(self, input: ScalarLike = 0.0) -> Scalar:
-        """Return the stage as warm as the room."""
+        """Return the state in which the stage has the temperature of the room."""
         return as_array(input)
 
     def step(self, state: Scalar, input: ScalarLike) -> tuple[Scalar, Scalar]:

@@ -1,4 +1,4 @@
-"""A system that runs faster than what drives it."""
+"""System that runs at a multiple of the sample rate of its input."""
 
 from typing import Any
 
@@ -8,10 +8,10 @@ from ..core.system import System
 
 
 class Held(System):
-    """``system`` stepped ``samples`` times under each input, its last output taken.
+    """``system`` stepped ``samples`` times under each input; returns the last output.
 
-    A stage simulated at one rate behind a converter that holds the voltage of a slower
-    loop. Raises ValueError unless ``samples`` is a whole number of at least 1.
+    It models a stage behind a converter that holds the voltage of a slower loop. Raises
+    ValueError unless ``samples`` is a whole number of at least 1.
     """
 
     system: System

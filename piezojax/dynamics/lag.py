@@ -55,9 +55,9 @@ class FirstOrderLag(Fittable):
 class SecondOrderLag(Designed):
     """``y'' + 2 zeta w y' + w^2 y = w^2 x``, unit DC gain: the reference model (4.47).
 
-    y in the unit of x; zeta may be above 1. Exact for an input held between samples:
-    the output belongs to the end of the sample. The state is y and dy/dt. Raises
-    ValueError for parameters outside their limits.
+    y has the unit of x; zeta may be above 1. The step is exact for an input held
+    between samples, and its output is that at the end of the sample. The state is y and
+    dy/dt. Raises ValueError for parameters outside their limits.
     """
 
     frequency: Scalar = parameter(
@@ -73,7 +73,7 @@ class SecondOrderLag(Designed):
     dt: float = sample_time()
 
     def resolved(self) -> "LinearOscillator":
-        """Return the lag with its coefficients for one sample."""
+        """Return the LinearOscillator with the coefficients of one sample."""
         decay = self.damping * self.frequency
         even, odd = _cosine_and_sinc((self.frequency**2 - decay**2) * self.dt**2)
         odd = odd * self.dt
@@ -87,7 +87,7 @@ class SecondOrderLag(Designed):
 
 
 class LinearOscillator(System):
-    """Position and velocity one sample on: what SecondOrderLag runs.
+    """Recursion of position and velocity over one sample, the resolved SecondOrderLag.
 
     With d = y - x: y <- x + ``keep`` d + ``carry`` dy/dt (s) and
     dy/dt <- ``slow`` dy/dt - ``pull`` d (1/s).
@@ -112,7 +112,7 @@ class LinearOscillator(System):
 
 
 def _cosine_and_sinc(square: Scalar) -> tuple[Scalar, Scalar]:
-    """cos x and sin(x)/x of x^2 = ``square``, of either sign, smooth through zero."""
+    """Return cos x and sin(x)/x for x^2 = ``square`` of either sign, smooth at zero."""
     small = jnp.abs(square) < 1e-3  # the series is exact to rounding there
     x = jnp.sqrt(jnp.where(small, 1.0, jnp.abs(square)))
     real = square > 0.0

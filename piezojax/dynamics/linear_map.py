@@ -1,4 +1,4 @@
-"""A constant matrix: what several actuators make of a stage, or sensors of its pose."""
+"""Constant matrix between signals: the geometry of actuators or of sensors."""
 
 from jaxtyping import Array, ArrayLike, Float
 

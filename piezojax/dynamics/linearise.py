@@ -1,4 +1,4 @@
-"""Any System as a linear model around an operating point, by differentiation."""
+"""Linearisation of a System around an operating point, by differentiation."""
 
 from typing import Any
 
@@ -23,20 +23,21 @@ def linearise(
 ) -> StateSpace:
     """Return ``system`` linearised around ``state`` and ``input``.
 
-    The matrices are the exact derivatives of one step: A [n, n], B [n, m], C [p, n],
-    D [p, m] for the n numbers of the raveled state, the m of the input and the p of the
+    The matrices are the exact derivatives of one step: A [n, n], B [n, m], C [p, n], D
+    [p, m] for the n numbers of the raveled state, the m of the input and the p of the
     output, in the order in which ``jax.tree.leaves`` lists them and in the units of the
     system; they map deviations from the operating point to deviations. Counters and
-    what is ``Learned`` are held and no states of the model.
+    ``Learned`` states are held constant and are not states of the model.
 
-    ``state`` is that at rest under ``input`` if left out. ``dt`` in s is looked for in
-    the parts of the system. Where a step has a kink, as hysteresis has at rest, the
-    derivative is the one JAX takes at that very point: that of the ascending branch for
-    Coleman-Hodgdon models, the mean of both for a play operator. An ``input`` a little
-    to one side of the point picks the branch.
+    Without ``state``, the state at rest under ``input`` is used. Without ``dt`` (s),
+    the sample time of the parts of the system is used. At a kink of the step, such as
+    that of a hysteresis at rest, the derivative is the one that JAX takes at that
+    point: that of the ascending branch for Coleman-Hodgdon models, the mean of both
+    branches for a play operator. An ``input`` slightly to one side of the point selects
+    the branch.
 
-    Usable inside ``jax.jit`` and differentiable. Raises ValueError where the parts of
-    the system name no sample time or several, and ``dt`` is not given.
+    The function works inside ``jax.jit`` and is differentiable. Raises ValueError if
+    ``dt`` is not given and the parts of the system have no sample time or several.
     """
     dt = sample_time(system) if dt is None else dt
     input = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), input)
@@ -55,9 +56,9 @@ def linearise(
 
 
 def parted(state: State) -> tuple[State, State]:
-    """Return what small motions move of ``state``, and what they leave where it is.
+    """Split ``state`` into the part that small motions change and the part they do not.
 
-    A counter has no derivative, and what is ``Learned`` is held.
+    The second holds counters, which have no derivative, and ``Learned`` states.
     """
 
     def is_learned(part: Any) -> bool:
@@ -70,9 +71,9 @@ def parted(state: State) -> tuple[State, State]:
 
 
 def sample_time(system: System) -> float:
-    """Return the one sample time (s) that the parts of ``system`` name.
+    """Return the common sample time (s) of the parts of ``system``.
 
-    Raises ValueError if they name none, or several.
+    Raises ValueError if they have no sample time, or several.
     """
     found = [float(dt) for dt in static_fields(system, "dt")]
     if found and np.allclose(found, found[0], rtol=1e-9, atol=0.0):

@@ -22,11 +22,12 @@ from .state_space import StateSpace
 class MatrixARMA(System):
     """``y(k+1) = sum_i autoregressive[i] y(k-i) + sum_i moving[i] u(k-i)``.
 
-    p matrices [q, q] each, newest first: of the thesis' (7.5)-(7.6) ``autoregressive``
-    holds A_(p-1), ..., A_0 and ``moving`` B_(p-1), ..., B_0 (the last q rows of B_c1,
-    Gamma_1, Gamma_0). Answers u(k) with y(k+1). Inputs and outputs are tuples of q
-    scalars; the state is what the past adds to the outputs 1, 2, ... samples ahead.
-    Raises ValueError for different numbers of matrices or other sizes.
+    Both hold p matrices [q, q], newest first. In (7.5)-(7.6) of the thesis,
+    ``autoregressive`` is A_(p-1), ..., A_0 and ``moving`` is B_(p-1), ..., B_0 (the
+    last q rows of B_c1, Gamma_1, Gamma_0). A step maps u(k) to y(k+1). Inputs and
+    outputs are tuples of q scalars; the state is the contribution of past samples to
+    the outputs 1, 2, ... samples ahead. Raises ValueError for different numbers of
+    matrices or other sizes.
     """
 
     autoregressive: tuple[Rows, ...] = parameter(
@@ -91,7 +92,7 @@ class MatrixARMA(System):
         return tuple(memory), output
 
     def _older(self, state: tuple[Axes, ...], input: Axes) -> list[list[Axes]]:
-        """What outputs 2, 3, ... samples ahead get besides the next output's part."""
+        """Return the terms of the new state that do not depend on the new output."""
         kept = zip(state[1:], self.moving[1:], strict=True)
         return [[memory, product(b, input)] for memory, b in kept] + [[]]
 
@@ -102,13 +103,13 @@ def observability_form(model: StateSpace, lags: int | None = None) -> MatrixARMA
     p is ``lags``, by default the least with p q >= n. F = [C; CA; ...; CA^(p-1)] (7.4)
     gives [A_0 ... A_(p-1)] F = C A^p, and B_(p-1-j) = h_j - sum_i A_(p-i) h_(j-i) for
     the Markov parameters h (7.5). For n = p q the A are those of the thesis, the last
-    rows of F A F^-1. Otherwise F has more rows than columns, the A are the smallest
-    that solve it, and the model is met exactly all the same: p q - n modes are added
-    that no input moves. More lags than needed make F better conditioned.
+    rows of F A F^-1. Otherwise F has more rows than columns, and the A are the solution
+    of least norm. The result is still exact: it has p q - n additional modes that no
+    input excites. More lags than needed improve the condition of F.
 
-    Raises ValueError for a model that is not square, D that is not zero, one that
-    cannot be observed in p samples, or added modes outside the unit circle of a stable
-    model, which rounding would set going.
+    Raises ValueError for a model that is not square, has D other than zero or is not
+    observable in p samples. Raises it also if a stable model would get additional modes
+    on or outside the unit circle, which rounding would excite.
     """
     (n, inputs), q = model.B.shape, len(model.C)
     if inputs != q:

@@ -1,4 +1,4 @@
-"""A linear state space with neurons beside it: dynamics of unknown structure."""
+"""Neural state-space model, for dynamics of unknown structure."""
 
 from typing import Any
 
@@ -14,13 +14,13 @@ from ..core.system import System
 class NeuralStateSpace(System):
     """``x(k+1) = A x + B v + F tanh(G x + H v + b)``, ``y(k+1) = C x(k+1) + y_0``.
 
-    v = u - u_0; the input u(k) moves the output y(k+1). A single input or output is a
-    plain number, m inputs or p outputs are vectors. Shapes, with n states and h
-    neurons: ``state_matrix`` A [n, n], ``input_matrix`` B [n, m], ``output_matrix``
-    C [p, n], ``neuron_output`` F [n, h], ``neuron_state`` G [h, n], ``neuron_input``
-    H [h, m], ``neuron_bias`` b [h], ``input_offset`` u_0 [m] and ``output_offset``
-    y_0 [p] in the units of input and output; the states have none. Source: Suykens et
-    al., Nonlinear system identification using neural state space models, 1995.
+    v = u - u_0; a step maps u(k) to y(k+1). A single input or output is a scalar,
+    several are vectors. Shapes, with n states and h neurons: ``state_matrix`` A [n, n],
+    ``input_matrix`` B [n, m], ``output_matrix`` C [p, n], ``neuron_output`` F [n, h],
+    ``neuron_state`` G [h, n], ``neuron_input`` H [h, m], ``neuron_bias`` b [h],
+    ``input_offset`` u_0 [m] and ``output_offset`` y_0 [p] in the units of input and
+    output; the states have none. Source: Suykens et al., Nonlinear system
+    identification using neural state space models, 1995.
 
     Raises ValueError for shapes that do not belong together or non-finite numbers.
     """
@@ -61,7 +61,7 @@ class NeuralStateSpace(System):
                 )
 
     def init(self, input: Any = 0.0) -> Float[Array, " n"]:
-        """Return the state that ``input`` holds, found by Newton's method from zero."""
+        """Return the state at rest under ``input``, by Newton's method from zero."""
         zero = jnp.zeros_like(self.state_matrix[0])
         rest = optx.root_find(
             lambda state, _: self._next(state, input) - state,

@@ -1,4 +1,4 @@
-"""Models of fewer states with nearly the same response."""
+"""Model reduction: balanced truncation, and removal of slow modes."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -9,15 +9,16 @@ from scipy import linalg
 from .state_space import StateSpace
 
 NEGLIGIBLE = 1e-7
-"""Hankel singular values below this share of the largest may be rounding: the roots of
-the Gramians, from which they are computed, hold half the digits."""
+"""Hankel singular values below this share of the largest may be rounding errors: they
+are computed from roots of the Gramians, which hold half the digits."""
 
 
 class Reduction(NamedTuple):
-    """A ``model`` of fewer states, and what that costs.
+    """Reduced ``model`` and its error bound.
 
-    ``hankel_singular_values`` [n] of the whole model, largest first; ``error_bound``:
-    nowhere in frequency is the largest singular value of the difference above it.
+    ``hankel_singular_values`` [n] are those of the full model, largest first.
+    ``error_bound`` is an upper bound, at all frequencies, of the largest singular value
+    of the difference between both responses.
     """
 
     model: StateSpace
@@ -26,19 +27,19 @@ class Reduction(NamedTuple):
 
 
 def balanced_reduction(model: StateSpace, order: int) -> Reduction:
-    """Return ``model`` with the ``order`` states that most connect input and output.
+    """Return ``model`` reduced to ``order`` states by balanced truncation.
 
-    In balanced coordinates each state is reached by inputs as well as it shows in
-    outputs, its Hankel singular value; those with the smallest are left out. What
-    remains is stable; its difference has at most twice the sum of the values left out.
-    Scale inputs and outputs first where their units differ: the values depend on them.
-    The gain at rest changes, by no more than the bound.
+    In balanced coordinates each state is equally controllable and observable, as
+    measured by its Hankel singular value. The states with the smallest values are
+    removed. The reduced model is stable, and its error is at most twice the sum of the
+    removed values. The values depend on the units: scale inputs and outputs first if
+    their units differ. The gain at rest changes by no more than the bound.
 
     Sources: B. C. Moore, IEEE Trans. Automatic Control 26, 1981, pp. 17-32 (balancing);
     U. M. Al-Saggaf and G. F. Franklin, IEEE Trans. Automatic Control 32, 1987, pp.
     815-819 (the bound for discrete time). Raises ValueError for a model that is not
-    stable, or an ``order`` that is not between 1 and the number of states, or that
-    reaches into states that are not connected at all.
+    stable, and for an ``order`` below 1 or above the number of states that connect
+    inputs and outputs.
     """
     if not 1 <= order <= model.order:
         raise ValueError(f"order is {order}; it must be between 1 and {model.order}")
@@ -54,9 +55,9 @@ def balanced_reduction(model: StateSpace, order: int) -> Reduction:
 def reduced(model: StateSpace, most: int) -> StateSpace:
     """Return ``model`` with at most ``most`` states, by balanced reduction.
 
-    A model that has no more is returned unchanged; states that do not connect input and
-    output are left out whatever ``most`` is. Raises ValueError for a model to be
-    reduced that is not stable.
+    A model with at most ``most`` states is returned unchanged. Otherwise states that do
+    not connect input and output are removed too. Raises ValueError if a model with more
+    states is not stable.
     """
     if model.order <= most:
         return model
@@ -66,12 +67,13 @@ def reduced(model: StateSpace, most: int) -> StateSpace:
 
 
 def fast_part(model: StateSpace, angle: float, share: float = 0.1) -> StateSpace:
-    """Return ``model`` without the slow modes that hardly respond at ``angle``.
+    """Return ``model`` without the slow modes that contribute little at ``angle``.
 
-    Slow are modes of a natural frequency abs(log z) below a tenth of ``angle`` (rad a
-    sample), such as creep, or a memory with a pole at z = 1. As many of the slowest are
-    left out together as change the response at ``angle`` by at most ``share`` of it.
-    What is left keeps its own gain at rest, not that of ``model``.
+    A mode is slow if its natural frequency abs(log z) is below a tenth of ``angle``
+    (rad per sample), as of creep, or of an integrator with its pole at z = 1. The
+    largest set of slowest modes is removed that changes the response at ``angle`` by at
+    most the share ``share``. The gain at rest of the result differs from that of
+    ``model``.
     """
     A, B, C = (np.asarray(matrix) for matrix in (model.A, model.B, model.C))
     rates = natural_rates(np.linalg.eigvals(A))
@@ -84,16 +86,16 @@ def fast_part(model: StateSpace, angle: float, share: float = 0.1) -> StateSpace
 
 
 def natural_rates(poles: Sequence[complex] | np.ndarray) -> np.ndarray:
-    """Return the natural frequencies abs(log z) (rad a sample) of ``poles`` z.
+    """Return the natural frequencies abs(log z) (rad per sample) of ``poles`` z.
 
-    That of a pole at 0, a pure delay, is infinite.
+    The natural frequency of a pole at 0, a pure delay, is infinite.
     """
     with np.errstate(divide="ignore"):
         return np.abs(np.log(np.asarray(poles, dtype=complex)))
 
 
 class _Balance(NamedTuple):
-    """Change into balanced coordinates and back, largest Hankel value first."""
+    """Transformations to and from balanced coordinates, largest Hankel value first."""
 
     hankel: np.ndarray
     into: np.ndarray
@@ -124,7 +126,7 @@ def _balance(model: StateSpace) -> _Balance:
 
 
 def _root(gramian: np.ndarray) -> np.ndarray:
-    """Return R with R R' = ``gramian``, which rounding may have made indefinite."""
+    """Return R with R R' = ``gramian``; negative eigenvalues from rounding become 0."""
     values, vectors = np.linalg.eigh(0.5 * (gramian + gramian.T))
     return vectors * np.sqrt(np.clip(values, 0.0, None))
 
@@ -135,9 +137,9 @@ Matrices = tuple[np.ndarray, np.ndarray, np.ndarray]
 def _split(
     A: np.ndarray, B: np.ndarray, C: np.ndarray, rate: float
 ) -> tuple[Matrices, Matrices]:
-    """Return the modes faster than ``rate``, and those that are not, in parallel."""
+    """Return two models in parallel: the modes faster than ``rate``, and the others."""
 
-    above = 1.000001 * rate + 1e-9  # rounding moves poles, those at z = 1 among them
+    above = 1.000001 * rate + 1e-9  # rounding moves poles, also those at z = 1
     # A lambda: SciPy counts the arguments, which a decorator would hide.
     ordered: Any = linalg.schur(
         A,
@@ -147,7 +149,7 @@ def _split(
     schur, basis, count = ordered
     fast, slow = slice(0, count), slice(count, None)
     B, C = basis.T @ B, C @ basis
-    # The Sylvester equation takes the coupling out of the triangular form.
+    # The Sylvester equation removes the coupling from the triangular form.
     X = linalg.solve_sylvester(
         schur[fast, fast], -schur[slow, slow], -schur[fast, slow]
     )

@@ -1,4 +1,4 @@
-"""Dynamics that change with the amplitude they are driven at."""
+"""State-space dynamics scheduled by the amplitude of the input."""
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,13 @@ from .state_space import StateSpace
 class AmplitudeScheduled(System):
     """State-space dynamics interpolated between models of several drive levels.
 
-    ``models``: one a level, alike in size and sample time, their states alike in
-    meaning (as ``refined`` from one start gives them); ``levels``: the rms of the input
-    over all channels at which each holds, rising, in the input's unit;
-    ``time_constant`` in s of the mean square that measures the level. Between two
-    levels the matrices are interpolated linearly in the level, outside they stay those
-    of the nearest. Where every A is built of scaled rotations it never stretches a
-    state, whatever the level does: the interpolation is as stable as its models.
+    ``models`` holds one model per level, of equal size and sample time, whose states
+    have the same meaning (as those that ``refined`` returns from one start). ``levels``
+    are their rms inputs over all channels, ascending, in the unit of the input.
+    ``time_constant`` (s) is that of the mean square that measures the level. Between
+    two levels the matrices are interpolated linearly in the level; beyond them the
+    nearest model holds. If every A consists of scaled rotations, no step enlarges a
+    state, for any course of the level: the interpolation is as stable as its models.
 
     Raises ValueError for fewer than two models, models that differ in size or sample
     time, levels that do not rise, or a time constant shorter than a sample.
@@ -72,7 +72,8 @@ class AmplitudeScheduled(System):
 
 
 def _hats(level: Scalar, levels: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Weights of linear interpolation at ``level``, held at both ends."""
+    """Return the weights of linear interpolation at ``level``, constant beyond the
+    ends."""
     share = jnp.clip((level - levels[:-1]) / jnp.diff(levels), 0.0, 1.0)
     left = jnp.concatenate([jnp.ones(1), share])
     right = jnp.concatenate([share, jnp.zeros(1)])

@@ -14,7 +14,7 @@ from ..core.system import System
 from .arma import ARMA
 
 INNERMOST = 1.0 - 1e-6
-"""Largest modulus that ``stabilised`` gives to a pole it has moved."""
+"""Largest modulus of a pole that ``stabilised`` has moved."""
 
 
 class StateSpace(System):
@@ -24,8 +24,8 @@ class StateSpace(System):
     outputs in the units of the neighbours in the chain. Inputs and outputs are vectors,
     also where there is only one.
 
-    A loop and ``free_run`` expect a plant that answers u(k) with y(k+1): see ``ahead``.
-    Raises ValueError for matrices that do not fit together or numbers that are not
+    A loop and ``free_run`` expect a plant that maps u(k) to y(k+1): see ``ahead``.
+    Raises ValueError for matrices whose shapes do not match or numbers that are not
     finite.
     """
 
@@ -59,7 +59,7 @@ class StateSpace(System):
         return self.C @ _at_rest(self.A, self.B) + self.D
 
     def markov(self, count: int) -> Float[Array, "count p m"]:
-        """Return ``C A^s B`` for s = 0 .. count-1: the impulse response behind D."""
+        """Return ``C A^s B`` for s = 0 .. count-1: the impulse response after D."""
         _, powers = jax.lax.scan(
             lambda power, _: (self.A @ power, self.C @ power), self.B, length=count
         )
@@ -74,9 +74,9 @@ class StateSpace(System):
         return self.C @ jnp.linalg.solve(resolvent, self.B + 0j) + self.D
 
     def ahead(self) -> "StateSpace":
-        """Return the model that answers u(k) with y(k+1), the plant a loop expects.
+        """Return the model that maps u(k) to y(k+1), as a loop expects of its plant.
 
-        Raises ValueError where u(k) reaches y(k): a loop would be algebraic.
+        Raises ValueError if D is not zero, because the loop would be algebraic.
         """
         if np.any(np.asarray(self.D)):
             raise ValueError("D is not zero; an input must not reach its own sample")
@@ -85,7 +85,7 @@ class StateSpace(System):
     def as_arma(self) -> ARMA:
         """Return the difference equation of a model with one input and one output.
 
-        The order stays. Raises ValueError for several inputs or outputs.
+        The order is unchanged. Raises ValueError for several inputs or outputs.
         """
         outputs, inputs = self.D.shape
         if (outputs, inputs) != (1, 1):
@@ -101,9 +101,9 @@ class StateSpace(System):
         return ARMA(-denominator[1:], numerator)
 
     def delayed(self) -> "StateSpace":
-        """Return the model with its input a sample later: D = 0, and m states more.
+        """Return the model with its input delayed by a sample: D = 0, m more states.
 
-        What a controller meets that needs a sample to compute its command.
+        A controller that needs one sample to compute its command acts on this model.
         """
         n, m = self.B.shape
         return StateSpace(
@@ -130,10 +130,11 @@ def _at_rest(A: Array, forcing: Array) -> Array:
 
 
 def stacked(channels: Sequence[StateSpace]) -> StateSpace:
-    """Return one model from models of its input channels, (6.19)-(6.22).
+    """Return one model of several inputs from models of the channels, (6.19)-(6.22).
 
-    Each has its own states; their outputs are summed. Raises ValueError for channels
-    that differ in their outputs or sample time, or for none.
+    Each channel has its own states; their outputs are summed. Raises ValueError if
+    there are no channels, or if they differ in the number of outputs or the sample
+    time.
     """
     if not channels:
         raise ValueError("there are no channels to stack")
@@ -153,7 +154,7 @@ def stacked(channels: Sequence[StateSpace]) -> StateSpace:
 
 
 def stabilised(model: StateSpace) -> tuple[StateSpace, int]:
-    """Return ``model`` with every pole inside the unit circle, and how many moved."""
+    """Return ``model`` with every pole inside the unit circle, and the number moved."""
     A, moved = reflected(np.asarray(model.A))
     return StateSpace(A, model.B, model.C, model.D, model.dt), moved
 
@@ -161,10 +162,11 @@ def stabilised(model: StateSpace) -> tuple[StateSpace, int]:
 def reflected(
     A: Float[np.ndarray, "n n"],
 ) -> tuple[Float[np.ndarray, "n n"], int]:
-    """Return ``A`` with every eigenvalue inside the unit circle, and how many moved.
+    """Return ``A`` with every eigenvalue inside the unit circle, and the number moved.
 
-    One on or outside the circle becomes 1/conj(z), which keeps the shape of its
-    resonance, in the real Schur form, where it is a block of its own.
+    An eigenvalue z on or outside the circle becomes 1/conj(z), which preserves the
+    shape of its resonance. It is scaled within its diagonal block of the real Schur
+    form.
     """
     schur, basis = linalg.schur(A, output="real")[:2]
     moved, first = 0, 0

@@ -1,4 +1,4 @@
-"""How far off its contour a stage is, however late it is on it."""
+"""Contour error: distance of a stage from its path, independent of its lag."""
 
 from typing import NamedTuple
 
@@ -16,28 +16,27 @@ _Point = tuple[Scalar, Scalar]
 
 
 class ContourFigures(NamedTuple):
-    """Distance from the contour over the window of a ContourError: its root mean square
-    and its largest value, in the unit of the axes."""
+    """Root mean square and peak of the contour error, in the unit of the axes."""
 
     rms: Scalar
     peak: Scalar
 
 
 class ContourError(Metric):
-    """Distance of the displacement from the path of the reference, from a sample on.
+    """Metric of the distance of the displacement from the path of the reference.
 
-    ``axes`` are the places of the two axes of the contour, which should be of one unit;
-    ``start`` is the first sample counted. Being late or early along the path does not
-    count, unlike in Tracking.
+    ``axes`` are the indices of the two axes of the contour, which should have the same
+    unit; ``start`` is the first sample counted. Unlike Tracking, it does not count a
+    lag along the path.
 
-    Measured from the circle through three successive points of the reference, the
-    straight line where they lie on one: exact on circles and lines, however large the
-    lag, elsewhere while error and curvature change little over the lag. (The usual
-    estimate, the error's component across the reference's velocity, takes lag on a
-    curve for contour error.) At rest and at a sharp corner the path is a point, from
-    which the whole distance counts. The last sample has no successor and is left out;
-    figures of a run that ends before ``start`` are NaN. Gradients are 0 where the
-    distance is.
+    The distance is measured from the circle through three successive points of the
+    reference, or from their straight line if they lie on one. It is exact on circles
+    and lines for any lag, and elsewhere as long as error and curvature change little
+    over the lag. (The usual estimate, the component of the error across the velocity of
+    the reference, counts lag on a curve as contour error.) At rest and at a sharp
+    corner the path is a point, and the whole distance from it counts. The last sample
+    is left out, because it has no successor. If a run ends before ``start``, the
+    figures are NaN. The gradient is 0 where the distance is 0.
     """
 
     axes: tuple[int, int] = eqx.field(static=True, default=(0, 1))
@@ -64,7 +63,7 @@ class ContourError(Metric):
             _less(total["last"], total["before"]),
             _less(reference, total["last"]),
         )
-        # What is judged is the sample before; the first has no predecessor.
+        # The distance is that of the previous sample; the first one has no predecessor.
         inside = (index > self.start) & (index > 1)
         square = jnp.where(inside, square, 0.0)
         return {
@@ -98,7 +97,7 @@ def _square_distance(error: _Point, there: _Point, on: _Point) -> Scalar:
         for a, b in zip(there, on, strict=True)
     ]
     steepness = tangent[0] ** 2 + tangent[1] ** 2
-    # A path that stands, or returns on itself, has no tangent: it is a point.
+    # A path at rest, or one that reverses, has no tangent: it is a point.
     smooth = (squares[0] > 0.0) & (squares[1] > 0.0) & (steepness > 0.0)
     length = jnp.sqrt(jnp.where(smooth, steepness, 1.0))
     across = (tangent[0] * error[1] - tangent[1] * error[0]) / length
@@ -119,12 +118,12 @@ def _positive(square: Scalar) -> Scalar:
 def nearest_on(
     points: Float[np.ndarray, "points 2"], path: Float[np.ndarray, "samples 2"]
 ) -> Float[np.ndarray, "points 2"]:
-    """Return the place on the polyline ``path`` that is nearest to each point.
+    """Return the nearest point of the polyline ``path`` to each of ``points``.
 
-    On the nearest of all its segments, so where a path crosses itself the branch that
-    was meant is not told from the other. In NumPy, for pictures and checks: takes
-    points x samples. NaN for a point that is not finite. Raises ValueError unless the
-    path has two points or more.
+    All segments are searched, so the two branches at a crossing of the path are not
+    distinguished. The function uses NumPy, for pictures and checks; its cost grows as
+    points x samples. The result is NaN for a point that is not finite. Raises
+    ValueError if the path has fewer than two points.
     """
     points, path = np.asarray(points, float), np.asarray(path, float)
     if len(path) < 2:
@@ -132,16 +131,17 @@ def nearest_on(
     begin, leg = path[:-1], np.diff(path, axis=0)
     square = np.sum(leg**2, axis=1)
     square = np.where(square > 0.0, square, 1.0)
-    found = np.full_like(points, np.nan)
+    nearest = np.full_like(points, np.nan)
     for i in np.flatnonzero(np.all(np.isfinite(points), axis=1)):
         along = np.clip(np.sum((points[i] - begin) * leg, axis=1) / square, 0.0, 1.0)
         places = begin + along[:, None] * leg
-        found[i] = places[np.argmin(np.sum((points[i] - places) ** 2, axis=1))]
-    return found
+        nearest[i] = places[np.argmin(np.sum((points[i] - places) ** 2, axis=1))]
+    return nearest
 
 
 def distance_to(
     points: Float[np.ndarray, "points 2"], path: Float[np.ndarray, "samples 2"]
 ) -> Float[np.ndarray, " points"]:
-    """Return how far each point is from the polyline ``path``; see ``nearest_on``."""
+    """Return the distance of each point from the polyline ``path``; see
+    ``nearest_on``."""
     return np.linalg.norm(points - nearest_on(points, path), axis=1)

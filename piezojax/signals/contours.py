@@ -1,10 +1,9 @@
 """Contours: paths of two axes in time, and their names in a motion.
 
-A named contour is two signals of ``piezojax.signals``: ``Rx+Ry:CIRCLE5`` is a
-shorthand for ``Rx:SIN5 Ry:COS5``. Every contour lies on its path from the first sample
-on, so that a loop, at rest on its first point, has only a jump in speed to get over
-(the SIN, the SCAN and the stairs have none); with ``rise`` the functions below have
-none at all.
+A named contour stands for two signals of ``piezojax.signals``: ``Rx+Ry:CIRCLE5`` is a
+shorthand for ``Rx:SIN5 Ry:COS5``. Every contour starts on its path, so that a loop at
+rest on its first point meets only a jump in speed (none with SIN, SCAN and the stairs).
+With ``rise`` the functions below have no such jump.
 """
 
 import math
@@ -22,10 +21,10 @@ Pair = ScalarLike | tuple[ScalarLike, ScalarLike]
 """One value for both axes, or one for each."""
 
 LINES = 20
-"""Lines of a raster up to its end, unless told."""
+"""Default number of lines of a raster."""
 
 FORMS = ("CIRCLE5", "LISSAJOUS5/4", "RASTER10", "RASTER10/0.5")
-"""How contours are named: frequencies in Hz, of both axes where there are two."""
+"""Examples of contour names; the numbers are frequencies in Hz, one per axis if two."""
 
 
 def circle(
@@ -35,12 +34,13 @@ def circle(
     offset: Pair = 0.0,
     rise: float = 0.0,
 ) -> Path:
-    """Return a circle about ``offset + amplitude``; of two amplitudes, an ellipse.
+    """Return a circle about ``offset + amplitude``; for two amplitudes, an ellipse.
 
-    Clockwise from the middle of its left side, seen with the first axis to the right
-    and the second up. ``frequency`` in Hz; ``amplitude``, the radius, and ``offset`` in
-    the unit of the axes. The speed rises evenly from rest over the first ``rise`` s.
-    Differentiable in all but ``rise``. Raises ValueError for a ``rise`` below 0.
+    It runs clockwise from the middle of its left side, seen with the first axis to the
+    right and the second up. ``frequency`` in Hz; ``amplitude``, the radius, and
+    ``offset`` in the unit of the axes. The speed rises evenly from rest over the first
+    ``rise`` s. Differentiable in all but ``rise``. Raises ValueError for a ``rise``
+    below 0.
     """
     return lissajous(time, frequency, (1, 1), amplitude, offset, rise)
 
@@ -55,10 +55,10 @@ def lissajous(
 ) -> Path:
     """Return the Lissajous figure that closes after 1/``frequency`` s.
 
-    Each axis swings ``cycles`` times meanwhile, a quarter of a period apart, the one
-    ahead chosen so that the figure does not run back on itself. Other arguments as for
-    ``circle``. Raises ValueError for cycles that are not whole, positive and without
-    common factor.
+    Each axis swings ``cycles`` times in that time, a quarter of a period apart. The
+    leading axis is chosen so that the figure does not retrace itself. Other arguments
+    as for ``circle``. Raises ValueError for cycles that are not whole, positive and
+    without common factor.
     """
     whole = all(isinstance(count, int) and count > 0 for count in cycles)
     if not whole or math.gcd(*cycles) > 1:
@@ -86,13 +86,14 @@ def raster(
     stepped: bool = False,
     rise: float = 0.0,
 ) -> Path:
-    """Return a raster scan: the first axis to and fro, the second slowly up and down.
+    """Return a raster scan: the first axis scans fast, the second slowly up and down.
 
-    ``frequency`` in Hz of the first axis, two lines a period, whose turns take the
-    share ``turnaround`` of it (0 for a triangle). The second covers its range in
-    ``lines`` lines, at constant speed, or ``stepped`` by one line in each turn. Both
-    from ``offset`` to ``offset + 2 amplitude``. ``rise`` as for ``circle``. Raises
-    ValueError for fewer than 2 lines or a turnaround outside 0 to 0.5.
+    ``frequency`` (Hz) is that of the first axis, with two lines per period. Each turn
+    takes the share ``turnaround`` of the period (0 for a triangle). The second axis
+    covers its range in ``lines`` lines, at constant speed or, with ``stepped``, by one
+    line in each turn. Both axes range from ``offset`` to ``offset + 2 amplitude``.
+    ``rise`` as for ``circle``. Raises ValueError for fewer than 2 lines or a turnaround
+    outside 0 to 0.5.
     """
     if not isinstance(lines, int) or lines < 2:
         raise ValueError(f"lines is {lines!r}; it must be a whole number of 2 or more")
@@ -108,21 +109,22 @@ def raster(
 
 
 def signals_of(name: str) -> tuple[str, str]:
-    """Return the signals that a contour's name stands for.
+    """Return the names of the two signals of the contour ``name``.
 
-    ``CIRCLE5`` is SIN5 and COS5. ``LISSAJOUS5/4`` is SIN5 and COS4, or COS and SIN
-    where these would run back on themselves. ``RASTER10/0.5`` is SCAN10 and TRI0.5;
-    without the second number there are 20 lines. Raises ValueError for another name.
+    ``CIRCLE5`` gives SIN5 and COS5. ``LISSAJOUS5/4`` gives SIN5 and COS4, or COS and
+    SIN if the figure would otherwise retrace itself. ``RASTER10/0.5`` gives SCAN10 and
+    TRI0.5; without the second number the raster has 20 lines. Raises ValueError for
+    another name.
     """
-    found = re.fullmatch(r"([A-Z]+)(\d*\.?\d+)(?:/(\d*\.?\d+))?", name)
-    kind, first, second = found.groups() if found else ("", "1", None)
+    match = re.fullmatch(r"([A-Z]+)(\d*\.?\d+)(?:/(\d*\.?\d+))?", name)
+    kind, first, second = match.groups() if match else ("", "1", None)
     if all(float(number) > 0.0 for number in (first, second or "1")):
         if kind == "CIRCLE" and not second:
             return f"SIN{first}", f"COS{first}"
         if kind == "LISSAJOUS" and second:
             ratio = Fraction(first) / Fraction(second)
-            one, other = _quadrature(ratio.numerator)
-            return f"{one}{first}", f"{other}{second}"
+            waves = _quadrature(ratio.numerator)
+            return f"{waves[0]}{first}", f"{waves[1]}{second}"
         if kind == "RASTER":
             slow = second or str(Fraction(first) / LINES * 1.0)
             return f"SCAN{first}", f"TRI{slow}"
@@ -133,8 +135,8 @@ def signals_of(name: str) -> tuple[str, str]:
 
 
 def _quadrature(first: int) -> tuple[str, str]:
-    # cos(p w) and sin(q w), p and q coprime, have a mirror in w, and so run back on
-    # themselves, just if p is even.
+    # The figure cos(p w), sin(q w) with p and q coprime is mirrored in w, and so
+    # retraces itself, if and only if p is even.
     return ("COS", "SIN") if first % 2 == 0 else ("SIN", "COS")
 
 
@@ -143,7 +145,7 @@ def _pair(value: Pair) -> tuple[ScalarLike, ScalarLike]:
 
 
 def _eased(time: signals.Time, rise: float) -> signals.Time:
-    """Return a time whose pace rises evenly from 0 to 1 over ``rise`` s."""
+    """Return a time whose rate rises linearly from 0 to 1 over ``rise`` s."""
     check("rise in s", rise, least=0.0)
     if rise == 0.0:
         return time
@@ -151,7 +153,7 @@ def _eased(time: signals.Time, rise: float) -> signals.Time:
 
 
 def _stairs(line: signals.Time, lines: int, turnaround: float) -> signals.Time:
-    """Return 0 to 1 in equal steps, one at each whole ``line`` but 0, and back down."""
+    """Return stairs from 0 to 1 and back: a step at each whole ``line`` except 0."""
     nearest = jnp.floor(line + 0.5)
     width = max(turnaround, 1e-9)
     along = jnp.clip((line - nearest + width) / (2.0 * width), 0.0, 1.0)

@@ -1,8 +1,8 @@
-"""References of several axes by name: ``"Z:SIN1"``, ``"Z:PWSW2 Ry:SW10"``.
+"""Named references of several axes, such as ``"Z:SIN1"`` or ``"Z:PWSW2 Ry:SW10"``.
 
-Each word drives one axis with a signal of ``piezojax.signals``, or two with a contour
-of ``piezojax.signals.contours``, as in ``"Rx+Ry:CIRCLE5"``; all others hold their
-offset.
+Each word drives one axis with a signal of ``piezojax.signals``, or two axes with a
+contour of ``piezojax.signals.contours``, as in ``"Rx+Ry:CIRCLE5"``. The other axes hold
+their offset.
 """
 
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ from . import waveforms as signals
 
 
 def parse(name: str, axes: Sequence[str]) -> dict[str, str]:
-    """Return the signal on each driven axis, by the axis.
+    """Return the name of the signal on each driven axis, by axis.
 
-    Raises ValueError for an axis that is not among ``axes``, one driven twice, none
-    driven, or an unknown signal or contour.
+    Raises ValueError for an axis that is not in ``axes``, an axis driven twice, no
+    driven axis, or an unknown signal or contour.
     """
     driven: dict[str, str] = {}
     for word in name.split():
@@ -41,7 +41,7 @@ def parse(name: str, axes: Sequence[str]) -> dict[str, str]:
 
 
 def contour_axes(name: str, axes: Sequence[str]) -> tuple[int, int] | None:
-    """Return which two of ``axes`` the first contour in a motion drives, if any.
+    """Return the indices in ``axes`` of the first contour of a motion, or None.
 
     Raises ValueError as ``parse``.
     """

@@ -88,7 +88,7 @@ def cosine(
     amplitude: ScalarLike = 5.0,
     offset: ScalarLike = 0.0,
 ) -> Time:
-    """COS: ``sine`` a quarter of a period on; it starts in its middle, at full speed.
+    """COS: the sine a quarter of a period on, from mid-range at full speed.
 
     With SIN on another axis it makes a circle about the middle of both.
     """
@@ -102,11 +102,11 @@ def scan(
     offset: ScalarLike = 0.0,
     turnaround: float = 0.1,
 ) -> Time:
-    """Triangle that turns round gently, at rest at its start.
+    """SCAN: triangle with rounded turns, at rest at its start.
 
     Each of the two turns takes the share ``turnaround`` of the period, at constant
-    acceleration; the range, ``offset`` to ``offset + 2 amplitude``, is the triangle's.
-    Raises ValueError for a share outside 0 to 0.5.
+    acceleration. The range is ``offset`` to ``offset + 2 amplitude``, as for the
+    triangle. Raises ValueError for a share outside 0 to 0.5.
     """
     check("turnaround", turnaround, least=0.0, most=0.5)
     half = 0.5 * turnaround
@@ -124,7 +124,7 @@ def piecewise_sine(
     amplitude: ScalarLike = 5.0,
     offset: ScalarLike = 0.0,
 ) -> Time:
-    """PWSW: periods of the sine at 100, 100, 50 and 15 % of A, over and over."""
+    """PWSW: periods of the sine at 100, 100, 50 and 15 % of A, repeated."""
     period = jnp.floor(time * frequency + 1e-9).astype(jnp.int32) % 4
     share = jnp.asarray([1.0, 1.0, 0.5, 0.15])[period]
     return offset + share * (sine(time, frequency, amplitude))
@@ -187,7 +187,8 @@ def prbs(
     offset: ScalarLike = 0.0,
     seed: int = 0,
 ) -> Time:
-    """Pseudo-random binary signal: 0 or ``2 amplitude``, held for 1/frequency."""
+    """Pseudo-random binary signal: ``offset`` plus 0 or ``2 amplitude``, held
+    1/frequency."""
     bits = np.random.default_rng(seed).integers(0, 2, 4096)
     slot = jnp.floor(time * frequency + 1e-9).astype(jnp.int32) % bits.size
     return offset + 2.0 * amplitude * jnp.asarray(bits, time.dtype)[slot]
@@ -207,7 +208,7 @@ SIGNALS: dict[str, Callable[..., Time]] = {
     "COS": cosine,
     "SCAN": scan,
 }
-"""Signals by the name a study uses; a trailing number is the frequency: ``SIN10``."""
+"""Signals by name in a study; a number after the name is the frequency: ``SIN10``."""
 
 THESIS = (
     "SIN1",
@@ -225,9 +226,9 @@ THESIS = (
 
 
 def parse(name: str) -> tuple[str, float | None]:
-    """Split ``"PWSW30"`` into ``("PWSW", 30.0)``; no number gives None.
+    """Split ``"PWSW30"`` into ``("PWSW", 30.0)``; without a number the second is None.
 
-    Raises ValueError, listing the signals, for a name that is none.
+    Raises ValueError, listing the signals, for an unknown name.
     """
     kind = name.rstrip("0123456789.")
     digits = name[len(kind) :]
