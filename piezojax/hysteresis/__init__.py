@@ -1,4 +1,4 @@
-"""Hysteresis models, one file each, with their inverses beside them."""
+"""Hysteresis models and their inverses, one model per file."""
 
 # isort: off
 # Models are listed and tried in this order.

@@ -21,14 +21,14 @@ from .plays import (
 
 
 class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
-    """A Prandtl-Ishlinskii model with loops that are wider on one side.
+    """Prandtl-Ishlinskii model with loops that are wider on one side.
 
     ``y = P(x) + sum_i weights[i] play_i(x) + sum_i skew[i] play_i(q(x))``, where q is
-    the one-sided square (x - origin)^2 / (2 scale) for x above ``origin`` and 0 below:
-    plays of q have a width in x that shrinks as x grows, which is how the envelope
-    functions of a generalised play skew a loop (Al Janaideh, Rakheja and Su 2009,
-    Mechatronics 19(5)), here with the weights still linear. Everything else as in
-    PrandtlIshlinskii. Raises ValueError as there.
+    the one-sided square (x - origin)^2 / (2 scale) for x above ``origin`` and 0 below.
+    The width in x of a play of q shrinks as x grows. The envelope functions of a
+    generalised play skew a loop in the same way (Al Janaideh, Rakheja and Su 2009,
+    Mechatronics 19(5)); here the model stays linear in the weights. Units, memory,
+    remaining parameters and errors as in PrandtlIshlinskii.
     """
 
     before: ClassVar[str | None] = "rest_input"

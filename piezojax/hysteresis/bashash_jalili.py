@@ -1,4 +1,4 @@
-"""The memory rule of Bashash and Jalili: exponential curves between stored extrema."""
+"""Bashash-Jalili hysteresis: exponential curves between stored extrema."""
 
 from typing import ClassVar, NamedTuple
 
@@ -15,11 +15,11 @@ Points = tuple[Scalar, ...]
 
 
 class ExtremaState(NamedTuple):
-    """Last input (V), output (um), and the turning points that are remembered.
+    """Last input (V), last output (um) and the remembered turning points.
 
-    ``inputs`` (V) and ``outputs`` (um), oldest first, are valid up to ``count``: the
-    active curve leads from the last of them towards the one before, ``direction`` +1 if
-    that is upwards.
+    The first ``count`` elements of ``inputs`` (V) and ``outputs`` (um), oldest first,
+    are valid. The active curve leads from the last of them towards the one before;
+    ``direction`` is +1 if that is upwards, else -1.
     """
 
     input: Scalar
@@ -31,7 +31,7 @@ class ExtremaState(NamedTuple):
 
 
 class BashashJalili(Hysteresis, Fittable):
-    """Hysteresis by a rule: every branch is a curve between two remembered extrema.
+    """Hysteresis whose branches are curves between two remembered extrema.
 
     Input v in V, output x in um. The curve from a turning point (v1, x1) towards the
     extreme (v2, x2) is (2.8)
@@ -39,27 +39,28 @@ class BashashJalili(Hysteresis, Fittable):
     ``x = x1 + k (1 + alpha exp(-tau |v - v1|)) (v - v1)``,
     ``k = (x2 - x1) / ((v2 - v1) (1 + alpha exp(-tau |v2 - v1|)))``,
 
-    with v2 in k, where v is printed, so that it passes through both points, and with
-    the distance in the exponent, so that it holds downwards too. A turn stores an
-    extreme, and the new branch heads for the one stored before; where it arrives, the
-    loop is wiped out and the branch that was interrupted there goes on (2.9). The
-    outermost extrema are those of the reference loop, ``lower_input``, ``lower_output``
-    and ``upper_input``, ``upper_output``; beyond them its branches are continued. It
-    starts on the rising one (below ``lower_input`` on the falling one).
+    with two corrections of the printed equation: k contains v2 instead of v, so that
+    the curve passes through both points, and the exponent contains the distance, so
+    that the curve also holds downwards. A turn stores an extreme, and the new branch
+    heads for the extreme stored before. When it arrives there, the loop is wiped out
+    and the branch that was interrupted there continues (2.9). The outermost extrema are
+    those of the reference loop, ``lower_input``, ``lower_output`` and ``upper_input``,
+    ``upper_output``; beyond them its branches are extended. The model starts on the
+    rising branch, or below ``lower_input`` on the falling one.
 
-    The alphas lie above -1 and below e^2, so that every curve rises with v. Negative
-    alphas give a branch that starts flat: loops run
-    counter-clockwise, as a piezo's do; positive ones run clockwise.
+    The alphas lie above -1 and below e^2, so that every curve rises with v. With
+    negative alphas a branch starts flat, and loops run counter-clockwise, as for a
+    piezo; with positive alphas they run clockwise.
 
-    ``depth`` turning points inside the reference loop are remembered. Where a further
-    one would have to be, the branch is run back as it came: a loop nested deeper than
-    that has no width, the output stays continuous, and all that is stored still holds.
+    The model remembers ``depth`` turning points inside the reference loop. Without room
+    for a further one, the input moves back on its present branch: a loop nested deeper
+    has no width, the output stays continuous, and the stored points stay valid.
 
     Return-point memory, wiping-out and rate independence hold exactly. Congruency does
-    not: a minor loop's height follows from its own two extrema, which lie elsewhere
-    after another history. Inverse: InverseHysteresis; none in closed form, v stands in
-    (2.8) outside and inside the exponential. Source: Bashash and Jalili 2007, J.
-    Micromech. Microeng. 17.
+    not, because the height of a minor loop depends on its two extrema, which differ
+    after another history. The inverse is InverseHysteresis; there is no closed form,
+    because v occurs in (2.8) outside and inside the exponential. Source: Bashash and
+    Jalili 2007, J. Micromech. Microeng. 17.
 
     Raises ValueError for numbers outside their limits, or a reference loop whose upper
     extreme is not above the lower one.
@@ -135,13 +136,14 @@ class BashashJalili(Hysteresis, Fittable):
             )
             for new, points in ((state.input, inputs), (state.output, outputs))
         )
-        # Run back past its own start, the last branch is over too.
+        # A branch that is traced back beyond its start ends as well.
         retraced = turns & full & (direction * (input - inputs[-1]) >= 0.0)
         count = count + jnp.where(stores, 1.0, 0.0) - jnp.where(retraced, 1.0, 0.0)
         follows = ~turns | stores | retraced
 
-        # The branch heads for the point before the last one; past it, for the point
-        # two before, and so on: every second one is on this side, and nested.
+        # The branch heads for the point before the last one; beyond it, for the point
+        # two places earlier, and so on: every second point lies on this side, each
+        # outside the next.
         odd = count - 2.0 * jnp.floor(0.5 * count)
         wiped = jnp.zeros(())
         for i in range(1, slots - 1):
@@ -149,7 +151,7 @@ class BashashJalili(Hysteresis, Fittable):
             ahead = (odd == i % 2) & (count > i + 1.5)
             wiped = wiped + jnp.where(follows & ahead & past, 2.0, 0.0)
         count = count - wiped
-        # Past the far end of the reference loop its other branch is the outermost.
+        # Beyond the far end of the reference loop its other branch is active.
         swaps = count < 1.5
         count = jnp.where(swaps, 2.0, count)
         inputs, outputs = (
@@ -180,8 +182,8 @@ class BashashJalili(Hysteresis, Fittable):
                 "the output falls while the input rises; the curves of bashash_jalili "
                 "rise"
             )
-        # The reference loop is that over the record's range; beside an offset of the
-        # output only one of its two ends is free.
+        # The reference loop spans the range of the record. The offset of the output
+        # fixes one of its ends, so only the other is fitted.
         lower, upper = slope * extent.low, slope * extent.high
         ends = lower + 0.3 * extent.span, lower + 3.0 * extent.span
         bounds = {"upper_output": Range(*ends)}
@@ -219,7 +221,7 @@ class BashashJalili(Hysteresis, Fittable):
         v2: Scalar,
         x2: Scalar,
     ) -> Scalar:
-        """(2.8) from (v1, x1) towards (v2, x2), at v."""
+        """Return the curve (2.8) from (v1, x1) towards (v2, x2) at v."""
         rising = direction > 0.0
         alpha = jnp.where(rising, self.rising_alpha, self.falling_alpha)
         tau = jnp.where(rising, self.rising_tau, self.falling_tau)
@@ -234,7 +236,7 @@ class BashashJalili(Hysteresis, Fittable):
 
 
 def _picked(points: Points, count: Scalar, back: int) -> Scalar:
-    """Return the valid point that is ``back`` from the end, 1 the last."""
+    """Return the valid point at place ``back`` from the end; 1 is the last."""
     found = points[2 - back]
     for i in range(3 - back, len(points) + 1 - back):
         found = jnp.where(count == i + back, points[i], found)

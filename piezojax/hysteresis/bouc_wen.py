@@ -1,4 +1,4 @@
-"""Bouc-Wen hysteresis: a restoring force that remembers the displacement."""
+"""Bouc-Wen hysteresis of a restoring force over a displacement."""
 
 from typing import ClassVar, NamedTuple
 
@@ -23,15 +23,15 @@ class BoucWen(Hysteresis):
 
     ``z' = alpha y' - beta_gamma |y'| |z|^(nu - 1) z - beta_delta y' |z|^nu``
 
-    Of the usual factors beta, gamma, delta only two products act on the force. The
-    step is of fourth order except in parts where y or z changes its sign; the force
-    is followed as long as ``nu (|beta_gamma| + |beta_delta|) |z|^(nu - 1)`` times the
-    displacement in a part stays well below 1. Sources: Bouc 1967, Wen 1976.
+    Of the usual factors beta, gamma, delta only two products act on the force. Each
+    step has ``substeps`` parts of fourth order, except parts where y' or z changes
+    sign. It is accurate as long as ``nu (|beta_gamma| + |beta_delta|) |z|^(nu - 1)``
+    times the displacement in a part is well below 1. Sources: Bouc 1967, Wen 1976.
 
-    Loops close in the limit of many cycles only: there is no return-point memory, no
-    wiping-out and no congruency, and the force drifts when a partial unloading is
-    repeated. As a dissipating force over a displacement its loops run clockwise, not
-    counter-clockwise as a piezo's displacement over its voltage. Inverse:
+    Loops close only in the limit of many cycles: there is no return-point memory, no
+    wiping-out and no congruency, and the force drifts under repeated partial unloading.
+    Its loops run clockwise, as for a dissipating force over a displacement; those of
+    the displacement of a piezo over its voltage run counter-clockwise. The inverse is
     InverseHysteresis, below the force where z' = 0, which no displacement exceeds.
 
     Raises ValueError for parameters outside their limits.
@@ -47,7 +47,7 @@ class BoucWen(Hysteresis):
 
     def rate(self, force: Scalar, velocity: Scalar) -> Scalar:
         """Return z' at force z and velocity y'; along a path, dz from dy."""
-        # |z|^nu has no derivative by nu at z = 0, and none by z for nu < 1.
+        # At z = 0, |z|^nu has no derivative with respect to nu, nor to z if nu < 1.
         loaded = force != 0.0
         power = jnp.where(
             loaded, jnp.abs(jnp.where(loaded, force, 1.0)) ** self.nu, 0.0

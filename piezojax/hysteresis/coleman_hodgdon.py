@@ -1,4 +1,5 @@
-"""Coleman-Hodgdon (ferromagnetic) hysteresis, four discretisations, and its inverse."""
+"""Coleman-Hodgdon (ferromagnetic) hysteresis in four discretisations, and its
+inverse."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -16,7 +17,7 @@ from .model import Hysteresis, Laws, fades
 
 
 class HysteresisState(NamedTuple):
-    """Last input (V) and output (um); ``older`` holds the pair before, if needed."""
+    """Last input (V) and output (um); ``older`` is the previous pair, if needed."""
 
     input: Scalar
     output: Scalar
@@ -38,10 +39,11 @@ class ColemanHodgdon(Hysteresis, Fittable):
     - ``"voros"`` (2.11), explicit, first order: the earlier model the thesis compares;
     - ``"exact"``, the closed form on each monotone branch.
 
-    What was fades with the path of the input, and is not wiped out: no return-point
-    memory, no wiping-out and no congruency; a loop closes after many cycles only. It
-    runs counter-clockwise, as a piezo's, if a > |c| b. Speed does not matter, exactly
-    in the scheme "exact", else to the order of the scheme.
+    The memory fades along the path of the input and is not wiped out: there is no
+    return-point memory, no wiping-out and no congruency, and a loop closes only after
+    many cycles. Loops run counter-clockwise, as for a piezo, if a > |c| b. Rate
+    independence holds exactly for the scheme "exact", otherwise to the order of the
+    scheme.
 
     Raises ValueError for parameters outside their limits or an unknown scheme.
     """
@@ -126,7 +128,7 @@ def _direction(dx: Scalar) -> Scalar:
 
 
 def _trapezoid(model: ColemanHodgdon, state: HysteresisState, x: Scalar) -> Scalar:
-    """(3.26)-(3.29): implicit in the output, solved in closed form."""
+    """Return the output by (3.26)-(3.29), implicit and solved in closed form."""
     dx = x - state.input
     sign = _direction(dx)
     half = 0.5 * sign * model.c * dx
@@ -135,7 +137,7 @@ def _trapezoid(model: ColemanHodgdon, state: HysteresisState, x: Scalar) -> Scal
 
 
 def _quadratic(model: ColemanHodgdon, state: HysteresisState, x: Scalar) -> Scalar:
-    """(3.21)-(3.24) with the quadrature weights q1, q2, q3 in closed form."""
+    """Return the output by (3.21)-(3.24), with q1, q2, q3 in closed form."""
     assert state.older is not None
     older_input, older_output = state.older
     d0, d1 = state.input - older_input, x - state.input
@@ -154,14 +156,14 @@ def _quadratic(model: ColemanHodgdon, state: HysteresisState, x: Scalar) -> Scal
 
 
 def _voros(model: ColemanHodgdon, state: HysteresisState, x: Scalar) -> Scalar:
-    """(2.11) with alpha (f - y) = a x + c y: everything at the old sample."""
+    """Return the output by (2.11), explicit, with alpha (f - y) = a x + c y."""
     dx = x - state.input
     pull = model.a * state.input + model.c * state.output
     return state.output + pull * _direction(dx) * dx + model.b * dx
 
 
 def _exact(model: ColemanHodgdon, state: HysteresisState, x: Scalar) -> Scalar:
-    """The branch y = p x + q + K exp(s c x), from the last point to the new one."""
+    """Return the output on the branch y = p x + q + K exp(s c x)."""
     dx = x - state.input
     sign = _direction(dx)
     p = -model.a / model.c
@@ -181,10 +183,10 @@ SCHEMES: dict[str, Callable[[ColemanHodgdon, HysteresisState, Scalar], Scalar]] 
 class InverseColemanHodgdon(Inverse):
     """Voltage that moves a trapezoid Coleman-Hodgdon model to a wanted output.
 
-    Input f(k) in um, output u(k) in V. Source: (5.24)-(5.25) with
-    ``2 [f(k+1) - f(k)]`` in zeta (printed as a sum), in the form that also holds for
-    ``a = 0``. The state is that of the model itself, so a controller whose voltage was
-    clipped can advance it with the voltage that was really applied.
+    Input f(k) in um, output u(k) in V. Source: (5.24)-(5.25) with ``2 [f(k+1) - f(k)]``
+    in zeta (printed as a sum), in a form that also holds for ``a = 0``. The state is
+    that of the model, so that a controller can advance it with the voltage applied
+    after clipping.
 
     Raises ValueError unless the model uses the trapezoid scheme.
     """

@@ -1,4 +1,4 @@
-"""The generalised Duhem model: hysteresis as a differential equation of the input."""
+"""Generalised Duhem model: hysteresis as a differential equation of the input."""
 
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -33,26 +33,26 @@ class DuhemState(NamedTuple):
 class Duhem(Hysteresis, Fittable):
     """``x' = F(x, u) u' + G(x, u) |u'|``, ``y = h(x, u)``: rate-independent hysteresis.
 
-    The generalised Duhem model, (2.4), with g(u') = (u', |u'|) and f = (F, G); in the
-    thesis' own choice g(u') = (max(u', 0), min(u', 0)) the two are F + G and F - G: the
-    slope dx/du of the rising and of the falling branch. Input u in V, output y in um,
-    x in any unit.
+    This is the generalised Duhem model (2.4) with g(u') = (u', |u'|) and f = (F, G).
+    With g(u') = (max(u', 0), min(u', 0)), the choice of the thesis, f is (F + G, F -
+    G): the slopes dx/du of the rising and of the falling branch. Input u in V, output y
+    in um, x in any unit.
 
-    F = ``reversible`` + |x| ``reversible_modulus`` and G = ``irreversible`` + |x|
-    ``irreversible_modulus``; these and h = ``output`` (x itself, if left out) are
-    polynomials: row i, column j multiplies x^i u^j, and rows may differ in length. A
-    ShapedColemanHodgdon is ``reversible`` = (slope,), ``irreversible`` = (pull, (c,));
-    a BoucWen of nu = 1 is ``reversible`` = ((alpha,),), ``reversible_modulus`` =
-    ((-beta_delta,),), ``irreversible`` = ((), (-beta_gamma,)). The material starts on
-    its virgin curve from ``rest_input`` (V), ``rest_memory``.
+    F is ``reversible`` + |x| ``reversible_modulus``, G is ``irreversible`` + |x|
+    ``irreversible_modulus`` and h is ``output`` (by default x). All are polynomials:
+    the coefficient in row i, column j multiplies x^i u^j, and rows may differ in
+    length. A ShapedColemanHodgdon is ``reversible`` = (slope,), ``irreversible`` =
+    (pull, (c,)); a BoucWen of nu = 1 is ``reversible`` = ((alpha,),),
+    ``reversible_modulus`` = ((-beta_delta,),), ``irreversible`` = ((), (-beta_gamma,)).
+    The material starts on its virgin curve from ``rest_input`` (V), ``rest_memory``.
 
-    ``substeps`` parts a step, Runge-Kutta of fourth order except where x changes its
-    sign under a modulus. Rate-independent in the same order; what else holds is the
-    shape functions' doing. In general, as in the two special cases, the extrema are
-    not remembered: no return-point memory, no wiping-out, no congruency. Source: Oh and
-    Bernstein 2005, IEEE Trans. Automat. Contr. 50(5).
+    A step has ``substeps`` Runge-Kutta parts of fourth order, except where x changes
+    sign under a modulus. Rate independence holds to the same order; other laws depend
+    on the shape functions. In general, as in the two special cases, extrema are not
+    remembered: there is no return-point memory, no wiping-out and no congruency.
+    Source: Oh and Bernstein 2005, IEEE Trans. Automat. Contr. 50(5).
 
-    Inverse: InverseHysteresis, where y rises with u on every branch.
+    The inverse is InverseHysteresis, if y rises with u on every branch.
 
     Raises ValueError for parameters outside their limits or an empty ``output``.
     """
@@ -109,9 +109,9 @@ class Duhem(Hysteresis, Fittable):
 
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
-        # Oh and Bernstein 2005, with one state; rising and falling each have a slope, a
-        # pull and a decay of their own. A constant pull that changes its sign with the
-        # branch and an offset of the output are the same.
+        # Oh and Bernstein 2005, with one state; the rising and the falling branch each
+        # have a slope, a pull and a decay. A constant pull whose sign changes with the
+        # branch is equivalent to an offset of the output and is left out.
         width, slope = extent.width, extent.slope
         rest = extent.first[1] - extent.centre
         reach = 2.0 * extent.span
@@ -145,7 +145,7 @@ class Duhem(Hysteresis, Fittable):
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         return InverseHysteresis(self, lower, upper)
 
-    # In reverse mode a step is worked out again: its stages take longer to store.
+    # Reverse mode recomputes a step, because storing its stages takes longer.
     @partial(jax.checkpoint, prevent_cse=False)
     def step(self, state: DuhemState, input: ScalarLike) -> tuple[DuhemState, Scalar]:
         input = as_array(input)
@@ -167,7 +167,7 @@ def _value(surface: Surface, x: Scalar, u: Scalar) -> Scalar:
 def _polynomial(coefficients: Sequence[Scalar], at: Scalar) -> Scalar:
     if not coefficients:
         return jnp.zeros_like(at)
-    # From the highest one: a product with a zero in front of it would be worked out.
+    # Horner's rule from the highest coefficient, without a multiplication by zero.
     *lower, total = coefficients
     for coefficient in reversed(lower):
         total = total * at + coefficient

@@ -1,4 +1,4 @@
-"""Hysteresis and dynamics in one model that is linear in all parameters but one."""
+"""ARMA model with hysteresis, linear in all parameters except one."""
 
 from typing import ClassVar
 
@@ -18,13 +18,13 @@ from .model import Hysteresis
 class HystereticARMA(Hysteresis):
     """Two Coleman-Hodgdon operators behind one autoregressive denominator, (3.32).
 
-    ``z(k) = sum_i autoregressive[i] z(k-1-i) + sum_i moving_1[i] y_1(k-i) +
-    sum_i moving_2[i] y_2(k-i)``, and ``offset`` (um) added to z. y_1 (V^2) and y_2 (V)
-    are the hysteresis with (a, b) = (1, 0) and (0, 1); they depend on ``c`` (1/V) and
-    on nothing else, so for a given c the model is linear in what is left.
-    ``moving_1`` and ``moving_2`` are of one length. ``rest_input`` and ``scheme`` as in
-    ``ColemanHodgdon``; with the scheme "voros" this is the earlier
-    model (2.11) that the thesis compares with.
+    ``z(k) = sum_i autoregressive[i] z(k-1-i) + sum_i moving_1[i] y_1(k-i) + sum_i
+    moving_2[i] y_2(k-i)``, and ``offset`` (um) added to z. y_1 (V^2) and y_2 (V) are
+    the outputs of the hysteresis with (a, b) = (1, 0) and (0, 1). They depend only on
+    ``c`` (1/V), so that for a given c the model is linear in the other coefficients.
+    ``moving_1`` and ``moving_2`` have equal length. ``rest_input`` and ``scheme`` as in
+    ``ColemanHodgdon``; with the scheme "voros" this is the earlier model (2.11), with
+    which the thesis compares.
 
     Raises ValueError for parameters outside their limits, numerators of different
     length or an unknown scheme.
@@ -53,7 +53,7 @@ class HystereticARMA(Hysteresis):
     def expanded(self) -> Series:
         """Return the same model as a sum of two chains and an offset.
 
-        Every parameter of the denominator and of the operators then stands there twice.
+        Each parameter of the denominator and of the operators then occurs twice.
         """
         first, second = operators(self.c, self.rest_input, self.scheme)
         chains = (first >> ARMA(self.autoregressive, self.moving_1)) + (
@@ -76,20 +76,20 @@ class HystereticARMA(Hysteresis):
         )
 
     def cascade(self, tolerance: float = 1e-3) -> Series:
-        """Return one hysteresis, then one ARMA of unit DC gain, then the offset.
+        """Return one hysteresis in series with one ARMA of unit DC gain and the offset.
 
-        Exact where ``moving_1`` is a multiple of ``moving_2``; otherwise both keep
-        their DC gain, which becomes a and b, and share the shape that fits both best
-        (the first singular vector of the two, each scaled to length one). Raises
-        ValueError where the sine of the angle between them is above ``tolerance`` (1
-        lets every model pass), or where the shared shape passes no constant input.
+        The result is exact if ``moving_1`` is a multiple of ``moving_2``. Otherwise
+        both keep their DC gains, which become a and b, and share the shape that fits
+        both best (the first singular vector of the two, each scaled to length one).
+        Raises ValueError if the sine of the angle between them is above ``tolerance``
+        (1 accepts every model), or if the shared shape has no DC gain.
         """
         numerators = np.array([self.moving_1, self.moving_2], dtype=float)
         lengths = np.linalg.norm(numerators, axis=1, keepdims=True)
         if not lengths.any():
             raise ValueError("moving_1 and moving_2 are zero; there is no dynamics")
         rows = numerators / np.where(lengths > 0.0, lengths, 1.0)
-        # The area the two unit rows span; 1 - cos^2 would lose half the digits.
+        # The area that the two unit rows span; 1 - cos^2 would lose half the digits.
         sine = float(np.prod(np.linalg.svd(rows, compute_uv=False)[:2]))
         if rows.shape[1] > 1 and sine > tolerance:
             raise ValueError(

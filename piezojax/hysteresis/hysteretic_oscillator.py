@@ -1,4 +1,4 @@
-"""A mass on a spring, a damper and a hysteretic element."""
+"""Oscillator of a mass, a spring, a damper and a hysteretic element."""
 
 from typing import ClassVar, NamedTuple
 
@@ -23,9 +23,9 @@ class OscillatorState(NamedTuple):
 class HystereticOscillator(Hysteresis):
     """``mass y'' + damping y' + stiffness y + z = u``, z the Bouc-Wen force of y.
 
-    Input u in N, held during the step; output y in m, at its end, integrated by the
-    Runge-Kutta rule in the substeps of ``hysteresis``. Source: Noel & Schoukens,
-    Hysteretic benchmark with a dynamic nonlinearity, 2016.
+    The input u in N is held during the step; the output is y in m at its end. The
+    Runge-Kutta rule integrates it in the ``substeps`` of ``hysteresis``. Source: Noel &
+    Schoukens, Hysteretic benchmark with a dynamic nonlinearity, 2016.
 
     Raises ValueError for parameters outside their limits.
     """
@@ -39,7 +39,8 @@ class HystereticOscillator(Hysteresis):
     dt: float = sample_time()
 
     def init(self, input: ScalarLike = 0.0) -> OscillatorState:
-        """Return the state at rest under ``input`` (N), the element without force."""
+        """Return the state at rest under ``input`` (N), with no force of the
+        element."""
         still = jnp.zeros(())
         return OscillatorState(as_array(input) / self.stiffness, still, still)
 

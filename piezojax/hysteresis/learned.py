@@ -1,4 +1,4 @@
-"""A learned operator: plays of the input, a layer of neurons, past outputs."""
+"""Learned hysteresis operator from plays, a layer of neurons and past outputs."""
 
 from typing import ClassVar, NamedTuple
 
@@ -20,8 +20,9 @@ LEARNED_PLAYS, NEURONS = 5, 4
 SEEDS = 16
 """Draws of the first weights of a fit, the same in every run.
 
-On records that a learned operator made (tests/benchmarks/choice.py) all of twelve ended
-in a worse place than the true one for two of three draws of the noise, of sixteen not.
+On records simulated with a learned operator (tests/benchmarks/choice.py), all of 12
+starts ended in a worse optimum than the true one for two of three noise draws; of 16
+starts at least one did not.
 """
 
 
@@ -36,18 +37,19 @@ class LearnedState(NamedTuple):
 class LearnedOperator(Hysteresis, Fittable):
     """``y(k) = sum_i a_i y(k-i) + linear . s(k) + output . tanh(mixing s(k) + bias)``.
 
-    For a loop that no closed form fits: a nonlinear autoregressive model with input
-    (NARX, section 2.4.3) whose regressors s(k) remember as hysteresis does. They are
-    the scaled input v = (x - centre) / scale, its plays of the half-widths
-    ``thresholds``, and its change over the last sample, x(k) - x(k-1) over ``pace``,
-    which lets the loop depend on the rate: n + 2 of n plays. Only the past outputs are
-    linear, with the coefficients ``autoregressive``, so that their poles alone decide
-    whether a free run is stable. Input x in V, output y in um; sizes are ``linear``
-    [n + 2], ``output`` [neurons], ``mixing`` [neurons, n + 2], ``bias`` [neurons]. The
-    material starts without memory at ``rest_input``.
+    It suits a loop that no closed form fits. It is a nonlinear autoregressive model
+    with input (NARX, section 2.4.3) whose regressors s(k) have the memory of
+    hysteresis. With n plays there are n + 2 regressors: the scaled input v = (x -
+    centre) / scale, its plays of the half-widths ``thresholds``, and the change of the
+    input over the last sample, (x(k) - x(k-1)) / ``pace``, which makes the loop
+    rate-dependent. Past outputs act only linearly, with the coefficients
+    ``autoregressive``, so that their poles alone decide whether a free run is stable.
+    Input x in V, output y in um; the sizes are ``linear`` [n + 2], ``output``
+    [neurons], ``mixing`` [neurons, n + 2], ``bias`` [neurons]. The material starts
+    without memory at ``rest_input``.
 
-    Raises ValueError for parameters outside their limits, sizes that do not fit, or
-    past outputs that hold any output.
+    Raises ValueError for parameters outside their limits, sizes that do not match, or
+    autoregressive coefficients whose sum is 1 or more, with no output at rest.
     """
 
     before: ClassVar[str | None] = "rest_input"
@@ -97,7 +99,7 @@ class LearnedOperator(Hysteresis, Fittable):
         return (input - self.centre) / self.scale
 
     def _driven(self, input: Scalar, plays: Memory, change: Scalar) -> Scalar:
-        """Return what input and memory add to the output."""
+        """Return the contribution of input and memory to the output."""
         regressors = (self._scaled(input), *plays, change / self.pace)
         total = _dot(self.linear, regressors)
         for weight, row, bias in zip(self.output, self.mixing, self.bias, strict=True):
@@ -142,7 +144,7 @@ class LearnedOperator(Hysteresis, Fittable):
                 thresholds=np.arange(1, LEARNED_PLAYS + 1) / (LEARNED_PLAYS + 1),
                 centre=0.5 * (extent.low + extent.high),
                 scale=0.5 * extent.width,
-                # Ten times there and back in the record.
+                # The mean change per sample of ten cycles over the range in the record.
                 pace=20.0 * extent.width * extent.dt / extent.duration,
                 rest_input=extent.first[0],
             ),
@@ -178,7 +180,7 @@ def _dot(weights: Memory, values: Memory) -> Scalar:
 
 
 def _drawn(seed: int, count: int, height: float) -> dict[str, float]:
-    """Return first weights of the neurons: small, so that each works where it bends."""
+    """Return initial weights of the neurons, small so that tanh is not saturated."""
     draw = np.random.default_rng(seed).normal
     return {
         **{

@@ -1,4 +1,4 @@
-"""Moving a hysteresis along its loading curve, before the loop over time begins."""
+"""Initial states of a hysteresis from its loading curve."""
 
 from typing import Any
 
@@ -12,9 +12,9 @@ PARTS = 64
 
 
 def loaded(system: System, state: Any, input: Scalar) -> State:
-    """Return ``state`` after its input moved steadily to ``input``, in 64 steps.
+    """Return ``state`` after its input has moved to ``input`` in 64 equal steps.
 
-    ``state`` has the field ``input``, the last one.
+    ``state`` has the field ``input``, the last input.
     """
     start = state.input
 
@@ -23,4 +23,4 @@ def loaded(system: System, state: Any, input: Scalar) -> State:
 
     shares = jnp.arange(1, PARTS + 1) / PARTS
     state, _ = jax.lax.scan(part, state, shares)
-    return state._replace(input=input)  # not off by rounding: a rest moves nothing
+    return state._replace(input=input)  # exact, so that a step at rest has no change

@@ -1,4 +1,4 @@
-"""The interface of every hysteresis model."""
+"""Interface of hysteresis models, and the laws that a model keeps."""
 
 import abc
 from collections.abc import Mapping
@@ -11,13 +11,15 @@ from ..core.system import System
 from .inverse import Inverse
 
 Laws: TypeAlias = Mapping[str, float]
-"""Laws that a model keeps, and the share of the output's span to which it does."""
+"""Laws that a model keeps, each with its largest defect as a share of the output's
+span."""
 
 EXACT = 1e-9
-"""Defect of a law that is kept to rounding."""
+"""Largest defect of a law that holds up to rounding."""
 
 STEP = 5e-3
-"""Defect of a law that is kept to the order of the step, at 16 samples a branch."""
+"""Largest defect of a law that holds to the order of the step, at 16 samples per
+branch."""
 
 LAWS: Laws = {
     "return-point memory": EXACT,
@@ -27,8 +29,9 @@ LAWS: Laws = {
     "pauses": EXACT,
     "counter-clockwise": STEP,
 }
-"""Every law. Minor loops close, larger extrema wipe out those between them, minor loops
-of one range have one shape, speed and pauses do not matter, loops turn like a piezo's.
+"""All laws, in this order: minor loops close; larger extrema wipe out those between
+them; minor loops of one input range have one shape; speed does not matter; pauses do
+not matter; loops run in the sense of a piezo.
 """
 
 
@@ -48,13 +51,14 @@ class Hysteresis(System):
 
     Input in V and output in um, unless the model says otherwise.
 
-    ``before`` names the field that holds the input in force before a record begins, if
-    the model has one; a free run then starts at rest under that input, otherwise at
-    rest under the record's first input. ``laws`` are those that the model keeps with
-    the parameters of a piezo, such as its recipe starts from.
+    ``before`` is the name of the field with the input before a record, or None. A free
+    run starts at rest under that input; with None it starts at rest under the first
+    input of the record. ``laws`` are those that the model keeps with the parameters of
+    a piezo, such as those its recipe starts from.
 
-    ``dynamic`` says that the output may go on while the input rests: the model holds
-    dynamics that cannot be separated from the hysteresis, and needs no lag behind it.
+    ``dynamic`` is True if the output can change while the input rests: the model
+    contains dynamics that cannot be separated from the hysteresis, and needs no lag
+    after it.
     """
 
     before: ClassVar[str | None] = None
@@ -65,9 +69,9 @@ class Hysteresis(System):
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         """Return the inverse for inputs from ``lower`` to ``upper`` (V).
 
-        A closed form where there is one, InverseHysteresis otherwise. Raises ValueError
-        with the reason where no inverse exists, such as an output that falls while the
-        input rises.
+        The inverse is a closed form if there is one, else InverseHysteresis. Raises
+        ValueError with the reason if no inverse exists, such as an output that falls
+        while the input rises.
         """
 
 
@@ -82,9 +86,9 @@ def hystereses(system: Any) -> list[Hysteresis]:
 
 
 def input_before(system: Any, otherwise: ScalarLike) -> Scalar | ScalarLike:
-    """Return the input (V) in force before a record, as ``system`` holds it.
+    """Return the input (V) before a record, from the hysteresis in ``system``.
 
-    ``otherwise`` is returned for a system without such a memory.
+    ``otherwise`` is returned if no hysteresis has a field for it.
     """
     for model in hystereses(system):
         if model.before is not None:

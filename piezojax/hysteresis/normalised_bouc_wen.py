@@ -1,4 +1,4 @@
-"""The normalised Bouc-Wen model: an actuator's line and a bounded hysteretic part."""
+"""Normalised Bouc-Wen model: a straight line and a bounded hysteretic part."""
 
 from typing import ClassVar, NamedTuple
 
@@ -27,30 +27,29 @@ class NormalisedBoucWenState(NamedTuple):
 class NormalisedBoucWen(Hysteresis, Fittable):
     """``y = k_x x + k_w w``: a straight line and a bounded part with hysteresis.
 
-    ``w' = rho (x' - sigma |x'| |w|^(n-1) w + (sigma - 1) x' |w|^n)``, (2.5) with its
-    symbols set right: as printed w is called the input and the second line is headed by
-    x'. Here x is the input in V, w the internal state without unit, which stays within
-    -1 and 1, and y the output Phi in um; n need not be whole. w is the force of a
-    classical Bouc-Wen model, ``classical()``. Source: Ikhouane and Rodellar, Systems
-    with Hysteresis, 2007.
+    ``w' = rho (x' - sigma |x'| |w|^(n-1) w + (sigma - 1) x' |w|^n)``, (2.5) with
+    corrected symbols: the print calls w the input and begins the second line with x'.
+    Here x is the input in V, w the internal state without unit, between -1 and 1, and y
+    the output Phi in um; n need not be whole. w is the force of the classical Bouc-Wen
+    model ``classical()``. Source: Ikhouane and Rodellar, Systems with Hysteresis, 2007.
 
-    With ``k_w > 0``, which (2.5) asks for, loops run clockwise, as a force over a
-    displacement does: the sign of a spring that dissipates. A piezo's displacement lags
-    behind its voltage, counter-clockwise: ``k_w < 0`` (Low and Guo 1995). The material
-    starts on its virgin curve from ``rest_input`` (V), where w = 0.
+    With ``k_w > 0``, as (2.5) requires, loops run clockwise, as for a dissipating force
+    over a displacement. The displacement of a piezo lags its voltage, and loops run
+    counter-clockwise: ``k_w < 0`` (Low and Guo 1995). The material starts on its virgin
+    curve from ``rest_input`` (V), where w = 0.
 
-    ``scheme`` is ``"runge_kutta"``, fourth order in the input step except where w
-    changes its sign, parted by ``substeps``; or ``"exact"``, the closed form on every
-    monotone branch, for n = 1. Loops close in the limit of many cycles only: there is
-    no return-point memory, no wiping-out and no congruency, and w drifts when a partial
-    unloading is repeated.
+    ``scheme`` is ``"runge_kutta"``, with ``substeps`` parts per step, of fourth order
+    except where w changes sign; or ``"exact"``, the closed form on every monotone
+    branch, for n = 1. Loops close only in the limit of many cycles: there is no
+    return-point memory, no wiping-out and no congruency, and w drifts under repeated
+    partial unloading.
 
-    Inverse: InverseHysteresis. y rises with x on every branch, so that one exists, if
-    and only if ``k_x > 0`` and ``k_x + 2 sigma rho k_w > 0``, the slope that is left
-    just after a turn at w = 1 or -1.
+    The inverse is InverseHysteresis. It exists if and only if y rises with x on every
+    branch: ``k_x > 0`` and ``k_x + 2 sigma rho k_w > 0``, the slope just after a turn
+    at w = 1 or -1.
 
     Raises ValueError for parameters outside their limits, an unknown scheme, or "exact"
-    with another n than 1.
+    with n other than 1.
     """
 
     before: ClassVar[str | None] = "rest_input"
@@ -108,7 +107,7 @@ class NormalisedBoucWen(Hysteresis, Fittable):
     def recipe(cls, extent: Extent) -> Recipe:
         width, slope = extent.width, extent.slope
         return Recipe(
-            # A displacement lags behind its voltage for k_w of the other sign than k_x.
+            # The displacement lags the voltage if k_w and k_x have opposite signs.
             cls(
                 k_x=1.1 * slope,
                 k_w=-0.1 * slope * width,

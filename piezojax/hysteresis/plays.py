@@ -14,7 +14,7 @@ from ..core.space import Range
 Memory = tuple[Scalar, ...]
 
 ITERATIONS = 20
-"""Newton steps, halving where one leaves the bracket, for a polynomial P."""
+"""Newton steps for a polynomial P; a step that leaves the bracket halves it instead."""
 
 PLAYS = 10
 """Operators of a fitted Prandtl-Ishlinskii model."""
@@ -35,7 +35,7 @@ def stopped(change: Scalar, memory: Memory, thresholds: Memory) -> Memory:
     """Advance stop operators (spring and slider) by a change of the input.
 
     e <- min(r, max(-r, e + dx)), Brokate and Sprekels 1996, section 2.1: an elastic
-    element that yields at +-r. Of the same input, play and stop add up to it.
+    element that yields at +-r. Play and stop of the same input add up to this input.
     """
     return tuple(
         _limited(e + change, -r, r) for r, e in zip(thresholds, memory, strict=True)
@@ -43,7 +43,8 @@ def stopped(change: Scalar, memory: Memory, thresholds: Memory) -> Memory:
 
 
 def _limited(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
-    # The gradient of a maximum shares ties out, which makes it take twice as long.
+    # The gradient of jnp.maximum divides ties between its arguments, which takes twice
+    # as long.
     return jnp.where(value < low, low, jnp.where(value > high, high, value))
 
 
@@ -57,7 +58,7 @@ def check_plays(thresholds: Memory, weights: Memory, name: str = "weights") -> N
 
 
 def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
-    """Return fields and bounds that the Prandtl-Ishlinskii models share."""
+    """Return the common fields and bounds of the Prandtl-Ishlinskii models."""
     width, slope = extent.width, extent.slope
     # A play wider than half the range of the input never moves.
     thresholds = 0.5 * width * np.arange(1, PLAYS + 1) / (PLAYS + 1)
@@ -86,12 +87,12 @@ def memoryless(polynomial: Memory, x: Scalar) -> Scalar:
 
 
 def weighted(weights: Memory, plays: Memory) -> Scalar:
-    """Return the sum of ``plays``, each by its weight."""
+    """Return the weighted sum of ``plays``."""
     return sum((w * p for w, p in zip(weights, plays, strict=True)), as_array(0.0))
 
 
 def check_invertible(polynomial: Memory, thresholds: Memory, weights: Memory) -> None:
-    """Raise ValueError unless ``solved`` finds the one input for any output."""
+    """Raise ValueError unless ``solved`` can find a unique input for any output."""
     if not polynomial:
         raise ValueError("the polynomial is empty; an inverse needs its linear term")
     for i, (low, high) in enumerate(itertools.pairwise(thresholds)):
@@ -108,14 +109,14 @@ def solved(
     memory: Memory,
     wanted: Scalar,
 ) -> Scalar:
-    """Return the input x for which P(x) + sum weights play(x) from memory is wanted.
+    """Return the input x at which P(x) + sum weights play(x) equals ``wanted``.
 
-    ``memory`` must be one that plays with these thresholds can have: two of them differ
-    by no more than their thresholds do.
+    The plays start from ``memory``, in which two plays must not differ by more than
+    their thresholds do.
     """
     slope, constant = as_array(0.0), as_array(0.0)
     low, high = as_array(-jnp.inf), as_array(jnp.inf)
-    # Where the i-th play begins to move all before it do, and none after it.
+    # Where the i-th play begins to move, all plays before it move and none after it.
     moving, reach, resting = slope, slope, weighted(weights, memory)
     for r, w, m in zip(thresholds, weights, memory, strict=True):
         moving, reach, resting = moving + w, reach + w * r, resting - w * m
@@ -138,7 +139,8 @@ def solved(
 
 
 def _root(polynomial: Memory, value: Scalar, low: Scalar, high: Scalar) -> Scalar:
-    """Return x between low and high, infinite or not, with ``polynomial`` at value."""
+    """Return x from low to high, both possibly infinite, where ``polynomial`` is
+    value."""
     fixed, target, low, high = jax.lax.stop_gradient((polynomial, value, low, high))
     x = jnp.clip(target / jnp.where(fixed[0] > 0.0, fixed[0], jnp.inf), low, high)
     for _ in range(ITERATIONS):
@@ -147,11 +149,11 @@ def _root(polynomial: Memory, value: Scalar, low: Scalar, high: Scalar) -> Scala
         newton = x - error / _rising(fixed, x)
         middle = 0.5 * (low + high)
         middle = jnp.where(jnp.isfinite(middle), middle, x)
-        # At the root itself rounding decides which side a step falls to.
+        # At the root rounding decides on which side a step ends.
         arrived = jnp.abs(newton - x) <= 1e-9 * (1.0 + jnp.abs(x))
         inside = (newton >= low) & (newton <= high)
         x = jnp.where(inside | arrived, newton, middle)
-    # One step more, differentiated with the slope held: the implicit derivative.
+    # A further step, differentiated at constant slope, has the implicit derivative.
     return x - (memoryless(polynomial, x) - value) / _rising(fixed, x)
 
 

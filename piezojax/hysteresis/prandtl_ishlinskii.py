@@ -28,7 +28,7 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
     Trans. Ind. Electron. 61(3)). The material starts without memory at ``rest_input``.
     Loops close for weights >= 0.
 
-    Raises ValueError for parameters outside their limits, or a different count of
+    Raises ValueError for parameters outside their limits, or a different number of
     thresholds and weights.
     """
 
@@ -81,20 +81,20 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
 class InversePrandtlIshlinskii(Inverse):
     """Voltage that moves a Prandtl-Ishlinskii model to a wanted output.
 
-    Input f(k) in um, output u(k) in V. From a given memory the model's next output
-    rises with its input in pieces, a corner where each play begins to move; the plays
-    move in the order of their thresholds. Which ones do for f is seen by the outputs at
-    the corners; what is left is linear and solved in closed form, or, with terms above
-    the first in P, a polynomial that rises on a known interval, solved by a bracketed
-    Newton method to 1e-9 um. For a linear P it is the inverse of Krejci and Kuhnen
-    (2001, IEE Proc. Control Theory Appl. 148(3)), which ``operator`` gives as the
-    Prandtl-Ishlinskii operator it is. The state is that of the model itself, so a
-    controller whose voltage was clipped can advance it with what was really applied.
+    Input f(k) in um, output u(k) in V. From a given memory the next output of the model
+    rises piecewise with its input, with a corner where each play begins to move; the
+    plays move in the order of their thresholds. The outputs at the corners determine
+    which plays move for f. The remaining equation is linear and solved in closed form;
+    with terms above the first in P it is a polynomial that rises on a known interval,
+    solved by a bracketed Newton method to 1e-9 um. For a linear P this is the inverse
+    of Krejci and Kuhnen (2001, IEE Proc. Control Theory Appl. 148(3)), which
+    ``operator`` returns as a Prandtl-Ishlinskii operator. The state is that of the
+    model, so that a controller can advance it with the voltage applied after clipping.
 
-    Raises ValueError for thresholds that do not ascend, for an empty polynomial, or,
-    with a linear P, for weights that do not leave the output rising with the input.
-    With a polynomial P the sum must rise over the inputs that are used; where it does
-    not the voltage is finite, but another.
+    Raises ValueError for thresholds that do not ascend, an empty polynomial, or, with a
+    linear P, weights for which the output does not rise with the input. With a
+    polynomial P the output must rise over the inputs in use; otherwise the voltage is
+    finite but wrong.
     """
 
     model: PrandtlIshlinskii
@@ -118,7 +118,7 @@ class InversePrandtlIshlinskii(Inverse):
     def operator(self) -> PrandtlIshlinskii:
         """Return the inverse as a Prandtl-Ishlinskii operator from um to V.
 
-        Its plays follow the wanted output alone, from the virgin state. Raises
+        Its plays depend only on the wanted output, from the virgin state. Raises
         ValueError for a polynomial with terms above the first.
         """
         model = self.model

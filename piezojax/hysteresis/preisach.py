@@ -27,36 +27,36 @@ Levels = Float[Array, " cells"]
 Rows = tuple[Float[Array, " cells"], ...]
 
 STARTS = ("virgin", "saturated")
-"""What the material remembers before its first input."""
+"""Initial states of the material."""
 
 
 ROUNDING = 1e-13
-"""Change of the output, um, below which the inverse stays where it is."""
+"""Change of the output, um, below which the inverse does not change its voltage."""
 
 
 class Preisach(Hysteresis, Designed):
-    """A weighted sum of relays, (2.1)-(2.2): the weights of those that are up.
+    """Weighted sum of relays, (2.1)-(2.2): the weights of the relays that are up.
 
-    A relay goes up where the input rises through its alpha and down where it falls
-    through its beta. Both run from ``low`` to ``high`` (V) in n equal cells;
-    ``weights[i, j]`` (um) belongs to alpha in cell i and beta in cell j, n x n, zero
-    where beta is above alpha (j > i), and nowhere negative. ``lowest`` (um) is the
-    output with all relays down. Input in V, output in um; beyond ``low`` and ``high``
-    the output is flat.
+    A relay goes up when the input rises through its alpha and down when it falls
+    through its beta. Both range from ``low`` to ``high`` (V) in n equal cells.
+    ``weights`` [n, n] (um) are not negative: element [i, j] belongs to alpha in cell i
+    and beta in cell j and is zero where beta is above alpha (j > i). ``lowest`` (um) is
+    the output with all relays down. Input in V, output in um; beyond ``low`` and
+    ``high`` the output is flat.
 
-    Within a cell the weight is spread over relays along the cell's diagonal, where
-    alpha - beta is that of its corners. So the relays lie on n lines of one width
-    alpha - beta = k (high - low)/n, k = 0 ... n-1, and those of one line are up exactly
-    as far as a play operator of that width stands: n scalars are the whole memory, with
-    neither turning points to store nor relays to step (Brokate and Sprekels, Hysteresis
-    and Phase Transitions, 1996, section 2.2). The laws of Preisach's model hold to
-    rounding; where turning points fall on edges of cells the output is that of relays
-    spread in any other way within their cells; and it is continuous and piecewise
-    linear in the input, with its slope everywhere finite. Weights on the diagonal
-    (k = 0) have no width: they are what follows the input back without hysteresis.
+    Within a cell the weight is distributed over relays on the diagonal of the cell,
+    where alpha - beta is that of its corners. The relays therefore lie on n lines of
+    constant width alpha - beta = k (high - low)/n, k = 0 ... n-1. On each line the
+    relays are up exactly as far as the position of a play operator of that width. The
+    memory thus consists of n scalars, without turning points or relays (Brokate and
+    Sprekels, Hysteresis and Phase Transitions, 1996, section 2.2). The laws of the
+    Preisach model hold to rounding. If turning points fall on edges of cells, the
+    output equals that of any other distribution of the relays within their cells. The
+    output is continuous and piecewise linear in the input, with finite slope. Weights
+    on the diagonal (k = 0) have no width: they follow the input without hysteresis.
 
-    ``start``: ``"virgin"``, demagnetised about ``rest_input`` (V), or ``"saturated"``,
-    after an input at or below ``low``.
+    ``start`` is ``"virgin"``, demagnetised about ``rest_input`` (V), or
+    ``"saturated"``, after an input at or below ``low``.
 
     Raises ValueError for parameters outside their limits, weights that are not square
     or lie above the diagonal, ``low >= high`` or an unknown start.
@@ -111,9 +111,10 @@ def check_weights(name: str, weights: Matrix) -> None:
 
 
 def rows_of(weights: Matrix) -> Rows:
-    """Return, for each cell of beta, the weights of all lines there.
+    """Return the weights of all lines in each cell of beta.
 
-    Line k, of the cells with alpha k above beta, is element k; 0 where it has ended.
+    Element k belongs to line k, of the cells whose alpha is k cells above beta; it is 0
+    beyond the end of the line.
     """
     cells = weights.shape[0]
     column = np.arange(cells)
@@ -122,36 +123,36 @@ def rows_of(weights: Matrix) -> Rows:
     return tuple(lines)
 
 
-class Way(NamedTuple):
-    """Lines on their way from one end of the input: a row a cell, a column a line.
+class Traverse(NamedTuple):
+    """Outputs of the lines while the input traverses all cells in one direction.
 
-    ``reached`` (um) is what a line has put out before the cell, ``slopes`` (um) what it
-    adds there.
+    Rows are cells, columns are lines. ``reached`` (um) is the output of a line before
+    the cell, ``slopes`` (um) the change of its output in the cell.
     """
 
     reached: Matrix
     slopes: Matrix
 
 
-def _upwards(rows: Rows) -> Way:
-    """Return the lines on the way up, on which their alphas are passed."""
+def _upwards(rows: Rows) -> Traverse:
+    """Return the lines for a rising input, which passes their alphas."""
     alpha, line = np.arange(len(rows))[:, None], np.arange(len(rows))
     slopes = jnp.where(line <= alpha, jnp.stack(rows)[alpha - line, line], 0.0)
-    return Way(jnp.cumsum(slopes, axis=0) - slopes, slopes)
+    return Traverse(jnp.cumsum(slopes, axis=0) - slopes, slopes)
 
 
-def _downwards(rows: Rows) -> Way:
-    """Return the lines on the way down, from the top and with the sign turned round."""
+def _downwards(rows: Rows) -> Traverse:
+    """Return the lines for a falling input, from the top and with reversed sign."""
     slopes = jnp.stack(rows)[::-1]
     reached = jnp.cumsum(slopes, axis=0) - slopes - jnp.sum(slopes, axis=0)
-    return Way(reached, slopes)
+    return Traverse(reached, slopes)
 
 
 @partial(jax.checkpoint, prevent_cse=False)
 def outputs(levels: Levels, *densities: Rows) -> tuple[Levels, ...]:
-    """Return, for each density, what each line of its relays puts out, um.
+    """Return the output (um) of each line of relays, for each density.
 
-    In reverse mode it is worked out again: that is four times faster than storing it.
+    Reverse mode recomputes it, which is four times faster than storing it.
     """
     totals = [jnp.zeros_like(levels) for _ in densities]
     for beta, weights in enumerate(zip(*densities, strict=True)):
@@ -163,16 +164,16 @@ def outputs(levels: Levels, *densities: Rows) -> tuple[Levels, ...]:
 
 
 class PlayLines(System):
-    """What a Preisach model steps with: a play operator for each width.
+    """Resolved Preisach model: a play operator for each width.
 
-    ``rows`` as ``rows_of`` gives them; ``size`` (V) of a cell. The state holds, for
-    each line, the beta up to which its relays are up, counted in cells from ``low``;
-    that of line 0 is the input.
+    ``rows`` are those of ``rows_of``; ``size`` (V) is that of a cell. The state holds,
+    for each line, the beta up to which its relays are up, in cells from ``low``; that
+    of line 0 is the input.
     """
 
     rows: Rows
-    upwards: Way
-    downwards: Way
+    upwards: Traverse
+    downwards: Traverse
     low: Scalar
     size: Scalar
     lowest: Scalar
@@ -180,12 +181,12 @@ class PlayLines(System):
     start: str = eqx.field(static=True)
 
     def resolved(self) -> "PlayLines":
-        """Return itself: there is nothing more to work out."""
+        """Return itself, which is already resolved."""
         return self
 
     @property
     def widths(self) -> Float[np.ndarray, " cells"]:
-        """alpha - beta of the lines, in cells."""
+        """Widths alpha - beta of the lines, in cells."""
         return np.arange(float(len(self.rows)))
 
     def rest(self) -> Levels:
@@ -200,10 +201,11 @@ class PlayLines(System):
         return (as_array(input) - self.low) / self.size
 
     def played(self, levels: Levels, input: ScalarLike) -> Levels:
-        """Return ``levels`` after ``input``."""
+        """Return the ``levels`` after a step to ``input``."""
         x = self.position(input)
         # Relays with beta above x are down, those with alpha below it are up. A level
-        # at either end goes with the input: the slope at rest is that of the way there.
+        # at either end moves with the input: the slope at rest is that of the last
+        # movement.
         lower = x - self.widths
         raised = jnp.where(levels <= lower, lower, levels)
         return jnp.where(levels >= x, x, raised)
@@ -219,12 +221,12 @@ class PlayLines(System):
     def solve(self, state: Levels, wanted: ScalarLike) -> Scalar:
         """Return the input (V) for which the next output is ``wanted`` (um).
 
-        The output is monotone in the input, so its values at the edges of the cells
-        tell the cell in which the input lies. There the output of a line stays where it
-        is until the input reaches it, then grows on a straight line, and narrow lines
-        are reached first: the sum is convex, the largest of n straight lines, and the
-        smallest of their n solutions is the solution. Downwards everything is
-        reflected: what remains of a line is counted from the top.
+        The output is monotone in the input, so that its values at the edges of the
+        cells determine the cell of the input. Within the cell the output of a line is
+        constant until the input reaches its level, then it grows linearly, and narrow
+        lines are reached first. The sum is therefore convex, the maximum of n linear
+        functions, and the least of their n solutions is the solution. For a falling
+        input everything is reflected: the rest of a line is counted from the top.
         """
         (held,) = outputs(state, self.rows)
         rise = as_array(wanted) - self.lowest - jnp.sum(held)
@@ -233,7 +235,7 @@ class PlayLines(System):
         held, target = sign * held, sign * (as_array(wanted) - self.lowest)
         way = jax.tree.map(partial(jnp.where, up), self.upwards, self.downwards)
 
-        # Loops, not one array operation: XLA would work out ``held`` over and over.
+        # Loops, not one array operation, for which XLA would recompute ``held``.
         def edge(found, row):
             _, here = row
             passed = jnp.sum(jnp.maximum(here.reached, held)) <= target
@@ -257,8 +259,8 @@ class PlayLines(System):
         start = (target - jnp.sum(held), none, none + 1.0)
         (_, _, share), _ = jax.lax.scan(line, start, (held, *here))
         x = cell + jnp.maximum(share, 0.0)
-        # At rest it stays, and rounding does not turn it round where the output is
-        # flat. What this adds has no gradient: elsewhere it is zero up to rounding.
+        # At rest the voltage stays, and rounding does not reverse it where the output
+        # is flat. The correction has no gradient: elsewhere it is zero up to rounding.
         last = jnp.clip(jnp.where(up, state[0], cells - state[0]), 0.0, cells)
         still = jnp.abs(rise) <= ROUNDING
         back = jnp.where(still, last - x, jnp.maximum(last - x, 0.0))
@@ -269,11 +271,11 @@ class PlayLines(System):
 class InversePreisach(Inverse):
     """Voltage that moves a Preisach model to a wanted output, in closed form.
 
-    Input in um, output in V, exact to rounding with the exact gradient. The state is
-    that of the model itself. An output that no input between ``low`` and ``high``
-    reaches gives the nearer of the two. The voltage is continuous in what is wanted
-    where the weights on the model's diagonal are positive; without them the output is
-    flat after each turn and the voltage jumps across.
+    Input in um, output in V, exact to rounding, with the exact gradient. The state is
+    that of the model. If no input between ``low`` and ``high`` reaches the wanted
+    output, the nearer limit is returned. The voltage is continuous in the wanted output
+    if the weights on the diagonal of the model are positive; without them the output is
+    flat after each turn, and the voltage jumps over the flat part.
     """
 
     model: Preisach

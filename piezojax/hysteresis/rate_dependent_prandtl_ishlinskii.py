@@ -24,7 +24,7 @@ from .prandtl_ishlinskii import PrandtlIshlinskii
 
 
 class RateState(NamedTuple):
-    """Plays and last input (V), and the rate at which that was reached (V/s)."""
+    """Plays (V), last input (V) and its rate over the last sample (V/s)."""
 
     plays: Memory
     input: Scalar
@@ -32,16 +32,16 @@ class RateState(NamedTuple):
 
 
 class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
-    """A Prandtl-Ishlinskii model whose thresholds grow with the rate of the input.
+    """Prandtl-Ishlinskii model whose thresholds grow with the rate of the input.
 
     ``y = P(x) + sum_i weights[i] play_i(x)`` with plays of the half-width
-    ``thresholds[i] + growth |dx/dt|`` (V), everything else as in
-    ``PrandtlIshlinskii``. Source: Al Janaideh and Krejci, Inverse
-    rate-dependent Prandtl-Ishlinskii model for feedforward compensation of hysteresis
-    in a piezomicropositioning actuator, 2013 (IEEE/ASME Trans. Mechatronics 18(5)),
-    with one growth for all plays: they keep their order and distance at every rate. The
-    rate is that between the two samples before: at the one to come it would hang on the
-    input that the inverse looks for, and a play could run away from a fast step.
+    ``thresholds[i] + growth |dx/dt|`` (V); the rest as in ``PrandtlIshlinskii``.
+    Source: Al Janaideh and Krejci, Inverse rate-dependent Prandtl-Ishlinskii model for
+    feedforward compensation of hysteresis in a piezomicropositioning actuator, 2013
+    (IEEE/ASME Trans. Mechatronics 18(5)), with one growth for all plays, so that they
+    keep their order and distance at every rate. The rate is that between the two
+    previous samples. The rate of the present step would depend on the input that the
+    inverse seeks, and a play could widen faster than a fast step moves it.
 
     Raises ValueError as ``PrandtlIshlinskii``.
     """
@@ -89,8 +89,8 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
         fields, bounds = plays_recipe(extent)
-        # A sine over the whole range needs some periods in the record; at the growth of
-        # a sixth of its period no play moves any more.
+        # A sine over the whole range needs several periods in the record; if the growth
+        # is a sixth of its period, no play moves.
         most = 0.05 * extent.duration
         return Recipe(
             cls(**fields, growth=0.01 * most, dt=extent.dt),
@@ -102,7 +102,8 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
         if len(self.polynomial) > 1:
-            # The slopes are those at rest: the rate moves the corners between them.
+            # The slopes are those at rest; the rate only moves the corners between
+            # them.
             at_rest = PrandtlIshlinskii(
                 self.polynomial, self.thresholds, self.weights, self.rest_input
             )
@@ -113,8 +114,8 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
 class InverseRateDependentPrandtlIshlinskii(Inverse):
     """Voltage that moves a rate-dependent model to a wanted output.
 
-    Input f(k) in um, output u(k) in V. The thresholds of the step to come are known, so
-    it is solved as that of ``InversePrandtlIshlinskii``, exactly at every rate; state
+    Input f(k) in um, output u(k) in V. The thresholds of the next step are known, so
+    that it is solved as in ``InversePrandtlIshlinskii``, exactly at every rate; state
     and errors as there.
     """
 

@@ -1,4 +1,4 @@
-"""Preisach hysteresis whose density depends on how fast the input moves."""
+"""Preisach hysteresis whose density depends on the rate of the input."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -14,15 +14,14 @@ from .preisach import Levels, PlayLines, Preisach, Rows, check_weights, outputs,
 class RateDependentPreisach(Hysteresis, Designed):
     """``y = integral of mu(alpha, beta, du/dt) relay(u)``, (2.10), of a Preisach model.
 
-    mu goes from the density of ``slow`` to that of ``fast_weights`` (um, n x n as in
-    Preisach), cell by cell, with the share r^2 / (1 + r^2), r = (du/dt) / ``rate``:
-    half way at ``rate``, smooth where the input turns. du/dt is that over the last
-    sample. The relays themselves, and what they remember, are those
-    of ``slow``. Input in V, output in um. The thesis leaves mu to a neural network;
-    this form of it is ours.
+    In each cell mu changes from the density of ``slow`` to that of ``fast_weights``
+    (um, n x n as in Preisach) with the share r^2 / (1 + r^2), r = (du/dt) / ``rate``.
+    The share is 1/2 at ``rate`` and smooth where the input turns. du/dt is the rate
+    over the last sample. The relays and their memory are those of ``slow``. Input in V,
+    output in um. The thesis represents mu by a neural network; this form is ours.
 
-    Raises ValueError for parameters outside their limits, weights that Preisach refuses
-    or another number of cells than ``slow`` has.
+    Raises ValueError for parameters outside their limits, weights that Preisach rejects
+    or a number of cells other than that of ``slow``.
     """
 
     slow: Preisach
@@ -62,12 +61,13 @@ class _Blend(System):
     def step(self, state: Levels, input: ScalarLike) -> tuple[Levels, Scalar]:
         levels = self.slow.played(state, input)
         slow, fast = outputs(levels, self.slow.rows, self.fast)
-        # Of both, element 0 is the input.
+        # In both, element 0 is the input.
         share = fast_share((levels[0] - state[0]) / self.half_way)
         return levels, self.slow.lowest + jnp.sum(slow + share * (fast - slow))
 
 
 def fast_share(rate: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return how far the density is the fast one, at a rate over that half way."""
+    """Return the share of the fast density; ``rate`` is relative to that of share
+    1/2."""
     square = rate**2
     return square / (1.0 + square)

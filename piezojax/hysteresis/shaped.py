@@ -23,15 +23,15 @@ class LastPoint(NamedTuple):
 class ShapedColemanHodgdon(Hysteresis, Fittable):
     """``y' = |x'| (p(x) + c y) + g(x) x'`` with polynomials p and g.
 
-    The general model of Coleman and Hodgdon, alpha |x'| (f(x) - y) + g(x) x', with
-    c = -alpha and p = alpha f, of which the thesis takes f and g linear (section
-    3.1, its first limitation). Input x in V, output y in um; p(x) = pull[0] + pull[1] x
-    + ..., g(x) = slope[0] + slope[1] x + .... Trapezoid step: the polynomials are
-    integrated exactly, y by the trapezoid rule. ``pull = (0, a)``, ``slope = (b,)`` is
-    ColemanHodgdon. As there the virgin curve starts at ``rest_input``; no return-point
-    memory, no wiping-out and no congruency. Inverse: InverseHysteresis, where y rises
-    on every branch. Loops run counter-clockwise, as a piezo's, where p'(x) > |c| g(x),
-    and clockwise below that.
+    This is the general model of Coleman and Hodgdon, alpha |x'| (f(x) - y) + g(x) x',
+    with c = -alpha and p = alpha f; the thesis takes f and g linear (section 3.1, its
+    first limitation). Input x in V, output y in um; p(x) = pull[0] + pull[1] x + ...,
+    g(x) = slope[0] + slope[1] x + .... A step integrates the polynomials exactly and y
+    by the trapezoid rule. With ``pull = (0, a)``, ``slope = (b,)`` it is
+    ColemanHodgdon. As there, the virgin curve starts at ``rest_input``, and there is no
+    return-point memory, no wiping-out and no congruency. The inverse is
+    InverseHysteresis, if y rises on every branch. Loops run counter-clockwise, as for a
+    piezo, where p'(x) > |c| g(x), and clockwise where it is less.
 
     Raises ValueError for parameters outside their limits or empty polynomials.
     """
@@ -60,8 +60,8 @@ class ShapedColemanHodgdon(Hysteresis, Fittable):
                 raise ValueError(f"{name} is empty; it must hold a coefficient")
 
     def init(self, input: ScalarLike = 0.0) -> LastPoint:
-        # In closed form, because a single trapezoid over the range is a poor one:
-        # y = q(x) + K exp(s c x), where the polynomial q solves the equation.
+        # Closed form, because one trapezoid over the range is inaccurate: y = q(x) + K
+        # exp(s c x), where the polynomial q solves the equation.
         input, start = as_array(input), self.rest_input
         rate = jnp.where(input >= start, 1.0, -1.0) * self.c
         sign = rate / self.c
@@ -100,7 +100,7 @@ class ShapedColemanHodgdon(Hysteresis, Fittable):
                 rest_output=rest,
             ),
             {
-                # A constant pull and an offset of the output are the same thing.
+                # A constant pull is equivalent to an offset of the output.
                 **{
                     f"pull.{i}": Range(-50 * s, 50 * s)
                     for i, s in enumerate(scales)

@@ -1,4 +1,4 @@
-"""Prandtl-Ishlinskii hysteresis by stop operators, the dual of plays."""
+"""Prandtl-Ishlinskii hysteresis of weighted stop operators, the dual of plays."""
 
 from typing import ClassVar, NamedTuple
 
@@ -14,23 +14,23 @@ from .prandtl_ishlinskii import PrandtlIshlinskii
 
 
 class StopState(NamedTuple):
-    """Last input (V) and what each stop holds of it (V)."""
+    """Last input (V) and the output of each stop (V)."""
 
     input: Scalar
     stops: Memory
 
 
 class StopPrandtlIshlinskii(Hysteresis, Fittable):
-    """``y = P(x) - sum_i weights[i] stop_i(x)``: what the stops hold back.
+    """``y = P(x) - sum_i weights[i] stop_i(x)``: rate-independent, symmetric loops.
 
-    Input x in V, output y in um. A stop of half-width ``thresholds[i]`` follows x
-    until it yields. ``polynomial`` and ``rest_input`` as in ``PrandtlIshlinskii``: P is
-    the slope of the loop's axis, where with plays it is the
-    slope right after a turning point. Since play and stop add up to x the same model
-    can be had of plays, ``as_plays``, and with it the inverse. Source: Brokate and
-    Sprekels, Hysteresis and Phase Transitions, 1996, section 2.1.
+    Input x in V, output y in um. A stop of half-width ``thresholds[i]`` follows x until
+    it yields. ``polynomial`` and ``rest_input`` as in ``PrandtlIshlinskii``, but P has
+    the slope of the axis of the loop, whereas with plays it has the slope right after a
+    turning point. Because play and stop add up to x, ``as_plays`` returns the same
+    model with plays, which has the inverse. Source: Brokate and Sprekels, Hysteresis
+    and Phase Transitions, 1996, section 2.1.
 
-    Raises ValueError for parameters outside their limits, or a different count of
+    Raises ValueError for parameters outside their limits, or a different number of
     thresholds and weights.
     """
 
