@@ -1,4 +1,4 @@
-"""What in a record stands against a fit: clipping, few cycles or frequencies, start."""
+"""Checks of a record before a fit: clipping, excitation, initial state."""
 
 from collections.abc import Iterator
 
@@ -8,22 +8,22 @@ import scipy
 from .record import Record
 
 CYCLES = 3
-"""Fewer full hysteresis cycles than this in the training part give a warning."""
+"""Least number of full hysteresis cycles in the training part without a warning."""
 
 STROKE = 0.1
-"""Smallest rise or fall, as a share of the input's span, that is part of a cycle."""
+"""Smallest rise or fall of a cycle, as a share of the input's span."""
 
 LINE = 0.03
-"""Weakest component, as a share of the strongest, that counts as above the noise."""
+"""Weakest spectral component above the noise, as a share of the strongest one."""
 
 LINE_BINS = 6
-"""Bins above LINE that a single sine fills behind a Blackman-Harris window."""
+"""Number of bins above LINE of a single sine under a Blackman-Harris window."""
 
 NEAR = 0.02
-"""Two levels of a signal within this share of its span are the same place."""
+"""Largest difference of two equal levels of a signal, as a share of its span."""
 
 FAR = 0.2
-"""Two levels further apart than this share of a span are surely not the same place."""
+"""Least difference of two levels that surely differ, as a share of the span."""
 
 
 def record_warnings(
@@ -34,33 +34,33 @@ def record_warnings(
     order: int = 0,
     hysteresis: bool = True,
 ) -> list[str]:
-    """Return what in ``record`` stands against a fit, a sentence each.
+    """Return warnings about ``record``, a sentence each; none for a good record.
 
-    ``train`` and ``validate``: the samples to fit and to judge on. ``order``: how many
-    parameters of linear dynamics the model has; an input excites them all if it holds
-    half as many frequencies (Ljung, System Identification, 2nd ed., 13.2).
-    ``hysteresis``: whether the model has some, and so needs full cycles from a known
-    state. A good record gives an empty list.
+    ``train`` and ``validate`` are the samples to fit and to validate on. ``order`` is
+    the number of parameters of the linear dynamics: an input excites them all if it
+    holds half as many frequencies (Ljung, System Identification, 2nd ed., 13.2). A
+    model with ``hysteresis`` needs full cycles from a known initial state.
     """
-    found = [
+    warnings = [
         *_clipping(record),
-        *(_hysteresis_cycles(record, train) if hysteresis else ()),
-        *_excitation(record, train, order, hysteresis),
-        *_start(record, hysteresis),
+        *(_few_cycles(record, train) if hysteresis else ()),
+        *_poor_excitation(record, train, order, hysteresis),
+        *_unknown_start(record, hysteresis),
     ]
     if validate.start < train.stop and train.start < validate.stop:
-        found.append(
+        warnings.append(
             "the validation part shares samples with the training part: "
             "its error is no measure of prediction"
         )
-    return found
+    return warnings
 
 
 def cycles(input: np.ndarray) -> int:
     """Return the number of full cycles in ``input`` [samples].
 
     A cycle is a rise and a fall between reversals, each of at least STROKE of the
-    span. The first and the last count for as much as they cover of their neighbour.
+    span. The first and the last stroke count in proportion to the stroke next to them,
+    as one stroke at most.
     """
     ends = input[_reversals(input, STROKE * np.ptp(input))]
     strokes = np.abs(np.diff(ends))
@@ -68,43 +68,43 @@ def cycles(input: np.ndarray) -> int:
         return 0
     first = min(1.0, strokes[0] / strokes[1])
     last = min(1.0, strokes[-1] / strokes[-2])
-    # A twentieth more, so that noise at the ends does not take a cycle away.
+    # Add a twentieth, so that noise at the ends does not remove a cycle.
     return int((first + strokes.size - 2 + last) / 2.0 + 0.05)
 
 
 def _reversals(signal: np.ndarray, least: float) -> list[int]:
-    """Return where strokes of at least ``least`` begin and end.
+    """Return the samples at which strokes of at least ``least`` begin and end.
 
-    Shorter ones are part of the longer stroke around them.
+    A shorter stroke is part of the longer stroke around it.
     """
     steps = np.sign(np.diff(signal))
     moving = np.flatnonzero(steps)
     turns = moving[np.flatnonzero(np.diff(steps[moving])) + 1]
-    found, low, high, way = [0], 0, 0, 0
+    reversals, low, high, direction = [0], 0, 0, 0
     for i in map(int, (*turns, len(signal) - 1)):
         low = i if signal[i] < signal[low] else low
         high = i if signal[i] > signal[high] else high
-        if way <= 0 and signal[i] - signal[low] >= least:
-            found += [low] if way else []
-            way, high = 1, i
-        elif way >= 0 and signal[high] - signal[i] >= least:
-            found += [high] if way else []
-            way, low = -1, i
-    return [*found, high if way > 0 else low]
+        if direction <= 0 and signal[i] - signal[low] >= least:
+            reversals += [low] if direction else []
+            direction, high = 1, i
+        elif direction >= 0 and signal[high] - signal[i] >= least:
+            reversals += [high] if direction else []
+            direction, low = -1, i
+    return [*reversals, high if direction > 0 else low]
 
 
-def _named(side: str, columns: np.ndarray) -> list[tuple[str, np.ndarray]]:
+def _labelled(side: str, columns: np.ndarray) -> list[tuple[str, np.ndarray]]:
     if columns.shape[1] == 1:
         return [(side, columns[:, 0])]
     return [(f"{side} {i}", column) for i, column in enumerate(columns.T)]
 
 
 def _clipping(record: Record) -> Iterator[str]:
-    inputs = zip(_named("input", record.inputs), record.input_units, strict=True)
-    outputs = zip(_named("output", record.outputs), record.output_units, strict=True)
+    inputs = zip(_labelled("input", record.inputs), record.input_units, strict=True)
+    outputs = zip(_labelled("output", record.outputs), record.output_units, strict=True)
     for (name, signal), unit in (*inputs, *outputs):
         for level in (signal.min(), signal.max()):
-            runs = _clipped(signal, level)
+            runs = _clipped_runs(signal, level)
             if runs:
                 start, stop = max(runs, key=lambda run: run[1] - run[0])
                 yield (
@@ -114,31 +114,32 @@ def _clipping(record: Record) -> Iterator[str]:
                 )
 
 
-def _clipped(signal: np.ndarray, level: float) -> list[tuple[int, int]]:
-    """Return the runs [start, stop) of ``level`` that no smooth signal would have.
+def _clipped_runs(signal: np.ndarray, level: float) -> list[tuple[int, int]]:
+    """Return the runs [start, stop) at ``level`` that are due to clipping.
 
-    A parabola that stays within one resolution step q for n samples falls by 9 q at
-    most over n more; a clipped signal comes and goes at its usual pace, and, unlike a
-    held one, over more than one sample.
+    A smooth signal is a parabola near its extreme. If it stays within one resolution
+    step q for n samples, it falls by at most 9 q over the next n samples. A clipped
+    signal reaches and leaves the level at its usual rate. A held signal does so within
+    one sample, a clipped signal over several samples.
     """
     resolution = np.diff(np.unique(signal)).min()
     pace = np.mean(np.abs(np.diff(signal)))
     reach = max(3, int(np.ceil(20.0 * resolution / pace)))
     fall = max(12.0 * resolution, 0.1 * pace * reach)
     edges = np.diff(np.concatenate([[0], signal == level, [0]]).astype(int))
-    found = []
+    runs = []
     for start, stop in zip(*map(np.flatnonzero, (edges > 0, edges < 0)), strict=True):
         if stop - start < reach or start < reach or stop + reach > signal.size:
             continue
         far = np.abs(signal[[start - reach, stop - 1 + reach]] - level)
         near = np.abs(signal[[start - 1, stop]] - level)
         if np.all((far > fall) & (far > 2.0 * near)):
-            found.append((int(start), int(stop)))
-    return found
+            runs.append((int(start), int(stop)))
+    return runs
 
 
-def _hysteresis_cycles(record: Record, train: slice) -> Iterator[str]:
-    for name, input in _named("input", record.inputs[train]):
+def _few_cycles(record: Record, train: slice) -> Iterator[str]:
+    for name, input in _labelled("input", record.inputs[train]):
         count = cycles(input)
         if count < CYCLES:
             yield (
@@ -148,10 +149,10 @@ def _hysteresis_cycles(record: Record, train: slice) -> Iterator[str]:
             )
 
 
-def _excitation(
+def _poor_excitation(
     record: Record, train: slice, order: int, hysteresis: bool
 ) -> Iterator[str]:
-    for name, input in _named("input", record.inputs[train]):
+    for name, input in _labelled("input", record.inputs[train]):
         count = lines(input)
         if 2 * count < order:
             yield (
@@ -169,7 +170,7 @@ def _excitation(
 
 
 def lines(input: np.ndarray) -> int:
-    """Return how many sines the spectrum of ``input`` [samples] amounts to."""
+    """Return the number of sines in the spectrum of ``input`` [samples]."""
     window = scipy.signal.windows.blackmanharris(input.size)
     spectrum = np.abs(np.fft.rfft((input - np.mean(input)) * window))
     strong = np.concatenate([[0], spectrum > LINE * spectrum.max(), [0]])
@@ -178,10 +179,10 @@ def lines(input: np.ndarray) -> int:
     return int(np.sum(np.maximum(1, widths // LINE_BINS)))
 
 
-def _start(record: Record, hysteresis: bool) -> Iterator[str]:
-    """Yield what speaks against rest, or a known loading, before sample 0."""
+def _unknown_start(record: Record, hysteresis: bool) -> Iterator[str]:
+    """Yield warnings if rest or a known loading before sample 0 is doubtful."""
     inputs, outputs = record.inputs, record.outputs
-    for name, input in _named("input", inputs):
+    for name, input in _labelled("input", inputs):
         if record.period is None and _begins_in_motion(input):
             yield (
                 f"{name} moves from sample 0 on, at {input[0]:g}, well inside its "
@@ -189,7 +190,7 @@ def _start(record: Record, hysteresis: bool) -> Iterator[str]:
             )
     left = np.any(np.abs(inputs - inputs[0]) > NEAR * np.ptp(inputs, axis=0), axis=1)
     rest = int(np.argmax(left))
-    for name, output in _named("output", outputs):
+    for name, output in _labelled("output", outputs):
         before, after = output[: rest // 3], output[rest - rest // 3 : rest]
         if before.size < 3:
             continue
@@ -200,29 +201,30 @@ def _start(record: Record, hysteresis: bool) -> Iterator[str]:
                 f"while the input rests until sample {rest}"
             )
     if hysteresis and inputs.shape[1] == 1:
-        input_end = _place(inputs[:, 0])
-        for name, output in _named("output", outputs):
+        input_start = _start_fraction(inputs[:, 0])
+        for name, output in _labelled("output", outputs):
             rising = np.corrcoef(inputs[:, 0], output)[0, 1] > 0
-            place = _place(output if rising else -output)
-            end = round(input_end)
-            if abs(input_end - end) < NEAR and abs(place - end) > FAR:
+            output_start = _start_fraction(output if rising else -output)
+            end = round(input_start)
+            if abs(input_start - end) < NEAR and abs(output_start - end) > FAR:
+                away = 100.0 * abs(output_start - end)
                 yield (
-                    f"{name} starts {100.0 * abs(place - end):.0f} % of its range away "
+                    f"{name} starts {away:.0f} % of its range away "
                     f"from the end where input starts: its initial loading is unknown"
                 )
 
 
-def _place(signal: np.ndarray) -> float:
-    """Return where in its range ``signal`` starts: 0 lowest, 1 highest."""
+def _start_fraction(signal: np.ndarray) -> float:
+    """Return the first value of ``signal`` as a fraction of its range, from 0 to 1."""
     return float((signal[0] - signal.min()) / np.ptp(signal))
 
 
 def _begins_in_motion(input: np.ndarray) -> bool:
-    """Whether ``input`` starts on its way: neither from zero nor from a reversal."""
+    """Return whether ``input`` starts in motion, neither at zero nor at a reversal."""
     span = np.ptp(input)
-    if abs(input[0]) < NEAR * span or not NEAR < _place(input) < 1.0 - NEAR:
+    if abs(input[0]) < NEAR * span or not NEAR < _start_fraction(input) < 1.0 - NEAR:
         return False
-    # Over so many samples that noise does not pass for motion.
+    # A lag is long enough when the signal moves by more than the noise within it.
     for lag in 2 ** np.arange(int(np.log2(input.size / 4)) + 1):
         usual = np.median(np.abs(input[lag:] - input[:-lag]))
         if usual > 2.5 * NEAR * span:

@@ -1,4 +1,4 @@
-"""Tables of text: rows of cells, in whatever dialect, into columns of numbers."""
+"""Parser of text tables: rows of cells in any dialect to columns of numbers."""
 
 import codecs
 import csv
@@ -9,23 +9,24 @@ from typing import NamedTuple
 import numpy as np
 
 SEPARATORS = (";", "\t", ",", None)
-"""What may stand between two cells; None: blanks. The first that fits as well wins."""
+"""Separators of cells, None for blanks. Of equally good ones the first is taken."""
 
 DECIMALS = (".", ",")
 
 COMMENT = ("#", "%")
-"""Lines that begin so are no data."""
+"""First characters of comment lines."""
 
 
 class ContentError(Exception):
-    """What is wrong with a file's content, in words; the file is named elsewhere."""
+    """Error in the content of a file; the caller adds the name of the file."""
 
 
 class Column(NamedTuple):
     """A column of a file.
 
-    ``values`` [samples]; ``unit`` and ``dt`` (s) where the file holds them; ``fault``:
-    what keeps ``values`` from being numbers, of no matter until the column is used.
+    ``values`` [samples]; ``unit`` and ``dt`` (s) if the file holds them. ``fault``
+    describes the first cell that is not a number; it matters only if the column is
+    used.
     """
 
     values: np.ndarray
@@ -38,26 +39,26 @@ Columns = dict[str, Column]
 
 
 def decoded(content: bytes) -> str:
-    """Return text in UTF-8, in UTF-16 with its mark, or in a Western Windows code page.
+    """Decode text in UTF-8, UTF-16 with a byte order mark, or Windows code page 1252.
 
-    Raises ValueError for what is no text.
+    Raises ValueError for content that is not text.
     """
     marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
         text = content.decode("utf-16" if marked else "utf-8-sig")
     except UnicodeDecodeError:
-        text = content.decode("cp1252")  # where "µ" is one byte
+        text = content.decode("cp1252")  # "µ" is one byte there
     if "\0" in text:
         raise ValueError("a zero byte is no text")
     return text
 
 
 def parsed(text: str) -> Columns:
-    """Return the columns of a text table; its dialect is found from its lines.
+    """Return the columns of a text table; infer its dialect from its lines.
 
-    Cells are separated by ``;``, tabs, commas or blanks, numbers have a point or a
-    comma; a header and a row of units below it may be there or not. Raises ContentError
-    for an empty file, rows of different length, or two columns of one name.
+    Cells are separated by ``;``, tabs, commas or blanks. The decimal sign is a point or
+    a comma. A header and a row of units below it are optional. Raises ContentError for
+    an empty file, rows of different length, or two columns with the same name.
     """
     lines = [
         line
@@ -71,7 +72,7 @@ def parsed(text: str) -> Columns:
 
 
 def table(rows: Sequence[Sequence[str]], decimal: str = ".") -> Columns:
-    """Return the columns of ``rows`` of cells. Raises ContentError as ``parsed``."""
+    """Return the columns of ``rows`` of cells; errors as for ``parsed``."""
     rows = [row for row in rows if any(row)]
     if not rows:
         raise ContentError("the file is empty")
@@ -98,7 +99,7 @@ def table(rows: Sequence[Sequence[str]], decimal: str = ".") -> Columns:
 
 
 def _dialect(lines: Sequence[str]) -> tuple[str | None, str]:
-    """Return separator and decimal sign under which most lines are all numbers."""
+    """Return the separator and decimal sign that make most lines all numbers."""
 
     def score(dialect):
         separator, decimal = dialect
@@ -106,7 +107,7 @@ def _dialect(lines: Sequence[str]) -> tuple[str | None, str]:
             [_numeric(cell, decimal) if cell else None for cell in row]
             for row in _cells(lines, separator)
         ]
-        # An empty cell is a missing number: it neither speaks for nor against.
+        # An empty cell is a missing number, no evidence for or against a dialect.
         full = sum(False not in row for row in rows)
         return full, sum(row.count(True) for row in rows), sum(map(len, rows))
 
@@ -119,7 +120,7 @@ def _cells(lines: Sequence[str], separator: str | None) -> list[list[str]]:
     return list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
 
 
-# A comma becomes a point and a point a comma, so that 1.234,5 is no number.
+# Swap comma and point, so that 1.234,5 is not a number.
 _SWAP = str.maketrans(",.", ".,")
 
 
@@ -136,7 +137,7 @@ def _numeric(cell: str, decimal: str) -> bool:
 
 
 def _mostly_text(row: Sequence[str], decimal: str) -> bool:
-    # One text among numbers is a broken sample, no header and no units.
+    # A single text among numbers is a broken sample, not a header or a unit.
     filled = [cell for cell in row if cell]
     return 2 * sum(_numeric(cell, decimal) for cell in filled) < len(filled)
 

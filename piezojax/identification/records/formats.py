@@ -1,6 +1,7 @@
-"""Files that labs have, each read into columns of numbers by name.
+"""Readers of lab file formats: columns of numbers by name.
 
-Libraries are imported where they are used: a record of one kind needs one of them.
+Libraries are imported in the reader that needs them, so that a file of one format does
+not need the libraries of the others.
 """
 
 from collections.abc import Callable, Iterable
@@ -13,12 +14,12 @@ from .columns import Column, Columns, ContentError, decoded, parsed, table
 
 
 def read_columns(path: Path) -> Columns:
-    """Return the columns of the file ``path``, whose kind its suffix tells (FORMATS).
+    """Read the columns of the file ``path``; its suffix gives its format (FORMATS).
 
-    Scalars and text are no columns. A matrix ``u`` becomes ``u[0]``, ``u[1]``, ...,
-    with time along its longer side; a field of a structure ``s`` becomes ``s.field``.
-    Raises ValueError, in one line, for a file that is missing, of another kind or
-    broken, or whose kind needs a package that is missing.
+    Scalars and text are skipped. A matrix ``u`` becomes ``u[0]``, ``u[1]``, ..., with
+    time along its longer side; a field of a structure ``s`` becomes ``s.field``. Raises
+    ValueError for a file that is missing, broken or of an unknown format, or if the
+    package that reads the format is missing.
     """
     kind = path.suffix.lower()
     if kind not in FORMATS:
@@ -42,7 +43,7 @@ def read_columns(path: Path) -> Columns:
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
             raise ValueError(f"record {path}: {error.strerror}") from None
-        # A library that is fed a broken file may raise anything.
+        # A library may raise any exception on a broken file.
         raise ValueError(
             f"record {path} cannot be read: it is no {form.content}"
         ) from error
@@ -77,11 +78,11 @@ def _hdf5(file: BinaryIO, separator: str = "/") -> Columns:
     found = []
 
     def visit(path, item):
-        # MATLAB keeps text and empty matrices as numbers, and its own tables under #.
-        said = item.attrs
-        text = "MATLAB_empty" in said or said.get("MATLAB_class") == b"char"
+        # MATLAB stores text and empty matrices as numbers, and its own tables under #.
+        attributes = item.attrs
+        text = "MATLAB_empty" in attributes or attributes.get("MATLAB_class") == b"char"
         if isinstance(item, h5py.Dataset) and not text and not path.startswith("#"):
-            unit = _text(said.get("units", said.get("unit")))
+            unit = _text(attributes.get("units", attributes.get("unit")))
             found.append(_spread(path.replace("/", separator), item[()], unit))
 
     with h5py.File(file, "r") as tree:
@@ -112,7 +113,7 @@ def _tdms(file: BinaryIO) -> Columns:
 
 
 def _lvm(file: BinaryIO) -> Columns:
-    # Not `lvm_read.read`: that one leaves a pickle beside the file, and trusts it.
+    # `lvm_read.read` would write a pickle beside the file and load it later.
     from lvm_read import read_str
 
     content = read_str(decoded(file.read()))
@@ -123,7 +124,7 @@ def _lvm(file: BinaryIO) -> Columns:
 
 
 def _segment(segment: dict[str, Any], first: int) -> Columns:
-    """Columns of an LVM segment; ``first``: where its header has the first of them."""
+    """Return the columns of an LVM segment; its header starts with column ``first``."""
     names = segment["Channel names"]
     columns = {}
     for j, (name, values) in enumerate(zip(names, segment["data"].T, strict=False)):
@@ -131,7 +132,7 @@ def _segment(segment: dict[str, Any], first: int) -> Columns:
             dict(enumerate(segment.get(key, ()), start=-first)).get(j)
             for key in ("Y_Unit_Label", "Delta_X")
         )
-        if names.count(name) > 1:  # each channel may have an X_Value of its own
+        if names.count(name) > 1:  # each channel may have its own X_Value
             name = f"{name}[{names[:j].count(name)}]"
         if name != "Comment":
             columns[name] = Column(values, unit or None, dt if dt and dt > 0 else None)
@@ -168,7 +169,7 @@ FORMATS = {
     ".lvm": _Format("LabVIEW measurement file", _lvm),
     ".xlsx": _Format("Excel workbook", _xlsx),
 }
-"""How a file is read, by its suffix; a workbook is read from its first sheet."""
+"""File formats by suffix; of a workbook the first sheet is read."""
 
 
 def _spread(
@@ -200,7 +201,7 @@ def _merged(parts: Iterable[Columns]) -> Columns:
 
 
 def _prefixed(groups: dict[str, Columns]) -> Columns:
-    """Columns of several groups as ``group/name``; of a single one as they are."""
+    """Return columns as ``group/name``, or as ``name`` if there is a single group."""
     groups = {group: columns for group, columns in groups.items() if columns}
     if len(groups) == 1:
         return next(iter(groups.values()))
@@ -212,7 +213,7 @@ def _prefixed(groups: dict[str, Columns]) -> Columns:
 
 
 def _text(value: Any) -> str | None:
-    """Return a file's property if it is text, in whatever way the library gives it."""
+    """Return a property of a file if it is text, as text or bytes, else None."""
     value = np.asarray(value).flat[0] if np.size(value) == 1 else None
     value = value.decode(errors="replace") if isinstance(value, bytes) else value
     return str(value) if isinstance(value, str) else None

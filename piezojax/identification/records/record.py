@@ -1,4 +1,4 @@
-"""A lab's record: time, input, output, read from a file and checked."""
+"""Measured records: input and output columns, read from a file and checked."""
 
 import dataclasses
 import re
@@ -13,16 +13,16 @@ from .formats import read_columns
 from .units import seconds_of, unit_of
 
 Key = str | int
-"""A column's name, or its number from zero."""
+"""Name of a column, or its number from zero."""
 
 SHORTEST = 50
-"""Fewest samples a record may have."""
+"""Least number of samples in a record."""
 
 IS_TIME = re.compile(r"time\b|time_", re.IGNORECASE)
-"""Names of columns that are no signal."""
+"""Pattern of the names of time columns."""
 
 UNIFORM = 1e-3
-"""How far, as a share, time steps may lie from each other to be one sample time."""
+"""Largest relative difference of time steps that count as one sample time."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,13 @@ class Record:
     """A measured record, uniformly sampled.
 
     ``inputs`` [samples, m] and ``outputs`` [samples, p] in ``input_units`` and
-    ``output_units``, one name a column; a single column may be given as [samples] and
-    its unit as one name. ``dt`` in s; ``source``: where it came from; ``period``: the
-    samples of one period where the input repeats itself. Raises ValueError, naming
-    column and sample, for columns of different length, too few samples, numbers that
-    are missing, a column that never changes, or a sample time that is not positive.
+    ``output_units``, one unit a column. A single column may be given as [samples] and
+    its unit as one text. ``dt`` is the sample time in s, ``source`` the origin named in
+    messages, ``period`` the number of samples in a period of a periodic input.
+
+    Raises ValueError, naming column and sample, for columns of different length, too
+    few samples, missing numbers, a constant column, a sample time that is not positive,
+    or a period outside 2..samples.
     """
 
     inputs: np.ndarray
@@ -102,12 +104,12 @@ class Record:
 
     @property
     def input(self) -> np.ndarray:
-        """The input [samples] of a record with one; ValueError if it has several."""
+        """The only input [samples]; ValueError if the record has several."""
         return self._only("input", self.inputs)
 
     @property
     def output(self) -> np.ndarray:
-        """The output [samples] of a record with one; ValueError if it has several."""
+        """The only output [samples]; ValueError if the record has several."""
         return self._only("output", self.outputs)
 
     def _only(self, side: str, columns: np.ndarray) -> np.ndarray:
@@ -130,16 +132,16 @@ class Record:
 
     @property
     def spans(self) -> np.ndarray:
-        """Largest less smallest of each output [p]."""
+        """Range of each output [p], largest minus smallest value."""
         return np.ptp(self.outputs, axis=0)
 
     @property
     def span(self) -> float:
-        """Largest less smallest of the only output."""
+        """Range of the only output, largest minus smallest value."""
         return float(np.ptp(self.output))
 
     def until(self, stop: int) -> "Record":
-        """Return the record of the first ``stop`` samples; ValueError as the record."""
+        """Return the first ``stop`` samples as a record; errors as for Record."""
         return dataclasses.replace(
             self,
             inputs=self.inputs[:stop],
@@ -150,7 +152,7 @@ class Record:
 
     @property
     def time(self) -> np.ndarray:
-        """Sample instants from 0, s."""
+        """Sample instants from 0, in s."""
         return np.arange(self.samples) * self.dt
 
 
@@ -164,26 +166,26 @@ def read_record(
     period: int | None = None,
     resample: float | None = None,
 ) -> Record:
-    """Read a record from a file of any kind in ``formats.FORMATS``.
+    """Read a record from a file in one of ``formats.FORMATS``.
 
     ``time``, ``input`` and ``output`` are column names or zero-based numbers; several
     inputs or outputs are a sequence of them, or one text with commas. The sample time
-    is that of the column ``time``, or ``rate`` (Hz), or what the file itself says of
-    its channels; those that are there must agree within 0.1 %. Units are those the file
-    holds, or stand in names such as ``displacement_um`` or ``drive [V]``. ``period``:
-    see Record, in samples of the record returned. ``resample`` (Hz) puts the columns on
-    a uniform grid by straight lines between the samples, whatever the steps of time.
+    comes from the column ``time``, from ``rate`` (Hz) or from the channel properties in
+    the file; if several of these are known, they must agree within 0.1 %. Units come
+    from the file or from column names such as ``displacement_um`` or ``drive [V]``.
+    ``period`` is that of Record, in samples of the returned record. ``resample`` (Hz)
+    interpolates the columns linearly on a uniform grid; time steps may then be uneven.
 
     Raises ValueError, naming the column and the sample, for a file that cannot be read,
     a missing column, missing numbers, unsorted time, uneven time without ``resample``,
-    sample times that contradict each other, or a record that is too short.
+    contradicting sample times, or a record that is too short.
     """
     path = Path(path)
     columns = read_columns(path)
     try:
-        clock = _named(columns, [] if time is None else [time], "time")
-        inputs = _named(columns, input, "input")
-        outputs = _named(columns, output, "output")
+        clock = _column_names(columns, [] if time is None else [time], "time")
+        inputs = _column_names(columns, input, "input")
+        outputs = _column_names(columns, output, "output")
         values = _numbers(columns, {"time": clock, "input": inputs, "output": outputs})
         steps = {f"column {n!r}": columns[n].dt for n in inputs + outputs}
         if rate is not None:
@@ -193,7 +195,7 @@ def read_record(
             instants = values[name] * seconds_of(name, columns[name])
             step = _time_step(instants, even=resample is None)
             steps = {f"column {name!r}": step} | steps
-        dt = _agreed(steps)
+        dt = _common_step(steps)
         for role, names in (("input", inputs), ("output", outputs)):
             _check_signals(names, role)
         if resample is not None:
@@ -221,8 +223,10 @@ def _check_signals(names: list[str], role: str) -> None:
             )
 
 
-def _named(columns: Columns, wanted: Key | Sequence[Key], role: str) -> list[str]:
-    """Return the names of the columns that ``wanted`` names or counts."""
+def _column_names(
+    columns: Columns, wanted: Key | Sequence[Key], role: str
+) -> list[str]:
+    """Return the names of the columns ``wanted``, given by name or number."""
     if isinstance(wanted, str) and wanted not in columns and "," in wanted:
         wanted = [key.strip() for key in wanted.split(",")]
     names = list(columns)
@@ -241,7 +245,7 @@ def _named(columns: Columns, wanted: Key | Sequence[Key], role: str) -> list[str
 
 
 def _numbers(columns: Columns, roles: dict[str, list[str]]) -> dict[str, np.ndarray]:
-    """Return the columns named for ``roles`` as finite floats of one length."""
+    """Return the columns of all ``roles`` as finite floats of one length."""
     values, role_of = {}, {}
     for role, name in ((role, name) for role, names in roles.items() for name in names):
         if name in role_of:
@@ -277,7 +281,7 @@ def _above_zero(value: float, name: str) -> float:
 
 
 def _time_step(time: np.ndarray, even: bool) -> float:
-    """Return the mean step of an increasing and, if so asked, even time axis, s."""
+    """Return the mean step in s of an increasing time axis; check it for ``even``."""
     if time.size < 2:
         raise ContentError(f"{time.size} samples; at least {SHORTEST} are needed")
     steps = np.diff(time)
@@ -295,8 +299,8 @@ def _time_step(time: np.ndarray, even: bool) -> float:
     return float((time[-1] - time[0]) / (time.size - 1))
 
 
-def _agreed(steps: dict[str, float | None]) -> float:
-    """Return the sample time, s, that all who know it say."""
+def _common_step(steps: dict[str, float | None]) -> float:
+    """Return the sample time in s; check that all known values agree."""
     known = [(who, step) for who, step in steps.items() if step is not None]
     if not known:
         raise ContentError("name the time column, or give its rate in Hz")
@@ -313,9 +317,9 @@ def _agreed(steps: dict[str, float | None]) -> float:
 def _resampled(
     values: dict[str, np.ndarray], instants: np.ndarray, rate: float
 ) -> tuple[dict[str, np.ndarray], float]:
-    """Return ``values`` on a uniform grid of ``rate``, Hz, and its step, s."""
+    """Return ``values`` on a uniform grid of ``rate`` (Hz), and the step in s."""
     dt = 1.0 / _above_zero(rate, "resample")
-    # A hair more, so that rounding does not cost the last sample.
+    # The factor keeps the last sample despite rounding.
     count = int((instants[-1] - instants[0]) / dt * (1.0 + 1e-12)) + 1
     grid = instants[0] + dt * np.arange(count)
     return {name: np.interp(grid, instants, v) for name, v in values.items()}, dt

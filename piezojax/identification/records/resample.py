@@ -1,4 +1,4 @@
-"""Periodic records: the mean over their periods, and samples between their samples."""
+"""Periodic records: averaging over periods, and resampling to a finer grid."""
 
 from dataclasses import replace
 
@@ -10,9 +10,10 @@ from .record import Record
 def average_periods(record: Record, skip: int = 1) -> Record:
     """Return the mean of the record's periods after the first ``skip``.
 
-    The first holds the transient from rest; averaging P periods divides the sensor's
-    noise by sqrt(P) and keeps all that repeats. Samples after the last whole period are
-    left out. Raises ValueError for a record without ``period``, or too few periods.
+    The first period holds the transient from rest. Averaging P periods divides the
+    sensor noise by sqrt(P) and keeps the periodic part. Samples after the last whole
+    period are left out. Raises ValueError for a record without ``period``, or if
+    ``skip`` leaves no whole period.
     """
     period = record.period
     if period is None:
@@ -34,7 +35,7 @@ def average_periods(record: Record, skip: int = 1) -> Record:
 def whole_periods(record: Record, train: slice) -> Record:
     """Return the samples ``train`` of a periodic record, cut to whole periods.
 
-    Raises ValueError for a record without ``period`` or a part without a whole one.
+    Raises ValueError for a record without ``period`` or a part below one period.
     """
     if record.period is None:
         raise ValueError(f"{record.source}: this method needs the record's period")
@@ -49,13 +50,14 @@ def whole_periods(record: Record, train: slice) -> Record:
 
 
 def resample(record: Record, factor: int = 1) -> Record:
-    """Return ``record``, one period, with ``factor`` samples for each of its own.
+    """Resample ``record``, one period, to ``factor`` times its sampling rate.
 
-    For an excitation that is smooth between its samples (a band-limited multisine) and
-    models that hold their input: output k is that at the instant k, input k the mean
-    over the sample that starts there. Both are exact for a periodic signal without
-    content from half the sampling rate up. At ``factor`` 1 only the inputs change.
-    Raises ValueError if the record is not exactly one period or ``factor`` is below 1.
+    The excitation must be smooth between its samples (a band-limited multisine), and
+    the model must hold its input over a sample. Output k is the value at the instant k.
+    Input k is the mean over the sample that starts at the instant k. Both are exact for
+    a periodic signal without content at or above half the sampling rate. With a
+    ``factor`` of 1 only the inputs change. Raises ValueError if the record is not
+    exactly one period or ``factor`` is below 1.
     """
     if record.period != record.samples:
         raise ValueError(
@@ -70,15 +72,15 @@ def resample(record: Record, factor: int = 1) -> Record:
     held = np.exp(1j * angle) * np.sinc(angle / np.pi)
     return replace(
         record,
-        inputs=_through(held, record.inputs, samples),
-        outputs=_through(np.ones_like(angle), record.outputs, samples),
+        inputs=_filtered(held, record.inputs, samples),
+        outputs=_filtered(np.ones_like(angle), record.outputs, samples),
         dt=record.dt / factor,
         period=samples,
     )
 
 
-def _through(response: np.ndarray, columns: np.ndarray, samples: int) -> np.ndarray:
+def _filtered(response: np.ndarray, columns: np.ndarray, samples: int) -> np.ndarray:
     spectrum = response * np.fft.rfft(columns, axis=0)
     if samples > len(columns) and len(columns) % 2 == 0:
-        spectrum[-1] *= 0.5  # half the sampling rate, now with its mirror image
+        spectrum[-1] *= 0.5  # half the sampling rate: shared with its mirror image
     return np.fft.irfft(spectrum, samples, axis=0) * (samples / len(columns))

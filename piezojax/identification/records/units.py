@@ -1,11 +1,11 @@
-"""Units of a file's columns, from the file or from the names of the columns."""
+"""Units of columns, from the file or from the column names."""
 
 import re
 
 from .columns import Column, ContentError
 
-# In brackets anything; after a blank or an underscore a unit proper: `drive_raw` is in
-# no "raw".
+# Any text in brackets is a unit. After a blank or an underscore only known units count:
+# the unit of `drive_raw` is not "raw".
 _UNIT = re.compile(
     r"[\[(]\s*([^\])]+?)\s*[\])]\s*$"
     r"|[_\s]([fpnumk]?(?:V|A|m|N|g|s|rad|deg|Hz)|sec|min|h|d|arcsec|counts)$"
@@ -17,7 +17,7 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 def unit_of(name: str, column: Column) -> str | None:
-    """Return the unit that the file holds, or that in ``drive_V`` or ``drive [V]``."""
+    """Return the unit from the file, or from a name as ``drive_V`` or ``drive [V]``."""
     unit = _ascii(column.unit or "").strip(" []()")
     if not unit:
         found = _UNIT.search(_ascii(re.sub(r"\[\d+\]$", "", name)))
@@ -30,7 +30,7 @@ def _ascii(text: str) -> str:
 
 
 def seconds_of(name: str, column: Column) -> float:
-    """Return the unit of a time column, s. Raises ContentError for one unknown."""
+    """Return the unit of a time column in s; raise ContentError if it is unknown."""
     unit = unit_of(name, column) or "s"
     if unit not in _SECONDS:
         raise ContentError(
