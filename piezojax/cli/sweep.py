@@ -15,7 +15,7 @@ from .terminal import Bar
 
 # JAX and what needs it are imported by the bodies: --help waits for none of it.
 if TYPE_CHECKING:
-    from ..sweeping.sweeper import Swept
+    from ..sweeping.sweeper import SweepResult
 
 
 def _shard(context: click.Context, option: click.Parameter, text: str) -> tuple:
@@ -66,7 +66,7 @@ def main(
 
     def body(console: Console) -> None:
         from ..report.sweep_maps import write_pictures
-        from ..sweeping.cluster import client_of
+        from ..sweeping.cluster import dask_client
         from ..sweeping.sweeper import read_swept, run_sweep
 
         if shard != (1, 1) and out is None:
@@ -78,14 +78,14 @@ def main(
                 bar.stage(f"reading {path.name}")
                 case = read_swept(path, seed=seed, samples=samples)
                 folder = out or numbered_folder(RESULTS / path.stem)
-                with nullcontext() if dask is None else client_of(dask) as client:
-                    swept = run_sweep(
+                with nullcontext() if dask is None else dask_client(dask) as client:
+                    result = run_sweep(
                         case, folder, shard=shard, client=client, progress=bar
                     )
-                if swept.finished:
+                if result.finished:
                     bar.finish()
                     bar.stage("drawing")
-                    write_pictures(swept.path, folder)
+                    write_pictures(result.path, folder)
         except KeyboardInterrupt:
             if folder is None or not folder.exists():
                 raise
@@ -95,31 +95,31 @@ def main(
                 err=True,
             )
             raise SystemExit(INTERRUPTED) from None
-        _report(swept, folder, shard, console)
+        _report(result, folder, shard, console)
 
     run(quiet, body)
 
 
 def _report(
-    swept: "Swept", folder: Path, shard: tuple[int, int], console: Console
+    result: "SweepResult", folder: Path, shard: tuple[int, int], console: Console
 ) -> None:
     from ..report.sweep_maps import best_table
 
-    if swept.finished:
-        console.print(best_table(swept.path))
-    if swept.simulated:
-        rate = swept.lane_steps / swept.core_s
+    if result.finished:
+        console.print(best_table(result.path))
+    if result.simulated:
+        rate = result.lane_steps / result.core_s
         console.print(
-            f"{swept.lane_steps:.3g} samples in {swept.wall_s:.1f} s, "
-            f"{swept.core_s:.3g} core-seconds of simulating: {rate:.3g} samples a "
+            f"{result.lane_steps:.3g} samples in {result.wall_s:.1f} s, "
+            f"{result.core_s:.3g} core-seconds of simulating: {rate:.3g} samples a "
             "second and core",
             soft_wrap=True,
         )
-    if swept.finished:
-        console.print(f"results in {folder}, data set {swept.path}", soft_wrap=True)
+    if result.finished:
+        console.print(f"results in {folder}, data set {result.path}", soft_wrap=True)
     else:
         console.print(
-            f"shard {shard[0]}/{shard[1]} is there, {swept.chunks} chunks; the data "
+            f"shard {shard[0]}/{shard[1]} is there, {result.chunks} chunks; the data "
             f"set is merged when the other shards are in {folder}, too",
             soft_wrap=True,
         )

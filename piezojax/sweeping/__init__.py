@@ -1,6 +1,6 @@
-"""Maps of what a loop does over parameters, plants and references."""
+"""Sweeps: tracking figures of a loop over parameters, plants and references."""
 
-from .sweeper import Swept as Swept
+from .sweeper import SweepResult as SweepResult
 from .sweeper import read_swept as read_swept
 from .sweeper import run_sweep as run_sweep
 from .sweeper import sweep as sweep

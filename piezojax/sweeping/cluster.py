@@ -1,4 +1,4 @@
-"""Chunks on a cluster of Dask workers: the same program in other processes."""
+"""Simulation of chunks on a cluster of Dask workers."""
 
 import hashlib
 import logging
@@ -11,24 +11,26 @@ import jax
 
 from ..core.runtime import simulate_side_by_side
 from ..study import Case
-from .local import Done
+from .local import FinishedChunk
 from .simulator import Simulator
 
 if TYPE_CHECKING:
     from distributed import Client
 
-AHEAD = 2
-"""Chunks handed to each worker: one at work, one waiting."""
+CHUNKS_PER_WORKER = 2
+"""Chunks submitted to each worker: one running, one waiting."""
 
 RETRIES = 10
-"""How often a chunk is tried anew after its worker has died under it."""
+"""Largest number of retries of a chunk whose worker died."""
 
 
 @contextmanager
-def client_of(where: str) -> Iterator["Client"]:
-    """Give a client of the scheduler at an address, or of so many new local workers.
+def dask_client(where: str) -> Iterator["Client"]:
+    """Connect a Dask client; close it on exit.
 
-    Raises ValueError if there is none, or the extra ``cluster`` is not installed.
+    ``where`` is the address of a scheduler, or the number of local workers to start.
+    Raises ValueError if no scheduler answers, if the number is 0, or if the extra
+    ``cluster`` is not installed.
     """
     try:
         from dask.config import set as dask_option
@@ -47,7 +49,7 @@ def client_of(where: str) -> Iterator["Client"]:
         return
     if int(where) < 1:
         raise ValueError(f"--dask {where}: it takes at least 1 worker")
-    # Spawned: JAX has threads, and a fork of them may hang.
+    # Spawned, because JAX has threads and a forked copy of them may hang.
     with (
         dask_option({"distributed.worker.multiprocessing-method": "spawn"}),
         LocalCluster(
@@ -65,24 +67,26 @@ def client_of(where: str) -> Iterator["Client"]:
 @contextmanager
 def cluster_chunks(
     client: "Client", simulator: Simulator, chunks: Sequence[int]
-) -> Iterator[Iterator[Done]]:
-    """Give an iterator over ``chunks`` as workers get them done, in any order.
+) -> Iterator[Iterator[FinishedChunk]]:
+    """Yield an iterator over the finished ``chunks``, in any order.
 
-    What a worker that dies had at work goes to another one.
+    If a worker dies, its chunks go to another one. On exit, unfinished chunks are
+    cancelled.
     """
     from distributed import wait
 
-    synchronous: Any = client  # its methods return coroutines for others
+    # The annotation of Client includes coroutines, which an asynchronous one returns.
+    synchronous: Any = client
 
     case = _pickled(simulator.case)
     running: set[Any] = set()
-    finished: Any = wait
+    wait_for: Any = wait
 
-    def iterate() -> Iterator[Done]:
+    def iterate() -> Iterator[FinishedChunk]:
         nonlocal running
         todo = iter(chunks)
         while True:
-            room = AHEAD * max(1, sum(synchronous.nthreads().values()))
+            room = CHUNKS_PER_WORKER * max(1, sum(synchronous.nthreads().values()))
             while len(running) < room:
                 chunk = next(todo, None)
                 if chunk is None:
@@ -95,7 +99,7 @@ def cluster_chunks(
             if not running:
                 return
             with client.as_current():
-                done, running = finished(running, return_when="FIRST_COMPLETED")
+                done, running = wait_for(running, return_when="FIRST_COMPLETED")
             for future in done:
                 yield future.result()
 
@@ -111,8 +115,8 @@ def _pickled(case: Case) -> bytes:
     return cloudpickle.dumps(case)
 
 
-def simulate_chunk(case: bytes, chunk: int) -> Done:
-    """Simulate a chunk of a pickled case; for a worker."""
+def simulate_chunk(case: bytes, chunk: int) -> FinishedChunk:
+    """Simulate a chunk of a pickled case in a worker process."""
     key = hashlib.sha256(case).digest()
     if key not in _simulators:
         import cloudpickle
@@ -128,4 +132,4 @@ def simulate_chunk(case: bytes, chunk: int) -> Done:
 
 
 _simulators: dict[bytes, Simulator] = {}
-"""That of the last sweep, for as long as the worker lives: compiled once."""
+"""Compiled simulator of the latest sweep of this worker, by the hash of the case."""

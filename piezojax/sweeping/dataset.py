@@ -1,4 +1,4 @@
-"""All chunks of a sweep in one labelled netCDF file."""
+"""Labelled netCDF file with all chunks of a sweep."""
 
 import json
 import math
@@ -28,33 +28,33 @@ LONG_NAMES = {
 }
 """Meaning of each variable."""
 
-_ERRORS = ("rms_error", "peak_error", "displacement", "followed")
-_PLAIN = ("saturated", SENSITIVITY)
+_DISPLACEMENTS = ("rms_error", "peak_error", "displacement", "followed")
+_DIMENSIONLESS = ("saturated", SENSITIVITY)
 
 
 def unit_of(name: str, axes: bool) -> str:
-    """Return the unit of a variable; on a stage with axes each has its own."""
-    if name in _PLAIN:
+    """Return the unit of a variable; on a stage with ``axes`` each axis has its own."""
+    if name in _DIMENSIONLESS:
         return "1"
     if axes:
-        # Commands of such a stage are in the unit of the axis, too.
+        # The commands of a multi-axis stage are in the unit of the axis, too.
         return "that of the axis"
-    return "um" if name in _ERRORS else "V"
+    return "um" if name in _DISPLACEMENTS else "V"
 
 
 def boxes(
     shape: tuple[int, ...], start: int, stop: int
 ) -> Iterator[tuple[tuple[slice, ...], int, int]]:
-    """Cut the points ``start`` to ``stop`` of a grid, in C order, into boxes.
+    """Split the points ``start`` to ``stop`` of a grid, in C order, into boxes.
 
-    Yields each box as slices, with its first point and the one after its last.
+    Yields each box as slices, with its first point and the point after its last.
     """
     if not shape or start >= stop:
         return
     inner = math.prod(shape[1:])
     row, rest = divmod(start, inner)
     if rest or stop - start < inner:
-        # A part of one row, then what follows it.
+        # The first part covers at most one row.
         end = min(stop, (row + 1) * inner)
         for box, a, b in boxes(shape[1:], rest, end - row * inner):
             yield (slice(row, row + 1), *box), a + row * inner, b + row * inner
@@ -67,7 +67,10 @@ def boxes(
 
 
 class Merger:
-    """Writer of the data set of a sweep, chunk by chunk, in constant memory."""
+    """Writer of the data set of a sweep.
+
+    It writes chunk by chunk, so that its memory does not grow with the sweep.
+    """
 
     def __init__(self, simulator: Simulator, store: Store):
         self._simulator, self._store = simulator, store
@@ -87,7 +90,7 @@ class Merger:
             self.sizes["time"] = times.size
 
     def merge(self) -> None:
-        """Write the data set, in one move.
+        """Write the data set atomically.
 
         Raises DamagedError, and writes nothing, if chunks are damaged.
         """
@@ -96,17 +99,19 @@ class Merger:
         store, damaged = self._store, []
         with written_elsewhere(store.folder / RESULT) as path:
             with h5netcdf.File(path, "w") as file:
-                self._frame(file)
+                self._write_frame(file)
                 for chunk in range(self._simulator.plan.chunks):
-                    kept = store.read(chunk)
-                    if kept is None:
+                    stored = store.read(chunk)
+                    if stored is None:
                         damaged.append(chunk)
                     else:
-                        self._put(file, chunk, kept[0])
+                        self._write_chunk(file, chunk, stored[0])
             if damaged:
                 raise DamagedError(damaged)
 
-    def _put(self, file: Any, chunk: int, arrays: dict[str, np.ndarray]) -> None:
+    def _write_chunk(
+        self, file: Any, chunk: int, arrays: dict[str, np.ndarray]
+    ) -> None:
         plan = self._simulator.plan
         start, stop = plan.span(chunk)
         for name, array in arrays.items():
@@ -117,8 +122,8 @@ class Merger:
                 values = array[a - start : b - start].reshape(*size, *inner)
                 variable[(*box, *(slice(0, n) for n in inner))] = values
 
-    def _frame(self, file: Any) -> None:
-        """Write everything but the results."""
+    def _write_frame(self, file: Any) -> None:
+        """Write the attributes, coordinates and references; create the variables."""
         simulator, study = self._simulator, self._simulator.case.study
         file.dimensions = self.sizes
         for key, value in {
@@ -132,7 +137,7 @@ class Merger:
             "rate_Hz": study.rate,
         }.items():
             file.attrs[key] = value
-        self._coordinates(file)
+        self._write_coordinates(file)
         names = (*simulator.metrics, *(TRAJECTORIES if simulator.every else ()))
         for name in names:
             self._variable(file, name, self._dimensions(name))
@@ -158,7 +163,7 @@ class Merger:
             variable.attrs["coordinates"] = " ".join(others)
         return variable
 
-    def _coordinates(self, file: Any) -> None:
+    def _write_coordinates(self, file: Any) -> None:
         import h5py
 
         simulator, plan = self._simulator, self._simulator.plan
@@ -195,15 +200,15 @@ class Merger:
 
 
 class DamagedError(Exception):
-    """Damaged chunks, which must be simulated again."""
+    """Some chunks are damaged and must be simulated again."""
 
     def __init__(self, chunks: list[int]):
         super().__init__(f"damaged chunks: {chunks}")
         self.chunks = chunks
 
 
-def merged(folder: Path, fingerprint: str) -> bool:
-    """Return whether ``folder`` holds the data set of this sweep."""
+def is_merged(folder: Path, fingerprint: str) -> bool:
+    """Return whether ``folder`` holds the data set of the sweep ``fingerprint``."""
     import h5netcdf
 
     try:

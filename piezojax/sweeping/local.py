@@ -1,4 +1,4 @@
-"""Chunks on the devices of this machine: a thread for each, one for each CPU core."""
+"""Simulation of chunks on this machine, with a thread for each device or CPU core."""
 
 import os
 import threading
@@ -14,13 +14,13 @@ import numpy as np
 from ..core.runtime import simulate_side_by_side
 from .simulator import Simulator
 
-Done = tuple[int, dict[str, np.ndarray], float]
-"""A chunk, what is kept of it, and the seconds it took."""
+FinishedChunk = tuple[int, dict[str, np.ndarray], float]
+"""Number of a chunk, its results, and its simulation time, s."""
 
 
-def workers() -> list[Any]:
-    """Return a device for each thread: of a CPU one for each core the process has."""
-    together = simulate_side_by_side()
+def worker_devices() -> list[Any]:
+    """Return the device of each thread; a CPU has a thread for each available core."""
+    parallel = simulate_side_by_side()
     devices = jax.local_devices()
     if devices[0].platform != "cpu":
         return devices
@@ -28,21 +28,21 @@ def workers() -> list[Any]:
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    return [devices[i % len(devices)] for i in range(cores if together else 1)]
+    return [devices[i % len(devices)] for i in range(cores if parallel else 1)]
 
 
 @contextmanager
 def local_chunks(
     simulator: Simulator, chunks: Sequence[int], devices: Sequence[Any]
-) -> Iterator[Iterator[Done]]:
-    """Give an iterator over ``chunks`` as ``devices`` get them done, in any order.
+) -> Iterator[Iterator[FinishedChunk]]:
+    """Yield an iterator over the finished ``chunks``, in any order.
 
-    Left early, it ends after the blocks at work.
+    An early exit waits for the running blocks only.
     """
-    stop, free = threading.Event(), list(devices)
+    stop, idle = threading.Event(), list(devices)
 
-    def work(chunk: int) -> Done | None:
-        device = free.pop()
+    def work(chunk: int) -> FinishedChunk | None:
+        device = idle.pop()
         try:
             begin = time.perf_counter()
             arrays = simulator.chunk(chunk, device, stop.is_set)
@@ -50,15 +50,15 @@ def local_chunks(
                 return None
             return chunk, arrays, time.perf_counter() - begin
         finally:
-            free.append(device)
+            idle.append(device)
 
     with ThreadPoolExecutor(len(devices)) as pool:
 
-        def iterate() -> Iterator[Done]:
+        def iterate() -> Iterator[FinishedChunk]:
             todo = iter(chunks)
             running: set[Future] = set()
             while True:
-                # Few wait: results that nobody has taken do not pile up.
+                # A short queue bounds the memory of results that are not yet read.
                 while len(running) < len(devices) + 1:
                     chunk = next(todo, None)
                     if chunk is None:

@@ -1,4 +1,4 @@
-"""Points of a sweep, cut into chunks: a pure function of the study."""
+"""Plan of a sweep: its points and their division into chunks."""
 
 import math
 from collections.abc import Sequence
@@ -18,20 +18,24 @@ from ..study.parameters import check_value
 from ..study.sweep_table import SweepTable, SweptTable
 
 CHUNK_LANE_STEPS = 5e7
-"""Simulated samples of a chunk, plants and references included: most of a second, so
-that an interrupt loses little and writing costs less."""
+"""Simulated samples of a chunk, all plants and references together.
+
+A chunk takes almost a second: an interrupt loses little, and writing costs less than
+simulating.
+"""
 
 CHUNK_BYTES = 64e6
-"""Largest size of the kept results of a chunk in memory, bytes."""
+"""Largest size of the results of a chunk, bytes."""
 
 MOST_CHUNKS = 4096
-"""Largest number of chunks; beyond it chunks grow, as far as memory allows."""
+"""Target for the largest number of chunks; chunks grow to meet it, within
+``CHUNK_BYTES``."""
 
 FEWEST_CHUNKS = 16
 """Smallest number of chunks, so that small sweeps keep several cores busy."""
 
 TRAJECTORIES = ("displacement", "voltage")
-"""Signals of which a study may keep every N-th sample."""
+"""Signals that a sweep may record at every N-th sample."""
 
 
 class Axis(NamedTuple):
@@ -43,15 +47,14 @@ class Axis(NamedTuple):
 
 
 class Plan:
-    """The points of a sweep.
+    """Points of a sweep, which depend on the study alone.
 
-    ``shape`` is that of the grid, or the number of samples. Points are numbered in
-    C order; a chunk holds ``chunk`` of them, in blocks of ``width``. The points depend
-    on the study alone.
+    ``shape`` is the shape of the grid, or the number of random samples. Points are
+    numbered in C order. A chunk holds ``chunk`` points, in blocks of ``width``.
     """
 
     def __init__(self, case: Case):
-        study, table = case.study, swept(case.study)
+        study, table = case.study, sweep_table(case.study)
         self.axes = tuple(_axes(case, table))
         self.method = table.method
         _check_paths(case, self.axes)
@@ -78,12 +81,12 @@ class Plan:
         return max(1, math.ceil(wanted / self.width)) * self.width
 
     def span(self, chunk: int) -> tuple[int, int]:
-        """Return the first point of a chunk and the one after its last."""
+        """Return the first point of a chunk and the point after its last."""
         start = chunk * self.chunk
         return start, min(start + self.chunk, self.points)
 
     def values(self, start: int, stop: int) -> np.ndarray:
-        """Return the parameters of points: an array [points, parameters]."""
+        """Return the parameters of the points in a span, as [points, parameters]."""
         if self._sampled is not None:
             return self._sampled[start:stop]
         places = np.unravel_index(np.arange(start, stop), self.shape)
@@ -94,7 +97,7 @@ class Plan:
         return np.stack(columns, axis=1)
 
     def share(self, shard: tuple[int, int]) -> range:
-        """Return the chunks of shard i of n, counted from 1.
+        """Return the chunks of shard (i, n), the i-th of n, counted from 1.
 
         Raises ValueError for a shard outside 1/n to n/n.
         """
@@ -107,8 +110,8 @@ class Plan:
         return range(number - 1, self.chunks, count)
 
 
-def swept(study: Study) -> SweepTable:
-    """Return the table ``[sweep]``; raise ValueError without one."""
+def sweep_table(study: Study) -> SweepTable:
+    """Return the table ``[sweep]``; raise ValueError if the study has none."""
     if study.sweep is None:
         raise ValueError(
             'the study has no table [sweep]: add method = "grid" and a parameter, as '
@@ -122,41 +125,43 @@ def swept(study: Study) -> SweepTable:
 def references_of(study: Study) -> tuple[str, ...]:
     """Return the references that a sweep follows."""
     table = study.references
-    return swept(study).references or (*table.tune, *table.unseen)
+    return sweep_table(study).references or (*table.tune, *table.unseen)
 
 
 def plants_of(case: Case) -> dict[str, System]:
-    """Return the plants of a sweep by name, the study's own if it names none."""
+    """Return the plants of a sweep by name, by default the plant of the study."""
     own = str(case.study.plant.get("catalog", "own"))
     return dict(case.plants) or {own: case.loop.plant}
 
 
 def runs_of_point(study: Study) -> int:
-    """Return the number of simulations of a point."""
-    plants = len(swept(study).plants) or 1
+    """Return the number of simulations for each point."""
+    plants = len(sweep_table(study).plants) or 1
     return plants * len(references_of(study)) * study.holdout_draws
 
 
 def samples_of(study: Study) -> int:
-    """Return the number of samples of a simulation."""
+    """Return the number of samples of each simulation."""
     return round(study.references.duration * study.rate)
 
 
 def bytes_of_point(study: Study) -> int:
-    """Return the size of the kept results of a point, bytes."""
-    table = swept(study)
-    kept = len(table.metrics)
+    """Return the size of the results of a point, bytes."""
+    table = sweep_table(study)
+    numbers = len(table.metrics)
     if table.every:
-        kept += len(TRAJECTORIES) * -(-samples_of(study) // table.every)
-    return 8 * runs_of_point(study) * kept * study.axis_count
+        numbers += len(TRAJECTORIES) * -(-samples_of(study) // table.every)
+    return 8 * runs_of_point(study) * numbers * study.axis_count
 
 
 def _axes(case: Case, table: SweepTable) -> list[Axis]:
     if table.parameters:
-        return [_axis(case, path, swept) for path, swept in table.parameters.items()]
+        return [
+            _axis(case, path, parameter) for path, parameter in table.parameters.items()
+        ]
     return [
-        Axis(path, replace(one, unit=case.unit(path)))
-        for path, one in case.space.ranges().items()
+        Axis(path, replace(bounds, unit=case.unit(path)))
+        for path, bounds in case.space.ranges().items()
     ]
 
 
@@ -166,27 +171,27 @@ def _axis(case: Case, path: str, table: SweptTable) -> Axis:
         values = np.array(table.values, dtype=float)
         scale = table.scale or "linear"
         return Axis(path, Range(values[0], values[-1], scale, unit=unit), values)
-    wanted = table.range(declared(case.loop, path), where)
-    wanted = replace(wanted, unit=unit)
-    wanted.check(where)
+    bounds = table.range(declared(case.loop, path), where)
+    bounds = replace(bounds, unit=unit)
+    bounds.check(where)
     if table.count is None:
-        return Axis(path, wanted)
-    space = space_of({path: wanted})
+        return Axis(path, bounds)
+    space = space_of({path: bounds})
     unit_points = as_array(np.linspace(0.0, 1.0, table.count)[:, None])
     values = np.array(jax.vmap(space.from_unit)(unit_points))[:, 0]
-    values[[0, -1]] = wanted.lower, wanted.upper
-    return Axis(path, wanted, values)
+    values[[0, -1]] = bounds.lower, bounds.upper
+    return Axis(path, bounds, values)
 
 
 def _samples(table: SweepTable, axes: Sequence[Axis], seed: int) -> np.ndarray:
-    # Half a second to import, which most commands can do without.
+    # Imported here, because the import takes half a second.
     from scipy.stats import qmc
 
     assert table.samples is not None
-    # A stream of its own: noise and ensembles have the others.
+    # A separate random stream; noise and ensembles use the others.
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4,)))
     if table.method == "sobol":
-        # Drawn to a power of two: the first points of a balanced set.
+        # The points are the first ones of a balanced set, whose size is a power of 2.
         power = max(0, math.ceil(math.log2(table.samples)))
         engine = qmc.Sobol(len(axes), rng=generator)
         unit = engine.random_base2(power)[: table.samples]
@@ -197,7 +202,7 @@ def _samples(table: SweepTable, axes: Sequence[Axis], seed: int) -> np.ndarray:
 
 
 def _check_paths(case: Case, axes: Sequence[Axis]) -> None:
-    """Raise ValueError for a path or a bound that one of the loops refuses."""
+    """Raise ValueError for an unknown path or a bound that one of the loops refuses."""
     for name, plant in plants_of(case).items():
         for axis in axes:
             part = axis.path.split(".")[0]

@@ -1,4 +1,4 @@
-"""Simulation of a sweep: one program, called for block after block of points."""
+"""Simulator of a sweep: one compiled program for every block of points."""
 
 import dataclasses
 import threading
@@ -23,13 +23,14 @@ from ..signals.waveforms import time_grid
 from ..study import Case, Stage
 from ..study.sweep_table import SENSITIVITY
 from ..tuning.data import make_data
-from .plan import TRAJECTORIES, Plan, plants_of, references_of, swept
+from .plan import TRAJECTORIES, Plan, plants_of, references_of, sweep_table
 
-_OUTSIDE = 1e-6  # of the unit circle: hysteresis remembers at 1, to rounding
+# Poles of the hysteresis lie at 1, up to rounding, and must count as stable.
+_TOLERANCE = 1e-6
 
 
-class Metered(System):
-    """A loop that accumulates a metric beside its state, so that one run gives both."""
+class LoopWithMetric(System):
+    """A loop that also accumulates a metric, so that one run gives both."""
 
     loop: Feedback
     metric: Metric
@@ -45,16 +46,16 @@ class Metered(System):
 
 
 class Simulator:
-    """Simulates chunks of the plan of a case.
+    """Simulator of the chunks of the plan of a case.
 
-    References and noise are those of the study's hold-out, the same for every point: a
-    block is ``plan.width`` points that follow one reference. So a run of a hundred
-    thousand points reads no more inputs than one.
+    References and noise are those of the hold-out of the study, the same for every
+    point. A block is ``plan.width`` points that follow one reference. Therefore a sweep
+    of a hundred thousand points reads no more inputs than a single point.
     """
 
     def __init__(self, case: Case):
         self.case, self.plan = case, Plan(case)
-        study, table = case.study, swept(case.study)
+        study, table = case.study, sweep_table(case.study)
         self.plants = plants_of(case)
         self.references = references_of(study)
         self.metrics, self.every = table.metrics, table.every
@@ -63,9 +64,9 @@ class Simulator:
                 f"sweep.metrics: {SENSITIVITY} is there for a stage with one axis"
             )
         data = make_data(case).holdout
-        every = (*study.references.tune, *study.references.unseen)
-        chosen = np.array([every.index(name) for name in self.references])
-        # One row a run: each reference as often as there are draws of noise.
+        names = (*study.references.tune, *study.references.unseen)
+        chosen = np.array([names.index(name) for name in self.references])
+        # One row for each run: each reference repeats for every draw of noise.
         self.draws = data.noise.shape[1]
         self.reference = data.references[np.repeat(chosen, self.draws)]
         self.noise = data.noise[chosen].reshape(self.reference.shape)
@@ -82,11 +83,11 @@ class Simulator:
 
     @property
     def lane_steps(self) -> int:
-        """Simulated samples of a point, its plants and runs together."""
+        """Number of simulated samples of a point, all plants and runs together."""
         return self.samples * self.reference.shape[0] * len(self.plants)
 
     def times(self) -> np.ndarray | None:
-        """Return the instants (s) of kept samples; None if none are kept."""
+        """Return the times (s) of the recorded samples; None if none are recorded."""
         if self.every is None:
             return None
         study = self.case.study
@@ -108,47 +109,47 @@ class Simulator:
         noise: Float[Array, "runs samples *axes"],
         disturbance: Float[Array, "runs samples *axes"] | None,
     ) -> dict[str, Any]:
-        """Return the kept results of each run: arrays [runs, width, ...].
+        """Return the results of a block as arrays [runs, width, ...].
 
-        Of the sensitivity those of ``_peaks``, [width, branches, ...].
+        The sensitivity is returned as the arrays of ``_peaks`` [width, branches, ...].
         """
         paths = [axis.path for axis in self.plan.axes]
         metric = self._metric()
 
-        def of_point(values):
+        def loop_at(values):
             return replace(loop, dict(zip(paths, values, strict=True)))
 
-        def run(signals):
-            reference, noise, disturbance = signals
+        def run(drives):
+            reference, noise, disturbance = drives
             inputs = loop_inputs(reference, noise, disturbance)
 
-            def one(values):
-                system, first = of_point(values), reference[0]
+            def simulate_point(values):
+                system, first = loop_at(values), reference[0]
                 if self.every is None:
                     start = system.init(first)
                     return simulate(
                         system, inputs, start, metric=metric, segment=self.samples
                     )[1], {}
-                metered = Metered(system, metric)
+                metered = LoopWithMetric(system, metric)
                 end, log = simulate(
                     metered, inputs, metered.init(first), every=self.every
                 )
-                kept = {name: packed(getattr(log, name)) for name in TRAJECTORIES}
-                # Time last, as in the data set.
-                kept = {name: jnp.moveaxis(x, 0, -1) for name, x in kept.items()}
-                return metric.result(end[1]), kept
+                signals = {name: packed(getattr(log, name)) for name in TRAJECTORIES}
+                # The data set has time as its last dimension.
+                signals = {name: jnp.moveaxis(x, 0, -1) for name, x in signals.items()}
+                return metric.result(end[1]), signals
 
-            figures, log = jax.vmap(one)(values)
+            figures, log = jax.vmap(simulate_point)(values)
             return figures._asdict() | log
 
-        found = jax.lax.map(run, (reference, noise, disturbance))
+        results = jax.lax.map(run, (reference, noise, disturbance))
         if SENSITIVITY in self.metrics:
-            found[SENSITIVITY] = jax.vmap(lambda v: self._peaks(of_point(v)))(values)
+            results[SENSITIVITY] = jax.vmap(lambda v: self._peaks(loop_at(v)))(values)
         names = (*self.metrics, *(TRAJECTORIES if self.every else ()))
-        return {name: found[name] for name in names}
+        return {name: results[name] for name in names}
 
     def _peaks(self, loop: Feedback) -> tuple[Array, Array]:
-        """Return Ms and the matrix of the closed loop, both on every branch."""
+        """Return Ms and the state matrix of the closed loop, both for every branch."""
         point = OperatingPoint(self.case.study.highest, dt=self.case.study.dt)
         models = [
             open_loop(loop, dataclasses.replace(point, branch=name))
@@ -159,9 +160,9 @@ class Simulator:
             jnp.stack([model.A - model.B @ model.C for model in models]),
         )
 
-    def _on(self, device: Any, plant: str) -> Callable:
-        """Return the program of a plant on a device: points to what is kept."""
-        # One thread at a time: two would compile the same.
+    def _program(self, device: Any, plant: str) -> Callable:
+        """Return the compiled program that simulates a plant on a device."""
+        # The lock keeps two threads from compiling the same program.
         with self._lock:
             if device not in self._inputs:
                 self._inputs[device] = jax.device_put(
@@ -182,9 +183,9 @@ class Simulator:
             return self._programs[key]
 
     def compile(self, device: Any) -> None:
-        """Compile what runs on a device, once; ``chunk`` does so when it has to."""
+        """Compile all programs of a device; ``chunk`` compiles the missing ones."""
         for plant in self.plants:
-            self._on(device, plant)
+            self._program(device, plant)
 
     def chunk(
         self,
@@ -192,10 +193,10 @@ class Simulator:
         device: Any = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> dict[str, np.ndarray] | None:
-        """Return what is kept of a chunk, or None if ``stopped`` in the midst of it.
+        """Return the results of a chunk, or None if ``stopped`` becomes true meanwhile.
 
-        Arrays [points, plants, references, draws, ...], the sensitivity [points,
-        plants]. The last block is filled up with copies of its last point.
+        The results are arrays [points, plants, references, draws, ...]; the sensitivity
+        is [points, plants]. Copies of the last point fill the last block.
         """
         device = jax.devices()[0] if device is None else device
         start, stop = self.plan.span(index)
@@ -203,24 +204,26 @@ class Simulator:
         width = self.plan.width
         parts: list[list[dict[str, np.ndarray]]] = []
         for plant in self.plants:
-            program = self._on(device, plant)
+            program = self._program(device, plant)
             parts.append([])
             for first in range(0, stop - start, width):
                 if stopped():
                     return None
                 places = np.minimum(np.arange(first, first + width), stop - start - 1)
-                found = program(jax.device_put(values[places], device))
-                if SENSITIVITY in found:
-                    found[SENSITIVITY] = _worse(*found[SENSITIVITY])
-                parts[-1].append({name: np.asarray(x) for name, x in found.items()})
+                results = program(jax.device_put(values[places], device))
+                if SENSITIVITY in results:
+                    results[SENSITIVITY] = _worse_peak(*results[SENSITIVITY])
+                parts[-1].append({name: np.asarray(x) for name, x in results.items()})
         return {
-            name: self._joined(name, [[b[name] for b in p] for p in parts])[
+            name: self._concatenated(name, [[b[name] for b in p] for p in parts])[
                 : stop - start
             ]
             for name in parts[0][0]
         }
 
-    def _joined(self, name: str, parts: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
+    def _concatenated(
+        self, name: str, parts: Sequence[Sequence[np.ndarray]]
+    ) -> np.ndarray:
         if name == SENSITIVITY:
             return np.stack([np.concatenate(blocks) for blocks in parts], axis=1)
         # [plants, runs, points, ...] to [points, plants, references, draws, ...].
@@ -230,16 +233,16 @@ class Simulator:
         return np.ascontiguousarray(whole.reshape(shape))
 
 
-def _worse(peaks: Any, closed: Any) -> np.ndarray:
+def _worse_peak(peaks: Any, closed: Any) -> np.ndarray:
     """Return Ms [points] of the worse branch from ``peaks`` [points, branches].
 
-    It is infinite where ``closed`` [points, branches, order, order] has a pole outside
-    the unit circle, NaN where that is not finite. In NumPy: XLA may wait for LAPACK
-    without end on a CPU.
+    It is inf if ``closed`` [points, branches, order, order] has a pole outside the unit
+    circle, and NaN if ``closed`` is not finite. NumPy computes the poles, because
+    LAPACK calls of XLA may deadlock on a CPU.
     """
     peaks, closed = np.asarray(peaks), np.asarray(closed)
     finite = np.isfinite(closed).all((-3, -2, -1))
     poles = np.linalg.eigvals(np.where(finite[:, None, None, None], closed, 0.0))
-    stable = (np.abs(poles) <= 1.0 + _OUTSIDE).all(axis=-1)
+    stable = (np.abs(poles) <= 1.0 + _TOLERANCE).all(axis=-1)
     worse = np.where(stable, peaks, np.inf).max(axis=-1)
     return np.where(finite, worse, np.nan)

@@ -17,16 +17,18 @@ from ..core.serial import to_data
 from .simulator import Simulator
 
 MANIFEST, CHUNKS, RESULT = "manifest.json", "chunks", "sweep.nc"
-"""Names in the folder."""
+"""Names in the folder of a sweep."""
 
 VERSIONED = ("piezojax", "jax", "jaxlib", "numpy", "scipy")
 
-_DIGITS = 9  # of numbers in the fingerprint: machines differ in the last ones
-_FORGOTTEN = 3600.0  # s: a half-written file this old has no process any more
+# Digits of numbers in the fingerprint; the last digits differ between machines.
+_DIGITS = 9
+# Age (s) at which a partial file no longer belongs to a running process.
+_STALE = 3600.0
 
 
 def identity_of(simulator: Simulator) -> dict[str, Any]:
-    """Return what decides on the numbers of a sweep: the same for the same numbers."""
+    """Return all settings that determine the results of a sweep, as plain data."""
     case, plan = simulator.case, simulator.plan
     systems = {
         "controller": case.loop.controller,
@@ -34,7 +36,7 @@ def identity_of(simulator: Simulator) -> dict[str, Any]:
         "sensor": case.loop.sensor,
         **{f"plant {name}": plant for name, plant in simulator.plants.items()},
     }
-    # Files that the study names are in here, by what was built from them.
+    # The built Systems stand for the contents of the files that the study names.
     built = {name: _rounded(to_data(system)) for name, system in systems.items()}
     return {
         "study": case.study.model_dump(mode="json", exclude_none=True),
@@ -68,8 +70,8 @@ def _rounded(data: Any) -> Any:
 class Store:
     """Finished chunks of one sweep, in a folder that several processes may share.
 
-    A chunk is written beside its place, put on the disk and moved there in one step: it
-    is there whole or not at all, and who writes it a second time writes the same.
+    A chunk is written to a temporary file, flushed to the disk and renamed, so that it
+    is either complete or missing. Writing a chunk again gives the same contents.
     """
 
     def __init__(self, folder: Path, identity: dict[str, Any]):
@@ -77,10 +79,10 @@ class Store:
         self.fingerprint = _hash(identity)
 
     def open(self) -> None:
-        """Make the folder, or go on in it.
+        """Create the folder, or open it to continue the sweep.
 
-        Raises ValueError if it holds something else, or a sweep with other settings, or
-        cannot be written.
+        Raises ValueError if the folder cannot be written, holds other files, or holds a
+        sweep with other settings.
         """
         manifest = self.folder / MANIFEST
         try:
@@ -105,29 +107,29 @@ class Store:
             content = {"fingerprint": self.fingerprint, **self.identity}
             write_text(manifest, json.dumps(content, indent=2) + "\n")
         for path in (*self.folder.glob(".*"), *(self.folder / CHUNKS).glob(".*")):
-            self._forget(path)
+            self._delete_if_stale(path)
 
-    def _forget(self, path: Path) -> None:
-        """Delete what a process that was killed had half written."""
+    def _delete_if_stale(self, path: Path) -> None:
+        """Delete a partial file of a killed process."""
         try:
-            if time.time() - path.stat().st_mtime > _FORGOTTEN:
+            if time.time() - path.stat().st_mtime > _STALE:
                 path.unlink(missing_ok=True)
         except OSError:
-            pass  # gone already, or not ours
+            pass  # another process deleted it, or it is not ours
 
     def _compare(self, manifest: Path) -> None:
         try:
-            found = json.loads(manifest.read_text(encoding="utf-8"))
-            same = found["fingerprint"] == self.fingerprint
+            stored = json.loads(manifest.read_text(encoding="utf-8"))
+            same = stored["fingerprint"] == self.fingerprint
         except (OSError, ValueError, KeyError, TypeError):
             raise ValueError(
                 f"{manifest} is damaged; name a new folder with --out"
             ) from None
         if same:
             return
-        differing = [k for k in self.identity if found.get(k) != self.identity[k]]
-        if "study" in differing and isinstance(found.get("study"), dict):
-            own, old = self.identity["study"], found["study"]
+        differing = [k for k in self.identity if stored.get(k) != self.identity[k]]
+        if "study" in differing and isinstance(stored.get("study"), dict):
+            own, old = self.identity["study"], stored["study"]
             tables = [k for k in {**old, **own} if old.get(k) != own.get(k)]
             differing = [f"study.{key}" for key in tables]
         raise ValueError(
@@ -136,11 +138,11 @@ class Store:
         )
 
     def path(self, chunk: int) -> Path:
-        """Return where a chunk is kept."""
+        """Return the path of the file of a chunk."""
         return self.folder / CHUNKS / f"{chunk:08d}.chunk"
 
     def write(self, chunk: int, arrays: dict[str, np.ndarray], seconds: float) -> None:
-        """Keep a chunk, which took ``seconds`` of one core or device."""
+        """Store a chunk, which took ``seconds`` of one core or device."""
         payload = b"".join(
             np.ascontiguousarray(array, dtype="<f8").tobytes()
             for array in arrays.values()
@@ -156,9 +158,9 @@ class Store:
         write_bytes(self.path(chunk), checksum + b"\n" + content, durable=True)
 
     def read(self, chunk: int) -> tuple[dict[str, np.ndarray], float] | None:
-        """Return a chunk and its seconds; None if it is not there whole.
+        """Return a chunk and its seconds, or None if it is missing or damaged.
 
-        Raises ValueError for one of another sweep.
+        Raises ValueError for a chunk of another sweep.
         """
         path = self.path(chunk)
         try:
@@ -181,9 +183,12 @@ class Store:
         return arrays, float(header["seconds"])
 
     def missing(self, chunks: Iterable[int]) -> list[int]:
-        """Return which of ``chunks`` are not there whole. Raises ValueError as read."""
+        """Return the missing or damaged ones of ``chunks``.
+
+        Raises ValueError as ``read`` does.
+        """
         return [chunk for chunk in chunks if self.read(chunk) is None]
 
-    def there(self, chunks: Iterable[int]) -> bool:
-        """Tell whether all are there, without a look at what is in them."""
+    def exist(self, chunks: Iterable[int]) -> bool:
+        """Return whether the files of all ``chunks`` exist, without reading them."""
         return all(self.path(chunk).exists() for chunk in chunks)

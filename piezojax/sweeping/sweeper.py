@@ -1,4 +1,4 @@
-"""A sweep from its study to its data set, on this machine or on a cluster."""
+"""Sweeps of studies, on this machine or on a cluster."""
 
 import math
 import tempfile
@@ -13,8 +13,8 @@ from ..study import Case, Study, build, load, shipped
 from ..study.sweep_table import SweepTable
 from ..study.tables import validated
 from .cluster import cluster_chunks
-from .dataset import DamagedError, Merger, merged
-from .local import local_chunks, workers
+from .dataset import DamagedError, Merger, is_merged
+from .local import local_chunks, worker_devices
 from .simulator import Simulator
 from .store import RESULT, Store, identity_of
 
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 DEFAULT = "sweep_p753"
-"""Name of the study that is swept when none is given."""
-
+"""Name of the default study."""
 
 ATTEMPTS = 3
-"""How often damaged chunks are done again."""
+"""Largest number of attempts at simulating and merging, if chunks are damaged."""
 
 
 @dataclass
-class Swept:
-    """What a run of a sweep has done.
+class SweepResult:
+    """Result of one run of a sweep.
 
-    ``chunks`` of this run's share of ``points``; ``simulated`` of them now, in
-    ``core_s`` seconds of cores or devices and ``wall_s`` of time. ``finished`` if the
-    data set is there, at ``path``.
+    ``chunks`` is the number of chunks in the share of this run; it simulated
+    ``simulated`` of them (``lane_steps`` samples) in ``core_s`` seconds of cores or
+    devices and ``wall_s`` seconds of time. ``finished`` is true if the data set
+    ``path`` exists.
     """
 
     simulator: Simulator
@@ -61,15 +61,15 @@ def sweep(
     """Simulate every point of a study's ``[sweep]`` and return the labelled data set.
 
     ``study`` is a Case, the path of a study file, or None for the shipped example.
-    ``out`` is the folder that holds what is done; a sweep that was interrupted goes on
-    in it, and ``sweep.nc`` is there at the end. Without it nothing is kept but what is
-    returned. ``shard`` (i, n) does the i-th of n parts: None is returned until all are
-    there, which then are merged. ``samples`` draws so many points (Sobol) of the
-    study's own box if it has no ``[sweep]``. ``client`` is a Dask client whose workers
-    simulate instead of this process.
+    ``out`` is the folder of the results. An interrupted sweep continues in it, and at
+    the end it contains ``sweep.nc``. Without ``out`` no files remain. ``shard`` (i, n)
+    simulates the i-th of n parts; the run that completes the last part merges all of
+    them, and the other runs return None. ``samples`` is the number of random points; a
+    study without ``[sweep]`` draws them (Sobol) from the box of its tuned parameters.
+    ``client`` is a Dask client, whose workers simulate instead of this process.
 
-    Raises ValueError for a study that cannot be swept, and for a folder that holds
-    something else.
+    Raises ValueError for a study that cannot be swept, and for a folder with other
+    contents.
     """
     import xarray as xr
 
@@ -82,14 +82,14 @@ def sweep(
     options: dict[str, Any] = {"shard": shard, "client": client, "progress": progress}
 
     if out is not None:
-        swept = run_sweep(case, Path(out), **options)
-        if not swept.finished:
+        result = run_sweep(case, Path(out), **options)
+        if not result.finished:
             return None
-        return xr.open_dataset(swept.path, engine="h5netcdf", decode_times=False)
+        return xr.open_dataset(result.path, engine="h5netcdf", decode_times=False)
     with tempfile.TemporaryDirectory(prefix="piezojax-sweep-") as folder:
-        swept = run_sweep(case, Path(folder), **options)
+        result = run_sweep(case, Path(folder), **options)
         with xr.open_dataset(
-            swept.path, engine="h5netcdf", decode_times=False
+            result.path, engine="h5netcdf", decode_times=False
         ) as dataset:
             return dataset.load()
 
@@ -100,9 +100,9 @@ def read_swept(
     seed: int | None = None,
     samples: int | None = None,
 ) -> Case:
-    """Read and build a study that is to be swept.
+    """Read the study of a sweep and build its Case.
 
-    Raises ValueError as ``study.read``, and for ``samples`` where ``[sweep]`` is a
+    Raises ValueError as ``study.read`` does, and for ``samples`` if ``[sweep]`` is a
     grid.
     """
     path = Path(shipped(DEFAULT) if study is None else study)
@@ -132,11 +132,11 @@ def run_sweep(
     shard: tuple[int, int] = (1, 1),
     client: "Client | None" = None,
     progress: Progress | None = None,
-) -> Swept:
-    """Do what is still to do of a share of the sweep, and merge if that was the last.
+) -> SweepResult:
+    """Simulate the missing chunks of a shard; merge if no shard has missing chunks.
 
-    Raises ValueError as ``sweep``. ``KeyboardInterrupt`` leaves whole files, from which
-    the next call goes on.
+    Raises ValueError as ``sweep`` does. After a ``KeyboardInterrupt`` the stored chunks
+    are complete, and the next call continues from them.
     """
     progress = progress or Silent()
     progress.stage("preparing")
@@ -145,30 +145,30 @@ def run_sweep(
     plan = simulator.plan
     share = plan.share(shard)
     store.open()
-    swept = Swept(simulator, folder / RESULT, len(share))
-    if merged(folder, store.fingerprint):
-        swept.finished = True
-        return swept
+    result = SweepResult(simulator, folder / RESULT, len(share))
+    if is_merged(folder, store.fingerprint):
+        result.finished = True
+        return result
     begin = time.perf_counter()
     todo = store.missing(share)
     for _ in range(ATTEMPTS):
-        _simulate(swept, store, todo, client, progress)
-        swept.wall_s = time.perf_counter() - begin
-        if not store.there(range(plan.chunks)):
-            return swept
+        _simulate(result, store, todo, client, progress)
+        result.wall_s = time.perf_counter() - begin
+        if not store.exist(range(plan.chunks)):
+            return result
         progress.stage("merging")
         try:
             Merger(simulator, store).merge()
         except DamagedError as error:
             todo = error.chunks
             continue
-        swept.finished = True
-        return swept
+        result.finished = True
+        return result
     raise ValueError(f"{folder}: chunks {todo[:5]} keep being damaged; see to the disk")
 
 
 def _simulate(
-    swept: Swept,
+    result: SweepResult,
     store: Store,
     todo: list[int],
     client: "Client | None",
@@ -176,14 +176,15 @@ def _simulate(
 ) -> None:
     if not todo:
         return
-    simulator, devices = swept.simulator, workers()
+    simulator, devices = result.simulator, worker_devices()
     if client is None:
         progress.stage("compiling")
         for device in dict.fromkeys(devices):
             simulator.compile(device)
-    kept = swept.chunks - len(todo)
+    stored = result.chunks - len(todo)
     progress.stage(
-        f"simulating {len(todo)} chunks" + (f" ({kept} are kept)" if kept > 0 else ""),
+        f"simulating {len(todo)} chunks"
+        + (f" ({stored} are stored)" if stored > 0 else ""),
         len(todo),
     )
     if client is None:
@@ -195,20 +196,20 @@ def _simulate(
         for number, (chunk, arrays, seconds) in enumerate(chunks, start=1):
             store.write(chunk, arrays, seconds)
             start, stop = simulator.plan.span(chunk)
-            swept.simulated += 1
-            swept.lane_steps += (stop - start) * simulator.lane_steps
-            swept.core_s += seconds
+            result.simulated += 1
+            result.lane_steps += (stop - start) * simulator.lane_steps
+            result.core_s += seconds
             now = time.perf_counter()
             each = (now - begin) / number
             if number == 1:
-                first = now  # until then workers of a cluster start and compile
+                first = now  # before, the workers of a cluster start and compile
             else:
                 each = (now - first) / (number - 1)
             progress.advance(math.nan, remaining(each * (len(todo) - number)))
 
 
 def remaining(seconds: float) -> str:
-    """Return how long is left, in words."""
+    """Return the remaining time as text."""
     for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
         if seconds >= 2.0 * size:
             return f"about {seconds / size:.1f} {unit} left"

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 import piezojax as pj
-from piezojax.sweeping.cluster import client_of
+from piezojax.sweeping.cluster import dask_client
 
 # Some 60 chunks of a few milliseconds each.
 MANY = {"method": "latin_hypercube", "samples": 4000, "chunk": 64}
@@ -66,7 +66,7 @@ def test_workers_of_a_cluster_give_the_same_and_may_be_killed(
     path = write(MANY | {"samples": 700})
     whole = pj.sweep(path)
     assert whole is not None
-    with client_of("2") as client:
+    with dask_client("2") as client:
         victims = list(client.run(os.getpid).values())
         assert len(set(victims)) == 2
 
