@@ -65,7 +65,7 @@ def _check_part(kind: type[Fittable]) -> None:
 
 @cache
 def discover() -> None:
-    """Load what installed packages add, once: their modules, and with them tables."""
+    """Load the modules of installed packages once, with their Systems and tables."""
     for point in entry_points(group=ENTRY_POINTS):
         loaded = point.load()
         for value in [loaded] if isinstance(loaded, type) else vars(loaded).values():

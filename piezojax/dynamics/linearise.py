@@ -75,10 +75,10 @@ def sample_time(system: System) -> float:
 
     Raises ValueError if they have no sample time, or several.
     """
-    found = [float(dt) for dt in static_fields(system, "dt")]
-    if found and np.allclose(found, found[0], rtol=1e-9, atol=0.0):
-        return found[0]
-    named = ", ".join(f"{dt:g} s" for dt in sorted(set(found))) or "none"
+    times = [float(dt) for dt in static_fields(system, "dt")]
+    if times and np.allclose(times, times[0], rtol=1e-9, atol=0.0):
+        return times[0]
+    named = ", ".join(f"{dt:g} s" for dt in sorted(set(times))) or "none"
     raise ValueError(
         f"the sample time is not known: the parts of the {type(system).__name__} "
         f"name {named}; give dt"

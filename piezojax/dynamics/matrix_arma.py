@@ -55,14 +55,14 @@ class MatrixARMA(System):
 
     def responses(self) -> tuple[Rows, ...]:
         """Return the first p Markov parameters h_0 = C B, h_1 = C A B, ..., (7.6)."""
-        found: list[Rows] = []
+        responses: list[Rows] = []
         for j, moved in enumerate(self.moving):
             fed_back = [
-                matrix_product(self.autoregressive[i], found[j - 1 - i])
+                matrix_product(self.autoregressive[i], responses[j - 1 - i])
                 for i in range(j)
             ]
-            found.append(plus(moved, *fed_back))
-        return tuple(found)
+            responses.append(plus(moved, *fed_back))
+        return tuple(responses)
 
     def dc_gain(self) -> jax.Array:
         """Return outputs over inputs at rest [q, q]."""

@@ -237,7 +237,7 @@ class BashashJalili(Hysteresis, Fittable):
 
 def _picked(points: Points, count: Scalar, back: int) -> Scalar:
     """Return the valid point at place ``back`` from the end; 1 is the last."""
-    found = points[2 - back]
+    picked = points[2 - back]
     for i in range(3 - back, len(points) + 1 - back):
-        found = jnp.where(count == i + back, points[i], found)
-    return found
+        picked = jnp.where(count == i + back, points[i], picked)
+    return picked

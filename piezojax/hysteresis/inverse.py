@@ -92,8 +92,8 @@ class InverseHysteresis(Inverse):
             )
             return output - target, slope
 
-        def nearer(_: Any, found: tuple[Scalar, Scalar, Scalar]) -> Any:
-            low, high, voltage = found
+        def newton_step(_: Any, bracket: tuple[Scalar, Scalar, Scalar]) -> Any:
+            low, high, voltage = bracket
             error, slope = missed(voltage)
             low = jnp.where(error <= 0.0, voltage, low)
             high = jnp.where(error >= 0.0, voltage, high)
@@ -110,7 +110,7 @@ class InverseHysteresis(Inverse):
         # times longer.
         first = getattr(still_state, "input", 0.5 * (lower + upper))
         start = (2.0 * lower - upper, 2.0 * upper - lower, first)
-        voltage = jax.lax.fori_loop(0, self.iterations, nearer, start)[2]
+        voltage = jax.lax.fori_loop(0, self.iterations, newton_step, start)[2]
         _, slope = missed(voltage)
         slope = jnp.where(slope > 0.0, slope, 1.0)
         output = self.model.step(state, voltage)[1]

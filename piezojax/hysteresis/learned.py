@@ -79,15 +79,15 @@ class LearnedOperator(Hysteresis, Fittable):
 
     def __check_init__(self):
         regressors, neurons = len(self.thresholds) + 2, len(self.bias)
-        for name, found, needed in (
+        for name, size, needed in (
             ("linear", len(self.linear), regressors),
             ("mixing in each row", len(self.mixing[0]), regressors),
             ("mixing in rows", len(self.mixing), neurons),
             ("output", len(self.output), neurons),
         ):
-            if found != needed:
+            if size != needed:
                 raise ValueError(
-                    f"{name} has {found} weights; with {len(self.thresholds)} plays "
+                    f"{name} has {size} weights; with {len(self.thresholds)} plays "
                     f"and {neurons} neurons it must have {needed}"
                 )
         check("sum of the autoregressive part", self._held(), below=1.0)

@@ -233,16 +233,16 @@ class PlayLines(System):
         up = rise >= 0.0
         sign = jnp.where(up, 1.0, -1.0)
         held, target = sign * held, sign * (as_array(wanted) - self.lowest)
-        way = jax.tree.map(partial(jnp.where, up), self.upwards, self.downwards)
+        traverse = jax.tree.map(partial(jnp.where, up), self.upwards, self.downwards)
 
         # Loops, not one array operation, for which XLA would recompute ``held``.
-        def edge(found, row):
+        def edge(last, row):
             _, here = row
             passed = jnp.sum(jnp.maximum(here.reached, held)) <= target
-            return jax.tree.map(partial(jnp.where, passed), row, found), None
+            return jax.tree.map(partial(jnp.where, passed), row, last), None
 
         cells = len(self.rows)
-        rows = (jnp.arange(float(cells)), way)
+        rows = (jnp.arange(float(cells)), traverse)
         first = jax.tree.map(lambda column: column[0], rows)
         others = jax.tree.map(lambda column: column[1:], rows)
         (cell, here), _ = jax.lax.scan(edge, first, others)
@@ -252,8 +252,8 @@ class PlayLines(System):
             put_out, reached, slope = own
             missing, steepness = missing + put_out - reached, steepness + slope
             steep = steepness > 0.0
-            found = jnp.where(steep, missing / jnp.where(steep, steepness, 1.0), 1.0)
-            return (missing, steepness, jnp.minimum(share, found)), None
+            solution = jnp.where(steep, missing / jnp.where(steep, steepness, 1.0), 1.0)
+            return (missing, steepness, jnp.minimum(share, solution)), None
 
         none = jnp.zeros_like(target)
         start = (target - jnp.sum(held), none, none + 1.0)

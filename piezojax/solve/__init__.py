@@ -1,1 +1,1 @@
-"""Solvers of bounded problems; they know nothing of studies."""
+"""Solvers of bounded problems, independent of studies."""

@@ -1,4 +1,4 @@
-"""Augmented Lagrangian: constraints as squares, and rounds that raise the multipliers.
+"""Augmented Lagrangian: constraint terms as squares, and multiplier updates.
 
 Source: Nocedal and Wright, Numerical Optimization, 2006, section 17.4.
 """
@@ -15,7 +15,7 @@ PENALTY = 10.0
 """Penalty of the first round, for losses and violations of order 1."""
 
 ROUNDS = 5
-"""Minimisations, the multipliers raised between them."""
+"""Number of minimisations; the multipliers are updated between them."""
 
 GROWTH = 3.0
 """Factor of the penalty from one round to the next."""
@@ -44,7 +44,7 @@ def updated(
 
 
 def with_zero_multipliers(problem: Problem, size: int) -> Problem:
-    """Return ``problem``, of ``size`` unknowns, with multipliers 0 of its limits."""
+    """Return ``problem`` with ``size`` unknowns and all multipliers 0."""
     if not problem.limits:
         return problem
     middle = jnp.full(size, 0.5)
@@ -53,7 +53,7 @@ def with_zero_multipliers(problem: Problem, size: int) -> Problem:
 
 
 def rounds(problem: Problem, steps: int) -> Iterator[tuple[float, int, bool]]:
-    """Yield penalty and step limit of each round, and whether it is the last.
+    """Yield penalty, step limit and whether it is the last, for each round.
 
     A problem without limits takes one round.
     """

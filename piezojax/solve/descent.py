@@ -1,9 +1,9 @@
-"""Gauss-Newton on the errors themselves, several dampings at once.
+"""Gauss-Newton descent on the errors, with several dampings at once.
 
 The loss of a control loop has long, narrow, curved valleys, in which gradient methods
-zigzag. It is made of squared errors, so their derivatives give its curvature too. A
-step along the valley leaves its floor where the valley bends; the errors there and the
-same derivatives lead back (a simplified Newton method: Deuflhard, Newton Methods for
+zigzag. It is a sum of squared errors, so that their derivatives also give its
+curvature. A step along a curved valley leaves its floor; the errors at its end and the
+same derivatives correct it (simplified Newton method: Deuflhard, Newton Methods for
 Nonlinear Problems, 2004).
 """
 
@@ -20,25 +20,26 @@ from .gauss_newton import EDGE, Quadratic, boxed_step, damped_solution
 from .problem import HOPELESS, Verdict
 
 MOST = 0.5
-"""A correction that is a larger share of its step is not trusted."""
+"""Largest accepted correction as a share of its step."""
 
 SAMPLES = 20_000
 """Number of errors, over all runs, from which the curvature is computed."""
 
 SHORTEST = 5
-"""Least distance of two of them, samples."""
+"""Least distance between two of these errors, in samples."""
 
-_ADDED = np.sqrt(2.0)  # a square of the Lagrangian counts whole, not half
+_ADDED = np.sqrt(2.0)  # the squares of the Lagrangian count fully, not half
 
 
 class Ladder(NamedTuple):
-    """Dampings that a descent tries, and how they follow its success.
+    """Dampings of a descent, and the rule that adapts them.
 
     Each attempt tries the ``multiples`` of the present damping at once and takes the
-    best point if it lowers the loss; the damping becomes ``taken`` times that of the
-    point, not below ``least``. If none does, it grows by the factor ``rejected``, and a
-    step makes up to ``attempts``. The descent ends when it exceeds ``last``. Each point
-    is corrected ``corrections`` times with the derivatives of the step's start.
+    best point if it lowers the loss. The damping then becomes ``taken`` times that of
+    this point, but at least ``least``. If no point lowers the loss, the damping grows
+    by the factor ``rejected``; a step makes up to ``attempts`` attempts. The descent
+    ends when the damping exceeds ``last``. Each point is corrected ``corrections``
+    times with the derivatives at the start of the step.
     """
 
     first: float
@@ -66,8 +67,8 @@ PARALLEL = Ladder(
     attempts=1,
     corrections=2,
 )
-"""For losses that cost as much for four points as for one, and the unit box, where the
-curvature of a control loop is 1 to 1e6."""
+"""Ladder for losses that cost as much at four points as at one, and for the unit box,
+in which the curvature of a control loop is 1 to 1e6."""
 
 SEQUENTIAL = Ladder(
     first=1e-3,
@@ -79,13 +80,15 @@ SEQUENTIAL = Ladder(
     attempts=15,
     corrections=0,
 )
-"""For losses that are cheap beside their derivatives, and a metric of unit diagonal."""
+"""Ladder for losses much cheaper than their derivatives, and a metric of unit
+diagonal."""
 
 
 class Patience(NamedTuple):
-    """When to give up: the gain in so many ``steps`` is less than it should be.
+    """Stopping rule: a descent ends if it gains too little in ``steps`` steps.
 
-    Less than ``gain`` plus the share ``share`` of the loss before them.
+    The gain is too small below ``gain`` plus the share ``share`` of the loss before
+    them.
     """
 
     steps: int
@@ -93,7 +96,7 @@ class Patience(NamedTuple):
     share: float = 0.0
 
     def exhausted(self, losses: Sequence[float]) -> bool:
-        """Return whether the last of ``losses``, one a step, gained too little."""
+        """Return whether ``losses``, one per step, have improved too little."""
         if len(losses) <= self.steps:
             return False
         before = losses[-1 - self.steps]
@@ -101,9 +104,10 @@ class Patience(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """Losses and Verdicts of some points and, for corrections, the terms squared in
-    them: a sample of the ``errors`` [points, runs, samples], and those ``added`` by the
-    augmented Lagrangian [points, constraints].
+    """Losses and Verdicts of points and, for corrections, the terms that are squared.
+
+    These are a sample of the ``errors`` [points, runs, samples], and the terms
+    ``added`` by the augmented Lagrangian [points, constraints].
     """
 
     losses: Any
@@ -113,8 +117,10 @@ class Trials(NamedTuple):
 
 
 class Derivatives(NamedTuple):
-    """Loss and weights of the errors at a point, and derivatives of the loss, of the
-    errors, and of the terms of the augmented Lagrangian.
+    """Loss, weights of the errors, and derivatives at a point.
+
+    ``gradient`` is that of the loss, ``jacobian`` that of the errors and ``added`` that
+    of the terms of the augmented Lagrangian.
     """
 
     loss: Float[Array, ""]
@@ -125,7 +131,7 @@ class Derivatives(NamedTuple):
 
 
 def trials_at(problem, units: Float[Array, "points n"], every: int) -> Trials:
-    """Return the Trials of ``problem`` at ``units``, one of ``every`` errors."""
+    """Return the Trials of ``problem`` at ``units``, with one of ``every`` errors."""
     return Trials(*jax.vmap(lambda unit: problem.errors(unit, every)[:4])(units))
 
 
@@ -133,8 +139,8 @@ def derivatives_at(problem, unit: Float[Array, " n"], every: int) -> Derivatives
     """Return value and derivatives at ``unit``, all in one forward pass."""
 
     def values(unit):
-        found = problem.errors(unit, every)
-        return (found.loss, found.errors, found.added), found.weights
+        point = problem.errors(unit, every)
+        return (point.loss, point.errors, point.added), point.weights
 
     (loss, *_), (gradient, jacobian, added), weights = jax.vmap(
         lambda direction: jax.jvp(values, (unit,), (direction,), has_aux=True),
@@ -144,7 +150,7 @@ def derivatives_at(problem, unit: Float[Array, " n"], every: int) -> Derivatives
 
 
 def spacing(runs: int, counted: int) -> int:
-    """Return the distance of the errors sampled: a prime, against aliasing."""
+    """Return the distance of the sampled errors, a prime number against aliasing."""
     most = max(2, counted // SHORTEST)
     wanted = min(max(SHORTEST, -(-runs * counted // SAMPLES)), most)
     return next(
@@ -153,7 +159,7 @@ def spacing(runs: int, counted: int) -> int:
 
 
 class LocalModel(NamedTuple):
-    """The Quadratic of a loss at a point and, for corrections, its parts.
+    """Quadratic model of a loss at a point and, for corrections, its parts.
 
     ``jacobian`` [n, residuals] of the weighted errors, ``scale`` [runs, 1] their
     weights.
@@ -165,7 +171,7 @@ class LocalModel(NamedTuple):
 
     @classmethod
     def of(cls, here: Derivatives) -> "LocalModel | None":
-        """Return the model from weighted errors, None where it is not finite."""
+        """Return the model from weighted errors, or None if it is not finite."""
         slopes, weights = np.asarray(here.jacobian), np.asarray(here.weights)
         gradient = np.asarray(here.gradient)
         scale = np.sqrt(np.maximum(weights, 0.0) / slopes.shape[2])[:, None]
@@ -185,8 +191,8 @@ class LocalModel(NamedTuple):
     ) -> np.ndarray:
         """Return ``step`` corrected towards the least damped sum of squares.
 
-        From the residuals ``moved`` at its end and the derivatives at ``unit``, within
-        the unit box.
+        The correction uses the residuals ``moved`` at the end of the step and the
+        derivatives at ``unit``, and stays within the unit box.
         """
         free = (unit + step > EDGE) & (unit + step < 1.0 - EDGE)
         if not np.all(np.isfinite(moved)) or not free.any():
@@ -201,12 +207,12 @@ class LocalModel(NamedTuple):
 
 @dataclass
 class Descent:
-    """One start on its way down; ``step`` moves it.
+    """Descent from one start; ``step`` advances it.
 
-    ``linearise(unit)`` returns the LocalModel, None where there is none, and
-    ``evaluate(units)`` the Trials of as many points as ``rule`` tries at once;
-    ``patience`` and the rule say when it is ``done``. ``losses`` are those after each
-    step.
+    ``linearise(unit)`` returns the LocalModel, or None if it is not finite.
+    ``evaluate(units)`` returns the Trials of as many points as ``rule`` tries at once.
+    ``patience`` and ``rule`` determine when the descent is ``done``. ``losses`` holds
+    the loss after each step.
     """
 
     unit: np.ndarray
@@ -247,15 +253,16 @@ class Descent:
         return taken
 
     def _attempt(self, model: LocalModel, dampings: np.ndarray) -> int | None:
-        """Return the place of the damping that led to the best point, if any did."""
+        """Return the index of the damping of the best point, or None without a better
+        one."""
         start = self.unit
         steps = [boxed_step(model.quadratic, start, d, self.box) for d in dampings]
         steps = np.clip(start + np.stack(steps), *self.box) - start
-        found = self.evaluate(start + steps)
-        best = self._take(start + steps, found, None)
+        trials = self.evaluate(start + steps)
+        best = self._take(start + steps, trials, None)
         for _ in range(self.rule.corrections):
             residuals = map(
-                model.residuals, np.asarray(found.errors), np.asarray(found.added)
+                model.residuals, np.asarray(trials.errors), np.asarray(trials.added)
             )
             steps = np.stack(
                 [
@@ -265,16 +272,17 @@ class Descent:
                     )
                 ]
             )
-            found = self.evaluate(start + steps)
-            best = self._take(start + steps, found, best)
+            trials = self.evaluate(start + steps)
+            best = self._take(start + steps, trials, best)
         return best
 
-    def _take(self, points: np.ndarray, found: Trials, best: int | None) -> int | None:
-        """Go to the best of ``points`` if it is better; else return ``best``."""
-        losses = np.asarray(found.losses)
+    def _take(self, points: np.ndarray, trials: Trials, best: int | None) -> int | None:
+        """Move to the best of ``points`` if it is better; return its index, else
+        ``best``."""
+        losses = np.asarray(trials.losses)
         leader = int(np.argmin(losses))
         if losses[leader] >= self.loss:
             return best
         self.unit, self.loss = points[leader], float(losses[leader])
-        self.verdict = jax.tree.map(lambda x: np.asarray(x)[leader], found.verdicts)
+        self.verdict = jax.tree.map(lambda x: np.asarray(x)[leader], trials.verdicts)
         return leader

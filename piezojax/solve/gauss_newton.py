@@ -1,7 +1,8 @@
-"""Damped Gauss-Newton: the quadratic model, its damped step, and when a step is taken.
+"""Damped Gauss-Newton: the quadratic model, its damped step and the trust region.
 
-``descent`` runs it from Python with several dampings at once and bounds as active sets;
-``damped_gauss_newton`` runs it inside a compiled program, many starts by ``jax.vmap``.
+``descent`` runs it from Python, with several dampings at once and bounds as active
+sets. ``damped_gauss_newton`` runs it in a compiled program, with many starts by
+``jax.vmap``.
 """
 
 from collections.abc import Callable
@@ -23,7 +24,7 @@ EDGE = 1e-9
 class Quadratic(NamedTuple):
     """Gauss-Newton model of half a sum of squares: ``gradient`` J'r, ``curvature`` J'J.
 
-    ``metric`` [n] weighs the damping of each unknown; 1 damps all alike.
+    ``metric`` [n] weights the damping of each unknown; 1 damps all equally.
     """
 
     gradient: Any
@@ -32,7 +33,7 @@ class Quadratic(NamedTuple):
 
 
 class TrustRegion(NamedTuple):
-    """When a step is taken, and how the damping follows, by the decrease predicted.
+    """Rule that accepts steps and adapts the damping by the predicted decrease.
 
     A step is taken if it achieves the share ``taken`` of the predicted decrease, else
     the damping grows by the factor ``grow``; it shrinks by ``shrink`` after a step that
@@ -47,7 +48,7 @@ class TrustRegion(NamedTuple):
 
 
 class _Trial(NamedTuple):
-    """The point to try next, the model at the present one, and the damping."""
+    """Next point to try, model at the present point, and damping."""
 
     point: Array
     model: Quadratic
@@ -65,10 +66,11 @@ def damped_gauss_newton(
     """Return Levenberg-Marquardt with a trust-region rule as an Optimiser.
 
     ``linearise(unit)`` returns Jacobian [residuals, n] and residuals
-    (``problem.linearised``); it is evaluated once a step and only J'J and J'r are kept:
-    for long residuals of few unknowns. With the default ``rule`` the steps are those of
-    optimistix, compiled in a third of the time. A ``bounded`` problem lives in [0, 1]^n
-    and is searched through a sigmoid, another on the whole space.
+    (``problem.linearised``); it is evaluated once per step, and only J'J and J'r are
+    stored, which suits long residuals of few unknowns. With the default ``rule`` the
+    steps are those of optimistix, but compile in a third of the time. A ``bounded``
+    problem has the domain [0, 1]^n and is searched through a sigmoid; any other problem
+    is searched on the whole space.
     """
     rule = rule or TrustRegion()
 
@@ -102,7 +104,7 @@ def damped_gauss_newton(
         near = jnp.abs(old.point - point) < tolerance * (1.0 + jnp.abs(point))
         level = jnp.abs(change) < tolerance * (1.0 + 0.5 * carry.loss)
         done = accept & ~first & jnp.all(near) & level
-        # Without a finite slope no step is ever found.
+        # Without a finite slope no further step exists.
         done = done | ~jnp.all(jnp.isfinite(model.curvature))
         move = _damped_step(model, damping)
         predicted = model.gradient @ move + 0.5 * move @ model.curvature @ move
@@ -119,7 +121,7 @@ def damped_gauss_newton(
 
 def _damped_step(model: Quadratic, damping: Array) -> Array:
     """Return the damped step; 0 where it is not finite."""
-    # A direction without any slope must not make the matrix singular.
+    # The floor keeps the matrix regular if a direction has no slope.
     floor = 1e-14 * jnp.max(jnp.diagonal(model.curvature))
     damping = jnp.maximum(jnp.maximum(damping, floor), 1e-300)
     damping = damping * model.metric * jnp.eye(model.gradient.size)
@@ -137,8 +139,8 @@ def boxed_step(
 ) -> Float[np.ndarray, " n"]:
     """Return the damped Gauss-Newton step from ``point`` within the box.
 
-    An unknown that would leave the box stops at its side, and the rest is solved for
-    again.
+    An unknown that would leave the box stops at its bound, and the others are solved
+    for again.
     """
     gradient, curvature = model.gradient, model.curvature
     lower, upper = box
@@ -161,7 +163,8 @@ def damped_solution(
 ) -> np.ndarray:
     """Return the solution of the damped normal equations for the unknowns ``free``.
 
-    They are scaled by the root of the metric, so that the damping is a multiple of 1.
+    The unknowns are scaled by the root of the metric, so that the damping is a multiple
+    of the unit matrix.
     """
     scale = np.sqrt(np.broadcast_to(model.metric, force.shape))[free]
     curvature = model.curvature[np.ix_(free, free)] / np.outer(scale, scale)

@@ -10,12 +10,12 @@ from .clock import Clock
 
 @dataclass
 class History:
-    """The best loss after each batch of evaluations of one search.
+    """Best loss after each batch of evaluations of one search.
 
-    ``times_s`` are seconds since the search began, compiling included; ``compile_s`` is
-    the part of them spent compiling, ``cpu_s`` the processor time of all threads, which
-    other work on the machine does not lengthen. ``evaluations`` counts evaluations of
-    the loss, those with derivatives too.
+    ``times_s`` are seconds since the start of the search, including compilation;
+    ``compile_s`` is the part spent compiling. ``cpu_s`` is the processor time of all
+    threads, which does not depend on other work on the machine. ``evaluations`` counts
+    all evaluations of the loss, with or without derivatives.
     """
 
     clock: Clock = field(default_factory=Clock)
@@ -40,14 +40,14 @@ class History:
         return self.losses[-1] if self.losses else float("inf")
 
     def reached(self, loss: float) -> int | None:
-        """Return the index of the first entry no worse than ``loss``; None if none."""
+        """Return the index of the first entry with at most ``loss``, or None."""
         return next((i for i, best in enumerate(self.losses) if best <= loss), None)
 
 
 def batch_loss(problem, units: jax.Array, clock: Clock) -> Callable:
-    """Return the function of points that returns their losses.
+    """Return a function from points of the unit box to their losses.
 
-    Compiled for as many points of the unit box as ``units``.
+    It is compiled for as many points as ``units`` has.
     """
     program = clock.compiled(
         lambda problem, units: jax.vmap(lambda unit: problem.loss(unit))(units),

@@ -1,4 +1,4 @@
-"""Lockstep descent: one of ``optimisers.METHODS`` from all starts at once."""
+"""Lockstep descent: an optimiser of ``optimisers.METHODS`` from all starts at once."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ from .optimisers import METHODS
 from .problem import Problem, Verdict
 
 STALLED = Patience(20, gain=1e-3)
-"""A search ends when its best start gained less than this in so many steps."""
+"""Patience with the best start: a gain of 1e-3 in 20 steps."""
 
 
 class LockstepDescent:
@@ -68,7 +68,7 @@ class LockstepDescent:
         return jax.tree.map(np.asarray, program(self._problem, as_array(units)))
 
     def wait(self) -> None:
-        """Do nothing: nothing compiles in the background."""
+        """Do nothing, because no program compiles in the background."""
 
     def prepare(self, starts: int, progress: Progress) -> None:
         """Compile the programs that begin, advance and return violations."""
@@ -78,7 +78,7 @@ class LockstepDescent:
 
         def optimiser(problem, multipliers):
             problem = problem.with_multipliers(multipliers)
-            # A lambda, because a bound method would be hashed with its arrays.
+            # A lambda, because JAX would hash a bound method, and arrays have no hash.
             loss = with_finite_gradient(
                 lambda unit: problem.loss(unit), forward=self._forward
             )
@@ -92,7 +92,7 @@ class LockstepDescent:
             )
 
         def advance(problem, carry, multipliers):
-            def one(carry, multipliers):
+            def advance_one(carry, multipliers):
                 solver = optimiser(problem, multipliers)
                 carry = solver.step(carry)
                 view = solver.view(carry)
@@ -100,7 +100,7 @@ class LockstepDescent:
                     return carry, view, problem.verdict(view.unit)
                 return carry, view, Verdict(view.loss, jnp.zeros(()))
 
-            return jax.vmap(one)(carry, multipliers)
+            return jax.vmap(advance_one)(carry, multipliers)
 
         def violated(problem, units):
             return jax.vmap(lambda unit: problem.violated(unit))(units)
@@ -119,7 +119,7 @@ class LockstepDescent:
     def begin(
         self, problem: Problem, units: np.ndarray, multipliers: Array
     ) -> tuple[InStep, int]:
-        """Return descents from ``units``, and the evaluations that took."""
+        """Return descents from ``units``, and the number of evaluations used."""
         begin, advance, _ = self._programs[len(units)]
         problem = problem.with_multipliers(self._problem.multipliers)
         descents = InStep(

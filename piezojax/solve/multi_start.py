@@ -1,9 +1,8 @@
-"""Multi-start: descents from many starts, of which the worse may be dropped.
+"""Multi-start: descents from many starts, of which a Cut may drop the worse.
 
 One loop, ``descend``, serves every search. Descents advance in one compiled program
-(``InStep``) or in threads (``InThreads``); a Cut says how many go on. ``minimise`` adds
-the rounds of the augmented Lagrangian; its strategies are ``successive_halving`` and
-``lockstep``.
+(``InStep``) or in threads (``InThreads``). ``minimise`` adds the rounds of the
+augmented Lagrangian; its strategies are ``successive_halving`` and ``lockstep``.
 """
 
 import os
@@ -25,13 +24,14 @@ from .problem import Problem, Verdict
 from .search_state import SearchState
 
 Cut = Callable[[int, int], int | None]
-"""``cut(step, running)``: how many descents go on after a step, None for no cut."""
+"""``cut(step, running)`` returns the number of descents kept after a step, or None to
+keep all."""
 
 
 class Standing(NamedTuple):
-    """The descents still running, one entry each, and the evaluations of a step.
+    """State of the running descents, one entry each, and the evaluations of a step.
 
-    ``places`` are those among the starts.
+    ``places`` are their indices among the starts.
     """
 
     units: np.ndarray
@@ -65,9 +65,9 @@ def descend(
 ) -> tuple[Standing, bool]:
     """Advance ``descents`` by at least one and at most ``steps`` steps.
 
-    Ends when all are done or ``patience`` with the best, counted anew after each cut,
-    is exhausted. ``watch`` sees every step. Returns the last Standing, and whether the
-    descents came to their end.
+    The loop ends when all are done or ``patience`` with the best is exhausted, which
+    restarts after each cut. ``watch`` receives the Standing of every step. Returns the
+    last Standing, and whether the descents ended before the step limit.
     """
     step, bests = 0, []
     while True:
@@ -108,10 +108,10 @@ class InStep:
 
     def advance(self) -> Standing:
         """Move every descent by one step; return where they stand."""
-        found = [self._advance(carry) for carry in self._carries]
-        self._carries = [carry for carry, _, _ in found]
+        advanced = [self._advance(carry) for carry in self._carries]
+        self._carries = [carry for carry, _, _ in advanced]
         view, verdict = jax.tree.map(
-            lambda *parts: np.concatenate(parts), *(rest for _, *rest in found)
+            lambda *parts: np.concatenate(parts), *(rest for _, *rest in advanced)
         )
         return Standing(
             view.unit, view.loss, verdict, view.done, self._places, len(view.loss)
@@ -134,9 +134,10 @@ def _filled(places: np.ndarray, width: int) -> np.ndarray:
 
 
 class InThreads:
-    """Descents that are stepped from Python, one a thread.
+    """Descents stepped from Python, each in its own thread.
 
-    An evaluation keeps one processor busy and releases the lock of the interpreter.
+    Threads run in parallel, because an evaluation uses one processor and releases the
+    interpreter lock.
     """
 
     def __init__(self, descents: Sequence[Descent]):
@@ -166,7 +167,7 @@ class InThreads:
 
 @runtime_checkable
 class Strategy(Protocol):
-    """A way to minimise a Problem from many starts, with its compiled programs.
+    """Strategy to minimise a Problem from many starts, with its compiled programs.
 
     Rounds are those of the augmented Lagrangian.
     """
@@ -183,7 +184,7 @@ class Strategy(Protocol):
 
     @property
     def finalists(self) -> int | None:
-        """Descents that go on from round to round, None for all."""
+        """Number of descents kept from round to round, or None for all."""
         ...
 
     @property
@@ -196,17 +197,17 @@ class Strategy(Protocol):
         ...
 
     def wait(self) -> None:
-        """Wait until all that compiles in the background is compiled."""
+        """Wait for the programs that compile in the background."""
         ...
 
     def prepare(self, starts: int, progress: Progress) -> None:
-        """Compile what descents from so many starts need."""
+        """Compile the programs for descents from ``starts`` starts."""
         ...
 
     def begin(
         self, problem: Problem, units: np.ndarray, multipliers: Array
     ) -> tuple[Descents, int]:
-        """Return descents from ``units``, and the evaluations that took.
+        """Return descents from ``units``, and the number of evaluations used.
 
         ``multipliers`` [starts, constraints] are those of each descent.
         """
@@ -227,8 +228,8 @@ def minimise(
 ) -> None:
     """Improve ``state`` from ``starts`` by up to ``steps`` steps.
 
-    With constraints these are shared by the rounds of the augmented Lagrangian, each of
-    which starts from the end of the one before.
+    With constraints the rounds of the augmented Lagrangian share these steps; each
+    round starts from the end of the previous one.
     """
     strategy.prepare(len(starts), progress)
     progress.stage(f"tuning from {len(starts)} starts", steps)

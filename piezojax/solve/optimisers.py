@@ -1,8 +1,8 @@
 """Optimisers of optimistix and jaxopt behind one interface: start, step, view.
 
-Each follows one point; ``jax.vmap`` runs many starts at once. They are stepped from
-Python, so that progress can be shown, the history kept and a run interrupted with its
-best point in hand.
+Each moves one point; ``jax.vmap`` runs many starts at once. Python calls every step, so
+that progress can be shown, the history recorded and a run interrupted without losing
+its best point.
 """
 
 import warnings
@@ -40,7 +40,8 @@ class Optimiser(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """An optimiser between steps: point, its own state, loss of the point."""
+    """Optimiser between two steps: point, internal state, loss, and whether it is
+    done."""
 
     point: Array
     state: Any
@@ -49,8 +50,8 @@ class Carry(NamedTuple):
 
 
 def settled(carry: Carry) -> Carry:
-    """Return ``carry`` with leaves of definite type."""
-    # Weakly typed leaves would make the second step compile anew.
+    """Return ``carry`` with strongly typed leaves."""
+    # Weakly typed leaves would cause a second compilation of the step.
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), carry)
 
 
@@ -63,7 +64,7 @@ def frozen_when_done(old: Carry, new: Carry) -> Carry:
 def _optimistix(
     solver: Any, function: Function, loss_of: Callable[[Array], Array], options: dict
 ) -> Optimiser:
-    """Wrap an optimistix solver; it knows no bounds, so it works on the whole line."""
+    """Wrap an optimistix solver; without bounds, it searches the real line."""
 
     def objective(free, _):
         value = function(squash(free))
@@ -74,8 +75,9 @@ def _optimistix(
         return solver.init(objective, free, None, options, value, loss, frozenset())
 
     def fixed(free):
-        # A solver's state also holds functions and shapes, which no carry can take:
-        # they follow from the point's shape, so each step finds them again by tracing.
+        # The state of a solver also holds functions and shapes, which a carry cannot
+        # hold. They follow from the shape of the point, so each step recovers them by
+        # tracing.
         shapes = eqx.filter_eval_shape(initial, free)
         return eqx.filter(shapes, _is_shape, inverse=True)
 
@@ -86,7 +88,8 @@ def _optimistix(
 
     def step(carry):
         state = eqx.combine(carry.state, fixed(carry.point))
-        # The step returns the loss of the point before; the state has this one's.
+        # The step returns the loss of the previous point; the state has that of this
+        # one.
         point, state, _ = solver.step(
             objective, carry.point, None, options, state, frozenset()
         )
@@ -118,8 +121,9 @@ def levenberg_marquardt(
 ) -> Optimiser:
     """Levenberg-Marquardt (optimistix) on the residuals, forward Jacobian."""
     del loss
-    # Far more residuals than unknowns: their normal equations are small, where a QR of
-    # the tall Jacobian takes most of a step, and many times more on a busy machine.
+    # There are far more residuals than unknowns, so the normal equations are small. A
+    # QR of the tall Jacobian takes most of a step, and many times more on a busy
+    # machine.
     solver = optx.LevenbergMarquardt(
         rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
     )
@@ -129,7 +133,7 @@ def levenberg_marquardt(
 
 
 def lbfgsb(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
-    """L-BFGS-B (jaxopt) on the loss, which takes the bounds as they are."""
+    """L-BFGS-B (jaxopt) on the loss, with the bounds of the box."""
     del residuals
     with warnings.catch_warnings():
         # jaxopt announces on import that it is no longer maintained.
@@ -166,4 +170,4 @@ METHODS: dict[str, Callable[[Function, Function, float], Optimiser]] = {
 """Optimisers by the name a study uses."""
 
 GAUSS_NEWTON = "gauss_newton"
-"""Successive halving of Gauss-Newton descents on the errors, by the study's name."""
+"""Name in a study of successive halving with Gauss-Newton descents on the errors."""

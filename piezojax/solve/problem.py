@@ -10,7 +10,7 @@ Unit = Float[Array, " n"]
 """A point of the unit box [0, 1]^n."""
 
 HOPELESS = 1e6
-"""Loss where it has no finite value: finite, so that a line search can step back."""
+"""Loss in place of a value that is not finite, so that a line search can step back."""
 
 TOLERANCE = 1e-3
 """A constraint violated by less than this counts as satisfied."""
@@ -24,12 +24,12 @@ class Verdict(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """A point as a problem of least squares.
+    """Least-squares form of a problem at a point.
 
-    ``loss`` is minimised; ``errors`` are a sample of those of each run, ``added`` are
+    ``loss`` is minimised; ``errors`` are a sample of the errors of each run, ``added``
     the terms of the augmented Lagrangian. A weight is the slope of the loss over half
-    the mean square of a run's errors: with these weights, and 2 on the added terms, the
-    squares have the gradient of the loss as far as it depends on them.
+    the mean square of the errors of a run. With these weights, and 2 for the added
+    terms, the squares have the gradient of the loss as far as it depends on them.
     """
 
     loss: Float[Array, ""]
@@ -54,7 +54,7 @@ class Problem(Protocol):
 
     @property
     def multipliers(self) -> Array:
-        """Multipliers of the augmented Lagrangian, one a constraint."""
+        """Multipliers of the augmented Lagrangian, one per constraint."""
         ...
 
     def with_multipliers(self, multipliers: Array) -> "Problem":
@@ -82,18 +82,18 @@ class Problem(Protocol):
         ...
 
     def errors(self, unit: Unit, every: int) -> Errors:
-        """Return the point as least squares, with one of ``every`` errors."""
+        """Return the least-squares form at ``unit``, with one of ``every`` errors."""
         ...
 
     def residuals(self, unit: Unit) -> Float[Array, " residuals"]:
-        """Return residuals whose squares sum to the loss, if it is such a sum."""
+        """Return residuals whose squares sum to the loss, for a loss of this form."""
         ...
 
 
 def linearised(
     residuals: Callable[[Array], Array],
 ) -> Callable[[Array], tuple[Array, Array]]:
-    """Return the function of a point that returns Jacobian and residuals.
+    """Return a function from a point to the Jacobian and the residuals.
 
     The Jacobian [residuals, n] comes from forward mode, in one pass with the residuals.
     """

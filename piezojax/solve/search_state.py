@@ -1,4 +1,4 @@
-"""The state of a search: its best point so far, and how points are ranked."""
+"""State of a search: its best point so far, and the rank of points."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -16,7 +16,7 @@ VIOLATED = 0.5 * HOPELESS
 
 @dataclass
 class SearchState:
-    """The best point found so far, in [0, 1]^n, and the way to it.
+    """Best point of a search so far, in [0, 1]^n, and its history.
 
     ``loss`` is its objective, ``violation`` its largest violation of a constraint.
     ``losses_by_start`` holds the lowest loss of each of the ``starts`` after each step,
@@ -45,9 +45,9 @@ class SearchState:
     ) -> None:
         """Take the best of ``units`` if it is better than the present one.
 
-        A point that satisfies the constraints is better than any that does not; of
-        those that do not, the one with the least violation is the best. The points took
-        so many ``evaluations``, one each if not given.
+        A point that satisfies the constraints is better than any that does not; among
+        points that do not, the least violation is best. ``evaluations`` is the number
+        of evaluations used, by default one per point.
         """
         ranks = rank(verdict)
         leader = int(np.argmin(ranks))

@@ -34,16 +34,16 @@ POINTS = len(PARALLEL.multiples)
 
 
 def better_half(step: int, running: int) -> int | None:
-    """Return how many descents go on: half, rounded up, at the end of each lap."""
+    """Return the number of descents kept: half, rounded up, at the end of a lap."""
     return (running + 1) // 2 if step % LAP == 0 else None
 
 
 class SuccessiveHalving:
-    """Gauss-Newton descents on the errors of ``problem``, of which half go on.
+    """Gauss-Newton descents on the errors of ``problem``; a lap drops the worse half.
 
-    The curvature is taken from one of ``every`` errors; a descent ends when it gains
+    The curvature is computed from one of ``every`` errors. A descent ends when it gains
     less than ``tolerance`` in PATIENCE steps. ``size`` is the number of unknowns. After
-    the first round of an augmented Lagrangian only the best descent goes on.
+    the first round of an augmented Lagrangian only the best descent continues.
     """
 
     cut = staticmethod(better_half)
@@ -56,7 +56,7 @@ class SuccessiveHalving:
         self._problem = problem = with_zero_multipliers(problem, size)
         self._clock, self._patience = clock, Patience(PATIENCE, gain=tolerance)
         units = as_array(np.zeros((POINTS, size)))
-        # The derivatives take longer to compile: meanwhile the box is screened.
+        # The derivatives compile in the background, while the box is screened.
         self._pool = ThreadPoolExecutor(1)
         self._derivatives = self._pool.submit(
             lambda: (
@@ -68,7 +68,7 @@ class SuccessiveHalving:
         self._trials = clock.compiled(
             lambda p, units: trials_at(p, units, every), problem, units
         )
-        # Without limits there is one round, which needs no violations.
+        # A problem without limits has one round, which needs no violations.
         self._violated: Callable = (
             clock.compiled(lambda p, unit: p.violated(unit), problem, units[0])
             if problem.limits
@@ -89,8 +89,10 @@ class SuccessiveHalving:
     ) -> tuple[np.ndarray, Verdict]:
         filler = np.repeat(units[-1:], -len(units) % POINTS, axis=0)
         batches = np.concatenate([units, filler]).reshape(-1, POINTS, units.shape[1])
-        found = [self._trials(problem, as_array(batch))[:2] for batch in batches]
-        return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(units)], *found)
+        results = [self._trials(problem, as_array(batch))[:2] for batch in batches]
+        return jax.tree.map(
+            lambda *parts: np.concatenate(parts)[: len(units)], *results
+        )
 
     def wait(self) -> None:
         """Wait until the derivatives are compiled."""
@@ -104,7 +106,7 @@ class SuccessiveHalving:
     def begin(
         self, problem: Problem, units: np.ndarray, multipliers: Array
     ) -> tuple[InThreads, int]:
-        """Return descents from ``units``, and the evaluations that took."""
+        """Return descents from ``units``, and the number of evaluations used."""
         # All 0 in the first round; later there is only one descent.
         problem = problem.with_multipliers(multipliers[0])
         losses, verdicts = self._screened(problem, units)
