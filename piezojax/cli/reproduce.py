@@ -17,7 +17,7 @@ NAMES = (
     *("8-2", "8-3", "figure-8-4", "figure-8-5"),
     "figure-4-10",
 )
-"""Every table and figure that can be reproduced."""
+"""Tables and figures that can be reproduced."""
 
 
 @click.command(cls=Command)
@@ -88,21 +88,24 @@ def main(tables, calibrate, out, seed, quiet):
             write_calibration,
         )
         from ..reproduction.calibration import EXPERIMENTS, calibrate
-        from ..reproduction.judged import as_plain, together
+        from ..reproduction.calibration_report import (
+            calibration_report,
+            held_out_ratios,
+        )
 
         if tables:
             raise ValueError("--calibrate has tables of its own; leave --table out")
         with results_folder(out, "calibrate") as folder:
             with Bar(console) as bar:
-                found = {n: calibrate(n, progress=bar) for n in EXPERIMENTS}
-            plain = {n: as_plain(n, swaps) for n, swaps in found.items()}
-            both = together(found)
-            text = json.dumps(plain | {"together": both}, indent=2)
+                fits = {n: calibrate(n, progress=bar) for n in EXPERIMENTS}
+            plain = {n: calibration_report(n, both) for n, both in fits.items()}
+            held_out = held_out_ratios(fits)
+            text = json.dumps(plain | {"together": held_out}, indent=2)
             write_text(folder / "calibration.json", text + "\n")
-            write_calibration(found, plain, folder)
-        for name, swaps in found.items():
-            console.print(calibration_table(name, swaps, plain[name]))
-        console.print(together_table(both))
+            write_calibration(fits, plain, folder)
+        for name, both in fits.items():
+            console.print(calibration_table(name, both, plain[name]))
+        console.print(together_table(held_out))
         console.print(f"results in {folder}", soft_wrap=True)
 
     run(quiet, calibration if calibrate else body)

@@ -7,39 +7,39 @@ from typing import Any
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ..reproduction.calibration import EXPERIMENTS, Swap
-from ..reproduction.judged import BAR
+from ..reproduction.calibration import EXPERIMENTS, HalfFit
+from ..reproduction.calibration_report import TARGET
 from ..reproduction.selection import Round
 from .figures import AFTER, BEFORE, REFERENCE, figure, styled, write
 
-Judged = Mapping[str, Mapping[str, Any]]
-"""Figures of an experiment by its fitted half, as ``judged.as_plain`` returns them."""
+Report = Mapping[str, Mapping[str, Any]]
+"""Report of an experiment by its fitted half, from ``calibration_report``."""
 
 
 def write_calibration(
-    found: Mapping[str, Sequence[Swap]], judged: Mapping[str, Judged], folder: Path
+    fits: Mapping[str, Sequence[HalfFit]], reports: Mapping[str, Report], folder: Path
 ) -> None:
     """Write calibration.png into ``folder``."""
     with styled():
-        write(calibration_figure(found, judged), folder / "calibration.png")
+        write(calibration_figure(fits, reports), folder / "calibration.png")
 
 
 def calibration_figure(
-    found: Mapping[str, Sequence[Swap]], judged: Mapping[str, Judged]
+    fits: Mapping[str, Sequence[HalfFit]], reports: Mapping[str, Report]
 ) -> Figure:
-    """Draw simulation against print: a row an experiment, a panel a fitted half."""
-    picture = figure(8.4, 4.2 * len(found))
-    panels = picture.subplots(len(found), 2, squeeze=False)
-    for row, (name, swaps) in zip(panels, found.items(), strict=True):
-        for ax, swap in zip(row, swaps, strict=True):
-            both = [*swap.train, *swap.held_out]
+    """Draw simulation against print: a row per experiment, a panel per half."""
+    picture = figure(8.4, 4.2 * len(fits))
+    panels = picture.subplots(len(fits), 2, squeeze=False)
+    for row, (name, halves) in zip(panels, fits.items(), strict=True):
+        for ax, fit in zip(row, halves, strict=True):
+            both = [*fit.train, *fit.held_out]
             low = 0.8 * min(min(c.paper, c.sim) for c in both)
             high = 1.25 * max(max(c.paper, c.sim) for c in both)
             ax.plot([low, high], [low, high], color=REFERENCE, lw=0.8)
-            half = judged[name][swap.half]
+            half = reports[name][fit.half]
             for label, ratios, cells, marker, colour in (
-                ("fitted", half["fitted"], swap.train, "o", BEFORE),
-                ("held out", half["held_out"], swap.held_out, "s", AFTER),
+                ("fitted", half["fitted"], fit.train, "o", BEFORE),
+                ("held out", half["held_out"], fit.held_out, "s", AFTER),
             ):
                 ax.loglog(
                     [c.paper for c in cells],
@@ -50,7 +50,7 @@ def calibration_figure(
                     label=f"{label}: {ratios['geomean_ratio']:.3f}",
                 )
             ax.set(
-                title=f"{name}\nfitted to the {swap.half} cells",
+                title=f"{name}\nfitted to the {fit.half} cells",
                 xlabel="printed (µm)",
                 ylabel="simulated (µm)",
             )
@@ -58,26 +58,26 @@ def calibration_figure(
     return picture
 
 
-def calibration_table(name: str, swaps: Sequence[Swap], judged: Judged) -> Table:
-    """Return ratios, fitted values and the choice of the doubts, a column a half.
+def calibration_table(name: str, fits: Sequence[HalfFit], report: Report) -> Table:
+    """Return the ratios, fitted values and selection rounds, one column for each half.
 
-    A print that one half alone puts in doubt has no value in the other's column.
+    A suspect number of one half only has no value in the column of the other.
     """
-    table = Table(title=f"{name}: fitted to one half of the cells, judged on the other")
+    table = Table(title=f"{name}: fitted to one half of the cells, tested on the other")
     table.add_column("")
-    for swap in swaps:
-        table.add_column(f"fitted: {swap.half}", justify="right")
-    halves = [judged[swap.half] for swap in swaps]
+    for fit in fits:
+        table.add_column(f"fitted: {fit.half}", justify="right")
+    halves = [report[fit.half] for fit in fits]
 
     def ratios(part: str) -> list[str]:
         return [f"{half[part]['geomean_ratio']:.3f}" for half in halves]
 
     table.add_row("geometric-mean ratio, fitted", *ratios("fitted"))
     table.add_row("geometric-mean ratio, held out", *ratios("held_out"), style="bold")
-    alone = ratios("held_out_without_doubts")
-    table.add_row("the same, the stage alone, no print in doubt", *alone)
+    alone = ratios("held_out_stage_only")
+    table.add_row("held out, stage alone", *alone)
     met = ("met" if half["met"] else "missed" for half in halves)
-    table.add_row(f"bar of {BAR:g}", *met)
+    table.add_row(f"target of {TARGET:g}", *met)
     table.add_section()
     places = [half["held_out"]["columns"] for half in halves]
     for place in sorted({name for columns in places for name in columns}):
@@ -85,26 +85,26 @@ def calibration_table(name: str, swaps: Sequence[Swap], judged: Judged) -> Table
             f"held out, {place}", *(f"{columns[place]:.3f}" for columns in places)
         )
     table.add_section()
-    every = [name for swap in swaps for name in swap.values]
+    every = [name for fit in fits for name in fit.values]
     for quantity, about in EXPERIMENTS[name].quantities().items():
         if quantity in every:
             values = (
-                f"{swap.values[quantity]:.4g}" if quantity in swap.values else "-"
-                for swap in swaps
+                f"{fit.values[quantity]:.4g}" if quantity in fit.values else "-"
+                for fit in fits
             )
             table.add_row(f"{quantity} ({about.unit})", *values)
-    table.add_row("pull towards print", *(f"{swap.strength:g}" for swap in swaps))
+    table.add_row("weight of the penalty", *(f"{fit.penalty_weight:g}" for fit in fits))
     table.add_section()
-    for number in range(max(len(swap.rounds) for swap in swaps)):
-        told = (_told(swap.rounds[number : number + 1]) for swap in swaps)
-        table.add_row(f"cross-validated inside the half, doubt {number + 1}", *told)
+    for number in range(max(len(fit.rounds) for fit in fits)):
+        rounds = (_round_text(fit.rounds[number : number + 1]) for fit in fits)
+        table.add_row(f"cross-validated inside the half, round {number + 1}", *rounds)
     return table
 
 
 def together_table(halves: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return the ratio of all held-out cells, a column a half.
+    """Return the ratio of all held-out cells, one column for each half.
 
-    ``halves`` is the result of ``judged.together``.
+    ``halves`` is the result of ``calibration_report.held_out_ratios``.
     """
     table = Table(title="all held-out cells of Tables 5-3, 5-5 and 4-5")
     table.add_column("")
@@ -115,21 +115,21 @@ def together_table(halves: Mapping[str, Mapping[str, Any]]) -> Table:
         "cells", *(str(half["held_out"]["cells"]) for half in halves.values())
     )
     table.add_row("geometric-mean ratio", *(f"{x:.3f}" for x in ratios), style="bold")
-    judged = ("met" if half["met"] else "missed" for half in halves.values())
-    table.add_row(f"bar of {BAR:g}", *judged)
+    met = ("met" if half["met"] else "missed" for half in halves.values())
+    table.add_row(f"target of {TARGET:g}", *met)
     return table
 
 
-def _told(rounds: Sequence[Round]) -> str:
-    """Return what the round said, one finalist a line; nothing for no round."""
+def _round_text(rounds: Sequence[Round]) -> str:
+    """Return the ratios of a round, one finalist on each line; "" without a round."""
     return "\n".join(
         line
-        for found in rounds
+        for entry in rounds
         for line in (
-            f"without: {found.before:.3f}",
+            f"without: {entry.before:.3f}",
             *(
-                f"{name}{' (taken)' if name == found.taken else ''}: {ratio:.3f}"
-                for name, ratio in found.after.items()
+                f"{name}{' (taken)' if name == entry.taken else ''}: {ratio:.3f}"
+                for name, ratio in entry.after.items()
             ),
         )
     )

@@ -1,4 +1,4 @@
-"""The thesis' result tables, simulated with its printed numbers."""
+"""Reproduction of the result tables of the thesis with its printed numbers."""
 
 from collections.abc import Callable
 
@@ -7,18 +7,18 @@ from .cell import Cell as Cell
 from .summary import summarise as summarise
 
 CHAPTERS = (chapter3, chapter4, chapter5, chapter6, chapter7, chapter8)
-"""One module a chapter: its ``TABLES``, and ``cells`` that simulates one of them."""
+"""One module for each chapter: ``TABLES``, and ``cells`` to simulate one of them."""
 
 TABLES: dict[str, Callable[[str], list[Cell]]] = {
     table: chapter.cells for chapter in CHAPTERS for table in chapter.TABLES
 }
-"""Tables that can be reproduced, by their number."""
+"""Function that simulates a table, by the number of the table."""
 
 
 def reproduce(table: str) -> list[Cell]:
-    """Return the cells of ``table``, paper beside simulation.
+    """Return the simulated cells of ``table``.
 
-    Raises ValueError, listing the tables, for one that is unknown.
+    Raises ValueError, listing the tables, for an unknown table.
     """
     if table not in TABLES:
         raise ValueError(f"table {table!r} is unknown; there are {', '.join(TABLES)}")

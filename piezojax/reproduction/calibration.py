@@ -1,10 +1,10 @@
-"""The stage fitted through the closed loops to half of the cells, judged on the rest.
+"""Calibration: the stage fitted to half of the cells and tested on the other half.
 
-Fitted on one half of the cells of Tables 5-3 and 5-5, the stage predicts the other
-half; then the halves change places. Which prints are doubted, and fitted too, is
-decided on the fitting half (``selection``), of all that could be (``doubts``). Chapter
-4 (Table 4-5) is another experiment, with another printed model of the stage, and is
-fitted on its own in the same way.
+The stage is fitted through the closed loops to one half of the cells of Tables 5-3 and
+5-5, and predicts the other half; then the halves are exchanged. Suspect numbers are
+fitted too. They are selected on the fitting half (``selection``) from all candidates
+(``suspect_numbers``). Chapter 4 (Table 4-5) is another experiment with another printed
+model of the stage, and is fitted separately in the same way.
 """
 
 from collections.abc import Sequence
@@ -20,19 +20,19 @@ from ..core.space import Range, space_of
 from ..dynamics import ARMA
 from . import chapter5
 from .cell import Cell, printed
-from .doubts import candidates
 from .lanes import by_column, lanes_of
 from .selection import Round, select
 from .stage_fit import STEPS, Point, Problem, log_ratios
 from .stage_parameters import quantities, within
+from .suspect_numbers import candidates_of
 
 HALVES = ("even", "odd")
-"""The cells' place in the printed order, row by row, table after table."""
+"""Halves of the cells, by position in the printed order: row by row, then table."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Tables that one stage is to explain, and the print its fit starts from."""
+    """Tables that one stage has to explain, and the printed dynamics of that stage."""
 
     chapter: str
     tables: tuple[str, ...]
@@ -40,9 +40,9 @@ class Experiment:
     dynamics: ARMA
 
     def cells(self) -> dict[str, list[Cell]]:
-        """Return the cells of each half: every other one in the printed order.
+        """Return the cells of each half: every other cell in the printed order.
 
-        Columns that are left out are counted all the same.
+        The cells of omitted columns keep their position but are left out.
         """
         every = [
             cell
@@ -55,17 +55,17 @@ class Experiment:
         }
 
     def quantities(self) -> dict[str, Range]:
-        """Return what may be fitted: the stage's, then every candidate for a doubt."""
+        """Return the fitted quantities: those of the stage, then all candidates."""
         every = [cell for half in self.cells().values() for cell in half]
         return quantities(self.dynamics) | {
-            name: within(1.0, doubt.span, "of print")
-            for name, doubt in candidates(every).items()
+            name: within(1.0, suspect.span, "of print")
+            for name, suspect in candidates_of(every).items()
         }
 
     def problem(self, cells: Sequence[Cell], *, short: bool) -> Problem:
         """Return the Problem of ``cells``, in the order of ``by_column``."""
-        found = self.quantities()
-        space = space_of(found)
+        ranges = self.quantities()
+        space = space_of(ranges)
         order = [cell for group in by_column(cells) for cell in group]
         return Problem(
             space=space,
@@ -74,8 +74,8 @@ class Experiment:
             lanes=lanes_of(cells, short=short),
             paper=jnp.asarray([cell.paper for cell in order]),
             counts=jnp.ones(len(order)),
-            start=space.to_unit(jnp.asarray([q.start for q in found.values()])),
-            strength=jnp.asarray(1.0),
+            start=space.to_unit(jnp.asarray([q.start for q in ranges.values()])),
+            penalty_weight=jnp.asarray(1.0),
         )
 
 
@@ -95,35 +95,38 @@ def _chapter4() -> Experiment:
 
 
 EXPERIMENTS = {"chapter 5": _chapter5(), "chapter 4": _chapter4()}
-"""What is fitted. The traditional column of Table 4-5 is in none, because its gains are
-not printed."""
+"""Experiments by name. None contains the traditional column of Table 4-5, because its
+gains are not printed."""
 
 
-class Swap(NamedTuple):
-    """A fit to one half: its values, its pull, and all cells simulated with them.
+class HalfFit(NamedTuple):
+    """A fit to one half, and all cells simulated with it.
 
-    ``values`` of the stage and of the ``doubts``, as factors on print; ``rounds`` say
-    how these were chosen; ``alone`` are the held-out cells of the stage without them.
+    ``values`` holds the quantities of the stage and the factors on the printed values
+    of ``suspects``, which were selected in ``rounds``. ``penalty_weight`` is the weight
+    of the penalty on the distance from the printed stage. ``train`` and ``held_out``
+    are the cells simulated with the fit; ``stage_only`` are the held-out cells
+    simulated with a fit without suspect numbers.
     """
 
     half: str
-    strength: float
+    penalty_weight: float
     values: dict[str, float]
-    doubts: tuple[str, ...]
+    suspects: tuple[str, ...]
     rounds: tuple[Round, ...]
     train: list[Cell]
     held_out: list[Cell]
-    alone: list[Cell]
+    stage_only: list[Cell]
 
 
 def calibrate(
     name: str, steps: int = STEPS, progress: Progress | None = None
-) -> list[Swap]:
-    """Return both fits of ``EXPERIMENTS[name]``, each judged on the other half.
+) -> list[HalfFit]:
+    """Return both fits of ``EXPERIMENTS[name]``, each tested on the other half.
 
-    Fitted on shortened runs (``lanes.WARM_UP``, ``lanes.SHORT``), judged on the runs
-    that the tables of this package use. The held-out cells are simulated once both fits
-    are final.
+    The fits use shortened runs (``lanes.WARM_UP``, ``lanes.SHORT``); the tests use the
+    runs of the tables of this package. The held-out cells are simulated after both fits
+    are final. ``steps`` is the largest number of optimiser steps from each start.
     """
     progress = Silent() if progress is None else progress
     experiment = EXPERIMENTS[name]
@@ -135,33 +138,33 @@ def calibrate(
         for half, cells in halves.items()
     }
     everything = [cell for half in halves.values() for cell in half]
-    judge = experiment.problem(everything, short=False)
+    full_runs = experiment.problem(everything, short=False)
     order = [cell for group in by_column(everything) for cell in group]
 
-    def judged(point: Point) -> list[Cell]:
-        ratios = np.exp(np.asarray(log_ratios(judge, point)))
+    def cells_at(point: Point) -> list[Cell]:
+        ratios = np.exp(np.asarray(log_ratios(full_runs, point)))
         return [
             cell.simulated(float(cell.paper * ratio))
             for cell, ratio in zip(order, ratios, strict=True)
         ]
 
-    swaps = []
+    fits = []
     for half, choice in choices.items():
-        mine = {(cell.table, cell.row, cell.column) for cell in halves[half]}
-        inside = [(c.table, c.row, c.column) in mine for c in order]
-        found, alone = judged(choice.point), judged(choice.alone)
-        values = judge.space.named(choice.point)
-        fitted = (*judge.space.paths[: judge.stage], *choice.doubts)
-        swaps.append(
-            Swap(
+        fitted_keys = {(cell.table, cell.row, cell.column) for cell in halves[half]}
+        inside = [(c.table, c.row, c.column) in fitted_keys for c in order]
+        both, stage_only = cells_at(choice.point), cells_at(choice.stage_only)
+        values = full_runs.space.named(choice.point)
+        names = (*full_runs.space.paths[: full_runs.stage], *choice.suspects)
+        fits.append(
+            HalfFit(
                 half,
-                choice.strength,
-                {n: float(values[n]) for n in fitted},
-                choice.doubts,
+                choice.penalty_weight,
+                {n: float(values[n]) for n in names},
+                choice.suspects,
                 choice.rounds,
-                [c for c, ours in zip(found, inside, strict=True) if ours],
-                [c for c, ours in zip(found, inside, strict=True) if not ours],
-                [c for c, ours in zip(alone, inside, strict=True) if not ours],
+                [c for c, used in zip(both, inside, strict=True) if used],
+                [c for c, used in zip(both, inside, strict=True) if not used],
+                [c for c, used in zip(stage_only, inside, strict=True) if not used],
             )
         )
-    return swaps
+    return fits

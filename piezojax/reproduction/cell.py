@@ -1,4 +1,4 @@
-"""What all chapters share: a printed cell, and the window in which errors count."""
+"""Printed cells, and the window in which errors count, for all chapters."""
 
 import csv
 from dataclasses import dataclass, replace
@@ -9,18 +9,18 @@ import numpy as np
 from ..signals import waveforms as signals
 
 SHORTEST = 1.0
-"""Least length of the window in which errors count, s."""
+"""Shortest length of the window in which errors count, s."""
 
 PERIODS = {"SIN": 1.0, "PWSW": 4.0, "SW": 20.0}
-"""Periods of the named frequency after which a signal repeats itself."""
+"""Periods of the frequency in the name after which a signal repeats."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One printed number, its simulation beside it, both in ``unit``.
+    """A printed number ``paper`` and its simulated value ``sim``, both in ``unit``.
 
-    ``sim`` is NaN until it has been simulated. ``group``, if not empty, is what the
-    cell counts to in the summary besides its column.
+    ``sim`` is NaN before the simulation. ``group`` is an additional group of the
+    summary, besides the column, that includes the cell; "" means none.
     """
 
     table: str
@@ -32,23 +32,23 @@ class Cell:
     group: str = ""
 
     def simulated(self, value: float, group: str = "") -> "Cell":
-        """Return the same cell with ``value`` beside the print."""
+        """Return the cell with ``value`` as its simulated value."""
         return replace(self, sim=value, group=group)
 
     @property
     def ratio(self) -> float:
-        """Simulation over print."""
+        """Ratio of the simulated to the printed value."""
         return self.sim / self.paper
 
 
 def title_of(table: str) -> str:
-    """Return the title of a table, or of a figure whose numbers are redone."""
+    """Return the title of a table or figure."""
     number = table.removeprefix("figure-")
     return f"Table {table}" if number == table else f"Figure {number}"
 
 
 def window(name: str) -> float:
-    """Return the shortest whole number of repeats of a signal that lasts 1 s, in s."""
+    """Return the shortest time (s) of at least 1 s in which a signal repeats."""
     kind, frequency = signals.parse(name)
     assert frequency is not None
     repeat = PERIODS[kind] / frequency
@@ -56,7 +56,10 @@ def window(name: str) -> float:
 
 
 def printed(chapter: str, table: str) -> dict[tuple[str, str], Cell]:
-    """Return the cells of ``table`` in ``data/{chapter}.csv`` by row and column."""
+    """Return the printed cells of ``table`` by row and column.
+
+    The source is ``data/{chapter}.csv``.
+    """
     source = files("piezojax.reproduction").joinpath(f"data/{chapter}.csv")
     lines = csv.DictReader(source.read_text(encoding="utf-8").splitlines())
     return {

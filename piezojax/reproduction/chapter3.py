@@ -1,4 +1,4 @@
-"""Tables 3-6 and 3-7: how well three discretisations of hysteresis predict."""
+"""Tables 3-6 and 3-7: prediction errors of three discretisations of hysteresis."""
 
 from functools import cache
 
@@ -15,23 +15,24 @@ from ..signals import waveforms as signals
 from .cell import Cell, printed, window
 
 TABLES = {"3-6": ("voros", "trapezoid"), "3-7": ("trapezoid", "quadratic")}
-"""Table: the schemes it compares, which are its columns."""
+"""Discretisation schemes of each table, which are its columns."""
 
 AMPLITUDE = 35.0
 """V: the inputs of the thesis swing by 70 V."""
 
-SEARCHED = (-0.1, -0.01)
-"""Bounds of c, 1/V, about the thesis' first fit of it, -0.0378."""
+C_BOUNDS = (-0.1, -0.01)
+"""Bounds of c, 1/V, around its first fit in the thesis, -0.0378."""
 
 TRAINING = {"SIN1": 1.0, "SIN10": 0.2, "SIN50": 0.1, "SIN100": 0.1, "SIN200": 0.1}
-"""Sines of the identification record, one after the other, and their length in s."""
+"""Consecutive sines of the identification record, and their duration, s."""
 
 
-def truth() -> Series:
-    """Return the stage that stands in for the thesis' hardware, V to um.
+def simulated_stage() -> Series:
+    """Return the simulated stage that replaces the hardware of the thesis, V to um.
 
-    The exact hysteresis with chapter 3's a, b and c, then the denominator and the y_2
-    numerator of Table 3-2, scaled to unit DC gain: no discretisation is favoured.
+    The exact hysteresis with a, b and c of chapter 3 is followed by the denominator and
+    the y_2 numerator of Table 3-2, scaled to unit DC gain. The exact solution favours
+    none of the discretisations.
     """
     model = p753.ARMA_HYSTERESIS["3-2"]
     dynamics = ARMA(model["autoregressive"], model["moving_2"])
@@ -57,31 +58,35 @@ def _voltage(name: str, duration: float) -> jax.Array:
 @cache
 def _model(scheme: str) -> System:
     voltage = jnp.concatenate([_voltage(*part) for part in TRAINING.items()])
-    output = np.asarray(_output(truth(), voltage)) + _noise(voltage.size, seed=0)
+    clean = np.asarray(_output(simulated_stage(), voltage))
+    output = clean + _noise(voltage.size, seed=0)
     record = Record(np.asarray(voltage), output, p753.DT)
     structure = Orders(scheme=scheme)
-    return instrumental_variables(record, structure, c=SEARCHED).model
+    return instrumental_variables(record, structure, c=C_BOUNDS).model
 
 
 def cells(table: str) -> list[Cell]:
     """Return the 22 cells of ``table`` ("3-6" or "3-7"), simulated.
 
-    One reading for all of them, nothing tuned. The hardware is replaced by ``truth``
-    with the sensor's white noise, ``p753.NOISE_RMS``. Every scheme is identified from
-    one record of 70 V sines up to 200 Hz. The thesis' online estimation is not defined;
-    its poles (Tables 3-2, 3-4) are free of the bias of least squares, so refined
-    instrumental variables stand for it. The error is the RMS of free run less measured
-    displacement over the second half of two windows, from rest. What the hardware does
-    and no model here does (most of the printed errors) cannot show up: the simulated
-    ones are those of the discretisation and of the noise.
+    One reading applies to all cells; nothing is tuned. ``simulated_stage`` with the
+    white noise of the sensor, ``p753.NOISE_RMS``, replaces the hardware. Every scheme
+    is identified from one record of 70 V sines up to 200 Hz. The thesis does not define
+    its online estimation. The poles it gives (Tables 3-2, 3-4) are free of the bias of
+    least squares, so refined instrumental variables replace it. The error is the RMS of
+    the free run minus the measured displacement, from rest, over the second of two
+    windows.
+
+    The simulated errors contain the errors of the discretisation and the noise. They do
+    not contain the effects that only the hardware has, which cause most of the printed
+    errors.
     """
     paper = printed("ch3", table)
-    found = []
+    simulated = []
     for seed, name in enumerate(dict.fromkeys(row for row, _ in paper), start=1):
         voltage = _voltage(name, 2.0 * window(name))
-        measured = _output(truth(), voltage) + _noise(voltage.size, seed)
+        measured = _output(simulated_stage(), voltage) + _noise(voltage.size, seed)
         for scheme in TABLES[table]:
             error = (_output(_model(scheme), voltage) - measured)[voltage.size // 2 :]
             rms = float(jnp.sqrt(jnp.mean(error**2)))
-            found.append(paper[name, scheme].simulated(rms))
-    return found
+            simulated.append(paper[name, scheme].simulated(rms))
+    return simulated

@@ -1,4 +1,4 @@
-"""Tables 4-5 and 4-6, and the numbers of the steps in Figures 4.5 and 4.7."""
+"""Tables 4-5 and 4-6, and the step responses of Figures 4.5 and 4.7."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -15,27 +15,30 @@ from ..signals import waveforms as signals
 from .cell import Cell, printed, window
 
 RATES = {"4-5": 20_000, "4-6": 5_000}
-"""Result table: its sampling rate, Hz."""
+"""Sampling rate of each table, Hz."""
 
 STEP, STEP_DURATION = 5.0, 0.2
-"""Height in um and length in s of a step; the second half counts as settled."""
+"""Height (um) and duration (s) of a step; the second half counts as settled."""
 
 BAND = 0.02
-"""Of the step's height: the band that ends the settling."""
+"""Half width of the settling band, as a share of the step."""
 
 
-def _same(controller: System, reference: jax.Array) -> jax.Array:
+def _reference_target(controller: System, reference: jax.Array) -> jax.Array:
     return reference
 
 
-def _desired(controller: Any, reference: jax.Array) -> jax.Array:
-    """Return y_d (um), from rest at zero; its model answers one sample ahead."""
+def _model_target(controller: Any, reference: jax.Array) -> jax.Array:
+    """Return the output y_d (um) of the reference model, from rest at zero.
+
+    The model is one sample ahead, so its output is delayed by a sample.
+    """
     ahead = simulate(controller.reference_model, reference)[1]
     return jnp.concatenate([jnp.zeros(1), ahead[:-1]])
 
 
 class Column(NamedTuple):
-    """A controller by its sampling rate, and what its output is to follow."""
+    """Functions that make the controller for a rate (Hz) and its target (um)."""
 
     make: Callable[[int], System]
     target: Callable[[System, jax.Array], jax.Array]
@@ -43,17 +46,19 @@ class Column(NamedTuple):
 
 COLUMNS = {
     "4-5": {
-        "traditional": Column(p753_chapter4.traditional, _same),
-        "model_reference": Column(p753_chapter4.model_reference, _desired),
-        "continuous": Column(p753_chapter4.continuous, _same),
+        "traditional": Column(p753_chapter4.traditional, _reference_target),
+        "model_reference": Column(p753_chapter4.model_reference, _model_target),
+        "continuous": Column(p753_chapter4.continuous, _reference_target),
     },
     "4-6": {
-        "model_reference": Column(p753_chapter4.model_reference, _desired),
-        "continuous": Column(p753_chapter4.continuous, _same),
+        "model_reference": Column(p753_chapter4.model_reference, _model_target),
+        "continuous": Column(p753_chapter4.continuous, _reference_target),
     },
 }
-"""Columns of the tables by the name ``cells.csv`` uses. The gains of the traditional
-design at 5 kHz are not printed, so that column of Table 4-6 is left out."""
+"""Columns of the tables by their names in ``cells.csv``.
+
+Table 4-6 lacks the traditional column, because its gains at 5 kHz are not printed.
+"""
 
 
 @eqx.filter_jit
@@ -62,7 +67,7 @@ def displacement(
 ) -> jax.Array:
     """Return the displacement (um) of a loop without noise, from rest at zero.
 
-    ``reference`` (um) is sampled at ``rate`` (Hz); ``stage`` as in
+    ``reference`` (um) is sampled at ``rate`` (Hz). ``stage`` is that of
     ``p753_chapter4.loop``.
     """
     loop = p753_chapter4.loop(controller, rate, stage, noise_rms=0.0)
@@ -70,9 +75,10 @@ def displacement(
 
 
 def rms_errors(column: Column, names: Sequence[str], rate: int) -> dict[str, float]:
-    """Return the RMS error (um) of a column's controller on the references ``names``.
+    """Return the RMS errors (um) of the controller of a column, by reference.
 
-    All of them in one batch, the shorter ones held at their end, which is not counted.
+    The references ``names`` form one batch. Shorter ones are padded with their last
+    value, and the padding does not count.
     """
     references = {
         name: signals.signal(name, signals.time_grid(2.0 * window(name), float(rate)))
@@ -105,16 +111,16 @@ def _errors(column: Column, references: jax.Array, rate: int) -> jax.Array:
 
 
 class StepFigures(NamedTuple):
-    """``overshoot`` in % of the step; ``settling`` in ms, to stay within 2 %."""
+    """Overshoot (% of the step) and settling time (ms, to within 2 %)."""
 
     overshoot: float
     settling: float
 
 
 def step_figures(output: Any, rate: float) -> StepFigures:
-    """Return the figures of a response (um) to the ``STEP`` at sample 0.
+    """Return the figures of a response (um) to a ``STEP`` at sample 0.
 
-    ``settling`` is infinite where the last sample is still outside the band.
+    ``settling`` is infinite if the last sample is outside the band.
     """
     output = np.asarray(output)
     outside = np.flatnonzero(np.abs(output - STEP) > BAND * STEP)
@@ -124,7 +130,7 @@ def step_figures(output: Any, rate: float) -> StepFigures:
 
 
 class Chatter(NamedTuple):
-    """``amplitude``, from peak to peak, and ``centre`` of an oscillation, um."""
+    """Peak-to-peak ``amplitude`` and ``centre`` of an oscillation, um."""
 
     amplitude: float
     centre: float
@@ -140,18 +146,19 @@ def chatter(output: Any) -> Chatter:
 def step_responses(rate: int = 20_000) -> dict[str, np.ndarray]:
     """Return the responses (um) to a ``STEP`` at ``rate`` (1 or 20 kHz) by column.
 
-    The stage is that of chapter 5 and the model-reference controller of Table 4-3 sees
-    the displacement unfiltered: with the printed filter neither stage settles at 20
-    kHz, and with the stage of the tables bang-bang hits its limits at every sample.
+    The stage is that of chapter 5, because with the stage of the tables the bang-bang
+    controller hits its limits at every sample. The model-reference controller of Table
+    4-3 receives the unfiltered displacement, because with the printed filter neither
+    stage settles at 20 kHz.
     """
     reference = jnp.full(round(STEP_DURATION * rate), STEP)
-    following = p753_chapter4.model_reference(
+    controller = p753_chapter4.model_reference(
         rate, "4-3", p753_chapter4.unfiltered(rate)
     )
     stage = p753.plant()
     responses = {
-        "reference_model": _desired(following, reference),
-        "model_reference": displacement(following, reference, rate, stage),
+        "reference_model": _model_target(controller, reference),
+        "model_reference": displacement(controller, reference, rate, stage),
         "bang_bang": displacement(
             p753_chapter4.bang_bang(rate), reference, rate, stage
         ),
@@ -163,7 +170,7 @@ FIGURES = {
     "figure-4-5": ("bang_bang",),
     "figure-4-7": ("reference_model", "model_reference"),
 }
-"""Figures whose numbers the text prints, at 20 kHz: their columns."""
+"""Columns of each figure with numbers in the text, at 20 kHz."""
 
 TABLES = (*RATES, *FIGURES)
 
@@ -171,18 +178,20 @@ TABLES = (*RATES, *FIGURES)
 def cells(table: str) -> list[Cell]:
     """Return the cells of ``table`` ("4-5", "4-6" or a figure's numbers), simulated.
 
-    One reading for all cells of both tables, nothing tuned: the printed gains and the
-    rows of Table 4-1 as they stand, the alpha-beta filter of 20 kHz also at 5 kHz,
-    where none is printed, the stage of ``p753_chapter4.plant``, no sensor noise, a
-    start from rest at zero, and the RMS of the true displacement over the second half
-    of a run of two windows (see ``window``). The model-reference controller is held
-    against its reference model's output, the others against the reference.
+    One reading applies to all cells of both tables; nothing is tuned:
 
-    The traditional column cannot agree: the only gains printed for it, Table 4-2, have
-    a control weight that leaves it too slow for any of its cells. Nor does the
-    continuous one at 5 kHz, whose printed integral gain is ten times too small. The
-    figures have a reading of their own, see ``step_responses``; the steps at 1 kHz are
-    not reproduced.
+    - The gains and the rows of Table 4-1 are used as printed. The alpha-beta filter of
+      20 kHz is also used at 5 kHz, where none is printed.
+    - The stage is ``p753_chapter4.plant``, without sensor noise, from rest at zero.
+    - A cell is the RMS error of the true displacement over the second of two windows
+      (see ``window``). The error of the model-reference controller is relative to the
+      output of its reference model, that of the others to the reference.
+
+    The traditional column cannot agree: the only printed gains, Table 4-2, have a
+    control weight that makes it too slow for all of its cells. The continuous column at
+    5 kHz disagrees too: its printed integral gain looks ten times too small. For the
+    reading of the figures see ``step_responses``; the steps at 1 kHz are not
+    reproduced.
     """
     return _figure(table) if table in FIGURES else _table(table)
 

@@ -1,4 +1,4 @@
-"""Tables 5-3 and 5-5: three PID-based sliding mode controllers, ten references."""
+"""Tables 5-3 and 5-5: three PID-based sliding mode controllers on ten references."""
 
 import equinox as eqx
 import jax
@@ -15,10 +15,10 @@ COLUMNS = {
     "inversion": p753.inversion,
     "dob": p753.disturbance_observer,
 }
-"""Columns of the tables by the name ``cells.csv`` uses."""
+"""Controllers of the columns, by their names in ``cells.csv``."""
 
 TABLES = {"5-3": "5-2", "5-5": "5-4"}
-"""Result table: the table that prints its gains."""
+"""Table of the gains of each result table."""
 
 
 @eqx.filter_jit
@@ -32,18 +32,18 @@ def _rms_error(controller: System, reference: jax.Array) -> jax.Array:
 def cells(table: str) -> list[Cell]:
     """Return the 30 cells of ``table`` ("5-3" or "5-5"), simulated.
 
-    One reading for all of them, nothing tuned: the gains as printed, the stage with
-    unit DC gain behind its hysteresis, no sensor noise, a start from rest at zero, and
-    the RMS of the true displacement against the reference over the second half of a run
-    of two windows (see ``window``).
+    One reading applies to all cells; nothing is tuned. The gains are those printed. The
+    stage has unit DC gain behind its hysteresis and no sensor noise, and starts from
+    rest at zero. A cell is the RMS error of the true displacement over the second of
+    two windows (see ``window``).
     """
     paper = printed("ch5", table)
-    found = []
+    simulated = []
     for name in signals.THESIS:
         reference = signals.signal(
             name, signals.time_grid(2.0 * window(name), p753.RATE)
         )
         for column, make in COLUMNS.items():
             error = float(_rms_error(make(TABLES[table]), reference))
-            found.append(paper[name, column].simulated(error))
-    return found
+            simulated.append(paper[name, column].simulated(error))
+    return simulated

@@ -1,4 +1,4 @@
-"""Table 7-4 and Figure 7.4: multi-axis sliding mode control against a PID."""
+"""Table 7-4 and Figure 7.4: multi-axis sliding mode control and PID control."""
 
 from functools import partial
 
@@ -7,35 +7,41 @@ from .cell import Cell
 from .three_dof import Column, experiment_cells, table_cells
 
 DELAY = 1
-"""Samples of delay of the stage beyond (7.53)."""
+"""Additional delay of the stage beyond (7.53), samples."""
 
 COLUMNS = {
     "pid_smc": Column(partial(p558_control.multi_axis, "dynamic", False), DELAY),
     "pid": Column(p558_control.pid, DELAY),
 }
-"""Controllers by the name ``cells.csv`` uses."""
+"""Controllers by their names in ``cells.csv``."""
 
 FIGURE = "figure-7-4"
-"""The second combined experiment; nothing is printed on the first (Figure 7.3)."""
+"""Second combined experiment; no numbers are printed for the first (Figure 7.3)."""
 
 TABLES = ("7-4", FIGURE)
-"""The table and figure of this chapter."""
+"""Table and figure of this chapter."""
 
 
 def cells(table: str) -> list[Cell]:
     """Return the 54 cells of Table 7-4 or the 6 of Figure 7.4, simulated.
 
-    One reading for all of them, nothing tuned per cell: the gains as printed for
-    dynamic tracking; (7.53) behind a hysteresis of about 1 % and one further sample of
-    delay; sensor noise of 0.8 nm and 13 nrad rms, which is the floor of the table; no
-    alpha-beta filter in front of the sliding mode controller; the measured output
-    less r over the second half of 4 s. With the filter, as the text has it, or
-    without the further delay the driven axes agree less (docs/reproduction.md).
+    One reading applies to all cells; nothing is tuned for single cells:
 
-    Off its diagonal Table 7-4 is printed transposed: the row of a driven Rx under Z has
-    the error of Rx when Z is driven. (``unit`` is that of the printed column all the
-    same; such a cell holds the unit of its row's axis.) What the text says
-    of Rx in the second experiment names no axis; it is the one with no reference.
+    - The gains are those printed for dynamic tracking.
+    - The stage is (7.53) behind a hysteresis of about 1 %, with one additional sample
+      of delay. The sensor noise is 0.8 nm and 13 nrad rms, the floor of the errors in
+      the table.
+    - The sliding mode controller has no alpha-beta filter in front of it.
+    - A cell is the RMS of the measured output minus r over the second half of 4 s.
+
+    With the filter that the text describes, or without the additional delay, the driven
+    axes agree less (docs/reproduction.md).
+
+    Table 7-4 is printed transposed off its diagonal: the cell in the row of a driven Rx
+    and the column Z is the error of Rx while Z is driven. ``unit`` remains that of the
+    printed column, but the number of such a cell is in the unit of the axis of its row.
+    The text on the second experiment does not name the axis of one number; it is Rx,
+    the axis without a reference.
     """
     if table == FIGURE:
         return experiment_cells("ch7", table, COLUMNS, "experiment_2")

@@ -1,4 +1,4 @@
-"""Cells of Tables 4-5, 5-3 and 5-5 simulated at once, for a stage that is fitted."""
+"""Batched simulation of the cells of Tables 4-5, 5-3 and 5-5 with a given stage."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -17,46 +17,50 @@ from ..core.system import Feedback, LoopInput, System, loop_inputs
 from ..signals import waveforms as signals
 from . import chapter4, chapter5
 from .cell import Cell, window
-from .doubts import DOUBTS, REFERENCE, candidates
+from .suspect_numbers import CANDIDATES, REFERENCE, candidates_of
 
 WARM_UP = 0.3
-"""Of a shortened run, before errors count, s: a jump of SW at its start rings off."""
+"""Time before the errors of a shortened run count, s.
+
+The response to the jump of SW at its start decays in this time.
+"""
 
 SHORT = 1.0
-"""Longest window of a shortened run, s: less than SW10 and SW30 take to repeat."""
+"""Longest window of a shortened run, s; SW10 and SW30 repeat after a longer time."""
 
 SEED = 0
-"""Of the sensor's noise."""
+"""Seed of the sensor noise."""
 
 
 class Lanes(eqx.Module):
-    """Loops of one kind of controller, a lane a cell; time first, in um.
+    """Loops of one kind of controller, one lane for each cell.
 
-    ``weight`` is one over the number of samples counted, or zero outside the window;
-    ``noise``, of unit variance, is the same in all lanes. ``follow`` turns controller
-    and reference into what the displacement is judged against; ``concerned`` marks,
-    for each of ``doubts.DOUBTS`` that counts here, the lanes that hold it.
+    ``reference`` is in um. ``weight`` is one over the number of counted samples, and
+    zero outside the window. ``noise`` has unit variance and is the same in all lanes.
+    ``affected`` marks the lanes that contain a candidate, for each of
+    ``suspect_numbers.CANDIDATES`` that appears in the cells. ``make_target`` maps
+    controller and reference to the target of the displacement.
     """
 
     controller: System
     reference: Float[Array, "samples lanes"]
     weight: Float[Array, "samples lanes"]
     noise: Float[Array, " samples"]
-    concerned: dict[str, Bool[Array, " lanes"]]
-    follow: Callable[[System, Array], Array] = eqx.field(static=True)
+    affected: dict[str, Bool[Array, " lanes"]]
+    make_target: Callable[[System, Array], Array] = eqx.field(static=True)
 
     def target(self) -> Float[Array, "samples lanes"]:
-        """Return what the displacement is to be, um."""
-        return jax.vmap(self.follow, (0, 1), 1)(self.controller, self.reference)
+        """Return the target of the displacement, um."""
+        return jax.vmap(self.make_target, (0, 1), 1)(self.controller, self.reference)
 
-    def with_doubts(self, factors: Mapping[str, Any]) -> "Lanes":
-        """Return the lanes with their prints times ``factors``, by name."""
+    def scaled(self, factors: Mapping[str, Any]) -> "Lanes":
+        """Return the lanes with their printed numbers multiplied by ``factors``."""
         reference, leaves = self.reference, parameters(self.controller)
-        for name, lanes in self.concerned.items():
-            factor, doubt = jnp.where(lanes, factors[name], 1.0), DOUBTS[name]
-            if doubt.leaf == REFERENCE:
+        for name, lanes in self.affected.items():
+            factor, suspect = jnp.where(lanes, factors[name], 1.0), CANDIDATES[name]
+            if suspect.leaf == REFERENCE:
                 reference = factor * reference
-            for path in doubt.leaves(leaves):
+            for path in suspect.leaves(leaves):
                 leaves[path] = factor * leaves[path]
         return eqx.tree_at(
             lambda lanes: (lanes.controller, lanes.reference),
@@ -73,18 +77,18 @@ def _maker(cell: Cell) -> Callable[[], System]:
     return lambda: make(chapter4.RATES[cell.table])
 
 
-def _reference(controller: System, reference: Array) -> Array:
+def _reference_target(controller: System, reference: Array) -> Array:
     return reference
 
 
-def _follow(cell: Cell) -> Callable[[System, Array], Array]:
+def _target_maker(cell: Cell) -> Callable[[System, Array], Array]:
     if cell.table in chapter5.TABLES:
-        return _reference
+        return _reference_target
     return chapter4.COLUMNS[cell.table][cell.column].target
 
 
-def _spans(name: str, short: bool) -> tuple[int, int]:
-    """Return first and last sample that count."""
+def _counted_span(name: str, short: bool) -> tuple[int, int]:
+    """Return the first counted sample and the sample after the last one."""
     repeat = window(name)
     first, length = (WARM_UP, min(repeat, SHORT)) if short else (repeat, repeat)
     start = round(first * p753.RATE)
@@ -92,28 +96,28 @@ def _spans(name: str, short: bool) -> tuple[int, int]:
 
 
 def lanes_of(cells: Sequence[Cell], *, short: bool) -> list[Lanes]:
-    """Return ``cells``, a Lanes for each column, in the order of ``by_column``.
+    """Return a Lanes for each column of ``cells``, in the order of ``by_column``.
 
-    ``short`` starts to count after ``WARM_UP`` and for at most ``SHORT`` seconds;
-    otherwise the second of two windows counts, as in the tables.
+    With ``short``, errors count after ``WARM_UP`` for at most ``SHORT`` seconds.
+    Otherwise they count in the second of two windows, as in the tables.
     """
-    longest = max(_spans(cell.row, short)[1] for cell in cells)
-    return [_together(group, longest, short) for group in by_column(cells)]
+    longest = max(_counted_span(cell.row, short)[1] for cell in cells)
+    return [_stacked(group, longest, short) for group in by_column(cells)]
 
 
 def by_column(cells: Sequence[Cell]) -> list[list[Cell]]:
-    """Return ``cells`` in groups of one controller's kind."""
+    """Return ``cells`` in groups with the same kind of controller."""
     columns = sorted({cell.column for cell in cells})
     return [[cell for cell in cells if cell.column == name] for name in columns]
 
 
-def _together(cells: Sequence[Cell], longest: int, short: bool) -> Lanes:
+def _stacked(cells: Sequence[Cell], longest: int, short: bool) -> Lanes:
     time = jnp.arange(longest) / p753.RATE
     controllers = [_maker(cell)() for cell in cells]
     references = [signals.signal(cell.row, time) for cell in cells]
     weight = np.zeros((longest, len(cells)))
     for lane, cell in enumerate(cells):
-        start, stop = _spans(cell.row, short)
+        start, stop = _counted_span(cell.row, short)
         weight[start:stop, lane] = 1.0 / (stop - start)
     return Lanes(
         jax.tree.map(lambda *leaves: jnp.stack(leaves), *controllers),
@@ -121,15 +125,15 @@ def _together(cells: Sequence[Cell], longest: int, short: bool) -> Lanes:
         jnp.asarray(weight),
         jnp.asarray(np.random.default_rng(SEED).standard_normal(longest)),
         {
-            name: jnp.asarray([doubt.concerns(cell) for cell in cells])
-            for name, doubt in candidates(cells).items()
+            name: jnp.asarray([suspect.appears_in(cell) for cell in cells])
+            for name, suspect in candidates_of(cells).items()
         },
-        _follow(cells[0]),
+        _target_maker(cells[0]),
     )
 
 
-class _Judged(System):
-    """A loop whose output is its squared error, weighted, in um^2."""
+class _SquaredError(System):
+    """A loop whose output is its weighted squared error, um^2."""
 
     loop: Feedback
 
@@ -156,19 +160,19 @@ class _Sum(Metric):
 
 
 def mean_squares(stage: System, sensor: System, lanes: Lanes) -> Float[Array, " lanes"]:
-    """Return the mean squared error (um^2) of the true displacement, a lane a cell.
+    """Return the mean squared error (um^2) of the true displacement in each lane.
 
-    ``stage`` turns V into um, ``sensor`` that and a draw into what is seen; from rest
-    at zero.
+    ``stage`` maps V to um; ``sensor`` maps the displacement and a noise sample to the
+    measured displacement. The loops start from rest at zero.
     """
 
-    def one(controller, reference, target, weight):
-        loop = _Judged(Feedback(controller, stage, p753.actuator(), sensor))
+    def simulate_lane(controller, reference, target, weight):
+        loop = _SquaredError(Feedback(controller, stage, p753.actuator(), sensor))
         inputs = (loop_inputs(reference, lanes.noise), target, weight)
         return simulate(
             loop, inputs, loop.init(0.0), metric=_Sum(), segment=reference.shape[0]
         )[1]
 
-    return jax.vmap(one, in_axes=(0, 1, 1, 1))(
+    return jax.vmap(simulate_lane, in_axes=(0, 1, 1, 1))(
         lanes.controller, lanes.reference, lanes.target(), lanes.weight
     )

@@ -9,13 +9,13 @@ from .summary import comma_separated
 FIGURE = "figure-4-10"
 
 SIGNALS = ("SIN1", "SIN10", "SIN30", "SIN50")
-"""The figure has sinusoids; which ones is not printed."""
+"""Sinusoids of the simulated figure; those of the printed figure are not specified."""
 
 RATES = {
     "model_reference": tuple(p753_chapter4.MODEL_REFERENCE_GAINS["4-4"]),
     "continuous": tuple(p753_chapter4.CONTINUOUS_GAINS),
 }
-"""Rates (Hz) by column for which gains are printed."""
+"""Rates (Hz) with printed gains, by column."""
 
 
 class RateError(NamedTuple):
@@ -30,9 +30,9 @@ class RateError(NamedTuple):
 def errors_by_rate(signals: tuple[str, ...] = SIGNALS) -> list[RateError]:
     """Return the errors of both columns at each rate with printed gains.
 
-    The reading is that of Tables 4-5 and 4-6. The figure's numbers are not printed:
-    what the text says of it is that the model reference is the better one, the more so
-    the lower the rate.
+    The reading is that of Tables 4-5 and 4-6. The numbers of the figure are not
+    printed. According to the text, the model-reference controller is better, and its
+    advantage grows towards low rates.
     """
     return [
         RateError(rate, column, row, error)

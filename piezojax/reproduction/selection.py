@@ -1,7 +1,7 @@
-"""Which prints to doubt, and how hard to pull: decided on the cells that are fitted.
+"""Selection of the suspect numbers and of the penalty weight, on the fitted cells only.
 
-Nothing here sees any other cell. All thresholds were fixed before the procedure was
-first run on print.
+No held-out cell is used. All thresholds were fixed before the first run on the printed
+data.
 """
 
 from collections.abc import Sequence
@@ -15,33 +15,36 @@ from ..core.progress import Progress, Silent
 from .stage_fit import STEPS, Point, Problem, costs, fit, log_ratios
 from .summary import geomean
 
-STRENGTHS = (0.3, 3.0)
-"""Pulls towards print tried: cost of a step from end to end of a quantity's range."""
+PENALTY_WEIGHTS = (0.3, 3.0)
+"""Candidate weights of the penalty on the distance of the stage from print.
+
+The weight is the residual of a step over the whole range of a quantity.
+"""
 
 FOLDS = 5
-"""Parts of the fitting half; each holds one cell of each column of each table."""
+"""Parts of the fitting half; each has one cell of each column of each table."""
 
 SHIFTS = ({}, {"slow_pole": 0.2})
-"""Starts of a fit without doubts, as shifts from print in the unit box."""
+"""Starts of a fit of the stage alone, as shifts from print in the unit box."""
 
-MOST = 3
-"""Doubts that are taken at most."""
+MAX_SUSPECTS = 3
+"""Largest number of selected suspect numbers."""
 
-WORTH = 1.02
-"""Least factor by which a doubt must lower the cross-validated ratio."""
+MIN_IMPROVEMENT = 1.02
+"""Smallest factor by which a suspect number must lower the cross-validated ratio."""
 
 GRID = 5
-"""Values of a candidate tried with the stage held; the middle one is print."""
+"""Grid values of a candidate with the stage fixed; the middle one is as printed."""
 
 SCREENING = 3
-"""Steps of the optimiser from the best of them, with the stage free."""
+"""Steps of the optimiser from the best grid value, with the stage free."""
 
 FINALISTS = 3
-"""Candidates, the cheapest after that, that are cross-validated."""
+"""Number of candidates with the least cost after screening that are cross-validated."""
 
 
 class Round(NamedTuple):
-    """One round: cross-validated ratio without a further doubt, and with each."""
+    """One round: cross-validated ratios before it and with each finalist."""
 
     before: float
     after: dict[str, float]
@@ -49,17 +52,17 @@ class Round(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """What was decided, and the fits to the whole half without and with the doubts."""
+    """Selected suspect numbers, and the fits to the half without and with them."""
 
-    doubts: tuple[str, ...]
+    suspects: tuple[str, ...]
     rounds: tuple[Round, ...]
-    strength: float
-    alone: Point
+    penalty_weight: float
+    stage_only: Point
     point: Point
 
 
 def starts(problem: Problem) -> list[Point]:
-    """Return the points of the unit box from which the stage alone is fitted."""
+    """Return the starts, in the unit box, of a fit of the stage alone."""
     names = problem.space.paths
     return [
         problem.start + jnp.asarray([shift.get(n, 0.0) for n in names])
@@ -74,7 +77,7 @@ def cross_validated(
     steps: int = STEPS,
     progress: Progress | None = None,
 ) -> float:
-    """Return the ratio of the cells, each predicted from the other folds."""
+    """Return the ratio of the cells, each predicted by a fit to the other folds."""
     fold = np.arange(problem.paper.size) % FOLDS
     logs = []
     for left_out in range(FOLDS):
@@ -86,21 +89,21 @@ def cross_validated(
     return ratio if np.isfinite(ratio) else np.inf
 
 
-def pulled(
+def with_best_penalty(
     problem: Problem,
     free: Sequence[int],
     begin: Sequence[Point],
     steps: int = STEPS,
     progress: Progress | None = None,
 ) -> tuple[Problem, float]:
-    """Return the problem with the best pull of ``STRENGTHS``, and its ratio."""
-    tried = [
-        eqx.tree_at(lambda p: p.strength, problem, jnp.asarray(strength))
-        for strength in STRENGTHS
+    """Return the problem with the best of ``PENALTY_WEIGHTS``, and its ratio."""
+    problems = [
+        eqx.tree_at(lambda p: p.penalty_weight, problem, jnp.asarray(weight))
+        for weight in PENALTY_WEIGHTS
     ]
-    ratios = [cross_validated(p, free, begin, steps, progress) for p in tried]
+    ratios = [cross_validated(p, free, begin, steps, progress) for p in problems]
     best = int(np.argmin(ratios))
-    return tried[best], ratios[best]
+    return problems[best], ratios[best]
 
 
 def screen(
@@ -109,29 +112,30 @@ def screen(
     point: Point,
     progress: Progress | None = None,
 ) -> list[tuple[int, Point]]:
-    """Return the ``FINALISTS`` that lower the cost most, each with its point.
+    """Return the ``FINALISTS`` candidates with the least cost, each with its point.
 
-    A wide step first, because what fits may be decades from print and the slope there
-    says little of it; then a few steps together with what is ``free`` already. All of
-    it twice: from ``point``, and from the printed stage, because a stage that was bent
-    to make up for a wrong print hides it.
+    A grid search comes first, because the best value may be decades from the printed
+    one, where the slope at the printed value is no guide. A few steps of the optimiser
+    follow, together with the quantities that are already ``free``. Both run twice, from
+    ``point`` and from the printed stage, because a stage fitted to compensate a
+    misprint hides the misprint.
     """
     progress = Silent() if progress is None else progress
     grid = (jnp.arange(GRID) + 0.5) / GRID
     bases = point, point.at[: problem.stage].set(problem.start[: problem.stage])
-    found = []
+    screened = []
     for place in range(problem.stage, point.size):
         if place in free:
             continue
-        tried = []
+        fits = []
         for base in bases:
             points = jnp.tile(base, (GRID, 1)).at[:, place].set(grid)
             begin = points[int(np.argmin(np.asarray(costs(problem, points))))]
-            tried.append(fit(problem, [*free, place], [begin], SCREENING, progress))
-        moved, least = min(tried, key=lambda entry: entry[1])
-        found.append((least, place, moved))
-    found.sort(key=lambda entry: entry[:2])
-    return [(place, moved) for _, place, moved in found[:FINALISTS]]
+            fits.append(fit(problem, [*free, place], [begin], SCREENING, progress))
+        best, least = min(fits, key=lambda entry: entry[1])
+        screened.append((least, place, best))
+    screened.sort(key=lambda entry: entry[:2])
+    return [(place, best) for _, place, best in screened[:FINALISTS]]
 
 
 def select(
@@ -140,23 +144,24 @@ def select(
     steps: int = STEPS,
     progress: Progress | None = None,
 ) -> Choice:
-    """Return the doubts that the cells of ``problem`` ask for, and the fits.
+    """Select the suspect numbers of ``problem`` by forward selection, and fit them.
 
-    Forward, one doubt at a time: of the finalists of the screening the one with the
-    best cross-validated ratio, if that is better by ``WORTH`` than without.
+    Each round takes the finalist of the screening with the best cross-validated ratio.
+    The selection ends when this ratio is not better by ``MIN_IMPROVEMENT``.
     """
     progress = Silent() if progress is None else progress
     names, begin = problem.space.paths, starts(problem)
     free = list(range(problem.stage))
     progress.stage(
-        f"{name}: the stage alone", (len(STRENGTHS) * FOLDS + 1) * len(begin) * steps
+        f"{name}: the stage alone",
+        (len(PENALTY_WEIGHTS) * FOLDS + 1) * len(begin) * steps,
     )
-    problem, ratio = pulled(problem, free, begin, steps, progress)
-    alone, _ = fit(problem, free, begin, steps, progress)
-    point, rounds = alone, []
-    while len(rounds) < MOST and len(free) < point.size:
+    problem, ratio = with_best_penalty(problem, free, begin, steps, progress)
+    stage_only, _ = fit(problem, free, begin, steps, progress)
+    point, rounds = stage_only, []
+    while len(rounds) < MAX_SUSPECTS and len(free) < point.size:
         progress.stage(
-            f"{name}: cross-validated {ratio:.3f}; screening for a doubt",
+            f"{name}: cross-validated {ratio:.3f}; screening candidates",
             2 * SCREENING * (point.size - len(free)),
         )
         finalists = screen(problem, free, point, progress)
@@ -166,18 +171,20 @@ def select(
             for place, moved in finalists
         }
         best = min(after, key=lambda place: after[place])
-        worth = after[best] * WORTH <= ratio
-        told = {names[place]: value for place, value in after.items()}
-        rounds.append(Round(ratio, told, names[best] if worth else None))
-        if not worth:
+        improves = after[best] * MIN_IMPROVEMENT <= ratio
+        ratios = {names[place]: value for place, value in after.items()}
+        rounds.append(Round(ratio, ratios, names[best] if improves else None))
+        if not improves:
             break
         free, ratio = [*free, best], after[best]
         point, _ = fit(problem, free, [dict(finalists)[best]], steps, progress)
-    doubts = tuple(names[place] for place in free[problem.stage :])
-    if doubts:
+    suspects = tuple(names[place] for place in free[problem.stage :])
+    if suspects:
         progress.stage(
-            f"{name}: {', '.join(doubts)}", (len(STRENGTHS) * FOLDS + 1) * steps
+            f"{name}: {', '.join(suspects)}", (len(PENALTY_WEIGHTS) * FOLDS + 1) * steps
         )
-        problem, _ = pulled(problem, free, [point], steps, progress)
+        problem, _ = with_best_penalty(problem, free, [point], steps, progress)
         point, _ = fit(problem, free, [point], steps, progress)
-    return Choice(doubts, tuple(rounds), float(problem.strength), alone, point)
+    return Choice(
+        suspects, tuple(rounds), float(problem.penalty_weight), stage_only, point
+    )

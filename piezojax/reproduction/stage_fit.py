@@ -1,4 +1,4 @@
-"""Cells to be explained by one stage: residuals, their Jacobian, and the fit."""
+"""Least-squares fit of one stage to cells: residuals, Jacobian, optimiser."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -20,28 +20,33 @@ from .lanes import Lanes, mean_squares
 from .stage_parameters import sensor_of, stage_of
 
 STEPS = 20
-"""Most steps of the optimiser from each start."""
+"""Largest number of optimiser steps from each start."""
 
 CORNER = 0.1
-"""|ln(sim/print)| at which the cost turns from square into linear."""
+"""|ln(sim/print)| at which the cost changes from quadratic to linear."""
 
 TOLERANCE = 1e-4
-"""Relative change of cost and point at which a start is done."""
+"""Relative change of cost and point at which the descent from a start ends."""
 
 STEEPEST = 1e4
-"""Slope of a residual over its box that is not believed: the loop is unstable, and its
-slope, unlike its voltage, has no limits. A residual without a number is as large."""
+"""Largest slope of a residual over the unit box; larger ones are set to zero.
+
+An unstable loop has larger ones: unlike its voltage, its slope has no limits. The value
+also replaces residuals that are not finite.
+"""
 
 Point = Float[Array, " n"]
 Free = Int[Array, " free"]
 
 
 class Problem(eqx.Module):
-    """Cells and what may be fitted: the stage's quantities first, then the doubts.
+    """Cells and the quantities that can be fitted to them.
 
-    ``paper`` in um and ``counts`` (1 or 0) follow the lanes one after the other;
-    ``strength`` is the pull of the first ``stage`` quantities towards ``start``, the
-    point of print in the unit box; what is in doubt is not pulled.
+    The first ``stage`` quantities are those of the stage; the candidates for suspect
+    numbers follow. ``numerator`` is that of the dynamics of the stage. ``paper`` (um)
+    and ``counts`` (1 or 0) are in the order of the lanes. ``start`` is the point of the
+    printed values in the unit box. ``penalty_weight`` is the weight of the penalty on
+    the distance of the stage from ``start``; suspect numbers have no penalty.
     """
 
     space: Space
@@ -51,14 +56,13 @@ class Problem(eqx.Module):
     paper: Float[Array, " cells"]
     counts: Float[Array, " cells"]
     start: Point
-    strength: Array
+    penalty_weight: Array
 
     def errors(self, values: Mapping[str, Any]) -> Float[Array, " cells"]:
         """Return the RMS error (um) of every cell for ``values`` of all quantities."""
         stage, sensor = stage_of(values, self.numerator), sensor_of(values)
         squares = [
-            mean_squares(stage, sensor, lanes.with_doubts(values))
-            for lanes in self.lanes
+            mean_squares(stage, sensor, lanes.scaled(values)) for lanes in self.lanes
         ]
         return jnp.sqrt(jnp.concatenate(squares))
 
@@ -67,28 +71,31 @@ class Problem(eqx.Module):
         return jnp.log(self.errors(self.space.named(point)) / self.paper)
 
     def residuals(self, point: Point) -> Array:
-        """Return what is squared and summed: nearly |ln(sim/print)|, and the pull."""
+        """Return the residuals of the cells and of the penalty.
+
+        The square of a residual approaches |ln(sim/print)| for large errors.
+        """
         log = self.log_ratios(point)
         misfit = self.counts * log / (log**2 + CORNER**2) ** 0.25
         misfit = jnp.where(jnp.isfinite(misfit), misfit, STEEPEST)
-        pull = self.strength * (point - self.start)[: self.stage]
-        return jnp.concatenate([misfit, pull])
+        penalty = self.penalty_weight * (point - self.start)[: self.stage]
+        return jnp.concatenate([misfit, penalty])
 
     def jacobian(self, point: Point, free: Free) -> tuple[Array, Array]:
-        """Return the residuals' forward-mode Jacobian [residual, free], and them.
+        """Return the forward-mode Jacobian [residual, free] and the residuals.
 
-        Slopes beyond ``STEEPEST`` are zero there.
+        Slopes beyond ``STEEPEST`` are set to zero.
         """
 
-        def twice(part):
-            found = self.residuals(point.at[free].set(part))
-            return found, found
+        def residuals_twice(part):
+            residuals = self.residuals(point.at[free].set(part))
+            return residuals, residuals
 
-        slope, value = jax.jacfwd(twice, has_aux=True)(point[free])
+        slope, value = jax.jacfwd(residuals_twice, has_aux=True)(point[free])
         return jnp.where(jnp.abs(slope) < STEEPEST, slope, 0.0), value
 
     def optimiser(self, point: Point, free: Free) -> Optimiser:
-        """Return damped Gauss-Newton on the quantities ``free``, the others held."""
+        """Return damped Gauss-Newton on the quantities ``free`` alone."""
         return damped_gauss_newton(
             lambda part: self.jacobian(point.at[free].set(part), free), TOLERANCE
         )
@@ -101,24 +108,24 @@ class _Carry(NamedTuple):
 
 @eqx.filter_jit
 def _begin(problem: Problem, starts: Float[Array, "starts n"], free: Free) -> _Carry:
-    def one(start):
+    def begin_at(start):
         return _Carry(start, problem.optimiser(start, free).start(start[free]))
 
-    return jax.vmap(one)(starts)
+    return jax.vmap(begin_at)(starts)
 
 
 @eqx.filter_jit
 def _advance(
     problem: Problem, free: Free, carry: _Carry
 ) -> tuple[_Carry, View, Verdict]:
-    def one(carry):
+    def step_from(carry):
         optimiser = problem.optimiser(carry.start, free)
         carry = carry._replace(state=optimiser.step(carry.state))
         part, loss, done = optimiser.view(carry.state)
         view = View(carry.start.at[free].set(part), loss, done)
         return carry, view, Verdict(loss, jnp.zeros_like(loss))
 
-    return jax.vmap(one)(carry)
+    return jax.vmap(step_from)(carry)
 
 
 @eqx.filter_jit
@@ -129,7 +136,7 @@ def log_ratios(problem: Problem, point: Point) -> Float[Array, " cells"]:
 
 @eqx.filter_jit
 def costs(problem: Problem, points: Float[Array, "points n"]) -> Array:
-    """Return the sum of squares at each of ``points``."""
+    """Return the sum of squared residuals at each of ``points``."""
     return jnp.sum(jax.vmap(problem.residuals)(points) ** 2, axis=1)
 
 
@@ -140,14 +147,14 @@ def fit(
     steps: int = STEPS,
     progress: Progress | None = None,
 ) -> tuple[Point, float]:
-    """Return the point where the cost is least, of all starts, and that cost.
+    """Return the point with the least cost, from all starts, and this cost.
 
-    Only the quantities ``free`` move. A trial step into instability costs more and is
-    not taken: the damping grows.
+    Only the quantities ``free`` are varied. A trial step into instability has a larger
+    cost and is rejected; the damping grows.
     """
     progress = Silent() if progress is None else progress
     places = jnp.asarray(free)
-    # One start a program: a batch of all cells keeps the processor busy by itself.
+    # One start at a time: a batch of all cells already keeps the processor busy.
     descents = InStep(
         lambda starts: _begin(problem, starts, places),
         lambda carry: _advance(problem, places, carry),

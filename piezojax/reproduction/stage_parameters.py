@@ -1,4 +1,4 @@
-"""Properties of the P-753 stage that are fitted, and the stage and sensor of them."""
+"""Fitted properties of the P-753 stage, and the stage and sensor with given values."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from ..hardware import Sensor
 from ..hysteresis import ColemanHodgdon
 
 LONGEST_DELAY = 4
-"""Samples that the delay line of the stage holds."""
+"""Longest delay of the stage, samples."""
 
 
 def within(value: float, ratio: float, unit: str) -> Range:
@@ -25,9 +25,9 @@ def within(value: float, ratio: float, unit: str) -> Range:
 def quantities(dynamics: ARMA) -> dict[str, Range]:
     """Return the ranges of the fitted properties, starting from printed ``dynamics``.
 
-    ``gain`` is the DC gain behind the hysteresis. The b of the hysteresis is not among
-    them: gain, a and c already reach every curve that it could. ``noise`` is what the
-    sensor adds, rms: the loop turns it into displacement.
+    ``gain`` is the DC gain behind the hysteresis. The b of the hysteresis is not
+    fitted, because gain, a and c already reach every curve that it could. ``noise`` is
+    the rms noise of the sensor, which the loop turns into displacement.
     """
     slow, fast = sorted(-p753.RATE * np.log(np.abs(dynamics.poles())))
     return {
@@ -60,7 +60,7 @@ def stage_of(values: Mapping[str, Any], numerator: Sequence[float]) -> Series:
 
 
 def sensor_of(values: Mapping[str, Any]) -> Series:
-    """Return the sensor, um to um: noise, then a lag."""
+    """Return the sensor, um to um: noise, then lag."""
     return series(
         noise=Sensor(values["noise"]),
         lag=FirstOrderLag(values["sensor_lag"], p753.DT),

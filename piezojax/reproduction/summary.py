@@ -1,4 +1,4 @@
-"""How close a table is to print, cell by cell and as a whole."""
+"""Agreement of simulated tables with print, and their comma-separated text."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ from .cell import Cell
 
 
 class Agreement(BaseModel):
-    """Geometric-mean and worst ratio of simulation and print, both at least 1."""
+    """Geometric-mean and worst ratio of simulation to print, both at least 1."""
 
     geomean_ratio: float
     worst_ratio: float
@@ -20,19 +20,19 @@ class Agreement(BaseModel):
 
 
 class TableAgreement(Agreement):
-    """The same for a whole table and for each of its columns."""
+    """Agreement of a table and of each of its columns."""
 
     columns: dict[str, Agreement]
 
 
 class GroupedAgreement(TableAgreement):
-    """The same for groups of cells that lie across columns too."""
+    """Agreement of a table, of its columns, and of groups of cells across columns."""
 
     groups: dict[str, Agreement]
 
 
 def geomean(logs: Any) -> float:
-    """Return exp(mean |ln(sim/print)|) of ``logs``, the ln(sim/print)."""
+    """Return exp(mean |ln(sim/print)|) of ``logs``, the values of ln(sim/print)."""
     return float(np.exp(np.mean(np.abs(logs))))
 
 
@@ -62,14 +62,16 @@ def summarise(cells: Sequence[Cell]) -> dict[str, TableAgreement]:
     summary = {}
     for table in dict.fromkeys(cell.table for cell in cells):
         inside = [cell for cell in cells if cell.table == table]
-        whole = _agreement(inside).model_dump()
+        table_agreement = _agreement(inside).model_dump()
         columns = _by(lambda cell: cell.column, inside)
         grouped = [cell for cell in inside if cell.group]
         if grouped:
             groups = _by(lambda cell: cell.group, grouped)
-            summary[table] = GroupedAgreement(**whole, columns=columns, groups=groups)
+            summary[table] = GroupedAgreement(
+                **table_agreement, columns=columns, groups=groups
+            )
         else:
-            summary[table] = TableAgreement(**whole, columns=columns)
+            summary[table] = TableAgreement(**table_agreement, columns=columns)
     return summary
 
 

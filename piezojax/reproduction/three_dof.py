@@ -1,4 +1,4 @@
-"""What chapters 7 and 8 share: the simulated stage, its references and its errors."""
+"""Simulated stage, references and errors of chapters 7 and 8."""
 
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -22,61 +22,62 @@ from .cell import Cell, printed
 AXES = p558.OUTPUTS
 
 FREQUENCIES = (1, 5, 10)
-"""Hz, of the sines in the tables."""
+"""Frequencies of the sines in the tables, Hz."""
 
 LENGTH_S = 4.0
-"""Length of a run in s; the second half counts. Not printed."""
+"""Duration of a run, s, which is not printed; the second half counts."""
 
 SEED = 7
-"""Of the sensor noise."""
+"""Seed of the sensor noise."""
 
 EXPERIMENTS = ("experiment_1", "experiment_2")
 """The combined experiments of sections 7.5.4.3 and 8.5.4.2."""
 
 
 class Column(NamedTuple):
-    """A controller, and the samples by which its stage is slower than (7.53)."""
+    """A controller, and the additional delay of its stage beyond (7.53), samples."""
 
     make: Callable[[], System]
     delay: int
 
 
 def references() -> dict[str, np.ndarray]:
-    """Return what the axes are to follow [samples, 3] by the name of the run.
+    """Return the references of the axes [samples, 3] by the name of the run.
 
-    The tables drive one axis at a time with a sine of 10 um or urad. Of the combined
-    experiments the first has 2 Hz, 10 um in Z and 5 Hz, 50 urad in Rx; the second 2 Hz,
-    10 um PWSW in Z and 10 Hz SW in Ry, whose largest distance from its mean is 50 urad.
+    The tables drive one axis at a time with a sine of 10 um or urad. The first combined
+    experiment has a sine of 2 Hz and 10 um in Z, and one of 5 Hz and 50 urad in Rx. The
+    second has a PWSW of 2 Hz and 10 um in Z, and an SW of 10 Hz in Ry, whose largest
+    distance from its mean is 50 urad.
     """
     time = signals.time_grid(LENGTH_S, 1.0 / p558.DT)
     still = np.zeros((time.size, 3))
-    found: dict[str, np.ndarray] = {}
+    runs: dict[str, np.ndarray] = {}
     for axis, name in enumerate(AXES):
         for hertz in FREQUENCIES:
             wave = still.copy()
             wave[:, axis] = 10.0 * _sine(time, float(hertz))
-            found[f"drive_{name}_{hertz}Hz"] = wave
+            runs[f"drive_{name}_{hertz}Hz"] = wave
     first, second = still.copy(), still.copy()
     first[:, 0], first[:, 1] = 10.0 * _sine(time, 2.0), 50.0 * _sine(time, 5.0)
     second[:, 0] = signals.piecewise_sine(time, 2.0, 10.0)
     wave = np.asarray(signals.superposed_sine(time, 10.0, 5.0)) - 5.0
     second[:, 2] = 50.0 * wave / np.abs(wave).max()
-    found.update(zip(EXPERIMENTS, (first, second), strict=True))
-    return found
+    runs.update(zip(EXPERIMENTS, (first, second), strict=True))
+    return runs
 
 
 def _sine(time: Array, hertz: float) -> np.ndarray:
     return np.sin(2.0 * np.pi * hertz * np.asarray(time))
 
 
-def draws(runs: int, samples: int) -> Float[Array, "runs samples axes"]:
-    """Return the noise of the sensors with unit variance, the same in every call."""
+def noise_draws(runs: int, samples: int) -> Float[Array, "runs samples axes"]:
+    """Return the sensor noise with unit variance; every call returns the same."""
     noise = np.random.default_rng(SEED).standard_normal((runs, samples, 3))
     return jnp.asarray(noise)
 
 
 class Measured(Metric):
-    """``metric`` of a loop whose displacement is what the sensors say."""
+    """A ``metric`` of the measured instead of the true displacement."""
 
     metric: Metric
 
@@ -84,17 +85,17 @@ class Measured(Metric):
         return self.metric.init()
 
     def update(self, total: State, index: Array, output: LoopSample) -> State:
-        seen = output._replace(displacement=output.measured)
-        return self.metric.update(total, index, seen)
+        measured = output._replace(displacement=output.measured)
+        return self.metric.update(total, index, measured)
 
     def result(self, total: State) -> Any:
         return self.metric.result(total)
 
 
 def _rest_at_zero(loop: System) -> State:
-    """Return ``loop.init`` at zero, which is zero throughout.
+    """Return the state of ``loop`` at rest at zero; all of its leaves are zero.
 
-    Compiling the search for it would take as long as compiling the run.
+    ``loop.init`` would give the same, but takes as long to compile as the run.
     """
     shapes = eqx.filter_eval_shape(loop.init, jnp.zeros(3))
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
@@ -105,29 +106,29 @@ def _rms_errors(loop: System, targets: Array, noise: Array) -> Float[Array, "run
     rest = _rest_at_zero(loop)
     metric = Measured(PerAxisMetric(Tracking(start=targets.shape[1] // 2), 3))
 
-    def one(target, noise):
+    def simulate_run(target, noise):
         inputs = loop_inputs(target, noise)
         return simulate(loop, inputs, rest, metric=metric, segment=target.shape[0])[
             1
         ].rms_error
 
-    return jax.vmap(one)(targets, noise)
+    return jax.vmap(simulate_run)(targets, noise)
 
 
 @cache
 def rms_errors(column: Column) -> Mapping[str, Mapping[str, float]]:
-    """Return the rms errors of all runs by name and axis, um and urad.
+    """Return the RMS errors of all runs by name and axis, um and urad.
 
-    Measured outputs less the reference, as section 7.5.4.3 has it, over the second
-    half, from rest at zero.
+    An error is the measured output minus the reference (section 7.5.4.3), over the
+    second half of a run from rest at zero.
     """
-    wanted = references()
-    targets = jnp.asarray(np.stack(list(wanted.values())))
+    runs = references()
+    targets = jnp.asarray(np.stack(list(runs.values())))
     loop = p558_control.loop(column.make(), plant=p558_stage.plant(delay=column.delay))
-    found = np.asarray(_rms_errors(loop, targets, draws(*targets.shape[:2])))
+    rms = np.asarray(_rms_errors(loop, targets, noise_draws(*targets.shape[:2])))
     return {
         name: dict(zip(AXES, map(float, errors), strict=True))
-        for name, errors in zip(wanted, found, strict=True)
+        for name, errors in zip(runs, rms, strict=True)
     }
 
 
@@ -136,11 +137,11 @@ def table_cells(
 ) -> list[Cell]:
     """Return the cells of a table of single sines, 27 for each of ``columns``.
 
-    Rows are the driven axes, columns those that are measured; ``transposed`` where
-    print has it the other way round off the diagonal. Groups are the cells of the
-    driven axes and the couplings.
+    Rows are driven axes, columns are measured axes; ``transposed`` exchanges them for
+    a table that is printed transposed off its diagonal. The groups are the cells of the
+    driven axes and the couplings, for each controller.
     """
-    found = []
+    simulated = []
     for (row, column), cell in printed(chapter, table).items():
         name, measured = column.split(":")
         _, driven, hertz = row.split("_")
@@ -148,14 +149,14 @@ def table_cells(
         if transposed:
             driven, measured = measured, driven
         errors = rms_errors(columns[name])[f"drive_{driven}_{hertz}"]
-        found.append(cell.simulated(errors[measured], f"{name} {group}"))
-    return found
+        simulated.append(cell.simulated(errors[measured], f"{name} {group}"))
+    return simulated
 
 
 def experiment_cells(
     chapter: str, table: str, columns: Mapping[str, Column], run: str
 ) -> list[Cell]:
-    """Return what is printed on the combined experiment ``run``, simulated."""
+    """Return the printed cells of the combined experiment ``run``, simulated."""
     return [
         cell.simulated(rms_errors(columns[column])[run][axis])
         for (axis, column), cell in printed(chapter, table).items()

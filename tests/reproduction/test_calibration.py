@@ -15,14 +15,14 @@ from piezojax.core.rollout import simulate
 from piezojax.core.system import Feedback, loop_inputs
 from piezojax.hardware import Sensor
 from piezojax.reproduction import chapter4, lanes
-from piezojax.reproduction.calibration import EXPERIMENTS, HALVES, Swap
+from piezojax.reproduction.calibration import EXPERIMENTS, HALVES, HalfFit
+from piezojax.reproduction.calibration_report import held_out_ratios
 from piezojax.reproduction.cell import Cell, printed
-from piezojax.reproduction.doubts import DOUBTS, REFERENCE, candidates
-from piezojax.reproduction.judged import together
 from piezojax.reproduction.selection import starts
 from piezojax.reproduction.stage_fit import STEEPEST, Problem, fit
 from piezojax.reproduction.stage_parameters import stage_of
 from piezojax.reproduction.summary import geomean, ratio_of
+from piezojax.reproduction.suspect_numbers import CANDIDATES, REFERENCE, candidates_of
 
 ROWS = ("SIN50", "PWSW50")
 """Short references whose errors the loop's speed sets."""
@@ -50,7 +50,7 @@ def test_a_known_stage_is_found_from_its_own_cells(problem):
     truth["slow_pole"] *= 1.3
     truth["gain"] *= 0.9
     made = eqx.tree_at(
-        lambda p: (p.paper, p.strength),
+        lambda p: (p.paper, p.penalty_weight),
         problem,
         (eqx.filter_jit(problem.errors)(truth), jnp.asarray(1e-2)),
     )
@@ -153,7 +153,7 @@ def test_every_number_of_every_loop_may_be_doubted(name):
     free = {"error_weight", "autoregressive", "rest_input", "rest_output", "correction"}
     cells = every_cell(name)
     for cell in cells:
-        doubts = [doubt for doubt in DOUBTS.values() if doubt.concerns(cell)]
+        doubts = [doubt for doubt in CANDIDATES.values() if doubt.appears_in(cell)]
         paths = parameters(lanes._maker(cell)())
         for path in paths:
             held = [doubt for doubt in doubts if path in doubt.leaves(paths)]
@@ -162,13 +162,13 @@ def test_every_number_of_every_loop_may_be_doubted(name):
         for doubt in doubts:
             assert doubt.leaf == REFERENCE or doubt.leaves(paths)
     quantities = EXPERIMENTS[name].quantities()
-    for doubt in candidates(cells):
+    for doubt in candidates_of(cells):
         assert quantities[doubt].start == 1.0
 
 
 def test_the_number_of_candidates():
-    assert len(candidates(every_cell("chapter 5"))) == 33
-    assert len(candidates(every_cell("chapter 4"))) == 17
+    assert len(candidates_of(every_cell("chapter 5"))) == 33
+    assert len(candidates_of(every_cell("chapter 4"))) == 17
 
 
 @pytest.mark.parametrize(
@@ -193,9 +193,9 @@ def test_only_the_doubted_number_is_replaced(doubt, column, expected):
     """``expected``: the leaves that change, in the lane of one table or in both."""
     cells = [printed("ch5", t)["SIN50", column] for t in ("5-3", "5-5")]
     made = lanes.lanes_of(cells, short=True)[0]
-    factors = dict.fromkeys(DOUBTS, 1.0) | {doubt: 0.1}
+    factors = dict.fromkeys(CANDIDATES, 1.0) | {doubt: 0.1}
     before = parameters(made.controller)
-    after = parameters(made.with_doubts(factors).controller)
+    after = parameters(made.scaled(factors).controller)
     changed = {}
     for path, leaf in before.items():
         share = np.asarray(after[path]) / np.where(leaf == 0.0, 1.0, leaf)
@@ -217,8 +217,8 @@ def test_sw_of_another_size_is_followed_by_all_that_follow_it():
         )
     ]
     for made in lanes.lanes_of(cells, short=True):
-        other = made.with_doubts(dict.fromkeys(DOUBTS, 1.0) | {"size of SW": 0.6})
-        assert made.concerned["size of SW"].tolist() == [True, False]
+        other = made.scaled(dict.fromkeys(CANDIDATES, 1.0) | {"size of SW": 0.6})
+        assert made.affected["size of SW"].tolist() == [True, False]
         time = np.arange(made.reference.shape[0]) / 20_000.0 - 0.1
         by_hand = 0.6 * (
             5.0
@@ -244,7 +244,7 @@ def test_sw_of_another_size_is_followed_by_all_that_follow_it():
 def test_a_doubted_reference_model_is_what_the_error_is_held_against():
     cell = printed("ch4", "4-5")["SIN50", "model_reference"]
     made = lanes.lanes_of([cell], short=True)[0]
-    other = made.with_doubts(dict.fromkeys(DOUBTS, 1.0) | {"zeta, 4.5.4.3": 2.0})
+    other = made.scaled(dict.fromkeys(CANDIDATES, 1.0) | {"zeta, 4.5.4.3": 2.0})
     controller = jax.tree.map(lambda leaf: leaf[0], made.controller)
     damped = eqx.tree_at(lambda c: c.reference_model.damping, controller, 0.5)
     follow = chapter4.COLUMNS["4-5"]["model_reference"].target
@@ -297,13 +297,13 @@ def test_geometric_mean_ratio_counts_both_directions():
 def test_all_held_out_cells_of_a_half_are_judged_together():
     def swap(half, ratios):
         cells = [Cell("5-3", f"row {i}", "pid", "um", 2.0, 2.0 * r) for i, r in ratios]
-        return Swap(half, 1.0, {}, (), (), [], cells, [])
+        return HalfFit(half, 1.0, {}, (), (), [], cells, [])
 
     found = {
         "one": [swap("even", [(0, 1.5), (1, 1.5), (2, 1.5)]), swap("odd", [(3, 1.0)])],
         "other": [swap("even", [(4, 1.0)]), swap("odd", [(5, 2.0)])],
     }
-    halves = together(found)
+    halves = held_out_ratios(found)
     assert halves["even"]["held_out"]["cells"] == 4
     # Cells count alike, not experiments.
     assert halves["even"]["held_out"]["geomean_ratio"] == pytest.approx(1.5**0.75)

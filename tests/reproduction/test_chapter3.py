@@ -65,7 +65,7 @@ def test_the_truth_is_the_exact_hysteresis_and_unit_dynamics():
     moving = np.array([-0.07323, 0.1736, -0.09756])
     moving *= (1.0 - 1.6531 + 0.6758) / moving.sum()
     expected = dynamics.arma(inner, (1.6531, -0.6758), moving)
-    found = chapter3._output(chapter3.truth(), jnp.asarray(voltage))
+    found = chapter3._output(chapter3.simulated_stage(), jnp.asarray(voltage))
     np.testing.assert_allclose(found[1:], expected[:-1], rtol=0, atol=1e-10)
     assert found[0] == 0.0
 

@@ -75,7 +75,7 @@ def test_cells_are_those_of_a_loop_written_from_the_equations(cell, controller):
     runs = list(three_dof.references())
     chosen = ["drive_Z_5Hz", "drive_Rx_10Hz", "drive_Ry_1Hz"]
     targets = oracle.table_sines()[:, [0, 1, 2], [1, 2, 0]]
-    noise = np.asarray(three_dof.draws(len(runs), 2000))
+    noise = np.asarray(three_dof.noise_draws(len(runs), 2000))
     noise = noise[[runs.index(run) for run in chosen]] * [0.0008, 0.013, 0.013]
     z = oracle.simulate(
         controller, targets, noise.swapaxes(0, 1), STAGE, arx="matched"

@@ -45,7 +45,7 @@ def made_up(wrong, scatter):
         paper=jnp.ones(CELLS),
         counts=jnp.ones(CELLS),
         start=space.to_unit(jnp.ones(len(names))),
-        strength=jnp.asarray(1.0),
+        penalty_weight=jnp.asarray(1.0),
     )
     truth = {name: jnp.asarray(1.0) for name in names}
     truth |= {"stage 0": jnp.asarray(1.3), "stage 1": jnp.asarray(0.8)} | wrong
@@ -61,12 +61,12 @@ def analytic(monkeypatch):
 
 def test_the_wrong_print_is_found_two_decades_off():
     choice = select(made_up({"print 3": jnp.asarray(0.03)}, 0.05))
-    assert choice.doubts == ("print 3",)
+    assert choice.suspects == ("print 3",)
     first, last = choice.rounds
     assert first.taken == "print 3"
     assert first.before > 1.1 > 1.06 > first.after["print 3"] == last.before
     assert last.taken is None
-    assert min(last.after.values()) * selection.WORTH > last.before
+    assert min(last.after.values()) * selection.MIN_IMPROVEMENT > last.before
     assert len(first.after) == selection.FINALISTS
 
 
@@ -74,17 +74,17 @@ def test_the_wrong_print_is_found_two_decades_off():
 def test_nothing_is_doubted_where_nothing_is_wrong(scatter):
     problem = made_up({}, scatter)
     choice = select(problem)
-    assert choice.doubts == ()
-    np.testing.assert_array_equal(choice.point, choice.alone)
+    assert choice.suspects == ()
+    np.testing.assert_array_equal(choice.point, choice.stage_only)
     np.testing.assert_array_equal(choice.point[STAGE:], problem.start[STAGE:])
 
 
 def test_no_more_than_the_most_are_taken(monkeypatch):
-    monkeypatch.setattr(selection, "MOST", 1)
+    monkeypatch.setattr(selection, "MAX_SUSPECTS", 1)
     wrong = {"print 1": jnp.asarray(10.0), "print 3": jnp.asarray(0.03)}
     choice = select(made_up(wrong, 0.0))
-    assert len(choice.doubts) == 1
-    assert choice.doubts[0] in wrong
+    assert len(choice.suspects) == 1
+    assert choice.suspects[0] in wrong
 
 
 def test_a_cell_is_predicted_without_itself():

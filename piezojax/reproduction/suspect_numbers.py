@@ -1,18 +1,23 @@
-"""Which prints may be wrong: every number of the loops, by one rule.
+"""Candidates for suspect numbers: every printed number of the loops, by one rule.
 
-A candidate is one number printed in one place, however many columns it serves: each
-gain, weight and filter constant of each parameter table and section, what the
-controllers know of the stage (K_e, the hysteresis that is inverted, of a model its DC
-gain as a factor on its numerator), the reference model, and the size of each kind of
-reference. Every array leaf of every controller belongs to one, but for three: Q acts
-through R/Q alone and is left to R, the poles of the models are left to their gain, and
-the rest point of the inverse is not printed. No candidates are what is no parameter of
-these loops: the sampling rate, the shape and the frequencies of the references, and the
-equations themselves. The stage is no print here: it is fitted anyway.
+A candidate is one number that is printed in one place, whatever the number of columns
+that use it. The candidates are:
 
-All are factors on print, 1 as printed. Tuned numbers may be two decimal places off,
-alpha one (it ends at 1); what was measured or describes a signal, threefold, as the
-stage's own quantities.
+- each gain, weight and filter constant of each parameter table and section,
+- the description of the stage in the controllers: K_e, the inverted hysteresis, and the
+  DC gain of each model, as a factor on its numerator,
+- the reference model,
+- the amplitude of each kind of reference.
+
+Every array leaf of every controller belongs to a candidate, with three exceptions. Q
+acts only through R/Q, which R covers. The poles of the models are covered by their
+gain. The rest point of the inverse is not printed. The sampling rate, the shapes and
+frequencies of the references, and the equations are not candidates, because they are no
+parameters of these loops. The stage is not a candidate, because it is fitted anyway.
+
+A candidate is varied by a factor on its printed value. Its bounds are a factor of 100
+in both directions for tuned numbers (10 for alpha, which ends at 1), and 3 for numbers
+that were measured or describe a signal, as for the quantities of the stage.
 """
 
 from collections.abc import Iterable
@@ -22,17 +27,19 @@ from ..signals import waveforms as signals
 from .cell import Cell
 
 TUNED, ALPHA, DESCRIBED = 100.0, 10.0, 3.0
-"""Largest factor on print, or its inverse."""
+"""Largest factors on a printed value; their inverses are the smallest."""
 
 REFERENCE = "reference"
-"""In place of a leaf: the reference itself."""
+"""Name of the leaf for a candidate that scales the reference."""
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """A printed number: the name of its leaf, and the cells whose loops hold it.
+class SuspectNumber:
+    """A printed number that may be wrong.
 
-    Empty ``columns`` or ``kinds`` (of reference) stand for all of them.
+    ``leaf`` is the name of its leaf in the controller, ``span`` the largest factor on
+    it. It appears in the loops of ``tables``, ``columns`` and ``kinds`` of reference;
+    empty ``columns`` or ``kinds`` mean all.
     """
 
     leaf: str
@@ -41,8 +48,8 @@ class Doubt:
     columns: tuple[str, ...] = ()
     kinds: tuple[str, ...] = ()
 
-    def concerns(self, cell: Cell) -> bool:
-        """Return whether the number is part of the cell's loop."""
+    def appears_in(self, cell: Cell) -> bool:
+        """Return whether the number appears in the loop of ``cell``."""
         return (
             cell.table in self.tables
             and (not self.columns or cell.column in self.columns)
@@ -50,7 +57,7 @@ class Doubt:
         )
 
     def leaves(self, paths: Iterable[str]) -> list[str]:
-        """Return those of a controller's ``paths`` that the number stands in."""
+        """Return the ``paths`` of a controller that hold the number."""
         return [path for path in paths if self.leaf in path.split(".")]
 
 
@@ -64,17 +71,19 @@ _EVERY = (*_CHAPTER_5, "4-5")
 def _tuned(place: str, names: Iterable[str], *where: tuple[str, ...]):
     spans = {"alpha": ALPHA}
     return {
-        f"{name}, {place}": Doubt(name, spans.get(name, TUNED), *where)
+        f"{name}, {place}": SuspectNumber(name, spans.get(name, TUNED), *where)
         for name in names
     }
 
 
-def _described(place: str, name: str, *where: tuple[str, ...]) -> dict[str, Doubt]:
-    return {place: Doubt(name, DESCRIBED, *where)}
+def _described(
+    place: str, name: str, *where: tuple[str, ...]
+) -> dict[str, SuspectNumber]:
+    return {place: SuspectNumber(name, DESCRIBED, *where)}
 
 
-DOUBTS: dict[str, Doubt] = {
-    # Table 5-2 and the sections print one set for all columns, Table 5-4 one a column.
+CANDIDATES: dict[str, SuspectNumber] = {
+    # Table 5-2 and the sections hold one set for all columns, Table 5-4 one for each.
     **_tuned("Table 5-2", GAINS, ("5-3",)),
     **_tuned("Table 5-4, PID-SMC", GAINS, ("5-5",), ("pid_smc",)),
     **_tuned("Table 5-4, inversion", GAINS, ("5-5",), ("inversion",)),
@@ -100,14 +109,14 @@ DOUBTS: dict[str, Doubt] = {
     **_described("size of PWSW", REFERENCE, _EVERY, (), ("PWSW",)),
     **_described("size of SW", REFERENCE, _EVERY, (), ("SW",)),
 }
-"""Every candidate by its name."""
+"""Candidates by name."""
 
 
-def candidates(cells: Iterable[Cell]) -> dict[str, Doubt]:
-    """Return the candidates that are part of the loop of any of ``cells``."""
+def candidates_of(cells: Iterable[Cell]) -> dict[str, SuspectNumber]:
+    """Return the candidates that appear in the loop of any of ``cells``."""
     cells = list(cells)
     return {
-        name: doubt
-        for name, doubt in DOUBTS.items()
-        if any(doubt.concerns(cell) for cell in cells)
+        name: suspect
+        for name, suspect in CANDIDATES.items()
+        if any(suspect.appears_in(cell) for cell in cells)
     }
