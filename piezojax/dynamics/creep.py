@@ -46,7 +46,7 @@ class ExponentialCreep(Fittable):
     passes at once. With 0 the output is the creep alone, to be added to a hysteresis of
     the same input, as in ``hysteresis + creep >> dynamics``; the gains are then in
     um/V. Raises ValueError for time constants that are not positive, gains that are not
-    finite, or a different number of both.
+    finite, or different numbers of gains and time constants.
     """
 
     part: ClassVar[Part] = Part(

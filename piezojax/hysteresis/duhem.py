@@ -160,7 +160,7 @@ class Duhem(Hysteresis, Fittable):
 
 
 def _value(surface: Surface, x: Scalar, u: Scalar) -> Scalar:
-    """Return sum_ij surface[i][j] x^i u^j by Horner's rule in both."""
+    """Return sum_ij surface[i][j] x^i u^j by Horner's rule in x and u."""
     return _polynomial([_polynomial(row, u) for row in surface], x)
 
 

@@ -18,7 +18,7 @@ from . import waveforms as signals
 
 Path = Float[Array, "samples 2"]
 Pair = ScalarLike | tuple[ScalarLike, ScalarLike]
-"""One value for both axes, or one for each."""
+"""One value for both axes, or a pair of values."""
 
 LINES = 20
 """Default number of lines of a raster."""

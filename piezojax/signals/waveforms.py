@@ -187,8 +187,10 @@ def prbs(
     offset: ScalarLike = 0.0,
     seed: int = 0,
 ) -> Time:
-    """Pseudo-random binary signal: ``offset`` plus 0 or ``2 amplitude``, held
-    1/frequency."""
+    """Pseudo-random binary signal of ``offset`` plus 0 or ``2 amplitude``.
+
+    Each value is held for 1/``frequency`` s.
+    """
     bits = np.random.default_rng(seed).integers(0, 2, 4096)
     slot = jnp.floor(time * frequency + 1e-9).astype(jnp.int32) % bits.size
     return offset + 2.0 * amplitude * jnp.asarray(bits, time.dtype)[slot]
