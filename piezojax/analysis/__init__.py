@@ -1,1 +1,1 @@
-"""Stability of a loop, and the limit of linear control."""
+"""Stability of loops and the limit of linear control."""

@@ -1,4 +1,4 @@
-"""Constraints on tuned gains: how they are measured, and how much is violated."""
+"""Constraints on tuned gains: definitions, values and violations."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -17,8 +17,8 @@ from .stability.differentiable import (
 )
 
 CAP = 3.0
-"""Logarithm of value over limit beyond which a violation grows slowly: the loop is
-unstable there, and the size of the violation has no meaning."""
+"""ln(value/limit) above which a violation is compressed: the loop is unstable there,
+and the size of the violation has no meaning."""
 
 
 class LoopFigures(NamedTuple):
@@ -41,10 +41,11 @@ Source = Literal["tracking", "extremes", "sensitivity"]
 
 
 class Constraint(NamedTuple):
-    """Definition of a constraint: unit, direction, and the figure that is limited.
+    """Definition of a constraint: unit, direction and limited figure.
 
-    ``values`` maps the field ``source`` of the LoopFigures, and dt, to values with the
-    plants on the first axis. A limit must lie above ``above`` and below ``below``.
+    ``values(source, dt)`` returns the values of the figure, with the plants on the
+    first axis, from the field ``source`` of the LoopFigures and dt in s. A limit must
+    lie above ``above`` and below ``below``.
     """
 
     unit: str
@@ -55,9 +56,9 @@ class Constraint(NamedTuple):
     below: float = math.inf
 
     def check(self, name: str, limit: Any) -> float:
-        """Return ``limit`` as a number.
+        """Return ``limit`` as a float.
 
-        Raises ValueError unless it is a finite number within the allowed limits.
+        Raises ValueError unless it is a finite number between ``above`` and ``below``.
         """
         number = isinstance(limit, int | float) and not isinstance(limit, bool)
         if not (number and self.above < limit < self.below):
@@ -68,7 +69,7 @@ class Constraint(NamedTuple):
         return float(limit)
 
     def read(self, loop: LoopFigures) -> Array:
-        """Return the values in the unit, of shape [plants] or [plants, branches]."""
+        """Return the values [plants] or [plants, branches] in ``unit``."""
         return self.values(getattr(loop, self.source), loop.dt)
 
 
@@ -104,24 +105,26 @@ CONSTRAINTS: dict[str, Constraint] = {
         "1", "at most", "extremes", lambda found, dt: _largest(found.overshoot)
     ),
 }
-"""Constraints by the name that a study uses, for every plant and reference of the
-objective. Sensitivity peak, disk margin and delay margin (samples) concern the loop,
-linearised at the highest reference on both branches of the hysteresis. The others are
-largest values in the runs, ``overshoot`` as a share of the reference's range."""
+"""Constraints by their name in a study; each holds for every plant and reference of
+the objective. The sensitivity peak, disk margin and delay margin (samples) are those of
+the loop, linearised at the highest reference on both branches of the hysteresis. The
+others are the largest values in the runs; ``overshoot`` is a share of the reference's
+range."""
 
 
 def uses(names: Iterable[str], source: Source) -> bool:
-    """Return whether one of the constraints ``names`` is evaluated from ``source``."""
+    """Return whether any of the constraints ``names`` is evaluated from ``source``."""
     return any(CONSTRAINTS[name].source == source for name in names)
 
 
 def violations(
     limits: Mapping[str, Array | float], loop: LoopFigures
 ) -> Float[Array, " constraints"]:
-    """Return ln(value/limit), or its negative for a lower limit, of all ``limits``.
+    """Return ln(value/limit) of all ``limits``, with the opposite sign for lower ones.
 
-    A number above 0 is a violation. One number for each plant and branch, in the order
-    of ``limits``; an infinite or undefined value counts as a large violation.
+    A number above 0 is a violation. There is one number for each plant and branch, in
+    the order of ``limits``. An infinite or undefined value counts as a large violation,
+    and above ``CAP`` a number is compressed to CAP (1 + ln(number/CAP)).
     """
     found = []
     for name, limit in limits.items():
@@ -137,7 +140,10 @@ def violations(
 
 
 def worst_by_plant(limits: Iterable[str], loop: LoopFigures) -> dict[str, Array]:
-    """Return the value [plants] nearest to, or farthest beyond, each limit."""
+    """Return the worst value [plants] of each limited figure, by constraint.
+
+    The worst value is the largest for an upper limit and the smallest for a lower one.
+    """
     pick = {"at most": jnp.max, "at least": jnp.min}
     found = {}
     for name in limits:

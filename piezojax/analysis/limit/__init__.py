@@ -1,4 +1,4 @@
-"""How small a tracking error any linear controller could leave."""
+"""Limit of linear control: the least tracking error of any linear controller."""
 
 from .attained import Attained as Attained
 from .attained import attained as attained

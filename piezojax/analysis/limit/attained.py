@@ -1,11 +1,12 @@
-"""The controller of the limit itself, run on the stage: is the limit one?
+"""Check of the limit: the optimal linear controller, simulated on the stage.
 
-A disturbance that comes from hysteresis is not given: another controller moves the
-stage otherwise and meets another. So the best one linear controller for what a loop's
-runs left over is run on the same stage, with the same noise; what it leaves over itself
-is measured, a controller is made for that, and so on. Where this settles, predicted and
-simulated error agree as far as the linear picture holds, and the limit is a figure that
-a linear controller has reached, with hysteresis, creep and the actuator's limits.
+The disturbance that hysteresis makes depends on the controller: another controller
+moves the stage differently and meets another disturbance. The one linear controller
+that is best for the disturbance of a loop's runs is therefore simulated on the same
+stage, with the same noise. The disturbance of its own runs is measured, the best
+controller for that is simulated, and so on. Once this converges, predicted and
+simulated error agree as far as the linear model holds, and a linear controller has
+reached the limit, with hysteresis, creep and the actuator's limits.
 """
 
 from typing import Any, NamedTuple
@@ -26,15 +27,16 @@ from .loop_runs import simulated
 from .performance import SEGMENT
 from .wiener import common_response, error_shares, inner_response
 
-_TAIL = 1e-7  # of the largest tap: where the controller's memory ends
+_TAIL = 1e-7  # of the largest tap: smaller taps at the end are cut off
 
 
 class Ahead(NamedTuple):
-    """What the controller knows beforehand of sample k, and what it does not.
+    """Inputs of a LinearLimit at sample k: three known in advance, two unknown.
 
-    ``voltage`` (V) makes the linear plant follow; ``foretold`` (um) is what the
-    disturbance should be, ``reference`` in um; ``noise`` a draw of unit variance,
-    ``disturbance`` (um) moves the displacement at k + 1.
+    Known: ``voltage`` (V), with which the linear plant follows the reference;
+    ``foretold`` (um), the predicted disturbance; ``reference`` (um). Unknown:
+    ``noise``, a draw of unit variance; ``disturbance`` (um), which is added to the
+    displacement at k + 1.
     """
 
     voltage: Scalar
@@ -45,10 +47,11 @@ class Ahead(NamedTuple):
 
 
 class LinearLimit(System):
-    """The stage of ``loop`` under u = voltage ahead - Q (measured - foreseen).
+    """Stage of ``loop`` under the controller u = voltage - Q (measured - predicted).
 
-    ``taps`` are the impulse response of Q (V/um); what is foreseen is the linear
-    ``model`` under u and the foretold disturbance.
+    ``voltage`` is that of Ahead. ``taps`` are the impulse response of Q (V/um). The
+    predicted displacement is that of the linear ``model`` under u plus the predicted
+    disturbance.
     """
 
     loop: Feedback
@@ -64,7 +67,7 @@ class LinearLimit(System):
         at, model, states, surprises = state
         loop = self.loop
         sensor, measured = loop.sensor.step(at.sensor, (at.displacement, input.noise))
-        # What the model does now it was told one sample ago.
+        # at.reference holds the displacement of the model, one sample after its input.
         surprise = measured - at.reference - input.foretold
         surprises = jnp.concatenate([surprise[None], surprises[:-1]])
         command = input.voltage - self.taps @ surprises
@@ -86,10 +89,10 @@ class LinearLimit(System):
 
 
 class Attained(NamedTuple):
-    """RMS errors [references] in um: what was predicted, and what the stage did.
+    """RMS errors [references] in um, predicted and simulated on the stage.
 
-    Both without the mean of a run, which no spectrum holds and the slowest integral
-    would take away.
+    Both leave out the mean of a run, which is not part of a spectrum and which the
+    slowest integral action would remove.
     """
 
     predicted: np.ndarray
@@ -107,11 +110,11 @@ def attained(
     dt: float | None = None,
     rounds: int = 5,
 ) -> list[Attained]:
-    """Return what the best one linear controller reaches on the stage of ``loop``.
+    """Return the errors of the best single linear controller on the stage of ``loop``.
 
-    One entry a round: the first controller is made for what the runs of ``loop`` left
-    over, each later one for what the one before did. Arguments as for
-    ``performance_limit``, and what is raised.
+    There is one entry for each of ``rounds``: the first controller is designed for the
+    disturbance of the runs of ``loop``, each later one for that of the controller
+    before it. Other arguments and errors are those of ``performance_limit``.
     """
     references, noise = as_array(references), as_array(noise)
     dt = loop_sample_time(loop) if dt is None else dt
@@ -119,37 +122,46 @@ def attained(
     runs, rest = simulated(loop, references, noise, disturbance)
     found = []
     for _ in range(rounds):
-        posed = problem_of(loop, runs, rest, known, start, segment, dt)
-        plant = posed.plant.response(posed.points)
-        inner = inner_response(*posed.plant.obstacles(), posed.points)
-        T = common_response(posed.spectra, posed.variance, inner)
+        problem = problem_of(loop, runs, rest, known, start, segment, dt)
+        plant = problem.plant.response(problem.points)
+        inner = inner_response(*problem.plant.obstacles(), problem.points)
+        T = common_response(problem.spectra, problem.variance, inner)
         predicted = [
-            np.sqrt(sum(error_shares(T, spectrum, posed.variance)))
-            for spectrum in posed.spectra
+            np.sqrt(sum(error_shares(T, spectrum, problem.variance)))
+            for spectrum in problem.spectra
         ]
-        taps = np.fft.ifft(T / plant).real[: posed.points // 2]
+        taps = np.fft.ifft(T / plant).real[: problem.points // 2]
         taps = taps[: 1 + np.flatnonzero(np.abs(taps) > _TAIL * np.abs(taps).max())[-1]]
-        control = LinearLimit(loop, posed.plant, taps)
-        foretold = posed.known.foretold(posed.left)
-        voltage = _ahead(posed, known, foretold) + rest.reshape(noise.shape[:2])[:, :1]
+        control = LinearLimit(loop, problem.plant, taps)
+        foretold = problem.known.foretold(problem.left)
+        voltage = (
+            _following_voltage(problem, known, foretold)
+            + rest.reshape(noise.shape[:2])[:, :1]
+        )
         moved = 0.0 if disturbance is None else disturbance
         still = jnp.broadcast_to(moved, noise.shape)
         logs = _logs(control, voltage, foretold, references, noise, still)
         runs = jax.tree.map(lambda x: np.asarray(x).reshape(-1, x.shape[-1]), logs)
-        error = posed.known.cut(np.asarray(logs.displacement - logs.reference))
+        error = problem.known.cut(np.asarray(logs.displacement - logs.reference))
         reached = np.sqrt(np.mean(error**2, axis=(1, 2)))
         found.append(Attained(np.array(predicted), reached))
     return found
 
 
-def _ahead(posed: Problem, references: np.ndarray, foretold: np.ndarray) -> np.ndarray:
-    """Return the voltages [references, samples] over those at rest that follow."""
+def _following_voltage(
+    problem: Problem, references: np.ndarray, foretold: np.ndarray
+) -> np.ndarray:
+    """Return the voltages [references, samples] that make the linear plant follow.
+
+    They are deviations (V) from the voltages at rest.
+    """
     wanted = references - references[:, :1] - foretold
     margin = wanted.shape[1] // 2
     wanted = np.pad(wanted, ((0, 0), (margin, margin)), mode="edge")
-    # Less a ramp from end to end the record is periodic, for a ramp is slow enough.
+    # Without a ramp from end to end the record is periodic. The ramp is slow enough for
+    # the gain at rest.
     ramp = np.linspace(wanted[:, 0], wanted[:, -1], wanted.shape[1], axis=1)
-    plant = posed.plant.response(wanted.shape[1])
+    plant = problem.plant.response(wanted.shape[1])
     voltage = np.fft.ifft(np.fft.fft(wanted - ramp) / plant).real
     voltage += ramp / plant[0].real
     return voltage[:, margin : margin + references.shape[1]]

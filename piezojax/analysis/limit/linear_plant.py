@@ -1,4 +1,4 @@
-"""The linear plant of a limit: the stage linearised, with the gain that it shows."""
+"""Linear plant of a limit: the linearised stage with the gain fitted to its runs."""
 
 from functools import partial
 
@@ -15,17 +15,17 @@ from ...dynamics import StateSpace
 from ...dynamics.linearise import linearise
 from ..stability.conserved import LinearLoop, without_conserved
 
-_CHUNK = 2048  # points of the circle at a time: few states, little memory
+_CHUNK = 2048  # points of the circle at a time, to bound the memory
 _ROUNDS = 8
 _NOTHING = 1e-12
 _ON_CIRCLE = 1e-6
 
 
 class LinearPlant(System):
-    """``y = output + C x + D (u - input)``, ``x`` at rest under the voltage ``input``.
+    """Linear plant ``x+ = A x + B (u - input)``, ``y = output + C x + D (u - input)``.
 
-    A [n, n], B [n], C [n], D in um/V; ``input`` in V, ``output`` in um. A step returns
-    y(k+1) for u(k), as a plant in a loop does.
+    The plant rests at ``output`` (um) under the voltage ``input`` (V). A [n, n], B [n],
+    C [n], D in um/V. A step returns y(k+1) for u(k), as every plant in a loop does.
     """
 
     A: Float[Array, "n n"] = eqx.field(converter=as_array)
@@ -56,7 +56,7 @@ class LinearPlant(System):
         return LinearPlant(self.A, self.B, C, D, self.input, self.output)
 
     def response(self, points: int) -> np.ndarray:
-        """Return y over u [points] around the unit circle, the loop's sample too."""
+        """Return y/u [points] on the unit circle, with the loop's delay of a sample."""
         A, B, C, D = (np.asarray(x) for x in (self.A, self.B, self.C, self.D))
         z = np.exp(2j * np.pi * np.arange(points) / points)
         eye = np.eye(len(A))
@@ -67,15 +67,16 @@ class LinearPlant(System):
         return (np.concatenate(states) + D) / z
 
     def obstacles(self) -> tuple[int, np.ndarray]:
-        """Return what no controller gets around: the delay, and the zeros outside.
+        """Return the delay (samples) and the zeros outside the unit circle.
 
-        The delay is in samples, with the loop's own; the zeros are those in the z plane
-        outside the unit circle. One on the circle costs nothing.
+        Both limit every controller. The delay includes the loop's sample. The zeros are
+        in the z plane; zeros on the circle cost nothing and are left out. Raises
+        ValueError if the voltage does not move the plant.
         """
         A, B, C, D = (np.asarray(x) for x in (self.A, self.B, self.C, self.D))
         delay, first = 1, float(D)
         size = abs(first) + np.linalg.norm(C) * np.linalg.norm(B)
-        # Look ahead until the input shows: the zeros are then those of C, D.
+        # Look ahead until the input acts: the zeros are then those of C and D there.
         while abs(first) <= _NOTHING * size and delay <= len(A):
             delay, first, C = delay + 1, float(C @ B), C @ A
         if abs(first) <= _NOTHING * size:
@@ -87,8 +88,9 @@ class LinearPlant(System):
 def linear_plant(loop: Feedback, reference: ScalarLike, dt: float) -> LinearPlant:
     """Return the plant of ``loop`` linearised at rest at ``reference`` (um).
 
-    What it only remembers, such as where on its branch a hysteresis is, is taken out;
-    ``dt`` in s. Raises ValueError for several axes and for a plant that is not stable.
+    Conserved modes, such as the position of a hysteresis on its branch, are removed;
+    ``dt`` in s. Raises ValueError for several axes, derivatives that are not finite,
+    and a plant that is not stable.
     """
 
     model = _derivatives(loop, as_array(reference), dt)
@@ -98,7 +100,7 @@ def linear_plant(loop: Feedback, reference: ScalarLike, dt: float) -> LinearPlan
     if not all(np.all(np.isfinite(matrix)) for matrix in (A, B, C, D)):
         raise ValueError("the plant's derivatives are not finite")
     found = LinearLoop(A, B[:, 0], C[0], dt)
-    # Of a chain of integrators nothing moves, one is seen at a time.
+    # A chain of integrators that no input moves shows one conserved mode at a time.
     while len(found.A):
         fewer = without_conserved(found)
         if len(fewer.A) == len(found.A):
@@ -120,9 +122,10 @@ def _derivatives(loop: Feedback, reference: jax.Array, dt: float) -> StateSpace:
 
 
 def answers(plant: LinearPlant, voltage: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return what ``plant`` does [runs, samples] under ``voltage``, from 0 um.
+    """Return the response (um) of ``plant`` to ``voltage`` (V), both [runs, samples].
 
-    It rests under the voltages ``rest`` [runs] before; sample k + 1 answers voltage k.
+    The plant starts at rest at 0 um under the voltages ``rest`` [runs]; sample k + 1
+    answers voltage k.
     """
 
     moved = np.asarray(_answers(plant, voltage, rest))
@@ -139,20 +142,23 @@ def _answers(plant: LinearPlant, voltage: jax.Array, rest: jax.Array) -> jax.Arr
 
 
 def felt_gain(answer: np.ndarray, displacement: np.ndarray, noise: np.ndarray) -> float:
-    """Return the gain with which the stage answers what noise makes of the voltage.
+    """Return the gain with which the stage answers voltage caused by sensor noise.
 
-    All are transforms [..., lines]: of what a plant of gain 1 does under the voltage,
-    of the stage's displacement and of the sensor's noise, the first two without what
-    the reference foretells. The noise is the instrument: what is left of the
-    displacement then has nothing to do with it, as a disturbance must not. Lines count
-    by how quiet it is there, in rounds. A hysteresis answers small fast motions less
-    than large slow ones; the large are foretold, feedback is about the small. Raises
-    ValueError if there is no positive gain.
+    All arguments are transforms [..., lines]: ``answer`` of the response of a plant of
+    gain 1 to the voltage, ``displacement`` of that of the stage, ``noise`` of the
+    sensor's noise, the first two without the part that the reference predicts.
+
+    The gain is an instrumental-variable estimate with the noise as instrument: the
+    residual displacement is then uncorrelated with the noise, as a disturbance must be.
+    Lines are weighted by 1 / (power of the residual), updated in rounds. A hysteresis
+    answers small fast motions less than large slow ones. The reference predicts the
+    large ones, and feedback acts on the small ones. Raises ValueError if there is no
+    positive gain.
     """
     runs = tuple(range(answer.ndim - 1))
     driven = np.mean(answer * np.conj(noise), axis=runs)
     moved = np.mean(displacement * np.conj(noise), axis=runs)
-    # The spectrum of what is left is a parabola in the gain, line by line.
+    # The spectrum of the residual is a quadratic function of the gain on each line.
     own = np.mean(np.abs(displacement) ** 2, axis=runs)
     both = np.mean(np.real(displacement * np.conj(answer)), axis=runs)
     other = np.mean(np.abs(answer) ** 2, axis=runs)

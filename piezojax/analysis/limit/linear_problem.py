@@ -1,4 +1,4 @@
-"""From a loop's runs to the linear problem: a plant, a disturbance and a noise."""
+"""Linear control problem of a loop's runs: a plant, a disturbance and a noise."""
 
 from typing import NamedTuple
 
@@ -10,12 +10,13 @@ from .spectra import Foretelling, grid_size, spectra, windowed
 
 
 class Problem(NamedTuple):
-    """What a linear controller meets, and the grids that it was measured on.
+    """Linear control problem, and the grids on which it was measured.
 
-    ``plant`` is the stage's linear model, ``left`` [references, draws, samples] what it
-    leaves of the runs (um), ``spectra`` [references, points] those of the part that
-    ``known``, the filter of the reference, does not foretell; ``variance`` (um^2) that
-    of the sensor's noise. ``window`` is in samples.
+    ``plant`` is the linear model of the stage, and ``left`` [references, draws,
+    samples] its residual in the runs (um), the disturbance. ``known`` is the linear
+    filter that predicts the disturbance from the reference, ``spectra`` [references,
+    points] (um^2) are those of the unpredicted part, and ``variance`` (um^2) is that of
+    the sensor's noise. ``window`` is in samples.
     """
 
     plant: LinearPlant
@@ -27,11 +28,11 @@ class Problem(NamedTuple):
 
     @property
     def points(self) -> int:
-        """Points of the circle on which spectra and responses lie."""
+        """Number of points of spectra and responses around the unit circle."""
         return self.spectra.shape[1]
 
     def lines(self, signals: np.ndarray) -> np.ndarray:
-        """Return the transforms of ``signals`` [..., count], window by window."""
+        """Return the transforms of ``signals`` [..., count] in each window."""
         return windowed(signals, self.window, self.points)
 
 
@@ -44,19 +45,22 @@ def problem_of(
     segment: float,
     dt: float,
 ) -> Problem:
-    """Return the problem that ``runs`` [references x draws, samples] pose.
+    """Return the linear problem of ``runs`` [references x draws, samples].
 
-    ``rest`` [references x draws] are the voltages before them; other arguments as for
-    ``performance_limit``, which see for what is raised.
+    ``rest`` [references x draws] are the voltages (V) before the runs; other arguments
+    as for ``performance_limit``.
+
+    Raises ValueError for a run that diverges, a sensor without noise, several axes, and
+    a plant that is unstable or does not move as its linear model does.
     """
-    heard = runs.measured - runs.displacement
+    sensor_noise = runs.measured - runs.displacement
     if not np.all(np.isfinite(runs.displacement)):
         raise ValueError("a run diverges")
-    variance = float(np.var(heard[:, start:]))
+    variance = float(np.var(sensor_noise[:, start:]))
     if variance == 0.0:
         raise ValueError("without sensor noise the limit of linear control is zero")
     count, samples = references.shape
-    # The filter is as long as a window: both hold as much of the past.
+    # The filter is as long as a window, so that both use an equal length of record.
     reach = min(round(0.5 * segment / dt), (samples - start) // 8)
     known = Foretelling(references, start, reach)
     window = min(round(segment / dt), known.count)
@@ -73,9 +77,9 @@ def problem_of(
     gain = felt_gain(
         lines(known.unforeseen(by_draw(answer))),
         lines(known.unforeseen(by_draw(runs.displacement))),
-        lines(known.cut(by_draw(heard))),
+        lines(known.cut(by_draw(sensor_noise))),
     )
-    # At rest, where it started, the linear plant leaves nothing.
+    # The residual of the linear plant is 0 at the start, at rest.
     left = by_draw(runs.displacement - runs.displacement[:, :1] - gain * answer)
     found = spectra(lines(known.unforeseen(left)))
     return Problem(plant.scaled(gain), left, known, found, variance, window)

@@ -1,4 +1,4 @@
-"""A loop's runs, and the same loop around a linear plant and what that leaves over."""
+"""Runs of a loop around its stage, and around a linear plant with a disturbance."""
 
 from typing import Any
 
@@ -16,8 +16,9 @@ def simulated(
 ) -> tuple[LoopSample, np.ndarray]:
     """Return the logs [runs, samples] and the voltages [runs] before the first sample.
 
-    ``references`` [references, samples], ``noise`` [references, draws, samples]: a run
-    each draw. ``disturbance``, if there is any, goes with the shape of the noise.
+    There is one run for each draw of ``noise`` [references, draws, samples];
+    ``references`` are [references, samples]. ``disturbance``, None if there is none,
+    broadcasts to the shape of the noise.
     """
     if disturbance is not None:
         disturbance = jnp.broadcast_to(disturbance, noise.shape)
@@ -39,13 +40,13 @@ def _logs(loop: Feedback, references: Any, noise: Any, disturbance: Any) -> Any:
 def quiet_error(
     loop: Feedback, plant: LinearPlant, references: jax.Array, left: np.ndarray
 ) -> np.ndarray:
-    """Return the error of ``loop`` around ``plant``, without noise.
+    """Return the error (um) of ``loop`` around ``plant``, without noise.
 
-    ``left`` is what the linear plant leaves of each run, in um; it acts as a
-    disturbance. With the run's noise the error would be that of the run. Both are
-    [references, draws, samples].
+    ``left`` (um) is the residual of the linear plant in each run and acts as a
+    disturbance. With the noise of the run, the error would equal that of the run. Both
+    are [references, draws, samples].
     """
-    # What a loop is given at k moves the displacement at k + 1.
+    # The disturbance of sample k moves the displacement at k + 1.
     ahead = np.concatenate([left[..., 1:], left[..., -1:]], axis=-1)
     return np.asarray(_errors(loop, plant, references, ahead))
 
@@ -56,7 +57,7 @@ def _errors(loop: Feedback, plant: LinearPlant, references: Any, left: Any) -> A
         start = loop.init(reference[0])
         resting = plant.at(start.voltage, start.displacement)
         around = Feedback(loop.controller, resting, loop.actuator, loop.sensor)
-        # The loop's own start: nothing but the plant is another.
+        # The start is the loop's own: only the plant differs.
         begun = start._replace(plant=resting.init(start.voltage))
         log = simulate(around, loop_inputs(reference, None, left), begun)[1]
         return log.displacement - log.reference

@@ -1,23 +1,23 @@
-"""The limit of linear control for a loop and its references, and how near it comes.
+"""Limit of linear control for a loop and its references.
 
-The plant is the stage linearised (``linear_plant``) with the gain with which it answers
-what noise makes of the voltage in the loop's own runs (``felt_gain``). The disturbance
-is all that this leaves of those runs, d = y - P u: what hysteresis, creep, drift and
-the study's own disturbance do. It is taken from the runs that are judged, noise
-included, because noise that reaches the voltage shakes a hysteresis and makes another
-disturbance than a quiet run does. A controller that shakes it otherwise meets another
-one; ``attained`` says how much that matters.
+The plant P is the linearised stage (``linear_plant``). Its gain is that with which the
+stage answers voltage caused by sensor noise in the loop's own runs (``felt_gain``). The
+disturbance is the residual of the plant in those runs, d = y - P u: the effect of
+hysteresis, creep, drift and the study's own disturbance. It is taken from the assessed
+runs with their noise, because noise that reaches the voltage changes the state of a
+hysteresis: a run without noise has another disturbance. So does another controller;
+``attained`` measures how much that matters.
 
-What one linear filter of the reference makes of all references is foretold, and with
-full preview costs nothing. The rest, known by its spectrum at a stated resolution, is
-what feedback is for, and ``wiener`` has the least that it can leave: for each reference
-alone, a controller made for it, and for all of them, the one controller with the least
-geometric mean. The first is the limit; the second is no lower bound for one reference,
-but what a loop with one set of gains can be held against.
+One linear filter of the reference predicts part of the disturbance on all references.
+With full preview that part costs nothing. Feedback acts on the rest, known by its
+spectrum at a stated resolution, and ``wiener`` computes the least error that it can
+leave: for each reference with a controller designed for it, and for all references with
+the one controller of least geometric mean. The first is the limit. The second is not a
+lower bound for one reference, but a fair comparison for a loop with one set of gains.
 
-Not in the limit: a price on voltage, limits of the actuator, plants other than this
-one. A controller that is no linear one, or that knows the reference's period, may do
-better.
+The limit leaves out a price on voltage, the limits of the actuator, and plants other
+than this one. A nonlinear controller, or one that uses the period of the reference, may
+do better.
 """
 
 from typing import Any
@@ -40,9 +40,9 @@ from .wiener import (
 )
 
 SEGMENT = 0.1
-"""Length of the windows of the spectra, s: what their resolution is the inverse of."""
+"""Length of the windows of the spectra, s; its inverse is their resolution."""
 
-_LINEAR = 1.2  # the most that shares of a linear loop may come to, over its error
+_LINEAR = 1.2  # largest RMS sum of the shares of a linear loop, over its error
 
 
 def performance_limit(
@@ -56,13 +56,13 @@ def performance_limit(
     segment: float = SEGMENT,
     dt: float | None = None,
 ) -> LimitReport:
-    """Return the limit for ``loop`` and how near its runs come to it.
+    """Return the limit for ``loop`` and the comparison of its runs with it.
 
     ``references`` [names, samples] in um; ``noise`` [names, draws, samples], draws of
-    unit variance; ``disturbance`` in um, if any, of a shape that goes with that: as the
-    tuner's Signals hold them. Samples before ``start`` do not count. ``segment`` (s) is
-    the window of the spectra, no longer than what counts; ``dt`` (s) is looked for in
-    the loop.
+    unit variance; ``disturbance`` in um, if any, broadcasts to the shape of the noise:
+    the fields of the tuner's Signals. Samples before ``start`` do not count.
+    ``segment`` (s) is the length of the windows of the spectra, at most that of the
+    counted samples; ``dt`` (s) is by default that of the loop.
 
     Raises ValueError for several axes, a sensor without noise, runs that diverge, and
     a plant that is unstable or does not move as its linear model does.
@@ -72,23 +72,23 @@ def performance_limit(
         raise ValueError("the limit is known for one axis only")
     dt = loop_sample_time(loop) if dt is None else dt
     runs, rest = simulated(loop, references, noise, disturbance)
-    posed = problem_of(loop, runs, rest, np.asarray(references), start, segment, dt)
-    known, variance, points = posed.known, posed.variance, posed.points
-    obstacles = posed.plant.obstacles()
+    problem = problem_of(loop, runs, rest, np.asarray(references), start, segment, dt)
+    known, variance, points = problem.known, problem.variance, problem.points
+    obstacles = problem.plant.obstacles()
     inner = inner_response(*obstacles, points)
-    shared = common_response(posed.spectra, variance, inner)
-    best = [best_response(spectrum, variance, inner) for spectrum in posed.spectra]
+    shared = common_response(problem.spectra, variance, inner)
+    best = [best_response(spectrum, variance, inner) for spectrum in problem.spectra]
 
     error = (runs.displacement - runs.reference).reshape(noise.shape)
-    quiet = quiet_error(loop, posed.plant, references, posed.left)
+    quiet = quiet_error(loop, problem.plant, references, problem.left)
     tuned = _mean_square(error[..., start:])
     noisy = _mean_square((error - quiet)[..., start:])
     kept = _mean_square(known.unforeseen(quiet))
-    whole = _mean_square(known.cut(posed.left))
+    whole = _mean_square(known.cut(problem.left))
     line = 1.0 / (points * dt)
     rows = {}
     for i, name in enumerate(names):
-        spectrum = posed.spectra[i]
+        spectrum = problem.spectra[i]
         least = error_shares(best[i], spectrum, variance)
         rows[name] = Reached(
             tuned=_root(tuned[i]),
@@ -101,20 +101,20 @@ def performance_limit(
             limit_shares=Shares(noise=_root(least[1]), unforeseen=_root(least[0])),
         )
     T, half = np.array(best), slice(1, points // 2)
-    lowest = np.abs(1.0 - T) ** 2 * posed.spectra + np.abs(T) ** 2 * variance
+    lowest = np.abs(1.0 - T) ** 2 * problem.spectra + np.abs(T) ** 2 * variance
     curves = Curves(
         frequency=line * np.arange(points)[half],
-        unforeseen=posed.spectra[:, half],
+        unforeseen=problem.spectra[:, half],
         noise=variance,
-        tuned=spectra(posed.lines(known.cut(error)))[:, half],
+        tuned=spectra(problem.lines(known.cut(error)))[:, half],
         limit=lowest[:, half],
     )
     return LimitReport(
         references=rows,
         dt=dt,
         noise_rms=_root(variance),
-        resolution=1.0 / (posed.window * dt),
-        gain=float(posed.plant.response(2)[0].real),
+        resolution=1.0 / (problem.window * dt),
+        gain=float(problem.plant.response(2)[0].real),
         delay=slow_delay(*obstacles),
         sensitivity_peak=float(np.max(np.abs(1.0 - shared))),
         curves=curves,
@@ -133,11 +133,11 @@ def _shares(whole: float, noise: float, unforeseen: float) -> Shares | None:
 
 
 def _root(square: float) -> float:
-    # What is missing to the whole may be less than nothing; a share is not.
+    # The remainder of a total may be negative; a share may not.
     return float(np.sqrt(max(square, 0.0)))
 
 
 def _last_above(spectrum: np.ndarray, level: float) -> int:
-    """Return the highest line at which ``spectrum`` is above ``level``, or 0."""
+    """Return the highest line on which ``spectrum`` lies above ``level``, else 0."""
     above = np.flatnonzero(spectrum[: len(spectrum) // 2] > level)
     return int(above[-1]) if above.size else 0

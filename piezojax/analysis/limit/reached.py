@@ -6,17 +6,18 @@ from typing import Any
 import numpy as np
 
 NEAR = 1.5
-"""How many times the limit still counts as near it."""
+"""Largest ratio of an error to its limit that counts as near the limit."""
 
 
 @dataclass(frozen=True)
 class Shares:
-    """Parts of an RMS error (um), whose squares add up to its square.
+    """Parts of an RMS error (um), whose squares sum to its square.
 
-    ``noise`` is what the sensor's noise makes; ``unforeseen`` what is left of the
-    disturbance that the reference does not foretell; ``foreseen`` what a linear filter
-    of the reference makes of the error: following, and the rest of the disturbance. It
-    is what is missing to the whole, 0 where the others alone are more.
+    ``noise`` is caused by the sensor's noise, and ``unforeseen`` by the part of the
+    disturbance that the reference does not predict. ``foreseen`` is the part that a
+    linear filter of the reference predicts: the following error and the rest of the
+    disturbance. Its square is the remainder of the total, 0 where the other two exceed
+    the total.
     """
 
     noise: float
@@ -26,13 +27,14 @@ class Shares:
 
 @dataclass(frozen=True)
 class Reached:
-    """One reference, all RMS figures in um.
+    """Comparison of a loop with the limit on one reference; RMS figures in um.
 
-    ``tuned`` is the loop's error. ``limit`` is the least that a linear controller made
-    for this reference can leave, ``one_controller`` what the one that is best for the
-    geometric mean of all references leaves of it. ``disturbance`` is all of d,
-    ``unforeseen`` the part that the reference does not foretell, whose spectrum lies
-    above the noise's up to ``bandwidth`` (Hz).
+    ``tuned`` is the error of the loop. ``limit`` is the least error of a linear
+    controller designed for this reference, ``one_controller`` the error here of the one
+    controller with the least geometric mean over all references. ``disturbance`` is the
+    whole of d, ``unforeseen`` the part that the reference does not predict. The
+    spectrum of that part lies above the noise's up to ``bandwidth`` (Hz).
+    ``tuned_shares`` is None where the loop is too nonlinear for shares of its error.
     """
 
     tuned: float
@@ -46,12 +48,12 @@ class Reached:
 
     @property
     def over(self) -> float:
-        """How many times the limit the loop's error is."""
+        """Ratio of the loop's error to the limit."""
         return self.tuned / self.limit
 
     @property
     def exceeding(self) -> str | None:
-        """Name of the share whose mean square is furthest above the limit's."""
+        """Name of the share whose mean square exceeds that of the limit most."""
         if self.tuned_shares is None:
             return None
         least = asdict(self.limit_shares)
@@ -61,10 +63,11 @@ class Reached:
 
 @dataclass(frozen=True)
 class Curves:
-    """Spectra by frequency (Hz), in um^2; the mean of a spectrum is a variance.
+    """Spectra (um^2) against ``frequency`` [lines] (Hz); their means are variances.
 
-    ``unforeseen`` [references, lines]; ``noise`` is flat. ``tuned`` and ``limit``
-    [references, lines] are of the errors.
+    ``unforeseen`` [references, lines] is that of the unpredicted disturbance;
+    ``noise`` is flat. ``tuned`` and ``limit`` [references, lines] are those of the
+    errors.
     """
 
     frequency: np.ndarray
@@ -76,12 +79,12 @@ class Curves:
 
 @dataclass(frozen=True)
 class LimitReport:
-    """Distance of a loop from the limit of linear control, by reference.
+    """Comparison of a loop with the limit of linear control, by reference.
 
     ``noise_rms`` in um; ``resolution`` of the spectra in Hz; ``gain`` of the linear
-    plant at rest in um/V and ``delay``, that of the plant's inner part for slow
-    motion, in samples. ``sensitivity_peak`` is that of the one controller, which the
-    limit does not bound. ``dt`` in s.
+    plant at rest in um/V. ``delay`` is that of the plant's inner part for slow motion,
+    in samples. ``sensitivity_peak`` is that of the one controller; the limit does not
+    bound it. ``dt`` in s.
     """
 
     references: dict[str, Reached]
@@ -95,14 +98,14 @@ class LimitReport:
 
     @property
     def worst(self) -> str:
-        """Name of the reference whose error is the most times its limit."""
+        """Name of the reference with the largest ratio of error to limit."""
         return max(self.references, key=lambda name: self.references[name].over)
 
     def densities(self, name: str) -> dict[str, np.ndarray]:
-        """Return one-sided amplitude densities [lines] of a reference, um per root Hz.
+        """Return one-sided amplitude densities [lines] for ``name``, um/sqrt(Hz).
 
-        Of the "unforeseen" disturbance, of the sensor's "noise", of the error at the
-        "limit", and of the error of the "tuned" loop.
+        They are those of the "unforeseen" disturbance, of the sensor's "noise", of the
+        error at the "limit", and of the error of the "tuned" loop.
         """
         i, curves = list(self.references).index(name), self.curves
         spectra = {
@@ -115,24 +118,24 @@ class LimitReport:
 
     @property
     def near(self) -> int:
-        """How many references come within ``NEAR`` times their limit."""
+        """Number of references whose error is at most ``NEAR`` times its limit."""
         return sum(one.over <= NEAR for one in self.references.values())
 
     @property
     def near_one_controller(self) -> int:
-        """The same for what the one controller for all references leaves."""
+        """Number of references at most ``NEAR`` times the one controller's error."""
         return sum(
             one.tuned <= NEAR * one.one_controller for one in self.references.values()
         )
 
     @property
     def over(self) -> float:
-        """Geometric mean over the references of error over limit."""
+        """Geometric mean over the references of the ratio of error to limit."""
         return self._mean([one.over for one in self.references.values()])
 
     @property
     def over_one_controller(self) -> float:
-        """The same over what the one controller leaves."""
+        """Geometric mean of the ratio of error to that of the one controller."""
         found = [one.tuned / one.one_controller for one in self.references.values()]
         return self._mean(found)
 

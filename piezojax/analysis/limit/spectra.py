@@ -1,30 +1,30 @@
-"""Spectra of short records, and what in them the reference foretells.
+"""Spectra of short records, and prediction of records from the reference.
 
-The disturbance that hysteresis makes of a periodic reference is periodic, and lines can
-be predicted without error by who knows their frequencies and may wait for ever. So a
-spectrum is only meaningful with its resolution: Welch's method (IEEE Trans. Audio
-Electroacoustics 15 (1967) 70-73) over Hann windows of a tenth of a second that overlap
-by half takes as unforeseeable what a tenth of a second does not tell. Longer windows
-lower the limit; their length is part of every figure made with them.
+A hysteresis under a periodic reference makes a periodic disturbance, which is
+predictable without error given its frequencies and unlimited time. A spectrum is
+therefore meaningful only together with its resolution. Welch's method (IEEE Trans.
+Audio Electroacoustics 15 (1967) 70-73) with Hann windows of a tenth of a second that
+overlap by half treats as unpredictable all that a tenth of a second cannot resolve.
+Longer windows lower the limit; their length is part of every figure computed with them.
 """
 
 import numpy as np
 
 TAPS = 100
-"""Of the filter that foretells: a millisecond apart in a tenth of a second."""
+"""Taps of the filter of the reference: 1 ms apart over a tenth of a second."""
 
 LEAST_SHARE = 1e-10
-"""Power of a direction in the taps, over the largest's, that tells something."""
+"""Least power of a direction of the taps that is used, as a share of the largest."""
 
 
 class Foretelling:
-    """What one linear filter of the reference, which may look ahead, makes of signals.
+    """Prediction of signals by one linear, non-causal filter of the reference.
 
-    ``references`` [references, samples] in um, at rest before they begin. The filter
-    reaches ``reach`` samples back and as far ahead, so signals are told apart from
-    sample ``start`` to that far from the end: ``count`` samples. It is fitted to
-    all references at once, by least squares of differences from sample to sample:
-    what is slow weighs less, since feedback sees to that.
+    ``references`` [references, samples] in um are constant before they begin. The
+    filter reaches ``reach`` samples back and ahead. Signals are therefore predicted on
+    ``count`` samples: from ``start`` to ``reach`` samples before the end. The filter is
+    fitted to all references at once, by least squares of the differences between
+    consecutive samples: slow parts weigh less, because feedback removes them.
     """
 
     def __init__(self, references: np.ndarray, start: int, reach: int):
@@ -33,8 +33,8 @@ class Foretelling:
             padded, 2 * reach + 1, axis=1
         )
         self._whole = ahead_and_back[:, :, :: max(2 * reach // TAPS, 1)]
-        self._seen = self._whole[:, start:]
-        self._start, self.count = start, self._seen.shape[1]
+        self._counted = self._whole[:, start:]
+        self._start, self.count = start, self._counted.shape[1]
         steps = self._steps()
         power, directions = np.linalg.eigh(sum(step.T @ step for step in steps))
         telling = power > LEAST_SHARE * max(power[-1], np.finfo(float).tiny)
@@ -42,56 +42,56 @@ class Foretelling:
         self._power = power[telling]
 
     def _steps(self) -> list[np.ndarray]:
-        return [np.diff(seen, axis=0) for seen in self._seen]
+        return [np.diff(rows, axis=0) for rows in self._counted]
 
     def cut(self, signals: np.ndarray) -> np.ndarray:
-        """Return ``signals`` [..., samples] where they are told apart, less means."""
+        """Return ``signals`` [..., samples] on the predicted samples, means removed."""
         part = self.told_apart(signals)
         return part - part.mean(axis=-1, keepdims=True)
 
     def told_apart(self, signals: np.ndarray) -> np.ndarray:
-        """Return ``signals`` [..., samples] where they are told apart."""
+        """Return ``signals`` [..., samples] on the predicted samples [..., count]."""
         return signals[..., self._start : self._start + self.count]
 
     def weights(self, signals: np.ndarray) -> np.ndarray:
-        """Return the filter's taps, the earliest reference first.
+        """Return the taps of the filter, that of the earliest reference first.
 
-        ``signals`` are [references, draws, samples]. All draws of a reference are
-        foretold alike: their mean says how.
+        ``signals`` are [references, draws, samples]. The filter is fitted to the mean
+        over the draws of each reference.
         """
         moved = np.diff(self.cut(signals).mean(axis=1), axis=1)
         product = sum(s.T @ m for s, m in zip(self._steps(), moved, strict=True))
         return self._directions @ (self._directions.T @ product / self._power)
 
     def unforeseen(self, signals: np.ndarray) -> np.ndarray:
-        """Return what is left [references, draws, count] of signals, means removed.
+        """Return the unpredicted part [references, draws, count], means removed.
 
         ``signals`` are [references, draws, samples].
         """
         weights = self.weights(signals)
-        told = np.stack([seen @ weights for seen in self._seen])
-        told -= told.mean(axis=1, keepdims=True)
-        return self.cut(signals) - told[:, None]
+        predicted = np.stack([rows @ weights for rows in self._counted])
+        predicted -= predicted.mean(axis=1, keepdims=True)
+        return self.cut(signals) - predicted[:, None]
 
     def foretold(self, signals: np.ndarray) -> np.ndarray:
-        """Return the filter's work [references, samples] on whole records.
+        """Return the predicted part [references, samples] on whole records.
 
-        With the mean that ``signals`` have; held where the record does not say what
-        comes next.
+        It has the mean of ``signals`` [references, draws, samples]. The last value is
+        held where the filter would reach beyond the end of the record.
         """
         weights = self.weights(signals)
-        told = np.stack([seen @ weights for seen in self._whole])
+        predicted = np.stack([rows @ weights for rows in self._whole])
         mean = self.told_apart(signals).mean(axis=(1, 2))
-        told += (mean - self.told_apart(told).mean(axis=1))[:, None]
-        missing = signals.shape[-1] - told.shape[1]
-        return np.pad(told, ((0, 0), (0, missing)), mode="edge")
+        predicted += (mean - self.told_apart(predicted).mean(axis=1))[:, None]
+        missing = signals.shape[-1] - predicted.shape[1]
+        return np.pad(predicted, ((0, 0), (0, missing)), mode="edge")
 
 
 def grid_size(segment: int) -> int:
-    """Return how many points the circle needs for spectra of ``segment`` samples.
+    """Return the number of points around the circle for windows of ``segment`` samples.
 
-    Factors of a spectrum have longer memories than it: 32 times, and no fewer than
-    2^14 points for the plant's own.
+    The factors of a spectrum have a longer memory than the spectrum: the circle has 32
+    times as many points as a window, and at least 2^14 for the memory of the plant.
     """
     return max(2**14, 2 ** int(np.ceil(np.log2(32 * segment))))
 
@@ -100,9 +100,9 @@ def windowed(records: np.ndarray, segment: int, points: int) -> np.ndarray:
     """Return the transforms [..., segments, lines] of ``records`` [..., samples].
 
     Lines are those of the upper half of a circle of ``points``, both ends included. The
-    mean squared magnitude is the spectrum whose mean over the circle is the variance.
+    mean squared magnitude is the spectrum, whose mean over the circle is the variance.
     """
-    # A window that fits its period: without the zero that ends a symmetric one.
+    # A periodic Hann window: without the last zero of a symmetric one.
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(segment) / segment)
     window /= np.sqrt(np.sum(window**2))
     starts = range(0, records.shape[-1] - segment + 1, max(segment // 2, 1))
@@ -113,7 +113,7 @@ def windowed(records: np.ndarray, segment: int, points: int) -> np.ndarray:
 def spectra(transforms: np.ndarray) -> np.ndarray:
     """Return the mean spectra [references, points] of transforms [references, ...].
 
-    They go all around the circle.
+    ``points`` covers the whole circle.
     """
     middle = tuple(range(1, transforms.ndim - 1))
     upper = np.mean(np.abs(transforms) ** 2, axis=middle)

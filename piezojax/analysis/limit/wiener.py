@@ -1,41 +1,41 @@
-"""The least error that linear feedback leaves of a disturbance seen through noise.
+"""Least error of linear feedback under a disturbance and measurement noise.
 
-A stable plant P answers the voltage u with a displacement to which a disturbance d of
-spectrum S is added; it is measured with white noise of variance s^2:
+A stable plant P answers the voltage u with a displacement. A disturbance d of spectrum
+S is added to it, and the sum is measured with white noise of variance s^2:
 
     y = P u + d,    z = y + n.
 
-The reference is known for ever. With no price on effort it costs nothing then: u may
-begin before the reference moves, so that a plant with delay and with zeros outside the
-unit circle, too, has a stable inverse, and whatever of d is a linear filter of the
-reference is cancelled the same way. What is left is feedback. Every stabilising linear
-controller is u = -Q (z - P u) with a stable causal Q (Youla, Jabr and Bongiorno, IEEE
-Trans. Automatic Control 21 (1976) 3-13), and with T = P Q
+The reference is known for all time. With no price on effort, following it then costs
+nothing: u may begin before the reference moves, so that even a plant with delay and
+with zeros outside the unit circle has a stable inverse. The part of d that is a linear
+filter of the reference is cancelled in the same way. Feedback acts on the rest. Every
+stabilising linear controller is u = -Q (z - P u) with a stable causal Q (Youla, Jabr
+and Bongiorno, IEEE Trans. Automatic Control 21 (1976) 3-13), and with T = P Q
 
     y = (1 - T) d - T n,    E y^2 = mean over frequency of |1 - T|^2 S + |T|^2 s^2.
 
 Write S + s^2 = |V|^2 with V and 1/V stable and causal, P = P_i P_o with |P_i| = 1 (the
 delay and the zeros outside the circle) and P_o free of both. The minimum over Q
-(Wiener-Hopf; cheap-control LQG is the same) is reached by
+(Wiener-Hopf; cheap-control LQG has the same) is reached by
 
     T = P_i [conj(P_i) S / conj(V)]_causal / V,
 
-and is the error of the smoother, mean of S s^2 / (S + s^2), which sees past and future,
-plus the mean square of the part that is not causal: the price of delay and zeros. For
-s = 0 it is that of minimum-variance control (Astrom, Introduction to Stochastic Control
-Theory, 1970, chapter 6), against which Harris' index judges loops (Can. J. Chem. Eng.
-67 (1989) 856-861).
+It is the sum of two terms: the error of the smoother, which uses past and future, mean
+of S s^2 / (S + s^2), and the mean square of the part that is not causal, the price of
+delay and zeros. For s = 0 it is that of minimum-variance control (Astrom, Introduction
+to Stochastic Control Theory, 1970, chapter 6), with which Harris' index compares loops
+(Can. J. Chem. Eng. 67 (1989) 856-861).
 
 All functions work on a grid of N points around the unit circle, z = exp(2 pi i k / N),
-N even, where multiplying by 1/z delays by a sample. V comes from the cepstrum: no
-model of the disturbance is fitted and no Riccati equation solved, which vanishing
-effort makes ill-conditioned.
+N even, where multiplying by 1/z delays by a sample. V comes from the cepstrum. No model
+of the disturbance is fitted, and no Riccati equation is solved: vanishing effort would
+make it ill-conditioned.
 """
 
 import numpy as np
 
 FLOOR = 1e-12
-"""Smallest magnitude that a factor has, over its largest: a zero on the circle."""
+"""Least magnitude of a factor, over its largest; it replaces zeros on the circle."""
 
 
 def outer_factor(magnitude: np.ndarray) -> np.ndarray:
@@ -54,10 +54,10 @@ def outer_factor(magnitude: np.ndarray) -> np.ndarray:
 
 
 def inner_response(delay: int, zeros: np.ndarray, points: int) -> np.ndarray:
-    """Return P_i [points] of a stable plant: its ``delay`` and ``zeros`` outside.
+    """Return P_i [points] of a stable plant from its ``delay`` and ``zeros``.
 
-    The delay is in samples, the loop's own among them, and the zeros are those in z
-    outside the unit circle. Up to a sign, which is no matter.
+    The delay is in samples and includes the loop's own. The zeros are those in z
+    outside the unit circle. The sign of P_i is arbitrary and does not matter.
     """
     w = np.exp(-2j * np.pi * np.arange(points) / points)
     response = w**delay
@@ -67,7 +67,7 @@ def inner_response(delay: int, zeros: np.ndarray, points: int) -> np.ndarray:
 
 
 def slow_delay(delay: int, zeros: np.ndarray) -> float:
-    """Return the delay (samples) that P_i amounts to for slow motion."""
+    """Return the delay (samples) of P_i at low frequency."""
     place = 1.0 / np.asarray(zeros, complex)
     return delay + float(np.sum((1.0 - np.abs(place) ** 2) / np.abs(1.0 - place) ** 2))
 
@@ -75,10 +75,10 @@ def slow_delay(delay: int, zeros: np.ndarray) -> float:
 def best_response(
     spectrum: np.ndarray, variance: float, inner: np.ndarray
 ) -> np.ndarray:
-    """Return the best T = P Q [N]: 1 - T is the sensitivity of the optimal loop.
+    """Return the optimal T = P Q [N]; 1 - T is the sensitivity of the optimal loop.
 
-    ``spectrum`` [N] is that of the disturbance, its mean the variance; ``variance``
-    that of the noise; ``inner`` the P_i of the plant.
+    ``spectrum`` [N] is that of the disturbance, with its variance as mean;
+    ``variance`` is that of the noise, and ``inner`` [N] the P_i of the plant.
     """
     factor = outer_factor(np.sqrt(spectrum + variance))
     wanted = np.fft.ifft(np.conj(inner) * spectrum / np.conj(factor))
@@ -89,9 +89,9 @@ def best_response(
 def error_shares(
     response: np.ndarray, spectrum: np.ndarray, variance: float
 ) -> tuple[float, float]:
-    """Return the mean squares that disturbance and noise leave under T = ``response``.
+    """Return the mean square errors due to disturbance and noise for T = ``response``.
 
-    ``spectrum`` need not be the one for which T is best.
+    ``spectrum`` need not be the one for which T is optimal.
     """
     left = float(np.mean(np.abs(1.0 - response) ** 2 * spectrum))
     return left, float(variance * np.mean(np.abs(response) ** 2))
@@ -106,10 +106,10 @@ def common_response(
 ) -> np.ndarray:
     """Return T of the one controller with the least geometric mean over ``spectra``.
 
-    ``spectra`` is [references, N]. The mean of logarithms lies below its tangent: best
-    for the spectra weighted by 1 / (mean square error) lowers it in each round, until
-    no error moves by more than ``tolerance`` of itself. What that leads to is a
-    stationary point; that there is no better one is not proved.
+    ``spectra`` is [references, N]. The mean of logarithms is concave and lies below its
+    tangent. The T that is optimal for the spectra weighted by 1 / (mean square error)
+    therefore lowers it in each round, until no error changes by more than the relative
+    ``tolerance``. The result is a stationary point and may not be the global minimum.
     """
     weights, last = np.ones(len(spectra)), np.zeros(len(spectra))
     response = np.zeros_like(inner)

@@ -1,9 +1,10 @@
 """Stability of a loop around an operating point: poles, margins, sensitivity.
 
-A sensitivity peak has two sources. ``stability_report`` is exact: the frequency
-response of the linearised loop, refined at its peaks, for loops of one or several axes;
-use it to judge a loop. ``sensitivity_peak`` is differentiable and cheap: the response
-of a loop of one axis to an impulse; use it in objectives, constraints and sweeps.
+Two functions compute a sensitivity peak. ``stability_report`` is exact: it refines the
+frequency response of the linearised loop at its peaks, for loops of one or several
+axes. Use it to assess a loop. ``sensitivity_peak`` is differentiable and cheap: it
+takes the impulse response of a loop of one axis. Use it in objectives, constraints and
+sweeps.
 """
 
 from .assess import AxesStability as AxesStability

@@ -1,4 +1,4 @@
-"""Stability of any loop at an operating point, and of several loops side by side."""
+"""Stability reports of one loop or several loops at an operating point."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from .margins import (
 from .operating_point import BRANCHES, OperatingPoint
 
 _SAME = 1e-5
-"""Relative difference of L below which two branches count as one."""
+"""Relative difference of L below which two branches count as equal."""
 
 
 @overload
@@ -46,8 +46,9 @@ def stability_report(
     """Return the stability of ``loop`` for small motions around an operating point.
 
     ``at`` is an ``OperatingPoint``, or the reference (um) at which the loop rests, on
-    the ascending branch of its hysteresis. With a vector or a tuple as reference, one
-    number an axis in its unit, the report is a MultiAxisReport.
+    the ascending branch of its hysteresis. For several axes the reference is a vector
+    or a tuple with one number for each axis, in its unit, and the report is a
+    MultiAxisReport.
 
     Raises ValueError if the loop cannot rest at the reference, its derivatives are not
     finite, or its sample time is not known.
@@ -70,7 +71,7 @@ def _located_axes_report(
 
 
 class LoopCurves(NamedTuple):
-    """Frequency responses of a loop of one axis, all arrays [lines].
+    """Frequency responses [lines] of a loop of one axis.
 
     ``frequency`` in Hz; L, S = 1/(1+L) and T = L/(1+L) are complex.
     """
@@ -82,7 +83,7 @@ class LoopCurves(NamedTuple):
 
 
 class AxesCurves(NamedTuple):
-    """Sizes of the sensitivities of a loop of several axes.
+    """Magnitudes of the sensitivities of a loop of several axes.
 
     ``frequency`` [lines] in Hz; ``each`` [axes, lines] is |S| of one axis with all
     others closed, ``largest`` [lines] the largest singular value of S.
@@ -101,7 +102,7 @@ class AxesStability:
     loop: LinearAxes
 
     def curves(self) -> AxesCurves:
-        """Return the sizes of the sensitivities over frequency."""
+        """Return the magnitudes of the sensitivities against frequency."""
         angle = angle_grid(self.loop)
         alone = [self.loop.one_cut(axis) for axis in range(len(self.loop.C))]
         return AxesCurves(
@@ -112,7 +113,7 @@ class AxesStability:
 
 
 class WorstMargins(NamedTuple):
-    """Largest Ms and smallest margins of several reports of stable loops."""
+    """Largest Ms and smallest margins over the reports of several stable loops."""
 
     sensitivity_peak: float
     gain_margin_dB: float  # noqa: N815
@@ -121,7 +122,7 @@ class WorstMargins(NamedTuple):
 
 
 def worst_margins(reports: Sequence[StabilityReport]) -> WorstMargins | None:
-    """Return the worst figures of ``reports``, None if one loop is unstable."""
+    """Return the worst figures of ``reports``, None if any loop is unstable."""
     if not all(report.stable for report in reports):
         return None
 
@@ -140,9 +141,9 @@ def worst_margins(reports: Sequence[StabilityReport]) -> WorstMargins | None:
 class StabilityReports:
     """Stability of several loops at one reference: the content of ``stability.json``.
 
-    ``reports`` and ``loops`` hold the reports and linear loops of one axis by name and
-    branch, ``axes`` those of several axes, named ``axis_names``. ``problems`` holds
-    the reason for each loop that has no report.
+    ``reports`` and ``loops`` hold the reports and linear loops of one axis, by name and
+    branch. ``axes`` holds those of several axes, by name; ``axis_names`` are the names
+    of the axes. ``problems`` holds the reason for each loop that has no report.
     """
 
     reports: dict[str, dict[str, StabilityReport]] = field(default_factory=dict)
@@ -152,7 +153,11 @@ class StabilityReports:
     axis_names: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON: by name, then by branch, or ``problem``."""
+        """Return plain values for JSON, by name.
+
+        Each value holds the reports of one axis by branch, the report of several axes,
+        or a ``problem``.
+        """
         found: dict[str, Any] = {
             name: {branch: report.as_dict() for branch, report in reports.items()}
             for name, reports in self.reports.items()
@@ -161,10 +166,10 @@ class StabilityReports:
         return found | {n: {"problem": why} for n, why in self.problems.items()}
 
     def curves(self, name: str, decades: float) -> dict[str, LoopCurves]:
-        """Return the responses of a loop of one axis by branch.
+        """Return the frequency responses of the loop ``name`` of one axis, by branch.
 
-        From ``decades`` below the Nyquist frequency up to it; a branch equal to the
-        first one is left out.
+        They cover the last ``decades`` up to the Nyquist frequency. A branch equal to
+        the first one is left out.
         """
         first, *others = self.loops[name].items()
         probe = np.array([1e-3, 0.1, 1.0, np.pi])
@@ -194,9 +199,9 @@ def stability_reports(
 ) -> StabilityReports:
     """Return the stability of ``loops``, by name, on both branches at ``reference``.
 
-    ``reference`` in um; with ``axis_names`` one number an axis, and the branch with the
-    smaller margin alone. ``dt`` in s. A loop that cannot be linearised is listed among
-    the problems; its error is not raised.
+    ``reference`` in um, ``dt`` in s. With ``axis_names`` the reference holds one number
+    for each axis, and only the branch with the smaller disk margin is reported. A loop
+    that cannot be linearised is listed in ``problems``; its error is not raised.
     """
     result = StabilityReports(axis_names=axis_names)
     points = [OperatingPoint(reference, branch, dt=dt) for branch in BRANCHES]
@@ -211,7 +216,7 @@ def stability_reports(
                 for point in points
             }
             result.loops[name] = {b: model for b, (model, _) in found.items()}
-        # Whatever goes wrong here, tuned gains stay worth having.
+        # A failed analysis must not lose the tuned gains.
         except Exception as error:
             why = str(error).partition("\n")[0] or type(error).__name__
             result.problems[name] = why

@@ -1,4 +1,4 @@
-"""Margins of a loop of several axes: one at a time, and all at once."""
+"""Margins of a loop of several axes: each axis alone, and all at once."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -21,36 +21,36 @@ from .margins import (
 )
 
 _SWEEPS = 12
-"""Of the balancing: a start only."""
+"""Sweeps of the balancing, which only starts the search for D."""
 
 _TOLERANCE = 1e-9
-"""To which the largest bound over the grid is searched, relative."""
+"""Relative tolerance of the largest bound over the grid."""
 
 
 @dataclass(frozen=True)
 class MultiAxisReport:
-    """How far a loop of several axes, cut at the plant's inputs, is from instability.
+    """Poles and margins of a loop of several axes, cut at the plant's inputs.
 
     L is its loop transfer matrix (see ``BrokenLoop``), S = (I+L)^-1, T = L (I+L)^-1.
-    All hold for the sampled loop up to the Nyquist frequency. Of an unstable loop only
-    the poles are given: all else is None, and there are no ``axes``.
+    All figures are those of the sampled loop up to the Nyquist frequency. For an
+    unstable loop only the poles are given: all else is None, and ``axes`` is empty.
 
     - ``stable``, ``poles``, ``conserved``, ``slowest_time_constant_s``: as in a
       ``StabilityReport``;
-    - ``axes``: a StabilityReport of each axis, cut alone with all others closed. Where
-      axes are coupled a loop can be fragile although each of these is robust;
-    - ``disk_margin``: alpha, such that gain and phase of all axes may vary at once and
-      apart, each within ``disk_gain_margin`` (that factor up, or its inverse) and
-      ``disk_phase_margin_deg``. A lower bound: 1 / max over frequency of the least
-      largest singular value of D (S - T)/2 D^-1, D diagonal, which does not depend on
-      the units of the axes; up to 3 axes and complex perturbations it is exact.
-      ``disk_margin_Hz`` is where it is smallest. Source: Seiler, Packard and Gahinet,
-      An introduction to disk margins, 2020;
+    - ``axes``: the StabilityReport of each axis, cut alone with all others closed. A
+      loop of coupled axes can be fragile although each of these is robust;
+    - ``disk_margin``: alpha. Gain and phase of all axes may vary at once and
+      independently, each within ``disk_gain_margin`` (that factor or its inverse) and
+      ``disk_phase_margin_deg``. Alpha is a lower bound, 1 / max over frequency of
+      min over D of the largest singular value of D (S - T)/2 D^-1, D diagonal. It does
+      not depend on the units of the axes, and for up to 3 axes and complex
+      perturbations it is exact. ``disk_margin_Hz`` is the frequency of the maximum.
+      Source: Seiler, Packard and Gahinet, An introduction to disk margins, 2020;
     - ``sensitivity_peak``, ``complementary_peak``: the largest singular values of S and
       T over frequency. They depend on the units of the commands.
 
-    ``reference``, ``command`` and ``branch`` say where the loop was linearised, in the
-    units of the axes. Frequencies in Hz, angles in degrees.
+    ``reference``, ``command`` and ``branch`` are the operating point, in the units of
+    the axes. Frequencies in Hz, angles in degrees.
     """
 
     stable: bool
@@ -77,7 +77,7 @@ class MultiAxisReport:
 
 
 def axes_report_of(loop: LinearAxes) -> MultiAxisReport:
-    """Return the report on a loop of several axes that is linear already."""
+    """Return the report on a linear loop of several axes."""
     found = poles_of(loop)
     if not found["stable"]:
         return MultiAxisReport(**found)
@@ -97,18 +97,18 @@ def _figures(loop: LinearAxes) -> dict[str, Any]:
 def _structured_peak(
     loop: LinearAxes, grid: np.ndarray, sampled: np.ndarray
 ) -> tuple[float, float]:
-    """Return the largest structured singular value of (S - T)/2, and where it lies."""
+    """Return the peak of the structured singular value of (S - T)/2, and its angle."""
     bounds = largest_singular(balancing(sampled)[1])
     best, at = 0.0, 0
     while True:
         index = int(np.argmax(bounds))
-        # What is bounded below the best cannot be the peak.
+        # A frequency whose bound lies below the best value cannot be the peak.
         if bounds[index] <= best * (1.0 + _TOLERANCE):
             break
         value, d = structured_bound(sampled[index])
         if value > best:
             best, at = value, index
-        # What suits one frequency suits its neighbours, and bounds them too.
+        # The D of one frequency bounds all others too, and its neighbours tightly.
         others = largest_singular(d[:, None] * sampled / d)
         bounds = np.minimum(bounds, others)
         bounds[index] = value
@@ -124,11 +124,12 @@ def _structured_peak(
 
 
 def structured_bound(matrix: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the least largest singular value of D ``matrix`` D^-1, and D [q].
+    """Return min over D of the largest singular value of D ``matrix`` D^-1, and D [q].
 
-    D is diagonal. The value is an upper bound of the structured singular value for a
-    complex number an axis, and that value itself up to 3 axes. Any D gives a bound; the
-    search starts at the one that balances rows and columns, and is convex in log D.
+    D is diagonal. The minimum is an upper bound of the structured singular value for
+    one complex perturbation on each axis, and equals it for up to 3 axes. Every D gives
+    a bound. The search starts at the D that balances rows and columns, and the problem
+    is convex in log D.
     """
     found, balanced = balancing(matrix[None])
     start, matrix = found[0], balanced[0]
@@ -154,7 +155,10 @@ def structured_bound(matrix: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def balancing(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return D [m, q] and D M D^-1 of M [m, q, q] with rows as long as columns."""
+    """Return D [m, q] and D M D^-1 of M [m, q, q].
+
+    D is diagonal and makes the off-diagonal norms of each row and column equal.
+    """
     size = matrices.shape[-1]
     off = np.where(np.eye(size, dtype=bool), 0.0, np.abs(matrices) ** 2)
     d = np.ones(matrices.shape[:-1])  # squared

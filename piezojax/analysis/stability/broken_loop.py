@@ -1,4 +1,4 @@
-"""Loop cut at the input of its plant, of which margins are taken."""
+"""Loop cut at the input of its plant, from which margins are computed."""
 
 from typing import Any, NamedTuple
 
@@ -14,15 +14,17 @@ from ...hardware import Saturation
 from .operating_point import OperatingPoint
 
 VOLTAGE_PUSH = 2.0**-40
-"""Push on voltages, over 1 + |u|: enough to pick a branch, too little to move on it."""
+"""Push on voltages as a share of 1 + |u|: enough to select a branch, too small to move
+along it."""
 
 COMMAND_PUSH = 2.0**-30
-"""Push on the command, by way of the reference, over 1 + |u|: larger than the other,
-for an inverse hysteresis in the controller to be on the same branch."""
+"""Push on the command, applied at the reference, as a share of 1 + |u|. It is larger
+than ``VOLTAGE_PUSH``, so that an inverse hysteresis in the controller is on the same
+branch."""
 
 
 class BrokenState(NamedTuple):
-    """A loop's state without its reference; ``applied`` is the actuator's own."""
+    """State of a cut loop; ``applied`` is the actuator's last voltage, V."""
 
     controller: State
     actuator: State
@@ -36,20 +38,20 @@ class BrokenLoop(System):
     """A Feedback loop cut between its actuator and its plant.
 
     Input: the voltage injected into the plant, V. Output: minus the voltage that the
-    actuator then returns, V, so that the loop is closed by feeding back minus the
-    output, and its transfer function L has the critical point -1. With several axes
-    both are tuples, all axes are cut at once, and L is a matrix.
+    actuator then returns, V. Feeding back minus the output closes the loop, and its
+    transfer function L has the critical point -1. With several axes input and output
+    are tuples, all axes are cut at once, and L is a matrix.
 
-    The cut lies behind the point where the controller learns what was applied:
-    ``applied`` stays the actuator's own last voltage. A disturbance observer so keeps
-    its inner loop, and L is the plant times everything the controller does to a
-    measurement: the margins are those against a gain, a phase or a delay of the
-    amplifier, the stage or the sensor that the controller does not know of. (With the
-    cut before that point the controller would be told of the change, and the margins
-    would be too good.)
+    The cut lies behind the point at which the controller reads the applied voltage:
+    ``applied`` stays the actuator's own last voltage. A disturbance observer therefore
+    keeps its inner loop, and L is the plant times the whole response of the controller
+    to a measurement. The margins are those against a gain, a phase or a delay of the
+    amplifier, the stage or the sensor that is unknown to the controller. (With the cut
+    before that point the controller would read the change, and the margins would be
+    too large.)
 
-    Use ``broken_loop`` to make one. ``reference`` (um) is held; the pushes (V, um) pick
-    a branch where a step has kinks; without them this is the loop as it runs.
+    Use ``broken_loop`` to make one. ``reference`` (um) is constant. The pushes (V, um)
+    select a branch where a step has kinks; without them the loop runs unchanged.
     """
 
     loop: Feedback
@@ -59,7 +61,7 @@ class BrokenLoop(System):
     reference_push: Signal | None = None
 
     def init(self, input: Any = None) -> BrokenState:
-        """Return the state of the operating point, whatever the input."""
+        """Return the state of the operating point; the input is ignored."""
         start = self.start
         return BrokenState(
             controller=start.controller,
@@ -94,16 +96,16 @@ def broken_loop(loop: Feedback, at: Any = 0.0) -> BrokenLoop:
 
     ``at`` is an ``OperatingPoint``, or the reference (um) at which the loop rests. At
     rest the plant is on the virgin loading curve of its hysteresis. There the local
-    gain depends on the direction in which the voltage moves next, which the point's
-    ``branch`` names: "ascending" on, "descending" back. All kinks, those of an inverse
-    hysteresis in the controller too, are taken on the same side, by a push of about
-    1e-12 V. For a Coleman-Hodgdon model at (x, y) the two slopes are b + h and b - h,
-    h = a x + c y: b is their mean, and -a/c, the axis of the loop, the limit of b + h
-    far along a branch. For a plant without kinks both branches are the same.
+    gain depends on the direction in which the voltage moves next. The point's
+    ``branch`` names it: "ascending" on, "descending" back. A push of about 1e-12 V
+    takes all kinks on the same side, those of an inverse hysteresis in the controller
+    too. For a Coleman-Hodgdon model at (x, y) the two slopes are b + h and b - h,
+    h = a x + c y. Their mean is b, and far along a branch b + h tends to -a/c, the
+    slope of the loop's axis. For a plant without kinks both branches are the same.
 
     Limits of the voltage (Saturation) are removed from the actuator, because margins
-    hold for small motions; slew limits and converters count with their slope at rest,
-    1. A switching term (``BangBang``) has no slope and is left out.
+    hold for small motions. Slew limits and converters have their slope at rest, 1. A
+    switching term (``BangBang``) has no slope and is left out.
     """
     point = OperatingPoint.at(at)
     return cut(loop, point.signal, point.side, point.state)
@@ -112,10 +114,13 @@ def broken_loop(loop: Feedback, at: Any = 0.0) -> BrokenLoop:
 def cut(
     loop: Feedback, reference: Signal, side: ScalarLike, state: LoopState | None
 ) -> BrokenLoop:
-    """Return the loop cut as by ``broken_loop``, ``side`` +1 or -1 for the branch."""
+    """Return ``loop`` cut at the plant's input, as ``broken_loop`` does.
+
+    ``side`` is +1 on the ascending branch and -1 on the descending one.
+    """
     start = loop.init(reference) if state is None else state
     freed = _without_limits(loop)
-    # How far the command follows the reference at once; it may go either way.
+    # Direct gain from the reference to the command; its sign may be either.
     tried = jax.tree.map(lambda r: VOLTAGE_PUSH**0.5 * (1.0 + jnp.abs(r)), reference)
     moved = BrokenLoop(freed, reference, start, reference_push=tried)
     _, output = moved.step(moved.init(), start.voltage)
@@ -147,11 +152,11 @@ def _without_limits(loop: Feedback) -> Feedback:
 
 
 def open_loop(loop: Feedback, at: Any = 0.0) -> StateSpace:
-    """Return L of ``loop`` cut at the plant's input: an input and an output an axis.
+    """Return L of ``loop`` cut at the plant's input.
 
-    The closed loop is ``A - B C``, since D = 0: a plant answers one sample later.
-    ``at`` as for ``broken_loop``; usable inside ``jax.jit``. Raises ValueError as
-    ``loop_sample_time`` and ``linearise``.
+    L has one input and one output for each axis. The closed loop is ``A - B C``, since
+    D = 0: a plant answers one sample later. ``at`` as for ``broken_loop``; usable
+    inside ``jax.jit``. Raises ValueError as ``loop_sample_time`` and ``linearise``.
     """
     point = OperatingPoint.at(at)
     dt = point.sample_time(loop)

@@ -1,4 +1,7 @@
-"""What a loop only remembers: modes at z = 1 that nothing moves."""
+"""Linear loops as matrices, without their conserved modes.
+
+A conserved mode has its pole at z = 1, and no input moves it.
+"""
 
 from typing import NamedTuple, TypeVar
 
@@ -6,13 +9,14 @@ import numpy as np
 from scipy import linalg
 
 TOLERANCE = 1e-9
-"""A direction counts as conserved if rows scaled to length 1 cancel this well."""
+"""Largest singular value of a conserved direction, with rows of [A - I, B] scaled to
+length 1."""
 
 
 class LinearLoop(NamedTuple):
-    """L as NumPy matrices: A [n, n], B [n], C [n]; ``dt`` in s.
+    """L of one axis as NumPy matrices: A [n, n], B [n], C [n]; ``dt`` in s.
 
-    ``conserved`` modes have been taken out.
+    ``conserved`` is the number of conserved modes that have been removed.
     """
 
     A: np.ndarray
@@ -26,21 +30,21 @@ class LinearLoop(NamedTuple):
         return self.A - np.outer(self.B, self.C)
 
     def integrates(self) -> bool:
-        """Return whether L has a pole at z = 1, as far as rounding lets one see."""
+        """Return whether L has a pole at z = 1, to within ``TOLERANCE``."""
         rows = self.A - np.eye(len(self.A))
         length = np.linalg.norm(rows, axis=1, keepdims=True)
         singular = np.linalg.svd(rows / length, compute_uv=False)
         return bool(np.any(singular < TOLERANCE))
 
     def response(self, angle: np.ndarray) -> np.ndarray:
-        """Return L at z = exp(i angle), angle [m] in rad a sample."""
+        """Return L [m] at z = exp(i angle), angle [m] in rad/sample."""
         z = np.exp(1j * np.atleast_1d(angle))
         resolvent = z[:, None, None] * np.eye(len(self.A)) - self.A
         states = np.linalg.solve(resolvent, self.B[:, None] + 0j)
         return states[..., 0] @ self.C
 
     def closed_responses(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return S = 1/(1+L) and T = L/(1+L) at exp(i angle), both [m, 1, 1]."""
+        """Return S = 1/(1+L) and T = L/(1+L), both [m, 1, 1], at z = exp(i angle)."""
         L = self.response(angle)[:, None, None]
         return 1.0 / (1.0 + L), L / (1.0 + L)
 
@@ -48,7 +52,7 @@ class LinearLoop(NamedTuple):
 class LinearAxes(NamedTuple):
     """L of several axes as NumPy matrices: A [n, n], B [n, q], C [q, n]; ``dt`` in s.
 
-    ``conserved`` modes have been taken out.
+    ``conserved`` is the number of conserved modes that have been removed.
     """
 
     A: np.ndarray
@@ -62,18 +66,18 @@ class LinearAxes(NamedTuple):
         return self.A - self.B @ self.C
 
     def sensitivity(self, angle: np.ndarray) -> np.ndarray:
-        """Return S = (I + L)^-1 [m, q, q] at z = exp(i angle), angle [m] in rad."""
+        """Return S = (I+L)^-1 [m, q, q] at exp(i angle), angle [m] in rad/sample."""
         z = np.exp(1j * np.atleast_1d(angle))
         resolvent = z[:, None, None] * np.eye(len(self.A)) - self.closed()
         return np.eye(len(self.C)) - self.C @ np.linalg.solve(resolvent, self.B + 0j)
 
     def closed_responses(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return S and T = I - S at exp(i angle), both [m, q, q]."""
+        """Return S and T = I - S, both [m, q, q], at z = exp(i angle)."""
         S = self.sensitivity(angle)
         return S, np.eye(len(self.C)) - S
 
     def one_cut(self, axis: int) -> LinearLoop:
-        """Return the loop of one axis, all others closed."""
+        """Return the loop cut in one axis, with all others closed."""
         others = np.arange(len(self.C)) != axis
         A = self.A - self.B[:, others] @ self.C[others]
         return LinearLoop(A, self.B[:, axis], self.C[axis], self.dt, self.conserved)
@@ -83,13 +87,14 @@ Matrices = TypeVar("Matrices", LinearLoop, LinearAxes)
 
 
 def without_conserved(loop: Matrices) -> Matrices:
-    """Return the loop without the combinations of states that never change.
+    """Return the loop without its conserved modes.
 
-    Hysteresis linearises to ``y(k) - y(k-1) = slope (x(k) - x(k-1))``: it remembers
-    ``y - slope x`` for ever, a pole at z = 1 that no input moves. The same holds for
-    the frozen bias of a start at rest, or an integral with zero gain. They say where
-    the operating point is, not whether it is stable, and are exactly the left
-    null space of [A - I, B]. Other modes stay, hidden ones too.
+    A conserved mode is a combination of states that never changes. Hysteresis
+    linearises to ``y(k) - y(k-1) = slope (x(k) - x(k-1))`` and conserves
+    ``y - slope x``: a pole at z = 1 that no input moves. The frozen bias of a start at
+    rest and an integral with zero gain are conserved too. Conserved modes determine the
+    operating point and not its stability. They span the left null space of [A - I, B].
+    All other modes stay, including uncontrollable and unobservable ones.
     """
     A, B, C, dt, _ = loop
     rows = np.hstack([A - np.eye(len(A)), B.reshape(len(A), -1)])
@@ -100,7 +105,7 @@ def without_conserved(loop: Matrices) -> Matrices:
     if count == 0:
         return loop
     kept_sum = left[:, len(A) - count :] / length[:, None]  # w' x is conserved
-    # Solve w' x = 0 for the states with the largest share in it.
+    # Solve w' x = 0 for the states with the largest weights in w.
     order = linalg.qr(kept_sum.T, mode="economic", pivoting=True)[-1]
     out, stay = np.sort(order[:count]), np.sort(order[count:])
     back = -np.linalg.solve(kept_sum[out].T, kept_sum[stay].T)
@@ -114,7 +119,7 @@ def without_conserved(loop: Matrices) -> Matrices:
 
 
 def balanced(loop: Matrices) -> Matrices:
-    """Return the same loop with its states in units that suit each other."""
+    """Return the loop with its states scaled to balance the rows and columns of A."""
     if len(loop.A) == 0:
         return loop
     A, change = linalg.matrix_balance(loop.A, permute=False)

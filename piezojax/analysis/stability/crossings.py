@@ -1,4 +1,4 @@
-"""Where the frequency response of a loop crosses, and where it peaks."""
+"""Frequency grid, zero crossings and peaks of the response of a loop."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,7 @@ from scipy import optimize
 from .conserved import LinearAxes, LinearLoop
 
 PER_DECADE = 400
-"""Grid points a decade, before those around the poles."""
+"""Grid points per decade, without the additional ones around the poles."""
 
 _AROUND = np.concatenate(
     [-np.geomspace(30.0, 0.03, 40), [0.0], np.geomspace(0.03, 30.0, 40)]
@@ -20,10 +20,10 @@ Function = Callable[[np.ndarray], np.ndarray]
 
 
 def angle_grid(loop: LinearLoop | LinearAxes) -> np.ndarray:
-    """Return angles (rad a sample) from far below the slowest pole to pi.
+    """Return angles (rad/sample) from far below the slowest pole to pi.
 
-    Logarithmic, and denser around each pole of the open and the closed loop, so that no
-    resonance falls between two points.
+    The grid is logarithmic, and denser around each pole of the open and the closed
+    loop, so that no resonance falls between two points.
     """
     poles = np.concatenate(
         [np.linalg.eigvals(loop.A), np.linalg.eigvals(loop.closed())]
@@ -41,7 +41,10 @@ def angle_grid(loop: LinearLoop | LinearAxes) -> np.ndarray:
 
 
 def roots(function: Function, grid: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the zeros of ``function`` between points where it changes its sign."""
+    """Return the zeros of ``function``, one in each interval with a change of sign.
+
+    ``values`` are those of ``function`` on ``grid``.
+    """
     places = np.flatnonzero(values[:-1] * values[1:] < 0.0)
     found = [
         optimize.brentq(
@@ -59,7 +62,10 @@ def roots(function: Function, grid: np.ndarray, values: np.ndarray) -> np.ndarra
 def peak(
     function: Function, grid: np.ndarray, values: np.ndarray
 ) -> tuple[float, float]:
-    """Return the largest value of ``function`` and where it lies."""
+    """Return the largest value of ``function`` and its argument.
+
+    ``values`` are those of ``function`` on ``grid``.
+    """
     inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:]))
     highest = (inner + 1)[np.argsort(values[inner + 1])[::-1][:_PEAKS]]
     best = int(np.argmax(values))

@@ -1,14 +1,16 @@
-"""Differentiable margins of a loop, from its response to an impulse.
+"""Differentiable margins of a loop, from its impulse response.
 
-The loop is linearised around an operating point, a voltage impulse is added at the
-plant's input, and the voltage that then acts there is the sensitivity S in time. One
-short run costs less than one reference, where a solution for every frequency costs
-more than all of them. Use these figures in objectives, constraints and sweeps;
-``stability_report`` is the exact source, for a judgement of one loop.
+The loop is linearised around an operating point, and a voltage impulse is added at the
+plant's input. The voltage that then acts there is the impulse response of the
+sensitivity S. This short run costs less than the run of one reference; solving for S at
+every frequency costs more than the runs of all references. Use these figures in
+objectives, constraints and sweeps; use ``stability_report``, which is exact, to assess
+one loop.
 
-Error: S is sampled every 1 / ``duration`` in frequency, so that the peak of a resonance
-of quality Q at f lies too low by a share of (Q / (duration f))^2 / 2 at most: 0.5 % for
-Q = 8 at 400 Hz. A loop that rings for longer than ``duration`` is seen truncated.
+Error: S is sampled every 1 / ``duration`` in frequency. The peak of a resonance of
+quality factor Q at frequency f is therefore too low by a relative error of at most
+(Q / (duration f))^2 / 2: 0.5 % for Q = 8 at 400 Hz. The response of a loop that rings
+for longer than ``duration`` is truncated.
 """
 
 from typing import Any
@@ -26,33 +28,33 @@ from .broken_loop import BrokenLoop, cut, open_loop
 from .operating_point import BRANCHES, OperatingPoint
 
 DURATION = 0.2
-"""Length of the impulse response, s: slower modes are seen truncated, and lines of the
+"""Length of the impulse response, s. Slower modes are truncated, and lines of the
 spectrum lie 1 / DURATION apart."""
 
 UNREACHED = 1e6
-"""Delay margin (samples) of a loop that no delay makes unstable: large, and finite for
-its logarithm."""
+"""Delay margin (samples) of a loop that no delay makes unstable: large, but finite so
+that its logarithm is."""
 
 Sensitivity = Complex[Array, "*batch lines"]
 
 
 class SmallMotion(System):
-    """A closed loop around an operating point: voltage added at the plant's input to
-    the voltage that then acts there, V. Its transfer function is S = 1/(1+L).
+    """Closed loop linearised around an operating point, with transfer function S.
 
-    States are those of ``broken`` as deviations from its operating point; ``push`` is
-    how far one volt at the plant moves them in a sample.
+    S = 1/(1+L). Input: the voltage added at the plant's input, V. Output: the voltage
+    that then acts there, V. States are those of ``broken`` as deviations from its
+    operating point; ``push`` is their change in one sample for 1 V at the plant.
     """
 
     broken: BrokenLoop
     push: State
 
     def init(self, input: Any = 0.0) -> State:
-        """Return the operating point."""
+        """Return the operating point: zero deviations."""
         return jax.tree.map(jnp.zeros_like, self.push)
 
     def step(self, state: State, input: ScalarLike) -> tuple[State, Scalar]:
-        # L answers one sample later: what it returns is known before it is fed.
+        # L answers one sample later: its output is known before its input.
         moved, returned = _tangent(self.broken, state, jnp.zeros(()))
         voltage = as_array(input) - returned
         return jax.tree.map(lambda x, b: x + b * voltage, moved, self.push), voltage
@@ -73,9 +75,10 @@ def sensitivity(
 ) -> Sensitivity:
     """Return S = 1/(1+L) [lines] at 0, 1/``duration``, 2/``duration``, ... Hz.
 
-    L as for ``broken_loop``, whose arguments and errors these are, for one axis;
-    ``duration`` in s. Usable inside ``jax.jit`` and differentiable. The response of an
-    unstable loop grows, and S is large: a barrier with a slope rather than a figure.
+    The loop has one axis. L, ``at`` and the errors raised are those of ``broken_loop``;
+    ``duration`` in s. Usable inside ``jax.jit`` and differentiable. The impulse
+    response of an unstable loop grows, and S is large: it serves as a barrier with a
+    slope and has no meaning as a figure.
     """
     point = OperatingPoint.at(at)
     reference, dt = as_array(point.reference), point.sample_time(loop)
@@ -85,9 +88,9 @@ def sensitivity(
 def sensitivities(
     loop: Feedback, at: Any = 0.0, duration: float = DURATION
 ) -> Sensitivity:
-    """Return S on every branch, [branches, lines]; otherwise as ``sensitivity``.
+    """Return S [branches, lines] on every branch; otherwise as ``sensitivity``.
 
-    The branch that ``at`` names does not matter.
+    The branch of ``at`` is ignored.
     """
     point = OperatingPoint.at(at)
     reference, dt = as_array(point.reference), point.sample_time(loop)
@@ -104,12 +107,11 @@ def sensitivity_peak(
 
 
 def closed_loop_poles(loop: Feedback, at: Any = 0.0) -> Complex[Array, " order"]:
-    """Return the eigenvalues of the closed loop in the z plane, in no order.
+    """Return the poles of the closed loop in the z plane, unordered.
 
-    The poles at z = 1 of the memory of a hysteresis are among them, one for each
-    hysteresis in the plant or in the controller; ``StabilityReport`` leaves them out.
-    Differentiable where eigenvalues are simple, on the CPU. Arguments and errors as for
-    ``open_loop``.
+    They include one conserved pole at z = 1 for each hysteresis in the plant or in the
+    controller; ``StabilityReport`` leaves these out. Differentiable where eigenvalues
+    are simple, on the CPU only. Arguments and errors are those of ``open_loop``.
     """
     model = open_loop(loop, at)
     return jnp.linalg.eigvals(model.A - model.B @ model.C)
@@ -142,9 +144,9 @@ def disk_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
 
 
 def delay_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
-    """Return the delay margin in samples, ``UNREACHED`` where |L| crosses 1 nowhere.
+    """Return the delay margin in samples, ``UNREACHED`` if |L| never crosses 1.
 
-    Crossings lie between two lines of the spectrum and are interpolated.
+    Crossings are interpolated between two lines of the spectrum.
     """
     loop = 1.0 / sensitivity[1:] - 1.0
     angle = jnp.linspace(0.0, jnp.pi, sensitivity.size)[1:]
@@ -152,7 +154,7 @@ def delay_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
     lag = jnp.mod(jnp.angle(loop) + jnp.pi, 2.0 * jnp.pi)
     crosses = gain[:-1] * gain[1:] < 0.0
     share = gain[:-1] / jnp.where(crosses, gain[:-1] - gain[1:], 1.0)
-    # The short way round between two lines.
+    # Phase difference of two lines, wrapped to [-pi, pi).
     turn = jnp.mod(lag[1:] - lag[:-1] + jnp.pi, 2.0 * jnp.pi) - jnp.pi
     there = jnp.mod(lag[:-1] + share * turn, 2.0 * jnp.pi)
     place = angle[:-1] + share * (angle[1:] - angle[:-1])

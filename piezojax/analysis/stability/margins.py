@@ -21,31 +21,35 @@ from .operating_point import OperatingPoint
 
 @dataclass(frozen=True)
 class StabilityReport:
-    """How far a discrete loop, cut at the plant's input, is from instability.
+    """Poles and margins of a discrete loop, cut at the plant's input.
 
     L is its loop transfer function (see ``BrokenLoop``), S = 1/(1+L), T = L/(1+L). All
-    hold for the sampled loop up to the Nyquist frequency. Of an unstable loop only the
-    poles are given, all else is None. A limit that no change reaches is infinite, a
-    frequency that then does not exist None.
+    figures are those of the sampled loop up to the Nyquist frequency. For an unstable
+    loop only the poles are given, and all else is None. A margin that no change reaches
+    is infinite, and its frequency is None.
 
-    - ``stable``: every pole of the closed loop inside the unit circle;
-    - ``poles``: of the closed loop in the z plane, largest first, without ``conserved``
-      poles at z = 1: what hysteresis remembers and nothing moves;
+    - ``stable``: every pole of the closed loop is inside the unit circle;
+    - ``poles``: of the closed loop in the z plane, largest first. They leave out the
+      ``conserved`` poles at z = 1, which belong to the memory of a hysteresis and which
+      no input moves;
     - ``slowest_time_constant_s``: of the pole nearest to the unit circle;
-    - ``gain_margin``: factor above 1 on the loop gain at which it becomes unstable
-      (``gain_margin_dB`` the same), and at which frequency it then oscillates;
-      ``gain_reduction_margin``: the factor below 1, 0 where there is none;
-    - ``phase_margin_deg``: smallest phase, lag or lead, that makes it unstable;
-    - ``delay_margin_s``, ``delay_margin_samples``: smallest delay that does, exact
-      for whole samples: the loop is stable with any whole number below it;
-    - ``disk_margin``: alpha, 1 / max |(S - T)/2|; gain and phase may vary at once
-      within ``disk_gain_margin`` (that factor up, or its inverse) and
+    - ``gain_margin``: smallest factor above 1 on the loop gain that makes the loop
+      unstable; ``gain_margin_dB``: the same in dB; ``phase_crossover_Hz``: frequency of
+      the oscillation then; ``gain_reduction_margin``: largest such factor below 1, 0 if
+      there is none;
+    - ``phase_margin_deg``: smallest phase, lag or lead, that makes the loop unstable;
+      ``gain_crossover_Hz``: frequency of the oscillation then;
+    - ``delay_margin_s``, ``delay_margin_samples``: smallest delay that makes the loop
+      unstable, exact for whole samples: the loop is stable with any whole number of
+      samples below it;
+    - ``disk_margin``: alpha, 1 / max |(S - T)/2|. Gain and phase may vary at once
+      within ``disk_gain_margin`` (that factor or its inverse) and
       ``disk_phase_margin_deg``. Source: Seiler, Packard and Gahinet, An introduction to
       disk margins, 2020;
-    - ``sensitivity_peak``: Ms = max |S|, ``complementary_peak``: Mt = max |T|.
+    - ``sensitivity_peak``: Ms = max |S|; ``complementary_peak``: Mt = max |T|.
 
-    ``reference_um``, ``voltage_V`` and ``branch`` say where the loop was linearised.
-    Frequencies in Hz, angles in degrees.
+    ``reference_um``, ``voltage_V`` and ``branch`` are the operating point. Frequencies
+    in Hz, angles in degrees.
     """
 
     stable: bool
@@ -106,7 +110,7 @@ def _linearised(
 def located_report(
     model: LinearLoop, start: LoopState, point: OperatingPoint
 ) -> StabilityReport:
-    """Return the report on ``model`` with the operating point it was made for."""
+    """Return the report on ``model``, including its operating point."""
     return dataclasses.replace(
         report_of(model),
         reference_um=float(point.reference),
@@ -116,10 +120,10 @@ def located_report(
 
 
 def linear_loop(loop: Feedback, at: Any = 0.0) -> tuple[LinearLoop, LoopState]:
-    """Return L as matrices, for ``report_of`` and pictures, and the operating state.
+    """Return L of a loop of one axis as matrices, and the operating state.
 
-    Arguments and errors as for ``stability_report``; ``linear_axes`` is for several
-    axes.
+    L is the argument of ``report_of`` and of plots. Arguments and errors are those of
+    ``stability_report``; for several axes use ``linear_axes``.
     """
     model, start = _model(loop, OperatingPoint.at(at))
     return without_conserved(
@@ -128,9 +132,9 @@ def linear_loop(loop: Feedback, at: Any = 0.0) -> tuple[LinearLoop, LoopState]:
 
 
 def linear_axes(loop: Feedback, at: Any) -> tuple[LinearAxes, LoopState]:
-    """Return L of a loop of several axes, cut in all, and the operating state.
+    """Return L of a loop cut in all its axes as matrices, and the operating state.
 
-    Arguments and errors as for ``stability_report``.
+    Arguments and errors are those of ``stability_report``.
     """
     model, start = _model(loop, OperatingPoint.at(at))
     return without_conserved(balanced(model)), start
@@ -152,7 +156,7 @@ def _model(loop: Feedback, point: OperatingPoint) -> tuple[LinearAxes, LoopState
 
 
 def report_of(loop: LinearLoop) -> StabilityReport:
-    """Return the report on a loop that is linear already."""
+    """Return the report on a linear loop of one axis."""
     found = poles_of(loop)
     figures: dict[str, Any] = dict.fromkeys(_FIGURES)
     if found["stable"]:
@@ -161,7 +165,7 @@ def report_of(loop: LinearLoop) -> StabilityReport:
 
 
 def poles_of(loop: LinearLoop | LinearAxes) -> dict[str, Any]:
-    """Return what a report says about the poles of the closed loop."""
+    """Return the fields of a report that concern the poles of the closed loop."""
     poles = np.linalg.eigvals(loop.closed())
     poles = poles[np.argsort(-np.abs(poles), kind="stable")]
     largest = float(np.abs(poles).max(initial=0.0))
@@ -177,7 +181,10 @@ def poles_of(loop: LinearLoop | LinearAxes) -> dict[str, Any]:
 
 
 def disk_figures(largest: float) -> dict[str, float]:
-    """Return alpha = 1/``largest``, of (S - T)/2, as margins of gain and phase."""
+    """Return alpha = 1/``largest``, and its margins of gain and phase.
+
+    ``largest`` is the peak of (S - T)/2 over frequency.
+    """
     alpha = 1.0 / largest
     return {
         "disk_margin": alpha,
@@ -200,9 +207,9 @@ def sensitivity_figures(
     """Return Ms and Mt of a stable linear loop, and their frequencies in Hz.
 
     They are the largest singular values of S and T over frequency, with one axis |S|
-    and |T|: sampled on ``grid`` (rad a sample, see ``angle_grid``) and refined by
-    bounded minimisation between neighbours of the highest points. This is the exact
-    source of a sensitivity peak; ``differentiable.sensitivity_peak`` is the cheap one.
+    and |T|. They are sampled on ``grid`` (rad/sample, see ``angle_grid``) and refined
+    by bounded minimisation between neighbours of the highest points. The result is
+    exact; ``differentiable.sensitivity_peak`` is the cheap approximation.
     """
     figures: dict[str, float | None] = {}
     sampled = loop.closed_responses(grid)
@@ -245,7 +252,7 @@ def _gain_margins(
     places = roots(
         lambda x: np.imag(loop.response(x)), grid[:-1], np.imag(response)[:-1]
     )
-    # At the Nyquist frequency, and at rest, L is real: a pole can leave there too.
+    # L is real at the Nyquist frequency and at 0; a pole can leave there too.
     places = np.append(places, np.pi)
     crossing = np.real(loop.response(places))
     if not loop.integrates():
@@ -292,5 +299,5 @@ def _phase_margins(
 
 
 def hertz(angle: float, dt: float) -> float:
-    """Return an angle in rad a sample as a frequency in Hz."""
+    """Return the frequency in Hz of an angle in rad/sample; ``dt`` in s."""
     return angle / (2.0 * math.pi * dt)

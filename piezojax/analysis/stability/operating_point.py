@@ -1,4 +1,4 @@
-"""Operating point around which a loop is linearised."""
+"""Operating points around which loops are linearised."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ from ...core.system import Feedback, LoopState
 from ...dynamics.linearise import sample_time
 
 BRANCHES = {"ascending": 1.0, "descending": -1.0}
-"""Directions in which the plant's input may start to move, by name."""
+"""Sign of the next change of the plant's input, by the name of the branch."""
 
 
 @dataclass(frozen=True)
@@ -20,11 +20,11 @@ class OperatingPoint:
 
     - ``reference``: um; with several axes a vector or a tuple, in the units of the
       axes;
-    - ``branch``: "ascending" or "descending", the side from which the slope of a
-      hysteresis is taken, see ``broken_loop``;
+    - ``branch``: "ascending" or "descending", the side on which the slope of a
+      hysteresis is taken (see ``broken_loop``);
     - ``state``: state of the loop, such as the last one of a simulation; by default
       the loop rests at the reference, on the virgin curve of a hysteresis;
-    - ``dt``: sample time in s; by default the one that the loop names.
+    - ``dt``: sample time in s; by default that of the loop.
 
     Raises ValueError for an unknown branch.
     """
@@ -42,7 +42,7 @@ class OperatingPoint:
 
     @classmethod
     def at(cls, place: Any) -> "OperatingPoint":
-        """Return ``place`` if it is an OperatingPoint, or rest at that reference."""
+        """Return ``place`` if it is an OperatingPoint, else rest at that reference."""
         return place if isinstance(place, OperatingPoint) else cls(place)
 
     @property
@@ -56,7 +56,7 @@ class OperatingPoint:
         return BRANCHES[self.branch]
 
     def sample_time(self, loop: Feedback) -> float:
-        """Return ``dt`` (s), or else the sample time of ``loop``.
+        """Return ``dt`` (s) if it is given, else the sample time of ``loop``.
 
         Raises ValueError as ``loop_sample_time``.
         """
@@ -65,7 +65,7 @@ class OperatingPoint:
     def check(self, start: LoopState) -> None:
         """Raise ValueError unless ``start`` is finite and rests at the reference.
 
-        A state given by the user is taken as it is.
+        A state given by the user is not checked.
         """
         if self.state is not None:
             return
@@ -91,8 +91,8 @@ class OperatingPoint:
 def loop_sample_time(loop: Feedback) -> float:
     """Return the controller's sample time (s), or that of the rest of the loop.
 
-    A plant may be stepped faster inside (``Held``). Raises ValueError if no part names
-    a sample time, or if several differ.
+    The controller's comes first because a plant may run faster inside (``Held``).
+    Raises ValueError if no part has a sample time, or if several differ.
     """
     try:
         return sample_time(loop.controller)
