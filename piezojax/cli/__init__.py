@@ -1,1 +1,1 @@
-"""The commands: they parse, call and report."""
+"""Commands: parse the options, call the package, report the results."""

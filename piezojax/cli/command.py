@@ -12,14 +12,14 @@ from ..core.files import fresh_folder, numbered_folder
 from .terminal import console
 
 RESULTS = Path("results")
-"""Folder of the results if none is named."""
+"""Parent folder of the results if ``--out`` is not given."""
 
 INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells have it."""
+"""Exit status after Ctrl-C, as in a shell."""
 
 
 def common(function: Callable) -> Callable:
-    """Add the options every command takes."""
+    """Add the options that every command takes."""
     for option in (
         click.option("--quiet", is_flag=True, help="Print nothing but errors."),
         click.option(
@@ -40,10 +40,10 @@ def common(function: Callable) -> Callable:
 
 
 class Command(click.Command):
-    """A command whose usage errors, too, are one line."""
+    """A command with one-line usage errors."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse as click does."""
+        """Parse the arguments. Raises ClickException, one line, for a usage error."""
         try:
             return super().parse_args(ctx, args)
         except click.UsageError as error:
@@ -52,10 +52,10 @@ class Command(click.Command):
 
 @contextmanager
 def results_folder(out: Path | None, name: str) -> Iterator[Path]:
-    """Give an empty folder for results: ``out``, or a fresh one named after ``name``.
+    """Yield an empty folder for results: ``out``, or a numbered one named ``name``.
 
-    It is taken away again if the work fails before anything is in it. Raises ValueError
-    if ``out`` is in use or cannot be written.
+    The folder is removed if the work fails while it is empty. Raises ValueError if
+    ``out`` is in use or cannot be written.
     """
     folder = fresh_folder(out if out is not None else numbered_folder(RESULTS / name))
     try:
@@ -67,7 +67,7 @@ def results_folder(out: Path | None, name: str) -> Iterator[Path]:
 
 
 def run(quiet: bool, body: Callable[[Console], Any]) -> None:
-    """Run ``body``; turn bad input into one line and a non-zero exit status."""
+    """Run ``body``; report bad input in one line, with a non-zero exit status."""
     try:
         body(console(quiet))
     except ValueError as error:

@@ -8,10 +8,10 @@ from .command import Command, common, results_folder, run
 from .terminal import Bar
 
 ALL = "all"
-"""The model that stands for every one that the records support."""
+"""Value of ``--model`` that fits every model the records support."""
 
 
-class _Part(click.ParamType):
+class _SampleRange(click.ParamType):
     name = "START:STOP"
 
     def convert(self, value, param, ctx):
@@ -68,9 +68,15 @@ class _Part(click.ParamType):
     show_default=True,
     help="Most steps of a descent.",
 )
-@click.option("--train", type=_Part(), help="Samples to fit (default: first half).")
-@click.option("--validate", type=_Part(), help="Samples to judge on (default: rest).")
-@click.option("--test", type=_Part(), help="With 'all': samples kept from the choice.")
+@click.option(
+    "--train", type=_SampleRange(), help="Samples to fit (default: first half)."
+)
+@click.option(
+    "--validate", type=_SampleRange(), help="Samples to judge on (default: rest)."
+)
+@click.option(
+    "--test", type=_SampleRange(), help="With 'all': samples kept from the choice."
+)
 @common
 def main(
     records,
@@ -94,9 +100,9 @@ def main(
     Text (.csv, .txt, .dat), .npz, .mat and .h5 files; .tdms, .lvm and .xlsx with
     piezojax[lab].
     """
-    del seed  # this fit draws nothing
+    del seed  # the random starts of a fit have fixed seeds
 
-    # JAX and what needs it are imported here: --help waits for none of it.
+    # JAX and its users are imported here, so that --help does not wait for them.
     def body(console):
         from ..identification.estimators.estimate import Options
         from ..identification.fit import identify

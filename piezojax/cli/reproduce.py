@@ -37,9 +37,9 @@ NAMES = (
 @common
 def main(tables, calibrate, out, seed, quiet):
     """Redo result tables of the thesis in simulation, with the printed gains."""
-    del seed  # what noise there is has seeds of its own
+    del seed  # the simulated noise has its own seeds
 
-    # JAX and what needs it are imported here: --help waits for none of it.
+    # JAX and its users are imported here, so that --help does not wait for them.
     def body(console):
         from ..report.summary_tables import reproduction_table
         from ..report.table_pictures import write_picture, write_rates
@@ -47,19 +47,19 @@ def main(tables, calibrate, out, seed, quiet):
         from ..reproduction.rates import FIGURE, errors_by_rate, rates_as_csv
         from ..reproduction.summary import as_csv, summarise
 
-        asked = tuple(dict.fromkeys(tables)) or NAMES
-        for table in asked:
+        requested = tuple(dict.fromkeys(tables)) or NAMES
+        for table in requested:
             if table not in NAMES:
                 raise ValueError(
                     f"--table {table} is unknown; there are {', '.join(NAMES)}"
                 )
-        wanted = [table for table in asked if table != FIGURE]
+        tabulated = [table for table in requested if table != FIGURE]
         cells = []
         with (
             results_folder(out, "reproduce") as folder,
             console.status("simulating") as status,
         ):
-            for table in wanted:
+            for table in tabulated:
                 status.update(f"simulating Table {table}")
                 cells += reproduce(table)
             summary = summarise(cells)
@@ -68,12 +68,12 @@ def main(tables, calibrate, out, seed, quiet):
             write_text(folder / "summary.json", json.dumps(plain, indent=2) + "\n")
             if cells:
                 write_picture(cells, folder)
-            if FIGURE in asked:  # its numbers are not printed: a curve, not cells
+            if FIGURE in requested:  # printed as a curve: no cells to compare
                 status.update("simulating Figure 4.10")
                 errors = errors_by_rate()
                 write_text(folder / f"{FIGURE}.csv", rates_as_csv(errors))
                 write_rates(errors, folder)
-        for table in wanted:
+        for table in tabulated:
             console.print(
                 reproduction_table(
                     table, [c for c in cells if c.table == table], summary[table]

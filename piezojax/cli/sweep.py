@@ -13,16 +13,16 @@ from ..core.runtime import simulate_side_by_side
 from .command import INTERRUPTED, RESULTS, Command, common, run
 from .terminal import Bar
 
-# JAX and what needs it are imported by the bodies: --help waits for none of it.
+# The bodies import JAX and its users, so that --help does not wait for them.
 if TYPE_CHECKING:
     from ..sweeping.sweeper import SweepResult
 
 
 def _shard(context: click.Context, option: click.Parameter, text: str) -> tuple:
-    found = re.fullmatch(r"(\d+)/(\d+)", text)
-    if not found or not 1 <= int(found[1]) <= int(found[2]):
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if not match or not 1 <= int(match[1]) <= int(match[2]):
         raise click.BadParameter(f"{text!r}; it must be i/n, from 1/n to n/n")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 @click.command(cls=Command)
@@ -71,7 +71,7 @@ def main(
 
         if shard != (1, 1) and out is None:
             raise ValueError("--shard needs --out, the folder that all shards share")
-        path = _path_of(study)
+        path = _study_path(study)
         folder = out
         try:
             with Bar(console) as bar:
@@ -125,7 +125,7 @@ def _report(
         )
 
 
-def _path_of(study: Path | None) -> Path:
+def _study_path(study: Path | None) -> Path:
     from .. import study as studies
     from ..sweeping.sweeper import DEFAULT
 

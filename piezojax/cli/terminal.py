@@ -1,4 +1,4 @@
-"""Terminal of a command: where it prints, and its progress while it works."""
+"""Terminal output of a command: console and progress."""
 
 import signal
 import sys
@@ -17,11 +17,11 @@ from rich.progress import (
 )
 
 NOTE_EVERY = 30.0
-"""Seconds between two notes where there is no terminal."""
+"""Least time between two notes without a terminal, s."""
 
 
 class Bar:
-    """Progress bar on a terminal; plain lines where there is none.
+    """Progress bar on a terminal; plain lines without one.
 
     While it runs, the first ``Ctrl-C`` waits for the next report of progress, because
     an exception inside JAX's compiler can be lost or crash it; the second acts at once.
@@ -68,18 +68,18 @@ class Bar:
     def finish(self) -> None:
         """Ignore the first ``Ctrl-C`` from here on, while results are written.
 
-        One that is pending already comes too late to stop anything.
+        A pending ``Ctrl-C`` is ignored too: the work is complete.
         """
         self._finishing = True
 
-    def _stop_if_asked(self) -> None:
+    def _raise_if_interrupted(self) -> None:
         if self._interrupted and not self._finishing:
             self._interrupted = False
             raise KeyboardInterrupt
 
     def stage(self, text: str, steps: int = 0) -> None:
-        """Show a new stage; without ``steps`` its length is unknown."""
-        self._stop_if_asked()
+        """Show a new stage of ``steps`` steps; 0 if their number is unknown."""
+        self._raise_if_interrupted()
         if not self._live:
             self._console.print(text)
         if self._task is not None:
@@ -87,8 +87,11 @@ class Bar:
         self._task = self._progress.add_task(text, total=steps or None, note="")
 
     def advance(self, best: float, note: str = "") -> None:
-        """Move the bar by one step; where there is none, print a note now and then."""
-        self._stop_if_asked()
+        """Move the bar by one step.
+
+        Without a terminal, print ``note`` at most every ``NOTE_EVERY`` seconds.
+        """
+        self._raise_if_interrupted()
         if self._task is not None:
             shown = note or f"objective {best:.3f}"
             self._progress.update(self._task, advance=1, note=shown)

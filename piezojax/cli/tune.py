@@ -11,7 +11,7 @@ from ..core.files import write_text
 from .command import INTERRUPTED, Command, common, results_folder, run
 from .terminal import Bar
 
-# JAX and what needs it are imported by the bodies: --help waits for none of it.
+# The bodies import JAX and its users, so that --help does not wait for them.
 if TYPE_CHECKING:
     from ..tuning.baselines import Budget
     from ..tuning.outcome import Outcome
@@ -44,7 +44,7 @@ def main(
         from .. import study as studies
         from ..tuning.baselines import Budget
 
-        paths = [_path_of(name) for name in study] or [studies.shipped()]
+        paths = [_study_path(name) for name in study] or [studies.shipped()]
         if len(paths) > 1 or studies.is_comparison_study(paths[0]):
             if baselines:
                 raise ValueError("--baselines takes one study, not a comparison")
@@ -144,13 +144,13 @@ def _compare(
         with results_folder(out, "comparison") as folder:
 
             def keep(outcome: "Outcome") -> None:
-                own = folder / outcome.case.name
-                own.mkdir()
-                write_numbers(outcome, own)
+                subfolder = folder / outcome.case.name
+                subfolder.mkdir()
+                write_numbers(outcome, subfolder)
                 text = tomli_w.dumps(
                     outcome.case.study.model_dump(mode="json", exclude_none=True)
                 )
-                write_text(own / "study.toml", text)
+                write_text(subfolder / "study.toml", text)
 
             comparison = compare(title, entries, progress=bar, done=keep)
             bar.finish()
@@ -169,7 +169,7 @@ def _compare(
         raise SystemExit(INTERRUPTED)
 
 
-def _path_of(study: Path) -> Path:
+def _study_path(study: Path) -> Path:
     from .. import study as studies
 
     if study.suffix or study.exists():

@@ -1,1 +1,1 @@
-"""Pictures, tables and progress shared by the commands."""
+"""Pictures, tables and result files of the commands."""

@@ -1,4 +1,4 @@
-"""The table, the picture and the file of the baselines beside the search."""
+"""Table, picture and file of the baselines and the search of piezojax."""
 
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,15 @@ from .comparison_map import COLOURS, MARKERS
 from .figures import AFTER, figure, headed, styled, ticks_in_full, write
 
 
-def baselines_table(found: Baselines) -> Table:
-    """Return loss, error and time of each method, and when ours was as good."""
+def baselines_table(baselines: Baselines) -> Table:
+    """Return a table of the methods: loss, held-out error, runs and wall time.
+
+    Two columns hold the time (s) at which the search of piezojax had a loss as low as a
+    baseline, and the ratio of the baseline's wall time to it.
+    """
     table = Table(
         title=Text(
-            f"{found.title}\nbaselines on the same objective: "
+            f"{baselines.title}\nbaselines on the same objective: "
             "error is the geometric mean on held-out noise\n"
             "(as good: when piezojax had a loss as low; sooner: how many times)"
         )
@@ -27,7 +31,7 @@ def baselines_table(found: Baselines) -> Table:
     table.add_column("method")
     for title in ("loss", "error", "runs", "time", "as good", "sooner"):
         table.add_column(title, justify="right")
-    for entry in (found.ours, *found.rivals):
+    for entry in (baselines.ours, *baselines.rivals):
         error = entry.holdout_geomean_um
         table.add_row(
             entry.method,
@@ -35,20 +39,20 @@ def baselines_table(found: Baselines) -> Table:
             "-" if error is None else f"{1e3 * error:.2f} nm",
             str(entry.evaluations),
             f"{entry.wall_s:.1f} s",
-            _seconds(entry.reached_s) if entry is not found.ours else "",
-            _times(entry.ratio) if entry is not found.ours else "",
-            style="bold" if entry.method == found.best else None,
+            _seconds(entry.reached_s) if entry is not baselines.ours else "",
+            _times(entry.ratio) if entry is not baselines.ours else "",
+            style="bold" if entry.method == baselines.best else None,
         )
-        if entry is found.ours:
+        if entry is baselines.ours:
             table.add_section()
     return table
 
 
-def baselines_text(found: Baselines) -> str:
-    """Return in one line how the search did against the best baseline."""
-    if found.best is None:
+def baselines_text(baselines: Baselines) -> str:
+    """Return one line that compares the search of piezojax with the best baseline."""
+    if baselines.best is None:
         return "no baseline has a stable loop"
-    rival, ours = found.rival(found.best), found.ours
+    rival, ours = baselines.rival(baselines.best), baselines.ours
     if rival.ratio is None or rival.reached_s is None:
         return f"{ours.method} never was as good as {rival.method}, the best baseline"
     running, near = _times(rival.ratio_running), _times(rival.ratio_best)
@@ -68,33 +72,33 @@ def _times(value: float | None) -> str:
     return "-" if value is None else f"{value:.1f}x"
 
 
-def write_baselines(found: Baselines, folder: Path) -> None:
+def write_baselines(baselines: Baselines, folder: Path) -> None:
     """Write baselines.json and baselines.png into ``folder``."""
-    write_text(folder / BASELINES_FILE, found.model_dump_json(indent=2) + "\n")
+    write_text(folder / BASELINES_FILE, baselines.model_dump_json(indent=2) + "\n")
     with styled():
-        write(baselines_figure(found), folder / "baselines.png")
+        write(baselines_figure(baselines), folder / "baselines.png")
 
 
-def baselines_figure(found: Baselines) -> Figure:
-    """Best loss of each method against wall time, compiling included."""
-    geometric = found.aggregate == "geometric_mean"
+def baselines_figure(baselines: Baselines) -> Figure:
+    """Draw the best loss of each method against wall time, compiling included."""
+    geometric = baselines.aggregate == "geometric_mean"
     picture = figure(7.6, 4.0)
     ax = picture.subplots()
     colours = [colour for colour in COLOURS if colour != AFTER]
-    for i, entry in enumerate(e for e in found.rivals if e.loss is not None):
-        look: dict[str, Any] = {
+    for i, entry in enumerate(e for e in baselines.rivals if e.loss is not None):
+        style: dict[str, Any] = {
             "color": colours[i % len(colours)],
             "label": entry.method,
         }
         if entry.unit is None:
-            look |= {"marker": MARKERS[i % len(MARKERS)], "ms": 5.0, "ls": ""}
-            ax.plot(entry.wall_s, _shown(entry, geometric)[-1], **look)
+            style |= {"marker": MARKERS[i % len(MARKERS)], "ms": 5.0, "ls": ""}
+            ax.plot(entry.wall_s, _as_drawn(entry, geometric)[-1], **style)
         else:
-            ax.step(entry.times_s, _shown(entry, geometric), where="post", **look)
-    ours = found.ours
+            ax.step(entry.times_s, _as_drawn(entry, geometric), where="post", **style)
+    ours = baselines.ours
     ax.step(
         ours.times_s,
-        _shown(ours, geometric),
+        _as_drawn(ours, geometric),
         where="post",
         color=AFTER,
         lw=2.2,
@@ -102,7 +106,7 @@ def baselines_figure(found: Baselines) -> Figure:
         zorder=3,
     )
     ax.set(xscale="log", xlabel="wall time, compiling included (s)")
-    headed(picture, found.title)
+    headed(picture, baselines.title)
     ticks_in_full(ax.xaxis)
     if geometric:
         ax.set(
@@ -116,5 +120,6 @@ def baselines_figure(found: Baselines) -> Figure:
     return picture
 
 
-def _shown(entry: Contestant, geometric: bool) -> np.ndarray:
+def _as_drawn(entry: Contestant, geometric: bool) -> np.ndarray:
+    """Return the losses as drawn: the logarithm of a geometric mean is undone."""
     return np.exp(entry.losses) if geometric else np.array(entry.losses)

@@ -18,44 +18,44 @@ from .figures import COLOURS, MEASURED, REFERENCE, figure, headed, styled, write
 STABILITY_FILE, STABILITY_PICTURE = "stability.json", "stability.png"
 
 LINES = {"ascending": "-", "descending": "--"}
-_DECADES = 4.5  # below the Nyquist frequency
-_REACH = 2.5  # half the side of the Nyquist plot
+_DECADES = 4.5  # frequency range drawn, below the Nyquist frequency
+_HALF_SIDE = 2.5  # half the side of the Nyquist plot
 
 
-def write_stability(found: StabilityReports, folder: Path, title: str = "") -> None:
+def write_stability(stability: StabilityReports, folder: Path, title: str = "") -> None:
     """Write stability.json and stability.png into ``folder``."""
-    text = json.dumps(found.as_dict(), indent=2, allow_nan=False)
+    text = json.dumps(stability.as_dict(), indent=2, allow_nan=False)
     write_text(folder / STABILITY_FILE, text + "\n")
     with styled():
-        if found.loops:
-            write(stability_figure(found, title), folder / STABILITY_PICTURE)
-        if found.axes:
-            picture = axes_figure(found.axes, found.axis_names, title)
+        if stability.loops:
+            write(stability_figure(stability, title), folder / STABILITY_PICTURE)
+        if stability.axes:
+            picture = axes_figure(stability.axes, stability.axis_names, title)
             write(picture, folder / STABILITY_PICTURE)
 
 
-def stability_figure(found: StabilityReports, title: str = "") -> Figure:
-    """Draw Bode and Nyquist plots of L, and the sensitivities |S| and |T|.
+def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
+    """Draw the Bode and Nyquist plots of L, and |S| and |T|.
 
-    The branches of a hysteresis are drawn full (ascending) and dashed (descending),
-    where they differ.
+    Where the branches of a hysteresis differ, the ascending one is a full line and the
+    descending one a dashed line.
     """
     picture = figure(9.0, 6.6)
     (gain, nyquist), (phase, sensitivity) = picture.subplots(2, 2)
-    for name in found.loops:
-        branches = found.curves(name, _DECADES)
+    for name in stability.loops:
+        branches = stability.curves(name, _DECADES)
         for branch, curves in branches.items():
             style: dict[str, Any] = {
                 "color": COLOURS.get(name, REFERENCE),
                 "ls": LINES[branch],
             }
-            report = found.reports[name][branch]
-            shown = _shown(name)
-            label = f"{shown}, {branch}" if len(branches) > 1 else shown
+            report = stability.reports[name][branch]
+            displayed = _label(name)
+            label = f"{displayed}, {branch}" if len(branches) > 1 else displayed
             hertz, L = curves.frequency, curves.L
             gain.loglog(hertz, np.abs(L), label=label, **style)
             degrees = np.degrees(np.unwrap(np.angle(L)))
-            # Drawn in the turn in which it starts between -360 and 0.
+            # Whole turns are subtracted so that the phase starts between -360° and 0°.
             degrees -= 360.0 * np.ceil(degrees[0] / 360.0 - 1e-6)
             phase.semilogx(hertz, degrees, **style)
             nyquist.plot(np.real(L), np.imag(L), label=label, **style)
@@ -83,7 +83,7 @@ def stability_figure(found: StabilityReports, title: str = "") -> Figure:
     return picture
 
 
-def _shown(name: str) -> str:
+def _label(name: str) -> str:
     return "tuned" if name == "after" else name
 
 
@@ -94,7 +94,7 @@ def _sensitivities(
     label: str,
     style: dict[str, Any],
 ) -> None:
-    if report.sensitivity_peak is None:  # unstable: S and T mean nothing
+    if report.sensitivity_peak is None:  # S and T of an unstable loop have no meaning
         return
     label = f"{label}: Ms = {report.sensitivity_peak:.2f}"
     ax.loglog(curves.frequency, np.abs(curves.S), label=label, **style)
@@ -102,13 +102,13 @@ def _sensitivities(
 
 
 def _critical_point(ax: Axes) -> None:
-    turn = np.linspace(0.0, 2.0 * np.pi, 200)
-    ax.plot(np.cos(turn), np.sin(turn), color=MEASURED, lw=0.7)
-    ax.plot(np.cos(turn) / 2 - 1, np.sin(turn) / 2, color=MEASURED, lw=0.7, ls=":")
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    ax.plot(np.cos(angle), np.sin(angle), color=MEASURED, lw=0.7)
+    ax.plot(np.cos(angle) / 2 - 1, np.sin(angle) / 2, color=MEASURED, lw=0.7, ls=":")
     ax.plot([-1.0], [0.0], "+", color=REFERENCE, ms=9.0, mew=1.4)
     ax.set(
-        xlim=(-_REACH, _REACH),
-        ylim=(-_REACH, _REACH),
+        xlim=(-_HALF_SIDE, _HALF_SIDE),
+        ylim=(-_HALF_SIDE, _HALF_SIDE),
         aspect="equal",
         xlabel="real part of L",
         ylabel="imaginary part of L",
@@ -119,27 +119,28 @@ def _critical_point(ax: Axes) -> None:
 def axes_figure(
     stabilities: dict[str, AxesStability], names: Sequence[str], title: str
 ) -> Figure:
-    """Draw |S| of each axis, the others closed, and the largest singular value of S."""
+    """Draw |S| of each axis, all others closed, and the largest singular value of S."""
     picture = figure(9.0, 3.6)
     left, right = picture.subplots(1, 2)
     lines = ("-", "--", "-.", ":")
-    for name, found in stabilities.items():
-        if not found.report.stable:
+    for name, stability in stabilities.items():
+        report = stability.report
+        if not report.stable:
             continue
-        colour, curves = COLOURS.get(name, REFERENCE), found.curves()
+        colour, curves = COLOURS.get(name, REFERENCE), stability.curves()
         for axis, (axis_name, size) in enumerate(zip(names, curves.each, strict=True)):
             left.loglog(
                 curves.frequency,
                 size,
                 color=colour,
                 ls=lines[axis % len(lines)],
-                label=f"{axis_name}, {_shown(name)}",
+                label=f"{axis_name}, {_label(name)}",
             )
         right.loglog(
             curves.frequency,
             curves.largest,
             color=colour,
-            label=f"{_shown(name)}: disk margin {found.report.disk_margin:.2f}",
+            label=f"{_label(name)}: disk margin {report.disk_margin:.2f}",
         )
     left.set(
         xlabel="frequency (Hz)",

@@ -1,4 +1,4 @@
-"""The table, the picture and the files of a comparison of tuned controllers."""
+"""Table, picture and file of a comparison of tuned controllers."""
 
 import math
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ _COLUMNS = 4
 
 
 def comparison_table(comparison: ComparisonResult) -> Table:
-    """Return before beside tuned by controller and rate, in nm rms."""
+    """Return errors before and after tuning by controller and rate, in nm rms."""
     table = Table(
         title=Text(
             f"{comparison.title}\nrms tracking error, nm: geometric mean over the "
@@ -41,16 +41,16 @@ def comparison_table(comparison: ComparisonResult) -> Table:
     for title in ("kHz", "before", "tuned", "better", "new: before", "tuned", "better"):
         table.add_column(title, justify="right")
     for controller in dict.fromkeys(row.controller for row in comparison.rows):
-        for row in _of(comparison, controller):
+        for row in _rows_of(comparison, controller):
             wins = comparison.best.get(f"{row.rate_Hz:g}") == controller
             table.add_row(
                 controller,
                 f"{row.rate_Hz / 1000:g}",
-                _shown(row.before_um) + ("*" if row.start == "scaled" else ""),
-                "failed" if row.status == "failed" else _shown(row.after_um),
+                _nanometres(row.before_um) + ("*" if row.start == "scaled" else ""),
+                "failed" if row.status == "failed" else _nanometres(row.after_um),
                 _times(row.ratio),
-                _shown(row.unseen_before_um),
-                _shown(row.unseen_um),
+                _nanometres(row.unseen_before_um),
+                _nanometres(row.unseen_um),
                 _times(row.unseen_ratio),
                 style="bold" if wins else None,
             )
@@ -73,24 +73,27 @@ def write_comparison(comparison: ComparisonResult, folder: Path) -> None:
 
 
 def comparison_figure(comparison: ComparisonResult) -> Figure:
-    """Error against sampling rate: before and tuned by controller, all tuned in one."""
+    """Draw error against sampling rate.
+
+    A panel for each controller, before and after tuning; one panel for all, tuned.
+    """
     controllers = list(comparison.better)
     columns = min(_COLUMNS, len(controllers) + 1)
     lines = math.ceil((len(controllers) + 1) / columns)
     picture = figure(2.45 * columns + 0.5, 2.3 * lines + 0.7)
     axes = picture.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
     places = list(axes.flat)
-    lowest = _lowest(comparison)
+    lowest = _lowest_errors(comparison)
     for i, (controller, ax) in enumerate(zip(controllers, places, strict=False)):
-        _before_and_tuned(ax, _of(comparison, controller), lowest)
+        _before_and_tuned(ax, _rows_of(comparison, controller), lowest)
         better = comparison.better[controller]
         shown = f"{better:.3g}x better" if better else "no factor"
         ax.set_title(f"({chr(97 + i)}) {controller}\n{shown}", fontsize=8.0)
     every = places[len(controllers)]
     for i, controller in enumerate(controllers):
-        rows = [row for row in _of(comparison, controller) if row.after_um]
+        rows = [row for row in _rows_of(comparison, controller) if row.after_um]
         every.plot(
-            *_line(rows, "after_um"),
+            *_curve(rows, "after_um"),
             color=COLOURS[i % len(COLOURS)],
             marker=MARKERS[i % len(MARKERS)],
             ms=3.5,
@@ -109,7 +112,7 @@ def comparison_figure(comparison: ComparisonResult) -> Figure:
         ax.set_xlabel("sampling rate (kHz)")
     for ax in axes[:, 0]:
         ax.set_ylabel("rms error (nm)")
-    handles = _legend_of(axes)
+    handles = _legend_handles(axes)
     picture.legend(
         handles.values(),
         handles.keys(),
@@ -131,7 +134,7 @@ def _before_and_tuned(
         label="lowest of all",
     )
     known = [row for row in rows if row.before_um]
-    ax.plot(*_line(known, "before_um"), color=BEFORE, lw=1.0)
+    ax.plot(*_curve(known, "before_um"), color=BEFORE, lw=1.0)
     for start, face, label in (
         ("printed", BEFORE, "before, printed gains"),
         ("scaled", "white", "before, scaled gains"),
@@ -141,7 +144,7 @@ def _before_and_tuned(
         some = [row for row in known if row.start == start]
         if some:
             ax.plot(
-                *_line(some, "before_um"),
+                *_curve(some, "before_um"),
                 color=BEFORE,
                 mfc=face,
                 marker="o",
@@ -150,37 +153,43 @@ def _before_and_tuned(
                 label=label,
             )
     tuned = [row for row in rows if row.after_um]
-    ax.plot(*_line(tuned, "after_um"), color=AFTER, marker="s", ms=4.0, label="tuned")
+    ax.plot(
+        *_curve(tuned, "after_um"),
+        color=AFTER,
+        marker="s",
+        ms=4.0,
+        label="tuned",
+    )
 
 
-def _line(rows: Sequence[TunedStudy], field: str) -> tuple[list[float], list[float]]:
+def _curve(rows: Sequence[TunedStudy], field: str) -> tuple[list[float], list[float]]:
     rows = sorted(rows, key=lambda row: row.rate_Hz)
     return [row.rate_Hz / 1000 for row in rows], [
         1e3 * getattr(row, field) for row in rows
     ]
 
 
-def _legend_of(axes) -> dict:
-    found: dict = {}
+def _legend_handles(axes) -> dict:
+    handles: dict = {}
     for ax in axes.flat:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
-    return found
+            handles.setdefault(label, handle)
+    return handles
 
 
-def _lowest(comparison: ComparisonResult) -> dict[float, float]:
-    found: dict[float, float] = {}
+def _lowest_errors(comparison: ComparisonResult) -> dict[float, float]:
+    lowest: dict[float, float] = {}
     for row in sorted(comparison.rows, key=lambda row: row.rate_Hz):
         if row.after_um:
-            found[row.rate_Hz] = min(row.after_um, found.get(row.rate_Hz, math.inf))
-    return found
+            lowest[row.rate_Hz] = min(row.after_um, lowest.get(row.rate_Hz, math.inf))
+    return lowest
 
 
-def _of(comparison: ComparisonResult, controller: str) -> list[TunedStudy]:
+def _rows_of(comparison: ComparisonResult, controller: str) -> list[TunedStudy]:
     return [row for row in comparison.rows if row.controller == controller]
 
 
-def _shown(value: float | None) -> str:
+def _nanometres(value: float | None) -> str:
     return "-" if value is None else f"{1e3 * value:.1f}"
 
 

@@ -1,4 +1,4 @@
-"""Picture of a contour: the path, its error magnified, and the distance in time."""
+"""Picture of contours: path, magnified error, and distance from it against time."""
 
 from collections.abc import Sequence
 
@@ -9,43 +9,49 @@ from ..study import Study
 from ..tuning.contouring import ContourErrors
 from .figures import AFTER, BEFORE, REFERENCE, UNITS, figure, headed, legend_above
 
-_SHARE = 0.2  # of the contour's extent that the largest error is drawn as
+_SHARE = 0.2  # largest error as drawn, as a share of the contour's extent
 
 
 def contour_figure(
     study: Study, title: str, contours: Sequence[ContourErrors]
 ) -> Figure | None:
-    """Draw paths before and after tuning; None if there is no contour."""
+    """Draw the paths before and after tuning. Return None if there is no contour."""
     if study.axes is None or not contours:
         return None
     names = (*study.references.tune, *study.references.unseen)
     picture = figure(9.0, 4.0 * len(contours) + 0.3)
     panels = picture.subplots(len(contours), 2, squeeze=False)
-    for found, (left, right) in zip(contours, panels, strict=True):
-        path, (run, axes) = found.path, found.contour
+    for errors, (left, right) in zip(contours, panels, strict=True):
+        path, (run, axes) = errors.path, errors.contour
         unit, small = UNITS[study.axes.units[axes[0]]]
         extent = np.ptp(path, axis=0).max()
-        both = (found.before, found.after)
-        magnified = _magnification([one.error for one in both], extent)
+        both = (errors.before, errors.after)
+        magnified = _magnification([deviation.error for deviation in both], extent)
         left.plot(*path.T, color=REFERENCE, ls="--", lw=0.9, label="reference")
-        for one, colour, label in zip(
+        for deviation, colour, label in zip(
             both, (BEFORE, AFTER), ("before", "tuned"), strict=True
         ):
             left.plot(
-                *(one.nearest + magnified * one.error).T, color=colour, label=label
+                *(deviation.nearest + magnified * deviation.error).T,
+                color=colour,
+                label=label,
             )
-            rms = 1e3 * one.rms
+            rms = 1e3 * deviation.rms
             shown = f"{label}, {rms:.4g} {small} rms" if np.isfinite(rms) else label
             right.plot(
-                found.time, 1e3 * one.distance, color=colour, lw=0.9, label=shown
+                errors.time,
+                1e3 * deviation.distance,
+                color=colour,
+                lw=0.9,
+                label=shown,
             )
-        one, other = (study.axes.names[axis] for axis in axes)
+        first, second = (study.axes.names[axis] for axis in axes)
         left.set(
-            xlabel=f"{one} ({unit})",
-            ylabel=f"{other} ({unit})",
+            xlabel=f"{first} ({unit})",
+            ylabel=f"{second} ({unit})",
             title=f"{names[run]}: error magnified {magnified:g} times\n",
         )
-        # A run that diverges leaves the picture.
+        # The limits follow the contour: the path of a diverging run is cut off.
         middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
         (x_low, y_low), (x_high, y_high) = middle - 0.7 * extent, middle + 0.7 * extent
         left.set(xlim=(x_low, x_high), ylim=(y_low, y_high), aspect="equal")
@@ -57,10 +63,10 @@ def contour_figure(
 
 
 def _magnification(errors: list[np.ndarray], extent: float) -> float:
-    """Return 1, 2 or 5 times a power of ten by which errors are drawn, at least 1.
+    """Return the magnification of errors: 1, 2 or 5 times a power of ten, at least 1.
 
-    The largest is drawn as a share of the contour; a run further off than the contour
-    is large does not count.
+    The largest error is drawn as ``_SHARE`` of the contour's ``extent``, or less. Runs
+    with an error of at least ``extent`` do not count.
     """
     largest = [np.abs(e[np.isfinite(e)]).max(initial=0.0) for e in errors]
     near = max((value for value in largest if value < extent), default=extent)

@@ -1,4 +1,4 @@
-"""Picture of the coupling of axes before and after tuning."""
+"""Picture of the coupling between axes before and after tuning."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,16 +9,16 @@ from matplotlib.image import AxesImage
 from ..tuning.coupling import Coupling
 from .figures import UNITS, figure, headed
 
-_LEAST = 1e-6  # %; a smaller share has no colour of its own
+_LEAST = 1e-6  # %; smaller shares have the colour of this one
 
 
 def coupling_figure(
     coupling: tuple[Coupling, Coupling] | None, title: str
 ) -> Figure | None:
-    """Draw heat maps of the errors on the hold-out while one axis alone is driven.
+    """Draw heat maps of the held-out errors while only one axis is driven.
 
-    ``coupling`` is that before and after tuning. None if there is nothing to show: one
-    axis, or none driven alone.
+    ``coupling`` is that before and after tuning. Return None if the stage has one axis,
+    or if no reference drives an axis alone.
     """
     if coupling is None:
         return None
@@ -32,8 +32,8 @@ def coupling_figure(
     picture = figure(10.0, 1.1 + 0.95 * len(before.names))
     panels = picture.subplots(1, 2)
     images = [
-        _map(ax, found, norm, heading)
-        for ax, found, heading in zip(
+        _map(ax, panel_coupling, norm, heading)
+        for ax, panel_coupling, heading in zip(
             panels, (before, after), ("before", "tuned"), strict=True
         )
     ]
@@ -47,18 +47,18 @@ def coupling_figure(
     return picture
 
 
-def _map(ax: Axes, found: Coupling, norm: LogNorm, title: str) -> AxesImage:
-    shares = np.clip(found.percent, norm.vmin, norm.vmax)
+def _map(ax: Axes, coupling: Coupling, norm: LogNorm, title: str) -> AxesImage:
+    shares = np.clip(coupling.percent, norm.vmin, norm.vmax)
     image = ax.imshow(shares, norm=norm, cmap="YlGnBu", aspect="auto")
-    places = range(len(found.names))
+    places = range(len(coupling.names))
     driven = [
         f"{name}\n{amplitude:g} {UNITS[unit][0]}"
         for name, amplitude, unit in zip(
-            found.names, found.amplitudes, found.units, strict=True
+            coupling.names, coupling.amplitudes, coupling.units, strict=True
         )
     ]
     ax.set(xlabel="axis measured", ylabel="axis driven, amplitude", title=title)
-    ax.set_xticks(places, found.names)
+    ax.set_xticks(places, coupling.names)
     ax.set_yticks(places, driven)
     ax.grid(visible=False)
     for row in places:
@@ -67,7 +67,7 @@ def _map(ax: Axes, found: Coupling, norm: LogNorm, title: str) -> AxesImage:
             ax.text(
                 column,
                 row,
-                _written(found, row, column),
+                _cell_text(coupling, row, column),
                 ha="center",
                 va="center",
                 color="white" if dark else "black",
@@ -75,12 +75,15 @@ def _map(ax: Axes, found: Coupling, norm: LogNorm, title: str) -> AxesImage:
     return image
 
 
-def _written(found: Coupling, row: int, column: int) -> str:
-    share, error = found.percent[row, column], found.errors[row, column]
+def _cell_text(coupling: Coupling, row: int, column: int) -> str:
+    share, error = coupling.percent[row, column], coupling.errors[row, column]
     if not np.isfinite(error):
         return "-"
-    driven, (large, small) = UNITS[found.units[row]][0], UNITS[found.units[column]]
-    alike = found.units[row] == found.units[column]
+    driven, (large, small) = (
+        UNITS[coupling.units[row]][0],
+        UNITS[coupling.units[column]],
+    )
+    alike = coupling.units[row] == coupling.units[column]
     ratio = f"{share:.3g} %" if alike else f"{10.0 * share:.3g} {small}/{driven}"
     amount = f"{error:.3g} {large}" if error >= 1.0 else f"{1e3 * error:.3g} {small}"
     return f"{ratio}\n{amount}"

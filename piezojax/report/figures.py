@@ -1,4 +1,4 @@
-"""The house style of every picture, and writing one to a file."""
+"""Style of all pictures, and writing of a picture to a file."""
 
 import io
 from pathlib import Path
@@ -17,10 +17,10 @@ REFERENCE, BEFORE, AFTER, MEASURED = "#222222", "#c9753d", "#1f6f8b", "#8a8a8a"
 """Colours with one meaning in every picture."""
 
 COLOURS = {"before": BEFORE, "after": AFTER}
-"""Those of a loop by its name."""
+"""Colours of a loop by its name."""
 
 UNITS = {"um": ("µm", "nm"), "urad": ("µrad", "nrad")}
-"""How a unit is written, and the unit a thousand times smaller."""
+"""A unit as written in pictures, and the unit a thousand times smaller."""
 
 STYLE: dict[Any, Any] = {
     "font.size": 9.0,
@@ -40,19 +40,19 @@ STYLE: dict[Any, Any] = {
 def figure(width: float, height: float) -> Figure:
     """Return an empty figure of ``width`` x ``height`` inches.
 
-    Made without pyplot: nothing global, no window, no backend to choose.
+    It is made without pyplot, which would keep global state and choose a backend.
     """
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def headed(picture: Figure, title: str) -> None:
-    """Put ``title`` above all panels, its lines in as many as the width needs."""
+    """Put ``title`` above all panels, with long lines wrapped to the width."""
     width = int(11.0 * picture.get_figwidth())
     picture.suptitle("\n".join(fill(line, width) for line in title.splitlines()))
 
 
 def legend_above(ax: Axes) -> None:
-    """Put the legend of ``ax`` above it, where it hides no data."""
+    """Put the legend of ``ax`` above its panel, so that it covers no data."""
     ax.legend(
         loc="lower right",
         bbox_to_anchor=(1.0, 0.98),
@@ -64,19 +64,19 @@ def legend_above(ax: Axes) -> None:
 
 
 def ticks_in_full(axis: Axis) -> None:
-    """Write numbers, not powers, at 1, 2 and 5 of a short logarithmic ``axis``."""
+    """Label a short logarithmic ``axis`` at 1, 2 and 5 with numbers, not powers."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
 
 
 def styled():
-    """Return the context in which pictures are drawn."""
+    """Return a context manager that applies ``STYLE``."""
     return mpl.rc_context(STYLE)
 
 
 def write(picture: Figure, path: Path) -> None:
-    """Write ``picture`` as PNG, whole or not at all."""
+    """Write ``picture`` as PNG; a failure leaves no partial file."""
     buffer = io.BytesIO()
     picture.savefig(buffer, format="png")
     write_bytes(path, buffer.getvalue())

@@ -23,7 +23,7 @@ from .figures import (
 from .frequency_response import response_figure, singular_values_figure
 
 SHOWN = 400
-"""Samples of an output drawn over time where there are several outputs."""
+"""Samples drawn of each output of a record with several outputs."""
 
 MODEL_FILE, FIT_FILE, PICTURE_FILE = "model.json", "fit.json", "fit.png"
 
@@ -66,7 +66,7 @@ def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> None:
 
 
 def outputs_figure(fit: Fit) -> Figure:
-    """Every output of the first record: the end of it, and the residual's spectrum."""
+    """Draw every output of the first record: its end and the residual's spectrum."""
     record, run, part = fit.record, fit.simulations[0], fit.validate
     shown = slice(max(part.start, part.stop - SHOWN), part.stop)
     picture = figure(9.0, 2.4 * run.shape[1] + 0.8)
@@ -99,7 +99,7 @@ def outputs_figure(fit: Fit) -> Figure:
 
 
 def loop_panel(ax: Axes, fit: Fit, label: str) -> None:
-    """Output against input over the validation part, the model under ``label``."""
+    """Draw output against input over the validation part, the model as ``label``."""
     record, part = fit.record, fit.validate
     ax.plot(
         record.input[part],
@@ -119,7 +119,7 @@ def loop_panel(ax: Axes, fit: Fit, label: str) -> None:
 
 
 def fit_figure(fit: Fit) -> Figure:
-    """Loop, time course and residual with its spectrum."""
+    """Draw the loop, the output over time, and the residual with its spectrum."""
     record, report = fit.record, fit.report
     time, error = record.time, fit.simulated - record.output
     unit = shown_unit(record.output_unit)
@@ -151,5 +151,5 @@ def fit_figure(fit: Fit) -> Figure:
 
 
 def shown_unit(unit: str) -> str:
-    """Return ``unit`` as it is written in a picture."""
+    """Return ``unit`` as written in pictures."""
     return unit.replace("um", "µm") if unit in ("um", "um/s") else unit

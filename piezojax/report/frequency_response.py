@@ -1,4 +1,4 @@
-"""Pictures of state-space identification: the order, and the transfer matrix."""
+"""Pictures of state-space identification: singular values, transfer matrix."""
 
 from collections.abc import Sequence
 
@@ -9,13 +9,13 @@ from ..identification.estimators.frequency import EmpiricalResponse
 from .figures import AFTER, BEFORE, MEASURED, figure
 
 SHOWN = 60
-"""Most singular values drawn."""
+"""Largest number of singular values drawn, unless the order is near it or above."""
 
 
 def singular_values_figure(
     values: Sequence[float] | np.ndarray, order: int, title: str = ""
 ) -> Figure:
-    """Singular values over their largest, on a log scale, ``order`` marked."""
+    """Draw singular values relative to the largest, with ``order`` marked."""
     shares = np.asarray(values)[: max(SHOWN, order + 5)] / np.max(values)
     number = np.arange(1, len(shares) + 1)
     picture = figure(5.6, 3.4)
@@ -44,9 +44,10 @@ def response_figure(
     outputs: Sequence[str],
     unit: str = "um/V",
 ) -> Figure:
-    """Draw a Bode plot, a column an input: measured with its 95 % band, and ``fitted``.
+    """Draw the Bode plot of a measured transfer matrix and of the model.
 
-    Both are [lines, p, m]; ``fitted`` is the response of the model.
+    A column for each input; the measured gain has its 95 % band. ``measured.response``
+    and ``fitted``, the response of the model, are [lines, p, m].
     """
     spread = measured.band()
     picture = figure(3.4 * len(inputs) + 0.6, 3.0 * len(outputs))

@@ -1,4 +1,4 @@
-"""The limit of linear control as file, picture and words."""
+"""File, picture and text on the limit of linear control."""
 
 import json
 from pathlib import Path
@@ -19,38 +19,41 @@ CAUSES: dict[str | None, str] = {
     "foreseen": "leaves what a linear filter of the reference would cancel",
     None: "is too far from linear to say why",
 }
-"""Explanation of the share of an error that exceeds the limit's most."""
+"""Explanations of a large error, by the share that exceeds the limit's most."""
 
 
-def write_limit(found: LimitReport | str, folder: Path, title: str = "") -> None:
+def write_limit(report: LimitReport | str, folder: Path, title: str = "") -> None:
     """Write limit.json, and limit.png if there is a limit, into ``folder``."""
-    content = {"problem": found} if isinstance(found, str) else found.as_dict()
+    content = {"problem": report} if isinstance(report, str) else report.as_dict()
     text = json.dumps(content, indent=2, allow_nan=False)
     write_text(folder / LIMIT_FILE, text + "\n")
-    if not isinstance(found, str):
+    if not isinstance(report, str):
         with styled():
-            write(limit_figure(found, title), folder / LIMIT_PICTURE)
+            write(limit_figure(report, title), folder / LIMIT_PICTURE)
 
 
-def limit_text(found: LimitReport | str) -> str:
-    """Return lines on the distance from the limit, and on the causes of a large one."""
-    if isinstance(found, str):
-        return f"note: no limit of linear control: {found}"
-    count = len(found.references)
+def limit_text(report: LimitReport | str) -> str:
+    """Return lines on the distance from the limit, with the causes of a large one."""
+    if isinstance(report, str):
+        return f"note: no limit of linear control: {report}"
+    count = len(report.references)
     lines = [
         "limit of linear control with full preview (resolved to "
-        f"{found.resolution:.3g} Hz): tuned is {found.over:.2f}x that, {found.near} of "
-        f"{count} references within {NEAR:g}x; it is {found.over_one_controller:.2f}x "
+        f"{report.resolution:.3g} Hz): tuned is {report.over:.2f}x that, "
+        f"{report.near} of {count} references within {NEAR:g}x; it is "
+        f"{report.over_one_controller:.2f}x "
         "what one such controller for all of them leaves, "
-        f"{found.near_one_controller} of {count}"
+        f"{report.near_one_controller} of {count}"
     ]
     by_cause: dict[str | None, list[str]] = {}
     below = []
-    for name, one in found.references.items():
-        if one.over < 1.0:
-            below.append(f"{name} {one.over:.2f}x")
-        elif one.over > NEAR:
-            by_cause.setdefault(one.exceeding, []).append(f"{name} {one.over:.2f}x")
+    for name, reached in report.references.items():
+        if reached.over < 1.0:
+            below.append(f"{name} {reached.over:.2f}x")
+        elif reached.over > NEAR:
+            by_cause.setdefault(reached.exceeding, []).append(
+                f"{name} {reached.over:.2f}x"
+            )
     lines += [
         f"note: on {', '.join(names)} the loop {CAUSES[cause]}"
         for cause, names in by_cause.items()
@@ -63,28 +66,28 @@ def limit_text(found: LimitReport | str) -> str:
     return "\n".join(lines)
 
 
-def limit_figure(found: LimitReport, title: str = "") -> Figure:
-    """Errors by reference beside their limits, and where in frequency they arise."""
+def limit_figure(report: LimitReport, title: str = "") -> Figure:
+    """Draw errors and limits by reference, and the spectra of the worst reference."""
     picture = figure(9.0, 3.8)
     left, right = picture.subplots(1, 2, width_ratios=(1.0, 1.1))
-    _errors(left, found)
-    _spectra(right, found)
+    _errors(left, report)
+    _spectra(right, report)
     if title:
         headed(picture, title)
     return picture
 
 
-def _errors(ax: Axes, found: LimitReport) -> None:
-    names = list(found.references)
+def _errors(ax: Axes, report: LimitReport) -> None:
+    names = list(report.references)
     rows = np.arange(len(names))[::-1]
     for key, colour, marker, label in (
         ("limit", REFERENCE, "|", "limit, a linear controller for each"),
         ("one_controller", BEFORE, "d", "best linear controller for all"),
         ("tuned", AFTER, "o", "tuned"),
     ):
-        values = [1e3 * getattr(found.references[name], key) for name in names]
+        values = [1e3 * getattr(report.references[name], key) for name in names]
         ax.plot(values, rows, marker, color=colour, label=label, ms=6.0, mew=1.6)
-    limits = np.array([1e3 * found.references[name].limit for name in names])
+    limits = np.array([1e3 * report.references[name].limit for name in names])
     ax.hlines(rows, limits, NEAR * limits, color=MEASURED, lw=0.8)
     ax.set(
         xlabel=f"rms error (nm); lines end {NEAR:g} times above the limit",
@@ -96,10 +99,10 @@ def _errors(ax: Axes, found: LimitReport) -> None:
     ax.legend(loc="upper left", fontsize=7.5)
 
 
-def _spectra(ax: Axes, found: LimitReport) -> None:
-    """Draw the spectra of the reference that is furthest above its limit."""
-    worst = found.worst
-    densities = found.densities(worst)
+def _spectra(ax: Axes, report: LimitReport) -> None:
+    """Draw the spectra of the reference whose error is the most times its limit."""
+    worst = report.worst
+    densities = report.densities(worst)
     for name, colour, width, label in (
         ("unforeseen", MEASURED, 0.9, "disturbance, not foretold"),
         ("noise", BEFORE, 0.9, "sensor noise"),
@@ -108,14 +111,14 @@ def _spectra(ax: Axes, found: LimitReport) -> None:
     ):
         nanometres = 1e3 * densities[name]
         ax.loglog(
-            found.curves.frequency, nanometres, color=colour, lw=width, label=label
+            report.curves.frequency, nanometres, color=colour, lw=width, label=label
         )
     top = 1e3 * np.max(densities["unforeseen"])
     ax.set(
-        xlim=(found.resolution / 2.0, None),
+        xlim=(report.resolution / 2.0, None),
         ylim=(1e-5 * top, 30.0 * top),
         xlabel="frequency (Hz)",
         ylabel="amplitude density (nm/√Hz)",
-        title=f"{worst}, {found.references[worst].over:.2f} times its limit",
+        title=f"{worst}, {report.references[worst].over:.2f} times its limit",
     )
     ax.legend(loc="upper right", fontsize=7.5)

@@ -30,13 +30,16 @@ RANKING_FILE, TABLE_FILE = "comparison.json", "comparison.csv"
 RANKING_PICTURE = "comparison.png"
 
 SHOWN = 3
-"""Models whose residuals are drawn."""
+"""Number of models with drawn residuals."""
 
 SHADES = (AFTER, BEFORE, REFERENCE)
 
 
 def write_ranking(ranking: ModelRanking, folder: Path) -> None:
-    """Write the ranking, the best fit as a single one, the others under models/."""
+    """Write the ranking, the files of the best fit, and the other models.
+
+    The other models are in the folders that their rows name, under models/.
+    """
     report = ranking.report
     for row in report.rows:
         if row.folder is None or row.model == report.best:
@@ -62,13 +65,13 @@ def _csv(report: RankingReport) -> str:
     return text.getvalue()
 
 
-def _broken(model: str) -> str:
-    """Return ``model`` on two lines, so that it fits a narrow column."""
+def _folded(model: str) -> str:
+    """Return ``model`` in two lines, to fit a narrow column."""
     return model.replace("+", "\n+", 1)
 
 
 def ranking_table(report: RankingReport) -> Table:
-    """Return the fitted models, best first, and those that failed."""
+    """Return the table of the fitted models, best first, and of the failed ones."""
     table = Table(title=f"free-run rms error on the validation part, {report.unit}")
     table.add_column("model", no_wrap=True)
     for title in ("error  ", "para-\nmeters", "BIC", "time,\ns", "notes"):
@@ -78,10 +81,10 @@ def ranking_table(report: RankingReport) -> Table:
         if row.status == "not tried":
             continue
         if row.bic is None or row.validation_rmse is None:
-            table.add_row(_broken(row.model), "failed", "-", "-", f"{row.wall_s:.1f}")
+            table.add_row(_folded(row.model), "failed", "-", "-", f"{row.wall_s:.1f}")
             continue
         table.add_row(
-            _broken(row.model),
+            _folded(row.model),
             f"{row.validation_rmse:.3g} {' ' if row.as_good else '*'}",
             str(row.parameters),
             f"+{row.bic - least:.0f}",
@@ -96,41 +99,41 @@ def ranking_table(report: RankingReport) -> Table:
 
 
 def ranking_notes(report: RankingReport) -> list[str]:
-    """Return the notes beside the table, a line each."""
-    found = [f"{row.model} failed: {row.note}" for row in _with(report, "failed")]
-    for reason, rows in groupby(_with(report, "not tried"), key=lambda row: row.note):
-        found.append(f"not tried: {', '.join(row.model for row in rows)}: {reason}")
-    found += [
-        f"{row.model} is {row.note}" for row in _with(report, "fitted") if row.note
+    """Return the notes on the table, one line each."""
+    notes = [f"{row.model} failed: {row.note}" for row in _rows(report, "failed")]
+    for reason, rows in groupby(_rows(report, "not tried"), key=lambda row: row.note):
+        notes.append(f"not tried: {', '.join(row.model for row in rows)}: {reason}")
+    notes += [
+        f"{row.model} is {row.note}" for row in _rows(report, "fitted") if row.note
     ]
     share = sum(report.effective_samples) / len(report.effective_samples)
-    found.append(
+    notes.append(
         f"{report.samples} training samples count as {share:.0f} in BIC: errors of a "
         "free run are correlated"
     )
     if report.interrupted:
-        found.append("interrupted: the best of those that were fitted by then")
-    found.append(f"best: {report.best} ({report.rule})")
+        notes.append("interrupted: the best of those that were fitted by then")
+    notes.append(f"best: {report.best} ({report.rule})")
     if report.test is None:
-        found.append(
+        notes.append(
             "the choice has seen the validation part: its error there is no hold-out "
             "figure; --test START:STOP keeps samples for one"
         )
     else:
-        found.append(
+        notes.append(
             f"its error on the test part, which neither fits nor choice have seen: "
             f"{report.test.rmse:.4g} {report.test.unit}, "
             f"{report.test.rmse_percent_of_span:.2f} % of span"
         )
-    return found
+    return notes
 
 
-def _with(report: RankingReport, status: str) -> list[RankedModel]:
+def _rows(report: RankingReport, status: str) -> list[RankedModel]:
     return [row for row in report.rows if row.status == status]
 
 
 def ranking_figure(ranking: ModelRanking) -> Figure:
-    """Validation error by model with its parameters; loop and residuals of the best."""
+    """Draw the validation errors of all models; loop and residuals of the best."""
     report = ranking.report
     picture = figure(10.0, max(4.5, 0.9 + 0.36 * len(ranking.fits)))
     grid = picture.add_gridspec(2, 2, width_ratios=(1.15, 1.0))
@@ -162,7 +165,7 @@ def _errors_panel(ax: Axes, report: RankingReport) -> None:
             color=colour,
             fontweight="bold" if chosen else "normal",
         )
-    ax.set_yticks(range(len(rows)), [_broken(row.model) for row in rows], fontsize=7)
+    ax.set_yticks(range(len(rows)), [_folded(row.model) for row in rows], fontsize=7)
     ax.set_ylim(-0.7, len(rows) - 0.3)
     ax.margins(x=0.12)
     if errors.max() > 5.0 * errors.min():

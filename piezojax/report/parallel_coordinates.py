@@ -1,4 +1,4 @@
-"""Many points of many parameters in one picture."""
+"""Picture of parallel coordinates: points of a sweep over many parameters."""
 
 import numpy as np
 from matplotlib import colormaps
@@ -13,13 +13,15 @@ from .figures import figure, headed
 from .sweep_scale import COLOUR_MAP, LOST, Parameter, colour_bar, scale_of
 
 MOST_LINES = 1500
-"""In a picture of parallel coordinates: the best, and an even choice of the others."""
+"""Largest number of lines.
+
+A third are the best points; the rest are chosen at regular steps of rank."""
 
 
 def parallel_coordinates(
     shown: list[MetricMap], axes: list[Parameter], title: str
 ) -> Figure:
-    """A line for each point, across one upright axis for each parameter."""
+    """Draw a line for each point across one vertical axis for each parameter."""
     picture = figure(max(5.5, 1.6 * len(axes) + 2.0), 0.7 + 3.4 * len(shown))
     places = picture.subplots(len(shown), 1, squeeze=False)[:, 0]
     for panel, ax in zip(shown, places, strict=True):
@@ -38,7 +40,7 @@ def parallel_coordinates(
             [np.broadcast_to(np.arange(len(axes)), (chosen.size, len(axes))).T, heights]
         ).T
         ax.add_collection(LineCollection(list(lines), colors=colours, linewidths=0.7))
-        _dress(ax, axes)
+        _draw_axes(ax, axes)
         note = "grey: unstable or lost" if lost.any() else ""
         colour_bar(picture, ax, ScalarMappable(norm, COLOUR_MAP), panel.unit, note)
         least = (
@@ -61,7 +63,7 @@ def parallel_coordinates(
 
 
 def _chosen(values: np.ndarray) -> np.ndarray:
-    """Return the points that are drawn, the best last, so that they lie on top."""
+    """Return the indices of the drawn points; the best are last, to lie on top."""
     order = np.argsort(np.where(np.isnan(values), np.inf, values))
     best, rest = order[: MOST_LINES // 3], order[MOST_LINES // 3 :]
     step = max(1, -(-rest.size // (MOST_LINES - MOST_LINES // 3)))
@@ -69,17 +71,17 @@ def _chosen(values: np.ndarray) -> np.ndarray:
 
 
 def _height(values: np.ndarray, every: np.ndarray, logarithmic: bool) -> np.ndarray:
-    """Return where ``values`` lie between the least and the largest, 0 to 1."""
+    """Return ``values`` relative to the range of ``every``, from 0 to 1."""
     low, high = every.min(), every.max()
     if logarithmic:
         values, low, high = np.log(values), np.log(low), np.log(high)
     return (values - low) / (high - low if high > low else 1.0)
 
 
-def _dress(ax: Axes, axes: list[Parameter]) -> None:
-    """Draw the upright axes, with the ends of each written at them."""
+def _draw_axes(ax: Axes, axes: list[Parameter]) -> None:
+    """Draw the vertical axes and label both ends of each."""
     ax.set(xlim=(-0.25, len(axes) - 0.75), ylim=(-0.02, 1.02), yticks=[])
-    ax.set_xticks(range(len(axes)), [_broken(axis.label) for axis in axes])
+    ax.set_xticks(range(len(axes)), [_in_lines(axis.label) for axis in axes])
     ax.tick_params(axis="x", length=0, pad=14)
     ax.grid(False)
     ax.spines[:].set_visible(False)
@@ -98,7 +100,7 @@ def _number(value: float) -> str:
     return np.format_float_positional(value, precision=3, fractional=False, trim="-")
 
 
-def _broken(label: str) -> str:
-    """Return a long label in two lines."""
+def _in_lines(label: str) -> str:
+    """Return ``label`` with a line for each part of the name."""
     name, bracket, unit = label.partition(" (")
     return name.replace(".", "\n") + bracket + unit

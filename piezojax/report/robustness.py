@@ -1,4 +1,4 @@
-"""Tuned gains off the nominal plant: their limits, and what robustness costs."""
+"""Tables and pictures of tuned gains on perturbed plants and Pareto fronts."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from .figures import AFTER, BEFORE, figure, headed, ticks_in_full
 
 
 def constraints_table(result: Result) -> Table:
-    """Return the limits, what became of them, and on how many held-out plants."""
+    """Return the limits, the values reached, and the held-out plants that keep them."""
     table = Table(title="limits")
     table.add_column("limit")
     for name in ("set", "tuned", "state", "held-out plants"):
@@ -22,21 +22,21 @@ def constraints_table(result: Result) -> Table:
     for name, kept in result.constraints.items():
         unit = "" if kept.unit == "1" else f" {kept.unit}"
         state = "missed" if not kept.kept else "active" if kept.active else "kept"
-        there = unseen.get(name)
+        held_out = unseen.get(name)
         table.add_row(
             f"{name}, {kept.sense}",
             f"{kept.limit:.4g}{unit}",
             _number(kept.value),
             state,
-            f"{_number(there.value)}, kept on {there.on} of {there.of}"
-            if there
+            f"{_number(held_out.value)}, kept on {held_out.on} of {held_out.of}"
+            if held_out
             else "-",
         )
     return table
 
 
 def front_table(front: Sequence[FrontPoint], constraint: str) -> Table:
-    """Return the points of a Pareto front."""
+    """Return the table of the points of a Pareto front."""
     table = Table(title="Pareto front")
     for name in (f"{constraint} limit", "reached", "error, nm", "objective"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -51,33 +51,33 @@ def front_table(front: Sequence[FrontPoint], constraint: str) -> Table:
     return table
 
 
-def perturbed_figure(found: Perturbed | None, title: str) -> Figure | None:
-    """Draw the errors on every held-out plant, and what is limited there."""
-    if found is None or not found.geomeans_um:
+def perturbed_figure(perturbed: Perturbed | None, title: str) -> Figure | None:
+    """Draw distributions over the held-out plants: errors and limited figures."""
+    if perturbed is None or not perturbed.geomeans_um:
         return None
-    limited = list(found.values)
+    limited = list(perturbed.values)
     picture = figure(3.6 * (1 + len(limited)), 3.2)
     panels = picture.subplots(1, 1 + len(limited), squeeze=False)[0]
     panel = panels[0]
     for name, values, colour in (
-        ("before", found.geomeans_before_um, BEFORE),
-        ("tuned", found.geomeans_um, AFTER),
+        ("before", perturbed.geomeans_before_um, BEFORE),
+        ("tuned", perturbed.geomeans_um, AFTER),
     ):
         errors = [1e3 * value for value in values if value is not None]
         lost = len(values) - len(errors)
         label = f"{name}, unstable on {lost}" if lost else name
-        _distribution(panel, errors, found.plants, color=colour, label=label)
+        _distribution(panel, errors, perturbed.plants, color=colour, label=label)
     panel.set_xscale("log")
     ticks_in_full(panel.xaxis)
     panel.set_xlabel("rms error, geometric mean over references, nm")
-    panel.set_ylabel(f"share of {found.plants} held-out plants, %")
+    panel.set_ylabel(f"share of {perturbed.plants} held-out plants, %")
     panel.legend()
     for panel, name in zip(panels[1:], limited, strict=True):
-        values = [value for value in found.values[name] if value is not None]
-        kept = found.constraints[name]
-        _distribution(panel, values, found.plants, color=AFTER, label="tuned")
+        values = [value for value in perturbed.values[name] if value is not None]
+        kept = perturbed.constraints[name]
+        _distribution(panel, values, perturbed.plants, color=AFTER, label="tuned")
         panel.axvline(kept.limit, color="0.3", ls="--", label=f"limit, {kept.sense}")
-        panel.set_xlabel(_named(name))
+        panel.set_xlabel(_constraint_label(name))
         panel.legend()
     headed(picture, title)
     return picture
@@ -92,7 +92,7 @@ def _distribution(panel: Any, values: Sequence[float], of: int, **style: Any) ->
 def front_figure(
     front: Sequence[FrontPoint] | None, constraint: str | None, title: str
 ) -> Figure | None:
-    """Draw error against what is limited, point by point."""
+    """Draw the error against the limited figure at each point of a Pareto front."""
     if not front or constraint is None:
         return None
     picture = figure(4.6, 3.4)
@@ -107,14 +107,14 @@ def front_figure(
         if points:
             colour = AFTER if kept else BEFORE
             panel.plot(*zip(*points, strict=True), style, color=colour, label=label)
-    panel.set_xlabel(f"{_named(constraint)} on the worst plant tuned on")
+    panel.set_xlabel(f"{_constraint_label(constraint)} on the worst plant tuned on")
     panel.set_ylabel("rms error on the nominal plant,\ngeometric mean, nm")
     panel.legend()
     headed(picture, title)
     return picture
 
 
-def _named(constraint: str) -> str:
+def _constraint_label(constraint: str) -> str:
     unit = CONSTRAINTS[constraint].unit
     name = constraint.replace("_", " ")
     return name if unit == "1" else f"{name}, {unit}"

@@ -1,4 +1,4 @@
-"""Tables that the commands print at their end."""
+"""Tables that the commands print."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from ..tuning.result import Perturbed, Result, Scores
 
 
 def models_table() -> Table:
-    """Return what can be identified: whole models, and parts to be joined by '+'."""
+    """Return the table of the models that can be fitted: parts and whole models."""
     table = Table(title="models; parts are joined by '+', as in coleman_hodgdon+lag")
     for column in ("model", "kind", "what it is, or how it is fitted"):
         table.add_column(column, no_wrap=column == "model", overflow="fold")
@@ -57,7 +57,7 @@ def tuning_table(result: Result) -> Table:
         many = len(before.per_reference_rms_um) > _MOST_ROWS
         for name, error in before.per_reference_rms_um.items():
             if many and heading == sections[-1][0]:
-                break  # two of three axes rest under each reference
+                break  # too many rows: two of three axes rest in each run
             tuned = after.per_reference_rms_um[name]
             peak = after.peak_error_um[name]
             table.add_row(
@@ -83,32 +83,35 @@ def tuning_table(result: Result) -> Table:
 _SMALL = {"um": "nm", "urad": "nrad"}
 """Units a thousand times smaller, in which errors are shown."""
 
-_MOST_ROWS = 12  # of the axes at rest
+_MOST_ROWS = 12  # above it, axes at rest have only their geometric mean
 
 
-def perturbed_text(found: Perturbed) -> str:
+def perturbed_text(perturbed: Perturbed) -> str:
     """Return one line on the plants of the ensemble."""
-    if found.unstable or found.median_better is None:
+    if perturbed.unstable or perturbed.median_better is None:
         return (
-            f"{found.plants} perturbed plants: {found.unstable} unstable "
-            f"({found.unstable_before} before)"
+            f"{perturbed.plants} perturbed plants: {perturbed.unstable} unstable "
+            f"({perturbed.unstable_before} before)"
         )
     rest = (
-        f", axes at rest {found.coupling_better:.2f}x" if found.coupling_better else ""
+        f", axes at rest {perturbed.coupling_better:.2f}x"
+        if perturbed.coupling_better
+        else ""
     )
     return (
-        f"{found.plants} perturbed plants: none unstable "
-        f"({found.unstable_before} before), {found.median_better:.1f}x better in the "
-        f"median, {found.worst_better:.1f}x on the worst{rest}"
+        f"{perturbed.plants} perturbed plants: none unstable "
+        f"({perturbed.unstable_before} before), "
+        f"{perturbed.median_better:.1f}x better in the median, "
+        f"{perturbed.worst_better:.1f}x on the worst{rest}"
     )
 
 
 def gains_table(result: Result) -> Table:
-    """Return the tuned parameters beside their start."""
-    # What all paths share is said once: long ones would squeeze out the numbers.
+    """Return the table of the parameters before and after tuning."""
+    # The common start of the paths is in the title: long paths would crowd the numbers.
     parents = zip(*(path.split(".")[:-1] for path in result.gains), strict=False)
-    alike = takewhile(lambda names: len(set(names)) == 1, parents)
-    shared = ".".join(names[0] for names in alike)
+    common = takewhile(lambda names: len(set(names)) == 1, parents)
+    shared = ".".join(names[0] for names in common)
     table = Table(title=f"gains of {shared}" if shared else "gains")
     table.add_column("parameter")
     table.add_column("before", justify="right", no_wrap=True)
@@ -121,20 +124,20 @@ def gains_table(result: Result) -> Table:
     return table
 
 
-def stability_table(found: StabilityReports) -> Table:
+def stability_table(stability: StabilityReports) -> Table:
     """Return the margins of each loop, on the worse branch of a hysteresis."""
     table = Table(title="stability for small motions, worse branch of the hysteresis")
     table.add_column("loop")
     for title in ("Ms", "gain margin", "phase margin", "delay margin"):
         table.add_column(title, justify="right")
-    for name, branches in found.reports.items():
+    for name, branches in stability.reports.items():
         shown = "tuned" if name == "after" else name
         table.add_row(shown, *_margins(list(branches.values())))
-    for name, axes in found.axes.items():
+    for name, axes in stability.axes.items():
         shown = "tuned" if name == "after" else name
         if not axes.report.stable:
             table.add_row(shown, *_UNSTABLE)
-        for axis, report in zip(found.axis_names, axes.report.axes, strict=False):
+        for axis, report in zip(stability.axis_names, axes.report.axes, strict=False):
             table.add_row(f"{shown}, {axis}", *_margins([report]))
         if axes.report.disk_margin is not None:
             table.add_row(
@@ -144,7 +147,7 @@ def stability_table(found: StabilityReports) -> Table:
                 f"{axes.report.disk_phase_margin_deg:.1f}°",
                 "-",
             )
-    for name in found.problems:
+    for name in stability.problems:
         table.add_row("tuned" if name == "after" else name, "-", "-", "-", "-")
     return table
 
@@ -165,7 +168,7 @@ def _margins(reports: Sequence[StabilityReport]) -> tuple[str, ...]:
 
 
 def fit_table(report: FitReport) -> Table:
-    """Return the parameters of a fit and how well it simulates the record."""
+    """Return the parameters of a fit, with its training and validation errors."""
     errors = "; ".join(
         f"{name} {part.rmse:.3g} {part.unit}, {part.rmse_percent_of_span:.2f} % of span"
         for name, part in (
@@ -185,13 +188,13 @@ def fit_table(report: FitReport) -> Table:
 
 
 WIDE = 3
-"""Most columns of a table beside each other: what fits into 80 characters."""
+"""Most columns of one table, so that it fits into 80 characters."""
 
 
 def reproduction_table(
     name: str, cells: Sequence[Cell], agreement: TableAgreement
 ) -> Table:
-    """Return paper beside simulation, a row a reference."""
+    """Return printed and simulated errors, a row for each reference."""
     columns = list(agreement.columns)
     units = ", ".join(dict.fromkeys(cell.unit for cell in cells))
     title = (
@@ -205,15 +208,15 @@ def reproduction_table(
             for group, part in agreement.groups.items()
         )
     if len(columns) <= WIDE:
-        return _beside(columns, cells, agreement, title)
+        return _part_table(columns, cells, agreement, title)
     stack = Table.grid()
     for start in range(0, len(columns), WIDE):
         part = columns[start : start + WIDE]
-        stack.add_row(_beside(part, cells, agreement, "" if start else title))
+        stack.add_row(_part_table(part, cells, agreement, "" if start else title))
     return stack
 
 
-def _beside(
+def _part_table(
     columns: Sequence[str],
     cells: Sequence[Cell],
     agreement: TableAgreement,
@@ -225,8 +228,8 @@ def _beside(
         table.add_column(column, justify="right")
     by_place = {(cell.row, cell.column): cell for cell in cells}
     for row in dict.fromkeys(cell.row for cell in cells):
-        found = [by_place[row, column] for column in columns]
-        table.add_row(row, *(f"{c.paper:.4f} / {c.sim:.4f}" for c in found))
+        row_cells = [by_place[row, column] for column in columns]
+        table.add_row(row, *(f"{c.paper:.4f} / {c.sim:.4f}" for c in row_cells))
     table.add_section()
     ratios = (f"{agreement.columns[c].geomean_ratio:.3f}" for c in columns)
     table.add_row("geometric-mean ratio", *ratios, style="bold")

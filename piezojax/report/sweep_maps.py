@@ -1,4 +1,4 @@
-"""Pictures and the closing table of a sweep."""
+"""Pictures of a sweep, and the table of its best points."""
 
 from pathlib import Path
 from textwrap import fill
@@ -28,7 +28,7 @@ MOST_PANELS = 12
 
 
 def write_pictures(path: Path, folder: Path) -> None:
-    """Draw each metric of the data set ``path`` into ``folder``."""
+    """Write a picture of each metric of the data set ``path`` into ``folder``."""
     with opened(path) as dataset, styled():
         for name in metrics_in(dataset):
             write(metric_figure(dataset, name), folder / f"{name}.png")
@@ -37,8 +37,8 @@ def write_pictures(path: Path, folder: Path) -> None:
 def metric_figure(dataset: "Dataset", name: str) -> Figure:
     """Return the picture of a metric.
 
-    A heat map of a grid of two parameters, a curve over one, and parallel coordinates
-    of samples and of larger grids.
+    A grid of one parameter gives a curve, a grid of two a heat map; larger grids and
+    samples give parallel coordinates.
     """
     shown = panels(dataset, name)[:MOST_PANELS]
     axes = parameters(dataset)
@@ -66,7 +66,7 @@ def metric_figure(dataset: "Dataset", name: str) -> Figure:
 
 
 def label_of(dataset: "Dataset", name: str) -> str:
-    """Return the label of a metric with the mean that is taken of it."""
+    """Return the label of a metric, with its average over references if it has one."""
     label = str(dataset[name].attrs["long_name"])
     if "reference" not in dataset[name].dims:
         return label
@@ -74,12 +74,12 @@ def label_of(dataset: "Dataset", name: str) -> str:
 
 
 def panels(dataset: "Dataset", name: str) -> list[MetricMap]:
-    """Return a metric, by point, of each plant and axis, in the units of pictures."""
-    found = []
-    for one in metric_maps(dataset, name):
-        unit, factor = _shown_unit(name, one.unit)
-        found.append(MetricMap(one.title, factor * one.values, unit))
-    return found
+    """Return the map of a metric for each plant and axis, in the units of pictures."""
+    maps = []
+    for metric in metric_maps(dataset, name):
+        unit, factor = _shown_unit(name, metric.unit)
+        maps.append(MetricMap(metric.title, factor * metric.values, unit))
+    return maps
 
 
 def _shown_unit(name: str, unit: str) -> tuple[str, float]:
@@ -92,20 +92,20 @@ def _shown_unit(name: str, unit: str) -> tuple[str, float]:
 
 def parameters(dataset: "Dataset") -> list[Parameter]:
     """Return the swept parameters, in the order of the study."""
-    found = []
+    swept = []
     for name, variable in dataset.coords.items():
         if "scale" not in variable.attrs:
             continue
         parts = str(name).split(".")
         unit = variable.attrs["units"]
-        # What is left of a long path still tells the parameters apart.
+        # The last two names of a path distinguish the parameters.
         label = ".".join(parts[-2:]).replace("_", " ") + (
             f" ({unit.replace('um', 'µm')})" if unit not in ("", "1") else ""
         )
-        found.append(
+        swept.append(
             Parameter(label, variable.values, variable.attrs["scale"] == "log")
         )
-    return found
+    return swept
 
 
 def _flattened(dataset: "Dataset", axes: list[Parameter]) -> list[Parameter]:
@@ -122,29 +122,29 @@ def _heat_map(
     picture: Figure, ax: Axes, panel: MetricMap, axes: list[Parameter]
 ) -> None:
     values = panel.kept()
-    across, up = axes[1], axes[0]
-    ax.set_facecolor(LOST)  # what is lost
+    horizontal, vertical = axes[1], axes[0]
+    ax.set_facecolor(LOST)
     mesh = ax.pcolormesh(
-        across.values,
-        up.values,
+        horizontal.values,
+        vertical.values,
         values,
         shading="nearest",
         cmap=COLOUR_MAP,
         norm=scale_of(values),
         rasterized=True,
     )
-    for axis, scale in ((across, ax.set_xscale), (up, ax.set_yscale)):
+    for axis, scale in ((horizontal, ax.set_xscale), (vertical, ax.set_yscale)):
         if axis.logarithmic:
             scale("log")
-    ax.set(xlabel=across.label, ylabel=up.label)
+    ax.set(xlabel=horizontal.label, ylabel=vertical.label)
     ax.grid(False)
     colour_bar(picture, ax, mesh, panel.unit)
     least = panel.least()
     if least is not None and np.sum(values == values[least]) == 1:
         row, column = least
         ax.plot(
-            across.values[column],
-            up.values[row],
+            horizontal.values[column],
+            vertical.values[row],
             "o",
             ms=7,
             mfc="none",
@@ -174,7 +174,7 @@ def _curve(ax: Axes, panel: MetricMap, axis: Parameter) -> None:
 
 
 def best_table(path: Path) -> Table:
-    """Return the point with the least first metric, for each plant and axis."""
+    """Return the point where the first metric is least, for each plant and axis."""
     with opened(path) as dataset:
         name = metrics_in(dataset)[0]
         axes = parameters(dataset)

@@ -10,13 +10,13 @@ from matplotlib.figure import Figure
 
 from .figures import ticks_in_full
 
-LOST = "#d9d9d9"  # the colour of points that are lost
-COLOUR_MAP = "viridis_r"  # dark is large: what is bad stands out
-_DECADE = 10.0  # values that span more are shown on a logarithmic scale
+LOST = "#d9d9d9"  # colour of unstable and lost points
+COLOUR_MAP = "viridis_r"  # dark for large values, so that large errors stand out
+_DECADE = 10.0  # values with a larger ratio have a logarithmic scale
 
 
 class Parameter(NamedTuple):
-    """A swept parameter: its points, its label and its scale."""
+    """A swept parameter: label, values, and whether its scale is logarithmic."""
 
     label: str
     values: np.ndarray
@@ -24,7 +24,7 @@ class Parameter(NamedTuple):
 
 
 def scale_of(values: np.ndarray) -> Normalize:
-    """Return the scale of colours: logarithmic where values span a decade."""
+    """Return the colour scale: logarithmic if positive values span over a decade."""
     if not np.isfinite(values).any():
         return Normalize(0.0, 1.0)
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
@@ -36,7 +36,7 @@ def scale_of(values: np.ndarray) -> Normalize:
 def colour_bar(
     picture: Figure, ax: Axes, mapped: ScalarMappable, unit: str, note: str = ""
 ) -> None:
-    """Draw the scale of colours, its ticks at 1, 2 and 5 if it is logarithmic."""
+    """Draw the colour bar, with ticks at 1, 2 and 5 if it is logarithmic."""
     bar = picture.colorbar(mapped, ax=ax)
     bar.set_label("; ".join(part for part in (unit, note) if part))
     if isinstance(mapped.norm, LogNorm):

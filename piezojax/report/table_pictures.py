@@ -1,4 +1,4 @@
-"""Pictures of simulated tables against print, and of errors against the rate."""
+"""Pictures of simulated against printed tables, and of errors by sampling rate."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from ..reproduction.rates import FIGURE, RateError
 from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
 
 ACROSS = 4
-"""Most panels in a row."""
+"""Largest number of panels in a row."""
 
 _MARKS = (("o", BEFORE), ("s", AFTER), ("^", MEASURED), ("x", REFERENCE))
 
@@ -22,7 +22,10 @@ def write_picture(cells: Sequence[Cell], folder: Path) -> None:
 
 
 def cells_figure(cells: Sequence[Cell]) -> Figure:
-    """Simulation against print, a panel a table; the diagonal is agreement."""
+    """Draw simulated against printed values, a panel for each table.
+
+    Values on the diagonal agree.
+    """
     tables = list(dict.fromkeys(cell.table for cell in cells))
     across = min(len(tables), ACROSS)
     down = -(-len(tables) // across)
@@ -72,7 +75,7 @@ def _unit(cell: Cell) -> str:
 
 
 def _series(cell: Cell) -> str:
-    """What a cell is drawn with: its group where there is one, or its column."""
+    """Return the series in which a cell is drawn: its group if any, else its column."""
     return cell.group or cell.column
 
 
@@ -83,7 +86,10 @@ def write_rates(errors: Sequence[RateError], folder: Path) -> None:
 
 
 def rates_figure(errors: Sequence[RateError]) -> Figure:
-    """RMS error against sampling rate, a panel a signal, a line a controller."""
+    """Draw rms error against sampling rate.
+
+    A panel for each signal, a line for each controller.
+    """
     rows = list(dict.fromkeys(e.row for e in errors))
     columns = list(dict.fromkeys(e.column for e in errors))
     picture = figure(3.2 * len(rows), 3.4)

@@ -29,22 +29,22 @@ from .figures import (
 )
 from .robustness import front_figure, perturbed_figure
 
-_SHOWN = 3  # references in the tracking picture
-_PERIODS = 4.0  # of the reference, at the end of the run
+_MOST_TRACES = 3  # in the tracking picture
+_PERIODS = 4.0  # of the reference, drawn from the end of the run
 
 
 def write_results(outcome: Outcome, folder: Path) -> None:
     """Write result.json, gains.toml and the pictures into ``folder``.
 
-    On a stage with several axes that of their coupling, and of the contours if there
-    are any, too.
+    A stage with several axes also has pictures of their coupling, and of the contours
+    if the study has any.
     """
     write_numbers(outcome, folder)
     study, result = outcome.case.study, outcome.result
-    shown = _shown(outcome)
+    shown = _drawn_traces(outcome)
     chosen = {trace.run for trace in shown} | {c.run for c in contours_in(study)}
     runs = outcome.logs(chosen)
-    logs = {trace: _of_axis(study, trace, runs[trace.run]) for trace in shown}
+    logs = {trace: _axis_logs(study, trace, runs[trace.run]) for trace in shown}
     with styled():
         pictures = {
             "tracking": tracking_figure(outcome, logs),
@@ -70,19 +70,23 @@ def write_numbers(outcome: Outcome, folder: Path) -> None:
     save(outcome.controller, folder / GAINS_FILE)
 
 
-def _moved(trace: Trace) -> str:
+def _quantity(trace: Trace) -> str:
     return "rotation" if trace.unit == "urad" else "displacement"
 
 
-def _of_axis(study: Study, trace: Trace, both: Logs) -> Logs:
+def _axis_logs(study: Study, trace: Trace, both: Logs) -> Logs:
     if not study.axes:
         return both
     before, after = (axis_of(log, trace.axis) for log in both)
     return before, after
 
 
-def _shown(outcome: Outcome) -> list[Trace]:
-    """Pick, of each kind of signal on each axis, the one that was hardest before."""
+def _drawn_traces(outcome: Outcome) -> list[Trace]:
+    """Return the traces to draw.
+
+    They are those with the largest error before tuning, for each kind of signal on each
+    axis.
+    """
     errors = outcome.result.before.per_reference_rms_um
     study = outcome.case.study
     by_kind: dict[tuple[int, str], Trace] = {}
@@ -94,27 +98,28 @@ def _shown(outcome: Outcome) -> list[Trace]:
         error = errors[trace.name] or np.inf
         if current is None or error > (errors[current.name] or np.inf):
             by_kind[place] = trace
-    # With several axes one of each comes before a second of the first.
+    # With several axes, one trace of each axis comes before a second one of any.
     first = {trace.axis: trace for trace in reversed(by_kind.values())}
     rest = [trace for trace in by_kind.values() if trace not in first.values()]
-    return [*(first[axis] for axis in sorted(first)), *rest][:_SHOWN]
+    return [*(first[axis] for axis in sorted(first)), *rest][:_MOST_TRACES]
 
 
 def _signal_of(study: Study, trace: Trace) -> str:
-    """Return the name of the signal that drives a trace."""
+    """Return the name of the signal that drives the axis of a trace."""
     run = (*study.references.tune, *study.references.unseen)[trace.run]
     axis = study.axes.names[trace.axis] if study.axes else ""
     return study.driven(run)[axis]
 
 
-def _window(study: Study, trace: Trace) -> float:
+def _drawn_from(study: Study, trace: Trace) -> float:
+    """Return the time (s) from which a trace is drawn."""
     table = study.references
     frequency = parse(_signal_of(study, trace))[1] or 1.0
     return max(table.settle, table.duration - _PERIODS / frequency)
 
 
 def tracking_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
-    """Displacement and error against time, before and after."""
+    """Draw displacement and error against time, before and after tuning."""
     study = outcome.case.study
     table, dt = study.references, study.dt
     picture = figure(9.0, 2.3 * len(logs) + 0.4)
@@ -122,7 +127,7 @@ def tracking_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
     for (trace, (before, after)), (left, right) in zip(logs.items(), axes, strict=True):
         unit, small = UNITS[trace.unit]
         time = np.arange(before.reference.size) * dt
-        shown = time >= _window(study, trace)
+        shown = time >= _drawn_from(study, trace)
         for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
             error = 1e3 * (log.displacement - log.reference)
             rms = 1e3 * tracking_rms(log, round(table.settle / dt))
@@ -142,7 +147,7 @@ def tracking_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
             lw=0.9,
             label="reference",
         )
-        left.set(ylabel=f"{trace.name}\n{_moved(trace)} ({unit})")
+        left.set(ylabel=f"{trace.name}\n{_quantity(trace)} ({unit})")
         right.set(ylabel=f"tracking error ({small})")
         legend_above(left)
         legend_above(right)
@@ -153,7 +158,7 @@ def tracking_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
 
 
 def hysteresis_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
-    """The stage's own loop, and what control leaves of it."""
+    """Draw the hysteresis of the stage, and the error that remains in closed loop."""
     table, dt = outcome.case.study.references, outcome.case.study.dt
     trace = next(iter(logs))
     name, (before, after) = trace.name, logs[trace]
@@ -166,7 +171,7 @@ def hysteresis_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
     left.plot(after.voltage[settled], after.displacement[settled], color=AFTER)
     left.set(
         xlabel=f"{drive} ({drive_unit})",
-        ylabel=f"{_moved(trace)} ({unit})",
+        ylabel=f"{_quantity(trace)} ({unit})",
         title=f"{name}: the stage's hysteresis, in the tuned loop",
     )
     for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
@@ -176,7 +181,7 @@ def hysteresis_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
         )
     right.set(
         xlabel=f"reference ({unit})",
-        ylabel=f"{_moved(trace)} less reference ({small})",
+        ylabel=f"{_quantity(trace)} less reference ({small})",
         title=f"{name}: what is left in closed loop\n",
     )
     legend_above(right)
@@ -184,7 +189,7 @@ def hysteresis_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
 
 
 def convergence_figure(outcome: Outcome) -> Figure:
-    """Objective of each start against steps, the best one drawn strong."""
+    """Draw the objective of each start against steps; the best start is thick."""
     history = np.array(outcome.result.history, dtype=float)
     geometric = outcome.case.study.objective.aggregate == "geometric_mean"
     shown = np.exp(history) if geometric else history
