@@ -1,4 +1,4 @@
-"""From a lab's records to a plant model."""
+"""Identification of plant models from measured records."""
 
 from .chain import chain as chain
 from .compare import identify_all as identify_all

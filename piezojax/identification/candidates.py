@@ -1,8 +1,8 @@
-"""Which models a record can support: what ``--model all`` tries, and what it does not.
+"""Candidate models for records: those that ``--model all`` tries or leaves out.
 
 Every hysteresis is first fitted with the richest creep and dynamics that the records
-can show; only the best few then with other creeps or none, and the best of those with
-simpler dynamics. All combinations would take many times as long and tell no more.
+support. Then the best few are fitted with other creeps or none, and the best of those
+with simpler dynamics. Fitting all combinations would take many times as long.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,55 +19,55 @@ from .records.checks import lines
 from .records.record import Record
 
 CREEP_SECONDS = 1.0
-"""Shortest training part in which creep is looked for.
+"""Shortest training part, in s, for which models with creep are tried.
 
 Creep goes with the logarithm of time from about 0.1 s on (Jung and Gweon 2000, Rev.
-Sci. Instrum. 71(4)): a second holds a decade of it.
+Sci. Instrum. 71(4)): a second covers one decade.
 """
 
 CREEP = "exponential_creep"
 """The creep tried first: the most general one."""
 
 DYNAMICS = ("arma", "lag")
-"""Dynamics of a chain, richest first; the last one is tried on any record."""
+"""Dynamics of a chain, richest first; the last is tried on any record."""
 
 
 LINEAR = "state_space"
-"""The whole model without hysteresis."""
+"""Name of the linear model, which is no chain of parts."""
 
 
 class Candidate(NamedTuple):
-    """A model to try, and the method that fits it (None: the first that can)."""
+    """A model to try and its method; None stands for the default method."""
 
     model: str
     method: str | None = None
 
 
 class Untried(NamedTuple):
-    """A model that is not tried, and why."""
+    """A model that is not tried, and the reason."""
 
     model: str
     reason: str
 
 
 class Companions(NamedTuple):
-    """Creeps ("" for none) and dynamics behind a hysteresis, richest first."""
+    """Creeps ("" for none) and dynamics that follow a hysteresis, richest first."""
 
     creeps: tuple[str, ...]
     dynamics: tuple[str, ...]
 
 
 def at(place: str) -> list[str]:
-    """Return the parts that have ``place`` in a chain."""
+    """Return the names of the parts for ``place`` in a chain."""
     return [name for name, kind in known_parts().items() if kind.part.place == place]
 
 
 def companions(
     records: Sequence[Record], train: slice
 ) -> tuple[Companions, list[Untried]]:
-    """Return the creeps and dynamics that records with one input and output support."""
+    """Return the creeps and dynamics that single-channel ``records`` support."""
     untried = []
-    seconds = max(_seen(record, train) for record in records)
+    seconds = max(_train_duration(record, train) for record in records)
     creeps = [CREEP, *(name for name in at("creep") if name != CREEP), ""]
     if seconds < CREEP_SECONDS:
         untried += [
@@ -82,7 +82,7 @@ def companions(
     found, extent = excitation(records, train), extent_of(records[0])
     dynamics = []
     for name in DYNAMICS:
-        needed = _unknowns(name, extent)
+        needed = _parameter_count(name, extent)
         if 2 * found >= needed or name == DYNAMICS[-1]:
             dynamics.append(name)
         else:
@@ -90,13 +90,13 @@ def companions(
     return Companions(tuple(creeps), tuple(dynamics)), untried
 
 
-def _unknowns(part: str, extent: Extent) -> int:
-    """Return how many parameters of a part are fitted."""
+def _parameter_count(part: str, extent: Extent) -> int:
+    """Return the number of fitted parameters of a part."""
     return len(known_parts()[part].recipe(extent).bounds)
 
 
 def excitation(records: Sequence[Record], train: slice) -> int:
-    """Return the most frequencies that an input holds in the training part."""
+    """Return the largest number of frequencies of an input in the training part."""
     return max(lines(input) for r in records for input in r.inputs[train].T)
 
 
@@ -107,12 +107,12 @@ def _too_few(found: int, needed: int) -> str:
     )
 
 
-def _seen(record: Record, train: slice) -> float:
+def _train_duration(record: Record, train: slice) -> float:
     return (min(train.stop, record.samples) - train.start) * record.dt
 
 
 def chained(hysteresis: str, creep: str, dynamics: str) -> str:
-    """Return the chain of the parts, of which some may be empty."""
+    """Return the name of the chain of the given parts; a part may be empty."""
     alone = hysteresis != "" and is_dynamic(hysteresis)
     parts = [hysteresis, creep, "" if alone else dynamics]
     return "+".join(part for part in parts if part)
@@ -124,11 +124,12 @@ def first_round(
     options: Options,
     hysteresis: Sequence[str] | None = None,
 ) -> tuple[list[Candidate], list[Untried]]:
-    """Return what to fit first: a linear model, each hysteresis, the whole models.
+    """Return the candidates of the first round, and the models that are not tried.
 
-    ``hysteresis`` names the parts and whole models to try (all if left out), beside
-    linear ones. Raises ValueError for a name that is no hysteresis, or if none of those
-    named can be tried.
+    The candidates are a linear chain, a chain with each hysteresis, and the whole
+    models (those that are no chains of parts). ``hysteresis`` names the parts and whole
+    models to try beside the linear ones; all of them if left out. Raises ValueError for
+    a name that is not a hysteresis, or if none of the named ones can be tried.
     """
     parts = at("hysteresis")
     known = [*parts, *(name for name in whole_names() if name != LINEAR)]
@@ -138,14 +139,16 @@ def first_round(
             raise ValueError(f"{name!r} is no hysteresis; there are {', '.join(known)}")
     parts = [name for name in names if name in parts]
     whole, untried = whole_models(records, train, options)
-    whole = [one for one in whole if one.model in (LINEAR, *names)]
-    untried = [one for one in untried if one.model in (LINEAR, *names)]
-    if names and {one.model for one in untried} >= set(names):
+    whole = [c for c in whole if c.model in (LINEAR, *names)]
+    untried = [excluded for excluded in untried if excluded.model in (LINEAR, *names)]
+    if names and {excluded.model for excluded in untried} >= set(names):
         reasons = "; ".join(
-            f"{one.model}: {one.reason}" for one in untried if one.model in names
+            f"{excluded.model}: {excluded.reason}"
+            for excluded in untried
+            if excluded.model in names
         )
         raise ValueError(f"none of them can be tried: {reasons}")
-    several = _several(records)
+    several = _not_single_channel(records)
     if several:
         return whole, [*(Untried(name, several) for name in parts), *untried]
     found, missing = companions(records, train)
@@ -157,28 +160,30 @@ def first_round(
 def later_rounds(
     records: Sequence[Record], train: slice
 ) -> list[Callable[[Sequence[str]], list[Candidate]]]:
-    """Return what makes further rounds of the best chains so far.
+    """Return functions from the best chains so far to the candidates of a next round.
 
-    Each with the other creeps, or none; then each with the simpler dynamics.
+    The first round replaces the creep, the second takes simpler dynamics.
     """
-    if _several(records):
+    if _not_single_channel(records):
         return []
     found, _ = companions(records, train)
 
     def creeps(best: Sequence[str]) -> list[Candidate]:
-        return _new(best, found.creeps[1:], found.dynamics[:1])
+        return _untried_chains(best, found.creeps[1:], found.dynamics[:1])
 
     def dynamics(best: Sequence[str]) -> list[Candidate]:
         return [
             candidate
             for model in best
-            for candidate in _new([model], [_creep_of(model)], found.dynamics[1:])
+            for candidate in _untried_chains(
+                [model], [_creep_of(model)], found.dynamics[1:]
+            )
         ]
 
     return [creeps, dynamics]
 
 
-def _new(
+def _untried_chains(
     best: Sequence[str], creeps: Sequence[str], dynamics: Sequence[str]
 ) -> list[Candidate]:
     return [
@@ -195,8 +200,8 @@ def _creep_of(model: str) -> str:
     return next((part for part in model.split("+") if part in at("creep")), "")
 
 
-def _several(records: Sequence[Record]) -> str | None:
-    """Return why no chain of parts can be fitted, or None."""
+def _not_single_channel(records: Sequence[Record]) -> str | None:
+    """Return the reason why chains cannot be fitted, or None for single channels."""
     for record in records:
         inputs, outputs = record.inputs.shape[1], record.outputs.shape[1]
         if (inputs, outputs) != (1, 1):
@@ -208,39 +213,41 @@ def _several(records: Sequence[Record]) -> str | None:
 
 
 def whole_names() -> list[str]:
-    """Return the models that are no chain of parts."""
-    return list(dict.fromkeys(m for way in METHODS.values() for m in way.models))
+    """Return the names of the models that are no chains of parts."""
+    return list(
+        dict.fromkeys(model for method in METHODS.values() for model in method.models)
+    )
 
 
 def whole_models(
     records: Sequence[Record], train: slice, options: Options
 ) -> tuple[list[Candidate], list[Untried]]:
-    """Return the models that are no chain of parts, those of METHODS, sorted out."""
+    """Return the whole models of METHODS as candidates or as untried."""
     found, untried = [], []
     for model in whole_names():
         method = None
         if model == LINEAR and all(r.period for r in records):
             method = "frequency_response"
-        against = _AGAINST.get(model, lambda *_: None)(records, train, options)
-        if against is None:
+        objection = _OBJECTIONS.get(model, lambda *_: None)(records, train, options)
+        if objection is None:
             found.append(Candidate(model, method))
         else:
-            untried.append(Untried(model, against))
+            untried.append(Untried(model, objection))
     return found, untried
 
 
-def _against_regression(
+def _objection_to_regression(
     records: Sequence[Record], train: slice, options: Options
 ) -> str | None:
     del options
-    if against := _against_all_but_one(records):
-        return against
+    if objection := _objection_to_single(records):
+        return objection
     found = excitation(records, train)
-    needed = _unknowns("arma", extent_of(records[0]))
+    needed = _parameter_count("arma", extent_of(records[0]))
     return _too_few(found, needed) if 2 * found < needed else None
 
 
-def _against_state_space(
+def _objection_to_state_space(
     records: Sequence[Record], train: slice, options: Options
 ) -> str | None:
     if all(record.period for record in records):
@@ -249,45 +256,45 @@ def _against_state_space(
         return (
             "several inputs at once need --period, or a record that drives each alone"
         )
-    if len(records) > 1 and _several(records) is None:
+    if len(records) > 1 and _not_single_channel(records) is None:
         return "it takes each record for another input of the stage"
     found, needed = excitation(records, train), 2 * options.order
     return _too_few(found, needed) if 2 * found < needed else None
 
 
-def _against_periods(
+def _objection_to_periods(
     records: Sequence[Record], train: slice, options: Options
 ) -> str | None:
     del train, options
     if records[0].period is None:
         return "it needs a periodic record (--period)"
-    return _against_several_records(records)
+    return _several_records(records)
 
 
-def _against_preisach(
+def _objection_to_preisach(
     model: str, records: Sequence[Record], train: slice, options: Options
 ) -> str | None:
     del options
-    if against := _against_all_but_one(records):
-        return against
+    if objection := _objection_to_single(records):
+        return objection
     return None if cells_told_apart(records[0], train, model) else TOO_FEW[model]
 
 
-def _against_all_but_one(records: Sequence[Record]) -> str | None:
-    """Return what speaks against all but one record of one input and one output."""
-    return _against_several_records(records) or _several(records)
+def _objection_to_single(records: Sequence[Record]) -> str | None:
+    """Return the objection unless there is one record with one input and output."""
+    return _several_records(records) or _not_single_channel(records)
 
 
-def _against_several_records(records: Sequence[Record]) -> str | None:
+def _several_records(records: Sequence[Record]) -> str | None:
     return f"{len(records)} records; it takes one" if len(records) > 1 else None
 
 
-_AGAINST = {
-    "hysteretic_arma": _against_regression,
-    LINEAR: _against_state_space,
-    "bouc_wen": lambda *of: _against_periods(*of) or _several(of[0]),
-    "neural_state_space": _against_periods,
-    PLAIN: partial(_against_preisach, PLAIN),
-    RATE_DEPENDENT: partial(_against_preisach, RATE_DEPENDENT),
+_OBJECTIONS = {
+    "hysteretic_arma": _objection_to_regression,
+    LINEAR: _objection_to_state_space,
+    "bouc_wen": lambda *of: _objection_to_periods(*of) or _not_single_channel(of[0]),
+    "neural_state_space": _objection_to_periods,
+    PLAIN: partial(_objection_to_preisach, PLAIN),
+    RATE_DEPENDENT: partial(_objection_to_preisach, RATE_DEPENDENT),
 }
-"""What speaks against a model; one that is not here is tried on any record."""
+"""Functions that return why a model is not tried; without one it is always tried."""

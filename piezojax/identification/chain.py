@@ -1,4 +1,4 @@
-"""Models to fit: chains of parts in series, with an offset."""
+"""Chains of parts in series with an offset, as structures to fit."""
 
 from collections.abc import Mapping
 from itertools import product
@@ -16,17 +16,17 @@ from .estimators.structure import Structure
 from .records.record import Record
 
 LINEAR = ("dynamics", "lag", "delay")
-"""Places of linear dynamics, which a record must hold frequencies enough for."""
+"""Places of linear dynamics, whose parameters the record must excite."""
 
 DEFAULT = "shaped_coleman_hodgdon+exponential_creep+lag"
-"""The model that is fitted if none is named."""
+"""Model that is fitted by default."""
 
 
 def chain(name: str) -> list[str]:
     """Return the parts of a model such as ``"coleman_hodgdon+logarithmic_creep+lag"``.
 
     A hysteresis by itself is followed by a lag, unless it contains dynamics. Raises
-    ValueError for a part that is not known, or for two in one place.
+    ValueError for an unknown part or for two parts in one place.
     """
     known = known_parts()
     parts = [part.strip() for part in name.split("+")]
@@ -67,9 +67,9 @@ def extent_of(record: Record) -> Extent:
 
 
 def structure(name: str, record: Record) -> Structure:
-    """Return the chain ``name`` with starts and bounds that suit ``record``.
+    """Return the chain ``name`` with starts and bounds derived from ``record``.
 
-    An offset of the output is always added. Raises ValueError as ``chain``.
+    An offset of the output is always added. Raises ValueError as for ``chain``.
     """
     extent = extent_of(record)
     known = known_parts()
@@ -92,7 +92,7 @@ def structure(name: str, record: Record) -> Structure:
         f"{place}.{path}": bound
         for place, part in parts.items()
         for path, bound in part.bounds.items()
-        # Of two gains in a row only the product shows in the record.
+        # The record determines only the product of gains in series.
         if f"{place}.{path}" not in gains[:-1]
     }
     space = space_of(bounds)
@@ -106,7 +106,7 @@ def structure(name: str, record: Record) -> Structure:
 
 
 def _starts(system: Series, space: Space, parts: Mapping[str, Recipe]) -> np.ndarray:
-    """Return every combination of the parts' alternatives, in the unit box."""
+    """Return all combinations of the parts' alternatives, as points of the unit box."""
     choices = [
         [
             {f"{place}.{path}": value for path, value in one.items()}

@@ -1,4 +1,4 @@
-"""Every model that records can support, fitted and judged side by side."""
+"""Comparison of all models that the records support."""
 
 import time
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from .ranking import RULE, ModelRanking, RankedModel, RankingReport, file_name
 from .records.record import Record
 
 KEPT = 2
-"""Chains with a hysteresis that go on to each further round."""
+"""Number of chains with a hysteresis that enter each further round."""
 
 
 def identify_all(
@@ -29,16 +29,16 @@ def identify_all(
 ) -> ModelRanking:
     """Fit every model that ``records`` support, and choose one by RULE.
 
-    First each hysteresis (of those named, if any) with the richest creep and dynamics
-    that the records can show, a linear model and the models that are no chain; then the
-    best few with other creeps or none, and with simpler dynamics. A model that fails is
-    a row of the report, as is one that the records cannot support. Parts as in
-    ``identify``;
-    without ``train`` and ``validate`` they are the halves of what comes before
-    ``test``. Ctrl-C ends the search and keeps what is fitted.
+    The first round fits each hysteresis (only the named ones, if any are named) with
+    the richest creep and dynamics that the records support, a linear model, and the
+    models that are no chains of parts. Further rounds fit the best few with other
+    creeps or none, and with simpler dynamics. Failed and unsupported models are rows of
+    the report. ``train`` and ``validate`` are as in ``identify``; left out, they are
+    the halves of the samples before ``test``. Ctrl-C ends the search and keeps the
+    models fitted so far.
 
-    Raises ValueError as ``identify`` for records and parts, for a ``test`` that shares
-    samples with the others, and when no model can be fitted.
+    Raises ValueError as ``identify`` does for records and parts, for a ``test`` that
+    shares samples with the other parts, and if no model can be fitted.
     """
     began = time.perf_counter()
     records = (records,) if isinstance(records, Record) else tuple(records)
@@ -54,9 +54,13 @@ def identify_all(
     try:
         search.fit(first, total)
         for later in rounds:
-            twins = search.twins()
+            duplicates = search.duplicates()
             chains = _chains(
-                [Candidate(model) for model in search.ranked() if model not in twins]
+                [
+                    Candidate(model)
+                    for model in search.ranked()
+                    if model not in duplicates
+                ]
             )
             search.fit(
                 [c for c in later(chains[:KEPT]) if c.model not in search.fits], total
@@ -71,11 +75,11 @@ def identify_all(
             "; ".join(f"{one.model}: {one.reason}" for one in untried)
         )
         raise ValueError(f"no model could be fitted ({why})")
-    return _judged(search, untried, test, interrupted, time.perf_counter() - began)
+    return _ranking_of(search, untried, test, interrupted, time.perf_counter() - began)
 
 
 def _chains(candidates: Sequence[Candidate]) -> list[str]:
-    """Return the models that are chains with a hysteresis."""
+    """Return the names of the candidates that are chains with a hysteresis."""
     names = at("hysteresis")
     return [c.model for c in candidates if c.model.split("+")[0] in names]
 
@@ -103,8 +107,8 @@ def _split(
     return train, validate, test
 
 
-class _Numbered:
-    """Progress that says which model of how many is meant."""
+class _LabelledProgress:
+    """Progress whose stages are labelled with the number and name of the model."""
 
     def __init__(self, progress: Progress, label: str):
         self._progress, self._label = progress, label
@@ -117,7 +121,7 @@ class _Numbered:
 
 
 class _Search:
-    """Fits so far, what failed, and what still waits."""
+    """Search state: fits, failed models and waiting candidates."""
 
     def __init__(
         self,
@@ -147,12 +151,12 @@ class _Search:
                     train=self.train,
                     validate=self.validate,
                     options=self._options,
-                    progress=_Numbered(self._progress, label),
+                    progress=_LabelledProgress(self._progress, label),
                 )
                 rmse = fit.report.train.rmse + fit.report.validation.rmse
                 if not np.isfinite(rmse):
                     raise ValueError("its free run is not finite")
-            # One model's failure, of whatever kind, must not cost the others.
+            # The failure of one model must not end the comparison.
             except Exception as error:
                 kind = "" if isinstance(error, ValueError) else type(error).__name__
                 note = ": ".join(text for text in (kind, str(error)) if text)
@@ -185,10 +189,10 @@ class _Search:
             for model, fit in self.fits.items()
         }
 
-    def twins(self) -> dict[str, str]:
-        """Return the models that are another way to write one, and that one.
+    def duplicates(self) -> dict[str, str]:
+        """Return each model that is equivalent to an earlier one, and that model.
 
-        In the order in which hysteresis parts are listed, not in that of the fits.
+        The order is that of the list of hysteresis parts, not that of the fits.
         """
         if not self.fits:
             return {}
@@ -204,13 +208,17 @@ class _Search:
         }
 
     def ranked(self) -> dict[str, bool]:
-        """Return whether each model validates as well as the best; best model first."""
+        """Return whether each model validates as well as the best, best model first."""
         if not self.fits:
             return {}
-        models, worth, twins = self._listed(), self.criteria(), self.twins()
-        # One model has one BIC, so that of its ways to be written the first is taken.
+        models, worth, duplicates = self._listed(), self.criteria(), self.duplicates()
+        # Equivalent models share their lowest BIC: the first listed ranks first.
         bics = [
-            min(worth[m].bic for m in models if twins.get(m, m) == twins.get(own, own))
+            min(
+                worth[m].bic
+                for m in models
+                if duplicates.get(m, m) == duplicates.get(own, own)
+            )
             for own in models
         ]
         errors = [self.fits[model].errors(self.validate) for model in models]
@@ -225,7 +233,7 @@ class _Search:
         )
 
 
-def _judged(
+def _ranking_of(
     search: _Search,
     untried: Sequence[Untried],
     test: slice | None,
@@ -234,12 +242,14 @@ def _judged(
 ) -> ModelRanking:
     ranked, worth = search.ranked(), search.criteria()
     fits = {model: search.fits[model] for model in ranked}
-    best, twins = next(iter(ranked)), search.twins()
+    best, duplicates = next(iter(ranked)), search.duplicates()
     rows = [
         RankedModel(
             model=model,
             status="fitted",
-            note=f"another way to write {twins[model]}" if model in twins else "",
+            note=f"another way to write {duplicates[model]}"
+            if model in duplicates
+            else "",
             parameters=fit.count,
             train_rmse=fit.report.train.rmse,
             validation_rmse=fit.report.validation.rmse,

@@ -1,10 +1,11 @@
-"""How much a fit is worth for its parameters: AIC, BIC, and which one to take.
+"""Model selection: AIC and BIC, equivalent models, and the ranking of fits.
 
-The errors of a free run are strongly autocorrelated: n samples are not n pieces of
-evidence. Counted as such, any parameter that takes a little off them would be "worth"
-it. The criteria therefore stand on an effective number of samples, as AIC does with a
-variance inflation factor (Lebreton et al. 1992, Ecol. Monogr. 62(1); Burnham and
-Anderson 2002, Model Selection, 2.5), one for all models: that of the best fit.
+The errors of a free run are strongly autocorrelated: n samples are fewer than n
+independent observations. With n samples counted, any parameter that lowers the error a
+little would lower the criteria. The criteria therefore count an effective number of
+samples, as AIC does with a variance inflation factor (Lebreton et al. 1992, Ecol.
+Monogr. 62(1); Burnham and Anderson 2002, Model Selection, 2.5). All models share the
+number of the best fit.
 """
 
 from collections.abc import Sequence
@@ -13,32 +14,33 @@ from typing import NamedTuple
 import numpy as np
 
 MARGIN = 2.0
-"""Standard errors by which a validation error must differ to count as worse."""
+"""Difference above which a validation error counts as worse, in standard errors."""
 
 BARE_MENTION = 2.0
-"""Difference of BIC that is not worth more (Kass and Raftery 1995, JASA 90(430))."""
+"""BIC difference "not worth more than a bare mention" (Kass and Raftery 1995, JASA
+90(430))."""
 
 SAME_RUN = 0.1
-"""Share of the rms error by which the free runs of one model may differ."""
+"""Largest difference of equivalent free runs, as a share of the rms error."""
 
 Errors = Sequence[np.ndarray]
 """Errors of a free run, [samples, p] for each record."""
 
 
 class Criteria(NamedTuple):
-    """AIC and BIC of one fit, both smaller for a better one."""
+    """AIC and BIC of a fit; smaller is better."""
 
     aic: float
     bic: float
 
 
 def correlation_time(signal: np.ndarray) -> float:
-    """Return in how many samples of ``signal`` [n] there is one independent of others.
+    """Return the number of samples of ``signal`` [n] per independent sample.
 
-    1 + 2 sum of the autocorrelation (Bayley and Hammersley 1946, J. R. Stat. Soc.
-    Suppl. 8(2)), summed as long as two neighbours in a row are above zero together
-    (Geyer 1992, Stat. Sci. 7(4), initial positive sequence): beyond, it is all noise.
-    Never below 1, for white noise 1.
+    The integrated autocorrelation 1 + 2 sum rho_k (Bayley and Hammersley 1946, J. R.
+    Stat. Soc. Suppl. 8(2)), at least 1 and 1 for white noise. The sum ends at the first
+    pair of neighbouring lags whose sum is not positive (Geyer 1992, Stat. Sci. 7(4),
+    initial positive sequence), beyond which the estimate is noise.
     """
     centred = np.asarray(signal, dtype=float) - np.mean(signal)
     n = centred.size
@@ -54,7 +56,7 @@ def correlation_time(signal: np.ndarray) -> float:
 
 
 def effective_samples(errors: Errors) -> np.ndarray:
-    """Return how many independent samples the ``errors`` are worth, [p]."""
+    """Return the effective number of independent samples of the ``errors``, [p]."""
     return np.sum(
         [
             [column.size / correlation_time(column) for column in record.T]
@@ -67,9 +69,10 @@ def effective_samples(errors: Errors) -> np.ndarray:
 def criteria(mean_squares: np.ndarray, samples: np.ndarray, count: int) -> Criteria:
     """Return AIC and BIC of Gaussian errors for a fit of ``count`` parameters.
 
-    ``mean_squares`` [p] over the training part, ``samples`` [p] the effective numbers:
-    ``sum(samples ln mean_squares)`` plus 2 (Akaike 1974) or ln(mean of samples)
-    (Schwarz 1978) for each parameter.
+    ``mean_squares`` [p] are those of the errors over the training part, ``samples`` [p]
+    the effective numbers of samples. Each criterion is ``sum(samples ln mean_squares)``
+    plus a penalty for each parameter: 2 (Akaike 1974) or ln(mean of samples) (Schwarz
+    1978).
     """
     squares = np.maximum(mean_squares, np.finfo(float).tiny)
     misfit = float(np.sum(samples * np.log(squares)))
@@ -78,11 +81,11 @@ def criteria(mean_squares: np.ndarray, samples: np.ndarray, count: int) -> Crite
 
 
 def as_good(errors: Errors, best: Errors) -> bool:
-    """Return whether ``errors`` are no larger than the ``best`` beyond chance.
+    """Return whether ``errors`` are not significantly larger than the ``best``.
 
-    The mean of the difference of their squares, sample by sample, is at most MARGIN of
-    its own standard errors, its correlation counted: what both models miss alike, such
-    as the noise, does not blur the comparison.
+    The test takes the mean difference of the squared errors, sample by sample. It must
+    be at most MARGIN of its standard errors, autocorrelation included. Errors common to
+    both models, such as noise, cancel in the difference.
     """
     difference = np.concatenate(
         [
@@ -99,10 +102,10 @@ def as_good(errors: Errors, best: Errors) -> bool:
 def ranking(
     bics: Sequence[float], validation: Sequence[Errors]
 ) -> tuple[list[int], list[bool]]:
-    """Return the order of the fits, best first, and which of them validate as well.
+    """Return the order of the fits, best first, and whether each is ``as_good``.
 
-    First those whose ``validation`` errors are no worse than the smallest, beyond
-    chance; among them, and among the others, the lowest BIC.
+    Fits whose ``validation`` errors are as good as the smallest come first. Both groups
+    are sorted by BIC, lowest first.
     """
     squares = [float(np.mean(np.concatenate(errors) ** 2)) for errors in validation]
     best = validation[int(np.argmin(squares))]
@@ -114,12 +117,13 @@ def ranking(
 def first_alike(
     bics: Sequence[float], counts: Sequence[int], errors: Sequence[Errors]
 ) -> list[int]:
-    """Return, for each fit, the first of the fits that is the same model.
+    """Return for each fit the index of the first fit that is equivalent to it.
 
-    Two ways to write one model, stops and plays say, have as many parameters and the
-    same free run, up to where their descents ended: runs less than SAME_RUN of the
-    smaller rms error apart, BIC less than BARE_MENTION. No record tells them apart, so
-    which one it is must not hang on rounding.
+    Two forms of one model, such as stops and plays, have the same number of parameters
+    and the same free run, except for the points at which their descents ended. Fits are
+    equivalent if their runs differ by less than SAME_RUN of the smaller rms error and
+    their BIC by less than BARE_MENTION. No record distinguishes such fits, so the
+    choice between them must not depend on rounding.
     """
     joined = [np.concatenate(one) for one in errors]
     found: list[int] = []

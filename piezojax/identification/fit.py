@@ -1,4 +1,4 @@
-"""From records to a plant: the verb ``identify``, its report, its warnings."""
+"""Identification of a plant from records: ``identify``, its report and warnings."""
 
 import time
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ from .records.checks import record_warnings
 from .records.record import Record
 
 POOR = 0.2
-"""A validation error above this share of the output's deviation gives a warning."""
+"""Validation error, as a share of the output's deviation, above which to warn."""
 
 
 class FitError(BaseModel):
     """RMS of the free-run simulation error over a part of the records.
 
-    ``rmse`` is that over all outputs, ``each`` has one an output.
+    ``rmse`` is the error over all outputs, ``each`` the error of each output.
     """
 
     rmse: float
@@ -33,7 +33,7 @@ class FitError(BaseModel):
 
 
 class FitReport(BaseModel):
-    """What a fit found: the content of ``fit.json``."""
+    """Report of a fit, the content of ``fit.json``."""
 
     model: str
     parameters: dict[str, FittedParameter]
@@ -49,8 +49,8 @@ class FitReport(BaseModel):
 class Spectra(NamedTuple):
     """Amplitudes [lines] of an output's sinusoids, without the mean.
 
-    ``frequency`` in Hz; ``measured`` and ``residual``, the free run less the record, in
-    the output's unit.
+    ``frequency`` is in Hz, ``measured`` and ``residual`` (free run minus record) in the
+    unit of the output.
     """
 
     frequency: np.ndarray
@@ -62,8 +62,8 @@ class Spectra(NamedTuple):
 class Fit:
     """A fitted plant, its report, the records and the simulated outputs (their unit).
 
-    ``system`` holds what was in force before the first record. ``count``: how many
-    parameters were fitted.
+    ``system`` holds the input in force before the first record. ``count`` is the number
+    of fitted parameters.
     """
 
     system: System
@@ -127,11 +127,12 @@ def identify(
     """Fit ``model`` to one record or to several with the same sample time.
 
     ``model`` is a chain of parts such as ``"prandtl_ishlinskii+logarithmic_creep+lag"``
-    (see ``--model help``) or one of the models of ``identify.METHODS``, ``method`` a
-    name there (left out, the first that can fit the model). Fitted over the samples
-    ``train`` of each record (its first half if left out), judged by its free run on
-    ``validate`` (the rest). Raises ValueError for an unknown model or method, an empty
-    part, records that do not go together, or when no start leads to a finite fit.
+    (see ``--model help``) or one of the models of ``identification.METHODS``.
+    ``method`` is a name in METHODS; left out, it is the first that can fit the model.
+    The model is fitted over the samples ``train`` of each record (the first half if
+    left out) and validated by its free run on ``validate`` (the rest if left out).
+    Raises ValueError for an unknown model or method, an empty part, records of
+    different sample time or units, or if no start leads to a finite fit.
     """
     began = time.perf_counter()
     chosen = method_for(model, method)
@@ -178,7 +179,7 @@ def identify(
 
 
 def check_together(records: tuple[Record, ...]) -> None:
-    """Raise ValueError unless there are records, of one sample time and units."""
+    """Raise ValueError unless all records have the same sample time and units."""
     if not records:
         raise ValueError("no record to fit a model to")
     for record in records[1:]:
@@ -199,7 +200,7 @@ def check_together(records: tuple[Record, ...]) -> None:
 def parts_of(
     samples: int, train: slice | None, validate: slice | None
 ) -> tuple[slice, slice]:
-    """Return the parts to fit and to judge on: halves where they are left out.
+    """Return the parts to fit and to validate on; left out, they are halves.
 
     Raises ValueError for a part that is empty or outside of the ``samples``.
     """

@@ -1,4 +1,4 @@
-"""The ways to fit a model to records, by name, behind one signature."""
+"""Methods of identification by name, with a common signature."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -24,10 +24,11 @@ from .records.record import Record
 from .records.resample import average_periods, resample, whole_periods
 
 AS_GOOD = 1e-3
-"""Starts whose mean square comes this close (as a share) to the best fit as well."""
+"""Relative excess of the mean square below which a fit equals the best one."""
 
 AMBIGUOUS = 0.01
-"""Share of its range over which a parameter of fits as good must differ to be said."""
+"""Spread of a parameter among equally good fits, as a share of its range, above which
+to warn."""
 
 Records = Sequence[Record]
 
@@ -43,7 +44,7 @@ def _free_runs(systems: Sequence[System], records: Records) -> tuple[np.ndarray,
 def _by_output_error(
     model: str, records: Records, train: slice, options: Options, progress: Progress
 ) -> Estimate:
-    # Bounds and starts, too, must not see what the fit is judged on.
+    # Bounds and starts must not depend on the validation part.
     seen = [record.until(train.stop) for record in records]
     shape = structure(model, max(seen, key=lambda record: record.span))
     optimum = output_error(
@@ -90,7 +91,7 @@ def _optimum_warnings(optimum: Optimum, steps: int) -> list[str]:
 
 
 def _by_regression(estimator: Callable) -> Callable[..., Estimate]:
-    """Return the method that fits (3.32) by ``estimator``."""
+    """Return the method that fits the model (3.32) by ``estimator``."""
 
     def estimate(model, records, train, options, progress) -> Estimate:
         del model, options
@@ -120,7 +121,7 @@ def _by_steady_state(
     record = _single(records)
     periods = whole_periods(record, train)
     period = record.period or 0
-    # The first holds the transient, unless it is all there is.
+    # The first period holds the transient; a single period is used as it is.
     one = average_periods(periods, skip=int(periods.samples > period))
     factor = options.oversample if model == "bouc_wen" else 1
     fine = resample(one, factor)
@@ -169,7 +170,7 @@ def _single(records: Records) -> Record:
 
 
 class Method(NamedTuple):
-    """What it is, the ``models`` it can fit (none: chains of parts), the fit itself."""
+    """Summary, names of the ``models`` (none: chains of parts) and fit of a method."""
 
     summary: str
     models: tuple[str, ...]
@@ -211,14 +212,14 @@ METHODS: dict[str, Method] = {
         _by_steady_state,
     ),
 }
-"""Methods by name; for a model that several can fit the first one is the default."""
+"""Methods by name; the first one that can fit a model is its default."""
 
 
 def method_for(model: str, name: str | None) -> Method:
     """Return the method ``name`` for ``model``, or the default for that model.
 
-    Raises ValueError, listing what there is, for a method that does not exist or cannot
-    fit the model.
+    Raises ValueError, listing the valid names, for a method that does not exist or
+    cannot fit the model.
     """
     able = [key for key, method in METHODS.items() if model in method.models]
     able = able or [key for key, method in METHODS.items() if not method.models]

@@ -14,14 +14,14 @@ RULE = (
     "part, with the effective number of samples; of several ways to write one model, "
     "the one listed first"
 )
-"""How the best model is chosen."""
+"""Rule for the choice of the best model."""
 
 
 class RankedModel(BaseModel):
     """Errors of a model of the ranking, or the reason why it has none.
 
-    ``parameters`` counts what was fitted; ``as_good``: validates as well as the best;
-    ``folder``: where its model.json and fit.json are.
+    ``parameters`` is the number of fitted parameters, ``as_good`` whether the model
+    validates as well as the best, ``folder`` the place of its model.json and fit.json.
     """
 
     model: str
@@ -40,11 +40,12 @@ class RankedModel(BaseModel):
 
 
 class RankingReport(BaseModel):
-    """Content of ``comparison.json``; ``rows`` best first, then the failed models.
+    """Content of ``comparison.json``.
 
-    ``test`` is the error of the best model on samples that neither a fit nor the choice
-    has seen, None if no such part was named. ``effective_samples`` (of ``samples``, for
-    each output) is what AIC and BIC count.
+    ``rows`` holds the fitted models, best first, then the failed and untried ones.
+    ``test`` is the error of the best model on samples used neither by a fit nor by the
+    choice, None without such a part. ``effective_samples`` (of ``samples``, for each
+    output) is the number that AIC and BIC count.
     """
 
     best: str
@@ -70,7 +71,7 @@ class ModelRanking:
 
     @property
     def best(self) -> Fit:
-        """The fit that was chosen."""
+        """Fit of the chosen model."""
         return self.fits[self.report.best]
 
 
