@@ -1,4 +1,4 @@
-"""What every method of identification takes and gives."""
+"""Options and results common to all methods of identification."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -19,22 +19,23 @@ class FittedParameter(BaseModel):
 
 
 EDGE = 1e-3
-"""How close to a bound, as a share of the range, a parameter lies at it."""
+"""Distance to a bound, as a share of the range, below which a parameter is at it."""
 
 
 def at_edge(name: str, place: float) -> list[str]:
-    """Return what to say of a parameter at ``place``, 0 to 1, in its range."""
+    """Return a warning if ``place``, from 0 to 1 in the range, is at a bound."""
     inside = EDGE <= place <= 1.0 - EDGE
     return [] if inside else [f"{name} lies at the edge of its bounds"]
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the methods may be told; each uses what it needs.
+    """Options of the methods; each method uses those that concern it.
 
-    ``order``: states of a linear model; ``window``: p, the past and future samples of
-    the Hankel-Toeplitz regression; ``oversample``: simulated samples for each of a
-    periodic record; ``steps``: most steps of a descent.
+    ``order`` is the number of states of a linear model, ``window`` the number p of past
+    and future samples in the Hankel-Toeplitz regression, ``oversample`` the number of
+    simulated samples per sample of a periodic record, ``steps`` the largest number of
+    steps of a descent.
     """
 
     order: int = 4
@@ -44,10 +45,10 @@ class Options:
 
 
 class LinearDetail(NamedTuple):
-    """What the pictures of a linear model show.
+    """Data for the plots of a linear model.
 
-    ``singular_values`` by input (or "" for all), of which ``order`` are kept;
-    ``measured``: the transfer matrix that ``model`` was fitted to, if one was.
+    ``singular_values`` are by input (or "" for all inputs); ``order`` of them are kept.
+    ``measured`` is the transfer matrix that ``model`` was fitted to, if any.
     """
 
     model: StateSpace
@@ -66,11 +67,11 @@ class LinearDetail(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A fitted system, its free run over every record [samples, p], what to say.
+    """A fitted system, its free run over every record [samples, p], and warnings.
 
-    ``order`` counts the parameters of linear dynamics that the records had to excite,
-    ``hysteresis`` tells whether they also had to show full cycles. ``count``: how many
-    parameters were fitted, where ``parameters`` does not name them all.
+    ``order`` is the number of parameters of linear dynamics that the records had to
+    excite. ``hysteresis`` is True if the records also had to hold full cycles.
+    ``count`` is the number of fitted parameters if ``parameters`` does not name all.
     """
 
     system: System
@@ -83,5 +84,5 @@ class Estimate(NamedTuple):
     count: int | None = None
 
     def counted(self) -> int:
-        """Return how many parameters were fitted."""
+        """Return the number of fitted parameters."""
         return len(self.parameters) if self.count is None else self.count

@@ -1,4 +1,4 @@
-"""From periodic records to an empirical transfer matrix and its noise."""
+"""Empirical transfer matrix of periodic records, and its noise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from ...core.system import System
 from ..records.record import Record
 
 EXCITED = 1e-4
-"""A line counts as excited from this share of the strongest line's input power on."""
+"""Least input power of an excited line, as a share of the strongest line."""
 
 INDEPENDENT = 1e-6
-"""Least ratio of the eigenvalues of the inputs' power at a line that can be solved."""
+"""Least eigenvalue ratio of the input power matrix of a line that can be solved."""
 
 
 CONFIDENCE = 1.96
-"""Deviations on either side that hold 95 % of normal errors."""
+"""Half-width of the 95 % interval of a normal error, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,9 @@ class EmpiricalResponse:
     """A measured transfer matrix, line by line.
 
     ``frequency`` [lines] in Hz; ``response`` [lines, p, m], outputs over inputs;
-    ``variance`` [lines, p, m] of each of its entries by the noise alone; ``power``
-    [lines, m, m], the weighted sum of the records' ``U U^H``, so that
-    ``2 sum tr(E power E^H)`` is the mean square that an error E of the response leaves
-    in the outputs; ``dt`` in s.
+    ``variance`` [lines, p, m] of its entries due to noise; ``power`` [lines, m, m], the
+    weighted sum of ``U U^H`` over the records; ``dt`` in s. An error E of the response
+    causes the mean-square output error ``2 sum tr(E power E^H)``.
     """
 
     frequency: np.ndarray
@@ -48,15 +47,15 @@ class EmpiricalResponse:
 def empirical_response(
     records: Sequence[Record], weights: Sequence[float] | None = None
 ) -> EmpiricalResponse:
-    """Return the transfer matrix that explains periodic ``records`` best, per line.
+    """Return the least-squares transfer matrix of periodic ``records``, per line.
 
-    Each record holds two or more periods in steady state; their mean is used and their
-    spread gives the noise. With as many records as inputs the matrix is ``G = Y U^-1``
-    (orthogonal inputs make it best), with more it is the least-squares solution in
-    which each record counts with its weight (1 if left out). Lines that no input
-    excites are left out. Raises ValueError for records without a period, with fewer
-    than two of them, of different kind, fewer than inputs, or whose inputs are not
-    independent.
+    Each record holds two or more periods in steady state. The estimate uses their mean;
+    their spread gives the noise. With as many records as inputs the matrix is
+    ``G = Y U^-1``, of least variance for orthogonal inputs. With more records it is the
+    least-squares solution with ``weights`` (1 by default). Lines that no input excites
+    are left out. Raises ValueError for records without a period, with fewer than two
+    periods, of different period, sample time or channels, for fewer records than
+    inputs, or for dependent inputs.
     """
     weights = [1.0] * len(records) if weights is None else weights
     _check_alike(records, weights)
@@ -67,7 +66,7 @@ def empirical_response(
     weight = np.asarray(weights, float)[:, None, None, None]
     power = np.sum(weight * _outer(inputs, inputs), axis=0)
     strength = np.real(np.trace(power, axis1=1, axis2=2))
-    strength[0] = 0.0  # a mean is an operating point, no response
+    strength[0] = 0.0  # the mean is the operating point, not a response
     lines = np.flatnonzero(strength > EXCITED * strength.max())
     power, inputs, outputs, noise = (
         power[lines],
@@ -97,7 +96,7 @@ def _periods(columns: np.ndarray, period: int) -> np.ndarray:
 
 
 def _spectra(record: Record) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean spectra [lines, channels] and the variance of the outputs' mean."""
+    """Return mean spectra [lines, channels] and the variance of the output means."""
     period = _period(record)
     inputs, outputs = (
         np.fft.rfft(_periods(columns, period), axis=1) / period
@@ -157,8 +156,8 @@ def periodic_errors(
 ) -> Float[np.ndarray, "records periods p"]:
     """Return the rms simulation error of each record, period and output, in its unit.
 
-    The model sees the inputs alone and starts at rest one period before the record, so
-    that it has settled when the record begins.
+    The model is driven by the inputs alone. It starts at rest one period before the
+    record, so that it has settled when the record begins.
     """
     run = eqx.filter_jit(_outputs)
     found = []

@@ -1,4 +1,4 @@
-"""Linear models of any number of inputs and outputs: the two methods that fit them."""
+"""Linear multivariable models, fitted by subspace or by frequency response."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ from .subspace import identify_channel
 
 
 class _Centre(NamedTuple):
-    """Means of the inputs [m] and outputs [p] that a linear model leaves out."""
+    """Means of the inputs [m] and outputs [p], removed before a linear fit."""
 
     input: np.ndarray
     output: np.ndarray
@@ -93,7 +93,7 @@ def by_frequency_response(
 ) -> Estimate:
     """Fit a state-space model to the transfer matrix of periodic records.
 
-    Raises ValueError as ``empirical_response`` and ``fit_response``.
+    Raises ValueError as ``empirical_response`` and ``fit_response`` do.
     """
     del model
     progress.stage("measuring the transfer matrix")
@@ -121,9 +121,9 @@ def by_frequency_response(
 def _without_feedthrough(
     model: StateSpace, measured: EmpiricalResponse, left: float
 ) -> StateSpace:
-    """Drop D where what it adds is no more than the mean square ``left`` by the fit.
+    """Set D to zero unless it adds more than the mean square ``left`` by the fit.
 
-    A held input reaches a sampled output a sample later, which a loop relies on.
+    A loop needs a held input to reach the sampled output one sample later.
     """
     D = np.asarray(model.D)
     added = 2.0 * np.real(np.einsum("pa,lab,pb->", D, measured.power, D))
@@ -136,7 +136,7 @@ def _without_feedthrough(
 def _run(
     model: StateSpace, inputs: Float[Array, "n m"], settle: int
 ) -> Float[Array, "n p"]:
-    """Free run from rest, after ``settle`` samples of the input have gone before."""
+    """Return the free run from rest, after the first ``settle`` inputs."""
     state = model.init(inputs[0])
     if settle:
         state, _ = simulate(model, inputs[:settle], state)
@@ -149,7 +149,7 @@ def _linear(
     warnings: list[str],
     centre: "_Centre",
 ) -> Estimate:
-    """Put a linear model into the form a loop takes: u(k) moves y(k+1)."""
+    """Return the estimate as a plant for a loop, in which u(k) moves y(k+1)."""
     stage = detail.model
     if np.any(np.asarray(stage.D)):
         warnings = [
@@ -167,7 +167,7 @@ def _linear(
         )
     }
     if stage.D.shape == (1, 1):
-        # A study's plant takes and gives numbers, not vectors of one.
+        # The plant of a study has scalar signals, not vectors of length 1.
         gain = float(stage.dc_gain()[0, 0])
         offset = float(centre.output[0] - gain * centre.input[0])
         system: System = series(
@@ -176,7 +176,7 @@ def _linear(
     else:
         system = plant
         warnings = [*warnings, "inputs and outputs are deviations from their means"]
-    # What a similarity of the states cannot change, and the means of the outputs.
+    # Count the parameters invariant under similarity, and the means of the outputs.
     outputs, inputs = stage.D.shape
     count = stage.order * (inputs + outputs) + np.count_nonzero(stage.D) + outputs
     return Estimate(

@@ -9,26 +9,26 @@ from ..records.record import Record
 from .structure import Structure
 
 SHARES = (0.25, 0.5, 0.75)
-"""Parts of the stiffness seen in the record that the hysteretic element may have."""
+"""Shares of the hysteretic element in the total stiffness, for the starts."""
 
 NU = 1.5
-"""Exponent of the starts."""
+"""Exponent nu of the starts."""
 
 WIDE = 100.0
-"""Upper bound of the bends, in bends of the starts: their unit depends on nu."""
+"""Upper bound of beta_gamma and beta_delta, as a multiple of the starts; their unit
+depends on nu."""
 
 
 def bouc_wen(record: Record) -> Structure:
     """Return a mass on a spring, a damper and a Bouc-Wen element, driven by a force.
 
-    The starts share out the stiffness of the best linear oscillator between the spring
-    and the element, whose loop bends over the displacements in the record in one of two
-    ways. Raises ValueError where no linear oscillator of positive mass and stiffness
-    comes close to the record.
+    The starts divide the stiffness of the best linear oscillator between the spring and
+    the element. The element's loop bends over the displacements in the record in one of
+    two shapes. Raises ValueError if the best linear oscillator does not have a positive
+    mass and stiffness.
     """
     mass, damping, stiffness = linear_oscillator(record)
-    # At the typical force the loop is to bend over the typical displacement; of the
-    # exponents in the box none is preferred.
+    # The bend makes the loop turn over at the typical force and displacement.
     displacement = float(np.std(record.output))
     bend = (0.5 * stiffness * displacement) ** (1.0 - NU) / displacement
     system = HystereticOscillator(
@@ -61,8 +61,8 @@ def bouc_wen(record: Record) -> Structure:
 def linear_oscillator(record: Record) -> tuple[float, float, float]:
     """Return mass (kg), damping (N s/m), stiffness (N/m) of the best linear oscillator.
 
-    Least squares of ``u = m y'' + c y' + k y`` over the frequencies that the input
-    holds, where a derivative is a product with i w.
+    Least squares of ``u = m y'' + c y' + k y`` in the frequency domain, at the
+    frequencies of the input. Raises ValueError for a mass or stiffness not above 0.
     """
     u, y = np.fft.rfft(record.input), np.fft.rfft(record.output)
     held = np.abs(u) > HELD * np.max(np.abs(u))
@@ -81,4 +81,4 @@ def linear_oscillator(record: Record) -> tuple[float, float, float]:
 
 
 HELD = 0.05
-"""Frequencies with this share of the input's largest line count as held by it."""
+"""Least amplitude of a frequency of the input, as a share of its largest line."""

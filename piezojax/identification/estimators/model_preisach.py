@@ -1,4 +1,4 @@
-"""Preisach models behind a lag, as fine as the record can tell their cells apart."""
+"""Fit of a Preisach model with a lag, with as many cells as the record determines."""
 
 import itertools
 from typing import NamedTuple
@@ -33,9 +33,9 @@ PLAIN, RATE_DEPENDENT = "preisach", "rate_dependent_preisach"
 """The models' names; the second one has two densities, blended by the rate."""
 
 CELLS = range(3, 11)
-"""Cells a side that a fit may have."""
+"""Allowed numbers of cells a side."""
 
-TOLD_APART = 1e-3
+LEAST_EFFECT = 1e-3
 """Least rms that the output changes by with weights moved by 1 um in all, shared out in
 whatever way shows least: below that, nanometres decide about tenths of a micrometre."""
 
@@ -45,13 +45,13 @@ TOO_FEW = {
     RATE_DEPENDENT: "turning points and paces of the training part do not tell even "
     f"the cells of two Preisach triangles with {CELLS[0]} a side apart",
 }
-"""Why a record supports no such model."""
+"""Reasons why a record supports no such model."""
 
 LAGS = (0.05, 50.0)
 """Bounds of the lag, samples."""
 
 LAG = 1.5
-"""Where the search for the lag begins, samples."""
+"""Start of the search for the lag, samples."""
 
 RATES = (0.1, 10.0)
 """Bounds of the rate at which both densities count alike, over the input's own: how
@@ -64,14 +64,14 @@ STEP = 1e-4
 """Share by which a lag or a rate is changed for the slope of the output by it."""
 
 ENDED = 1e-5
-"""Change of the logarithms at which their search ends: far below standard errors."""
+"""Change of the logarithms at which the search ends, far below standard errors."""
 
 STEPS = 20
-"""Most steps of that search."""
+"""Largest number of steps of that search."""
 
 
 class Chain(NamedTuple):
-    """A model and what follows it."""
+    """A Preisach model followed by a lag."""
 
     hysteresis: Model
     lag: FirstOrderLag
@@ -90,7 +90,7 @@ class Unknown(NamedTuple):
 
 
 class PreisachFit(NamedTuple):
-    """The plant, values and standard errors of its parameters by name, what to say."""
+    """Fitted plant, its parameters by name, their standard errors, and warnings."""
 
     system: Series
     values: dict[str, float]
@@ -99,30 +99,34 @@ class PreisachFit(NamedTuple):
 
 
 def cells_told_apart(record: Record, train: slice, model: str = PLAIN) -> int:
-    """Return how many cells a side the samples ``train`` can tell apart, 0 for none.
+    """Return the number of cells a side that the samples ``train`` determine, or 0.
 
-    Whatever the material remembers before the record.
+    It holds for any of the histories STARTS before the record.
     """
-    seen = _a_sample_later(record.until(train.stop))
+    seen = _delayed_input(record.until(train.stop))
     return next(
         (
             cells
             for cells in reversed(CELLS)
-            if all(_told_apart(seen, train, model, cells, start) for start in STARTS)
+            if all(
+                _distinguishable(seen, train, model, cells, start) for start in STARTS
+            )
         ),
         0,
     )
 
 
-def _told_apart(
+def _distinguishable(
     record: Record, train: slice, model: str, cells: int, start: str
 ) -> bool:
     shape = empty(record, cells, None, start)
     if model == RATE_DEPENDENT:
-        shape = RateDependentPreisach(shape, shape.weights, _pace(record), record.dt)
+        shape = RateDependentPreisach(
+            shape, shape.weights, _rms_rate(record), record.dt
+        )
     rows = responses(shape, record.input, None, train)
     strength = np.linalg.svd(rows - rows.mean(axis=0), compute_uv=False)
-    least = TOLD_APART * np.sqrt(len(rows))
+    least = LEAST_EFFECT * np.sqrt(len(rows))
     return len(rows) >= rows.shape[1] and bool(strength[-1] >= least)
 
 
@@ -138,7 +142,7 @@ def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:
     if not cells:
         raise ValueError(TOO_FEW[model])
     seen = record.until(train.stop)
-    problem = _Problem(seen, _a_sample_later(seen), train, cells)
+    problem = _Problem(seen, _delayed_input(seen), train, cells)
     unknowns = _unknowns(problem.shifted, model)
     ends = {start: problem.end(unknowns, start) for start in STARTS}
     start = min(STARTS, key=lambda start: ends[start].cost)
@@ -194,7 +198,7 @@ class _Problem(NamedTuple):
         return (np.column_stack(moved) - here[:, None]) / STEP
 
     def end(self, unknowns: list[Unknown], start: str) -> OptimizeResult:
-        """Return where the search ends, with one of the histories."""
+        """Return the result of the search with one of the histories."""
 
         def loss(logs: np.ndarray) -> float:
             return float(np.sum(self.reduced(logs, start) ** 2))
@@ -209,7 +213,7 @@ class _Problem(NamedTuple):
     def deviations(
         self, chain: Chain, searched: dict[str, float]
     ) -> list[float | None]:
-        """Return the standard errors of weights, lowest output and what is searched."""
+        """Return standard errors of weights, lowest output and searched parameters."""
         system = chain.system()
         left = self.errors(system)
         moved = [
@@ -226,7 +230,7 @@ class _Problem(NamedTuple):
 
 
 def _unknowns(record: Record, model: str) -> list[Unknown]:
-    """Return what the weights do not follow from, in the order of ``fitted``."""
+    """Return the parameters to search for, in the order of ``fitted``."""
     found = [
         Unknown(
             "lag.time_constant",
@@ -235,12 +239,12 @@ def _unknowns(record: Record, model: str) -> list[Unknown]:
         )
     ]
     if model == RATE_DEPENDENT:
-        pace = _pace(record)
-        firsts = tuple(pace * first for first in FIRST_RATES)
+        rate = _rms_rate(record)
+        firsts = tuple(rate * first for first in FIRST_RATES)
         found.append(
             Unknown(
                 "hysteresis.rate",
-                Range(RATES[0] * pace, RATES[1] * pace, "log", unit="V/s"),
+                Range(RATES[0] * rate, RATES[1] * rate, "log", unit="V/s"),
                 firsts,
             )
         )
@@ -271,13 +275,13 @@ def _at_edges(unknowns: list[Unknown], logs: np.ndarray) -> list[str]:
     ]
 
 
-def _pace(record: Record) -> float:
+def _rms_rate(record: Record) -> float:
     """Return how fast the input moves in the root mean square, V/s."""
     return float(np.sqrt(np.mean(np.diff(record.input) ** 2))) / record.dt
 
 
-def _a_sample_later(record: Record) -> Record:
-    """Return ``record`` with the input that a model has at each output.
+def _delayed_input(record: Record) -> Record:
+    """Return ``record`` with its input delayed by a sample.
 
     A plant maps u(k) to y(k+1).
     """

@@ -1,4 +1,4 @@
-"""Training a neural state space on one steady period of a record."""
+"""Training of a neural state space on one steady period of a record."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +10,13 @@ from ..records.record import Record
 from .steady_state import fit_steady_state
 
 LAGS = 12
-"""Samples of past and future that the linear start looks at."""
+"""Number of past and of future samples in the regression for the linear start."""
 
 RADIUS = 0.995
 """Largest modulus of a pole of the linear start."""
 
 WEAK = 1e-4
-"""Directions that the record excites less than this, as a share, are left out."""
+"""Relative excitation below which a direction is left out."""
 
 
 def fit_neural_state_space(
@@ -31,10 +31,11 @@ def fit_neural_state_space(
 ) -> NeuralStateSpace:
     """Fit a state space of ``order`` with ``neurons`` to ``record``, one steady period.
 
-    From each ``neural_start`` with the seeds ``seed``, ``seed + 1``, ...,
-    ``fit_steady_state`` moves all numbers, by the simulated output alone, and the best
-    is kept. Nothing of what made the record is known; it may have any number of inputs
-    and outputs. Raises ValueError as these two do, or if ``starts`` is below 1.
+    ``fit_steady_state`` fits all numbers to the simulated output, from each
+    ``neural_start`` with the seeds ``seed``, ``seed + 1``, ..., and the best fit is
+    returned. The fit uses no prior knowledge of the stage. The record may have any
+    number of inputs and outputs. Raises ValueError as these two functions do, or if
+    ``starts`` is below 1.
     """
     if starts < 1:
         raise ValueError(f"starts is {starts}; it must be at least 1")
@@ -52,12 +53,13 @@ def neural_start(
 ) -> NeuralStateSpace:
     """Return a stable linear model of one steady period, with unconnected neurons.
 
-    Subspace identification: least squares from ``LAGS`` past inputs and outputs, and as
-    many future inputs, to the future outputs; the principal directions of what the past
-    adds are the states, of unit deviation, and a second least squares gives A, B, C
-    (Van Overschee & De Moor 1996). What the neurons see is drawn by ``seed``; what they
-    add begins at zero. The record is taken as periodic. Raises ValueError unless
-    ``neurons`` is at least 1 and ``order`` lies between 1 and ``LAGS`` an output.
+    The linear model is found by subspace identification (Van Overschee & De Moor 1996).
+    Least squares predicts the future outputs from ``LAGS`` past inputs and outputs and
+    as many future inputs. The principal components of the past's contribution are the
+    states, with unit deviation. A second least squares gives A, B, C. ``seed`` draws
+    the input weights of the neurons; their output weights start at zero. The record is
+    treated as periodic. Raises ValueError unless ``neurons`` is at least 1 and
+    ``order`` lies between 1 and ``LAGS`` times the number of outputs.
     """
     inputs, outputs = record.inputs.shape[1], record.outputs.shape[1]
     if neurons < 1:

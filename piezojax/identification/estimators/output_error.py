@@ -1,4 +1,4 @@
-"""Fitting any System to records by its free-run simulation error."""
+"""Fit of any System to records by its free-run simulation error."""
 
 import itertools
 from collections.abc import Sequence
@@ -24,31 +24,33 @@ from ...solve.problem import Verdict, linearised
 from ..records.record import Record
 from .structure import Structure
 
-AT_ONCE = 4
-"""Starts that descend together in one program."""
+PARALLEL_STARTS = 4
+"""Number of starts that descend together in one program."""
 
 TRIAL_STEPS = 12
-"""Steps after which only the best starts go on."""
+"""Number of steps after which only the best starts continue."""
 
 TOLERANCE = 1e-10
-"""Relative change of the loss and of the point at which a start is done."""
+"""Relative change of loss and point below which a descent ends."""
 
 STALLED = Patience(14, share=1e-6)
-"""Steps in which the best mean square must fall by this share, or the fit has ended:
-where a parameter runs to its bound the point itself never comes to rest."""
+"""Steps within which the best mean square must fall by this share; otherwise the fit
+ends. A point with a parameter that tends to its bound does not converge by itself."""
 
 HOPELESS = 1e11
-"""A mean square this large stands for a simulation that is not finite."""
+"""Mean square from which on a simulation counts as not finite."""
 
 UNDETERMINED = 1e-12
-"""A parameter direction whose share of the Jacobian is below this is not determined."""
+"""Relative singular value of the Jacobian below which a direction is undetermined."""
 
 
 class Optimum(NamedTuple):
-    """Points the starts led to, best first: [starts, n] in the unit box, mean squares.
+    """Results of all starts, best first.
 
-    ``deviations``: standard errors at the best, None where a parameter is not
-    determined. ``finished``: whether the best start came to an end.
+    ``units`` [starts, n] are points in the unit box, ``losses`` their mean squares.
+    ``values`` and ``deviations`` are the parameters and standard errors of the best
+    point; an undetermined parameter has the deviation None. ``finished`` tells whether
+    the best descent ended by itself.
     """
 
     problem: "Problem"
@@ -61,10 +63,10 @@ class Optimum(NamedTuple):
 
 
 class Problem(eqx.Module):
-    """Records side by side: padded to one length, with weights that leave out the rest.
+    """Fit of one System to several records, padded to one length with zero weights.
 
-    ``which`` [records, n] tells which of the unknowns each record's parameters are:
-    all records share them but for what was in force before each began.
+    ``which`` [records, n] holds the indices of each record's parameters among the
+    unknowns. All records share them, except for the initial conditions of each.
     """
 
     system: System
@@ -85,7 +87,7 @@ class Problem(eqx.Module):
     def residuals(self, unknown: Float[Array, " unknowns"]) -> Float[Array, " all"]:
         """Return the weighted errors; their sum of squares is the mean square."""
         error = self.simulated(unknown) - self.outputs
-        # A start that diverges must not poison the others of its batch.
+        # A start that diverges must not affect the others of its batch.
         error = jnp.where(jnp.isfinite(error), jnp.clip(error, -1e6, 1e6), 1e6)
         return (self.weights * error).ravel()
 
@@ -104,7 +106,7 @@ def free_run(
 
 
 def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Free run from the rest point the model carries, or from the first input."""
+    """Return the free run from the rest input of the model, or from the first input."""
     return free_run(system, input, input_before(system, input[0]))
 
 
@@ -160,8 +162,8 @@ def output_error(
     """
     progress = progress or Silent()
     problem, names = problem_of(structure, records, train)
-    starts = _for_every_record(structure, problem)
-    width = min(AT_ONCE, len(starts))
+    starts = _starts_for_records(structure, problem)
+    width = min(PARALLEL_STARTS, len(starts))
     progress.stage(f"compiling the fit of {len(names)} parameters")
     descents = InStep(
         lambda units: _begin(problem, units),
@@ -185,8 +187,8 @@ def output_error(
     return Optimum(problem, names, units, losses, values, deviations, finished)
 
 
-def _for_every_record(structure: Structure, problem: Problem) -> np.ndarray:
-    """Return the starts with the values of its own for every record."""
+def _starts_for_records(structure: Structure, problem: Problem) -> np.ndarray:
+    """Return the starts, with the own parameters repeated for every record."""
     unknowns = int(np.max(problem.which)) + 1
     starts = np.empty((len(structure.starts), unknowns))
     for row in np.asarray(problem.which):

@@ -1,4 +1,4 @@
-"""Densities of Preisach models from a record, by non-negative least squares."""
+"""Fit of Preisach densities to a record by non-negative least squares."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ from ...hysteresis.rate_dependent_preisach import fast_share
 from ..records.record import Record
 
 LEAST_SLOPE = 0.01
-"""Slope after a turn, at least, over the mean slope of the record: see fit_preisach."""
+"""Least slope after a turn over the mean slope of the record: see fit_preisach."""
 
 
 def fit_preisach(
@@ -41,10 +41,10 @@ def fit_preisach(
     The record is taken to begin at rest, its memory by ``start``: ``"virgin"`` about
     the first input, or ``"saturated"``.
 
-    Cells that no turn of the input reaches are only told apart by ``smoothing``: its
+    Cells that no turn of the input reaches are determined only by ``smoothing``. Its
     square weighs the squared differences between neighbours against the mean squared
-    error, 0 for none. Weights on the diagonal are at least what gives 1 % of the
-    record's mean slope, so that the model has a continuous inverse.
+    error; 0 stands for none. Weights on the diagonal give at least 1 % of the mean
+    slope of the record, so that the model has a continuous inverse.
 
     Raises ValueError for an empty ``train``, limits that do not hold the record's
     input, ``cells`` or ``smoothing`` out of range, or an output that falls while the
@@ -88,7 +88,7 @@ def _filled(shape: Preisach, weights: np.ndarray, lowest: float) -> Preisach:
 def empty(
     record: Record, cells: int, limits: tuple[float, float] | None, start: str
 ) -> Preisach:
-    """Return a model with no weights for the input of ``record``, and its limits.
+    """Return a model with zero weights, with the limits and start for ``record``.
 
     Raises ValueError for less than one cell or limits that do not hold the input.
     """
@@ -139,7 +139,7 @@ def _densities(
     rough = np.kron(np.eye(count), rough)
     matrix = np.vstack([rows - centre, rough])
     right = np.append(wanted - wanted.mean(), np.zeros(len(rough))) - matrix @ least
-    # The triangle of the factorisation holds all that the search needs.
+    # The triangular factor gives the same solution with fewer rows.
     both = np.column_stack([matrix, right])
     small = np.asarray(np.linalg.qr(both, mode="r"))
     found = least + nnls(small[:, :-1], small[:, -1], maxiter=100 * least.size)[0]
@@ -162,7 +162,7 @@ def line_by_line(cells: int) -> list[tuple[int, int]]:
 
 
 class _Memory(System):
-    """The levels of a Preisach model, as an output."""
+    """The levels of a Preisach model as its output."""
 
     lines: PlayLines
 
@@ -186,7 +186,7 @@ def responses(
     dynamics: ARMA | None,
     part: slice,
 ) -> np.ndarray:
-    """Return what a weight of 1 um in each cell puts out over ``part``, a column each.
+    """Return the output over ``part`` of 1 um in each cell, one column a cell.
 
     Cells ``line_by_line``, first those of the slow density, then of a fast one.
     """
@@ -218,7 +218,7 @@ def _passed(signals: np.ndarray, dynamics: ARMA | None) -> np.ndarray:
 def _differences(places: list[tuple[int, int]]) -> np.ndarray:
     """Return the matrix of differences between neighbours off the diagonal.
 
-    The diagonal is not smoothed into the rest: it is what has no hysteresis.
+    The diagonal, which has no hysteresis, is smoothed only along itself.
     """
     index = {place: at for at, place in enumerate(places)}
     rows = []

@@ -1,4 +1,4 @@
-"""The regression of chapter 3 sample by sample, with forgetting."""
+"""Recursive regression of the model of chapter 3, with forgetting."""
 
 from typing import NamedTuple
 
@@ -19,9 +19,9 @@ from .regressors import Orders
 
 
 class Measured(NamedTuple):
-    """What is known at sample k: ``voltage`` u(k-1) in V, ``displacement`` z(k) in um.
+    """Signals known at sample k: ``voltage`` u(k-1) in V, ``displacement`` z(k) in um.
 
-    A controller finds both in its ``Observation``: ``applied`` and ``measured``.
+    They are ``applied`` and ``measured`` in a controller's ``Observation``.
     """
 
     voltage: ScalarLike
@@ -33,7 +33,7 @@ REST = Measured(0.0, 0.0)
 
 
 class RecursiveState(NamedTuple):
-    """Coefficients, a root of their covariance (S S' = P) and the row's memory."""
+    """Coefficients, a root S of their covariance P = S S', and past regressors."""
 
     theta: Float[Array, " n"]
     root: Float[Array, "n n"]
@@ -45,11 +45,11 @@ class RecursiveState(NamedTuple):
 class RecursiveLeastSquares(System):
     """Recursive least squares for the coefficients of a ``HystereticARMA``.
 
-    Input ``Measured``, output the ``HystereticARMA`` known after it; give a loop its
-    step to follow a plant that changes. ``c`` (1/V) is not estimated: take it from a
-    fit. ``forgetting`` lambda in (0, 1]: a sample n samples old counts lambda^n.
-    ``prior`` is the variance of every coefficient before the first sample; the larger,
-    the less the start (zero) counts. The covariance is carried as its square root
+    The input is ``Measured``, the output the estimated ``HystereticARMA``. In a loop
+    the steps follow a plant that changes. ``c`` (1/V) is not estimated: take it from a
+    fit. ``forgetting`` is lambda in (0, 1]: a sample n samples old has the weight
+    lambda^n. ``prior`` is the variance of every coefficient before the first sample;
+    the larger, the weaker the start at zero. The covariance is carried as a square root
     (Potter's update), which stays positive over any run. Without noise, or at
     lambda = 1 and a large prior, the result is that of ``least_squares``, its bias
     under noise included.
@@ -73,7 +73,7 @@ class RecursiveLeastSquares(System):
         self._operators()
 
     def init(self, input: Measured = REST) -> RecursiveState:
-        """Return the start: nothing known, the plant at rest under ``input``."""
+        """Return the state at zero coefficients, the plant at rest under ``input``."""
         size = self._structure().size
         hysteresis, now = self._operate(None, input.voltage)
         return RecursiveState(
@@ -118,10 +118,10 @@ class RecursiveLeastSquares(System):
 def recursive_least_squares(
     record: Record, estimator: RecursiveLeastSquares
 ) -> HystereticARMA:
-    """Run ``estimator`` over ``record``; the plant is taken to begin at rest.
+    """Run ``estimator`` over ``record``; the plant must begin at rest.
 
-    Returns the models sample by sample: a ``HystereticARMA`` whose numbers have a
-    leading axis [samples - 1]; the first is that after the second sample.
+    Returns the models of all samples as a ``HystereticARMA`` whose numbers have a
+    leading axis [samples - 1]. The first model is that after the second sample.
     """
     seen = Measured(jnp.asarray(record.input[:-1]), jnp.asarray(record.output[1:]))
     first = Measured(record.input[0], record.output[0])

@@ -1,9 +1,9 @@
-"""Chapter 3: the ARMA-based hysteresis model from a record, by linear regression.
+"""Linear regression of the ARMA-based hysteresis model of chapter 3.
 
-For a given c of the hysteresis the model (3.32) is linear in its other parameters; c is
-searched for on a line, judged by the free-run simulation (the one-step error hardly
-sees it). Plain least squares takes the measured output as a regressor, so noise on that
-output biases the poles; instrumental variables take the simulated output in its place.
+For a given c of the hysteresis, the model (3.32) is linear in its other parameters. A
+line search finds the c with the least free-run error; the one-step error is
+insensitive to c. Plain least squares takes the measured output as a regressor, so that
+noise on it biases the poles. Instrumental variables use the simulated output instead.
 """
 
 from collections.abc import Callable
@@ -26,22 +26,22 @@ from .output_error import HOPELESS, free_run
 from .regressors import Orders, operated, row_matrix, rows
 
 GRID = 9
-"""Values of c on the coarse grid, in equal ratios between its bounds."""
+"""Number of values of c on the coarse grid, in equal ratios between its bounds."""
 
 PASSES = 10
-"""Most rounds of instrumental variables for one value of c."""
+"""Largest number of rounds of instrumental variables for one value of c."""
 
 CONVERGED = 1e-7
-"""Largest relative change of the autoregressive part that ends the rounds."""
+"""Relative change of the autoregressive part below which the rounds end."""
 
 
 @dataclass(frozen=True)
 class Estimate:
     """A fitted model, um from V.
 
-    ``simulation_rms`` and ``one_step_rms`` (unit of the output) are errors over the
-    training part: of the free run, and of the prediction one sample ahead.
-    ``standard_errors`` has the model's own shape, NaN where theory gives none.
+    ``simulation_rms`` and ``one_step_rms`` (unit of the output) are the errors of the
+    free run and of the one-step prediction over the training part. ``standard_errors``
+    has the structure of the model, with NaN where theory gives none.
     """
 
     model: HystereticARMA
@@ -57,14 +57,14 @@ def least_squares(
     train: slice | None = None,
     c: float | tuple[float, float] | None = None,
 ) -> Estimate:
-    """Fit by ordinary least squares (3.35) over the samples ``train`` (all of them).
+    """Fit by ordinary least squares (3.35) over the samples ``train`` (all by default).
 
-    ``c`` (1/V) is a number to keep or the bounds to search between; left out, they span
-    a memory of 1/20 to 100 widths of the input. Consistent only without noise on the
-    output: the standard errors assume a white equation error, and noise on the output
-    makes them far too small; prefer ``instrumental_variables``. None is given for c.
-    Raises ValueError for an empty part, c out of range, or an input that does not tell
-    the coefficients apart.
+    ``c`` (1/V) is a fixed number or a pair of search bounds. By default the bounds span
+    a memory of 1/20 to 100 ranges of the input. The estimate is consistent only without
+    noise on the output. The standard errors assume a white equation error; noise on the
+    output makes them far too small, so prefer ``instrumental_variables``. c has no
+    standard error. Raises ValueError for an empty part, c out of range, or an input
+    that does not determine the coefficients.
     """
     problem = _Problem(record, structure or Orders(), _part(record, train))
     c, theta = _search(problem, problem.least_squares, c)
@@ -80,11 +80,12 @@ def instrumental_variables(
 ) -> Estimate:
     """Fit by refined instrumental variables; arguments as in ``least_squares``.
 
-    Rows and outputs are filtered by the inverse denominator, the instruments are the
-    same rows with the free run of the last model in place of the measured output; from
-    least squares on, until the denominator rests (Young and Jakeman, Int. J. Control
-    29, 1979). White noise on the output then biases nothing, and the result is as sharp
-    as the output-error fit, whose standard errors s^2 (J'J)^-1 are given, c included.
+    Rows and outputs are filtered by the inverse denominator. The instruments are the
+    same rows with the free run of the last model in place of the measured output. The
+    iteration starts at least squares and ends when the denominator has converged (Young
+    and Jakeman, Int. J. Control 29, 1979). White noise on the output then causes no
+    bias, and the variance equals that of the output-error fit, whose standard errors
+    s^2 (J'J)^-1 are returned, c included.
     """
     problem = _Problem(record, structure or Orders(), _part(record, train))
     c, theta = _search(problem, problem.refined, c)
@@ -101,7 +102,7 @@ def _part(record: Record, train: slice | None) -> slice:
 
 
 class _Problem:
-    """One record, one structure, one part to fit on: theta for any c."""
+    """Regression problem of one record, structure and training part, for any c."""
 
     def __init__(self, record: Record, structure: Orders, part: slice):
         samples = part.stop - part.start
@@ -118,7 +119,7 @@ class _Problem:
         return _solve(matrix, matrix, self.record.output[self.part])
 
     def refined(self, c: float, theta: np.ndarray | None = None) -> np.ndarray:
-        """Return theta for c, from ``theta`` or least squares on."""
+        """Return theta for c, iterated from ``theta`` or from least squares."""
         theta = self.least_squares(c) if theta is None else theta
         order = self.structure.autoregressive
         hysteresis = operated(self.record, c, self.structure)
@@ -127,7 +128,7 @@ class _Problem:
             theta = _stable(theta, order)
             run = self.simulated(c, theta)
             denominator = np.concatenate([[1.0], -theta[:order]])
-            # The measured output starts at rest where the run does, free of noise.
+            # The filtered output starts at the noise-free rest point of the run.
             start = np.array([run[0], run[0], *hysteresis[:, 0]])[:, None]
             signals = np.array([self.record.output, run, *hysteresis])
             moving = scipy.signal.lfilter([1.0], denominator, signals - start)
@@ -144,11 +145,11 @@ class _Problem:
         return theta
 
     def error(self, c: float, theta: np.ndarray) -> np.ndarray:
-        """Free-run error over the training part."""
+        """Return the free-run error over the training part."""
         return (self.simulated(c, theta) - self.record.output)[self.part]
 
     def simulated(self, c: float, theta: np.ndarray) -> np.ndarray:
-        """Free run over the whole record, [samples]."""
+        """Return the free run over the whole record, [samples]."""
         run = _simulated(self.structure, as_array(c), as_array(theta), self.input)
         return np.asarray(run)
 
@@ -165,7 +166,7 @@ class _Problem:
         )
 
     def equation_errors(self, c: float, theta: np.ndarray) -> HystereticARMA:
-        """s^2 (W'W)^-1 at the given c; to first order for the offset."""
+        """Return errors by s^2 (W'W)^-1 at fixed c, to first order for the offset."""
         matrix = rows(self.record, c, self.structure, self.record.output)[self.part]
         error = matrix @ theta - self.record.output[self.part]
         covariance = _covariance(matrix, error)
@@ -176,7 +177,7 @@ class _Problem:
         return _refilled(model(theta), [np.nan, *deviations[1:]])
 
     def output_errors(self, c: float, theta: np.ndarray) -> HystereticARMA:
-        """s^2 (J'J)^-1, J the slopes of the free run."""
+        """Return errors from s^2 (J'J)^-1 with the Jacobian J of the free run."""
         model = self.structure.model(c, theta)
         jacobian = np.asarray(_slopes(model, self.input))
         covariance = _covariance(jacobian[self.part], self.error(c, theta))
@@ -189,7 +190,7 @@ def _simulated(structure, c, theta, input):
 
 
 def _free(model: HystereticARMA) -> list:
-    """Return the fitted numbers: all but the rest point."""
+    """Return the fitted numbers: all except the rest input."""
     return [
         model.c,
         *model.autoregressive,
@@ -200,7 +201,7 @@ def _free(model: HystereticARMA) -> list:
 
 
 def _refilled(model: HystereticARMA, values) -> HystereticARMA:
-    """Return ``model`` with its fitted numbers replaced, of any size or sign."""
+    """Return ``model`` with its fitted numbers replaced, unchecked."""
     leaves = [jnp.asarray(value) for value in values]
     return eqx.tree_at(
         lambda m: [*_free(m), m.rest_input], model, [*leaves, jnp.asarray(np.nan)]
@@ -221,12 +222,12 @@ def _solve(
 ) -> np.ndarray:
     """Return theta with ``instruments' (matrix theta - target) = 0``.
 
-    With an orthonormal base of the instruments and columns of equal length the
-    condition number is that of the rows, not its square.
+    An orthonormal base of the instruments and scaled columns keep the condition number
+    at that of the rows, not its square.
     """
     scale = np.linalg.norm(matrix, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
-    # Column by column in memory: four times as fast.
+    # Column-major order is four times as fast.
     columns = np.divide(instruments, scale, order="F")
     factors: Any = linalg.qr(
         columns, mode="economic", overwrite_a=True, check_finite=False
@@ -242,7 +243,7 @@ def _solve(
 
 
 def _stable(theta: np.ndarray, order: int) -> np.ndarray:
-    """Return ``theta`` with poles outside the unit circle mirrored into it."""
+    """Return ``theta`` with poles outside the unit circle reflected into it."""
     poles = np.roots([1.0, *-theta[:order]])
     if np.all(np.abs(poles) < 1.0):
         return theta
@@ -251,7 +252,7 @@ def _stable(theta: np.ndarray, order: int) -> np.ndarray:
 
 
 def _covariance(jacobian: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Return s^2 (J'J)^-1 of a white error, by the singular values of J."""
+    """Return s^2 (J'J)^-1 for a white error, by singular value decomposition."""
     scale = np.linalg.norm(jacobian, axis=0)
     _, values, base = np.linalg.svd(jacobian / scale, full_matrices=False)
     root = base.T / values / scale[:, None]
@@ -268,7 +269,7 @@ def _search(
     fit: Callable[..., np.ndarray],
     c: float | tuple[float, float] | None,
 ) -> tuple[float, np.ndarray]:
-    """Return c and theta of least free-run error: a grid, then Brent's method."""
+    """Return c and theta of least free-run error, by a grid and Brent's method."""
     if c is None:
         width = float(np.ptp(problem.record.input))
         c = (-20.0 / width, -0.01 / width)
@@ -284,7 +285,7 @@ def _search(
 
     def loss(c: float, theta: np.ndarray) -> float:
         mean_square = float(np.mean(problem.error(c, theta) ** 2))
-        # Finite, because the search does sums with it.
+        # The search computes with the loss, so it must be finite.
         return mean_square if mean_square < HOPELESS else HOPELESS
 
     grid = -np.geomspace(-lowest, -highest, GRID)

@@ -1,4 +1,4 @@
-"""The rows of chapter 3's regression, in which its model is linear."""
+"""Regressors of the linear regression in chapter 3 of the thesis."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -15,12 +15,12 @@ from ..records.record import Record
 
 
 class Orders(eqx.Module):
-    """What is fixed before a regression.
+    """Orders and options of a regression, fixed before the fit.
 
-    ``autoregressive`` and ``moving`` count the coefficients of the model;
-    ``rest_input`` (V) is where the hysteresis was virgin, ``scheme`` its
-    discretisation: "trapezoid", "quadratic" or, for the earlier model (2.11), "voros".
-    Raises ValueError for counts that no model has.
+    ``autoregressive`` and ``moving`` are the numbers of coefficients. ``rest_input``
+    (V) is the input at which the hysteresis was virgin. ``scheme`` is the
+    discretisation of the hysteresis: "trapezoid", "quadratic" or, for the earlier model
+    (2.11), "voros". Raises ValueError for orders below 1.
     """
 
     autoregressive: int = eqx.field(static=True, default=2)
@@ -38,7 +38,7 @@ class Orders(eqx.Module):
         return self.autoregressive + 2 * self.moving + 1
 
     def model(self, c: ScalarLike, theta: Iterable[Any]) -> HystereticARMA:
-        """Return the model of the coefficients ``theta``, in the order of ``rows``."""
+        """Return the model with the coefficients ``theta``, ordered as in ``rows``."""
         theta = tuple(theta)
         first = self.autoregressive
         second = first + self.moving
@@ -60,16 +60,16 @@ def rows(
     """Return the rows of (3.33), [samples, structure.size].
 
     Row k holds output(k-1), output(k-2), ...; y_1 at k-1, k-2, ...; y_2 likewise; and 1
-    for the offset. ``output`` [samples] is the measured one, or what stands in for it.
-    One sample lies between voltage and displacement, as in the loop, hence y(k-1) where
-    (3.33) has y(k). The record begins at rest: what would lie before it repeats its
-    first sample.
+    for the offset. ``output`` [samples] is the measured output or an instrument for it.
+    The displacement follows the voltage by one sample, as in the loop, so that the row
+    has y(k-1) where (3.33) has y(k). The record begins at rest: samples before it equal
+    its first sample.
     """
     return row_matrix(structure, output, operated(record, c, structure))
 
 
 def operated(record: Record, c: ScalarLike, structure: Orders) -> np.ndarray:
-    """Return y_1 and y_2, [2, samples]."""
+    """Return the outputs y_1 and y_2 of both operators, [2, samples]."""
     return np.asarray(_run(structure, as_array(c), jnp.asarray(record.input)))
 
 
@@ -82,7 +82,7 @@ def _run(structure, c, input):
 def row_matrix(
     structure: Orders, output: np.ndarray, hysteresis: np.ndarray
 ) -> np.ndarray:
-    """Return ``rows`` from given y_1 and y_2 [2, samples]."""
+    """Return ``rows`` from y_1 and y_2, [2, samples]."""
     counts = (structure.autoregressive, structure.moving, structure.moving)
     lagged = [
         _delayed(signal, lag)

@@ -1,4 +1,4 @@
-"""State-space models of a measured transfer matrix: a subspace start, then descent."""
+"""Fit of state-space models to a measured transfer matrix."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,10 +17,10 @@ from ...solve.problem import Verdict
 from .frequency import EmpiricalResponse
 
 STEPS = 20
-"""Most steps of the descent."""
+"""Largest number of steps of the descent."""
 
 ENOUGH = Patience(1, share=1e-4)
-"""A step that lowers the cost by less than this share is the last."""
+"""Relative decrease of the cost below which the descent ends."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ def fit_response(
     """Fit a stable model with ``order`` states to ``measured``.
 
     The cost is the mean square of the outputs' error under the records' own inputs, not
-    noise-weighted: what a simulation will be judged by. It starts at the subspace
+    noise-weighted, as in a validation by simulation. The fit starts at the subspace
     estimate of McKelvey, Akcay and Ljung (IEEE Trans. Automatic Control 41, 1996,
-    algorithm 1) with ``rows`` block rows, stabilised where need be, and is ``refined``
+    algorithm 1) with ``rows`` block rows, stabilised if necessary, and is ``refined``
     from there. Raises ValueError unless 1 <= order < rows * p, or for fewer lines than
     the block rows need.
     """
@@ -95,7 +95,7 @@ def _data(measured: EmpiricalResponse) -> _Data:
 
 
 def _observability(data: _Data, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Basis of the extended observability matrix, and the singular values."""
+    """Return a basis of the extended observability matrix, and singular values."""
 
     def stack(columns):
         powers = np.asarray(data.z) ** np.arange(rows)[:, None]
@@ -112,7 +112,7 @@ def _observability(data: _Data, rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _realised(basis: np.ndarray, measured: EmpiricalResponse) -> tuple[StateSpace, int]:
-    """Shift invariance gives A and C; B and D follow by linear least squares."""
+    """Return the model: A and C by shift invariance, B and D by least squares."""
     n, p = basis.shape[1], measured.response.shape[1]
     A, moved = reflected(np.linalg.lstsq(basis[:-p], basis[p:])[0])
     C, eye = basis[:p], np.eye(p)
@@ -164,7 +164,7 @@ def _modes_of(model: StateSpace) -> _Modes:
 
 
 def _pair(parts: Array, outputs: int) -> tuple[Array, Array, Array]:
-    """Pole, left [p] and right [m] of a complex pair."""
+    """Return pole, left [p] and right [m] of a complex pair."""
     pole = jax.nn.sigmoid(parts[0]) * jnp.exp(1j * parts[1])
     left, right = parts[2 : 2 + 2 * outputs], parts[2 + 2 * outputs :]
     return pole, _complex(left), _complex(right)
@@ -176,7 +176,7 @@ def _complex(parts: Array) -> Array:
 
 
 def _single(parts: Array, sign: Array, outputs: int) -> tuple[Array, Array, Array]:
-    """Pole, left [p] and right [m] of a real pole."""
+    """Return pole, left [p] and right [m] of a real pole."""
     return (
         sign * jax.nn.sigmoid(parts[0]),
         parts[1 : 1 + outputs],
@@ -185,7 +185,7 @@ def _single(parts: Array, sign: Array, outputs: int) -> tuple[Array, Array, Arra
 
 
 def _weighted(pole: Array, left: Array, right: Array, data: _Data) -> Array:
-    """One pole's share of the response, times root."""
+    """Return the contribution of one pole to the response, times root."""
     right = right @ data.root
     return left[:, None] * (right / (data.z - pole)[:, None])[:, None, :]
 
@@ -217,7 +217,7 @@ def _cost(modes: _Modes, data: _Data) -> Array:
 
 @jax.jit
 def _normal_equations(modes: _Modes, data: _Data) -> tuple[Array, Array]:
-    """Gradient and Gauss-Newton matrix of half the cost, unknowns as in ``_moved``."""
+    """Return gradient and Gauss-Newton matrix of half the cost, as in ``_moved``."""
     outputs, inputs = modes.feedthrough.shape
 
     def slopes(response):
@@ -241,7 +241,7 @@ def _normal_equations(modes: _Modes, data: _Data) -> tuple[Array, Array]:
 
 
 def _flat(slopes: Array) -> Array:
-    """Real rows, one an unknown, of slopes [..., lines, p, m]."""
+    """Return slopes [..., lines, p, m] as real rows, one for each unknown."""
     rows = slopes.reshape(-1, int(np.prod(slopes.shape[-3:])))
     return jnp.hstack([rows.real, rows.imag])
 
@@ -257,7 +257,7 @@ def _moved(modes: _Modes, change: np.ndarray) -> _Modes:
 
 
 def _descend(modes: _Modes, data: _Data, steps: int) -> tuple[_Modes, list[float]]:
-    """Damped Gauss-Newton from the normal equations, over the change of the modes."""
+    """Fit the modes by damped Gauss-Newton steps on the normal equations."""
 
     def linearise(change: np.ndarray) -> LocalModel:
         equations = _normal_equations(_moved(modes, change), data)
@@ -285,13 +285,13 @@ def _descend(modes: _Modes, data: _Data, steps: int) -> tuple[_Modes, list[float
         losses=losses,
     )
     descend(InThreads([descent]), steps, lambda standing: None)
-    # A last step without a gain is none.
+    # A last step without a decrease does not count.
     costs = losses[:-1] if len(losses) > 1 and losses[-1] == losses[-2] else losses
     return _moved(modes, descent.unit), costs
 
 
 def _model_of(modes: _Modes, dt: float) -> StateSpace:
-    """Block-diagonal model: a rotation a complex pair, a number a real pole."""
+    """Return the block-diagonal model of the modes."""
     outputs = len(modes.feedthrough)
     A, B, C = [], [], []
     for parts in modes.pairs:

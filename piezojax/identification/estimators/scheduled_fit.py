@@ -1,4 +1,4 @@
-"""Models that change with the drive level, from records at several levels."""
+"""Fit of amplitude-scheduled models to records at several drive levels."""
 
 from collections.abc import Sequence
 
@@ -17,13 +17,13 @@ def fit_scheduled(
     time_constant: float = 0.1,
     steps: int = STEPS,
 ) -> AmplitudeScheduled:
-    """Fit dynamics that follow the drive level to periodic records, grouped by level.
+    """Fit dynamics scheduled by drive level to periodic records, grouped by level.
 
-    Each level's model is ``refined`` from ``start``, one model for all of them, so that
-    their modes correspond and what lies between two levels is interpolated mode by
-    mode. A level is the rms of its records' inputs; ``time_constant`` (s) is that of
-    its measurement in the model. Levels may come in any order. Raises ValueError as
-    ``empirical_response`` and AmplitudeScheduled do.
+    The model of each level is ``refined`` from the common ``start``, so that modes
+    correspond and can be interpolated between two levels. The level is the rms of the
+    inputs of its records; ``time_constant`` (s) is that of the level's measurement in
+    the model. Levels may come in any order. Raises ValueError as ``empirical_response``
+    and AmplitudeScheduled do.
     """
     drive = [
         np.sqrt(np.mean([np.mean(record.inputs**2) for record in records]))

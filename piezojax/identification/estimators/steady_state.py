@@ -1,4 +1,4 @@
-"""Fitting a System to one period of its steady response to a periodic input."""
+"""Fit of a System to one period of its steady response to a periodic input."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,22 +21,23 @@ from ..records.record import Record
 from .structure import Structure
 
 DIVERGED = 1e6
-"""Error of a sample where the simulation is not finite."""
+"""Error that replaces that of a sample without a finite simulation."""
 
 TOLERANCE = 1e-9
-"""Relative change of the loss and of the parameters at which a start is done."""
+"""Relative change of loss and parameters below which a descent ends."""
 
 
 @eqx.filter_jit
 def steady_response(
     system: System, input: Float[Array, " n *m"], settle: int
 ) -> Float[Array, " n *p"]:
-    """Return what ``system`` puts out in one period of ``input``, repeated for long.
+    """Return the steady output of ``system`` over one period of ``input``.
 
-    The last ``settle`` samples of a period come first, from rest under 0, to let the
-    transient pass. As in the loop, input k moves the output that is sample k + 1.
+    The simulation starts at rest under 0. It runs over the last ``settle`` samples of
+    the period first, so that the transient decays. As in the loop, input k moves output
+    k + 1.
     """
-    # What is settled does not depend on the start: no derivative, no solver's failure.
+    # The settled state does not depend on the start, so it needs no derivative.
     state = jax.lax.stop_gradient(system).init(jnp.zeros_like(input[0]))
     if settle:
         state, _ = simulate(system, input[-settle:], state)
@@ -54,12 +55,13 @@ def fit_steady_state(
 ) -> tuple[Float[Array, " n"], np.ndarray]:
     """Fit the parameters of ``put(parameters)`` to ``record``, one steady period.
 
-    Levenberg-Marquardt with the forward Jacobian on the simulated output, each channel
-    as a share of its deviation, from all ``starts`` at once. ``settle`` samples, a
-    whole period if left out, come before the period. Returns the best parameters and
-    the root mean square error that each start led to, as a share; a start that diverges
-    spoils no other. Raises ValueError if the record is not exactly one period, if
-    ``settle`` is longer, or when no start leads to a finite simulation.
+    Levenberg-Marquardt with the forward Jacobian runs from all ``starts`` at once on
+    the output error of each channel, divided by the channel's standard deviation. The
+    period follows ``settle`` samples, a whole period by default. Returns the best
+    parameters and the relative root mean square error reached from each start. A start
+    that diverges does not affect the others. Raises ValueError if the record is not
+    exactly one period, if ``settle`` is longer than it, or if no start leads to a
+    finite simulation.
     """
     if record.period != record.samples:
         raise ValueError(
@@ -71,7 +73,7 @@ def fit_steady_state(
         raise ValueError(
             f"settle is {settle}; it must lie in 0..{record.samples}, within the period"
         )
-    # One channel as a plain signal: the Systems for one input and output take scalars.
+    # Systems with one input and output take scalars, so a single channel is flat.
     input, output = (
         jnp.asarray(columns[:, 0] if columns.shape[1] == 1 else columns)
         for columns in (record.inputs, record.outputs)
@@ -99,12 +101,12 @@ def fit_structure(
     settle: int | None = None,
     steps: int = 200,
 ) -> tuple[System, np.ndarray]:
-    """Fit ``structure``, from its own starts and inside its box; else as above.
+    """Fit ``structure`` from its starts, inside its box, as ``fit_steady_state`` does.
 
-    Returns the fitted system and the error that each start led to, as a share.
+    Returns the fitted system and the relative error reached from each start.
     """
     starts = jnp.clip(jnp.asarray(structure.starts), INSIDE, 1.0 - INSIDE)
-    # A Partial, not a closure: another record of that length is no new compilation.
+    # A closure would compile again for every record; a Partial does not.
     put = eqx.Partial(_inside, structure.space, structure.system)
     best, errors = fit_steady_state(
         put, unsquash(starts), record, settle=settle, steps=steps
@@ -125,15 +127,15 @@ class _Problem(eqx.Module):
     settle: int = eqx.field(static=True)
 
     def residuals(self, parameters: Array) -> Array:
-        """Return the errors, each channel as a share of its deviation."""
+        """Return the errors, each channel divided by its standard deviation."""
         found = steady_response(self.put(parameters), self.input, self.settle)
         error = (found - self.output) / jnp.std(self.output, axis=0)
         return jnp.where(jnp.isfinite(error), error, DIVERGED).ravel()
 
     def unit(self, start: Array) -> Array:
-        """Return the change of each parameter that changes the output by its deviation.
+        """Return the change of each parameter that moves the output by one deviation.
 
-        Marquardt's scaling: in raw parameters most starts stall half way.
+        This is Marquardt's scaling; without it most starts stall half way.
         """
         residuals = lambda parameters: self.residuals(parameters)  # noqa: E731
         reach = jnp.linalg.norm(jax.jacfwd(residuals)(start), axis=0)

@@ -1,4 +1,4 @@
-"""A model to fit: what every estimator of parameters in a box works on."""
+"""Structure: the input of estimators that search a box of parameters."""
 
 from typing import NamedTuple
 
@@ -11,8 +11,8 @@ from ...core.system import System
 class Structure(NamedTuple):
     """A model to fit: its System, the box of its parameters, starts in the box.
 
-    ``own`` holds the paths of which every record has its own value, ``order`` counts
-    the parameters of linear dynamics.
+    ``own`` holds the paths whose value differs from record to record. ``order`` is the
+    number of parameters of linear dynamics.
     """
 
     system: System

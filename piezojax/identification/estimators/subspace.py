@@ -31,17 +31,17 @@ Estimate = Callable[[Rows, Targets], Theta]
 def least_squares(X: Rows, Y: Targets, tolerance: float = 1e-15) -> Theta:
     """Return the smallest theta that fits ``Y = X theta^T`` best, (6.16).
 
-    Directions in which X is weaker than ``tolerance`` times its strongest are left out.
+    Directions of X below ``tolerance`` times the strongest one are left out.
     """
     return np.linalg.lstsq(X, Y, rcond=tolerance)[0].T
 
 
 def maximum_a_posteriori(X: Rows, Y: Targets, variance: float, prior: float) -> Theta:
-    """Return the most probable theta after all rows at once.
+    """Return the most probable theta given all rows.
 
-    ``variance``: of the errors (sigma); ``prior``: variance of theta's entries around
-    zero (P_0). Equal to ``recursive`` over the same rows: both are ridge regression
-    with the penalty ``variance / prior``.
+    ``variance`` is that of the errors (sigma), ``prior`` the variance of the entries of
+    theta around zero (P_0). The result equals that of ``recursive`` over the same rows:
+    both are ridge regression with the penalty ``variance / prior``.
     """
     penalty = variance / prior * np.eye(X.shape[1])
     return linalg.solve(X.T @ X + penalty, X.T @ Y, assume_a="pos").T
@@ -50,10 +50,9 @@ def maximum_a_posteriori(X: Rows, Y: Targets, variance: float, prior: float) -> 
 def recursive(
     X: Rows, Y: Targets, variance: float, prior: float
 ) -> tuple[Theta, Float[np.ndarray, "regressors regressors"]]:
-    """Return theta and its covariance P after one row after the other, (6.17)-(6.18).
+    """Return theta and its covariance P, updated row by row, (6.17)-(6.18).
 
-    Starts at theta_0 = 0 and P_0 = ``prior`` I. New rows may be added to the result at
-    any time: that is what the recursion is for.
+    The recursion starts at theta_0 = 0 and P_0 = ``prior`` I.
     """
     theta = np.zeros((Y.shape[1], X.shape[1]))
     P = prior * np.eye(X.shape[1])
@@ -93,14 +92,14 @@ def markov_parameters(theta: Theta, p: int) -> Float[np.ndarray, "count q"]:
     return total / np.bincount(lag.ravel())[:, None]
 
 
-def _most(count: int) -> int:
-    """Largest order that ``count`` Markov parameters of one input can hold."""
+def _largest_order(count: int) -> int:
+    """Return the largest order that ``count`` Markov parameters of one input allow."""
     return count // 2
 
 
 def _hankel(markov: Float[np.ndarray, "count q"], shift: int) -> np.ndarray:
-    """Hbar(shift): block (a, b) is h(a + b + shift), as square as the data allow."""
-    size = _most(len(markov))
+    """Return Hbar(shift), block (a, b) = h(a + b + shift), as square as possible."""
+    size = _largest_order(len(markov))
     lag = np.arange(size)[:, None] + np.arange(size) + shift
     return markov[lag].swapaxes(1, 2).reshape(size * markov.shape[1], size)
 
@@ -113,7 +112,7 @@ def hankel_singular_values(
 
 
 def order_at_gap(singular_values: Float[np.ndarray, " values"], most: int) -> int:
-    """Return the order up to ``most`` behind which the singular values drop most."""
+    """Return the order up to ``most`` after which the singular values drop most."""
     head = np.asarray(singular_values)[: most + 1]
     return int(np.argmin(head[1:] / head[:-1])) + 1
 
@@ -121,17 +120,17 @@ def order_at_gap(singular_values: Float[np.ndarray, " values"], most: int) -> in
 def realised(
     markov: Float[np.ndarray, "count q"], order: int, dt: float
 ) -> tuple[StateSpace, int]:
-    """Return the model with ``order`` states, D = 0, and how many poles were moved.
+    """Return the model with ``order`` states and D = 0, and the number of moved poles.
 
     The eigensystem realisation of Lemma 6.1, from the singular value decomposition of
     Hbar(0); poles outside the unit circle are reflected. Raises ValueError for an order
-    that the parameters cannot hold.
+    that the parameters do not allow.
     """
     first = _hankel(markov, 0)
-    if not 1 <= order <= _most(len(markov)):
+    if not 1 <= order <= _largest_order(len(markov)):
         raise ValueError(
             f"order is {order}; {len(markov)} Markov parameters allow "
-            f"1..{_most(len(markov))}"
+            f"1..{_largest_order(len(markov))}"
         )
     left, values, right = np.linalg.svd(first, full_matrices=False)
     root = np.sqrt(values[:order])
@@ -150,23 +149,24 @@ def realised(
 
 
 PRIOR = partial(maximum_a_posteriori, variance=1.0, prior=10.0)
-"""The estimate ``identify_channel`` uses unless told otherwise. Least squares without a
-prior fails on a chirp: above its last frequency nothing but noise speaks."""
+"""Default estimate of ``identify_channel``. Least squares without a prior fails on a
+chirp, because the record holds only noise above its last frequency."""
 
-OPEN = 1e-3
-"""Directions of the input weaker than this share of the strongest count as open."""
+UNEXCITED = 1e-3
+"""Strength of an input direction, as a share of the strongest, below which it counts as
+unexcited."""
 
-CLOSE = 1.1
-"""``choose`` takes the smallest model whose error is within this factor of the best."""
+TOLERATED = 1.1
+"""Factor of the best error within which ``choose`` takes the smallest model."""
 
 
 @dataclass(frozen=True)
 class ChannelFit:
     """A model of one input channel.
 
-    ``markov`` [3p-1, q]: the estimates it was realised from, C A^s B for s = 0, 1, ...;
-    ``singular_values`` of their Hankel matrix; ``notes``: one line each on poles that
-    had to be brought into the unit circle and on an input that leaves directions open.
+    ``markov`` [3p-1, q] are the estimates of C A^s B, s = 0, 1, ..., from which the
+    model is realised; ``singular_values`` are those of their Hankel matrix. ``notes``
+    are one-line warnings about reflected poles and unexcited input directions.
     """
 
     model: StateSpace
@@ -183,10 +183,10 @@ def identify_channel(
 ) -> ChannelFit:
     """Fit a model with ``order`` states to a record with one input.
 
-    Input and outputs are divided by the input's rms first, so that ``estimate`` and its
-    prior see numbers of order one where the gain is. Stack the models of all channels
-    with ``stacked``. Raises ValueError for a record with several inputs, a p of less
-    than 1 or too long for the record, or an order that p cannot hold.
+    Input and outputs are first divided by the rms of the input, so that a gain of order
+    one suits the prior of ``estimate``. Stack the models of all channels with
+    ``stacked``. Raises ValueError for a record with several inputs, a p below 1 or too
+    long for the record, or an order that p does not allow.
     """
     if not 1 <= p <= record.samples // 4:
         raise ValueError(
@@ -203,7 +203,7 @@ def identify_channel(
         )
     inputs = np.hstack([X[:, :p], X[:, -p:]])
     strength = np.linalg.svdvals(inputs)
-    excited = int(np.sum(strength > OPEN * strength[0]))
+    excited = int(np.sum(strength > UNEXCITED * strength[0]))
     if excited < 2 * p:
         notes.append(
             f"the input excites {excited} of the {2 * p} directions of {2 * p} "
@@ -217,7 +217,7 @@ def simulation_errors(
 ) -> Float[np.ndarray, " q"]:
     """Return the rms error of each output in a free run from rest, in its unit.
 
-    The run begins with the record; samples from ``start`` on count.
+    The run begins with the record; samples from ``start`` on enter the error.
     """
     simulated = np.asarray(_free_run(model, jnp.asarray(record.inputs)))
     error = (simulated - record.outputs)[start:]
@@ -231,10 +231,10 @@ def _free_run(model: StateSpace, inputs: Float[Array, "n m"]) -> Float[Array, "n
 
 @dataclass(frozen=True)
 class Choice:
-    """What ``choose`` found.
+    """Choice of p and order, the result of ``choose``.
 
-    ``errors`` [len(ps), len(orders)]: the norm of the outputs' rms errors as a share of
-    the largest span, infinite where p cannot hold the order.
+    ``errors`` [len(ps), len(orders)] is the norm of the outputs' rms errors as a share
+    of the largest span, infinite where p does not allow the order.
     """
 
     p: int
@@ -249,26 +249,26 @@ def choose(
     orders: Sequence[int],
     estimate: Estimate = PRIOR,
 ) -> Choice:
-    """Choose p and the order by the free-run error on a record not fitted.
+    """Choose p and the order by the free-run error on the record ``validate``.
 
-    Among the pairs within CLOSE of the best the smallest order wins, then the smallest
-    p. Outputs of different units are added up as they are.
+    Of the pairs within the factor TOLERATED of the best error, the smallest order is
+    taken, then the smallest p. Errors in different units are added without scaling.
     """
     most = max(orders)
     errors = np.full((len(ps), len(orders)), np.inf)
     for i, p in enumerate(ps):
         for j, order in enumerate(orders):
-            if order <= _most(3 * p - 1):
+            if order <= _largest_order(3 * p - 1):
                 model = identify_channel(train, p, order, estimate).model
                 error = simulation_errors(_padded(model, most), validate)
                 errors[i, j] = np.linalg.norm(error) / validate.spans.max()
-    close = errors <= CLOSE * errors.min()
+    close = errors <= TOLERATED * errors.min()
     order, p = min((orders[j], ps[i]) for i, j in np.argwhere(close))
     return Choice(p, order, errors)
 
 
 def _padded(model: StateSpace, order: int) -> StateSpace:
-    """The same model with idle states: one compilation serves all orders."""
+    """Return the model with idle states added, so that all orders compile once."""
     more = order - model.order
     return StateSpace(
         np.pad(model.A, (0, more)),
