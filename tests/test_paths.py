@@ -1,6 +1,6 @@
 """Parameters by name."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -15,7 +15,13 @@ from piezojax import (
 from piezojax.catalog import CONTROLLERS, PLANTS, p753
 from piezojax.control import PID, DisturbanceObserverControl
 from piezojax.core.arrays import as_array, as_scalars
-from piezojax.core.parameter import declarations, parameter, sample_time
+from piezojax.core.parameter import (
+    PartUnits,
+    declarations,
+    parameter,
+    sample_time,
+    substituted,
+)
 from piezojax.core.paths import (
     declared,
     get,
@@ -175,6 +181,97 @@ def test_declarations_know_the_nyquist_frequency():
     cutoff = dict(declarations(DisturbanceObserverControl))["cutoff"]
     assert cutoff.below_nyquist
     assert cutoff.below == np.inf
+
+
+@pytest.mark.parametrize(
+    ("unit", "units", "expected"),
+    [
+        ("[v]/[s]", {"v": "V", "s": "um/s"}, "V s/um"),
+        ("[v]/([s] s)", {"v": "V", "s": "um/s"}, "V/um"),
+        ("[v]/([s] s)", {"v": "V", "s": "um"}, "V/(um s)"),
+        ("[v] s/[s]", {"v": "um", "s": "um/s"}, "s^2"),
+        ("[v]/[s]", {"v": "um", "s": "um"}, "1"),
+        ("[v]/([s] s)", {"v": "um", "s": "um"}, "1/s"),
+        ("[v]/[s]^(1/2)", {"v": "V", "s": "um/s"}, "V s^(1/2)/um^(1/2)"),
+        ("[v]^2/[s]", {"v": "V/um^(1/2)", "s": "um^-1"}, "V^2"),
+        ("[v]/[s]", {"s": "um/s"}, "[v] s/um"),
+        ("um/V^(i+1)", {"v": "V"}, "um/V^(i+1)"),
+        ("[w]/um", {"v": "V"}, "[w]/um"),
+    ],
+)
+def test_units_are_substituted_and_cancelled(unit, units, expected):
+    assert substituted(unit, units) == expected
+
+
+class Gain(System):
+    """A gain between two units that the System around it knows."""
+
+    gain: Any = parameter("[v]/[s]", "gain")
+
+    def init(self, input=0.0):
+        return ()
+
+    def step(self, state, input):
+        return state, self.gain * input
+
+
+class Outer(System):
+    """A part whose input is a speed and whose output is that of the whole."""
+
+    part_units: ClassVar[PartUnits] = {"inner": {"s": "um/s", "v": "[u]"}}
+
+    inner: System
+
+    def init(self, input=0.0):
+        return self.inner.init(input)
+
+    def step(self, state, input):
+        return self.inner.step(state, input)
+
+
+def test_units_come_from_the_systems_around():
+    alone = Gain(1.0)
+    assert declared(alone, "gain") is dict(declarations(Gain))["gain"]
+    assert declared(Outer(alone), "inner.gain").unit == "[u] s/um"
+    loop = Feedback(Outer(alone), alone, Affine(), Affine())
+    assert declared(loop, "controller.inner.gain").unit == "V s/um"
+    # The plant is not within the controller.
+    assert declared(loop, "plant.gain").unit == "[v]/[s]"
+    # The disturbance observer commands its controller in um.
+    observed = p753.disturbance_observer()
+    nested = Feedback(
+        eqx.tree_at(lambda c: c.feedback, observed, Outer(alone)),
+        *(Affine() for _ in range(3)),
+    )
+    assert declared(nested, "controller.feedback.inner.gain").unit == "s"
+
+
+@pytest.mark.parametrize(
+    ("controller", "path", "unit"),
+    [
+        ("p753_sliding_mode", "law.proportional", "V s/um"),
+        ("p753_model_reference", "law.integral", "V/(um s)"),
+        ("p753_boundary_layer", "law.width", "um/s"),
+        ("p753_super_twisting", "law.sign_gain", "V/s"),
+        # Behind the observer and the inverse, commands are in um.
+        ("p753_disturbance_observer", "feedback.law.derivative", "s^2"),
+        ("p753_inversion", "feedback.law.proportional", "s"),
+        # Table 8-1 prints P without unit and I in 1/s.
+        ("p558_disturbance_observer", "Z.controller.feedback.law.proportional", "1"),
+        ("p558_disturbance_observer", "Z.controller.feedback.law.integral", "1/s"),
+    ],
+)
+def test_units_of_switching_laws(controller, path, unit):
+    loop = p753.loop(CONTROLLERS[controller]())
+    assert declared(loop, f"controller.{path}").unit == unit
+
+
+@pytest.mark.parametrize("controller", sorted(CONTROLLERS))
+def test_no_gain_of_a_loop_has_an_open_unit(controller):
+    loop = p753.loop(CONTROLLERS[controller]())
+    for path in matching(loop, "controller.*"):
+        known = declared(loop, path)
+        assert known is None or "[" not in known.unit
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""An inverse of the stage, learned while the loop runs and fed forward."""
+"""Adaptive inverse feedforward: an inverse of the stage learned in the loop."""
 
 from typing import NamedTuple
 
@@ -21,11 +21,12 @@ class TermsState(NamedTuple):
 
 
 class MotionTerms(System):
-    """Terms of the voltage that holds a position: y, dy/dt, d2y/dt2 and stops of y.
+    """Regressors of the voltage for a motion y: y, dy/dt, d2y/dt2 and stops of y.
 
     Input um; output um, um/s, um/s^2, and um for each of ``thresholds`` (um). A stop
-    operator follows the position and saturates at its threshold: the dual of the play
-    of a Prandtl-Ishlinskii model, whose inverse is a sum of both.
+    operator follows the position and saturates at its threshold. It is the dual of the
+    play operator: the inverse of a Prandtl-Ishlinskii model is a weighted sum of the
+    position and its stops.
     """
 
     thresholds: Row = parameter(
@@ -53,8 +54,11 @@ class MotionTerms(System):
 
 
 class AdaptiveInverseState(NamedTuple):
-    """Controller, learned weights, both motions with their filters, and what was fed
-    forward: the voltage (V) and the motion that it belongs to."""
+    """States of the controller, the weights, the motion terms and their filters.
+
+    ``feedforward`` is the last feedforward voltage in V, ``motion`` the terms of the
+    reference from which it was computed.
+    """
 
     controller: State
     weights: State
@@ -66,27 +70,27 @@ class AdaptiveInverseState(NamedTuple):
 
 
 class AdaptiveInverse(System):
-    """``u = share * (learned inverse of the reference) + controller(the rest)``.
+    """``u = share * (learned inverse of the reference) + controller(residual)``.
 
-    The voltage of a stage is taken as a weighted sum of its MotionTerms: position,
-    velocity, acceleration and stop operators, the inverse of gain, two poles and
-    hysteresis. The weights are learned from what was applied and measured, both through
-    the same double lag at ``cutoff``, by RecursiveWeights, and the weighted sum of the
-    reference's own terms is fed forward. So gain, poles and hysteresis need not be
-    known, and the feedback is left with what no model says. Sources: adaptive inverse
-    control, Widrow and Walach 1996; stop operators for the inverse of a hysteresis,
-    Kuhnen and Krejci 2007.
+    The voltage of a stage is modelled as a weighted sum of its MotionTerms: position,
+    velocity, acceleration and stop operators. They are the inverse of a gain, two poles
+    and a hysteresis. RecursiveWeights learns the weights from the applied voltage and
+    the measured displacement, both filtered by the same double lag at ``cutoff``. The
+    weighted sum of the reference's terms is fed forward. Gain, poles and hysteresis
+    need not be known, and the feedback corrects the remaining error. Sources: adaptive
+    inverse control, Widrow and Walach 1996; stop operators for the inverse of a
+    hysteresis, Kuhnen and Krejci 2007.
 
-    With a ``share`` of 0 only ``controller`` acts. It sees the rest of the reference,
-    and measurement and voltage without the part that was fed forward. Only changes of
-    the motion are fed forward, so a learned weight moves nothing at rest, and the
-    margins there are those of ``controller``. While the stage moves, learning is a slow
-    loop of its own that the margins do not show.
+    With a ``share`` of 0 only ``controller`` acts. It sees reference, measurement and
+    voltage less the part that was fed forward. Only changes of the motion are fed
+    forward, so a learned weight does not change the voltage at rest, and the stability
+    margins at rest are those of ``controller``. While the stage moves, learning forms a
+    second, slow loop that these margins do not include.
 
-    ``weights`` are in V/um, V s/um and V s^2/um, then V/um for each stop. The start
-    settles the voltage at zero. Input an Observation, output V, one axis.
+    ``weights`` are in V/um, V s/um and V s^2/um, then V/um for each stop. The offset of
+    the voltage is set by the start. Input an Observation, output V, one axis.
 
-    Raises ValueError for counts that do not match.
+    Raises ValueError for a parameter outside its limits or counts that do not match.
     """
 
     controller: System
@@ -110,7 +114,7 @@ class AdaptiveInverse(System):
     )
     equation_error: Scalar = parameter(
         "V",
-        "standard deviation of the rest of the relation",
+        "standard deviation of the residual of the relation",
         above=0.0,
         scale="log",
         typical=(1e-2, 1e2),
@@ -125,7 +129,7 @@ class AdaptiveInverse(System):
     dt: float = sample_time()
     share: Scalar = parameter(
         "1",
-        "share of the reference that the inverse carries",
+        "share of the reference that is fed forward",
         typical=(0.0, 1.0),
         default=1.0,
     )
@@ -165,8 +169,8 @@ class AdaptiveInverse(System):
         lag = FirstOrderLag(1.0 / self.cutoff, self.dt)
         return lag >> lag
 
-    def _rest(self, input: Observation, feedforward: Scalar) -> Observation:
-        """Return what is left for the controller."""
+    def _residual(self, input: Observation, feedforward: Scalar) -> Observation:
+        """Return the Observation of the controller: ``input`` less the feedforward."""
         fed = self.share * input.reference
         return Observation(
             reference=input.reference - fed,
@@ -179,16 +183,18 @@ class AdaptiveInverse(System):
         voltage = as_array(input.applied)
         motion, low_pass = self._motion(), self._filter()
         measured, reference = motion.init(input.measured), motion.init(input.reference)
-        _, seen = motion.step(measured, input.measured)
-        _, wanted = motion.step(reference, input.reference)
+        _, measured_terms = motion.step(measured, input.measured)
+        _, reference_terms = motion.step(reference, input.reference)
         offset = voltage - self.weights[0] * input.measured
         return AdaptiveInverseState(
-            controller=self.controller.init(self._rest(input, voltage)),
+            controller=self.controller.init(self._residual(input, voltage)),
             weights=self._learning(offset).init(),
             measured=measured,
-            filtered=tuple(low_pass.init(signal) for signal in (voltage, *seen)),
+            filtered=tuple(
+                low_pass.init(signal) for signal in (voltage, *measured_terms)
+            ),
             reference=reference,
-            motion=wanted,
+            motion=reference_terms,
             feedforward=voltage,
         )
 
@@ -196,33 +202,35 @@ class AdaptiveInverse(System):
         self, state: AdaptiveInverseState, input: Observation
     ) -> tuple[AdaptiveInverseState, Scalar]:
         motion, low_pass = self._motion(), self._filter()
-        # u(k-1) and z(k) belong together, as u(k) and r(k+1) do below.
-        measured, seen = motion.step(state.measured, input.measured)
-        passed = [
+        # u(k-1) moved the stage to z(k), as u(k) moves it to r(k+1) below.
+        measured, measured_terms = motion.step(state.measured, input.measured)
+        filtered = [
             low_pass.step(memory, signal)
             for memory, signal in zip(
-                state.filtered, (input.applied, *seen), strict=True
+                state.filtered, (input.applied, *measured_terms), strict=True
             )
         ]
-        voltage, *row = (signal for _, signal in passed)
+        voltage, *row = (signal for _, signal in filtered)
         learned, (_, *weights) = self._learning(as_array(0.0)).step(
             state.weights, ((jnp.ones(()), *row), voltage)
         )
-        controller, left = self.controller.step(
-            state.controller, self._rest(input, state.feedforward)
+        controller, correction = self.controller.step(
+            state.controller, self._residual(input, state.feedforward)
         )
-        reference, wanted = motion.step(state.reference, input.next_reference)
+        reference, reference_terms = motion.step(state.reference, input.next_reference)
         feedforward = state.feedforward + sum(
             weight * (new - old)
-            for weight, new, old in zip(weights, wanted, state.motion, strict=True)
+            for weight, new, old in zip(
+                weights, reference_terms, state.motion, strict=True
+            )
         )
         state = AdaptiveInverseState(
             controller,
             learned,
             measured,
-            tuple(memory for memory, _ in passed),
+            tuple(memory for memory, _ in filtered),
             reference,
-            wanted,
+            reference_terms,
             feedforward,
         )
-        return state, left + self.share * feedforward
+        return state, correction + self.share * feedforward

@@ -1,4 +1,4 @@
-"""Control allocation: a pose shared out among more actuators than it has axes."""
+"""Control allocation: the commands of redundant actuators for a pose."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from ..core.system import System
 from .box import MOST_ACTUATORS, Numbers, Problem, clipped, null_space, within
 
 METHODS = {"minimum_norm": clipped, "weighted": clipped, "bounded": within}
-"""Ways to allocate by name."""
+"""Allocation methods by name."""
 
 
 def _numbers(value: Any) -> Numbers:
@@ -32,11 +32,12 @@ def _rows(value: Any) -> tuple[Numbers, ...]:
 
 
 class Allocated(NamedTuple):
-    """What became of a wanted pose.
+    """Allocated commands, their pose, its error and the internal strain.
 
-    ``commands`` [actuators] and the ``pose`` [axes] that they make; ``error`` [axes],
-    wanted - made; ``internal`` [actuators - axes], the part of the commands that moves
-    nothing and only strains the stage, along an orthonormal basis of the null space.
+    ``commands`` [actuators] and the ``pose`` [axes] that they produce; ``error``
+    [axes], the wanted pose less ``pose``; ``internal`` [actuators - axes], the part of
+    the commands that strains the stage without moving it, in an orthonormal basis of
+    the null space.
     """
 
     commands: Float[Array, " actuators"]
@@ -48,30 +49,31 @@ class Allocated(NamedTuple):
 class Allocation(System):
     """Commands q within bounds for which ``geometry`` q is the wanted pose.
 
-    Input a pose [axes], output commands [actuators], in the units between which
-    ``geometry`` [axes, actuators] goes; ``lower`` and ``upper`` [actuators] in those of
-    the commands. There is no state. By ``method``:
+    Input a pose [axes], output commands [actuators]. ``geometry`` [axes, actuators]
+    maps commands to a pose and fixes the unit of both; ``lower`` and ``upper``
+    [actuators] are in the unit of the commands. There is no state. ``method`` is one of
 
-    - ``"minimum_norm"``: the pseudo-inverse, least sum q^2, cut off at the bounds as
-      the actuators would: the pose is then missed, even if other commands make it.
-    - ``"weighted"``: the same with least sum ``weights`` q^2.
-    - ``"bounded"``: of the commands within the bounds those with the least sum
-      ``axis_weights`` (pose - geometry q)^2, which is zero for every pose that can be
-      made, and of these the one with the least sum ``weights`` q^2: the
-      pseudo-inverse where it keeps the bounds, elsewhere shifted along the null space
-      by no more than it takes.
+    - ``"minimum_norm"``: the pseudo-inverse, which minimises sum q^2, clipped at the
+      bounds as actuators clip. A clipped command misses the pose, even where other
+      commands reach it.
+    - ``"weighted"``: the same with the minimum of sum ``weights`` q^2.
+    - ``"bounded"``: commands within the bounds that minimise first sum ``axis_weights``
+      (pose - geometry q)^2, which is zero for every reachable pose, and then sum
+      ``weights`` q^2. They equal the pseudo-inverse where it satisfies the bounds;
+      elsewhere they are shifted along the null space by the least amount.
 
-    Weights are 1 where left out. An actuator is locked if its bounds are equal (see
-    ``locked``): its effect is taken off the pose and the others make the rest.
+    Weights are 1 where left out. An actuator with equal bounds is locked (see
+    ``locked``): its effect is subtracted from the pose and the others produce the
+    remainder.
 
-    Nothing is iterated: the least-squares solution on each of the 3^n faces of the box
-    of bounds is a fixed matrix times the pose, and the best of those within bounds is
-    the answer. The matrices come from ``geometry`` and the weights when a program is
-    traced, so these are no parameters to differentiate (for a stage of another geometry
-    than was thought, change the stage's); pose and bounds are. The commands of
-    ``"bounded"`` are continuous in both, with kinks where the face changes.
+    There is no iteration: the least-squares solution on each of the 3^n faces of the
+    box of bounds is a fixed matrix times the pose, and the best one within the bounds
+    is returned. The matrices are computed from ``geometry`` and the weights at trace
+    time, so these are not parameters to differentiate; pose and bounds are. To study an
+    error of the geometry, change that of the stage. The commands of ``"bounded"`` are
+    continuous in pose and bounds, with kinks where the face changes.
 
-    The problem is that of Johansen and Fossen, "Control allocation - a survey",
+    The problem is stated by Johansen and Fossen, "Control allocation - a survey",
     Automatica 49 (2013). Raises ValueError for numbers that are not finite, weights
     that are not positive (or not equal with ``"minimum_norm"``), a lower bound above
     the upper, lengths that do not fit, a geometry of less than full rank or of more
@@ -139,16 +141,16 @@ class Allocation(System):
         return state, METHODS[self.method](problem, bounds, as_array(input))
 
     def allocate(self, pose: Float[ArrayLike, " axes"]) -> Allocated:
-        """Return the commands for ``pose`` with what they make of it."""
+        """Return the commands for ``pose`` with the pose and error that result."""
         _, commands = self.step((), pose)
-        made = jnp.array(self.geometry) @ commands
+        reached = jnp.array(self.geometry) @ commands
         internal = jnp.array(null_space(self.geometry)) @ commands
-        return Allocated(commands, made, as_array(pose) - made, internal)
+        return Allocated(commands, reached, as_array(pose) - reached, internal)
 
     def locked(self, actuator: int, at: ScalarLike) -> "Allocation":
-        """Return the same allocation with one actuator stuck ``at`` a command.
+        """Return the allocation with one actuator held ``at`` a constant command.
 
-        Raises ValueError for an actuator that is not there.
+        Raises ValueError for an index without an actuator.
         """
         count = len(self.geometry[0])
         if not 0 <= actuator < count:

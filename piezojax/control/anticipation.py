@@ -1,4 +1,4 @@
-"""A controller that is shown its reference a little ahead of time."""
+"""Reference anticipation: a controller that receives its reference early."""
 
 from typing import Any
 
@@ -9,24 +9,24 @@ from ..core.system import Observation, System
 
 
 class Anticipation(System):
-    """``controller``, shown the reference ``lead`` samples ahead.
+    """``controller`` with its reference advanced by ``lead`` samples.
 
-    A closed loop lags its reference by a time that its tuning fixes. A reference shown
-    earlier by the same time removes the lag and leaves the feedback, its noise and its
-    margins unchanged. A lead of 1 is r(k+1), which is known; a larger one extrapolates
-    the line through r(k) and r(k+1). 0 changes nothing. Input an Observation, output
-    the controller's.
+    A closed loop lags its reference by a time that its tuning fixes. A reference
+    advanced by the same time removes the lag and leaves the feedback, its noise and its
+    margins unchanged. A lead of 1 gives r(k+1), which is known; a larger one
+    extrapolates the line through r(k) and r(k+1); 0 gives r(k). Input an Observation,
+    output that of ``controller``.
     """
 
     controller: System
     lead: tuple[Scalar, ...] = parameter(
         "samples",
-        "how far ahead the reference is shown, an axis each",
+        "advance of the reference, one number an axis",
         typical=(-5.0, 30.0),
         converter=as_scalars,
     )
 
-    def _ahead(self, input: Observation) -> Observation:
+    def _advanced(self, input: Observation) -> Observation:
         now, following = input.reference, input.next_reference
         if isinstance(now, tuple):
             pairs = [
@@ -40,10 +40,10 @@ class Anticipation(System):
         return input._replace(reference=now, next_reference=following)
 
     def init(self, input: Observation) -> State:
-        return self.controller.init(self._ahead(input))
+        return self.controller.init(self._advanced(input))
 
     def step(self, state: State, input: Observation) -> tuple[State, Any]:
-        return self.controller.step(state, self._ahead(input))
+        return self.controller.step(state, self._advanced(input))
 
 
 def _shifted(now: Scalar, following: Scalar, samples: Scalar) -> Axes:

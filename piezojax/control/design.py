@@ -1,8 +1,8 @@
-"""First controllers for an identified plant: stable and slow, for tuning to improve.
+"""Initial controllers for an identified plant: stable and slow, a start for tuning.
 
 A design is a function of a plant, the sample time of the loop in s and the limits of
-the actuator in V; ``DESIGNS`` names it for studies. It takes what it needs of the plant
-from ``design_model``.
+the actuator in V. Studies select it by its name in ``DESIGNS``. Each design is based on
+the ``design_model`` of the plant.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ Limits = tuple[float, float]
 def inversion_sliding_mode(
     plant: System, dt: float, limits: Limits
 ) -> InversionControl:
-    """Return an inversion-based PID-SMC.
+    """Return an inversion-based PID-based sliding mode control (PID-SMC).
 
     Raises ValueError where the hysteresis has no inverse between ``limits`` (V), and as
     ``design_model``; ``dt`` in s.
@@ -42,7 +42,7 @@ def disturbance_observer_sliding_mode(
     Raises ValueError where that is not positive, and as ``design_model``; ``dt`` in s.
     """
     model = design_model(plant, dt, limits)
-    # The observer has the whole gain from V to um, the model none.
+    # The observer holds the whole gain from V to um; the model has unit gain.
     dynamics = scaled_to_dc(model.dynamics, 1.0)
     slope = model.gain()
     if slope <= 0.0:
@@ -83,7 +83,7 @@ def inversion_pid(plant: System, dt: float, limits: Limits) -> InversionControl:
 
 def _sliding_mode(model: ARMA, dt: float, pace: float) -> SlidingMode:
     # Scaled from the printed P-753 set, whose surface is 0.9 / dt: the loop then
-    # crosses over near 0.1 / dt whatever the rate, and ``pace`` times that if slowed.
+    # crosses over near 0.1 / dt at any rate, or at ``pace`` times that.
     surface, weight = 0.5 / dt, 100.0
     scale = pace / model.dc_gain()
     integral = CROSSOVER * weight / (dt * surface)

@@ -1,4 +1,4 @@
-"""The model of a plant on which controllers are designed."""
+"""Design models: a plant as a static part and second-order linear dynamics."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
@@ -19,24 +19,24 @@ from .inversion import InverseGain
 S = TypeVar("S", bound=System)
 
 CROSSOVER = 0.1
-"""Highest crossover of a design, rad a sample."""
+"""Highest crossover frequency of a design, rad per sample."""
 
 GAIN_MARGIN = 3.0
 """Factor by which the plant's gain may rise before a designed loop is unstable."""
 
 SLOWEST = 1e-4
-"""Smallest pace that is tried."""
+"""Smallest pace that ``DesignModel.slowed`` tries."""
 
 
 class DesignModel(NamedTuple):
     """A plant as a static part, from V to um, and linear dynamics, from um to um.
 
-    ``hysteresis`` is that of the plant, if it has any. ``static`` is the same, or a
-    gain where there is none, or one that cannot be separated from its dynamics.
-    ``linear`` is all the rest of the plant, unreduced; ``dynamics`` is its fast part
-    reduced to second order, a_1, a_2 | b_0, b_1, b_2 with b_0 not zero and zeros inside
-    the unit circle. ``limits`` of the actuator in V; ``rest`` is the output of
-    ``static`` (um) in the middle of them; ``dt`` in s.
+    ``hysteresis`` is that of the plant, None without one. ``static`` equals it, or is
+    a gain where the plant has no hysteresis or one that cannot be separated from its
+    dynamics. ``linear`` contains all other parts of the plant, unreduced; ``dynamics``
+    is its fast part reduced to second order, a_1, a_2 | b_0, b_1, b_2 with b_0 not zero
+    and zeros inside the unit circle. ``limits`` of the actuator in V; ``rest`` is the
+    output of ``static`` (um) in the middle of them; ``dt`` in s.
     """
 
     hysteresis: Hysteresis | None
@@ -70,12 +70,12 @@ class DesignModel(NamedTuple):
         return rise / (upper - lower)
 
     def slowed(self, make: Callable[[float], S], static: System | None = None) -> S:
-        """Return ``make(pace)`` for the largest pace 1, 1/2, ... of a stable loop.
+        """Return ``make(pace)`` for the largest pace 1, 1/2, ... with a stable loop.
 
-        The loop is that around all of ``linear``, behind ``static`` if given, and must
-        stay stable when the gain is ``GAIN_MARGIN`` times as large: a resonance or a
-        delay beyond second order limits the crossover. Raises ValueError if no pace
-        down to ``SLOWEST`` is slow enough.
+        The loop contains all of ``linear``, behind ``static`` if given. It must stay
+        stable with ``GAIN_MARGIN`` times the gain, because a resonance or a delay
+        beyond second order limits the crossover. Raises ValueError if no pace down to
+        ``SLOWEST`` gives a stable loop.
         """
         plant = self.linear if static is None else static >> self.linear
         held = self.rest if static is None else as_array(np.mean(self.limits))
@@ -95,7 +95,7 @@ class DesignModel(NamedTuple):
 
 
 def design_model(plant: System, dt: float, limits: tuple[float, float]) -> DesignModel:
-    """Return the model of ``plant`` for a loop of the sample time ``dt`` (s).
+    """Return the design model of ``plant`` for a loop with sample time ``dt`` (s).
 
     ``limits`` of the actuator in V. Raises ValueError for a plant of several inputs or
     outputs, with hysteresis that is not in series with the other parts or occurs
@@ -118,19 +118,19 @@ def design_model(plant: System, dt: float, limits: tuple[float, float]) -> Desig
 def _separated(plant: System) -> tuple[Hysteresis | None, tuple[System, ...]]:
     """Return the hysteresis of ``plant``, None without one, and the other parts."""
     parts = _in_series(plant)
-    found = [part for part in parts if isinstance(part, Hysteresis)]
-    if len(hystereses(plant)) != len(found) or len(found) > 1:
+    hysteretic = [part for part in parts if isinstance(part, Hysteresis)]
+    if len(hystereses(plant)) != len(hysteretic) or len(hysteretic) > 1:
         raise ValueError(
             "a design needs one hysteresis in series with linear parts; the plant has "
             f"{', '.join(type(part).__name__ for part in parts)}"
         )
     others = tuple(part for part in parts if not isinstance(part, Hysteresis))
-    return (found[0] if found else None), others
+    return (hysteretic[0] if hysteretic else None), others
 
 
 def _in_series(plant: System) -> tuple[System, ...]:
     if isinstance(plant, HystereticARMA):
-        # Its two operators have one shape of the loop in common: the nearest cascade.
+        # Its two operators share the shape of the loop: take the nearest cascade.
         plant = plant.cascade(1.0)
     if not isinstance(plant, Series):
         return (plant,)
@@ -148,10 +148,9 @@ def _fast(system: System, input: Scalar, dt: float) -> StateSpace:
         )
     if not all(np.all(np.isfinite(m)) for m in (whole.A, whole.B, whole.C, whole.D)):
         raise ValueError("the plant's derivatives are not finite; a design needs them")
-    # Creep and other modes near z = 1 change the gain by a share, over many samples:
-    # far below the crossover, where the integral holds them off as it does any drift.
-    # At the crossover the plant has the gain of its fast part, and a reduction to few
-    # states must spend none on the slow ones.
+    # Creep and other modes near z = 1 act far below the crossover, where the integral
+    # suppresses them like any drift. At the crossover the plant has the gain of its
+    # fast part, so a reduction to few states must not spend any on the slow modes.
     fast = fast_part(whole, CROSSOVER)
     radius = np.max(np.abs(fast.poles()), initial=0.0)
     if radius >= 1.0:
@@ -177,14 +176,14 @@ def _gain(fast: StateSpace) -> float:
 
 
 def _second_order(fast: StateSpace) -> ARMA:
-    """Return ``fast`` as a_1, a_2 | b_0, b_1, b_2, zero where it has fewer."""
+    """Return ``fast`` reduced to a_1, a_2 | b_0, b_1, b_2, padded with zeros."""
     arma = reduced(fast, 2).as_arma()
     a, b = np.zeros(2), np.zeros(3)
     a[: len(arma.autoregressive)] = arma.autoregressive
     b[: len(arma.moving)] = arma.moving
     if abs(b[0]) <= 1e-9 * np.abs(b).sum() or np.any(np.abs(np.roots(b)) >= 1.0):
         # A delay, or zeros outside the unit circle, cannot be inverted: the numerator
-        # is replaced by its sum, as chapter 8 does.
+        # is replaced by its sum, as in chapter 8.
         b = np.array([b.sum(), 0.0, 0.0])
     return ARMA(tuple(a), tuple(b))
 

@@ -1,11 +1,11 @@
 """Disturbance observer (DOB) with its Q-filter, around any controller."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 
 from ..core.arrays import Scalar, State, check_not_zero
-from ..core.parameter import parameter, sample_time
+from ..core.parameter import PartUnits, parameter, sample_time
 from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
 from .output_tracking import check_second_order
@@ -16,8 +16,8 @@ COEFFICIENTS = ("corrected", "printed")
 class DisturbanceObserverState(NamedTuple):
     """State of the controller, the last estimate w, and the memory of the filter.
 
-    ``memory`` is what past samples add to c_0 w one and two samples later, in V: the
-    transposed direct form of (5.26), with the fewest numbers to carry.
+    ``memory`` holds the contributions of past samples to c_0 w one and two samples
+    later, in V: the transposed direct form of (5.26), which has the fewest states.
     """
 
     feedback: State
@@ -26,12 +26,13 @@ class DisturbanceObserverState(NamedTuple):
 
 
 class DisturbanceObserverControl(System):
-    """``u = f / gain - w``: the controller's f less the observed input disturbance w.
+    """``u = f / gain - w``: the controller's f less the estimated disturbance w.
 
     Figure 5.2, (5.26)-(5.32): w = Q/(gain G) z - Q u, where G is ``model``
     (a_1, a_2 | b_0, b_1, b_2, DC gain near 1), ``gain`` K_e is the linear part of the
     hysteresis, and Q has G's zeros, unit DC gain and a double pole at ``cutoff``. u is
-    the voltage that was applied, after the limits.
+    the applied voltage, after the limits. ``feedback`` sees the applied f,
+    gain (u + w), in um.
 
     ``coefficients`` is ``"corrected"`` (the bilinear double pole) or ``"printed"``
     ((5.32) as printed, whose poles lie at -0.54 and -7.46 times the cut-off). Input an
@@ -40,6 +41,8 @@ class DisturbanceObserverControl(System):
     Raises ValueError for a model of another order or with DC gain 0, and for an unknown
     name in ``coefficients``.
     """
+
+    part_units: ClassVar[PartUnits] = {"feedback": {"u": "um"}}
 
     feedback: System
     model: ARMA
@@ -96,7 +99,7 @@ class DisturbanceObserverControl(System):
         )
 
     def _past(self, input: Observation, w: Scalar) -> tuple[Scalar, Scalar]:
-        """Return what one sample adds to c_0 w one and two samples later."""
+        """Return the contributions of a sample to c_0 w one and two samples later."""
         _, b1, b2 = self.model.moving
         a1, a2 = self.model.autoregressive
         _, c1, c2 = self.denominator()
@@ -108,7 +111,7 @@ class DisturbanceObserverControl(System):
     ) -> tuple[DisturbanceObserverState, Scalar]:
         c0, _, _ = self.denominator()
         z, u = input.measured / self.gain, input.applied
-        # Both filters of (5.26) have the denominator c: one recursion serves both.
+        # Both filters of (5.26) have the denominator c, hence one recursion for both.
         w = (1.0 / c0) * (z - self.model.moving[0] * u + state.memory[0])
         next_term, last_term = self._past(input, w)
         memory = (next_term + state.memory[1], last_term)

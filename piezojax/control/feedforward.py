@@ -7,7 +7,7 @@ from ..core.system import Observation, System, rest_output
 
 
 class FeedforwardState(NamedTuple):
-    """State of the inverse, and the voltage that it misses at the start's rest."""
+    """State of the inverse, and the constant bias of its voltage in V."""
 
     inverse: State
     bias: Scalar
@@ -18,9 +18,9 @@ class InverseFeedforward(System):
 
     ``inverse`` maps the wanted displacement in um to a voltage in V: an
     ``InverseColemanHodgdon``, or inverse dynamics in series with one. u(k) moves the
-    stage to y(k+1), hence the next reference. The measurement is not looked at: what
-    the inverse gets wrong stays wrong. Started at rest where the inverse asks for
-    another voltage than was applied, the difference is kept as a constant bias.
+    stage to y(k+1), hence the next reference. The measurement is not used, so errors of
+    the inverse remain. If the inverse of the start differs from the applied voltage,
+    the difference is kept as a constant bias.
     """
 
     inverse: System
@@ -52,11 +52,11 @@ class FeedforwardFeedbackState(NamedTuple):
 class FeedforwardFeedback(System):
     """``u(k) = inverse(r(k+1)) + feedback``, Figure 2.9.
 
-    ``inverse`` as in ``InverseFeedforward``; ``feedback`` any controller from an
-    Observation to V. It sees as applied what was applied beyond the feedforward
-    voltage, so that its start and its anti-windup stay right. The inverse runs along
-    the reference alone: unlike in ``InversionControl``, what the feedback adds does not
-    move it, so the gain of the stage's hysteresis stays in the feedback loop.
+    ``inverse`` as in ``InverseFeedforward``; ``feedback`` is any controller from an
+    Observation to V. Its applied voltage is the applied one less the feedforward, so
+    its start and its anti-windup stay correct. The inverse depends on the reference
+    alone. Unlike in ``InversionControl`` the feedback does not act on it, so the gain
+    of the stage's hysteresis stays in the feedback loop.
     """
 
     inverse: System
@@ -65,9 +65,9 @@ class FeedforwardFeedback(System):
     def init(self, input: Observation) -> FeedforwardFeedbackState:
         reference = as_array(input.reference)
         forward = rest_output(self.inverse, reference)
-        seen = input._replace(applied=input.applied - forward)
+        observation = input._replace(applied=input.applied - forward)
         return FeedforwardFeedbackState(
-            self.inverse.init(reference), self.feedback.init(seen), forward
+            self.inverse.init(reference), self.feedback.init(observation), forward
         )
 
     def step(
@@ -76,6 +76,6 @@ class FeedforwardFeedback(System):
         inverse, forward = self.inverse.step(
             state.inverse, as_array(input.next_reference)
         )
-        seen = input._replace(applied=input.applied - state.forward)
-        feedback, voltage = self.feedback.step(state.feedback, seen)
+        observation = input._replace(applied=input.applied - state.forward)
+        feedback, voltage = self.feedback.step(state.feedback, observation)
         return FeedforwardFeedbackState(inverse, feedback, forward), forward + voltage

@@ -1,4 +1,4 @@
-"""A controller that sees its measurements through an observer."""
+"""Controller whose measurements are filtered by an observer."""
 
 from typing import Any
 
@@ -14,11 +14,11 @@ def _is_motion(node: Any) -> bool:
 
 
 class Filtered(System):
-    """``controller``, which is shown the position that ``filter`` estimates as z(k).
+    """``controller`` with the position estimated by ``filter`` in place of z(k).
 
     ``filter`` is an Observer, or one on each axis (``PerAxis``); its velocities are not
-    used. Everything behind it sees the filtered position, a disturbance observer too.
-    Input an Observation, output the controller's.
+    used. All parts of ``controller``, also a disturbance observer, see the filtered
+    position. Input an Observation, output that of ``controller``.
     """
 
     filter: System
@@ -30,6 +30,6 @@ class Filtered(System):
     def step(self, state: State, input: Observation) -> tuple[State, Any]:
         filter_state, motion = self.filter.step(state[0], input)
         position = jax.tree.map(lambda m: m.position, motion, is_leaf=_is_motion)
-        seen = input._replace(measured=position)
-        controller, command = self.controller.step(state[1], seen)
+        observation = input._replace(measured=position)
+        controller, command = self.controller.step(state[1], observation)
         return (filter_state, controller), command

@@ -1,27 +1,30 @@
-"""Inversion-based control: an inverse hysteresis behind any controller."""
+"""Inversion-based control: an inverse hysteresis in series with a controller."""
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ..core.arrays import Scalar, ScalarLike, State, as_array, check_not_zero
+from ..core.parameter import PartUnits
 from ..core.system import Affine, Observation, System, rest_output
 from ..hysteresis.inverse import Inverse
 
 
 class InversionState(NamedTuple):
-    """State of the controller, and of the hysteresis model up to the last voltage."""
+    """States of the controller and of the hysteresis model."""
 
     feedback: State
     hysteresis: State
 
 
 class InversionControl(System):
-    """``feedback`` asks for a hysteresis output f, the inverse turns it into volts.
+    """``feedback`` commands a hysteresis output f, which ``inverse`` turns into volts.
 
     Figure 5.1, (5.24)-(5.25). ``inverse`` is an InverseColemanHodgdon, or any other
-    ``Inverse``. The model is advanced with the voltage that the actuator
-    really applied, and ``feedback`` sees the model output for it in place of the
-    voltage, so limits and anti-windup stay right. Input an Observation, output in V.
+    ``Inverse``. Its hysteresis model is advanced with the applied voltage, and
+    ``feedback`` sees the output of the model, in um, in place of the voltage, so limits
+    and anti-windup stay correct. Input an Observation, output in V.
     """
+
+    part_units: ClassVar[PartUnits] = {"feedback": {"u": "um"}}
 
     feedback: System
     inverse: Inverse
@@ -29,21 +32,21 @@ class InversionControl(System):
     def init(self, input: Observation) -> InversionState:
         hysteresis = self.inverse.model.init(input.applied)
         force = rest_output(self.inverse.model, input.applied)
-        seen = input._replace(applied=force)
-        return InversionState(self.feedback.init(seen), hysteresis)
+        observation = input._replace(applied=force)
+        return InversionState(self.feedback.init(observation), hysteresis)
 
     def step(
         self, state: InversionState, input: Observation
     ) -> tuple[InversionState, Scalar]:
         hysteresis, force = self.inverse.model.step(state.hysteresis, input.applied)
-        seen = input._replace(applied=force)
-        feedback, wanted = self.feedback.step(state.feedback, seen)
+        observation = input._replace(applied=force)
+        feedback, wanted = self.feedback.step(state.feedback, observation)
         voltage = self.inverse.solve(hysteresis, wanted)
         return InversionState(feedback, hysteresis), voltage
 
 
 class InverseGain(Inverse):
-    """Voltage of a plant without hysteresis: the inverse of a gain.
+    """Inverse of a gain, for a plant without hysteresis.
 
     ``model`` maps V to um. Raises ValueError for a gain of 0.
     """

@@ -1,4 +1,4 @@
-"""Iterative learning control: one trial's error makes the next trial's feedforward."""
+"""Iterative learning control: feedforward learned from trial to trial."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,10 +18,10 @@ Signal = Float[Array, " samples"]
 
 
 class Trials(NamedTuple):
-    """What ``learn`` returns.
+    """Outcome of ``learn``.
 
-    ``feedforward``, that of a next trial, and ``error``, r - y of the last one in um,
-    of the length of the reference; ``rms_error`` of each trial in um, in their order.
+    ``feedforward`` [samples] of the next trial; ``error`` [samples], r - y of the last
+    trial in um; ``rms_error`` [trials] in um.
     """
 
     feedforward: Signal
@@ -32,18 +32,19 @@ class Trials(NamedTuple):
 class LearningLaw(eqx.Module):
     """``u_next = Q (u + gain z^lead e)``, with e = r - y of the trial in um.
 
-    (2.14) in time: its learning function rho / G is a gain and the ``lead`` in samples
-    that takes off the lag of what u drives. ``gain`` in the unit of u per um: V/um for
-    the stage itself, without unit for a loop whose reference is corrected. Q is a
-    zero-phase FIR filter with unit gain at zero: ``smoothing`` holds the weights w_1,
-    w_2, ... of the neighbours one, two, ... samples away on either side, the middle has
-    what is missing to 1; none is Q = 1. Beyond the ends of a trial, both signals are
-    taken as their end values.
+    The time-domain form of (2.14). Its learning function rho / G is a gain and a
+    ``lead`` in samples, which compensates the lag of the system that u drives. ``gain``
+    is in the unit of u per um: V/um for a stage, without unit for a loop whose
+    reference is corrected. Q is a zero-phase FIR filter with unit DC gain:
+    ``smoothing`` holds the weights w_1, w_2, ... of the neighbours one, two, ...
+    samples away on either side, and the weight of the sample itself is
+    1 - 2 (w_1 + w_2 + ...). Without weights Q = 1. Both signals are extended by their
+    end values.
 
     On a linear system with the matrix G from u to y, the trials contract to the fixed
-    point ``(I - Q (I - L G))^-1 Q L r`` if ``Q (I - L G)`` has norm below 1; for trials
-    that are long against the transients, if ``|Q (1 - gain z^lead G)| < 1`` at all
-    frequencies. The error that stays is zero only where Q = 1.
+    point ``(I - Q (I - L G))^-1 Q L r`` if ``Q (I - L G)`` has norm below 1. For trials
+    much longer than the transients the condition is ``|Q (1 - gain z^lead G)| < 1`` at
+    all frequencies. The remaining error is zero only where Q = 1.
     """
 
     gain: Scalar = parameter(
@@ -58,7 +59,7 @@ class LearningLaw(eqx.Module):
     )
     lead: int = parameter(
         "samples",
-        "lag of what the feedforward drives",
+        "lag of the system that the feedforward drives",
         least=0.0,
         whole=True,
         static=True,
@@ -69,16 +70,16 @@ class LearningLaw(eqx.Module):
         check_declared(self)
 
     def next(self, feedforward: Signal, error: Signal) -> Signal:
-        """Return the next trial's feedforward. Both signals have one length."""
+        """Return the next feedforward from that of a trial and its error [samples]."""
         samples = error.shape[0]
         ahead = jnp.minimum(jnp.arange(samples) + self.lead, samples - 1)
         wanted = feedforward + self.gain * error[ahead]
         taps = len(self.smoothing)
         padded = jnp.pad(wanted, taps, mode="edge")
         smooth = wanted
-        for away, weight in enumerate(self.smoothing, start=1):
-            before = padded[taps - away : taps - away + samples]
-            after = padded[taps + away : taps + away + samples]
+        for distance, weight in enumerate(self.smoothing, start=1):
+            before = padded[taps - distance : taps - distance + samples]
+            after = padded[taps + distance : taps + distance + samples]
             smooth = smooth + weight * (before + after - 2.0 * wanted)
         return smooth
 
@@ -95,11 +96,11 @@ def learn(
 
     Each trial starts from the same rest. ``system`` is a stage, V to um, whose input u
     is learned (y(k) is the output of the step with u(k)), or a Feedback loop, whose
-    reference is corrected to r + u. ``noise`` in um is added to what a stage's trial
-    learns from; to a loop, whose sensor scales it, it gives unit-variance draws.
-    ``feedforward`` of the first trial is zero if left out, as (2.14) has it. Pure, and
-    differentiable in the law as in the system. The errors returned are those of the
-    true displacement.
+    reference is corrected to r + u. ``noise`` [trials, samples] is added to the
+    measurement, for a stage in um, for a loop as unit-variance draws that its sensor
+    scales. ``feedforward`` of the first trial is zero if left out, as in (2.14). The
+    function is pure, and differentiable in ``law`` and ``system``. The returned errors
+    are those of the true displacement.
 
     Raises ValueError for fewer than one trial or signals of different lengths.
     """
@@ -146,7 +147,7 @@ def _stage_trial(
 def _loop_trial(
     system: System, reference: Signal, feedforward: Signal, noise: Signal
 ) -> tuple[Signal, Signal]:
-    # At rest at r itself: a correction of the first sample is a step of the loop.
+    # The loop rests at r: a correction of the first sample acts as a step.
     inputs = loop_inputs(reference + feedforward, noise)
     samples = simulate(system, inputs, system.init(reference[0]))[1]
     return samples.displacement, samples.measured

@@ -1,4 +1,4 @@
-"""Steady-state Kalman filter: state estimation from the voltage and the measurement."""
+"""Steady-state Kalman filter: an Observer from input and measurement."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from ..dynamics.arma import ARMA
 from .observer import Motion, Observer
 
 DOUBLINGS = 40
-"""Passes of the Riccati equation: 2^40 steps of it."""
+"""Doublings of the Riccati recursion: 2^40 steps."""
 
 
 class KalmanState(NamedTuple):
@@ -28,15 +28,15 @@ class KalmanState(NamedTuple):
 
 
 class KalmanFilter(Observer):
-    """Kalman filter on ``model``, as far as its gain has settled.
+    """Steady-state Kalman filter on ``model``.
 
-    The model (a_1, ..., a_n | b_0, ...) answers u(k) with
+    The model (a_1, ..., a_n | b_0, ...) is
     ``y(k+1) = a_1 y(k) + a_2 y(k-1) + ... + b_0 u(k) + b_1 u(k-1) + ... + d(k)``, where
-    the drift d in um stands for all that it leaves out: hysteresis, creep, a wrong gain
-    at rest. u is the applied input. ``gain`` corrects y(k), y(k-1), ..., as many as the
-    model has a coefficients and two at least, and then d. The velocity of the Motion is
-    (y(k) - y(k-1)) / dt with both estimated, the state of chapter 4's second-order
-    models; with a gain of zero the model runs on its own.
+    u is the applied input and the drift d in um represents unmodelled effects:
+    hysteresis, creep, an error of the DC gain. ``gain`` corrects y(k), y(k-1), ..., one
+    for each a coefficient and two at least, and then d. The velocity of the Motion is
+    (y(k) - y(k-1)) / dt of the estimates, the state of chapter 4's second-order models.
+    With a gain of zero the model runs in open loop.
 
     Raises ValueError for a model without a_1 or a gain of another length.
     """
@@ -98,30 +98,30 @@ class KalmanFilter(Observer):
 
 
 def positions_of(model: ARMA) -> int:
-    """Return how many positions a filter on ``model`` estimates: a velocity takes 2."""
+    """Return the number of estimated positions: that of a coefficients, at least 2."""
     return max(len(model.autoregressive), 2)
 
 
 def steady_gain(
     A: Float[np.ndarray, "n n"], Q: Float[np.ndarray, "n n"], noise_rms: float
 ) -> Float[np.ndarray, " n"]:
-    """Return the settled gain for x(k+1) = A x(k) + w, z = x_1 + v, cov w = ``Q``.
+    """Return the steady-state gain for x(k+1) = A x(k) + w, z = x_1 + v, cov w = ``Q``.
 
     It corrects the estimate at k by the measurement at k. ``noise_rms`` of v in the
-    unit of z. Raises ValueError where no gain settles: something that is seen by no
-    measurement, or kept at the edge of stability by no process noise.
+    unit of z. Raises ValueError without a steady state: for a marginally stable mode
+    that the measurement does not show or that has no process noise.
     """
-    # Doubling: each pass does twice as many steps of the Riccati recursion as the one
-    # before. Sums of positive parts only, so it also serves where the noise is small
-    # and the pencil of a Schur method has its eigenvalues next to the unit circle.
-    eye, seen = np.eye(len(A)), np.eye(len(A))[0]
-    F, G, P = A.T, np.outer(seen, seen), Q / noise_rms**2
+    # Each pass doubles the number of steps of the Riccati recursion. It adds positive
+    # terms only, so it stays accurate for small noise, where the eigenvalues of a Schur
+    # method's pencil lie next to the unit circle.
+    eye, output_row = np.eye(len(A)), np.eye(len(A))[0]
+    F, G, P = A.T, np.outer(output_row, output_row), Q / noise_rms**2
     for _ in range(DOUBLINGS):
         both = linalg.solve(eye + G @ P, np.hstack([F, G @ F.T]))
         forward, across = both[:, : len(A)], both[:, len(A) :]
         F, G, P = F @ forward, G + F @ across, P + F.T @ P @ forward
     gain = P[:, 0] / (P[0, 0] + 1.0)
-    poles = np.linalg.eigvals(A - np.outer(A @ gain, seen))
+    poles = np.linalg.eigvals(A - np.outer(A @ gain, output_row))
     if not np.abs(poles).max() < 1.0 - 1e-9:
         raise ValueError(
             "the filter has no steady state; every mode of the model at the edge of "
@@ -137,11 +137,11 @@ def model_kalman(
     drift_rms: ScalarLike,
     dt: float,
 ) -> KalmanFilter:
-    """Return the Kalman filter that sees both the input of ``model`` and the sensor.
+    """Return the Kalman filter on ``model`` for given noise of sensor and process.
 
-    All in um: ``noise_rms`` of the sensor, ``process_rms`` of what moves the
-    displacement each sample, ``drift_rms`` of the change of the drift each sample.
-    Raises ValueError for a value that is not above 0 (``process_rms``: below 0).
+    All in um: ``noise_rms`` of the sensor, ``process_rms`` of the random motion in a
+    sample, ``drift_rms`` of the change of the drift in a sample. Raises ValueError for
+    a value that is not above 0 (``process_rms``: below 0).
     """
     check("noise_rms in um", noise_rms, above=0.0)
     check("process_rms in um", process_rms, least=0.0)
@@ -159,10 +159,10 @@ def model_kalman(
 def kinematic_kalman(
     noise_rms: ScalarLike, acceleration_rms: ScalarLike, dt: float
 ) -> KalmanFilter:
-    """Return the Kalman filter of constant velocity, which needs no model of a stage.
+    """Return the Kalman filter of constant velocity, without a model of the stage.
 
     ``noise_rms`` of the sensor in um; ``acceleration_rms`` in um/s^2 of a random
-    acceleration that is constant within a sample and anew in the next. It is an
+    acceleration, constant within a sample and independent of the others. It is an
     alpha-beta filter: the gains are alpha and alpha - beta, functions of
     ``acceleration_rms dt^2 / noise_rms`` alone (Kalata, 1984). Raises ValueError for
     values that are not above 0.
@@ -170,7 +170,7 @@ def kinematic_kalman(
     check("noise_rms in um", noise_rms, above=0.0)
     check("acceleration_rms in um/s^2", acceleration_rms, above=0.0)
     check("sample time in s", dt, above=0.0)
-    # y(k-1) stands for y(k) - dt dy/dt, so the acceleration moves both, either way.
+    # y(k-1) represents y(k) - dt dy/dt: the acceleration moves both, oppositely.
     push = 0.5 * float(acceleration_rms) * dt**2 * np.array([1.0, -1.0])
     model = ARMA((2.0, -1.0), (0.0,))
     A = np.array([[2.0, -1.0], [1.0, 0.0]])

@@ -1,4 +1,4 @@
-"""H-infinity control of a linear stage by mixed sensitivity, in discrete time."""
+"""Discrete-time H-infinity control of a linear stage by mixed sensitivity."""
 
 from typing import NamedTuple
 
@@ -11,24 +11,24 @@ from ..dynamics.state_space import StateSpace
 from .state_space_controller import StateSpaceController
 
 GAMMA_TOLERANCE = 1e-3
-"""How close to its least gamma is brought, relative."""
+"""Relative tolerance of gamma above its infimum."""
 
 
 class Design(NamedTuple):
-    """A controller, and the bound that its loop keeps below: ||z / r|| < gamma."""
+    """A controller and the bound gamma of its weighted loop: ||z / r|| < gamma."""
 
     controller: StateSpaceController
     gamma: float
 
 
 class _Plant(NamedTuple):
-    """x' = A x + B [w, u]; z = C x + D [w, u]; the controller sees y = w - seen x."""
+    """Generalised plant x' = A x + B [w, u], z = C x + D [w, u], y = w - measured x."""
 
     A: np.ndarray
     B: np.ndarray
     C: np.ndarray
     D: np.ndarray
-    seen: np.ndarray
+    measured: np.ndarray
 
 
 def mixed_sensitivity(
@@ -39,22 +39,20 @@ def mixed_sensitivity(
     *,
     dt: float,
 ) -> Design:
-    """Return the controller that makes the weighted responses to r small at once.
+    """Return the controller that minimises the weighted responses to r.
 
-    ``model`` answers u(k) with y(k+1), um from its input's unit, and is all the stage
-    that is known. At every frequency up to Nyquist's,
+    ``model`` G maps u(k) to y(k+1) in um. At all frequencies up to Nyquist's,
     |W1 S|^2 + |W2 K S|^2 + |W3 T|^2 < gamma^2, with S = 1/(1 + G K) and T = 1 - S, W1 =
     ``error_weight``, W2 = ``effort_weight``, a number above 0 in um per unit of the
-    input, and W3 = ``output_weight``, none if left out. Gamma is brought within 0.1 %
-    of its least by bisection. The controller has the states of the model and of the
-    weights.
+    input, and W3 = ``output_weight``, none if left out. Bisection brings gamma within
+    0.1 % of its infimum. The controller has the states of the model and of the weights.
 
-    Since r reaches the error without a filter, the error tells r, and of the two
-    Riccati equations (Glover and Doyle, 1988; in discrete time Green and Limebeer,
-    1995, appendix B) the one of the estimator has the solution zero, provided that the
-    model and the weights are stable: an integrator in W1 has to leak. Raises ValueError
-    where they are not, for weights that are not scalar or of another ``dt``, and for an
-    effort weight that is not above 0.
+    The reference r enters the error without a filter, so the error determines r. Of the
+    two Riccati equations (Glover and Doyle, 1988; in discrete time Green and Limebeer,
+    1995, appendix B) that of the estimator then has the solution zero, provided that
+    the model and the weights are stable: an integrator in W1 must be leaky. Raises
+    ValueError for an unstable model or weight, weights that are not scalar or have
+    another ``dt``, and an effort weight that is not above 0.
     """
     check("sample time in s", dt, above=0.0)
     check("effort_weight", effort_weight, above=0.0)
@@ -78,18 +76,18 @@ def mixed_sensitivity(
     lower = 0.0
     while upper - lower > GAMMA_TOLERANCE * upper:
         middle = 0.5 * (lower + upper)
-        found = _controller(plant, middle, dt)
-        if found is None:
+        controller = _controller(plant, middle, dt)
+        if controller is None:
             lower = middle
         else:
-            upper, best = middle, found
+            upper, best = middle, controller
     return Design(best, upper)
 
 
 def first_order_weight(
     low: float, crossover: float, high: float, dt: float
 ) -> StateSpace:
-    """Return a weight of gain ``low`` at rest, ``high`` far up, 1 at ``crossover``.
+    """Return a weight with gain ``low`` at 0, 1 at ``crossover``, ``high`` above it.
 
     Gains without unit, one above 1 and the other below; ``crossover`` in rad/s, below
     pi/dt, exact after the bilinear transform. Raises ValueError for other values.
@@ -121,7 +119,7 @@ def _check_stable(name: str, poles: np.ndarray) -> None:
 def _augmented(
     model: ARMA, error: StateSpace, effort: float, output: StateSpace | None
 ) -> _Plant:
-    """Put the model and its weights into one plant: states of G, of W1, of W3."""
+    """Return the generalised plant with the states of G, W1 and W3."""
     a, b = map(np.array, (model.autoregressive, model.moving))
     n = max(a.size, b.size)
     G = np.eye(n, k=1)
@@ -129,17 +127,18 @@ def _augmented(
     drive = np.zeros((n, 1))
     drive[: b.size, 0] = b
     y = np.eye(1, n)
-    # Each weight with what it is fed: w - y, or y.
-    fed = [(error, 1.0, -y)] + ([] if output is None else [(output, 0.0, y)])
-    blocks = [np.asarray(weight.A) for weight, _, _ in fed]
+    # Each weight with its input: w - y, or y.
+    weighted = [(error, 1.0, -y)] + ([] if output is None else [(output, 0.0, y)])
+    blocks = [np.asarray(weight.A) for weight, _, _ in weighted]
     A = np.asarray(linalg.block_diag(G, *blocks))
     size = A.shape[0]
     B = np.zeros((size, 2))
     B[:n, 1:] = drive
-    C, D = np.zeros((len(fed) + 1, size)), np.zeros((len(fed) + 1, 2))
+    C = np.zeros((len(weighted) + 1, size))
+    D = np.zeros((len(weighted) + 1, 2))
     D[-1, 1] = effort
     first = n
-    for row, (weight, reference, states) in enumerate(fed):
+    for row, (weight, reference, states) in enumerate(weighted):
         rows = slice(first, first + weight.order)
         A[rows, :n] = np.asarray(weight.B) @ states
         B[rows, :1] = reference * np.asarray(weight.B)
@@ -147,14 +146,14 @@ def _augmented(
         C[row, :n] = (np.asarray(weight.D) @ states)[0]
         D[row, 0] = reference * float(weight.D[0, 0])
         first = rows.stop
-    seen = np.zeros((1, size))
-    seen[:, :n] = y
-    return _Plant(A, B, C, D, seen)
+    measured = np.zeros((1, size))
+    measured[:, :n] = y
+    return _Plant(A, B, C, D, measured)
 
 
 def _controller(plant: _Plant, gamma: float, dt: float) -> StateSpaceController | None:
     """Return the central controller for ``gamma``, or None if there is none."""
-    A, B, C, D, seen = plant
+    A, B, C, D, measured = plant
     R = D.T @ D - np.diag([gamma**2, 0.0])
     try:
         X = linalg.solve_discrete_are(A, B, C.T @ C, R, s=C.T @ D)
@@ -162,7 +161,7 @@ def _controller(plant: _Plant, gamma: float, dt: float) -> StateSpaceController 
         return None
     S = R + B.T @ X @ B
     cross = B.T @ X @ A + D.T @ C
-    # A saddle: least over u, greatest over w.
+    # Saddle-point conditions: a minimum over u and a maximum over w.
     if S[1, 1] <= 0.0 or S[0, 0] - S[0, 1] ** 2 / S[1, 1] >= 0.0:
         return None
     if np.linalg.eigvalsh(X).min() < -1e-8 * np.abs(X).max():
@@ -170,10 +169,10 @@ def _controller(plant: _Plant, gamma: float, dt: float) -> StateSpaceController 
     closed = A - B @ linalg.solve(S, cross)
     if np.abs(np.linalg.eigvals(closed)).max() >= 1.0:
         return None
-    # u = F x + f w, where w = y + seen x and x is run along with the plant.
+    # u = F x + f w, where w = y + measured x and the controller simulates x.
     F, f = -cross[1:] / S[1, 1], -S[1, 0] / S[1, 1]
-    F = F + f * seen
-    inner = A + B[:, :1] @ seen + B[:, 1:] @ F
+    F = F + f * measured
+    inner = A + B[:, :1] @ measured + B[:, 1:] @ F
     return StateSpaceController(
         StateSpace(inner, B[:, :1] + f * B[:, 1:], F, [[f]], dt)
     )

@@ -1,13 +1,13 @@
-"""Sliding mode control by the model-reference design (section 4.5.3.3)."""
+"""Model-reference sliding mode control (section 4.5.3.3)."""
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, State, as_array, as_scalars
-from ..core.parameter import parameter
+from ..core.parameter import PartUnits, parameter
 from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
 from .observer import Observer
@@ -16,7 +16,10 @@ from .switching import SwitchingLaw
 
 
 class ModelReferenceState(NamedTuple):
-    """Newest first: y_d from r(k) on in um, past errors in um, past u1 and u2 in V."""
+    """States of the parts; histories, newest first, of y_d and errors in um.
+
+    ``desired`` starts at y_d(k); ``forward`` and ``feedback`` hold past u1 and u2 in V.
+    """
 
     filter: State
     reference_model: State
@@ -28,22 +31,25 @@ class ModelReferenceState(NamedTuple):
 
 
 class ModelReferenceSlidingMode(System):
-    """Makes a model of any order n follow a reference model with output y_d.
+    """Sliding mode control of a model of any order n along a reference model.
 
-    With e = y - y_d, the output y from ``filter``, the sliding variable is
-    ``s(k) = surface[0] e(k-n+1) + ... + surface[n-2] e(k-1) + e(k)`` in um, (4.41) at
-    the last n known errors: the printed one holds e(k+1), which is not known. The
-    voltage is u1 + u_eq + du: u1 moves ``model`` (a_1, ..., a_n | b_0, ..., b_0 not
-    zero) along y_d (4.32), u_eq takes s to zero (4.42) and du is the output of ``law``
-    in V, a ``SwitchingPID`` in (4.43). Both u1 and u_eq divide by b_0, in the form
-    ``inversion`` of ``INVERSIONS``; du does not. ``reference_model`` turns r(k) into
-    y_d(k+1), so y_d is late by a sample and by its own lag: ``Anticipation`` makes up
-    for that.
+    The error is e = y - y_d, with y from ``filter`` and y_d the output of
+    ``reference_model``. The sliding variable is
+    ``s(k) = surface[0] e(k-n+1) + ... + surface[n-2] e(k-1) + e(k)`` in um: (4.41) at
+    the last n known errors, because the printed one contains e(k+1), which is not
+    known. The voltage is u1 + u_eq + du: u1 moves ``model`` (a_1, ..., a_n | b_0, ...,
+    b_0 not zero) along y_d (4.32), u_eq takes s to zero (4.42) and du is the output of
+    ``law`` in V, a ``SwitchingPID`` in (4.43). Both u1 and u_eq divide by b_0, in the
+    form ``inversion`` of ``INVERSIONS``; du does not. ``reference_model`` maps r(k) to
+    y_d(k+1), so y_d lags r by a sample and by the lag of the reference model;
+    ``Anticipation`` compensates both.
 
     Input an Observation, whose next reference is not used; output in V. Raises
     ValueError for a model without a_1, a surface of another length than n - 1, b_0 = 0
     or an unknown inversion.
     """
+
+    part_units: ClassVar[PartUnits] = {"law": {"s": "um", "v": "[u]"}}
 
     law: SwitchingLaw
     model: ARMA
@@ -80,7 +86,7 @@ class ModelReferenceSlidingMode(System):
         return gain * (wanted - _dot(later, past))
 
     def _advanced(self, outputs: tuple[Scalar, ...]) -> Scalar:
-        """Return what the model's past ``outputs`` alone add to the next one."""
+        """Return the contribution of the past ``outputs`` to the model's next one."""
         return as_array(_dot(self.model.autoregressive, outputs))
 
     def _sliding(self, errors: tuple[Scalar, ...]) -> Scalar:
@@ -91,7 +97,7 @@ class ModelReferenceSlidingMode(System):
         reference = as_array(input.reference)
         order, lags = len(self.model.autoregressive), len(self.model.moving) - 1
         desired = (reference,) * order
-        # At rest u1 is its own past: linear, so two values give the fixed point.
+        # At rest u1 equals its past; two values of a linear map give the fixed point.
         wanted = reference - self._advanced(desired)
         start = self._inverse(wanted, (jnp.zeros_like(reference),) * lags)
         slope = self._inverse(jnp.zeros_like(reference), (as_array(1.0),) * lags)
@@ -122,9 +128,9 @@ class ModelReferenceSlidingMode(System):
         forward = self._inverse(wanted, state.forward)
 
         sliding = self._sliding(errors)
-        # S A_e delta: each error one sample older, the newest as the model has it.
-        kept = _dot(reversed(self.surface), errors)
-        equivalent = self._inverse(-(self._advanced(errors) + kept), state.feedback)
+        # S A_e delta: each error one sample older, the newest predicted by the model.
+        shifted = _dot(reversed(self.surface), errors)
+        equivalent = self._inverse(-(self._advanced(errors) + shifted), state.feedback)
         law, switching = self.law.step(state.law, sliding)
         feedback = equivalent + switching
 
@@ -141,6 +147,6 @@ class ModelReferenceSlidingMode(System):
 
 
 def _dot(weights: Iterable[Scalar], values: Iterable[Scalar]) -> Scalar:
-    """Sum of the products of two sequences, as far as both go."""
+    """Return the sum of products up to the end of the shorter sequence."""
     pairs = zip(weights, values, strict=False)
     return sum((weight * value for weight, value in pairs), start=as_array(0.0))

@@ -1,6 +1,6 @@
 """Sliding mode control of square multi-axis stages (chapter 7)."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +19,16 @@ from ..core.axes import (
     plus,
     product,
 )
-from ..core.parameter import declarations, parameter
+from ..core.parameter import PartUnits, declarations, parameter
 from ..core.system import Designed, Observation, System
 from ..dynamics.matrix_arma import MatrixARMA
 from .switching import SwitchingLaw
 
 
 class MultiAxisState(NamedTuple):
-    """Histories newest first, in the units of the axes; commands likewise.
+    """States of the parts and histories, newest first, in the units of the axes.
 
-    ``desired`` holds y_d of the next sample and before; ``forward`` past u1;
+    ``desired`` holds y_d(k+1), y_d(k), ...; ``forward`` past u1;
     ``feedback`` the last u2; ``predicted`` the state X2 of (7.27); ``law`` the state of
     the switching law.
     """
@@ -44,30 +44,31 @@ class MultiAxisState(NamedTuple):
 class MultiAxisSlidingMode(Designed):
     """Output-tracking sliding mode control with static decoupling, (7.16)-(7.40).
 
-    For ``model``, q axes with p matrices each, any p. The command is u1 + u2. u1 moves
-    the model along the output y_d of ``reference_model``, which turns r(k) into
-    y_d(k+1): ``u1(k) = F1 R1 - K_s (u1(k-1) + ... + u1(k-p+1))`` with
+    ``model`` has q axes and any number p of lags. The command is u1 + u2. u1 moves the
+    model along the output y_d of ``reference_model``, which maps r(k) to y_d(k+1):
+    ``u1(k) = F1 R1 - K_s (u1(k-1) + ... + u1(k-p+1))`` with
     ``R1 = y_d(k+1) - sum_i A_i y_d``, ``decoupling`` K_s [q, q], lower triangular in
     the thesis, and F1 = (I + (p-1) K_s)(sum B)^-1, so that the axes are decoupled at
-    rest. u2 acts on e = y - y_d. The state X2 = [e(k); e(k+1); ...; e(k+p-1)], later
-    errors as far as they are known, follows from past e and u2 alone, and
+    rest. u2 acts on e = y - y_d. The state X2 = [e(k); e(k+1); ...; e(k+p-1)] contains
+    the known part of later errors, which depends on past e and u2 alone, and
     ``s = surface[0] e(k) + surface[1] e(k+1) + ...`` (7.28), each [q, q];
-    ``u2 = (S B)^-1 (reaching s - S A X2) + law(s)`` with ``reaching`` PHI [q, q]. The
-    law is a ``SwitchingPID`` with matrices [q, q] of gains in the thesis; its output
-    [v] is in the unit of the commands. PHI enters with the sign of (7.29), (7.31) and
+    ``u2 = (S B)^-1 (reaching s - S A X2) + law(s)`` with ``reaching`` PHI [q, q]. In
+    the thesis the law is a ``SwitchingPID`` with matrices [q, q] of gains; its output
+    is in the unit of the commands. PHI enters with the sign of (7.29), (7.31) and
     (7.40); that of (7.30) and (7.34) is unstable.
 
-    Input an Observation of q axes, output a tuple of q commands. (The thesis filters
-    the measurements: see ``Filtered``.) No parameter is limited in sign: a loop of
-    other gains may be unstable. The integral does not stop at a limit.
+    Input an Observation of q axes, output a tuple of q commands. The thesis filters the
+    measurements (see ``Filtered``). No parameter is limited in sign, so a loop may be
+    unstable. There is no anti-windup.
 
-    At rest without disturbance the state stays where it is. Where the model's DC gain
-    is not the stage's, s = 0 leaves a small error, because the prediction contains no
-    disturbance, and the start moves there slowly.
+    At rest without disturbance the state is constant. If the DC gain of the model
+    differs from that of the stage, a small error remains at s = 0, because the
+    prediction contains no disturbance, and the loop moves there slowly from the start.
 
-    Raises ValueError for matrices that are not [q, q] or a surface that has not p of
-    them.
+    Raises ValueError for matrices that are not [q, q] or a surface without p of them.
     """
+
+    part_units: ClassVar[PartUnits] = {"law": {"s": "um", "v": "[u]"}}
 
     law: SwitchingLaw
     model: MatrixARMA
@@ -122,7 +123,7 @@ class MultiAxisSlidingMode(Designed):
         reach = inverse(driven)
         equivalent = []
         for j, S in enumerate(surface):
-            # X2 moves up by one block; the model's A make the last.
+            # X2 moves up by one block; the A of the model give the last block.
             moved = matrix_product(surface[-1], A[-1 - j])
             if j > 0:
                 moved = plus(moved, surface[j - 1])
@@ -142,7 +143,7 @@ class MultiAxisSlidingMode(Designed):
 
 
 class ResolvedMultiAxis(System):
-    """The System that a MultiAxisSlidingMode steps: its matrices and those computed.
+    """MultiAxisSlidingMode with its gain matrices computed.
 
     ``forward`` F1, ``past_desired`` F1 A_i, ``rest`` (I + (p-1) K_s)^-1 and
     ``equivalent`` (S B)^-1 (PHI S - S A), a block for each of X2.
@@ -173,10 +174,10 @@ class ResolvedMultiAxis(System):
     ) -> tuple[Axes, ...]:
         """Return X2(k) from e(k), X2(k-1) and u2(k-1).
 
-        Each block is written with those before it in X2(k) and X2(k-1): both are
-        carried, so that a compiler computes neither twice.
+        Each block is computed from the blocks before it in X2(k) and X2(k-1), so that
+        no product is computed twice.
         """
-        found = [error]
+        blocks = [error]
         model = self.model
         A, B = model.autoregressive, model.moving
         p = len(B)
@@ -187,11 +188,11 @@ class ResolvedMultiAxis(System):
             older = last[j + 1] if inner else product(A[j], last[0])
             block = plus(block, older)
             for i in range(j):
-                known = found[j - 1 - i]
+                known = blocks[j - 1 - i]
                 known = minus(known, last[j - i]) if inner else known
                 block = plus(block, product(A[i], known))
-            found.append(block)
-        return tuple(found)
+            blocks.append(block)
+        return tuple(blocks)
 
     def _sliding(self, predicted: tuple[Axes, ...]) -> Axes:
         return _summed(self.surface, predicted)
@@ -201,7 +202,7 @@ class ResolvedMultiAxis(System):
         q, p = model.axes, len(model.moving)
         desired = (tuple(as_array(r) for r in input.reference),) * p
         zero = (jnp.zeros_like(desired[0][0]),) * q
-        # At rest u1 is its own past: u1 (I + (p-1) K_s) = F1 R1.
+        # At rest u1 equals its past: (I + (p-1) K_s) u1 = F1 R1.
         wanted = self._forward((*desired, desired[0]), (zero,) * (p - 1))
         forward = product(self.rest, wanted)
         feedback = minus(tuple(as_array(u) for u in input.applied), forward)

@@ -1,12 +1,12 @@
-"""Sliding mode control on the state of a nominal model (chapter 8)."""
+"""Nominal-model sliding mode control of one axis (chapter 8)."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, State, as_array
-from ..core.parameter import parameter
+from ..core.parameter import PartUnits, parameter
 from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
 from .output_tracking import check_second_order
@@ -16,8 +16,8 @@ READINGS = ("nominal_state", "measured_state")
 
 
 class NominalState(NamedTuple):
-    """States of model and law; last measurement, reference and disturbance, each in the
-    unit of the output."""
+    """States of model and law; the last measurement, reference and disturbance in the
+    unit of the axis."""
 
     model: State
     law: State
@@ -29,8 +29,8 @@ class NominalState(NamedTuple):
 class NominalSlidingMode(System):
     """Sliding mode control of one axis on the state of a nominal model, (8.17)-(8.39).
 
-    The printed equivalent control is unstable on the measured state in every form
-    tried. ``reading`` selects its replacement:
+    On the measured state, every tried form of the printed equivalent control is
+    unstable. ``reading`` selects a replacement:
 
     - ``"nominal_state"``: the equivalent control acts on the state of ``model``, which
       runs on the applied input: y_n(k) and y_n(k+1). The law acts on the measured
@@ -41,14 +41,16 @@ class NominalSlidingMode(System):
 
     ``correction`` weighs epsilon of (8.22), the effect of d = y - y_n on the next
     states: 1 as printed with a disturbance observer, 0 for the nominal controller.
-    ``model`` is a second-order ARMA (a_1, a_2 | b_0, b_1, b_2) whose input and output
-    have one unit; its numerator, whose zero may lie outside the unit circle, is
-    inverted at rest, by the sum of its coefficients, with Q/(Q+R) of (8.39). ``law``, a
-    ``SwitchingPID`` in the thesis, turns s into the switching part.
+    ``model`` is a second-order ARMA (a_1, a_2 | b_0, b_1, b_2) with one unit for input
+    and output. The zeros of its numerator may lie outside the unit circle, so the sum
+    of its coefficients is inverted instead, with Q/(Q+R) of (8.39). ``law``, a
+    ``SwitchingPID`` in the thesis, computes the switching part from s.
 
     Input an Observation, output the command. Raises ValueError for a model of another
     order or an unknown reading.
     """
+
+    part_units: ClassVar[PartUnits] = {"law": {"s": "um", "v": "um"}}
 
     law: SwitchingLaw
     model: ARMA
@@ -80,13 +82,13 @@ class NominalSlidingMode(System):
     def _advance(
         self, state: NominalState, input: Observation
     ) -> tuple[Scalar, Scalar, NominalState]:
-        """Return v less its switching part, s, and the next state but for the law."""
+        """Return v without switching part, s, and the next state with the old law."""
         a1, a2 = (-a for a in self.model.autoregressive)
         y, r, r_next = input.measured, input.reference, input.next_reference
         model, modelled = self.model.step(state.model, input.applied)
         disturbance = y - modelled
         if self.reading == "nominal_state":
-            # As if the last command were held: the next one is not known yet.
+            # The next command is not known yet: assume that the last one is held.
             _, ahead = self.model.step(model, input.applied)
             held = sum(self.model.moving) * input.applied
             predicted = -a1 * y - a2 * state.measured + held
@@ -117,7 +119,7 @@ class NominalSlidingMode(System):
             reference=as_array(input.reference),
             disturbance=input.measured - modelled,
         )
-        # The law holds what the command needs at rest.
+        # The law holds the part of the command at rest that v does not give.
         v, sliding, _ = self._advance(state, input)
         needed = (input.applied / self._inverse() - v) / sum(self.model.moving)
         return state._replace(law=self.law.start(sliding, needed))

@@ -1,4 +1,4 @@
-"""What an observer is to a controller: displacement and velocity from what is seen."""
+"""Observer protocol: displacement and velocity from an Observation."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,13 +16,13 @@ class Motion(NamedTuple):
 
 
 class Observer(System):
-    """A System from an Observation to a Motion, every ``dt`` seconds.
+    """A System from an Observation to a Motion, with the sample time ``dt`` in s.
 
-    It sees all that its controller sees: one that needs the measurement only looks at
-    nothing else, one with a model uses ``applied``, in the unit of the model's input.
+    It receives the Observation of its controller. A filter of the measurement uses only
+    ``measured``; one with a model also uses ``applied``, in the unit of its input.
     """
 
-    if TYPE_CHECKING:  # else a checker takes it for the first field of each observer
+    if TYPE_CHECKING:  # a type checker would take a field for the first argument
 
         @property
         def dt(self) -> float: ...

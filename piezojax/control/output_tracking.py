@@ -1,4 +1,4 @@
-"""Equations shared by sliding mode controllers that track an output (ch. 4 and 5)."""
+"""Equations of output-tracking sliding mode control (chapters 4 and 5)."""
 
 from collections.abc import Callable
 
@@ -12,9 +12,9 @@ INVERSIONS: dict[str, Callable[[Scalar, Scalar, Scalar], Scalar]] = {
 }
 """Inverses of b_0 with the weights Q and R, by name, both 1 / b_0 for R = 0.
 
-"printed" is (4.21): Q weighs how far the command is from that of the exact inverse.
-"tikhonov" weighs the same distance at the model's output, um, and so needs the far
-smaller R of Tables 4-3 and 4-4."""
+"printed" is (4.21): Q weighs the difference of the command from that of the exact
+inverse. "tikhonov" weighs the resulting difference of the model's output in um, which
+needs the far smaller R of Tables 4-3 and 4-4."""
 
 
 def check_inversion(form: str, model: ARMA) -> None:
@@ -42,7 +42,7 @@ def check_second_order(model: ARMA) -> None:
 def tracking_error(
     motion: Motion, reference: Scalar, older_reference: Scalar, dt: float
 ) -> Motion:
-    """Return e1 = y - r in um and e2 = dy/dt - dr/dt in um/s, r' by its last step."""
+    """Return e1 = y - r in um and e2 = dy/dt - dr/dt in um/s, dr/dt by difference."""
     return Motion(
         motion.position - reference,
         motion.velocity - (reference - older_reference) / dt,
@@ -52,7 +52,7 @@ def tracking_error(
 def feedforward(
     model: ARMA, next_reference: Scalar, reference: Scalar, older_reference: Scalar
 ) -> Scalar:
-    """Return v1 (4.6): it moves the model from the reference state to the next."""
+    """Return v1 (4.6), which moves the model from one reference state to the next."""
     a1, a2 = model.autoregressive
     return (next_reference - a1 * reference - a2 * older_reference) / model.moving[0]
 
@@ -60,7 +60,7 @@ def feedforward(
 def equivalent_control(
     model: ARMA, surface: Scalar, error: Motion, dt: float
 ) -> Scalar:
-    """Return v_eq (4.10), which brings s = ``surface`` e1 + e2 to zero at once.
+    """Return v_eq (4.10), which brings s = ``surface`` e1 + e2 to zero in one sample.
 
     The model's state is x = [y, (y - y')/T], driven through B = [b0, b0/T].
     """
@@ -75,7 +75,7 @@ def equivalent_control(
 def inverted(
     model: ARMA, gain: Scalar, v: Scalar, outputs: tuple[Scalar, Scalar]
 ) -> Scalar:
-    """Return f = gain [b0 v - b1 f' - b2 f''], the model's numerator inverted."""
+    """Return f = gain [b0 v - b1 f' - b2 f''], the inverse of the model's numerator."""
     b0, b1, b2 = model.moving
     older, oldest = outputs
     return gain * (b0 * v - b1 * older - b2 * oldest)

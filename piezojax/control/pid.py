@@ -1,4 +1,4 @@
-"""Discrete PID of two degrees of freedom, filtered derivative, and anti-windup."""
+"""Discrete PID with two degrees of freedom, filtered derivative and anti-windup."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from ..core.system import Observation, System
 
 
 class PIDState(NamedTuple):
-    """Integral part in V; the derivative's error in um and its filtered rate in um/s;
+    """Integral part in V, filtered rate in um/s, last error of the derivative in um,
     last command in V."""
 
     integral: Scalar
@@ -20,17 +20,17 @@ class PIDState(NamedTuple):
 
 
 class PID(System):
-    """``u = P (b r - z) + I int (r - z) dt + D d(c r - z)/dt``, r to be followed by z.
+    """``u = P (b r - z) + I int (r - z) dt + D d(c r - z)/dt`` for reference r.
 
-    The derivative acts through a first-order filter. With ``anti_windup`` the integral
-    gives back what the actuator could not deliver. The integral is rectangular and
-    holds volts, so that a new gain causes no jump.
+    The derivative acts through a first-order filter. ``anti_windup`` drives the
+    integral by the difference of the applied and the commanded voltage. The integral is
+    rectangular and in V, so a change of I causes no jump.
 
     ``proportional_weight`` b and ``derivative_weight`` c are the set-point weights of
     Astrom and Hagglund (Advanced PID Control, 2006). With 1 the PID acts on the error
     alone. Below 1 a jump of r is softened; above 1, P (b - 1) r and D (c - 1) dr/dt
-    feed the reference and its rate forward. The feedback, and with it noise and
-    stability, does not depend on them. The rate is that up to r(k); r(k+1) is not used.
+    feed the reference and its rate forward. Feedback, noise and stability do not
+    depend on them. The rate ends at r(k); r(k+1) is not used.
 
     Raises ValueError for a parameter outside its limits.
     """

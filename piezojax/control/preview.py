@@ -1,8 +1,8 @@
-"""Inputs that make a model follow a reference that is known ahead of time.
+"""Preview inverses: inputs by which a model follows a reference known in advance.
 
-A zero outside the unit circle makes the exact inverse unstable, but only forwards in
-time: who knows the reference ahead can do better. These work on a whole reference
-before the loop runs, as an input of their own or in front of a closed loop.
+A zero outside the unit circle makes the exact causal inverse unstable. An inverse that
+uses future values of the reference can be stable. These inverses act on a whole
+reference before the loop runs, as open-loop input or as the reference of a loop.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,13 @@ from ..dynamics.arma import ARMA
 
 
 class PreviewInverse(eqx.Module):
-    """u = ``causal`` applied to the weighted references ahead: arrays to arrays.
+    """Inverse of a model: a weighted sum of future references, then ``causal``.
 
-    The model (a_1, ... | b_0, ...) answers u(k) with y(k+1), as in a loop;
-    ``w(k) = sum_j weights[j] r(k + 1 + delay + j)`` and ``causal`` turns w into u. Out
-    comes one input for each sample of the reference, in the unit of the model's input.
-    The reference rests before its first and after its last sample, and so does the
-    input before the first: a bumpless start. Compile it with ``eqx.filter_jit``.
+    The model (a_1, ... | b_0, ...) maps u(k) to y(k+1), as in a loop.
+    ``w(k) = sum_j weights[j] r(k + 1 + delay + j)``, and ``causal`` maps w to u. The
+    output has one input for each sample of the reference, in the unit of the model's
+    input. The reference is constant before its first and after its last sample, and the
+    input before its first: a bumpless start. Compile it with ``eqx.filter_jit``.
     """
 
     causal: ARMA
@@ -33,7 +33,7 @@ class PreviewInverse(eqx.Module):
 
     @property
     def preview(self) -> int:
-        """How many samples ahead of k the reference is used."""
+        """Number of samples after k of which the reference is used."""
         return self.delay + self.weights.size
 
     def __call__(self, reference: Float[Array, " samples"]) -> Float[Array, " samples"]:
@@ -47,39 +47,39 @@ class PreviewInverse(eqx.Module):
 
 
 def direct_inverse(model: ARMA) -> PreviewInverse:
-    """Return the exact inverse: unstable if a zero of ``model`` is.
+    """Return the exact inverse, unstable for a zero outside the unit circle.
 
     Raises ValueError if all b are zero.
     """
     scale, b, delay = _numerator(model)
-    return _over(model, scale, b, np.ones(1), delay)
+    return _inverse(model, scale, b, np.ones(1), delay)
 
 
 def zero_phase_inverse(model: ARMA, margin: float = 1.0) -> PreviewInverse:
     """Return the zero-phase-error tracking controller (ZPETC; Tomizuka, 1987).
 
-    Zeros inside the circle of radius ``margin`` are cancelled; of the others, B_u, the
-    phase is: with this input y follows r through B_u(z) B_u(1/z) / B_u(1)^2, which has
-    no phase at any frequency and is 1 at rest. The gain elsewhere is not 1. Uses one
-    sample of preview for each such zero beyond the model's own delay. Raises ValueError
-    for a margin outside (0, 1], a zero at z = 1 or b that are all zero.
+    It cancels the zeros inside the circle of radius ``margin`` and the phase of the
+    others, B_u. From r to y then remains B_u(z) B_u(1/z) / B_u(1)^2, which has zero
+    phase at all frequencies and is 1 at rest. Its gain elsewhere is not 1. The inverse
+    uses one sample of preview for each zero of B_u beyond the model's delay. Raises
+    ValueError for a margin outside (0, 1], a zero at z = 1 or b that are all zero.
     """
     scale, stable, unstable, delay = _split(model, margin)
     at_rest = unstable.sum()
     if abs(at_rest) < 1e-9 * np.abs(unstable).sum():
         raise ValueError("the model has a zero at z = 1; it must pass a reference")
-    return _over(model, scale, stable, unstable / at_rest**2, delay)
+    return _inverse(model, scale, stable, unstable / at_rest**2, delay)
 
 
 def stable_inverse(model: ARMA, preview: int) -> PreviewInverse:
-    """Return the inverse whose unstable part runs backwards, cut off after ``preview``.
+    """Return the inverse with its unstable part run backwards over ``preview``.
 
     1 / (1 - z_i/z) for a zero |z_i| > 1 is bounded as a series in z: the sum over j of
-    -(z/z_i)^(j+1), which takes the reference ahead of time. What is cut off falls as
-    |z_i|^-preview, of the zero nearest to the circle (preview-based stable inversion;
-    Zou and Devasia, 1999). ``preview`` counts the samples beyond the model's own
-    delay. Raises ValueError unless there are more of them than zeros outside the unit
-    circle, for a zero on it, or b that are all zero.
+    -(z/z_i)^(j+1), which uses future references. The series is truncated after
+    ``preview`` samples beyond the model's delay; the truncated part falls as
+    |z_i|^-preview of the zero nearest to the circle (preview-based stable inversion;
+    Zou and Devasia, 1999). Raises ValueError unless ``preview`` exceeds the number of
+    zeros outside the unit circle, for a zero on it, or b that are all zero.
     """
     scale, stable, unstable, delay = _split(model, 1.0)
     zeros = np.roots(unstable)
@@ -96,7 +96,7 @@ def stable_inverse(model: ARMA, preview: int) -> PreviewInverse:
     for j in range(order + 1, preview):
         past = weights[j - order : j][::-1]
         weights[j] = -(ahead[1:] @ past) / ahead[0]
-    return _over(model, scale, stable, weights, delay)
+    return _inverse(model, scale, stable, weights, delay)
 
 
 INVERSES: dict[str, Callable[..., PreviewInverse]] = {
@@ -108,7 +108,7 @@ INVERSES: dict[str, Callable[..., PreviewInverse]] = {
 
 
 def _numerator(model: ARMA) -> tuple[float, np.ndarray, int]:
-    """Return the first b that is not zero, b over it, and how many went before."""
+    """Return the first nonzero b, all b from there divided by it, and its index."""
     b = np.trim_zeros(np.array([float(x) for x in model.moving]), "b")
     if b.size == 0:
         raise ValueError("all b of the model are 0; one must be another number")
@@ -117,7 +117,7 @@ def _numerator(model: ARMA) -> tuple[float, np.ndarray, int]:
 
 
 def _split(model: ARMA, margin: float) -> tuple[float, np.ndarray, np.ndarray, int]:
-    """Return scale, the factor of zeros inside ``margin``, of the others, and delay."""
+    """Return scale, polynomials of zeros inside and outside ``margin``, and delay."""
     check("margin", margin, above=0.0, most=1.0)
     scale, b, delay = _numerator(model)
     zeros = np.roots(b)
@@ -128,10 +128,10 @@ def _split(model: ARMA, margin: float) -> tuple[float, np.ndarray, np.ndarray, i
     return scale, np.atleast_1d(stable), np.atleast_1d(unstable), delay
 
 
-def _over(
+def _inverse(
     model: ARMA, scale: float, stable: np.ndarray, weights: np.ndarray, delay: int
 ) -> PreviewInverse:
-    """Return A / (scale B_s), behind ``weights`` on the reference ahead."""
+    """Return the inverse A / (scale B_s) of the references weighted by ``weights``."""
     a = [1.0, *(-float(x) for x in model.autoregressive)]
     causal = ARMA([-x for x in stable[1:]], [x / scale for x in a])
     return PreviewInverse(causal, weights, delay)

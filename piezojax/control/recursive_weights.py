@@ -1,11 +1,11 @@
-"""Weights of a linear relation, learned sample by sample."""
+"""Recursive least squares with forgetting, for the weights of a linear relation."""
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Matrix, Scalar, as_array, as_scalars, check
+from ..core.arrays import Matrix, Scalar, as_scalars
+from ..core.parameter import parameter, sample_time
 from ..core.recursive_update import update
 from ..core.system import Learned, System
 
@@ -15,8 +15,8 @@ Row = tuple[Scalar, ...]
 class RecursiveWeightsState(Learned):
     """Weights and their covariance.
 
-    The one matrix in a loop: as scalars it takes four times as long to compile, because
-    every element needs every other, and runs no faster.
+    The covariance is the only matrix in a loop: as scalars it takes four times as long
+    to compile, because every element needs every other, and runs no faster.
     """
 
     weights: Row
@@ -26,30 +26,37 @@ class RecursiveWeightsState(Learned):
 class RecursiveWeights(System):
     """Recursive least squares for ``target = sum_i weights[i] row[i]``.
 
-    Input a row and its target, output the weights known after it. ``weights`` are those
-    before the first sample, ``deviations`` how far off they may be (standard
-    deviations, in the unit of each; 0 holds a weight), ``equation_error`` the standard
-    deviation of what the relation leaves, in the unit of the target. What was learned
-    is forgotten with the time constant ``memory`` (s): the covariance goes back to that
-    of ``deviations``, so it is bounded where nothing moves (stabilised linear
-    forgetting: Milek and Kraus 1995, Automatica 31(2)). ``dt`` in s.
+    Input a row and its target, output the weights updated by them. Each weight has the
+    unit of the target per element of the row. A deviation of 0 fixes its weight. Old
+    samples are forgotten with the time constant ``memory``: the covariance returns to
+    that of ``deviations``, so it stays bounded when the rows do not change (stabilised
+    linear forgetting: Milek and Kraus 1995, Automatica 31(2)).
 
-    Raises ValueError for a different count of weights and deviations, deviations below
-    0, or an equation error, memory or ``dt`` that is not positive.
+    Raises ValueError for a parameter outside its limits, or different counts of weights
+    and deviations.
     """
 
-    weights: Row = eqx.field(converter=as_scalars)
-    deviations: Row = eqx.field(converter=as_scalars)
-    equation_error: Scalar = eqx.field(converter=as_array)
-    memory: Scalar = eqx.field(converter=as_array)
-    dt: float = eqx.field(static=True)
+    weights: Row = parameter(
+        "[target] per term", "weights at the start", converter=as_scalars
+    )
+    deviations: Row = parameter(
+        "[target] per term",
+        "standard deviations of the weights at the start",
+        least=0.0,
+        converter=as_scalars,
+    )
+    equation_error: Scalar = parameter(
+        "[target]",
+        "standard deviation of the residual of the relation",
+        above=0.0,
+        scale="log",
+    )
+    memory: Scalar = parameter(
+        "s", "time constant of forgetting", above=0.0, scale="log"
+    )
+    dt: float = sample_time()
 
     def __check_init__(self):
-        check("weights", self.weights)
-        check("deviations", self.deviations, least=0.0)
-        check("equation error", self.equation_error, above=0.0)
-        check("memory in s", self.memory, above=0.0)
-        check("sample time in s", self.dt, above=0.0)
         if len(self.weights) != len(self.deviations):
             raise ValueError(
                 f"{len(self.weights)} weights and {len(self.deviations)} deviations; "
@@ -57,7 +64,7 @@ class RecursiveWeights(System):
             )
 
     def init(self, input: Any = None) -> RecursiveWeightsState:
-        """Return the weights that the relation starts with, whatever the input."""
+        """Return the start of weights and covariance; ``input`` is not used."""
         return RecursiveWeightsState(self.weights, self._prior())
 
     def _prior(self) -> Matrix:
@@ -75,6 +82,6 @@ class RecursiveWeights(System):
             self.equation_error**2,
         )
         weights = as_scalars(weights)
-        kept = jnp.exp(-self.dt / self.memory)
-        covariance = kept * covariance + (1.0 - kept) * self._prior()
+        forgetting = jnp.exp(-self.dt / self.memory)
+        covariance = forgetting * covariance + (1.0 - forgetting) * self._prior()
         return RecursiveWeightsState(weights, covariance), weights

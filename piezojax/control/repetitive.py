@@ -13,8 +13,8 @@ from ..core.system import Observation, System
 class RepetitiveState(NamedTuple):
     """States of controller and Q-filter, w(k) in um, and the delay line.
 
-    ``line`` is one array of ``period - advance`` samples, um, ``index`` the place of
-    sample k in it: a step writes two samples and reads one, whatever the period.
+    ``line`` is a ring buffer of ``period - advance`` samples in um, ``index`` the place
+    of sample k in it: a step writes two samples and reads one at any period.
     """
 
     feedback: State
@@ -25,24 +25,24 @@ class RepetitiveState(NamedTuple):
 
 
 class RepetitiveControl(System):
-    """``feedback`` with its reference corrected by the errors of the last periods.
+    """``feedback`` with its reference corrected by the errors of past periods.
 
-    Plugged in as in section 2.6.3, Figure 2.17: ``feedback``, any controller, sees
+    The plug-in form of section 2.6.3, Figure 2.17: ``feedback``, any controller, sees
     r + w in place of r, with
 
     ``w = Q z^-period (w + gain z^lead e)``, e = r - z in um.
 
-    ``filter`` Q is any low pass from um to um with unit gain at zero, 0 at rest, whose
-    own delay ``advance`` is taken off the delay line. A ``FirstOrderLag`` of tau has
-    about tau / dt; ``ARMA`` coefficients that are symmetric about the middle make Q
+    ``filter`` Q is any low pass from um to um with unit DC gain, 0 at rest. Its delay
+    ``advance`` is subtracted from the delay line. A ``FirstOrderLag`` with time
+    constant tau has a delay of about tau / dt; symmetric ``ARMA`` coefficients make Q
     exactly zero-phase.
 
-    With T the inner loop from r to z and Q with its delay taken off, the error of a
-    linear loop dies out from period to period if ``|Q (1 - gain z^lead T)| < 1`` at all
-    frequencies. A reference out of reach winds it up, because it knows no limits.
+    Let T be the inner loop from r to z, and Q without its delay. The error of a linear
+    loop decays from period to period if ``|Q (1 - gain z^lead T)| < 1`` at all
+    frequencies. There is no anti-windup: an unreachable reference winds w up.
 
-    Input an Observation, output that of ``feedback``. At rest without error it does
-    nothing. Raises ValueError for ``lead + advance >= period``.
+    Input an Observation, output that of ``feedback``. At rest without error w is zero.
+    Raises ValueError for ``lead + advance >= period``.
     """
 
     feedback: System
@@ -53,7 +53,7 @@ class RepetitiveControl(System):
     )
     lead: int = parameter(
         "samples",
-        "lag of the inner loop, about",
+        "approximate lag of the inner loop",
         least=0.0,
         whole=True,
         static=True,
@@ -90,15 +90,15 @@ class RepetitiveControl(System):
     ) -> tuple[RepetitiveState, Scalar]:
         length = self.period - self.advance
         error = input.reference - input.measured
-        # e(k) belongs to w(k - lead), which has been in the line since then.
+        # e(k) corrects w(k - lead), which is still in the line.
         line = state.line.at[state.index].set(state.correction)
         learned = jnp.mod(state.index - self.lead, length)
         line = line.at[learned].add(self.gain * error)
         index = jnp.mod(state.index + 1, length)
         filter_state, correction = self.filter.step(state.filter, line[index])
-        seen = input._replace(
+        observation = input._replace(
             reference=input.reference + state.correction,
             next_reference=input.next_reference + correction,
         )
-        feedback, command = self.feedback.step(state.feedback, seen)
+        feedback, command = self.feedback.step(state.feedback, observation)
         return RepetitiveState(feedback, filter_state, correction, line, index), command

@@ -1,11 +1,11 @@
 """Output-tracking sliding mode control with any switching law (chapters 4 and 5)."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 
 from ..core.arrays import Scalar, State, as_array
-from ..core.parameter import parameter
+from ..core.parameter import PartUnits, parameter
 from ..core.system import Observation, System
 from ..dynamics.arma import ARMA
 from .observer import Observer
@@ -31,24 +31,25 @@ class SlidingModeState(NamedTuple):
 
 
 class SlidingMode(System):
-    """Sliding mode control of a second-order model that makes its output track.
+    """Output-tracking sliding mode control on a second-order model.
 
-    The state x = [y, dy/dt] comes from ``filter``, an observer. The sliding variable is
+    The observer ``filter`` estimates the state x = [y, dy/dt]. The sliding variable is
     ``s = surface e1 + e2`` in um/s (5.15). The equivalent control and the reference
     part v1 come from ``model`` (a_1, a_2 | b_0, b_1, b_2, b_0 not zero), the switching
     part from ``law``: a ``SwitchingPID`` (5.18), ``BangBang``, ``BoundaryLayer`` or
     ``SuperTwisting``. The zeros of the model, which may lie outside the unit circle,
     are inverted in the least-squares sense: f = Q/(Q+R) [v - (b1/b0) f' - (b2/b0) f'']
     (5.23), or in another form ``inversion`` of ``INVERSIONS``. ``correction`` weighs
-    the equivalent control: less of it weakens the feedback and leaves the reference
-    part.
+    the equivalent control: a smaller one weakens the feedback, not the reference part.
 
     Input an Observation; output f in the unit of the model's input: V if the model was
     identified from voltage, um behind an inverse hysteresis or in a disturbance
-    observer with its own gain. The law's [v] is that unit.
+    observer with its own gain. The switching part v has that unit.
 
     Raises ValueError for a model of another order, b_0 = 0 or an unknown inversion.
     """
+
+    part_units: ClassVar[PartUnits] = {"law": {"s": "um/s", "v": "[u]"}}
 
     law: SwitchingLaw
     model: ARMA
@@ -84,7 +85,7 @@ class SlidingMode(System):
     def init(self, input: Observation) -> SlidingModeState:
         reference, applied = as_array(input.reference), as_array(input.applied)
         b0, b1, b2 = self.model.moving
-        # At rest s = 0: the law alone holds what the feedforward leaves.
+        # At rest s = 0: the law holds the part that the feedforward does not give.
         needed = applied * (1.0 / self._inversion_gain() + b1 + b2) / b0
         held = needed - feedforward(self.model, reference, reference, reference)
         return SlidingModeState(
@@ -123,13 +124,15 @@ class ContinuousSlidingModeState(NamedTuple):
 
 
 class ContinuousSlidingMode(System):
-    """``u = law(s)`` with s = ``surface`` e + de/dt, sampled: no model of the stage.
+    """Sampled continuous design without a model: ``u = law(s)``.
 
-    The comparison of section 4.5.4.3, reference [98] there, for which the thesis prints
-    gains but no equation: the continuous design needs no model, so none is used.
-    e = y - r, where y and dy/dt come from ``filter``; s is in um/s, the law's output
-    in V. Input an Observation, output in V.
+    The sliding variable is s = ``surface`` e + de/dt in um/s with e = y - r, where y
+    and dy/dt come from ``filter``. It is the comparison of section 4.5.4.3, reference
+    [98] there, for which the thesis prints gains but no equation. The continuous design
+    needs no model. Input an Observation, output in V.
     """
+
+    part_units: ClassVar[PartUnits] = {"law": {"s": "um/s", "v": "[u]"}}
 
     law: SwitchingLaw
     filter: Observer

@@ -1,4 +1,4 @@
-"""A linear controller in state-space form, from the error to the command."""
+"""Linear controller in state-space form, from the error to the command."""
 
 from typing import NamedTuple
 
@@ -20,11 +20,11 @@ class LinearState(NamedTuple):
 class StateSpaceController(System):
     """``u = bias + law(r - z)`` with any linear ``law`` of one input and one output.
 
-    The law acts on the error in um; its state starts at zero and ``bias`` is what was
-    applied before, so that a start without error does not jump, also where the law
-    holds an integrator. Nothing stops it from winding up at a limit. Input an
+    The law acts on the error in um. Its state starts at zero, and ``bias`` is the
+    applied command at the start less the direct part of the law, so the start does not
+    jump, also for a law with an integrator. There is no anti-windup. Input an
     Observation, output in the unit of the law's output. Raises ValueError for a law of
-    other sizes.
+    several inputs or outputs.
     """
 
     law: StateSpace

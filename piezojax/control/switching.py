@@ -25,15 +25,15 @@ def as_gain(value: Any) -> Any:
 class SwitchingLaw(System):
     """A System from the sliding variable s to the switching part of a control.
 
-    The unit of s is [s], that of the output [v]; both are the controller's.
+    [s] is the unit of s and [v] that of the output; the controller declares both.
     """
 
     @abc.abstractmethod
     def start(self, sliding: Signal, output: Signal) -> State:
         """Return the state in which the law gives ``output`` at a resting ``sliding``.
 
-        A law without an integral holds what is missing as a constant bias, so that
-        every start at rest is bumpless.
+        A law without an integral adds a constant bias to its output, so that every
+        start at rest is bumpless.
         """
 
     def init(self, input: Signal = 0.0) -> State:
@@ -48,10 +48,10 @@ class SwitchingPIDState(NamedTuple):
 
 
 class SwitchingPID(SwitchingLaw):
-    """``v = -(P s + I int s dt + D ds/dt)``, a PID in place of a switching term.
+    """PID as switching part: ``v = -(P s + I int s dt + D ds/dt)``.
 
-    The law of (4.43), (5.18), (7.33) and (8.34). With several axes s and v
-    are tuples of one scalar an axis, and the gains matrices or scalars for all axes.
+    The law of (4.43), (5.18), (7.33) and (8.34). With several axes s and v are tuples
+    of one scalar an axis, and a gain is a matrix or a scalar for all axes.
     """
 
     proportional: Gain = parameter(
@@ -85,7 +85,7 @@ class SwitchingPID(SwitchingLaw):
     def step(
         self, state: SwitchingPIDState, input: Signal
     ) -> tuple[SwitchingPIDState, Signal]:
-        # A gain times dt does not change from sample to sample.
+        # Gain times dt is loop-invariant.
         rate = jax.tree.map(lambda gain: gain * self.dt, self.integral)
         integral = jax.tree.map(jnp.subtract, state.integral, _times(rate, input))
         change = jax.tree.map(jnp.subtract, input, state.sliding)
@@ -105,10 +105,11 @@ def _times(gain: Gain, signal: Signal) -> Any:
 
 
 class BangBang(SwitchingLaw):
-    """``v = -gain sign(s)``: it chatters, the baseline of sliding mode controllers.
+    """Bang-bang switching, ``v = -gain sign(s)``, which chatters.
 
-    The law of the nominal sliding mode control of section 4.5.4.1. Without an integral
-    an offset remains. The slope of sign is taken as zero.
+    The law of the nominal sliding mode control of section 4.5.4.1, the baseline of the
+    others. Without an integral an offset remains. The derivative of sign is taken as
+    zero.
     """
 
     gain: Scalar = parameter(
@@ -123,12 +124,12 @@ class BangBang(SwitchingLaw):
 
 
 class BoundaryLayer(SwitchingLaw):
-    """``v = -gain sat(s / width)``: proportional within the layer, ``gain`` outside.
+    """Boundary layer, ``v = -gain sat(s / width)``: proportional within ``width``.
 
-    The law of section 2.6.1.2, reference [94] there. A width near zero is bang-bang
-    switching. Without an integral an offset remains, which is smaller for a steeper
-    layer. The slope is -gain / width inside, zero outside and between the two on the
-    edge.
+    The law of section 2.6.1.2, reference [94] there. A width near zero gives
+    bang-bang switching. Without an integral an offset remains, which is smaller for a
+    larger gain / width. The derivative is -gain / width inside, zero outside and
+    between the two on the edge.
     """
 
     gain: Scalar = parameter(
@@ -149,14 +150,15 @@ class BoundaryLayer(SwitchingLaw):
 
 
 class SuperTwisting(SwitchingLaw):
-    """``v = w - root_gain |s|^(1/2) sign(s)``, ``dw/dt = -sign_gain sign(s)``, smooth.
+    """Smoothed super-twisting: ``v = w - root_gain |s|^(1/2) sign(s)``.
 
-    The second-order sliding mode that needs only s (A. Levant, Int. J. Control 58,
-    1993; section 2.6.1.2). Sampled, the sign chatters by ``sign_gain dt`` about s = 0,
-    and the slope of the root is infinite there. Both are therefore smoothed over
-    ``layer`` d: s / (s^2 + d^2)^(1/4) and s / (s^2 + d^2)^(1/2) equal the root and the
-    sign far outside the layer, and form a proportional-integral law of s inside. The
-    law rests at s = 0 with any w, its state.
+    Its state is w with ``dw/dt = -sign_gain sign(s)``. This second-order sliding mode
+    needs only s (A. Levant, Int. J. Control 58, 1993; section 2.6.1.2). In discrete
+    time the sign chatters by ``sign_gain dt`` about s = 0, and the derivative of the
+    root is infinite there. Both are therefore smoothed over ``layer`` d:
+    s / (s^2 + d^2)^(1/4) and s / (s^2 + d^2)^(1/2) equal the root and the sign far
+    outside the layer, and form a proportional-integral law of s inside. The law rests
+    at s = 0 with any w.
     """
 
     root_gain: Scalar = parameter(

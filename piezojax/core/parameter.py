@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping
+from fractions import Fraction
 from typing import Any, Literal
 
 import equinox as eqx
@@ -12,7 +14,11 @@ from .arrays import as_array, check
 
 Scale = Literal["linear", "log", "logit"]
 
+PartUnits = Mapping[str, Mapping[str, str]]
+"""Units inside each part of a System, by part and by name in brackets."""
+
 _KEY = "parameter"
+_FACTOR = re.compile(r"(/)|(\[\w+\]|[A-Za-z]+)(?:\^(-?\d+|\(\d+/\d+\)))?")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,9 +28,10 @@ class Parameter:
     ``above`` and ``below`` are exclusive limits, ``least`` and ``most`` inclusive ones.
     ``typical`` is the range of a search for which the study gives no range, on
     ``scale``: "log" for positive values that span decades, "logit" for values between 0
-    and 1. The ``unit`` of a pure number is "1". A frequency with ``below_nyquist`` must
-    be below pi / dt, with the sample time dt of the declaring System. A ``whole``
-    parameter is an integer, such as a count.
+    and 1. The ``unit`` of a pure number is "1"; a name in brackets, as in "[u]/um",
+    stands for a unit that only an outer System knows (see ``System.part_units``). A
+    frequency with ``below_nyquist`` must be below pi / dt, with the sample time dt of
+    the declaring System. A ``whole`` parameter is an integer, such as a count.
     """
 
     unit: str
@@ -43,6 +50,11 @@ class Parameter:
         if not self.below_nyquist:
             return self
         return dataclasses.replace(self, below=min(self.below, math.pi / dt))
+
+    def inside(self, units: Mapping[str, str]) -> "Parameter":
+        """Return the declaration with the names in brackets replaced by ``units``."""
+        unit = substituted(self.unit, units)
+        return self if unit == self.unit else dataclasses.replace(self, unit=unit)
 
     def check(self, name: str, value: Any) -> None:
         """Raise ValueError unless ``value`` is finite and within the limits."""
@@ -96,6 +108,45 @@ def parameter(
 def sample_time(**options: Any) -> Any:
     """Return the field of a sample time in s."""
     return parameter("s", "sample time", above=0.0, static=True, **options)
+
+
+def substituted(unit: str, units: Mapping[str, str]) -> str:
+    """Return ``unit`` with the names in brackets replaced by ``units`` and cancelled.
+
+    "[v]/[s]" becomes "V s/um" for v in V and s in um/s. A unit without such a name is
+    returned as it is.
+    """
+    if not any(f"[{name}]" in unit for name in units):
+        return unit
+    powers = _powers(unit, units)
+    over = [_factor(base, power) for base, power in powers.items() if power > 0]
+    under = [_factor(base, -power) for base, power in powers.items() if power < 0]
+    numerator, denominator = " ".join(over) or "1", " ".join(under)
+    if len(under) > 1:
+        denominator = f"({denominator})"
+    return f"{numerator}/{denominator}" if under else numerator
+
+
+def _powers(unit: str, units: Mapping[str, str]) -> dict[str, Fraction]:
+    """Return the exponent of each factor; all factors after the solidus divide."""
+    powers: dict[str, Fraction] = {}
+    sign = 1
+    for solidus, factor, exponent in _FACTOR.findall(unit):
+        if solidus:
+            sign = -1
+            continue
+        known = units.get(factor.strip("[]")) if factor.startswith("[") else None
+        inner = {factor: Fraction(1)} if known is None else _powers(known, {})
+        for base, power in inner.items():
+            total = powers.get(base, Fraction(0))
+            powers[base] = total + sign * Fraction(exponent.strip("()") or 1) * power
+    return powers
+
+
+def _factor(base: str, power: Fraction) -> str:
+    if power == 1:
+        return base
+    return f"{base}^{power}" if power.denominator == 1 else f"{base}^({power})"
 
 
 def declarations(kind: Any) -> Iterator[tuple[str, Parameter]]:

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 
 from .arrays import as_array
 from .axes import PerAxis
-from .parameter import Parameter, declarations
-from .system import Series
+from .parameter import Parameter, declarations, substituted
+from .system import Series, System
 
 S = TypeVar("S", bound=eqx.Module)
 
@@ -55,10 +55,13 @@ def declared(system: Any, path: str) -> Parameter | None:
     """Return the declaration of the parameter at ``path``, or None if it has none.
 
     The elements of a tuple, such as coefficients, share the declaration of their field.
-    A limit at the Nyquist frequency uses the sample time of the declaring System.
+    A limit at the Nyquist frequency uses the sample time of the declaring System. Names
+    in brackets in its unit are replaced by the units that the outer Systems declare for
+    them.
     """
     node: Any = system
     declaration = None
+    units: Mapping[str, str] = {}
     for name in path.split("."):
         children = _children(node)
         if name not in children:
@@ -67,6 +70,11 @@ def declared(system: Any, path: str) -> Parameter | None:
             declaration = dict(declarations(type(node))).get(name)
             if declaration is not None and declaration.below_nyquist:
                 declaration = declaration.at(children["dt"])
+            if declaration is not None:
+                declaration = declaration.inside(units)
+        if isinstance(node, System):
+            inner = node.part_units.get(name, {})
+            units = {**units, **{k: substituted(u, units) for k, u in inner.items()}}
         node = children[name]
     return declaration
 

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any, NamedTuple, dataclass_transform
+from typing import Any, ClassVar, NamedTuple, dataclass_transform
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from .arrays import Scalar, ScalarLike, Signal, State, as_array, as_signal
-from .parameter import check_declared, parameter, sample_time
+from .parameter import PartUnits, check_declared, parameter, sample_time
 
 
 @dataclass_transform(
@@ -22,6 +22,13 @@ class System(eqx.Module):
 
     Its array fields are its parameters. They can be differentiated, batched with
     ``jax.vmap``, and tuned or perturbed by path in any System.
+    """
+
+    part_units: ClassVar[PartUnits] = {}
+    """Units inside each part, for the names in brackets in the units it declares.
+
+    ``{"law": {"s": "um/s", "v": "[u]"}}`` for a field ``law`` with a gain in "[v]/[s]".
+    They hold at all depths unless an inner System replaces them.
     """
 
     def __check_init__(self):
@@ -248,6 +255,8 @@ class Feedback(System):
     With several axes every signal is a tuple with one scalar per axis, in the unit of
     the axis.
     """
+
+    part_units: ClassVar[PartUnits] = {"controller": {"u": "V"}}
 
     controller: System
     plant: System

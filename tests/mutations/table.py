@@ -234,8 +234,8 @@ MUTATIONS = (
     Mutation(
         "forgetting ten times faster",
         "control/recursive_weights.py",
-        "kept = jnp.exp(-self.dt / self.memory)",
-        "kept = jnp.exp(-10.0 * self.dt / self.memory)",
+        "forgetting = jnp.exp(-self.dt / self.memory)",
+        "forgetting = jnp.exp(-10.0 * self.dt / self.memory)",
         ("tests/control/test_adaptive_inverse.py",),
     ),
     Mutation(
