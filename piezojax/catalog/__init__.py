@@ -20,9 +20,9 @@ PLANTS: dict[str, Callable[..., System]] = {
     "p558": p558_stage.plant,
     "mirror": mirror.stage,
 }
-"""Plants by the name that a study uses. Arguments of a plant that need no keyword are
-the deviations that an ensemble may draw; the function says whether one is relative or a
-value. On several axes each takes one value an axis."""
+"""Plants by the name that a study uses. The positional arguments of a plant are the
+deviations that an ensemble may draw; the docstring of the plant states whether one is
+relative or absolute. On several axes each takes one value an axis."""
 
 CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_pid": p753.pid,
@@ -55,14 +55,14 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p558_disturbance_observer": p558_control.disturbance_observer,
     "mirror_multi_axis": mirror.anticipating_multi_axis,
 }
-"""Controllers a study can name, with printed gains except where they say "ours";
-those that take a ``rate`` (Hz) come at the study's."""
+"""Controllers by the name that a study uses, with printed gains unless their docstring
+says "ours". Those with an argument ``rate`` (Hz) are made for the rate of the study."""
 
 
 def deviations_of(plant: str) -> tuple[str, ...]:
     """Return the deviations that an ensemble may draw of a catalogued plant.
 
-    They are the arguments that need no keyword; an unknown plant has none.
+    They are its positional arguments; an unknown plant has none.
     """
     if plant not in PLANTS:
         return ()
@@ -76,9 +76,9 @@ def deviations_of(plant: str) -> tuple[str, ...]:
 def at_rate(
     catalog: Mapping[str, Callable[..., System]], name: str, rate: float | int
 ) -> System:
-    """Return ``catalog[name]``, made for ``rate`` (Hz) if it comes at several.
+    """Return ``catalog[name]``, made for ``rate`` (Hz) if it has that argument.
 
-    Raises ValueError for a rate at which there is none.
+    Raises ValueError for a rate without a printed model.
     """
     make = catalog[name]
     if "rate" not in inspect.signature(make).parameters:

@@ -1,18 +1,18 @@
-"""A fast-steering mirror, 3 piezo drives and 3 displacements, identified at 6.4 kHz.
+"""Fast-steering mirror: 3 piezo drives, 3 displacements, identified at 6.4 kHz.
 
 The records are M. Floren's (KU Leuven, ``fsm-benchmark-data``, CC BY 4.0; Floren et
 al., ISMA-USD 2024, pp. 2042-2052): open loop, orthogonal random-phase multisines on all
-lines from 0.78 to 3000 Hz. The models here fit those at 100 mV; on a realisation held
-out their simulation errors are
+lines from 0.78 to 3000 Hz. The models fit the records at 100 mV; their simulation
+errors on a held-out realisation are
 
 - order 12: 0.31 um rms,
 - order 24: 0.11 um rms,
 
-mean over the outputs, which move by 1.23, 1.35 and 1.51 um rms. A fit to the whole
-band follows the resonances, 640 to 2550 Hz, first: below 10 Hz its transfer matrix is
-36 % off with 12 states, 12 % with 24 (largest singular values). At 200 and 300 mV the
-resonances are lower, and no linear model is as good. There is no creep in the records,
-and no closed loop: that a loop here would be stable on the mirror is not shown.
+averaged over the outputs, which move by 1.23, 1.35 and 1.51 um rms. A fit to the whole
+band favours the resonances, 640 to 2550 Hz: below 10 Hz the error of its transfer
+matrix is 36 % with 12 states and 12 % with 24 (largest singular values). At 200 and
+300 mV the resonances are lower, and no linear model fits as well. The records contain
+no creep and no closed loop, so stability of a loop on the real mirror is not shown.
 
 Drives in V, displacements in um.
 """
@@ -39,7 +39,7 @@ ORDERS = (12, 24)
 """States of the identified models."""
 
 NOISE_RMS = 0.0127
-"""What two periods of the records differ by at 100 mV, um."""
+"""Rms difference of two periods of the records at 100 mV, um."""
 
 SURFACE = (
     (0.998, 0.915, 0.5),
@@ -48,16 +48,16 @@ SURFACE = (
     (0.223, 0.422, 0.364),
     (1.334, 0.707, 0.908),
 )
-"""Ours: weights of e(k), ..., e(k+4) by axis, before scaling; see ``multi_axis``."""
+"""Ours: weights of e(k), ..., e(k+4) by axis, scaled in ``multi_axis``."""
 
 REACHING = (0.534, 0.569, 0.668)
 """Ours: diagonal of PHI."""
 
 PROPORTIONAL, INTEGRAL = 0.13, 148.0
-"""Ours, of all axes; the integral in 1/s."""
+"""Ours: gains of all axes; the integral in 1/s."""
 
 FREQUENCY, DAMPING = 2.0 * np.pi * 150.0, 0.9
-"""Of the reference model, rad/s."""
+"""Ours: natural frequency in rad/s and damping ratio of the reference model."""
 
 
 @cache
@@ -67,7 +67,7 @@ def _models() -> dict[str, Any]:
 
 
 def model(order: int = 12) -> StateSpace:
-    """Return the identified model; D is what the drives do within their own sample.
+    """Return the identified model; D is the response within the sample of the input.
 
     Raises ValueError for an order that is not among ``ORDERS``.
     """
@@ -79,20 +79,20 @@ def model(order: int = 12) -> StateSpace:
 
 
 def stage(*, order: int = 12) -> MatrixARMA:
-    """Return the mirror as the plant of a loop that needs a sample to compute."""
+    """Return the mirror as plant of a loop, with one sample of delay to compute."""
     return observability_form(model(order).delayed())
 
 
 def multi_axis() -> MultiAxisSlidingMode:
-    """Return the control of chapter 7 on the model of 12 states and a sample's delay.
+    """Return the control of chapter 7 on the model of 12 states and a sample of delay.
 
-    ``SURFACE``, ``REACHING``, ``PROPORTIONAL`` and ``INTEGRAL`` are ours: from a random
-    search for the largest margin of all axes at once around ``stage()``. The sliding
-    variable is in V: the surface is scaled by the inverse of S B.
+    ``SURFACE``, ``REACHING``, ``PROPORTIONAL`` and ``INTEGRAL`` are ours: a random
+    search found them by the largest margin of all axes at once around ``stage()``. The
+    surface is scaled by the inverse of S B, so the sliding variable is in V.
 
-    They suit that model alone. On the one of 24 states the loop is unstable (largest
-    pole 1.25): the prediction of chapter 7 relies on a model of every resonance, so the
-    mirror itself must be expected to need other gains, or a better model.
+    The gains hold for that model alone. On the model of 24 states the loop is unstable
+    (largest pole 1.25), because the prediction of chapter 7 needs a model of every
+    resonance. The real mirror will need other gains or a better model.
     """
     plant = stage(order=12)
     scale = _surface_scale(plant)

@@ -1,8 +1,8 @@
-"""The P-558.TCD stage (Physik Instrumente): Z in um, Rx and Ry in urad, from commands
-of the same units.
+"""The P-558.TCD stage (Physik Instrumente) with the axes Z (um), Rx and Ry (urad).
 
-Every number carries its equation in Y. Cao's thesis (2013). The models are those of the
-stage with its amplifiers, sampled every 2 ms; each input channel was identified apart.
+Commands have the units of the axes. Every number carries its equation in Y. Cao's
+thesis (2013). The models describe the stage with its amplifiers, sampled every 2 ms;
+each input channel was identified separately.
 """
 
 import numpy as np
@@ -16,8 +16,8 @@ OUTPUTS = ("Z", "Rx", "Ry")
 UNITS = ("um", "urad", "urad")
 
 NOISE_RMS = (0.0008, 0.013, 0.013)
-"""Sensor noise in um, urad, urad: not printed, but the floor of Tables 7-4, 8-2, 8-3 is
-0.0008 to 0.0009 um and 0.013 to 0.018 urad."""
+"""Sensor noise in um, urad, urad: not printed; the least errors of Tables 7-4, 8-2 and
+8-3 are 0.0008 to 0.0009 um and 0.013 to 0.018 urad."""
 
 CHAPTER_6 = (
     {
@@ -112,13 +112,13 @@ CHAPTER_7 = (
 """(7.53), 3 states each."""
 
 MODELS = {"6": CHAPTER_6, "7": CHAPTER_7}
-"""Printed models by their chapter."""
+"""Printed models by chapter."""
 
 
 def channels(chapter: str = "7") -> tuple[StateSpace, ...]:
     """Return the models of the three input channels, Z, Rx and Ry.
 
-    Raises ValueError for a chapter that prints none.
+    Raises ValueError for a chapter without printed models.
     """
     if chapter not in MODELS:
         raise ValueError(

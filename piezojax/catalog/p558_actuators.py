@@ -1,9 +1,9 @@
 """Four actuators under the plate of the P-558.TCD stage: an assumption of ours.
 
-The thesis commands Z, Rx and Ry and does not say how many actuators there are, where
-they stand or how far they go. Assumed here: four alike in the corners of a square, each
-pushing up through the same stiffness, so that the plate, which is rigid, takes the pose
-that fits their elongations best.
+The thesis commands Z, Rx and Ry and gives no number, position or travel of the
+actuators. We assume four equal actuators in the corners of a square, which lift a rigid
+plate through equal stiffnesses. The plate then takes the least-squares pose of their
+elongations.
 """
 
 from collections.abc import Sequence
@@ -18,14 +18,14 @@ from ..core.system import Series, System, series
 from ..dynamics import LinearMap, StateSpace
 
 POSITIONS = ((50.0, 50.0), (-50.0, 50.0), (-50.0, -50.0), (50.0, -50.0))
-"""(x, y) of each actuator, mm; counterclockwise."""
+"""(x, y) of each actuator in mm, counterclockwise."""
 
 TRAVEL = (0.0, 50.0)
 """Bounds of each actuator's elongation, um."""
 
 
 def elongations() -> Float[np.ndarray, "4 3"]:
-    """Return what a pose (um, urad, urad) asks of each actuator, um.
+    """Return the matrix [4, 3] from a pose (um, urad, urad) to elongations in um.
 
     q = Z + y Rx - x Ry, x and y in m.
     """
@@ -33,19 +33,19 @@ def elongations() -> Float[np.ndarray, "4 3"]:
 
 
 def geometry() -> Float[np.ndarray, "3 4"]:
-    """Return what elongations (um) make of the plate: Z in um, Rx and Ry in urad."""
-    # The pseudo-inverse: in a square the columns are orthogonal to each other.
+    """Return the matrix [3, 4] from elongations in um to a pose (um, urad, urad)."""
+    # The pseudo-inverse: for a square the columns are orthogonal.
     return elongations().T / np.sum(elongations() ** 2, axis=0)[:, None]
 
 
 def allocation(method: str = "bounded") -> Allocation:
-    """Return the allocation of a pose to the four, um."""
+    """Return the allocation of a pose to the four elongations in um."""
     lower, upper = (jnp.full(len(POSITIONS), bound) for bound in TRAVEL)
     return Allocation(geometry(), lower, upper, method)
 
 
 def stage(actuator: StateSpace, method: str = "bounded") -> Series:
-    """Return the stage from a wanted pose to its pose, four times ``actuator`` inside.
+    """Return the stage from a wanted to a reached pose with four equal actuators.
 
     Named parts ``allocation``, ``actuators`` and ``plate``. Raises ValueError unless
     ``actuator`` has one input and one output, both in um.
@@ -71,10 +71,10 @@ def axes_stage(
 ) -> Series:
     """Return the stage as the plant of a loop of several axes: tuples of scalars.
 
-    From a commanded pose to the pose that ``actuators``, systems of a scalar each of
-    whatever dynamics and hysteresis, make of the share that ``sharing`` gives them,
-    ``allocation()`` unless told. Named parts as in ``stage``. Raises ValueError unless
-    there are four.
+    It maps a commanded pose to the reached one. ``sharing``, ``allocation()`` by
+    default, gives the commands of the four ``actuators``, scalar systems with any
+    dynamics and hysteresis. Named parts as in ``stage``. Raises ValueError unless there
+    are four.
     """
     if len(actuators) != len(POSITIONS):
         raise ValueError(f"{len(actuators)} actuators; there must be {len(POSITIONS)}")

@@ -26,7 +26,7 @@ PID_GAINS = ((1.5, 2.0, 2.0), (120.0, 90.0, 100.0), (0.0, 0.0, 0.0))
 """Table 7-3: P, I in 1/s and D in s by axis."""
 
 FILTER = {"alpha": 0.5, "beta": 0.002}
-"""Sections 7.5.4.2 and 8.5.4.2, by trial and error."""
+"""Alpha-beta filter, by trial and error: sections 7.5.4.2 and 8.5.4.2."""
 
 SURFACE = -0.7
 """m of section 7.5.4.2: S = [m^2 I, 2 m I, I], the state errors' double pole at -m."""
@@ -62,9 +62,10 @@ ARX = (
 """(8.40)-(8.42): coefficients of y(k-1), y(k-2) and u(k-1), u(k-2) by axis."""
 
 REPAIRS = (1.043, 0.404, 0.491)
-"""Factors on the numerators of (8.40)-(8.42) that give the DC gains of (7.53): printed
-they are 0.995, 2.32 and 1.92. With the printed Rx and Ry neither table comes near
-print; with the printed Z the observer does worse than no observer at 5 Hz."""
+"""Factors on the numerators of (8.40)-(8.42) that give the DC gains of (7.53): as
+printed the DC gains are 0.995, 2.32 and 1.92. With the printed Rx and Ry models neither
+table is reproduced; with the printed Z model the observer increases the error at
+5 Hz."""
 
 ARX_MODELS = ("repaired", "printed")
 
@@ -86,10 +87,10 @@ NOMINAL_SURFACE = 0.2
 """S = [0.2, 1] of section 8.5.4.2."""
 
 CUTOFF_HZ = 30.0
-"""Of the Q-filters, section 8.5.4.2."""
+"""Cut-off of the Q-filters in Hz, section 8.5.4.2."""
 
 LIMITS = ((0.0, 50.0), (-250.0, 250.0), (-250.0, 250.0))
-"""Travel of the stage in um and urad: the maker's data (Table 6-1)."""
+"""Travel of the stage in um and urad: data of the manufacturer (Table 6-1)."""
 
 
 def pid() -> System:
@@ -102,8 +103,8 @@ def pid() -> System:
 def multi_axis(gains: str = "dynamic", filtered: bool = True) -> System:
     """Return the PID-based sliding mode control of chapter 7.
 
-    ``gains`` is "step" or "dynamic"; without ``filtered`` it sees the measurements
-    themselves. Raises ValueError for other gains.
+    ``gains`` is "step" or "dynamic"; ``filtered`` adds the alpha-beta filters. Raises
+    ValueError for other gains.
     """
     chosen = _one_of(MULTI_AXIS_GAINS, gains)
     scale = (SURFACE**2, 2.0 * SURFACE, 1.0)
@@ -131,12 +132,12 @@ def multi_axis(gains: str = "dynamic", filtered: bool = True) -> System:
 
 
 def anticipating_multi_axis() -> System:
-    """Return chapter 7's controller with room for a lead on its reference (ours, 0)."""
+    """Return ``multi_axis`` in an Anticipation of lead 0 (ours), for tuning."""
     return Anticipation(multi_axis(), (0.0, 0.0, 0.0))
 
 
 def anticipating_disturbance_observer() -> System:
-    """Return chapter 8's controller with room for a lead on its reference (ours, 0)."""
+    """Return ``disturbance_observer`` in an Anticipation of lead 0 (ours)."""
     return Anticipation(disturbance_observer(), (0.0, 0.0, 0.0))
 
 

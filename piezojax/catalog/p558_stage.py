@@ -1,8 +1,8 @@
 """The P-558.TCD as the plant of a loop: hysteresis, then the printed dynamics.
 
-No hysteresis of this stage is printed: a play operator of 2 % stands in for what its
-internal loop leaves (an assumption of ours; the driven cells of Table 7-4 ask for about
-as much).
+No hysteresis of this stage is printed. A play operator of 2 % represents the residual
+hysteresis of its internal loop: an assumption of ours, consistent with the driven cells
+of Table 7-4.
 """
 
 import jax
@@ -39,11 +39,11 @@ def plant(
 ) -> Series:
     """Return the stage: hysteresis of each axis, then the dynamics of (7.53).
 
-    Relative deviations by axis: ``gain`` of the axis' channel; ``speed``, the time
-    scale of its poles and zeros (A becomes I + (1 + speed)(A - I), B is scaled alike:
-    same gain at rest); ``hysteresis``, the share of play; ``coupling``, the gain to the
-    other axes. ``delay`` in samples lies between hysteresis and dynamics, beyond the
-    one that every model has. Raises ValueError for a negative delay.
+    Relative deviations by axis: ``gain`` of the channel; ``speed`` of its poles and
+    zeros (A becomes I + (1 + speed)(A - I) and B is scaled alike, at the same DC gain);
+    ``hysteresis``, the share of play; ``coupling``, the gain to the other axes.
+    ``delay`` in samples lies between hysteresis and dynamics and adds to the one sample
+    of every model. Raises ValueError for a negative delay.
     """
     channels: list[Channel] = []
     for axis, part in enumerate(channels_of(p558.channels("7")).parts):

@@ -1,7 +1,7 @@
 """The P-753 actuator (Physik Instrumente, 15 um) and its printed controllers.
 
 Every number carries its equation or table in Y. Cao's thesis (2013). All sets hold at
-20 kHz unless their name says otherwise.
+20 kHz unless their name states another rate.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ RATE = 20_000.0
 
 DT = 1.0 / RATE
 VOLTAGE_LIMITS = (-20.0, 120.0)
-"""Range of the drive, V: the maker's data, not in the thesis."""
+"""Range of the drive in V: data of the manufacturer, not in the thesis."""
 
 NOISE_RMS = 0.012
 """Sensor noise, um: section 5.5.6 gives 10 to 15 nm rms."""
@@ -93,7 +93,7 @@ ARMA_HYSTERESIS = {
     },
 }
 """Tables 3-1 (trapezoid, least squares), 3-2 (trapezoid, online), 3-3 (quadratic, least
-squares), 3-4 (quadratic, online). 3-3 and 3-4 with their column heads put right."""
+squares), 3-4 (quadratic, online). The column heads of 3-3 and 3-4 are corrected."""
 
 DYNAMICS_BY_RATE = {
     1_000: {
@@ -117,8 +117,8 @@ DYNAMICS_BY_RATE = {
         "moving": (0.000778, -0.00041, 0.00134),
     },
 }
-"""Table 4-1, from voltage to displacement, by sampling rate in Hz. The row at 5 kHz
-does not fit the others (DC gain 0.054 against 0.11 to 0.16)."""
+"""Table 4-1, from voltage to displacement, by sampling rate in Hz. The DC gain of the
+row at 5 kHz is 0.054, that of the others 0.11 to 0.16."""
 
 GAINS = {
     "5-2": {
@@ -131,7 +131,7 @@ GAINS = {
         "dob": {"proportional": 0.05, "integral": 12.0, "derivative": 1e-6},
     },
 }
-"""Tables 5-2 (the same for all three) and 5-4 (adjusted one by one); ``pid`` is the
+"""Tables 5-2 (equal for all three) and 5-4 (adjusted for each); ``pid`` is the
 nominal PID-based SMC, as in the columns of Tables 5-3 and 5-5."""
 
 SURFACE = 18_000.0
@@ -147,7 +147,7 @@ CUTOFF = 500.0
 """Q-filter cut-off, rad/s, section 5.5.6.2."""
 
 PROCESS_RMS, DRIFT_RMS = 1e-3, 1e-4
-"""Of a Kalman filter, um a sample: ours, to start tuning from."""
+"""Noise of a Kalman filter in um a sample: ours, a start for tuning."""
 
 SENSITIVITY_WEIGHT = {"low": 1e3, "crossover": 3000.0, "high": 0.5}
 EFFORT_WEIGHT = 0.1
@@ -162,16 +162,16 @@ def hysteresis(scheme: str = "trapezoid") -> ColemanHodgdon:
 def plant(scheme: str = "trapezoid") -> Series:
     """Return the stage, V to um: hysteresis, then (5.33) scaled to unit DC gain.
 
-    The hysteresis was fitted from voltage to displacement at 1 Hz, so what follows it
-    must pass 1 Hz unchanged; with (5.33) as printed the 1 Hz cells of Table 5-3 are off
-    by the missing 27 %.
+    The hysteresis was fitted from voltage to displacement at 1 Hz, so the dynamics
+    behind it must have unit gain at 1 Hz. With (5.33) as printed the 1 Hz cells of
+    Table 5-3 are off by the missing 27 %.
     """
     dynamics = scaled_to_dc(ARMA(**DYNAMICS_BEHIND_HYSTERESIS), 1.0)
     return series(hysteresis=hysteresis(scheme), dynamics=dynamics)
 
 
 def kalman(model: ARMA) -> KalmanFilter:
-    """Return a Kalman filter on ``model`` with the printed sensor noise: ours."""
+    """Return a Kalman filter (ours) on ``model`` with the printed sensor noise."""
     return model_kalman(model, NOISE_RMS, PROCESS_RMS, DRIFT_RMS, DT)
 
 
@@ -218,7 +218,7 @@ def disturbance_observer(
 
 
 def anticipating_disturbance_observer(table: str = "5-2") -> Anticipation:
-    """Return ``disturbance_observer``, shown the reference ahead: a lead of 0, ours."""
+    """Return ``disturbance_observer`` in an Anticipation of lead 0 (ours)."""
     return Anticipation(disturbance_observer(table), (0.0,))
 
 
@@ -228,15 +228,16 @@ ADAPTIVE_INVERSE = {
     "equation_error": 3.0,
     "memory": 0.5,
 }
-"""Ours: um, rad/s, V, s. Stops for motions of some um; slower than half a second the
-feedback is enough."""
+"""Ours: um, rad/s, V, s. The stops suit motions of some um; the feedback corrects
+changes slower than half a second."""
 
 
 def adaptive_disturbance_observer(table: str = "5-2") -> AdaptiveInverse:
-    """Return ``disturbance_observer`` beside an inverse that is learned: ours.
+    """Return ``disturbance_observer`` in an AdaptiveInverse (ours).
 
-    With a share of 0 this is ``disturbance_observer``. The weights begin with the
-    printed gain and poles, and with stops of a hysteresis of the usual size.
+    Its share of 0 makes it equal to ``disturbance_observer``. The initial weights
+    follow from the printed gain and poles, those of the stops from a typical
+    hysteresis.
     """
     slow, fast = (
         -DT / float(np.log(pole))
@@ -255,7 +256,7 @@ def adaptive_disturbance_observer(table: str = "5-2") -> AdaptiveInverse:
 
 
 def pid() -> PID:
-    """Return a plain PID baseline, um to V: ours, the thesis prints none.
+    """Return a PID baseline (ours; the thesis prints none), um to V.
 
     An integral action of 60 V/(um s) crosses over near 400 rad/s.
     """
@@ -263,16 +264,16 @@ def pid() -> PID:
 
 
 def kalman_sliding_mode(table: str = "5-2") -> SlidingMode:
-    """Return ``sliding_mode`` with a Kalman filter for its alpha-beta filter."""
+    """Return ``sliding_mode`` with a Kalman filter as observer."""
     model = ARMA(**DYNAMICS_FROM_VOLTAGE)
     return _sliding_mode(model, GAINS[table]["pid"], kalman(model))
 
 
 def kalman_disturbance_observer(table: str = "5-2") -> DisturbanceObserverControl:
-    """Return ``disturbance_observer`` with a Kalman filter for its alpha-beta filter.
+    """Return ``disturbance_observer`` with a Kalman filter as observer.
 
-    The filter sees what the controller sees: K_e times the voltage and the disturbance
-    that is observed.
+    The filter receives the Observation of the inner controller: its applied input is
+    K_e times the sum of voltage and estimated disturbance.
     """
     model = ARMA(**DYNAMICS_BEHIND_HYSTERESIS)
     return DisturbanceObserverControl(
@@ -285,7 +286,7 @@ def kalman_disturbance_observer(table: str = "5-2") -> DisturbanceObserverContro
 
 
 def mixed_sensitivity_inversion() -> InversionControl:
-    """Return an H-infinity controller of (5.33) behind the inverse hysteresis: ours."""
+    """Return an H-infinity controller (ours) of (5.33) with inverse hysteresis."""
     error, effort = SENSITIVITY_WEIGHT, EFFORT_WEIGHT
     design = mixed_sensitivity(
         scaled_to_dc(ARMA(**DYNAMICS_BEHIND_HYSTERESIS), 1.0),

@@ -1,10 +1,11 @@
 """The P-753 and one controller of each kind at any sampling rate of Table 4-1.
 
-The printed gains where Y. Cao's thesis (2013) prints some. Elsewhere a start of our own
-by one rule: the printed set nearest in rate, as the same loop in samples. With s the
-ratio of the two sample times a gain on an error rate (um/s) is multiplied by s, one on
-its derivative by s^2, a surface in 1/s by 1/s; weights, the alpha-beta filter and
-cut-offs in rad/s stay, and the model is the rate's own row of Table 4-1. Rates in Hz.
+The gains are the printed ones where Y. Cao's thesis (2013) prints some. At other rates
+they are ours: the printed set of the nearest rate, scaled to the same loop in samples.
+With s the ratio of the two sample times, a gain on an error rate (um/s) is multiplied
+by s, one on its derivative by s^2 and a surface in 1/s by 1/s. Weights, the alpha-beta
+filter and cut-offs in rad/s are unchanged. The model is the row of Table 4-1 for the
+rate. Rates in Hz.
 
 All functions raise ValueError, listing the known rates, for a rate without a model.
 """
@@ -36,12 +37,12 @@ ULTIMATE = {
     10_000: (11.669, 5.437e-4),
     20_000: (8.616, 4.039e-4),
 }
-"""Ultimate gain (V/um) and period (s) by rate: the proportional gain and period at
-which the linear part of ``chapter4_plant``, K_e and its dynamics, starts to oscillate
-in the loop. At 1 and 2 kHz that is at every other sample."""
+"""Ultimate gain (V/um) and period (s) by rate: proportional gain and period at which
+the loop with the linear part of ``chapter4_plant``, K_e and its dynamics, starts to
+oscillate. At 1 and 2 kHz the period is two samples."""
 
 SCALING = {"proportional": 1, "derivative": 2, "surface": -1}
-"""Power of the ratio of sample times by gain; the others stay."""
+"""Power of the ratio of sample times by gain, 0 for the others."""
 
 TO_SCALE = {
     "traditional": tuple(p753_chapter4.TRADITIONAL_GAINS),
@@ -49,14 +50,15 @@ TO_SCALE = {
     "bang_bang": tuple(p753_chapter4.BANG_BANG_GAINS),
     "chapter 5": (int(p753.RATE),),
 }
-"""Rates of the printed sets that are scaled to others. The continuous one of 5 kHz is
-not: its integral gain looks ten times too small (see ``reproduce.chapter4.cells``)."""
+"""Rates of the printed sets that are scaled to other rates. The continuous set of 5 kHz
+is left out: its integral gain looks ten times too small (see
+``reproduction.chapter4.cells``)."""
 
 
 BANG_BANG_CONTROL_WEIGHT = {1_000: 50.0, 20_000: 20.0}
-"""R of bang-bang switching beside Q = 1, which is not printed, for ``chapter4_plant``,
-by trial: with the printed K and surface the first of 1, 2, 5, 10, 20, 50, ... at which
-the voltage keeps off its limits on sines of 5 um, and of that series the best."""
+"""R of bang-bang switching with Q = 1 for ``chapter4_plant``: ours, not printed. With
+the printed K and surface it is the first of 1, 2, 5, 10, 20, 50, ... at which the
+voltage stays within its limits on sines of 5 um, and the best of that series."""
 
 
 def plant(*, rate: int = 20_000) -> System:
@@ -75,14 +77,14 @@ def _resampled(stage: Series, rate: int) -> Series:
         raise ValueError(f"rate in Hz is {rate:g}; it must divide {p753.RATE:g}")
     hysteresis, dynamics = stage.parts
     assert isinstance(dynamics, ARMA)
-    # At a constant voltage the hysteresis rests: only its dynamics go on.
+    # At a constant voltage the hysteresis is static; only the dynamics move.
     return series(hysteresis=hysteresis, dynamics=held(dynamics, samples))
 
 
 def held(model: ARMA, samples: int) -> ARMA:
-    """Return ``model``, of second order, at a rate ``samples`` times lower.
+    """Return the second-order ``model`` at a rate ``samples`` times lower.
 
-    Its response to an input that is held for ``samples`` steps, at every last of them.
+    The input is held for ``samples`` steps and the output taken at the last of them.
     """
     if samples == 1:
         return model
@@ -129,7 +131,7 @@ def traditional(rate: int = 20_000) -> SlidingMode:
 
 def continuous(rate: int = 20_000) -> ContinuousSlidingMode:
     """Return the continuous PID-SMC (section 4.5.4.3: 5, 10 and 20 kHz), um to V."""
-    p753_chapter4.model(rate)  # it has no model, but the stage has those rates
+    p753_chapter4.model(rate)  # raises ValueError for a rate without a model
     near = _start("continuous", p753_chapter4.CONTINUOUS_GAINS, rate)
     printed = p753_chapter4.CONTINUOUS_GAINS[near] | {"surface": p753.SURFACE}
     gains = _scaled(printed, near / rate)
@@ -141,8 +143,9 @@ def continuous(rate: int = 20_000) -> ContinuousSlidingMode:
 def bang_bang(rate: int = 20_000) -> SlidingMode:
     """Return the nominal DSMC with bang-bang switching (1 and 20 kHz), um to V.
 
-    K is printed, R by trial; the R of 1 with which ``p753_chapter4.bang_bang`` gives
-    the printed step on chapter 5's stage hits the limits on chapter 4's.
+    K is printed; R is found by trial. With the R of 1, by which
+    ``p753_chapter4.bang_bang`` gives the printed step on the stage of chapter 5, the
+    voltage hits its limits on that of chapter 4.
     """
     model = p753_chapter4.model(rate)
     near = _start("bang_bang", p753_chapter4.BANG_BANG_GAINS, rate)
@@ -175,7 +178,7 @@ def disturbance_observer(rate: int = 20_000) -> DisturbanceObserverControl:
 def _behind_hysteresis(name: str, rate: int) -> SlidingMode:
     """Return chapter 5's PID-SMC, in um, for dynamics behind a hysteresis.
 
-    Where (5.33) is not printed the model is the row of Table 4-1 at unit DC gain.
+    At 20 kHz the model is (5.33), else the row of Table 4-1 scaled to unit DC gain.
     """
     model = p753_chapter4.model(rate)
     if rate == p753.RATE:
@@ -194,7 +197,7 @@ def _behind_hysteresis(name: str, rate: int) -> SlidingMode:
 
 
 def _start(name: str, printed: Iterable[int], rate: int) -> int:
-    """Return the printed rate whose set is taken at ``rate``."""
+    """Return the printed rate whose gains are scaled to ``rate``."""
     if rate in printed:
         return rate
     return min(TO_SCALE[name], key=lambda known: abs(math.log(known / rate)))

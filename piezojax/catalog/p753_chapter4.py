@@ -1,4 +1,4 @@
-"""The P-753 under the controllers of chapter 4, at sampling rates from 1 to 20 kHz.
+"""The P-753 with the controllers of chapter 4 at sampling rates from 1 to 20 kHz.
 
 Every number carries its table or section in Y. Cao's thesis (2013); the models are
 ``p753.DYNAMICS_BY_RATE`` (Table 4-1). Rates in Hz.
@@ -91,7 +91,7 @@ MODEL_REFERENCE_GAINS = {
         },
     },
 }
-"""Tables 4-3 (steps) and 4-4 (tracking); m and Q are the same throughout."""
+"""Tables 4-3 (steps) and 4-4 (tracking); m and Q are equal in all rows."""
 
 SURFACE = (0.99,)
 """m in S = [m, 1], Tables 4-3 and 4-4."""
@@ -113,18 +113,18 @@ CONTINUOUS_GAINS = {
 """Section 4.5.4.3, by Ziegler and Nichols; the surface is ``p753.SURFACE``."""
 
 BANG_BANG_GAINS = {1_000: 3.0, 20_000: 1.0}
-"""K, section 4.5.4.1."""
+"""K in V, section 4.5.4.1."""
 
 BANG_BANG_CONTROL_WEIGHT = 1.0
-"""R of the nominal DSMC beside Q = 1: ours, not printed. With the R = 400 of Table 4-2
-K = 1 is too small to move the stage; from about 1 on the voltage limits set what is
-seen."""
+"""R of the nominal DSMC with Q = 1: ours, not printed. With the R = 400 of Table 4-2
+K = 1 is too small to move the stage; at an R of about 1 and below the voltage limits
+determine the response."""
 
 FILTERS = {1_000: (0.3, 0.001), 20_000: (0.1, 1e-4)}
-"""Alpha and beta, section 4.5.4.1, where the other rates are missing."""
+"""Alpha and beta, section 4.5.4.1; the other rates are not printed."""
 
 UNPRINTED_FILTER = (0.1, 1e-4)
-"""Alpha and beta where none are printed: those of 20 kHz, an assumption."""
+"""Alpha and beta of the other rates: those of 20 kHz, an assumption."""
 
 
 def with_law(gains: Mapping[str, float], rate: int) -> dict[str, Any]:
@@ -135,12 +135,12 @@ def with_law(gains: Mapping[str, float], rate: int) -> dict[str, Any]:
 
 
 def alpha_beta(rate: int = 20_000) -> AlphaBeta:
-    """Return the printed filter at ``rate``, or that of 20 kHz where there is none."""
+    """Return the printed filter at ``rate``, or that of 20 kHz if none is printed."""
     return AlphaBeta(*FILTERS.get(rate, UNPRINTED_FILTER), 1.0 / rate)
 
 
 def unfiltered(rate: int = 20_000) -> AlphaBeta:
-    """Return a filter that passes the measured displacement as it is."""
+    """Return a filter with the measured displacement as its position."""
     return AlphaBeta(1.0, 0.0, 1.0 / rate)
 
 
@@ -154,8 +154,8 @@ def model_reference(
 ) -> ModelReferenceSlidingMode:
     """Return the model-reference PID-SMC of ``table`` "4-3" or "4-4", um to V.
 
-    ``filter`` stands in for the printed one. Raises ValueError for a rate or a table
-    that is not printed.
+    ``filter`` replaces the printed one. Raises ValueError for a rate or a table that is
+    not printed.
     """
     gains = _printed("table", MODEL_REFERENCE_GAINS, table)
     return ModelReferenceSlidingMode(
@@ -169,7 +169,7 @@ def model_reference(
 
 
 def anticipating_model_reference(rate: int = 20_000) -> Anticipation:
-    """Return ``model_reference`` of Table 4-4 with room for a lead on r (ours, 0)."""
+    """Return ``model_reference`` of Table 4-4 in an Anticipation of lead 0 (ours)."""
     return Anticipation(model_reference(rate), (0.0,))
 
 
@@ -223,8 +223,8 @@ def loop(
 ) -> Feedback:
     """Return ``controller``, running at ``rate``, around a stage simulated at 20 kHz.
 
-    ``stage`` (V to um) is ``plant`` if left out. Raises ValueError for a rate of which
-    20 kHz is no multiple.
+    ``stage`` (V to um) is ``plant`` if left out. Raises ValueError for a rate that does
+    not divide 20 kHz.
     """
     held, rest = divmod(int(p753.RATE), rate)
     if rest:

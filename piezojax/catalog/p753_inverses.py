@@ -1,8 +1,8 @@
-"""The P-753 with either hysteresis, and sliding mode control by an inverse of either.
+"""The P-753 with Coleman-Hodgdon or Preisach hysteresis, and control by its inverse.
 
-The thesis names the inverse Preisach model as its first future work. A stage whose
-hysteresis is Preisach's, the record that both inverses are fitted to and the fits are
-ours; gains and dynamics are the printed ones of ``p753``.
+The thesis names the inverse Preisach model as its first future work. The stage with
+Preisach hysteresis, the record for the fits of both inverses, and the fits are ours.
+Gains and dynamics are the printed ones of ``p753``.
 """
 
 from collections.abc import Callable
@@ -31,23 +31,23 @@ CELLS = 20
 """Cells a side of a fitted Preisach model: 7 V each."""
 
 TRUE_CELLS = 28
-"""Of the stage's own: no multiple of ``CELLS``, so that none of both are the same."""
+"""Cells a side of the stage: no multiple of ``CELLS``, so the two grids differ."""
 
 DENSITY = {"reversible": 0.09, "density": 0.0028, "width": 25.0, "tilt": 0.004}
-"""Of the stage's own, ours: um/V, um/V^2, V and 1/V, see ``preisach``."""
+"""Density of the stage (ours) in um/V, um/V^2, V and 1/V; see ``preisach``."""
 
 RECORD = {"duration": 4.0, "frequency": 5.0, "centre": 50.0, "amplitude": 70.0}
-"""Of the record that is fitted: s, Hz and V."""
+"""Duration in s, frequency in Hz, centre and amplitude in V of the fitted record."""
 
 SEED = 0
-"""Of the sensor's noise in it."""
+"""Seed of the sensor noise in the fitted record."""
 
 
 def preisach(cells: int = TRUE_CELLS) -> Preisach:
-    """Return a Preisach hysteresis of the size of the P-753's, V to um: ours.
+    """Return a Preisach hysteresis (ours) of the size of the P-753's, V to um.
 
     No density of this stage is published. This one decays with the width of a relay,
-    as those measured on piezo ceramics do, and grows along the triangle:
+    like measured densities of piezo ceramics, and grows along the diagonal:
     density * exp(-(alpha - beta)/width) (1 + tilt ((alpha + beta)/2 - centre)), with
     ``reversible`` um/V beside it. It rests at 0 um and 0 V.
     """
@@ -59,7 +59,7 @@ def preisach(cells: int = TRUE_CELLS) -> Preisach:
     weights = np.exp(-width / DENSITY["width"])
     weights *= 1.0 + DENSITY["tilt"] * (mean - 0.5 * (low + high))
     weights = np.tril(DENSITY["density"] * size**2 * weights)
-    # Of a cell on the diagonal half lies in the triangle.
+    # Half of a cell on the diagonal lies in the triangle.
     diagonal = 0.5 * np.diag(weights) + DENSITY["reversible"] * size
     weights[np.diag_indices(cells)] = diagonal
     bare = Preisach(weights, low, high)
@@ -67,7 +67,7 @@ def preisach(cells: int = TRUE_CELLS) -> Preisach:
 
 
 def preisach_plant() -> Series:
-    """Return ``p753.plant`` with ``preisach`` for its hysteresis, V to um."""
+    """Return ``p753.plant`` with ``preisach`` as its hysteresis, V to um."""
     return series(hysteresis=preisach(), dynamics=_dynamics())
 
 
@@ -75,7 +75,7 @@ PLANTS: dict[str, Callable[[], Series]] = {
     "Coleman-Hodgdon": p753.plant,
     "Preisach": preisach_plant,
 }
-"""The stage by the hysteresis that it has."""
+"""The stage by the name of its hysteresis model."""
 
 
 def _dynamics() -> ARMA:
@@ -93,8 +93,8 @@ def response(
 def record_of(plant: System, input: np.ndarray | None = None) -> Record:
     """Return a record of ``plant`` at 20 kHz with the printed sensor noise.
 
-    ``input`` (V) is a sine that shrinks over the whole range of the drive, from rest at
-    0 V, if left out: 20 periods in 4 s.
+    ``input`` (V) is ``excitation()`` if left out: a decaying sine over the whole range
+    of the drive, 20 periods in 4 s, from rest at 0 V.
     """
     input = excitation() if input is None else input
     noise = np.random.default_rng(SEED).normal(size=input.size)
@@ -108,7 +108,7 @@ def excitation() -> np.ndarray:
     left = 1.0 - time / RECORD["duration"]
     wave = np.sin(2.0 * np.pi * RECORD["frequency"] * time)
     swing = RECORD["centre"] + RECORD["amplitude"] * left * wave
-    # From 0 V to the centre within the first tenth of a second.
+    # Rise from 0 V to the centre within the first tenth of a second.
     return swing * np.minimum(time / 0.1, 1.0)
 
 
@@ -126,29 +126,29 @@ def fitted_preisach(record: Record, cells: int = CELLS) -> Preisach:
 def fitted_coleman_hodgdon(record: Record) -> ColemanHodgdon:
     """Return the Coleman-Hodgdon model that fits ``record`` behind the same dynamics.
 
-    For a given c its output is linear in a and b, (3.32): they are solved for, and c is
-    searched for on a line around the printed value.
+    For a given c the output is linear in a and b (3.32), which are solved for. A line
+    search around the printed value finds c.
     """
     printed = p753.HYSTERESIS_CHAPTER_5
     output, dynamics = record.output, _dynamics()
 
-    def solved(c: float) -> tuple[np.ndarray, float]:
+    def fitted(c: float) -> tuple[np.ndarray, float]:
         parts = [
             response(ColemanHodgdon(a, b, c) >> dynamics, record.input)
             for a, b in ((1.0, 0.0), (0.0, 1.0))
         ]
         matrix = np.column_stack([*parts, np.ones_like(output)])
-        found = np.linalg.lstsq(matrix, output, rcond=None)[0]
-        return found, float(np.sum((matrix @ found - output) ** 2))
+        values = np.linalg.lstsq(matrix, output, rcond=None)[0]
+        return values, float(np.sum((matrix @ values - output) ** 2))
 
     best: Any = minimize_scalar(
-        lambda log: solved(-float(np.exp(log)))[1],
+        lambda log: fitted(-float(np.exp(log)))[1],
         bounds=np.log(-printed["c"] * np.array([0.1, 10.0])),
         method="bounded",
         options={"xatol": 1e-6},
     )
     c = -float(np.exp(best.x))
-    a, b, rest = solved(c)[0]
+    a, b, rest = fitted(c)[0]
     return ColemanHodgdon(a, b, c, rest_output=rest)
 
 

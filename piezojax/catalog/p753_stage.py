@@ -1,8 +1,8 @@
-"""The P-753 as a lab meets it: with creep, a lightly damped mode, and off its values.
+"""The P-753 with creep, a lightly damped mode and deviations from nominal values.
 
-The printed model (``p753.plant``) stops at two real poles. A stage also creeps, and its
-flexure has a mode: 5.6 kHz +- 20 % unloaded says its maker, lower with a load on it.
-Neither is printed for this stage: both are assumptions of ours.
+The printed model (``p753.plant``) has two real poles only. A real stage also creeps,
+and its flexure has a mode: at 5.6 kHz +- 20 % unloaded according to its manufacturer,
+and lower with a load. Creep and mode are assumptions of ours, not printed.
 """
 
 import jax.numpy as jnp
@@ -15,10 +15,10 @@ from ..hysteresis import ColemanHodgdon
 from . import p753
 
 CREEP = {"gains": (0.01, 0.01, 0.01), "time_constants": (0.03, 0.3, 3.0)}
-"""Creep: shares of a step, and times in s. 1 % a decade is of the usual size."""
+"""Creep: shares of a step, and time constants in s. 1 % per decade is typical."""
 
 MODE_FREQUENCY = 4_000.0
-"""Of the lightly damped mode, Hz: with a load, between none (5.6 kHz) and 200 g."""
+"""Frequency of the mode in Hz, for a load between 0 (5.6 kHz) and 200 g."""
 
 MODE_DAMPING = 0.02
 """Damping ratio of the mode."""
@@ -34,13 +34,12 @@ def stage(
     mode_frequency: ScalarLike = MODE_FREQUENCY,
     mode_damping: ScalarLike = MODE_DAMPING,
 ) -> Series:
-    """Return the stage at 20 kHz, V to um, off its nominal values as given.
+    """Return the stage at 20 kHz, V to um, with deviations from its nominal values.
 
-    Relative deviations, 0 for none: ``gain`` at rest; ``poles``, ``zeros``, how much
-    faster they are (z becomes z^(1 + deviation)); ``hysteresis``, the size of a and c,
-    the width of the loop; ``creep``. ``delay`` in samples, from 0 to 1;
-    ``mode_frequency`` in Hz and ``mode_damping`` of a mode of unit gain at rest that
-    the stage has in series.
+    Relative deviations: ``gain`` at rest; ``poles`` and ``zeros``, the rate of each (z
+    becomes z^(1 + deviation)); ``hysteresis``, a and c, which set the width of the
+    loop; ``creep``. Absolute values: ``delay`` in samples, from 0 to 1;
+    ``mode_frequency`` in Hz and ``mode_damping`` of a mode of unit DC gain in series.
     """
     material = p753.HYSTERESIS_CHAPTER_5
     return series(
@@ -62,7 +61,7 @@ def stage(
 
 
 def _dynamics(poles: Scalar, zeros: Scalar) -> ARMA:
-    """Return (5.33) with unit DC gain, its roots moved along their rays of time."""
+    """Return (5.33) with unit DC gain, its roots raised to 1 + their deviation."""
     printed = ARMA(**p753.DYNAMICS_BEHIND_HYSTERESIS)
     _, *denominator = _moved(printed.poles(), poles)
     numerator = _moved(printed.zeros(), zeros)
@@ -71,7 +70,7 @@ def _dynamics(poles: Scalar, zeros: Scalar) -> ARMA:
 
 
 def _moved(roots: np.ndarray, faster: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Return 1, c_1, c_2 of the polynomial with both ``roots`` to 1 + ``faster``."""
+    """Return 1, c_1, c_2 of the polynomial with ``roots`` raised to 1 + ``faster``."""
     first, second = (jnp.exp((1.0 + faster) * np.log(root + 0j)) for root in roots)
     one = jnp.ones_like(faster)
     return one, -jnp.real(first + second), jnp.real(first * second)

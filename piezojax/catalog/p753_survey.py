@@ -1,8 +1,8 @@
-"""The P-753 under the control schemes that the thesis surveys, section 2.5 and 2.6.
+"""The P-753 with the control schemes surveyed in sections 2.5 and 2.6 of the thesis.
 
-The thesis prints no gains for them. Every number here is ours: start values at 20 kHz
-that hold SIN10 of 5 um with the printed noise, to be tuned. Models, filter and surface
-are the printed ones of ``p753``.
+The thesis prints no gains for them. All numbers here are ours: initial values for
+tuning at 20 kHz, which track SIN10 of 5 um with the printed noise. Models, filter and
+surface are the printed ones of ``p753``.
 """
 
 from ..control import (
@@ -23,19 +23,19 @@ from ..hysteresis import InverseColemanHodgdon
 from . import p753
 
 BOUNDARY_LAYER = {"gain": 1e4, "width": 4e4}
-"""K in V and the layer in um/s. The inverse passes 1 % of v, hence the large K."""
+"""K in V and the layer in um/s. K is large because the inverse passes 1 % of v."""
 
 SUPER_TWISTING = {"root_gain": 10.0, "sign_gain": 1e6, "layer": 1e4}
-"""In V/(um/s)^(1/2), V/s and um/s."""
+"""Gains in V/(um/s)^(1/2) and V/s, layer in um/s."""
 
 REPETITIVE = {"gain": 0.7, "lead": 40, "advance": 8}
-"""Learning gain, and samples; the Q-filter is a lag of ``advance`` samples."""
+"""Learning gain; lead and advance in samples; Q is a lag of ``advance`` samples."""
 
 LEARNING = {"gain": 0.7, "lead": 40, "smoothing": (0.25,)}
-"""Of a loop's reference, from trial to trial."""
+"""Learning law of the reference of a loop, lead in samples."""
 
 CHARGE_TIME = 1.0
-"""R C of amplifier and load, s: charge is followed from 0.16 Hz on."""
+"""R C of amplifier and load in s: the charge is controlled above 0.16 Hz."""
 
 
 def _switched(law: SwitchingLaw) -> SlidingMode:
@@ -76,8 +76,8 @@ def feedforward_pid() -> FeedforwardFeedback:
 def repetitive(period: int = 2_000) -> RepetitiveControl:
     """Return repetitive control around ``p753.pid``, um to V; gains ours.
 
-    ``period`` in samples at 20 kHz: 2000 is that of SIN10 and of whatever repeats
-    itself in 100 ms. Other references need their own.
+    ``period`` of the reference in samples at 20 kHz: 2000 for SIN10 and other
+    references with a period of 100 ms.
     """
     lag = FirstOrderLag(REPETITIVE["advance"] * p753.DT, p753.DT)
     return RepetitiveControl(p753.pid(), lag, **REPETITIVE, period=period)
