@@ -9,7 +9,7 @@ faster: `mode` in the rows), in C that of one-sided differences, a run for each
 parameter and one more. A bar is the most that `ratio_to_c` may be.
 
 A model takes part by its name in `--model help`, or OTHERS here, and a C function of
-that name in hysteresis.c.
+that name in hysteresis.c; without one it is listed as having no yardstick.
 """
 
 import argparse
@@ -86,6 +86,12 @@ MODELS = [name for name, kind in parts().items() if kind.part.place == "hysteres
 MODELS += [name for name in OTHERS if name not in MODELS]
 
 
+def has_yardstick(name):
+    """Return whether hysteresis.c has the model, with or without a compiler here."""
+    source = Path(__file__).with_name("hysteresis.c").read_text(encoding="utf-8")
+    return f"MODEL({name}," in source
+
+
 class MeanSquare(piezojax.Metric):
     """Mean of the squares of the output."""
 
@@ -151,7 +157,7 @@ def _size(bounds, leaf):
     """Usual size of each number in a leaf; by its bounds, where it starts at 0."""
     if leaf.ndim:
         return np.abs(leaf).ravel()
-    reach = 1.0 if bounds is None else bounds[1] - bounds[0]
+    reach = 1.0 if bounds is None else bounds.upper - bounds.lower
     return np.array([abs(leaf) if leaf else 0.01 * reach], dtype=float)
 
 
@@ -316,6 +322,9 @@ def main(arguments=None):
     throughput.pin_to_one_core()
     console, rows = Console(), []
     for name in options.models:
+        if not has_yardstick(name):
+            console.print(f"{name}: no yardstick")
+            continue
         problem = Problem(name, options.lanes, options.steps)
         for what in ("forward", "gradient"):
             try:

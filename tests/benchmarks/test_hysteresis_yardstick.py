@@ -1,4 +1,7 @@
-"""The hysteresis models in C and in piezojax compute the same thing."""
+"""The hysteresis models that hysteresis.c has compute the same there and in piezojax.
+
+A model without a function in C is no failure.
+"""
 
 import importlib
 import json
@@ -25,7 +28,14 @@ def c_engine(problem, what):
         raise
 
 
-@pytest.mark.parametrize("name", hysteresis.MODELS)
+YARDSTICKS = [name for name in hysteresis.MODELS if hysteresis.has_yardstick(name)]
+
+
+def test_the_first_models_have_a_yardstick():
+    assert {"coleman_hodgdon", *hysteresis.OTHERS} <= set(YARDSTICKS)
+
+
+@pytest.mark.parametrize("name", YARDSTICKS)
 def test_each_model(name):
     problem = hysteresis.Problem(name, LANES, STEPS)
     c = c_engine(problem, "forward").run()
@@ -71,3 +81,11 @@ def test_models_without_a_function_in_c_are_said(monkeypatch):
     problem.name = "unwritten"
     with pytest.raises(engines.UnavailableError, match="has no unwritten"):
         c_engine(problem, "forward")
+
+
+def test_a_model_without_a_yardstick_is_listed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(hysteresis.throughput, "pin_to_one_core", lambda: 1)
+    monkeypatch.setattr(hysteresis, "has_yardstick", lambda name: False)
+    arguments = ["--json", str(tmp_path / "out.json"), "--models", "duhem"]
+    assert hysteresis.main(arguments) == 1  # nothing else was asked for
+    assert "duhem: no yardstick" in capsys.readouterr().out

@@ -176,6 +176,9 @@ TURNS = np.array([11.3, 43.1, 23.7, 71.9, 51.3, 86.7, 57.1, 66.9, 38.3, 21.1, 47
 PATH = np.repeat(TURNS, 2)  # Every turn is followed by a pause.
 OTHER = 0.5 * PATH + 9.1
 RESTS = (-7.3, 0.0, 30.0, 107.1)
+QUICK = {"xla_backend_optimization_level": 0}
+"""Options of the compiler: a program that runs once need not be a fast one."""
+
 STEP = 1e-5
 """Change of a parameter and of a turn for their difference quotients, relative."""
 
@@ -228,7 +231,8 @@ def runs(name):
             base - moves,
         ]
     )
-    (losses, (outputs, first, last)), slopes = jax.jit(jax.vmap(gradients))(
+    program = jax.jit(jax.vmap(gradients), compiler_options=QUICK)
+    (losses, (outputs, first, last)), slopes = program(
         lanes[:, : flat.size], lanes[:, flat.size :]
     )
     upper, lower = np.split(np.asarray(losses[2 + len(RESTS) :]), 2)
@@ -304,7 +308,7 @@ CORNERS = [0.0, 100.0, 5.0, 90.0, 20.0, 75.0, 40.0, 60.0, 50.0]
 INPUT = np.interp(np.arange(129) / 16.0, np.arange(9), CORNERS)
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=QUICK)
 def missed(inverse, inputs):
     """Return how far the inverse misses outputs that the model has reached."""
 
@@ -332,7 +336,7 @@ def test_its_inverse_reaches_what_is_wanted_or_has_a_reason(name):
 # The recipe
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=QUICK)
 def response(system, input):
     return simulate(system, input, system.init(input[0]))[1]
 
