@@ -10,7 +10,7 @@ from piezojax import (
     loop_inputs,
     simulate,
 )
-from piezojax.catalog import p753, p753_chapter4
+from piezojax.catalog import p753
 from piezojax.control import (
     PID,
 )
@@ -27,11 +27,7 @@ QUIET = np.zeros(SAMPLES)
 
 LOOPS = {
     "pid": p753.loop(PID(0.5, 3000.0, 1e-5, 1e-4, 100.0, 3.0, -2.5, dt=p753.DT)),
-    "sliding mode": p753.loop(p753.sliding_mode()),
-    "inversion": p753.loop(p753.inversion()),
     "observer": p753.loop(p753.disturbance_observer()),
-    "model reference": p753_chapter4.loop(p753_chapter4.model_reference()),
-    "continuous": p753_chapter4.loop(p753_chapter4.continuous()),
 }
 
 

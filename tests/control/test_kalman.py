@@ -12,7 +12,6 @@ from oracles.published import plant_t2, smc_gains
 from scipy import linalg
 
 from piezojax import (
-    loop_inputs,
     simulate,
 )
 from piezojax.catalog import p753, p753_chapter4
@@ -21,9 +20,6 @@ from piezojax.control import (
     KalmanFilter,
 )
 from piezojax.control.kalman import kinematic_kalman, model_kalman, steady_gain
-from piezojax.core.metrics import (
-    Tracking,
-)
 from piezojax.core.system import LoopInput, Observation
 from piezojax.dynamics import (
     ARMA,
@@ -234,39 +230,6 @@ def test_controllers_take_it_for_their_filter(name):
         np.testing.assert_allclose(
             getattr(found, column), values, rtol=0.0, atol=1e-9, err_msg=column
         )
-
-
-def test_gradients_are_those_of_differences():
-    loop = p753.loop(p753.kalman_disturbance_observer())
-    reference = jnp.asarray(signals.ten_references()["SIN50"][:600])
-    inputs = loop_inputs(reference, jnp.asarray(DRAWS[0, :600]))
-
-    def loss(gain):
-        tuned = eqx.tree_at(lambda x: x.controller.feedback.filter.gain, loop, gain)
-        metric = Tracking(10)
-        return simulate(tuned, inputs, tuned.init(0.0), metric=metric)[1].rms_error
-
-    gain = loop.controller.feedback.filter.gain
-    compiled = jax.jit(loss)
-    slopes = jax.jit(jax.grad(loss))(gain)
-    for i in range(len(gain)):
-        step = 1e-6
-        ends = [
-            compiled((*gain[:i], gain[i] + s * step, *gain[i + 1 :])) for s in (1, -1)
-        ]
-        expected = (ends[0] - ends[1]) / (2.0 * step)
-        assert abs(expected) > 1e-6
-        np.testing.assert_allclose(slopes[i], expected, rtol=1e-4, atol=1e-8)
-
-
-def test_jit_changes_nothing():
-    kalman = p753.kalman(STAGE)
-    state, motions = kalman.init(at_rest()), []
-    for z, u in DRAWS[:2, :50].T:
-        state, motion = kalman.step(state, at_rest(z, u))
-        motions.append(motion.position)
-    found = observed(kalman, *map(jnp.asarray, DRAWS[:2, :50]))
-    np.testing.assert_allclose(found.position, motions, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -163,21 +163,6 @@ def test_a_start_at_rest_stays_at_rest(name):
     np.testing.assert_allclose(command, command[:1].repeat(SAMPLES, 0), atol=1e-7)
 
 
-@pytest.mark.parametrize("make", [catalog.nominal, catalog.disturbance_observer])
-def test_a_start_at_rest_stays_at_rest_if_the_axes_are_as_modelled(make):
-    # (7.53) couples the axes a little, which these controllers do not know.
-    held = tuple(jnp.asarray(HELD))
-    models = catalog.arx_models()
-    gains = [sum(m.moving) / (1.0 - sum(m.autoregressive)) for m in models]
-    applied = tuple(r / gain for r, gain in zip(held, gains, strict=True))
-    seen = Observation(held, held, held, applied)
-    controller = make()
-    state = controller.init(seen)
-    for _ in range(3):
-        state, command = controller.step(state, seen)
-        np.testing.assert_allclose(command, applied, rtol=0.0, atol=1e-9)
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_a_start_at_a_reference_is_without_a_bump(name):
     samples = samples_of(name)
@@ -221,16 +206,6 @@ LEAVES = {
             "controller.reference_model.Z.frequency": 1e-2,
         },
     ),
-    "observer": (
-        catalog.loop(catalog.disturbance_observer()),
-        {
-            "controller.Z.controller.feedback.surface": 1e-4,
-            "controller.Rx.controller.feedback.law.proportional": 1e-5,
-            "controller.Ry.controller.feedback.model.moving.1": 1e-6,
-            "controller.Z.controller.cutoff": 1e-2,
-            "controller.Rx.filter.alpha": 1e-5,
-        },
-    ),
 }
 
 
@@ -259,7 +234,7 @@ def test_gradients_are_those_of_finite_differences(name):
     np.testing.assert_allclose(slopes, expected, rtol=1e-4, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["multi-axis, dynamic, filtered", "observer"])
+@pytest.mark.parametrize("name", ["multi-axis, dynamic, filtered"])
 def test_compiled_steps_are_the_eager_ones(name):
     controller = CASES[name].controller
 
