@@ -190,6 +190,7 @@ def test_a_study_finds_the_controller_and_all_of_its_parameters(name, tmp_path):
         lower, upper = sorted([0.9 * float(value), 1.1 * float(value) or 1e-9])
         text += f'[parameters."controller.{path}"]\n'
         text += f"lower = {lower!r}\nupper = {upper!r}\n"
+        text += 'scale = "linear"\n'
     file = tmp_path / "study.toml"
     file.write_text(text)
     case = study.read(file)
