@@ -134,9 +134,9 @@ def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:
     """Return the Preisach model and lag whose free run fits ``record`` best.
 
     For each lag (and rate) the weights are those of ``fit_preisach`` (or
-    ``fit_rate_dependent_preisach``), so only these are searched for; of both histories
-    before the record, virgin and saturated, the better is taken. Raises ValueError as
-    those functions, and where the record tells too few cells apart.
+    ``fit_rate_dependent_preisach``), so the search is over the lag (and rate) only. Of
+    both histories before the record, virgin and saturated, the better is taken. Raises
+    ValueError as those functions do, and if the record determines too few cells.
     """
     cells = cells_told_apart(record, train, model)
     if not cells:

@@ -33,13 +33,13 @@ def fit_preisach(
 ) -> Preisach:
     """Return the Preisach model, ``cells`` a side, that fits ``record`` best.
 
-    The output is linear in the weights for a given input: (2.1) is solved for the
-    weights over the samples ``train`` (all of them; with a step only some are compared)
-    by least squares under the condition that none is negative. ``limits`` (V) are the
-    least and the highest input of the model, those of the record if left out;
-    ``dynamics`` is what follows the hysteresis before the output, nothing if left out.
-    The record is taken to begin at rest, its memory by ``start``: ``"virgin"`` about
-    the first input, or ``"saturated"``.
+    For a given input the output (2.1) is linear in the weights. They are found by least
+    squares over the samples ``train`` (all by default; a slice with a step takes only
+    some), subject to weights of at least 0. ``limits`` (V) are the lowest and highest
+    input of the model, by default those of the record. ``dynamics`` are those between
+    hysteresis and output, by default none. The record must begin at rest; ``start`` is
+    the memory of the model there, ``"virgin"`` about the first input or
+    ``"saturated"``.
 
     Cells that no turn of the input reaches are determined only by ``smoothing``. Its
     square weighs the squared differences between neighbours against the mean squared
@@ -68,8 +68,8 @@ def fit_rate_dependent_preisach(
 ) -> RateDependentPreisach:
     """Return the two densities, half way at ``rate`` (V/s), that fit ``record`` best.
 
-    For a given rate the output is linear in both, (2.10): all is as in fit_preisach,
-    for each of the two. A record that knows one speed only does not tell them apart.
+    For a given rate the output (2.10) is linear in both densities. Each is fitted as in
+    fit_preisach. A record with a single speed does not determine both.
     Raises ValueError as fit_preisach, and for ``rate <= 0``.
     """
     slow = empty(record, cells, limits, start)
