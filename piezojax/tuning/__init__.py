@@ -1,4 +1,4 @@
-"""From a study to gains."""
+"""Tuning of a study's controller: objective, search, result and comparison."""
 
 from .comparison import ComparisonResult as ComparisonResult
 from .comparison import compare as compare

@@ -1,4 +1,4 @@
-"""Comparison of several studies that are tuned one after another."""
+"""Comparison of several studies, tuned one after another."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -17,12 +17,12 @@ COMPARISON_FILE = "comparison.json"
 
 
 class TunedStudy(BaseModel):
-    """Study of a comparison: geometric means of rms errors over references, um.
+    """Tuned study of a comparison: geometric means of RMS errors over references, um.
 
-    ``before`` and ``after`` are on noise the optimiser has not seen,
-    ``unseen_before`` and ``unseen`` on references it has not seen either; None where a
-    run diverges or rails. A study that could not be tuned has the status "failed" and
-    the reason in ``notes``.
+    ``before_um`` and ``after_um`` are those on held-out noise, ``unseen_before_um`` and
+    ``unseen_um`` those on held-out references with held-out noise; None where a run
+    diverges or rails. A study that could not be tuned has the status "failed" and the
+    reason in ``notes``.
     """
 
     study: str
@@ -39,21 +39,22 @@ class TunedStudy(BaseModel):
 
     @property
     def ratio(self) -> float | None:
-        """Factor by which the error on held-out noise became smaller."""
+        """Ratio of the errors on held-out noise before and after tuning."""
         return _ratio(self.before_um, self.after_um)
 
     @property
     def unseen_ratio(self) -> float | None:
-        """Factor by which the error on references not tuned on became smaller."""
+        """Ratio of the errors on held-out references before and after tuning."""
         return _ratio(self.unseen_before_um, self.unseen_um)
 
 
 class ComparisonResult(BaseModel):
-    """Content of ``comparison.json``: the rows, with means by controller and rate.
+    """Content of ``comparison.json``: the rows, with summaries by controller and rate.
 
-    ``better`` and ``unseen_better`` are geometric means over the rates of a controller,
-    and None where one of its starts diverges or rails or one of its rows failed.
-    ``best`` is the controller with the lowest error after tuning at each rate (Hz).
+    ``better`` and ``unseen_better`` are the geometric means of ``ratio`` and
+    ``unseen_ratio`` over the rows of a controller, None where one of its runs diverges
+    or rails or one of its rows failed. ``best`` is the controller with the lowest error
+    after tuning at each rate (Hz).
     """
 
     title: str
@@ -77,7 +78,8 @@ def compare(
     """Tune every entry and return the comparison.
 
     ``done`` is called with each Outcome. A study without a stable point becomes a row
-    with the reason; ``Ctrl-C`` ends the current one, keeps it, and leaves out the rest.
+    with the reason. ``Ctrl-C`` ends the current study, keeps its row, and leaves out
+    the remaining studies.
     """
     progress = progress or Silent()
     began = time.perf_counter()

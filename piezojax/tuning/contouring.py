@@ -1,4 +1,4 @@
-"""Contour errors of a tuning run: distances from the path, before and after."""
+"""Contour errors of a tuning run: distances from the path before and after tuning."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,13 +13,13 @@ from ..signals.contour_error import nearest_on
 from ..study import Study
 from .outcome import Logs
 
-_MOST = 2  # contours
+_MOST = 2  # contours of a study
 _POINTS = 1500  # of each path
-_FINER, _SEGMENTS = 16, 64_000  # points of the contour by sample, and in all
+_FINER, _SEGMENTS = 16, 64_000  # most points of the path for each sample, and in all
 
 
 class Contour(NamedTuple):
-    """Reference number ``run`` of a study, whose contour drives two ``axes``."""
+    """Contour of a study: the number ``run`` of its reference, and its two ``axes``."""
 
     run: int
     axes: tuple[int, int]
@@ -28,8 +28,9 @@ class Contour(NamedTuple):
 class ContourError(NamedTuple):
     """Deviation of a run from its contour, at the instants of a ``ContourErrors``.
 
-    ``nearest`` [points, 2] are the nearest points of the contour, ``error`` [points, 2]
-    the displacement less those, both in the unit of the axes.
+    ``nearest`` [points, 2] are the points of the contour nearest to the displacement,
+    and ``error`` [points, 2] is the displacement minus ``nearest``, both in the unit of
+    the axes.
     """
 
     nearest: Float[np.ndarray, "points 2"]
@@ -60,9 +61,9 @@ class ContourErrors(NamedTuple):
 
 
 def contours_in(study: Study) -> list[Contour]:
-    """Return the references with a contour of two axes of one unit, two at most.
+    """Return the first two references, at most, with a contour of two axes of one unit.
 
-    Between axes of different units there is no distance.
+    Axes of different units have no common distance.
     """
     if study.axes is None:
         return []
@@ -75,7 +76,10 @@ def contours_in(study: Study) -> list[Contour]:
 
 
 def contour_errors(study: Study, runs: dict[int, Logs]) -> list[ContourErrors]:
-    """Return the errors of each contour of ``contours_in``, from samples by run."""
+    """Return the errors of each contour of ``contours_in``.
+
+    ``runs`` holds the samples before and after tuning by the number of the reference.
+    """
     found = []
     for contour in contours_in(study):
         logs = runs[contour.run]
@@ -101,7 +105,7 @@ def _error(
 def _path(study: Study, contour: Contour, samples: int) -> np.ndarray:
     """Return the path [points, 2] of a contour, with points between the samples.
 
-    The chord between two samples of a curve may be further off it than the stage.
+    The chord between two samples may lie further from the curve than the stage does.
     """
     assert study.axes is not None
     table = study.references

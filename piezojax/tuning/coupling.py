@@ -1,4 +1,4 @@
-"""How much each axis moves the others: errors while one axis is driven alone."""
+"""Coupling of axes: errors of all axes while one axis is driven alone."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -11,11 +11,12 @@ from .traces import traces_of
 
 
 class Coupling(NamedTuple):
-    """Errors of each axis while one alone is driven, [driven, measured].
+    """Errors of each measured axis while one driven axis moves alone.
 
-    ``errors`` are root mean squares in the unit of the measured axis, NaN where no
-    reference drives that axis alone or a run diverged; ``amplitudes`` are those of the
-    driven axes, in their unit. ``names`` and ``units`` are the axes'.
+    ``errors`` [driven, measured] are root mean squares in the unit of the measured
+    axis, NaN where no reference drives that axis alone or a run diverged.
+    ``amplitudes`` [driven] are those of the references, in the unit of the driven axis.
+    ``names`` and ``units`` are those of the axes.
     """
 
     errors: Float[np.ndarray, "driven measured"]
@@ -25,20 +26,21 @@ class Coupling(NamedTuple):
 
     @property
     def percent(self) -> Float[np.ndarray, "driven measured"]:
-        """The errors in hundredths of the driven amplitude.
+        """Errors as percentages of the driven amplitude, [driven, measured].
 
-        In % between axes of one unit, else in the measured unit per 100 of the driven.
+        Between axes of different units they are in the measured unit per 100 of the
+        driven unit.
         """
         return 100.0 * self.errors / self.amplitudes[:, None]
 
 
 def coupling_matrix(study: Study, errors: Mapping[str, float | None]) -> Coupling:
-    """Return the coupling of a study's axes from RMS errors by the name of their trace.
+    """Return the coupling of a study's axes from RMS ``errors`` by trace name.
 
-    Such as those of ``Result.holdout`` and ``Result.coupling`` together. References
-    that drive several axes say nothing of coupling and are left out; of several that
-    drive the same axis the mean square is taken. On the diagonal stands the tracking
-    error. Raises ValueError for a study of one axis.
+    Examples of ``errors`` are those of ``Result.holdout`` and ``Result.coupling``
+    together. References that drive several axes are left out, because they do not show
+    coupling. Over several references that drive the same axis the mean square is taken.
+    The diagonal holds the tracking errors. Raises ValueError for a study of one axis.
     """
     if study.axes is None:
         raise ValueError("the study has one axis; coupling takes several")

@@ -1,4 +1,4 @@
-"""What a case is tuned and judged on: references, noise draws, disturbances."""
+"""Signals of a case for tuning and hold-out: references, noise, disturbances."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from .traces import Trace, traces_of
 
 @dataclass
 class Data:
-    """Signals of a case: what tunes, what judges, and the traces among them."""
+    """Signals of a case for tuning and for the hold-out, with their traces."""
 
-    tuned: int  # the first so many traces are tuned on
+    tuned: int  # number of traces tuned on, the first of all
     traces: tuple[Trace, ...]
     tuning: Signals
     holdout: Signals
@@ -33,7 +33,10 @@ class Data:
 
 
 def make_data(case: Case) -> Data:
-    """Return references and noise of ``case``: the hold-out's are drawn apart."""
+    """Return the signals of ``case``, the tuning references before the unseen ones.
+
+    The noise of the hold-out comes from a random stream of its own.
+    """
     study = case.study
     table = study.references
     time_s = signal_library.time_grid(table.duration, study.rate)
@@ -89,20 +92,20 @@ def _signals(
     drift = np.array(case.study.by_axis(case.study.disturbance.drift_rms))
     if drift.any():
         steps = random.standard_normal(shape) * np.sqrt(case.study.dt)
-        # By axis only where there are several.
+        # One axis has no dimension for axes.
         walk = as_array(np.cumsum(steps, axis=2) * (drift if axes else drift[0]))
         disturbance = walk if disturbance is None else disturbance + walk
     return Signals(references, noise, disturbance, (), holding)
 
 
 def _holding(case: Case, begins: jax.Array) -> jax.Array:
-    """Return the inputs under which the stage rests where the references begin."""
+    """Return the inputs under which the stage rests at ``begins`` of the references."""
 
     def one(begin):
         held = holding_input(case.loop.plant, as_signal(begin))
         return jnp.stack(held) if isinstance(held, tuple) else held
 
-    # References begin in a few places, most of them in one.
+    # Many references begin at the same place: solve once for each place.
     places, which = np.unique(np.asarray(begins), axis=0, return_inverse=True)
     return jax.jit(jax.vmap(one))(as_array(places))[which.ravel()]
 
@@ -118,10 +121,11 @@ def _reference(study: Study, name: str, time_s: jax.Array) -> jax.Array:
 def _unexplained(
     case: Case, time_s: jax.Array, part: Literal["train", "validate"]
 ) -> jax.Array | None:
-    """Return what the fitted plant leaves unexplained of its record, as a disturbance.
+    """Return the residual [samples] of the fitted plant as a disturbance.
 
-    A controller that contains the fitted model would otherwise be tuned and judged as
-    if the stage were that model. Run forth and back to last as long as the references.
+    Without it, a controller that contains the fitted model would be tuned and evaluated
+    as if the stage were that model. The residual is played forwards and backwards until
+    the references end. None without a fit.
     """
     if case.fit is None:
         return None
@@ -130,13 +134,13 @@ def _unexplained(
     # The first half of the training part holds the initial loading, a single event.
     start = where.start if part == "validate" else (where.start + where.stop) // 2
     residual = (fit.record.output - fit.simulated)[start : where.stop]
-    there_and_back = np.concatenate([residual, residual[-2:0:-1]])
+    replayed = np.concatenate([residual, residual[-2:0:-1]])
     dt = fit.record.dt
     return as_array(
         np.interp(
             np.asarray(time_s),
-            np.arange(there_and_back.size) * dt,
-            there_and_back,
-            period=there_and_back.size * dt,
+            np.arange(replayed.size) * dt,
+            replayed,
+            period=replayed.size * dt,
         )
     )

@@ -1,4 +1,4 @@
-"""Evaluation of loops on signals and stages, compiled once for each shape."""
+"""Evaluation of loops on signals and stages, compiled once per shape of signals."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,9 +17,9 @@ from .runs import Signals, evaluate
 
 
 class Evaluator:
-    """Simulates loops on signals; each shape of signals is compiled once.
+    """Simulator of loops on signals, compiled once per shape of signals.
 
-    ``start`` is the first sample that counts; ``clock`` measures compilation.
+    ``start`` is the first sample that counts; ``clock`` measures the compile time.
     """
 
     def __init__(self, clock: Clock, case: Case, start: int):
@@ -42,7 +42,7 @@ class Evaluator:
         return program(loop, signals)
 
     def on_stages(self, loop: Feedback, stages: Stage, signals: Signals) -> LoopFigures:
-        """Return the figures of ``loop`` on ``stages``, stacked on a leading axis."""
+        """Return the figures of ``loop`` on ``stages``, both with a leading axis."""
         dynamic, static = eqx.partition(stages, eqx.is_array)
         signals = signals.for_another_plant()
         limits = self._case.study.constraints

@@ -1,4 +1,4 @@
-"""A Pareto front by continuation: the study solved for one limit after the other."""
+"""Pareto front by continuation: gains tuned for one limit after the other."""
 
 from collections.abc import Callable, Sequence
 
@@ -18,7 +18,7 @@ from .objective import Objective
 from .result import ConstraintOutcome, FrontPoint
 
 Place = tuple[np.ndarray, FrontPoint]
-"""A point of the unit box, and the same point on the front."""
+"""Gains as a point of the unit box, and the point of the front with those gains."""
 
 
 def trace_front(
@@ -31,30 +31,32 @@ def trace_front(
 ) -> list[FrontPoint]:
     """Return the best gains found for each limit of the study's front.
 
-    Each limit starts from the gains of the one before, the limits from the loosest to
-    the tightest, and the first from the result of ``search`` by ``strategy``. Where a
-    tighter limit came out better than a looser one, the looser one is solved again from
-    its gains, which keep both.
+    The limits are solved from the loosest to the tightest by ``strategy``. The first
+    starts from the result of ``search``, each later one from the gains of the limit
+    before. If a tighter limit gives a lower loss than a looser one, the looser one is
+    solved again from the tighter one's gains, which keep both limits.
     """
     table = case.study.pareto
     assert table is not None
     limits = case.study.constraints
 
-    def look(objective: Objective, unit: Array) -> tuple[dict[str, Array], Array]:
+    def worst_and_errors(
+        objective: Objective, unit: Array
+    ) -> tuple[dict[str, Array], Array]:
         loop = objective.figures(unit)
         return worst_by_plant(objective.limits, loop), loop.tracking.rms_error[0]
 
-    program = clock.compiled(look, objective, as_array(search.unit))
+    program = clock.compiled(worst_and_errors, objective, as_array(search.unit))
     loosest_first = sorted(
         table.limits, reverse=CONSTRAINTS[table.constraint].sense == "at most"
     )
 
     def solved(limit: float, unit: np.ndarray) -> Place:
-        asked = objective.with_limits(limits | {table.constraint: limit})
-        here = SearchState(unit, starts=unit[None])
-        minimise(strategy, asked, unit[None], here, table.steps, progress)
-        unit = here.unit
-        values, rms = jax.tree.map(np.asarray, program(asked, as_array(unit)))
+        limited = objective.with_limits(limits | {table.constraint: limit})
+        state = SearchState(unit, starts=unit[None])
+        minimise(strategy, limited, unit[None], state, table.steps, progress)
+        unit = state.unit
+        values, rms = jax.tree.map(np.asarray, program(limited, as_array(unit)))
         rms = np.sqrt(np.mean(rms**2, axis=1))
         reached = ConstraintOutcome.of_values(
             table.constraint, limit, values[table.constraint]
@@ -62,8 +64,8 @@ def trace_front(
         return unit, FrontPoint(
             limit=limit,
             value=reached.value,
-            loss=here.loss,
-            kept=here.violation <= TOLERANCE,
+            loss=state.loss,
+            kept=state.violation <= TOLERANCE,
             geomean_rms_um=float(np.exp(np.mean(np.log(rms)))),
             gains={
                 path: float(value)
@@ -81,9 +83,10 @@ def trace_front(
 def undominated(
     found: Sequence[Place], solved: Callable[[float, np.ndarray], Place]
 ) -> list[Place]:
-    """Return the front, from its tightest limit back to the loosest.
+    """Return the points ``found`` on the front, without dominated ones.
 
-    A looser limit that came out worse than a tighter one is ``solved`` from it again.
+    ``found`` runs from the loosest limit to the tightest. Each point that is worse than
+    the next tighter one is replaced by ``solved``, which starts from that one's gains.
     """
     found = list(found)
     for i in reversed(range(len(found) - 1)):

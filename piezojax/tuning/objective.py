@@ -28,38 +28,39 @@ Aggregate = Literal["geometric_mean", "mean_square", "worst"]
 Over = Literal["mean", "worst", "cvar"]
 
 RAILED = 0.9
-"""A run whose actuator saturates for more than this share of it has lost its loop."""
+"""Share of saturated samples above which a run counts as railed: its loop is open."""
 
 _SHARPNESS = 20.0  # of the smooth maximum in "worst"
-_FLOOR = 1e-9  # um: an error below a femtometre is as good as none
+_FLOOR = 1e-9  # um: errors below a femtometre count as equal
 
 
 def _on_each(function: Callable[[Stage | None], T], stages: Stage | None) -> T:
-    """Return ``function`` of each of the stacked ``stages``, or of None alone."""
+    """Return ``function`` of each of the stacked ``stages``, or of None, stacked."""
     if stages is None:
         return jax.tree.map(lambda x: x[None], function(None))
     return eqx.filter_vmap(function)(stages)
 
 
 class Objective(eqx.Module):
-    """The objective over a Space.
+    """Objective of tuning over a Space.
 
-    Each reference's RMS error, over its noise draws, is divided by ``scale`` (um), one
-    for each stage and reference. ``aggregate`` joins them: ``geometric_mean`` (mean of
-    logarithms: a tenfold gain counts the same on every reference), ``mean_square``, or
-    ``worst`` (a smooth maximum of the logarithms). ``weights`` says how much each
-    counts (alike if left out); a ``resting`` trace, of an axis that should not move,
-    counts only as far as its error exceeds its scale.
+    The RMS error of each reference over its noise draws is divided by ``scale`` (um),
+    which has one value for each stage and reference. ``aggregate`` joins the
+    references: ``geometric_mean`` (mean of logarithms: a tenfold improvement counts
+    the same on every reference), ``mean_square``, or ``worst`` (a smooth maximum of the
+    logarithms). ``weights`` are those of the references (equal if left out). A
+    ``resting`` trace, of an axis that should not move, counts only as far as its error
+    exceeds its scale.
 
-    ``stages``, stacked on a leading axis, take the place of the loop's own; ``over``
-    joins them: their mean, the worst, or the mean of the worst share ``tail``.
-    ``effort_weight`` and ``slew_weight`` add the mean RMS voltage and RMS voltage
-    change a sample, both as a share of ``voltage_span``.
+    ``stages``, stacked on a leading axis, replace the loop's own. ``over`` joins them:
+    their mean, the worst, or the mean of the worst share ``tail``. ``effort_weight``
+    and ``slew_weight`` weight the mean RMS voltage and the mean RMS change of voltage
+    per sample, both as a share of ``voltage_span``, which are added to the error.
 
-    ``limits`` are constraints by name (``constraints.CONSTRAINTS``), kept on every
-    stage, margins on every one of ``margin_stages`` at the reference ``highest`` (um).
-    ``multipliers`` and ``penalty`` are those of the augmented Lagrangian that ``loss``
-    is.
+    ``limits`` are the limits of constraints by name (``constraints.CONSTRAINTS``).
+    They must be kept on every stage, those on margins on every one of ``margin_stages``
+    at the reference ``highest`` (um). ``loss`` is an augmented Lagrangian with
+    ``multipliers`` and ``penalty``.
     """
 
     loop: Feedback
@@ -87,7 +88,7 @@ class Objective(eqx.Module):
 
     @property
     def lanes(self) -> int:
-        """Runs in one evaluation."""
+        """Number of runs in one evaluation."""
         runs = self.signals.noise.shape[0] * self.signals.noise.shape[1]
         return runs * self.scale.shape[0]
 
@@ -105,7 +106,7 @@ class Objective(eqx.Module):
         return dataclasses.replace(self, limits=arrays)
 
     def figures(self, unit: Float[Array, " n"]) -> LoopFigures:
-        """Return the figures [stages, references, draws] of errors and constraints."""
+        """Return the figures [stages, references, draws] of the loop at ``unit``."""
         return self._sampled(unit)[0]
 
     def _sampled(
@@ -144,10 +145,10 @@ class Objective(eqx.Module):
         square = jnp.mean(figures.rms_error**2, axis=2)
         normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
         if any(self.resting):
-            # A smooth maximum with 1: no gain in stillness, a price for motion.
+            # A smooth maximum with 1: only errors above the scale cost.
             above = jnp.logaddexp(0.0, _SHARPNESS * jnp.log(normalised)) / _SHARPNESS
             normalised = jnp.where(jnp.array(self.resting), jnp.exp(above), normalised)
-        # Limits turn divergence into a limit cycle between them.
+        # Voltage limits turn divergence into a limit cycle between them.
         railed = jnp.any(figures.saturated > RAILED)
         return jnp.where(railed, jnp.inf, normalised)
 
@@ -159,7 +160,7 @@ class Objective(eqx.Module):
         )
 
     def _shares(self) -> Array:
-        """Return how much each reference's error counts; the shares sum to 1."""
+        """Return the weights of the references, normalised to sum to 1."""
         count = self.scale.shape[1]
         weights = jnp.ones(count) if self.weights is None else self.weights
         return weights / jnp.sum(weights)
@@ -197,11 +198,11 @@ class Objective(eqx.Module):
         return self.both(unit)[0]
 
     def both(self, unit: Float[Array, " n"]) -> tuple[Float[Array, ""], Verdict]:
-        """Return ``loss`` and ``verdict`` of one simulation."""
+        """Return ``loss`` and ``verdict`` from one simulation."""
         return self._whole(self.figures(unit))[:2]
 
     def _whole(self, figures: LoopFigures) -> tuple[Array, Verdict, Array]:
-        """Return the loss, the verdict, and the roots of the added terms."""
+        """Return the loss, the verdict, and the square roots of the penalty terms."""
         total, violation = self._judged(figures)
         added = self._added(violation)
         loss, alone = (
@@ -211,7 +212,7 @@ class Objective(eqx.Module):
         return loss, Verdict(alone, jnp.max(violation, initial=0.0)), added
 
     def errors(self, unit: Float[Array, " n"], every: int) -> Errors:
-        """Return the objective and one of ``every`` errors of each run."""
+        """Return the objective and each ``every``-th error of a run."""
         loop, errors = self._sampled(unit, every)
         assert errors is not None
         tracking = loop.tracking
@@ -224,17 +225,17 @@ class Objective(eqx.Module):
         return Errors(loss, verdict, flat, added, weights.ravel())
 
     def verdict(self, unit: Float[Array, " n"]) -> Verdict:
-        """Return the objective without constraints, and the worst violation."""
+        """Return the objective without constraints, and the largest violation."""
         return self.both(unit)[1]
 
     def violated(self, unit: Float[Array, " n"]) -> Float[Array, " constraints"]:
-        """Return every violation, as ``constraints.violations``."""
+        """Return all violations, as ``constraints.violations`` does."""
         return self._judged(self.figures(unit))[1]
 
     def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " residuals"]:
-        """Return residuals whose squares sum to the loss, a mean square.
+        """Return residuals whose squares sum to the loss.
 
-        Raises ValueError for another aggregate.
+        Raises ValueError unless the aggregate is ``mean_square``.
         """
         if self.aggregate != "mean_square":
             raise ValueError(f"least squares cannot minimise {self.aggregate!r}")

@@ -26,12 +26,12 @@ Logs = tuple[LoopSample, LoopSample]
 
 @dataclass
 class Outcome:
-    """Result of tuning with the loops and signals behind it.
+    """Result of tuning with its loops and signals.
 
     ``before`` and ``after`` are the loops with the study's own gains and the tuned
-    ones, ``holdout`` the signals that the search has not seen. ``baselines`` are there
-    if they were asked for. ``stability``, ``limit`` and ``coupling`` are computed when
-    they are first read, so that many studies can be tuned without them.
+    gains; ``holdout`` are the held-out signals. ``baselines`` is None unless a budget
+    for them was given. ``stability``, ``limit`` and ``coupling`` are computed when they
+    are first read, so that many studies can be tuned without them.
     """
 
     result: Result
@@ -43,7 +43,7 @@ class Outcome:
 
     @property
     def controller(self) -> System:
-        """The tuned controller."""
+        """Tuned controller."""
         return self.after.controller
 
     @cached_property
@@ -63,9 +63,9 @@ class Outcome:
 
     @cached_property
     def limit(self) -> LimitReport | str:
-        """Limit of linear control for the tuned loop, or the reason why there is none.
+        """Limit of linear control for the tuned loop, or the reason for its absence.
 
-        On the references that were tuned on, with the noise of the hold-out.
+        It is that of the tuning references with the hold-out's noise.
         """
         study = self.case.study
         if study.axes is not None:
@@ -82,13 +82,16 @@ class Outcome:
                 start=round(study.references.settle * study.rate),
                 dt=study.dt,
             )
-        # Whatever goes wrong here, the tuned gains stay worth having.
+        # A failed analysis must not lose the tuned gains.
         except Exception as error:
             return str(error).partition("\n")[0] or type(error).__name__
 
     @cached_property
     def coupling(self) -> tuple[Coupling, Coupling] | None:
-        """Coupling of the axes before and after, on the hold-out; None for one axis."""
+        """Coupling of the axes before and after tuning, on the hold-out.
+
+        None for one axis.
+        """
         study, result = self.case.study, self.result
         if study.axes is None:
             return None
@@ -104,9 +107,9 @@ class Outcome:
         return matrix(before), matrix(after)
 
     def logs(self, runs: Iterable[int]) -> dict[int, Logs]:
-        """Return the samples of both loops under references number ``runs``.
+        """Return the samples of both loops by the number of the reference in ``runs``.
 
-        With the first draw of noise of the hold-out. Samples beyond 1e9 um or V, of a
+        The noise is the first draw of the hold-out. Samples beyond 1e9 um or V, of a
         run that diverges, are NaN.
         """
         signals = self.holdout
@@ -131,7 +134,7 @@ class Outcome:
 def tracking_rms(log: LoopSample, start: int) -> float:
     """Return the RMS tracking error from sample ``start`` on, NaN if the run diverged.
 
-    In the unit of the displacement, for samples of one axis.
+    The samples are those of one axis; the error is in the unit of the displacement.
     """
     error = np.asarray(log.displacement - log.reference)[start:]
     return float(np.sqrt(np.mean(error**2)))

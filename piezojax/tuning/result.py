@@ -1,4 +1,4 @@
-"""Result of tuning: the content of ``result.json``, and how it is read."""
+"""Result of tuning: the content of ``result.json``, and its reader."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +19,10 @@ GAINS_FILE = "gains.toml"
 
 
 class Scores(BaseModel):
-    """Tracking errors of one set of gains, um, by reference, over all noise draws."""
+    """Tracking errors (um) of one set of gains by reference, over all noise draws.
+
+    Errors are None for a run that diverged.
+    """
 
     per_reference_rms_um: dict[str, float | None]
     geomean_rms_um: float | None
@@ -30,16 +33,16 @@ class Scores(BaseModel):
 
     @property
     def stable(self) -> bool:
-        """Whether every run stayed finite and off the limits most of the time."""
+        """Whether every run stayed finite and no run railed (see ``RAILED``)."""
         railed = max(self.saturated_percent.values()) > 100.0 * RAILED
         return self.geomean_rms_um is not None and not railed
 
 
 class ConstraintOutcome(BaseModel):
-    """Outcome of a constraint: its limit, and the ``value`` nearest to it on any plant.
+    """Outcome of a constraint: its limit, and the worst ``value`` over all plants.
 
-    ``kept`` allows for ``solve.problem.TOLERANCE``; an ``active`` limit is kept by less
-    than 2 %. It is kept on ``on`` of ``of`` plants.
+    ``kept`` allows for ``solve.problem.TOLERANCE``. An ``active`` constraint is kept
+    with less than 2 % to spare. The constraint is kept on ``on`` of ``of`` plants.
     """
 
     limit: float
@@ -77,10 +80,11 @@ class ConstraintOutcome(BaseModel):
 
 
 class FrontPoint(BaseModel):
-    """Point of a Pareto front: a limit, and the best gains found that keep it.
+    """Point of a Pareto front: a limit and the best gains found for it.
 
-    ``value`` is the limited figure on the plants of the objective, ``loss`` the
-    objective, ``geomean_rms_um`` the error on the nominal plant.
+    ``kept`` tells whether the gains keep the limit. ``value`` is the worst value of the
+    limited figure on the plants of the objective, ``loss`` the objective, and
+    ``geomean_rms_um`` the geometric mean of the errors on the nominal plant.
     """
 
     limit: float
@@ -94,13 +98,14 @@ class FrontPoint(BaseModel):
 class Perturbed(BaseModel):
     """Figures of the tuned gains on perturbed plants, drawn for the hold-out.
 
-    ``unstable`` counts plants on which a run diverges or rails. ``geomeans_um`` and
-    ``geomeans_before_um`` hold the geometric mean of the errors of the driven axes by
-    plant, None where a loop is unstable. ``median_better`` and ``worst_better`` are how
-    many times smaller it is than before, on the plant in the middle and on the worst
-    one of those on which both are stable; ``coupling_better`` is the median of the axes
-    at rest. ``constraints`` holds the outcome of the limits there, ``values`` the
-    limited figures by plant.
+    ``unstable_before`` and ``unstable`` count the plants on which a run diverges or
+    rails. ``geomeans_before_um`` and ``geomeans_um`` hold, by plant, the geometric mean
+    of the errors of the driven axes, None where a loop is unstable. ``geomean_rms_um``
+    and ``worst_rms_um`` are the median and the largest of ``geomeans_um``.
+    ``median_better`` and ``worst_better`` are the median and the smallest ratio of the
+    geometric means before and after, over the plants on which both loops are stable;
+    ``coupling_better`` is the median ratio of the axes at rest. ``constraints`` holds
+    the outcomes of the limits on these plants, ``values`` the limited figures by plant.
     """
 
     plants: int
@@ -160,18 +165,18 @@ class Perturbed(BaseModel):
 
 
 class Result(BaseModel):
-    """Result of a tuning run, as it is written to ``result.json``.
+    """Result of a tuning run: the content of ``result.json``.
 
-    ``before`` and ``after`` are the study's own gains and the tuned ones on the tuning
-    references and draws; ``holdout_before`` and ``holdout`` are the same two on noise
-    the optimiser has not seen, and ``unseen_before`` and ``unseen`` on references it
-    has not seen, with that noise too. On a stage with several axes these are the driven
-    ones, each error in its own unit of ``units``; ``coupling_before`` and ``coupling``
-    are the axes that should rest, under all references of the hold-out.
-    ``constraints`` holds the outcome of the study's limits, ``front`` its Pareto front,
-    and ``perturbed`` the figures of the gains on the held-out plants of its ensemble.
-    ``history`` holds the lowest loss of each start after each step, ``times_s`` the
-    seconds from the start of the search to the end of that step.
+    ``before`` and ``after`` are the scores of the study's own gains and of the tuned
+    gains on the tuning references and draws. ``holdout_before`` and ``holdout`` are
+    those on held-out noise, and ``unseen_before`` and ``unseen`` those on held-out
+    references with held-out noise. On a stage with several axes all of these concern
+    the driven axes, each error in its own unit of ``units``. ``coupling_before`` and
+    ``coupling`` concern the axes that should rest, under all references of the
+    hold-out. ``constraints`` holds the outcomes of the study's limits, ``front`` its
+    Pareto front, and ``perturbed`` the figures of the gains on the held-out plants of
+    its ensemble. ``history`` holds the lowest loss of each start after each step, and
+    ``times_s`` the time (s) from the start of the search to the end of that step.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -208,7 +213,7 @@ class Result(BaseModel):
 
 
 def scores(figures: TrackingFigures, names: tuple[str, ...]) -> Scores:
-    """Return the Scores of figures of shape [reference, draw]."""
+    """Return the Scores of figures [references, draws]."""
     rms = np.sqrt(np.mean(np.asarray(figures.rms_error) ** 2, axis=1))
     peak = np.max(np.asarray(figures.peak_error), axis=1)
     saturated = 100.0 * np.mean(np.asarray(figures.saturated), axis=1)
@@ -227,7 +232,7 @@ def scores(figures: TrackingFigures, names: tuple[str, ...]) -> Scores:
 
 
 def _number(value: float) -> float | None:
-    # JSON has no infinity: a run that diverged has no figure.
+    # JSON has no infinity: the figure of a diverged run is None.
     return float(value) if np.isfinite(value) else None
 
 
@@ -236,9 +241,9 @@ def _numbers(values: Any) -> list[float | None]:
 
 
 def load_result(path: str | Path) -> Result:
-    """Read a ``result.json``, or the folder that holds one.
+    """Return the Result in a ``result.json``, or in the folder that holds one.
 
-    Raises ValueError if there is none or it is damaged.
+    Raises ValueError if the file is missing or damaged.
     """
     path = Path(path)
     path = path / RESULT_FILE if path.is_dir() else path

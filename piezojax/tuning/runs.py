@@ -1,4 +1,4 @@
-"""Runs of a loop: what drives them, and their figures all at once."""
+"""Runs of a loop: their input signals and their figures, computed in one batch."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,10 +18,10 @@ from ..core.system import Feedback, loop_inputs
 class Signals(eqx.Module):
     """References (um), unit-variance noise draws and disturbances (um) for a loop.
 
-    With several axes all have a last dimension for them, in the unit of each.
-    ``traces`` then are what is judged: pairs of a reference and an axis. ``holding`` is
-    the input under which the loop's own plant rests at the begin of each reference,
-    worked out if left out.
+    With several axes, each array has a last dimension for them, in the unit of each
+    axis, and ``traces`` are the evaluated pairs of a reference and an axis.
+    ``holding`` is the input under which the loop's own plant rests at the beginning of
+    each reference; None leaves it to ``Feedback.init``.
     """
 
     references: Float[Array, "references samples *axes"]
@@ -31,7 +31,7 @@ class Signals(eqx.Module):
     holding: Float[Array, "*begins"] | None = None
 
     def for_another_plant(self) -> "Signals":
-        """Return the same without ``holding``."""
+        """Return the signals without ``holding``, which depends on the plant."""
         return dataclasses.replace(self, holding=None)
 
 
@@ -44,9 +44,9 @@ def evaluate(
 ) -> Any:
     """Return the figures of ``loop_of(parameters)`` for each reference and noise draw.
 
-    With several axes, for each trace and noise draw. Every run starts at rest at its
-    reference; samples before ``start`` do not count. With ``beside``, another metric of
-    the same runs, a pair of both figures.
+    With several axes there are figures for each trace and noise draw. Every run starts
+    at rest at its reference; samples before ``start`` do not count. ``beside`` is
+    another metric of the same runs; with it, the result is the pair of both figures.
     """
     return sampled(loop_of, parameters, signals, start, beside)[0]
 
@@ -59,10 +59,10 @@ def sampled(
     beside: Metric | None = None,
     every: int = 1,
 ) -> tuple[Any, Array | None]:
-    """Return what ``evaluate`` does, and one of ``every`` errors (um) of each run.
+    """Return the figures of ``evaluate``, and each ``every``-th error (um) of a run.
 
-    The errors are those at samples counted, with time last; None unless ``every`` is
-    above 1.
+    The errors are those of the samples from ``start`` on, with time on the last axis;
+    None unless ``every`` is above 1.
     """
     metric: Metric = Tracking(start=start)
     if beside is not None:
@@ -82,7 +82,7 @@ def sampled(
         counted = jax.tree.map(lambda x: x[start // every :], error)
         return figures, jnp.stack(counted) if isinstance(counted, tuple) else counted
 
-    # A copy of the parameters for each run: their gradients are then summed once, at
+    # With a copy of the parameters for each run, their gradients are summed once, at
     # the end, and not in each step.
     runs = signals.noise.shape[:2]
     copies = jax.tree.map(

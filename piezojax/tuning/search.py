@@ -1,4 +1,4 @@
-"""The search of tuning: screen the box, then descend from the best starts."""
+"""Search of tuning: screening of the box, then descent from the best points."""
 
 import numpy as np
 import scipy
@@ -17,8 +17,9 @@ from ..study import Case
 from .objective import Objective
 
 FORWARD_BELOW, FORWARD_BELOW_WITH_AXES = 5, 64
-"""Fewer parameters than this are differentiated in forward mode: with several axes the
-reverse pass takes minutes to compile, three times as long."""
+"""Numbers of parameters below which forward-mode differentiation is used, with one axis
+and with several. With several axes the reverse pass takes minutes to compile, three
+times as long as the forward one."""
 
 
 def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:
@@ -45,10 +46,11 @@ def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:
 def search_box(
     objective: Objective, case: Case, clock: Clock, progress: Progress
 ) -> tuple[SearchState, Strategy | None]:
-    """Return the best point of the case's box, and the strategy with its programs.
+    """Return the search with the best point of the case's box, and its strategy.
 
-    ``Ctrl-C`` ends the search with the best point so far; the strategy is None if there
-    was none yet. Raises ValueError when the loop diverges at every point tried.
+    ``Ctrl-C`` ends the search with the best point so far; the strategy is None if it
+    was not compiled yet. Raises ValueError if the loop diverges or rails at every point
+    tried.
     """
     own, table = np.asarray(case.space.start(case.loop)), case.study.optimiser
     search = SearchState(own, starts=own[None])
@@ -72,7 +74,7 @@ def search_box(
 
 
 def candidates(case: Case) -> np.ndarray:
-    """Return the points to screen: the study's own start, then Sobol points."""
+    """Return points [points, n] to screen: the study's own start, then Sobol points."""
     own = np.asarray(case.space.start(case.loop))
     table, size = case.study.optimiser, len(case.space.paths)
     count = max(table.candidates, table.starts - 1)
@@ -83,7 +85,11 @@ def candidates(case: Case) -> np.ndarray:
 
 
 def _starts(losses: np.ndarray, count: int, search: SearchState) -> np.ndarray:
-    """Return the places of the study's own start and the best stable candidates."""
+    """Return the indices of the study's own start and the best stable candidates.
+
+    There are at most ``count``; the own start is left out if it is not stable. Raises
+    ValueError if no point is stable.
+    """
     stable = losses < HOPELESS
     if not stable.any():
         raise ValueError(

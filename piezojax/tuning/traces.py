@@ -1,4 +1,4 @@
-"""What is judged: each reference, on a stage with several axes each axis under it."""
+"""Traces of a study: pairs of a reference and an axis that have an error each."""
 
 from typing import NamedTuple
 
@@ -6,10 +6,11 @@ from ..study import Study
 
 
 class Trace(NamedTuple):
-    """Axis ``axis`` while reference ``run`` is followed.
+    """Trace of axis number ``axis`` under reference number ``run``.
 
-    ``driven`` axes should move, the others should rest: their error is coupling.
-    ``name`` is the reference's, with the axis in brackets unless it alone is driven.
+    ``driven`` axes should move; the others should rest, and their error is coupling.
+    ``name`` is that of the reference, followed by the axis in brackets unless that axis
+    alone is driven. ``unit`` is that of the axis.
     """
 
     run: int

@@ -1,4 +1,4 @@
-"""Tuning: screen the box, descend from the best starts, evaluate on the hold-out."""
+"""Tuning of a study: search of the box, and evaluation on the hold-out."""
 
 from importlib.metadata import version
 from pathlib import Path
@@ -41,11 +41,11 @@ def tune(
 ) -> Outcome:
     """Tune the controller of a study and evaluate it on held-out noise and references.
 
-    ``study`` is a Case, the path of a study file, or None for the default study.
-    With a budget the ``baselines`` are run on the same objective afterwards.
+    ``study`` is a Case, the path of a study file, or None for the default study. With
+    a budget as ``baselines``, the baselines are run on the same objective afterwards.
     ``Ctrl-C`` ends the search and keeps the best gains found so far. A start that
-    diverges is replaced by the best of the candidates. Raises ValueError when no point
-    of the box, the start included, gives a stable loop.
+    diverges or rails is replaced by the best of the candidates. Raises ValueError if
+    neither the start nor any candidate gives a stable loop.
     """
     progress = progress or Silent()
     clock = Clock()
@@ -87,7 +87,7 @@ def tune(
 
     after = space.put(case.loop, as_array(search.unit))
     try:
-        front, kept = None, _kept(objective, search, clock)
+        front, kept = None, _constraint_outcomes(objective, search, clock)
         if table.pareto is not None and strategy and search.status != "interrupted":
             front = trace_front(objective, case, search, strategy, clock, progress)
         progress.stage("judging on held-out noise")
@@ -95,7 +95,7 @@ def tune(
             case, data, evaluator, before, after, search, clock, kept, front
         )
     except KeyboardInterrupt:
-        # What was found is kept; only a second interrupt ends this too.
+        # The gains found are kept; only a second interrupt ends the report too.
         search.status = "interrupted"
         result = _report(case, data, evaluator, before, after, search, clock, {}, None)
     rivals = (
@@ -109,10 +109,10 @@ def tune(
 def _scale(
     before: TrackingFigures, data: Data, otherwise: jax.Array | None = None
 ) -> jax.Array:
-    """Return what each trace's error is measured against: what it was before.
+    """Return the scale (um) of the error of each trace: its RMS error before tuning.
 
-    Where the start diverges that is no measure: ``otherwise`` is, or, without it, the
-    reference's own swing.
+    If the start diverges or rails, the scale is ``otherwise``, or, without it, the
+    standard deviation of the reference.
     """
     rms = jnp.sqrt(jnp.mean(jnp.asarray(before.rms_error) ** 2, axis=1))
     usable = jnp.all(jnp.isfinite(rms)) & (jnp.max(before.saturated) <= RAILED)
@@ -134,7 +134,10 @@ def _swing(data: Data) -> jax.Array:
 
 
 def _weights(case: Case, data: Data) -> jax.Array | None:
-    """Return how much each trace counts: less where the axis should rest."""
+    """Return the weights of the traces: the coupling weight for axes that should rest.
+
+    None for one axis.
+    """
     if case.study.axes is None:
         return None
     coupling = case.study.objective.coupling_weight
@@ -143,7 +146,10 @@ def _weights(case: Case, data: Data) -> jax.Array | None:
 
 
 def _stages(case: Case, part: Part) -> Stage | None:
-    """Return the nominal stage and the drawn ones of a part, stacked; None if alone."""
+    """Return the nominal stage and the drawn stages of ``part``, stacked.
+
+    None if no stages are drawn.
+    """
     others = case.ensemble.stages(part) if case.ensemble else None
     if others is None:
         return None
@@ -160,21 +166,23 @@ def _perturbed(
     if stages is None:
         return None
     driven = np.array([trace.driven for trace in data.traces])
-    seen = [evaluator.on_stages(loop, stages, data.holdout) for loop in (before, after)]
-    return Perturbed.of(seen[0], seen[1], driven, case.study.constraints)
+    figures = [
+        evaluator.on_stages(loop, stages, data.holdout) for loop in (before, after)
+    ]
+    return Perturbed.of(figures[0], figures[1], driven, case.study.constraints)
 
 
-def _kept(
+def _constraint_outcomes(
     objective: Objective, search: SearchState, clock: Clock
 ) -> dict[str, ConstraintOutcome]:
-    """Return the outcome of the limits on the plants of the tuning."""
+    """Return the outcomes of the limits on the plants that were tuned on."""
     if not objective.limits:
         return {}
     unit = as_array(search.unit)
-    look = clock.compiled(
+    worst_values = clock.compiled(
         lambda o, u: worst_by_plant(o.limits, o.figures(u)), objective, unit
     )
-    values = jax.tree.map(np.asarray, look(objective, unit))
+    values = jax.tree.map(np.asarray, worst_values(objective, unit))
     return {
         name: ConstraintOutcome.of_values(name, float(limit), values[name])
         for name, limit in objective.limits.items()
@@ -193,15 +201,15 @@ def _report(
     front: list[FrontPoint] | None,
 ) -> Result:
     driven = np.array([trace.driven for trace in data.traces])
-    seen = np.arange(len(data.traces)) < data.tuned
+    tuned_on = np.arange(len(data.traces)) < data.tuned
 
     def held(figures: TrackingFigures, chosen: np.ndarray) -> Scores | None:
         return _chosen(figures, data.names, chosen) if chosen.any() else None
 
     def both(figures: TrackingFigures) -> tuple[Scores, Scores | None, Scores | None]:
         return (
-            _chosen(figures, data.names, driven & seen),
-            held(figures, driven & ~seen),
+            _chosen(figures, data.names, driven & tuned_on),
+            held(figures, driven & ~tuned_on),
             held(figures, ~driven),
         )
 
@@ -256,7 +264,7 @@ _VERSIONED = ("piezojax", "jax", "jaxlib", "optimistix", "jaxopt", "equinox", "n
 def _chosen(
     figures: TrackingFigures, names: tuple[str, ...], chosen: np.ndarray
 ) -> Scores:
-    """Return the scores of the traces that ``chosen`` marks."""
+    """Return the scores of the traces for which ``chosen`` is True."""
     where = np.flatnonzero(chosen)
     part = jax.tree.map(lambda x: np.asarray(x)[where], figures)
     return scores(part, tuple(names[i] for i in where))

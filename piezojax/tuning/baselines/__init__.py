@@ -1,4 +1,4 @@
-"""Classical tuning to be beaten: rules for a PID, searches without gradients."""
+"""Baselines of tuning: rules for a PID, and searches without gradients."""
 
 from .contest import contest as contest
 from .entries import Baselines as Baselines

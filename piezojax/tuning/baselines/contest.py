@@ -1,4 +1,4 @@
-"""The baselines beside the search, on one objective in one run."""
+"""Comparison of the baselines with the search on one objective, in one process."""
 
 import equinox as eqx
 import numpy as np
@@ -17,11 +17,11 @@ from .pids import by_rules
 from .searches import Budget, Method, cma_es, nelder_mead
 
 LARGER = 2
-"""How many times larger the second population of CMA-ES is."""
+"""Ratio of the second population of CMA-ES to the default one."""
 
 
 def methods(seed: int, size: int) -> dict[str, Method]:
-    """Return the searches by name, for ``size`` parameters."""
+    """Return the searches without gradients by name, for ``size`` parameters."""
     larger = LARGER * (4 + int(3.0 * np.log(size)))
     return {
         "CMA-ES": cma_es(seed=seed + 1),
@@ -38,10 +38,10 @@ def contest(
     budget: Budget,
     progress: Progress,
 ) -> Baselines:
-    """Run every baseline on the objective of ``search`` and set it beside that.
+    """Run every baseline on the objective of ``search`` and return the comparison.
 
-    Searches begin where ``search`` did and get the same box. ``Ctrl-C`` ends the
-    contest with the methods that have finished.
+    The baselines' searches have the same starts and the same box as ``search``.
+    ``Ctrl-C`` ends the contest and keeps the methods that have finished.
     """
 
     def entry_of(name, history, stop, unit):
@@ -88,10 +88,10 @@ def _figures(loop, signals, start):
 
 
 def holdout_geomean(loop: Feedback, data: Data, start: int) -> float | None:
-    """Return the geometric mean of the errors on the tuning references, um.
+    """Return the geometric mean of the RMS errors on the tuning references, um.
 
-    With the hold-out's noise, on the axes that are driven; None if the loop diverges
-    or rails.
+    The noise is that of the hold-out, and the axes are the driven ones. None if the
+    loop diverges or rails.
     """
     figures = _figures(loop, data.holdout, start)
     chosen = [i for i, t in enumerate(data.traces[: data.tuned]) if t.driven]

@@ -1,4 +1,4 @@
-"""What a contest of baselines comes to: ``baselines.json``, written and read."""
+"""Result of a contest of baselines: the content of ``baselines.json``."""
 
 from pathlib import Path
 
@@ -12,24 +12,25 @@ from ...solve.problem import HOPELESS
 BASELINES_FILE = "baselines.json"
 
 NEAR = 1e-3
-"""A search that is no further from its last loss than this has all but ended."""
+"""Distance from its last loss within which a search counts as finished."""
 
 
 class Contestant(BaseModel):
-    """A method, what it found, and how long that took.
+    """Method of a contest: its gains, loss and times.
 
-    ``loss`` is the objective, ``holdout_geomean_um`` the geometric mean of the rms
-    errors on noise that no method has seen, None where the loop diverges. ``wall_s``
-    is from the method's begin to its end, ``compile_s`` the part of it spent waiting
-    for the compiler, ``cpu_s`` the processor's seconds of all threads, ``best_s`` when
-    it had come within ``NEAR`` of its ``loss``. ``times_s``, ``compiled_s``, ``used_s``
-    (of the processor), ``evaluated`` and ``losses`` are its history; ``unit`` is the
-    point in the study's box, None for a rule, whose controller is a PID.
+    ``loss`` is the objective, ``holdout_geomean_um`` the geometric mean of the RMS
+    errors on held-out noise; both are None where the loop diverges. ``wall_s`` is the
+    duration of the method, ``compile_s`` the part of it spent waiting for the compiler,
+    ``cpu_s`` the processor time of all threads, and ``best_s`` the time at which the
+    method had come within ``NEAR`` of its ``loss``. ``times_s``, ``compiled_s``,
+    ``used_s`` (processor time), ``evaluated`` and ``losses`` are its history. ``unit``
+    is the point in the study's box, None for a rule, whose controller is a PID.
 
     ``reached_s`` is the time at which the search of ``piezojax.tune`` had a loss as
-    low, ``ratio`` is ``wall_s`` over it, ``ratio_running`` the same without compiling,
-    ``ratio_best`` with ``best_s`` for ``wall_s``, ``ratio_cpu`` the same in processor's
-    seconds; None if it never had.
+    low, and ``reached_evaluations`` the number of its evaluations then. ``ratio`` is
+    ``wall_s`` over ``reached_s``. ``ratio_running`` is the same without compile time,
+    ``ratio_best`` with ``best_s`` in place of ``wall_s``, and ``ratio_cpu`` with
+    processor times. All are None if the search never had a loss as low.
     """
 
     method: str
@@ -57,10 +58,11 @@ class Contestant(BaseModel):
 
 
 class Baselines(BaseModel):
-    """``baselines.json``: the search of piezojax and its rivals, in the order run.
+    """Content of ``baselines.json``: the search of piezojax and its rivals.
 
-    ``best`` names the rival with the lowest loss, None if none has a stable loop;
-    ``notes`` says what could not be run.
+    ``rivals`` are in the order in which they were run. ``best`` names the rival with
+    the lowest loss, None if none has a stable loop. ``notes`` lists the baselines that
+    could not be run, with the reasons.
     """
 
     study: str
@@ -73,14 +75,14 @@ class Baselines(BaseModel):
     notes: list[str]
 
     def rival(self, method: str) -> Contestant:
-        """Return the rival of that name. Raises KeyError if there is none."""
+        """Return the rival named ``method``. Raises KeyError if there is none."""
         return {rival.method: rival for rival in self.rivals}[method]
 
 
 def load_baselines(path: str | Path) -> Baselines:
-    """Read a ``baselines.json``, or the folder that holds one.
+    """Return the Baselines in a ``baselines.json``, or in the folder that holds one.
 
-    Raises ValueError if there is none or it is damaged.
+    Raises ValueError if the file is missing or damaged.
     """
     path = Path(path)
     path = path / BASELINES_FILE if path.is_dir() else path
@@ -95,7 +97,7 @@ def contestant(
     gains: dict[str, float],
     unit: np.ndarray | None,
 ) -> Contestant:
-    """Return a method's entry from its history."""
+    """Return the Contestant of a method from its history."""
     near = history.reached(history.loss + NEAR)
     assert near is not None
     return Contestant(
@@ -119,7 +121,7 @@ def contestant(
 
 
 def against(rival: Contestant, ours: Contestant) -> Contestant:
-    """Return ``rival`` with when ``ours`` was as good, and how much sooner."""
+    """Return ``rival`` with the time at which ``ours`` reached its loss, and ratios."""
     loss = np.inf if rival.loss is None else rival.loss
     place = next((i for i, own in enumerate(ours.losses) if own <= loss), None)
     if place is None:

@@ -1,4 +1,4 @@
-"""Two experiments that find the ultimate gain and period of a stage in its loop."""
+"""Experiments that find the ultimate gain and period of a stage in its loop."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -17,10 +17,11 @@ from ...solve.clock import Clock
 from .rules import Ultimate
 
 GAINS = 64
-"""Proportional gains tried at once."""
+"""Number of proportional gains simulated at once."""
 
 NARROWINGS = 3
-"""How often the interval between the last calm and the first wild gain is divided."""
+"""Number of refinements of the interval between the last gain whose oscillation decays
+and the first whose oscillation does not."""
 
 STEP = 0.02
 """Step of the ultimate-gain experiment, as a share of the references' amplitude."""
@@ -32,25 +33,25 @@ SIGMAS = 3.0
 """Hysteresis of the relay, in standard deviations of the sensor's noise."""
 
 _DECADES = (-6.0, 1.0)  # of the gains, around the voltage span over the step
-_WILD = 10.0  # steps: what swings further has left the linear range
-_CALM = 0.05  # steps: what swings less has settled
-_FEWEST = 3.0  # periods
+_WILD = 10.0  # steps: a larger displacement has left the linear range
+_CALM = 0.05  # steps: a smaller oscillation has settled
+_FEWEST = 3.0  # periods of an oscillation
 
 
 class RelayState(NamedTuple):
-    """The side that the relay is on, and the voltage it switches about."""
+    """State of a relay: its ``side``, +1 or -1, and its ``centre`` voltage, V."""
 
     side: Scalar
     centre: Scalar
 
 
 class Relay(System):
-    """``u = centre + height`` or ``centre - height`` by the sign of the error, um to V.
+    """Relay ``u = centre + height * sign(error)``, um to V.
 
-    It switches when the error passes ``hysteresis`` (um) on the other side, so that
-    noise does not switch it; the centre is the voltage at rest. Astrom and Hagglund
-    (1984). Raises ValueError unless ``height`` (V) is positive and ``hysteresis`` not
-    negative.
+    It switches when the error exceeds ``hysteresis`` (um) with the opposite sign, so
+    that noise does not switch it. The centre is the voltage at rest. Source: Astrom and
+    Hagglund (1984). Raises ValueError unless ``height`` (V) is positive and
+    ``hysteresis`` is not negative.
     """
 
     height: Scalar = eqx.field(converter=as_array)
@@ -75,12 +76,13 @@ class Relay(System):
 def ultimate_by_gain(
     loop: Feedback, *, step: float, span: float, dt: float, samples: int, clock: Clock
 ) -> Ultimate:
-    """Return the ultimate gain and period by raising a proportional gain.
+    """Return the ultimate gain and period by increasing a proportional gain.
 
-    ``loop`` gets a P controller, no noise, and a step of ``step`` um from rest at 0.
-    The ultimate gain is the lowest whose oscillation does not decay from the second to
-    the last quarter of ``samples``; ``span`` (V) bounds what is tried. Raises
-    ValueError if every gain decays, or none.
+    ``loop`` has a P controller and no noise, and follows a step of ``step`` um from
+    rest at 0. The ultimate gain is the lowest one whose oscillation does not decay from
+    the second to the last quarter of ``samples``. The gains tried range from 1e-6 to 10
+    times ``span`` (V) over ``step``. Raises ValueError if the oscillation decays at
+    every gain, or does not decay at the lowest.
     """
     reference = jnp.full(samples, step).at[0].set(0.0)
 
@@ -114,7 +116,7 @@ def ultimate_by_gain(
 
 
 def _swing(run: Float[jax.Array, " samples"], step: float) -> jax.Array:
-    """Return whether a step response swings on, rather than settling."""
+    """Return whether the oscillation of a step response does not decay."""
     quarter = run.shape[0] // 4
     early = jnp.std(run[quarter : 2 * quarter])
     late = jnp.std(run[3 * quarter :])
@@ -132,12 +134,13 @@ def ultimate_by_relay(
     noise: Float[np.ndarray, " samples"],
     clock: Clock,
 ) -> Ultimate:
-    """Return the ultimate gain and period by a relay in the place of the controller.
+    """Return the ultimate gain and period by a relay in place of the controller.
 
-    With the loop's own sensor and its noise, from rest at the reference 0. By the
-    describing function of the relay the gain is 4 h / (pi a), with a, in um, the
-    amplitude at the cycle's frequency of what was measured in the second half of the
-    run. Raises ValueError if there is no cycle.
+    The run has the loop's own sensor and its noise, and starts from rest at the
+    reference 0. By the describing function of the relay the gain is 4 h / (pi a). Here
+    h is the ``height`` (V), and a (um) the amplitude, at the cycle's frequency, of the
+    measurement in the second half of the run. ``hysteresis`` (um) is that of the relay,
+    ``noise`` [samples] a draw of unit variance. Raises ValueError if there is no cycle.
     """
 
     def run(loop, relay, noise):
@@ -160,11 +163,11 @@ def cycle_of(
     switched: Float[np.ndarray, " samples"],
     dt: float,
 ) -> tuple[float, float]:
-    """Return amplitude, at its own frequency, and period (s) of a relay's cycle.
+    """Return the amplitude of the fundamental and the period (s) of a relay's cycle.
 
-    ``switched`` is what the relay put out, ``wave`` what came of it. Noise moves the
-    switching: each period is taken by itself, from rise to rise, and their fundamentals
-    are averaged. Raises ValueError for fewer than three periods.
+    ``switched`` is the output of the relay, ``wave`` the response to it. Because noise
+    moves the instants of switching, the fundamental is computed for each period, from
+    rise to rise, and averaged. Raises ValueError for fewer than three periods.
     """
     middle = 0.5 * (switched.max() + switched.min())
     period = period_of(switched - middle, dt)
@@ -178,9 +181,10 @@ def cycle_of(
 
 
 def period_of(wave: Float[np.ndarray, " samples"], dt: float) -> float:
-    """Return the mean period (s) of ``wave`` by its rises through 0, between samples.
+    """Return the mean period (s) of ``wave`` from its upward zero crossings.
 
-    Raises ValueError for fewer than three periods.
+    Crossings are interpolated between samples. Raises ValueError for fewer than three
+    periods.
     """
     rises = np.flatnonzero((wave[:-1] < 0.0) & (wave[1:] >= 0.0))
     if rises.size < _FEWEST + 1 or not np.all(np.isfinite(wave)):

@@ -1,4 +1,4 @@
-"""PIDs by rules, judged in the loop of a study by its own objective."""
+"""PIDs by rules, evaluated in the loop of a study with its own objective."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -31,7 +31,7 @@ PATHS = tuple(
 
 
 class ByRule(NamedTuple):
-    """A PID's name, its history, the loop around it, and its numbers by path."""
+    """PID by a rule: its name, its history, its loop, and its gains by path."""
 
     name: str
     history: History
@@ -40,16 +40,16 @@ class ByRule(NamedTuple):
 
 
 def by_rules(objective: Objective, case: Case) -> tuple[list[ByRule], list[str]]:
-    """Return the PIDs that rules give for a case, with the loss of each.
+    """Return the PIDs by rules for a case with their losses, and notes on failures.
 
-    Ziegler and Nichols' from the ultimate gain; theirs and Tyreus and Luyben's, which
-    are slower, from a relay. In the study's own loop: same stage, actuator, sensor,
-    noise, signals and scale, only the controller is another. Also returns what could
-    not be found, and why.
+    The ultimate gain gives the rules of Ziegler and Nichols. The relay gives theirs and
+    those of Tyreus and Luyben, which are slower. The loop is the study's own, with the
+    same stage, actuator, sensor, noise, signals and scale: only the controller differs.
+    A note names an experiment that failed, and the reason.
     """
     if case.study.axes is not None:
         return [], ["rules for a PID: they are for a stage with one axis"]
-    ways = {
+    experiments = {
         "ultimate gain": (_by_gain, _named("Ziegler-Nichols", ZIEGLER_NICHOLS)),
         "relay": (
             _by_relay,
@@ -59,7 +59,7 @@ def by_rules(objective: Objective, case: Case) -> tuple[list[ByRule], list[str]]
     }
     found: list[ByRule] = []
     notes: list[str] = []
-    for name, (experiment, rules) in ways.items():
+    for name, (experiment, rules) in experiments.items():
         clock = Clock()
         try:
             ultimate = experiment(objective, case, clock)
@@ -104,21 +104,21 @@ def judged(
     dt: float,
     clock: Clock,
 ) -> list[ByRule]:
-    """Return the PID of each rule with its loss, all simulated in one batch."""
+    """Return the PID of each rule with its loss, from one batch of simulations."""
     loops = {
         name: _around(objective.loop, rule.pid(ultimate, dt))
         for name, rule in rules.items()
     }
     values = np.array([[get(loop, path) for path in PATHS] for loop in loops.values()])
-    # Their own box, so that one program runs them all: each number from 0 to twice the
-    # largest, and 1 where every rule has 0.
+    # A common box lets one program run all PIDs: each number from 0 to twice the
+    # largest, or to 1 where every rule has 0.
     upper = np.where(values.max(axis=0) > 0.0, 2.0 * values.max(axis=0), 1.0)
     space = space_of(
         {path: Range(0.0, high) for path, high in zip(PATHS, upper, strict=True)}
     )
-    mine = replace(objective, loop=next(iter(loops.values())), space=space)
+    in_box = replace(objective, loop=next(iter(loops.values())), space=space)
     units = as_array(values / upper)
-    losses = np.asarray(batch_loss(mine, units, clock)(units))
+    losses = np.asarray(batch_loss(in_box, units, clock)(units))
     found = []
     for (name, loop), row, loss in zip(loops.items(), values, losses, strict=True):
         history = History(clock)

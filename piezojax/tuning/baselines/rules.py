@@ -1,4 +1,4 @@
-"""Rules that turn the ultimate gain and period of a stage into a PID."""
+"""Tuning rules that give a PID from the ultimate gain and period of a stage."""
 
 from typing import NamedTuple
 
@@ -6,18 +6,18 @@ from ...control import PID
 from ...core.arrays import check
 
 FILTER = 8.0
-"""The derivative's filter is so many times faster than the derivative."""
+"""Ratio of the derivative time to the time constant of the derivative's filter."""
 
 
 class Ultimate(NamedTuple):
-    """Gain (V/um) and period (s) of a proportional loop that just oscillates."""
+    """Gain (V/um) and period (s) at which a proportional loop just oscillates."""
 
     gain: float
     period: float
 
 
 class Rule(NamedTuple):
-    """Gain as a share of the ultimate one, times as shares of the ultimate period."""
+    """Tuning rule: gain and times as shares of the ultimate gain and period."""
 
     gain: float
     integral: float
@@ -26,8 +26,8 @@ class Rule(NamedTuple):
     def pid(self, ultimate: Ultimate, dt: float) -> PID:
         """Return the PID (um to V) for a sample time of ``dt`` s.
 
-        The integral gives back what the actuator could not deliver within the integral
-        time. Raises ValueError for a gain or period that is not positive.
+        The time constant of the anti-windup is the integral time. Raises ValueError for
+        a gain or period that is not positive.
         """
         check("ultimate gain in V/um", ultimate.gain, above=0.0)
         check("ultimate period in s", ultimate.period, above=0.0)
@@ -48,10 +48,12 @@ ZIEGLER_NICHOLS = {
     "PI": Rule(gain=0.45, integral=1.0 / 1.2),
     "PID": Rule(gain=0.6, integral=0.5, derivative=0.125),
 }
-"""Ziegler and Nichols (1942): a quarter of the amplitude from swing to swing."""
+"""Rules of Ziegler and Nichols (1942): each swing has a quarter of the amplitude of the
+one before."""
 
 TYREUS_LUYBEN = {
     "PI": Rule(gain=1.0 / 3.2, integral=2.2),
     "PID": Rule(gain=1.0 / 2.2, integral=2.2, derivative=1.0 / 6.3),
 }
-"""Tyreus and Luyben (1992): slower, with more damping; for integrating stages."""
+"""Rules of Tyreus and Luyben (1992): slower, with more damping, for integrating
+stages."""

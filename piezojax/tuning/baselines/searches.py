@@ -1,4 +1,4 @@
-"""Searches without gradients, over the same box and objective."""
+"""Searches without gradients over the same box and objective as the tuner."""
 
 import warnings
 from collections.abc import Callable
@@ -12,16 +12,17 @@ from ...core.progress import Progress
 from ...solve.history import History, batch_loss
 
 SPREAD = 0.2
-"""First standard deviation of CMA-ES, as a share of the box."""
+"""Initial standard deviation of CMA-ES, as a share of the box."""
 
 SIMPLEX = 0.1
-"""Side of the first simplex of Nelder and Mead, as a share of the box."""
+"""Side of the initial simplex of Nelder and Mead, as a share of the box."""
 
 
 class Budget(NamedTuple):
-    """When a search ends: its own criteria at ``tolerance``, or ``evaluations``.
+    """Stopping criteria of a search: ``tolerance`` and number of ``evaluations``.
 
-    The tolerance is on the loss, and for Nelder and Mead's simplex on the unit box too.
+    A search stops by its own criteria at ``tolerance``, or after ``evaluations``. The
+    tolerance is on the loss, and for Nelder and Mead's simplex also on the unit box.
     """
 
     evaluations: int = 10_000
@@ -29,7 +30,7 @@ class Budget(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The best point in [0, 1]^n, how the search went, and why it ended."""
+    """Result of a search: best point in [0, 1]^n, history, and reason to stop."""
 
     unit: np.ndarray
     history: History
@@ -37,21 +38,23 @@ class Found(NamedTuple):
 
 
 Method = Callable[[Any, np.ndarray, Budget, Progress], Found]
-"""``method(objective, starts, budget, progress)``; ``starts`` are points of the unit
-box, the best first guess in front. ``objective`` has a ``loss(unit)``."""
+"""Function ``method(objective, starts, budget, progress)`` that returns a Found.
+
+``starts`` [starts, n] are points of the unit box, the best one first. ``objective`` has
+a method ``loss(unit)``."""
 
 
 class _SpentError(Exception):
-    """The budget is spent."""
+    """Error that ends a search once its evaluations are spent."""
 
 
 def nelder_mead(
     objective: Any, starts: np.ndarray, budget: Budget, progress: Progress
 ) -> Found:
-    """Nelder and Mead's simplex (SciPy, adaptive, bounded) from each start in turn.
+    """Search with Nelder and Mead's simplex (SciPy, adaptive, bounded).
 
-    A start after the first takes what is left of the budget. One point at a time: the
-    method gives no two that could be simulated at once.
+    The search runs from each start in turn; each later start has the rest of the
+    budget. Points are simulated one at a time, because the method is sequential.
     """
     history = History()
     size = starts.shape[1]
@@ -96,8 +99,9 @@ def nelder_mead(
 def cma_es(population: int | None = None, seed: int = 1) -> Method:
     """Return CMA-ES (the library ``cma``) with a population, None for its default.
 
-    From the first start alone: it spreads by itself. Each population is simulated in
-    one batch. ``seed`` must not be 0, which the library takes for none.
+    It runs from the first start only, because it explores the box from there. Each
+    population is simulated in one batch. ``seed`` must not be 0: the library would then
+    seed itself from the clock.
     """
 
     def search(
@@ -121,7 +125,7 @@ def cma_es(population: int | None = None, seed: int = 1) -> Method:
 
 def _strategy(start: np.ndarray, population: int | None, seed: int, budget: Budget):
     with warnings.catch_warnings():
-        # On import it says which optional packages it does not find.
+        # The import warns about missing optional packages.
         warnings.simplefilter("ignore")
         import cma
 
