@@ -28,7 +28,7 @@ Aggregate = Literal["geometric_mean", "mean_square", "worst"]
 Over = Literal["mean", "worst", "cvar"]
 
 RAILED = 0.9
-"""Share of saturated samples above which a run counts as railed: its loop is open."""
+"""Share of saturated samples above which a run counts as railed."""
 
 _SHARPNESS = 20.0  # of the smooth maximum in "worst"
 _FLOOR = 1e-9  # um: errors below a femtometre count as equal

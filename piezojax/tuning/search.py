@@ -19,7 +19,7 @@ from .objective import Objective
 FORWARD_BELOW, FORWARD_BELOW_WITH_AXES = 5, 64
 """Numbers of parameters below which forward-mode differentiation is used, with one axis
 and with several. With several axes the reverse pass takes minutes to compile, three
-times as long as the forward one."""
+times as long."""
 
 
 def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:

@@ -1,4 +1,4 @@
-"""Traces of a study: pairs of a reference and an axis that have an error each."""
+"""Traces of a study: pairs of a reference and an axis, with one error each."""
 
 from typing import NamedTuple
 

@@ -56,7 +56,7 @@ class LinearPlant(System):
         return LinearPlant(self.A, self.B, C, D, self.input, self.output)
 
     def response(self, points: int) -> np.ndarray:
-        """Return y/u [points] on the unit circle, with the loop's delay of a sample."""
+        """Return y/u [points] on the unit circle, with the loop's unit delay."""
         A, B, C, D = (np.asarray(x) for x in (self.A, self.B, self.C, self.D))
         z = np.exp(2j * np.pi * np.arange(points) / points)
         eye = np.eye(len(A))
@@ -76,7 +76,7 @@ class LinearPlant(System):
         A, B, C, D = (np.asarray(x) for x in (self.A, self.B, self.C, self.D))
         delay, first = 1, float(D)
         size = abs(first) + np.linalg.norm(C) * np.linalg.norm(B)
-        # Look ahead until the input acts: the zeros are then those of C and D there.
+        # Look ahead until the input acts: the zeros are those of the C and D there.
         while abs(first) <= _NOTHING * size and delay <= len(A):
             delay, first, C = delay + 1, float(C @ B), C @ A
         if abs(first) <= _NOTHING * size:

@@ -123,7 +123,7 @@ class LimitReport:
 
     @property
     def near_one_controller(self) -> int:
-        """Number of references at most ``NEAR`` times the one controller's error."""
+        """Number of references whose error is near that of the one controller."""
         return sum(
             one.tuned <= NEAR * one.one_controller for one in self.references.values()
         )
