@@ -55,18 +55,14 @@ class Constraint(NamedTuple):
     above: float = 0.0
     below: float = math.inf
 
-    def check(self, name: str, limit: Any) -> float:
-        """Return ``limit`` as a float.
-
-        Raises ValueError unless it is a finite number between ``above`` and ``below``.
-        """
+    def check(self, name: str, limit: Any) -> None:
+        """Raise ValueError unless ``limit`` is a number within its allowed limits."""
         number = isinstance(limit, int | float) and not isinstance(limit, bool)
         if not (number and self.above < limit < self.below):
             bound = f" and below {self.below:g}" if math.isfinite(self.below) else ""
             raise ValueError(
                 f"{name} is {limit!r}; it must be a number above {self.above:g}{bound}"
             )
-        return float(limit)
 
     def read(self, loop: LoopFigures) -> Array:
         """Return the values [plants] or [plants, branches] in ``unit``."""

@@ -2,11 +2,10 @@
 
 import difflib
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from ..analysis.constraints import CONSTRAINTS
 from ..core.registry import discover
@@ -89,27 +88,6 @@ class TunedTable(RangeTable):
     start: Finite | None = None
 
 
-def _checked_limits(limits: Any) -> dict[str, float]:
-    """Return the limits by the name of their constraint.
-
-    Raises ValueError for an unknown constraint or a limit outside its bounds.
-    """
-    if not isinstance(limits, Mapping):
-        raise ValueError("it must be a table of limits")
-    for name in limits:
-        if name not in CONSTRAINTS:
-            near = difflib.get_close_matches(name, CONSTRAINTS, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(
-                f"{name} is unknown; allowed are {', '.join(CONSTRAINTS)}{hint}"
-            )
-    return {name: CONSTRAINTS[name].check(name, limits[name]) for name in limits}
-
-
-Limits = Annotated[dict[str, float], BeforeValidator(_checked_limits)]
-"""Limits by the name of a constraint, one of ``analysis.constraints.CONSTRAINTS``."""
-
-
 class ParetoTable(Table):
     """Pareto front: the study is solved for each of ``limits`` of one constraint.
 
@@ -179,7 +157,7 @@ class Study(Table):
     optimiser: OptimiserTable = OptimiserTable()
     disturbance: DisturbanceTable = DisturbanceTable()
     ensemble: EnsembleTable | None = None
-    constraints: Limits = Field(default_factory=dict)
+    constraints: dict[str, Any] = Field(default_factory=dict)
     pareto: ParetoTable | None = None
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
     sweep: SweepTable | None = None
@@ -245,6 +223,15 @@ class Study(Table):
     @model_validator(mode="after")
     def _constrained(self) -> "Study":
         limits = self.constraints
+        for name, limit in limits.items():
+            if name not in CONSTRAINTS:
+                near = difflib.get_close_matches(name, CONSTRAINTS, n=1)
+                hint = f"; did you mean {near[0]!r}?" if near else ""
+                raise ValueError(
+                    f"constraints.{name} is unknown; "
+                    f"allowed are {', '.join(CONSTRAINTS)}{hint}"
+                )
+            CONSTRAINTS[name].check(f"constraints.{name}", limit)
         if self.axes and limits:
             raise ValueError(
                 f"constraints.{next(iter(limits))}: constraints are for one axis; "
