@@ -1,6 +1,5 @@
 """Tables of a study file, and their validation."""
 
-import difflib
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,6 +22,7 @@ from .tables import (
     RangeTable,
     Table,
     one_of,
+    unknown_key,
     validated,
 )
 
@@ -225,12 +225,7 @@ class Study(Table):
         limits = self.constraints
         for name, limit in limits.items():
             if name not in CONSTRAINTS:
-                near = difflib.get_close_matches(name, CONSTRAINTS, n=1)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
-                raise ValueError(
-                    f"constraints.{name} is unknown; "
-                    f"allowed are {', '.join(CONSTRAINTS)}{hint}"
-                )
+                raise ValueError(unknown_key(f"constraints.{name}", name, CONSTRAINTS))
             CONSTRAINTS[name].check(f"constraints.{name}", limit)
         if self.axes and limits:
             raise ValueError(

@@ -2,6 +2,7 @@
 
 import difflib
 import re
+from collections.abc import Iterable
 from typing import Annotated, Any, TypeVar, get_args
 
 import numpy as np
@@ -66,6 +67,14 @@ def one_of(name: str, allowed: Any) -> str:
     return name
 
 
+def unknown_key(key: str, name: str, known: Iterable[str]) -> str:
+    """Return the message for an unknown ``name`` at ``key``, with the nearest known."""
+    known = list(known)
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return f"{key} is unknown; allowed are {', '.join(known)}{hint}"
+
+
 def validated(kind: type[Any], data: Any, where: str) -> Any:
     """Return ``data`` validated as ``kind``.
 
@@ -97,10 +106,7 @@ def _message(error: ValidationError, kind: type[BaseModel], where: str) -> str:
         for part in first["loc"][:-1]:
             field = getattr(table, "model_fields", {}).get(part)
             table = _table_in(field.annotation if field else table)
-        known = list(table.model_fields)
-        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        return f"{key} is unknown; allowed are {', '.join(known)}{hint}"
+        return unknown_key(key, str(first["loc"][-1]), table.model_fields)
     if first["type"] == "missing":
         return f"{key} is missing"
     message = first["msg"].removeprefix("Value error, ")
