@@ -15,8 +15,8 @@ LIMIT_FILE, LIMIT_PICTURE = "limit.json", "limit.png"
 
 CAUSES: dict[str | None, str] = {
     "noise": "lets through more sensor noise than it has to",
-    "unforeseen": "cancels too little of what the reference does not foretell",
-    "foreseen": "leaves what a linear filter of the reference would cancel",
+    "unpredicted": "cancels too little of what the reference does not predict",
+    "predicted": "leaves what a linear filter of the reference would cancel",
     None: "is too far from linear to say why",
 }
 """Explanations of a large error, by the share that exceeds the limit's most."""
@@ -39,20 +39,20 @@ def limit_text(report: LimitReport | str) -> str:
     count = len(report.references)
     lines = [
         "limit of linear control with full preview (resolved to "
-        f"{report.resolution:.3g} Hz): tuned is {report.over:.2f}x that, "
+        f"{report.resolution:.3g} Hz): tuned is {report.ratio:.2f}x that, "
         f"{report.near} of {count} references within {NEAR:g}x; it is "
-        f"{report.over_one_controller:.2f}x "
+        f"{report.ratio_to_one_controller:.2f}x "
         "what one such controller for all of them leaves, "
         f"{report.near_one_controller} of {count}"
     ]
     by_cause: dict[str | None, list[str]] = {}
     below = []
-    for name, reached in report.references.items():
-        if reached.over < 1.0:
-            below.append(f"{name} {reached.over:.2f}x")
-        elif reached.over > NEAR:
-            by_cause.setdefault(reached.exceeding, []).append(
-                f"{name} {reached.over:.2f}x"
+    for name, found in report.references.items():
+        if found.ratio < 1.0:
+            below.append(f"{name} {found.ratio:.2f}x")
+        elif found.ratio > NEAR:
+            by_cause.setdefault(found.largest_excess, []).append(
+                f"{name} {found.ratio:.2f}x"
             )
     lines += [
         f"note: on {', '.join(names)} the loop {CAUSES[cause]}"
@@ -104,7 +104,7 @@ def _spectra(ax: Axes, report: LimitReport) -> None:
     worst = report.worst
     densities = report.densities(worst)
     for name, colour, width, label in (
-        ("unforeseen", MEASURED, 0.9, "disturbance, not foretold"),
+        ("unpredicted", MEASURED, 0.9, "disturbance, not predicted"),
         ("noise", BEFORE, 0.9, "sensor noise"),
         ("limit", REFERENCE, 1.2, "error at the limit"),
         ("tuned", AFTER, 1.2, "error, tuned"),
@@ -113,12 +113,12 @@ def _spectra(ax: Axes, report: LimitReport) -> None:
         ax.loglog(
             report.curves.frequency, nanometres, color=colour, lw=width, label=label
         )
-    top = 1e3 * np.max(densities["unforeseen"])
+    top = 1e3 * np.max(densities["unpredicted"])
     ax.set(
         xlim=(report.resolution / 2.0, None),
         ylim=(1e-5 * top, 30.0 * top),
         xlabel="frequency (Hz)",
         ylabel="amplitude density (nm/√Hz)",
-        title=f"{worst}, {report.references[worst].over:.2f} times its limit",
+        title=f"{worst}, {report.references[worst].ratio:.2f} times its limit",
     )
     ax.legend(loc="upper right", fontsize=7.5)

@@ -10,14 +10,19 @@ from scipy import signal
 import piezojax as pj
 from piezojax.analysis.limit import (
     NEAR,
+    LimitComparison,
     LimitReport,
-    Reached,
     Shares,
     performance_limit,
 )
+from piezojax.analysis.limit.limit_report import Curves
 from piezojax.analysis.limit.linear_plant import LinearPlant, linear_plant
-from piezojax.analysis.limit.reached import Curves
-from piezojax.analysis.limit.spectra import Foretelling, grid_size, spectra, windowed
+from piezojax.analysis.limit.spectra import (
+    ReferencePredictor,
+    grid_size,
+    spectra,
+    windowed,
+)
 from piezojax.report.limit_bars import limit_text, write_limit
 from piezojax.signals import waveforms as references_of
 
@@ -72,9 +77,9 @@ def test_a_linear_loop_is_seen_as_it_is(linear, disturbance):
     assert linear.resolution == pytest.approx(10.0)
     for found in linear.references.values():
         whole = disturbance[START:].std()
-        assert found.unforeseen == pytest.approx(whole, rel=0.1)
-        # A gain 1 % wrong adds as much of the stage's own motion, all foretold.
-        assert found.unforeseen <= found.disturbance < whole + 0.02 * 5.0
+        assert found.unpredicted == pytest.approx(whole, rel=0.1)
+        # A gain 1 % wrong adds as much of the stage's own motion, all predicted.
+        assert found.unpredicted <= found.disturbance < whole + 0.02 * 5.0
 
 
 def test_the_limit_is_that_of_the_scalar_riccati_equation(linear):
@@ -98,17 +103,17 @@ def test_errors_and_their_shares_are_those_of_the_loop(linear, disturbance):
 
         shares = found.tuned_shares
         assert shares.noise == pytest.approx(rms(heard), rel=0.03)
-        assert shares.unforeseen == pytest.approx(rms(left), rel=0.15)
-        parts = shares.noise**2 + shares.unforeseen**2 + shares.foreseen**2
+        assert shares.unpredicted == pytest.approx(rms(left), rel=0.15)
+        parts = shares.noise**2 + shares.unpredicted**2 + shares.predicted**2
         assert np.sqrt(parts) == pytest.approx(found.tuned, rel=0.05)
         # An integral lags behind a sine by its frequency over the loop's bandwidth.
         if i == 0:
             lag = 2.0 * np.pi * 10.0 / (8000.0 * SLOPE)
             swing = references[0].std()
             expected = swing * lag / np.hypot(1.0, lag)
-            assert shares.foreseen == pytest.approx(expected, rel=0.05)
-            assert found.exceeding == "foreseen"
-        assert found.over > NEAR
+            assert shares.predicted == pytest.approx(expected, rel=0.05)
+            assert found.largest_excess == "predicted"
+        assert found.ratio > NEAR
 
 
 def test_a_better_controller_comes_nearer(linear, disturbance):
@@ -127,12 +132,12 @@ def test_a_better_controller_comes_nearer(linear, disturbance):
         for integral in (8000.0, 40000.0)
     }
     good, keen = found[8000.0], found[40000.0]
-    assert 1.0 < good.over < 1.2
+    assert 1.0 < good.ratio < 1.2
     assert good.near == good.near_one_controller == 2
-    assert good.over_one_controller < good.over
-    assert keen.over > 2.0
+    assert good.ratio_to_one_controller < good.ratio
+    assert keen.ratio > 2.0
     assert keen.near == 0
-    assert {one.exceeding for one in keen.references.values()} == {"noise"}
+    assert {one.largest_excess for one in keen.references.values()} == {"noise"}
     # The limit is the disturbance's and the noise's, not the loop's.
     for name in NAMES:
         limits = [report.references[name].limit for report in (good, keen)]
@@ -148,10 +153,10 @@ def test_a_hysteretic_stage(tmp_path):
     )
     for one in found.references.values():
         assert one.limit < one.one_controller < one.tuned
-        # The reference foretells most of what its hysteresis does.
-        assert 0.0 < one.unforeseen < 0.5 * one.disturbance
+        # The reference predicts most of what its hysteresis does.
+        assert 0.0 < one.unpredicted < 0.5 * one.disturbance
         assert one.limit**2 == pytest.approx(
-            one.limit_shares.noise**2 + one.limit_shares.unforeseen**2
+            one.limit_shares.noise**2 + one.limit_shares.unpredicted**2
         )
     write_limit(found, tmp_path, "a stage")
     data = json.loads((tmp_path / "limit.json").read_text(encoding="utf-8"))
@@ -202,12 +207,12 @@ def test_what_stands_in_the_way_of_a_controller():
             np.roots(moving),
         ),
     ):
-        found = linear_plant(loop_of(plant), 0.0, DT).obstacles()
+        found = linear_plant(loop_of(plant), 0.0, DT).delay_and_zeros()
         assert found[0] == delay
         np.testing.assert_allclose(np.sort(found[1]), np.sort(zeros), rtol=1e-6)
     still = LinearPlant([[0.5]], [0.0], [1.0], 0.0)
     with pytest.raises(ValueError, match="voltage does not move"):
-        still.obstacles()
+        still.delay_and_zeros()
 
 
 def test_spectra_hold_the_variance():
@@ -223,31 +228,31 @@ def test_spectra_hold_the_variance():
     assert np.abs(shape.reshape(64, -1).mean(axis=1) - 1.0).max() < 0.15
 
 
-def test_a_filter_of_the_reference_is_foretold_and_nothing_else():
+def test_a_filter_of_the_reference_is_predicted_and_nothing_else():
     time = np.arange(10_000) * DT
     names = ("SIN1", "SIN10", "SW30", "PWSW10")
     moving = np.stack([references_of.signal(name, jnp.asarray(time)) for name in names])
-    known = Foretelling(moving, 5_000, 250)
+    known = ReferencePredictor(moving, 5_000, 250)
     assert known.count == 10_000 - 5_000 - 250
     # Lag, lead and slope: what a controller and a linear stage make of a reference.
     lagging = signal.lfilter([0.05], [1.0, -0.95], moving - moving[:, :1])
     ahead = np.concatenate([moving[:, 20:], moving[:, -20:]], axis=1)
     signals = (lagging + 0.3 * ahead + 4.0)[:, None]
-    rest = known.unforeseen(signals)
-    whole = known.cut(signals)
+    rest = known.unpredicted(signals)
+    whole = known.centred(signals)
     assert np.all(rest.std(axis=2) < 1e-3 * whole.std(axis=2))
     # Harmonics are no linear filter's work, and neither is anything of one's own.
     other = np.stack([np.sin(2.0 * np.pi * 3.0 * 10.0 * time)] * 4)[:, None]
-    kept = known.unforeseen(
+    kept = known.unpredicted(
         signals + np.array([0.0, 1.0, 0.0, 0.0])[:, None, None] * other
     )
     assert kept[1].std() == pytest.approx(np.sqrt(0.5), rel=0.2)
     drawn = np.random.default_rng(4).standard_normal((4, 2, 10_000))
-    left = known.unforeseen(drawn)
+    left = known.unpredicted(drawn)
     np.testing.assert_allclose(left.std(axis=2), 1.0, atol=0.05)
-    # A reference that does not move foretells nothing.
-    still = Foretelling(np.full((4, 10_000), 5.0), 5_000, 250)
-    np.testing.assert_array_equal(still.unforeseen(signals), still.cut(signals))
+    # A reference that does not move predicts nothing.
+    still = ReferencePredictor(np.full((4, 10_000), 5.0), 5_000, 250)
+    np.testing.assert_array_equal(still.unpredicted(signals), still.centred(signals))
 
 
 def test_what_has_no_limit():
@@ -283,24 +288,24 @@ class Scalar(pj.System):
         return state, output[0]
 
 
-def reached(tuned, limit, shares):
-    least = Shares(noise=0.6 * limit, unforeseen=0.8 * limit)
-    return Reached(tuned, limit, 1.1 * limit, 0.3, 0.02, 200.0, shares, least)
+def comparison(tuned, limit, shares):
+    least = Shares(noise=0.6 * limit, unpredicted=0.8 * limit)
+    return LimitComparison(tuned, limit, 1.1 * limit, 0.3, 0.02, 200.0, shares, least)
 
 
 def test_the_words_name_what_exceeds():
     rows = {
-        "A": reached(4.0, 2.0, Shares(3.9, 0.5, 0.7)),
-        "B": reached(4.0, 2.0, Shares(1.2, 3.7, 0.7)),
-        "C": reached(4.0, 2.0, Shares(1.2, 1.6, 3.4)),
-        "D": reached(2.2, 2.0, Shares(1.5, 1.6)),
-        "E": reached(1.0, 2.0, None),
-        "F": reached(4.0, 2.0, None),
+        "A": comparison(4.0, 2.0, Shares(3.9, 0.5, 0.7)),
+        "B": comparison(4.0, 2.0, Shares(1.2, 3.7, 0.7)),
+        "C": comparison(4.0, 2.0, Shares(1.2, 1.6, 3.4)),
+        "D": comparison(2.2, 2.0, Shares(1.5, 1.6)),
+        "E": comparison(1.0, 2.0, None),
+        "F": comparison(4.0, 2.0, None),
     }
     nothing = Curves(np.zeros(0), np.zeros((6, 0)), 1.0, *np.zeros((2, 6, 0)))
     report = LimitReport(rows, DT, NOISE, 10.0, SLOPE, 1.0, 1.1, nothing)
     assert report.near == 2
-    assert report.over == pytest.approx((2.0**4 * 1.1 * 0.5) ** (1.0 / 6.0))
+    assert report.ratio == pytest.approx((2.0**4 * 1.1 * 0.5) ** (1.0 / 6.0))
     text = limit_text(report)
     assert "on A 2.00x the loop lets through more sensor noise" in text
     assert "on B 2.00x the loop cancels too little" in text

@@ -66,7 +66,7 @@ class LinearPlant(System):
         ]
         return (np.concatenate(states) + D) / z
 
-    def obstacles(self) -> tuple[int, np.ndarray]:
+    def delay_and_zeros(self) -> tuple[int, np.ndarray]:
         """Return the delay (samples) and the zeros outside the unit circle.
 
         Both limit every controller. The delay includes the loop's sample. The zeros are
@@ -121,7 +121,9 @@ def _derivatives(loop: Feedback, reference: jax.Array, dt: float) -> StateSpace:
     return linearise(loop.plant, start.voltage, start.plant, dt)
 
 
-def answers(plant: LinearPlant, voltage: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def plant_response(
+    plant: LinearPlant, voltage: np.ndarray, rest: np.ndarray
+) -> np.ndarray:
     """Return the response (um) of ``plant`` to ``voltage`` (V), both [runs, samples].
 
     The plant starts at rest at 0 um under the voltages ``rest`` [runs]; sample k + 1
@@ -141,12 +143,14 @@ def _answers(plant: LinearPlant, voltage: jax.Array, rest: jax.Array) -> jax.Arr
     return jax.vmap(one)(voltage, rest)
 
 
-def felt_gain(answer: np.ndarray, displacement: np.ndarray, noise: np.ndarray) -> float:
+def gain_from_noise(
+    response: np.ndarray, displacement: np.ndarray, noise: np.ndarray
+) -> float:
     """Return the gain with which the stage answers voltage caused by sensor noise.
 
-    All arguments are transforms [..., lines]: ``answer`` of the response of a plant of
-    gain 1 to the voltage, ``displacement`` of that of the stage, ``noise`` of the
-    sensor's noise, the first two without the part that the reference predicts.
+    All arguments are transforms [..., lines]. ``response`` is that of a plant of gain 1
+    to the voltage and ``displacement`` that of the stage, both without the part that
+    the reference predicts; ``noise`` is the sensor's.
 
     The gain is an instrumental-variable estimate with the noise as instrument: the
     residual displacement is then uncorrelated with the noise, as a disturbance must be.
@@ -155,13 +159,13 @@ def felt_gain(answer: np.ndarray, displacement: np.ndarray, noise: np.ndarray) -
     large ones, and feedback acts on the small ones. Raises ValueError if there is no
     positive gain.
     """
-    runs = tuple(range(answer.ndim - 1))
-    driven = np.mean(answer * np.conj(noise), axis=runs)
+    runs = tuple(range(response.ndim - 1))
+    driven = np.mean(response * np.conj(noise), axis=runs)
     moved = np.mean(displacement * np.conj(noise), axis=runs)
     # The spectrum of the residual is a quadratic function of the gain on each line.
     own = np.mean(np.abs(displacement) ** 2, axis=runs)
-    both = np.mean(np.real(displacement * np.conj(answer)), axis=runs)
-    other = np.mean(np.abs(answer) ** 2, axis=runs)
+    both = np.mean(np.real(displacement * np.conj(response)), axis=runs)
+    other = np.mean(np.abs(response) ** 2, axis=runs)
     gain = 0.0
     for _ in range(_ROUNDS):
         left = own - 2.0 * gain * both + gain**2 * other

@@ -5,23 +5,24 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.system import Feedback, LoopSample
-from .linear_plant import LinearPlant, answers, felt_gain, linear_plant
-from .spectra import Foretelling, grid_size, spectra, windowed
+from .linear_plant import LinearPlant, gain_from_noise, linear_plant, plant_response
+from .spectra import ReferencePredictor, grid_size, spectra, windowed
 
 
-class Problem(NamedTuple):
+class LinearProblem(NamedTuple):
     """Linear control problem, and the grids on which it was measured.
 
-    ``plant`` is the linear model of the stage, and ``left`` [references, draws,
-    samples] its residual in the runs (um), the disturbance. ``known`` is the linear
-    filter that predicts the disturbance from the reference, ``spectra`` [references,
-    points] (um^2) are those of the unpredicted part, and ``variance`` (um^2) is that of
-    the sensor's noise. ``window`` is in samples.
+    ``plant`` is the linear model of the stage, and ``residual`` [references, draws,
+    samples] the disturbance (um): the displacement of the runs without the response of
+    that model. ``predictor`` is the linear filter that predicts the disturbance from
+    the reference, ``spectra`` [references, points] (um^2) are those of the unpredicted
+    part, and ``variance`` (um^2) is that of the sensor's noise. ``window`` is in
+    samples.
     """
 
     plant: LinearPlant
-    left: np.ndarray
-    known: Foretelling
+    residual: np.ndarray
+    predictor: ReferencePredictor
     spectra: np.ndarray
     variance: float
     window: int
@@ -44,7 +45,7 @@ def problem_of(
     start: int,
     segment: float,
     dt: float,
-) -> Problem:
+) -> LinearProblem:
     """Return the linear problem of ``runs`` [references x draws, samples].
 
     ``rest`` [references x draws] are the voltages (V) before the runs; other arguments
@@ -62,8 +63,8 @@ def problem_of(
     count, samples = references.shape
     # The filter is as long as a window, so that both use an equal length of record.
     reach = min(round(0.5 * segment / dt), (samples - start) // 8)
-    known = Foretelling(references, start, reach)
-    window = min(round(segment / dt), known.count)
+    predictor = ReferencePredictor(references, start, reach)
+    window = min(round(segment / dt), predictor.count)
     points = grid_size(window)
 
     def by_draw(signals: np.ndarray) -> np.ndarray:
@@ -73,13 +74,15 @@ def problem_of(
         return windowed(signals, window, points)
 
     plant = linear_plant(loop, 0.5 * (references.min() + references.max()), dt)
-    answer = answers(plant, runs.voltage, rest)
-    gain = felt_gain(
-        lines(known.unforeseen(by_draw(answer))),
-        lines(known.unforeseen(by_draw(runs.displacement))),
-        lines(known.cut(by_draw(sensor_noise))),
+    response = plant_response(plant, runs.voltage, rest)
+    gain = gain_from_noise(
+        lines(predictor.unpredicted(by_draw(response))),
+        lines(predictor.unpredicted(by_draw(runs.displacement))),
+        lines(predictor.centred(by_draw(sensor_noise))),
     )
     # The residual of the linear plant is 0 at the start, at rest.
-    left = by_draw(runs.displacement - runs.displacement[:, :1] - gain * answer)
-    found = spectra(lines(known.unforeseen(left)))
-    return Problem(plant.scaled(gain), left, known, found, variance, window)
+    residual = by_draw(runs.displacement - runs.displacement[:, :1] - gain * response)
+    found = spectra(lines(predictor.unpredicted(residual)))
+    return LinearProblem(
+        plant.scaled(gain), residual, predictor, found, variance, window
+    )

@@ -11,7 +11,7 @@ from ...core.system import Feedback, LoopSample, loop_inputs
 from .linear_plant import LinearPlant
 
 
-def simulated(
+def simulate_runs(
     loop: Feedback, references: jax.Array, noise: jax.Array, disturbance: Any
 ) -> tuple[LoopSample, np.ndarray]:
     """Return the logs [runs, samples] and the voltages [runs] before the first sample.
@@ -37,7 +37,7 @@ def _logs(loop: Feedback, references: Any, noise: Any, disturbance: Any) -> Any:
     return jax.vmap(each)(references, noise, disturbance)
 
 
-def quiet_error(
+def noise_free_error(
     loop: Feedback, plant: LinearPlant, references: jax.Array, left: np.ndarray
 ) -> np.ndarray:
     """Return the error (um) of ``loop`` around ``plant``, without noise.

@@ -1,12 +1,12 @@
 """Limit of linear control for a loop and its references.
 
 The plant P is the linearised stage (``linear_plant``). Its gain is that with which the
-stage answers voltage caused by sensor noise in the loop's own runs (``felt_gain``). The
-disturbance is the residual of the plant in those runs, d = y - P u: the effect of
-hysteresis, creep, drift and the study's own disturbance. It is taken from the assessed
-runs with their noise, because noise that reaches the voltage changes the state of a
-hysteresis: a run without noise has another disturbance. So does another controller;
-``attained`` measures how much that matters.
+stage responds to voltage caused by sensor noise in the loop's own runs
+(``gain_from_noise``). The disturbance is the residual of the plant in those runs, d = y
+- P u: the effect of hysteresis, creep, drift and the study's own disturbance. It is
+taken from the assessed runs with their noise, because noise that reaches the voltage
+changes the state of a hysteresis: a run without noise has another disturbance. So does
+another controller; ``verify_limit`` measures how much that matters.
 
 One linear filter of the reference predicts part of the disturbance on all references.
 With full preview that part costs nothing. Feedback acts on the rest, known by its
@@ -27,9 +27,9 @@ import numpy as np
 from ...core.arrays import as_array
 from ...core.system import Feedback
 from ..stability.operating_point import loop_sample_time
+from .limit_report import Curves, LimitComparison, LimitReport, Shares
 from .linear_problem import problem_of
-from .loop_runs import quiet_error, simulated
-from .reached import Curves, LimitReport, Reached, Shares
+from .loop_runs import noise_free_error, simulate_runs
 from .spectra import spectra
 from .wiener import (
     best_response,
@@ -71,42 +71,42 @@ def performance_limit(
     if references.ndim != 2:
         raise ValueError("the limit is known for one axis only")
     dt = loop_sample_time(loop) if dt is None else dt
-    runs, rest = simulated(loop, references, noise, disturbance)
+    runs, rest = simulate_runs(loop, references, noise, disturbance)
     problem = problem_of(loop, runs, rest, np.asarray(references), start, segment, dt)
-    known, variance, points = problem.known, problem.variance, problem.points
-    obstacles = problem.plant.obstacles()
-    inner = inner_response(*obstacles, points)
+    predictor, variance, points = problem.predictor, problem.variance, problem.points
+    delay_and_zeros = problem.plant.delay_and_zeros()
+    inner = inner_response(*delay_and_zeros, points)
     shared = common_response(problem.spectra, variance, inner)
     best = [best_response(spectrum, variance, inner) for spectrum in problem.spectra]
 
     error = (runs.displacement - runs.reference).reshape(noise.shape)
-    quiet = quiet_error(loop, problem.plant, references, problem.left)
+    quiet = noise_free_error(loop, problem.plant, references, problem.residual)
     tuned = _mean_square(error[..., start:])
     noisy = _mean_square((error - quiet)[..., start:])
-    kept = _mean_square(known.unforeseen(quiet))
-    whole = _mean_square(known.cut(problem.left))
+    kept = _mean_square(predictor.unpredicted(quiet))
+    whole = _mean_square(predictor.centred(problem.residual))
     line = 1.0 / (points * dt)
     rows = {}
     for i, name in enumerate(names):
         spectrum = problem.spectra[i]
         least = error_shares(best[i], spectrum, variance)
-        rows[name] = Reached(
+        rows[name] = LimitComparison(
             tuned=_root(tuned[i]),
             limit=_root(sum(least)),
             one_controller=_root(sum(error_shares(shared, spectrum, variance))),
             disturbance=_root(whole[i]),
-            unforeseen=_root(np.mean(spectrum)),
+            unpredicted=_root(np.mean(spectrum)),
             bandwidth=_last_above(spectrum, variance) * line,
             tuned_shares=_shares(tuned[i], noisy[i], kept[i]),
-            limit_shares=Shares(noise=_root(least[1]), unforeseen=_root(least[0])),
+            limit_shares=Shares(noise=_root(least[1]), unpredicted=_root(least[0])),
         )
     T, half = np.array(best), slice(1, points // 2)
     lowest = np.abs(1.0 - T) ** 2 * problem.spectra + np.abs(T) ** 2 * variance
     curves = Curves(
         frequency=line * np.arange(points)[half],
-        unforeseen=problem.spectra[:, half],
+        unpredicted=problem.spectra[:, half],
         noise=variance,
-        tuned=spectra(problem.lines(known.cut(error)))[:, half],
+        tuned=spectra(problem.lines(predictor.centred(error)))[:, half],
         limit=lowest[:, half],
     )
     return LimitReport(
@@ -115,7 +115,7 @@ def performance_limit(
         noise_rms=_root(variance),
         resolution=1.0 / (problem.window * dt),
         gain=float(problem.plant.response(2)[0].real),
-        delay=slow_delay(*obstacles),
+        delay=slow_delay(*delay_and_zeros),
         sensitivity_peak=float(np.max(np.abs(1.0 - shared))),
         curves=curves,
     )
@@ -125,11 +125,11 @@ def _mean_square(signals: np.ndarray) -> np.ndarray:
     return np.mean(signals**2, axis=(1, 2))
 
 
-def _shares(whole: float, noise: float, unforeseen: float) -> Shares | None:
-    if noise + unforeseen > _LINEAR**2 * whole:
+def _shares(whole: float, noise: float, unpredicted: float) -> Shares | None:
+    if noise + unpredicted > _LINEAR**2 * whole:
         return None
-    foreseen = _root(whole - noise - unforeseen)
-    return Shares(_root(noise), _root(unforeseen), foreseen)
+    predicted = _root(whole - noise - unpredicted)
+    return Shares(_root(noise), _root(unpredicted), predicted)
 
 
 def _root(square: float) -> float:

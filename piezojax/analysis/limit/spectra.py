@@ -17,7 +17,7 @@ LEAST_SHARE = 1e-10
 """Least power of a direction of the taps that is used, as a share of the largest."""
 
 
-class Foretelling:
+class ReferencePredictor:
     """Prediction of signals by one linear, non-causal filter of the reference.
 
     ``references`` [references, samples] in um are constant before they begin. The
@@ -44,12 +44,12 @@ class Foretelling:
     def _steps(self) -> list[np.ndarray]:
         return [np.diff(rows, axis=0) for rows in self._counted]
 
-    def cut(self, signals: np.ndarray) -> np.ndarray:
+    def centred(self, signals: np.ndarray) -> np.ndarray:
         """Return ``signals`` [..., samples] on the predicted samples, means removed."""
-        part = self.told_apart(signals)
+        part = self.window(signals)
         return part - part.mean(axis=-1, keepdims=True)
 
-    def told_apart(self, signals: np.ndarray) -> np.ndarray:
+    def window(self, signals: np.ndarray) -> np.ndarray:
         """Return ``signals`` [..., samples] on the predicted samples [..., count]."""
         return signals[..., self._start : self._start + self.count]
 
@@ -59,11 +59,11 @@ class Foretelling:
         ``signals`` are [references, draws, samples]. The filter is fitted to the mean
         over the draws of each reference.
         """
-        moved = np.diff(self.cut(signals).mean(axis=1), axis=1)
+        moved = np.diff(self.centred(signals).mean(axis=1), axis=1)
         product = sum(s.T @ m for s, m in zip(self._steps(), moved, strict=True))
         return self._directions @ (self._directions.T @ product / self._power)
 
-    def unforeseen(self, signals: np.ndarray) -> np.ndarray:
+    def unpredicted(self, signals: np.ndarray) -> np.ndarray:
         """Return the unpredicted part [references, draws, count], means removed.
 
         ``signals`` are [references, draws, samples].
@@ -71,9 +71,9 @@ class Foretelling:
         weights = self.weights(signals)
         predicted = np.stack([rows @ weights for rows in self._counted])
         predicted -= predicted.mean(axis=1, keepdims=True)
-        return self.cut(signals) - predicted[:, None]
+        return self.centred(signals) - predicted[:, None]
 
-    def foretold(self, signals: np.ndarray) -> np.ndarray:
+    def predicted(self, signals: np.ndarray) -> np.ndarray:
         """Return the predicted part [references, samples] on whole records.
 
         It has the mean of ``signals`` [references, draws, samples]. The last value is
@@ -81,8 +81,8 @@ class Foretelling:
         """
         weights = self.weights(signals)
         predicted = np.stack([rows @ weights for rows in self._whole])
-        mean = self.told_apart(signals).mean(axis=(1, 2))
-        predicted += (mean - self.told_apart(predicted).mean(axis=1))[:, None]
+        mean = self.window(signals).mean(axis=(1, 2))
+        predicted += (mean - self.window(predicted).mean(axis=1))[:, None]
         missing = signals.shape[-1] - predicted.shape[1]
         return np.pad(predicted, ((0, 0), (0, missing)), mode="edge")
 

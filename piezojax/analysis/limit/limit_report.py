@@ -13,26 +13,26 @@ NEAR = 1.5
 class Shares:
     """Parts of an RMS error (um), whose squares sum to its square.
 
-    ``noise`` is caused by the sensor's noise, and ``unforeseen`` by the part of the
-    disturbance that the reference does not predict. ``foreseen`` is the part that a
+    ``noise`` is caused by the sensor's noise, and ``unpredicted`` by the part of the
+    disturbance that the reference does not predict. ``predicted`` is the part that a
     linear filter of the reference predicts: the following error and the rest of the
     disturbance. Its square is the remainder of the total, 0 where the other two exceed
     the total.
     """
 
     noise: float
-    unforeseen: float
-    foreseen: float = 0.0
+    unpredicted: float
+    predicted: float = 0.0
 
 
 @dataclass(frozen=True)
-class Reached:
+class LimitComparison:
     """Comparison of a loop with the limit on one reference; RMS figures in um.
 
     ``tuned`` is the error of the loop. ``limit`` is the least error of a linear
     controller designed for this reference, ``one_controller`` the error here of the one
     controller with the least geometric mean over all references. ``disturbance`` is the
-    whole of d, ``unforeseen`` the part that the reference does not predict. The
+    whole of d, ``unpredicted`` the part that the reference does not predict. The
     spectrum of that part lies above the noise's up to ``bandwidth`` (Hz).
     ``tuned_shares`` is None where the loop is too nonlinear for shares of its error.
     """
@@ -41,18 +41,18 @@ class Reached:
     limit: float
     one_controller: float
     disturbance: float
-    unforeseen: float
+    unpredicted: float
     bandwidth: float
     tuned_shares: Shares | None
     limit_shares: Shares
 
     @property
-    def over(self) -> float:
+    def ratio(self) -> float:
         """Ratio of the loop's error to the limit."""
         return self.tuned / self.limit
 
     @property
-    def exceeding(self) -> str | None:
+    def largest_excess(self) -> str | None:
         """Name of the share whose mean square exceeds that of the limit most."""
         if self.tuned_shares is None:
             return None
@@ -65,13 +65,13 @@ class Reached:
 class Curves:
     """Spectra (um^2) against ``frequency`` [lines] (Hz); their means are variances.
 
-    ``unforeseen`` [references, lines] is that of the unpredicted disturbance;
+    ``unpredicted`` [references, lines] is that of the unpredicted disturbance;
     ``noise`` is flat. ``tuned`` and ``limit`` [references, lines] are those of the
     errors.
     """
 
     frequency: np.ndarray
-    unforeseen: np.ndarray
+    unpredicted: np.ndarray
     noise: float
     tuned: np.ndarray
     limit: np.ndarray
@@ -87,7 +87,7 @@ class LimitReport:
     bound it. ``dt`` in s.
     """
 
-    references: dict[str, Reached]
+    references: dict[str, LimitComparison]
     dt: float
     noise_rms: float
     resolution: float
@@ -99,17 +99,17 @@ class LimitReport:
     @property
     def worst(self) -> str:
         """Name of the reference with the largest ratio of error to limit."""
-        return max(self.references, key=lambda name: self.references[name].over)
+        return max(self.references, key=lambda name: self.references[name].ratio)
 
     def densities(self, name: str) -> dict[str, np.ndarray]:
         """Return one-sided amplitude densities [lines] for ``name``, um/sqrt(Hz).
 
-        They are those of the "unforeseen" disturbance, of the sensor's "noise", of the
+        They are those of the "unpredicted" disturbance, of the sensor's "noise", of the
         error at the "limit", and of the error of the "tuned" loop.
         """
         i, curves = list(self.references).index(name), self.curves
         spectra = {
-            "unforeseen": curves.unforeseen[i],
+            "unpredicted": curves.unpredicted[i],
             "noise": np.full_like(curves.frequency, curves.noise),
             "limit": curves.limit[i],
             "tuned": curves.tuned[i],
@@ -119,7 +119,7 @@ class LimitReport:
     @property
     def near(self) -> int:
         """Number of references whose error is at most ``NEAR`` times its limit."""
-        return sum(one.over <= NEAR for one in self.references.values())
+        return sum(one.ratio <= NEAR for one in self.references.values())
 
     @property
     def near_one_controller(self) -> int:
@@ -129,12 +129,12 @@ class LimitReport:
         )
 
     @property
-    def over(self) -> float:
+    def ratio(self) -> float:
         """Geometric mean over the references of the ratio of error to limit."""
-        return self._mean([one.over for one in self.references.values()])
+        return self._mean([one.ratio for one in self.references.values()])
 
     @property
-    def over_one_controller(self) -> float:
+    def ratio_to_one_controller(self) -> float:
         """Geometric mean of the ratio of error to that of the one controller."""
         found = [one.tuned / one.one_controller for one in self.references.values()]
         return self._mean(found)
@@ -152,15 +152,15 @@ class LimitReport:
             shares = {key: plain.pop(key) for key in ("tuned_shares", "limit_shares")}
             rows[name] = {f"{key}_rms_um": value for key, value in plain.items()}
             rows[name] |= {
-                "tuned_over_limit": one.over,
+                "tuned_over_limit": one.ratio,
                 "tuned_over_one_controller": one.tuned / one.one_controller,
                 "disturbance_bandwidth_Hz": bandwidth,
                 **{f"{key}_rms_um": parts for key, parts in shares.items()},
-                "exceeding": one.exceeding,
+                "largest_excess": one.largest_excess,
             }
         return {
-            "tuned_over_limit": self.over,
-            "tuned_over_one_controller": self.over_one_controller,
+            "tuned_over_limit": self.ratio,
+            "tuned_over_one_controller": self.ratio_to_one_controller,
             "within": NEAR,
             "references_within": self.near,
             "references_within_one_controller": self.near_one_controller,

@@ -22,25 +22,25 @@ from ...core.rollout import simulate
 from ...core.system import Feedback, LoopSample, System
 from ..stability.operating_point import loop_sample_time
 from .linear_plant import LinearPlant
-from .linear_problem import Problem, problem_of
-from .loop_runs import simulated
+from .linear_problem import LinearProblem, problem_of
+from .loop_runs import simulate_runs
 from .performance import SEGMENT
 from .wiener import common_response, error_shares, inner_response
 
 _TAIL = 1e-7  # of the largest tap: smaller taps at the end are cut off
 
 
-class Ahead(NamedTuple):
+class LimitInput(NamedTuple):
     """Inputs of a LinearLimit at sample k: three known in advance, two unknown.
 
     Known: ``voltage`` (V), with which the linear plant follows the reference;
-    ``foretold`` (um), the predicted disturbance; ``reference`` (um). Unknown:
+    ``prediction`` (um), the predicted disturbance; ``reference`` (um). Unknown:
     ``noise``, a draw of unit variance; ``disturbance`` (um), which is added to the
     displacement at k + 1.
     """
 
     voltage: Scalar
-    foretold: Scalar
+    prediction: Scalar
     reference: Scalar
     noise: Scalar
     disturbance: Scalar
@@ -49,9 +49,9 @@ class Ahead(NamedTuple):
 class LinearLimit(System):
     """Stage of ``loop`` under the controller u = voltage - Q (measured - predicted).
 
-    ``voltage`` is that of Ahead. ``taps`` are the impulse response of Q (V/um). The
-    predicted displacement is that of the linear ``model`` under u plus the predicted
-    disturbance.
+    ``voltage`` is that of LimitInput. ``taps`` are the impulse response of Q (V/um).
+    The predicted displacement is that of the linear ``model`` under u plus the
+    predicted disturbance.
     """
 
     loop: Feedback
@@ -63,14 +63,14 @@ class LinearLimit(System):
         resting = self.model.at(start.voltage, start.displacement)
         return start, resting, resting.init(start.voltage), jnp.zeros_like(self.taps)
 
-    def step(self, state: State, input: Ahead) -> tuple[State, LoopSample]:
-        at, model, states, surprises = state
+    def step(self, state: State, input: LimitInput) -> tuple[State, LoopSample]:
+        at, model, states, innovations = state
         loop = self.loop
         sensor, measured = loop.sensor.step(at.sensor, (at.displacement, input.noise))
         # at.reference holds the displacement of the model, one sample after its input.
-        surprise = measured - at.reference - input.foretold
-        surprises = jnp.concatenate([surprise[None], surprises[:-1]])
-        command = input.voltage - self.taps @ surprises
+        innovation = measured - at.reference - input.prediction
+        innovations = jnp.concatenate([innovation[None], innovations[:-1]])
+        command = input.voltage - self.taps @ innovations
         actuator, voltage = loop.actuator.step(at.actuator, command)
         plant, displacement = loop.plant.step(at.plant, voltage)
         states, modelled = model.step(states, voltage)
@@ -85,10 +85,10 @@ class LinearLimit(System):
             reference=modelled,
             voltage=voltage,
         )
-        return (at, model, states, surprises), sample
+        return (at, model, states, innovations), sample
 
 
-class Attained(NamedTuple):
+class LimitErrors(NamedTuple):
     """RMS errors [references] in um, predicted and simulated on the stage.
 
     Both leave out the mean of a run, which is not part of a spectrum and which the
@@ -99,7 +99,7 @@ class Attained(NamedTuple):
     simulated: np.ndarray
 
 
-def attained(
+def verify_limit(
     loop: Feedback,
     references: Any,
     noise: Any,
@@ -109,7 +109,7 @@ def attained(
     segment: float = SEGMENT,
     dt: float | None = None,
     rounds: int = 5,
-) -> list[Attained]:
+) -> list[LimitErrors]:
     """Return the errors of the best single linear controller on the stage of ``loop``.
 
     There is one entry for each of ``rounds``: the first controller is designed for the
@@ -119,12 +119,12 @@ def attained(
     references, noise = as_array(references), as_array(noise)
     dt = loop_sample_time(loop) if dt is None else dt
     known = np.asarray(references)
-    runs, rest = simulated(loop, references, noise, disturbance)
+    runs, rest = simulate_runs(loop, references, noise, disturbance)
     found = []
     for _ in range(rounds):
         problem = problem_of(loop, runs, rest, known, start, segment, dt)
         plant = problem.plant.response(problem.points)
-        inner = inner_response(*problem.plant.obstacles(), problem.points)
+        inner = inner_response(*problem.plant.delay_and_zeros(), problem.points)
         T = common_response(problem.spectra, problem.variance, inner)
         predicted = [
             np.sqrt(sum(error_shares(T, spectrum, problem.variance)))
@@ -133,29 +133,31 @@ def attained(
         taps = np.fft.ifft(T / plant).real[: problem.points // 2]
         taps = taps[: 1 + np.flatnonzero(np.abs(taps) > _TAIL * np.abs(taps).max())[-1]]
         control = LinearLimit(loop, problem.plant, taps)
-        foretold = problem.known.foretold(problem.left)
+        prediction = problem.predictor.predicted(problem.residual)
         voltage = (
-            _following_voltage(problem, known, foretold)
+            _following_voltage(problem, known, prediction)
             + rest.reshape(noise.shape[:2])[:, :1]
         )
         moved = 0.0 if disturbance is None else disturbance
         still = jnp.broadcast_to(moved, noise.shape)
-        logs = _logs(control, voltage, foretold, references, noise, still)
+        logs = _logs(control, voltage, prediction, references, noise, still)
         runs = jax.tree.map(lambda x: np.asarray(x).reshape(-1, x.shape[-1]), logs)
-        error = problem.known.cut(np.asarray(logs.displacement - logs.reference))
+        error = problem.predictor.centred(
+            np.asarray(logs.displacement - logs.reference)
+        )
         reached = np.sqrt(np.mean(error**2, axis=(1, 2)))
-        found.append(Attained(np.array(predicted), reached))
+        found.append(LimitErrors(np.array(predicted), reached))
     return found
 
 
 def _following_voltage(
-    problem: Problem, references: np.ndarray, foretold: np.ndarray
+    problem: LinearProblem, references: np.ndarray, prediction: np.ndarray
 ) -> np.ndarray:
     """Return the voltages [references, samples] that make the linear plant follow.
 
     They are deviations (V) from the voltages at rest.
     """
-    wanted = references - references[:, :1] - foretold
+    wanted = references - references[:, :1] - prediction
     margin = wanted.shape[1] // 2
     wanted = np.pad(wanted, ((0, 0), (margin, margin)), mode="edge")
     # Without a ramp from end to end the record is periodic. The ramp is slow enough for
@@ -171,14 +173,14 @@ def _following_voltage(
 def _logs(
     control: LinearLimit,
     voltage: Any,
-    foretold: Any,
+    prediction: Any,
     references: Any,
     noise: Any,
     disturbance: Any,
 ) -> LoopSample:
-    def one(voltage, foretold, reference, noise, disturbance):
-        inputs = Ahead(voltage, foretold, reference, noise, disturbance)
+    def one(voltage, prediction, reference, noise, disturbance):
+        inputs = LimitInput(voltage, prediction, reference, noise, disturbance)
         return simulate(control, inputs, control.init(reference[0]))[1]
 
     each = jax.vmap(one, in_axes=(None, None, None, 0, 0))
-    return jax.vmap(each)(voltage, foretold, references, noise, disturbance)
+    return jax.vmap(each)(voltage, prediction, references, noise, disturbance)

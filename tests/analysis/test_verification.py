@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 import piezojax as pj
-from piezojax.analysis.limit import attained, performance_limit
+from piezojax.analysis.limit import performance_limit, verify_limit
 from piezojax.signals import waveforms as references_of
 
 RATE, DT, START, SAMPLES = 5_000.0, 2e-4, 2_500, 6_000
@@ -28,7 +28,7 @@ def test_on_a_linear_stage_at_once():
         slope=pj.core.system.Affine(0.15), lag=pj.dynamics.FirstOrderLag(5e-4, DT)
     )
     loop = loop_of(stage, 4000.0)
-    (found,) = attained(loop, REFERENCES, NOISE, disturbance, start=START, rounds=1)
+    (found,) = verify_limit(loop, REFERENCES, NOISE, disturbance, start=START, rounds=1)
     report = performance_limit(loop, NAMES, REFERENCES, NOISE, disturbance, start=START)
     shared = [one.one_controller for one in report.references.values()]
     np.testing.assert_allclose(found.predicted, shared, rtol=1e-9)
@@ -41,7 +41,7 @@ def test_on_a_linear_stage_at_once():
 def test_on_a_hysteretic_stage_once_it_has_met_its_own_disturbance():
     model = pj.hysteresis.ColemanHodgdon(0.0077, 0.1167, -0.0487)
     stage = pj.series(hysteresis=model, lag=pj.dynamics.FirstOrderLag(5e-4, DT))
-    first, *_, last = attained(
+    first, *_, last = verify_limit(
         loop_of(stage, 4000.0), REFERENCES, NOISE, start=START, rounds=3
     )
     np.testing.assert_allclose(last.simulated, last.predicted, rtol=0.2)
@@ -55,4 +55,4 @@ def test_what_cannot_be_attained():
         loop.controller, loop.plant, loop.actuator, pj.hardware.Sensor(0.0)
     )
     with pytest.raises(ValueError, match="without sensor noise"):
-        attained(quiet, REFERENCES, NOISE, start=START)
+        verify_limit(quiet, REFERENCES, NOISE, start=START)
