@@ -13,12 +13,14 @@ from . import study as study
 from . import sweeping as sweeping
 from . import tuning as tuning
 from .analysis.stability import stability_report as stability_report
+from .core.about import About as About
 from .core.axes import PerAxis as PerAxis
 from .core.metrics import Tracking as Tracking
 from .core.registry import register as register
 from .core.rollout import Metric as Metric
 from .core.rollout import simulate as simulate
 from .core.serial import load as load
+from .core.serial import read_about as read_about
 from .core.serial import save as save
 from .core.system import Affine as Affine
 from .core.system import Delay as Delay

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import piezojax as pj
 from piezojax.catalog import CONTROLLERS, PLANTS, p753
-from piezojax.core.serial import from_data, load, save, to_data
+from piezojax.core.serial import from_data, load, read_about, save, to_data
 from piezojax.core.system import Observation
 
 SCALAR = {
@@ -417,6 +417,50 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
         save(pj.core.system.Affine(3.0), path)
     monkeypatch.undo()
     assert load(path).gain == 2.0
+
+
+ALARMS = ["Ms 3.1 is above its limit 2", "SW30 rails"]
+
+
+@pytest.mark.parametrize("name", ["a.toml", "a.json"])
+def test_a_file_says_where_its_system_is_from(tmp_path, name):
+    about = pj.About(study="mine", seed=3, rate_Hz=2e4, units={"command": "V"})
+    save(pj.core.system.Affine(2.0), tmp_path / name, about)
+    assert load(tmp_path / name) == pj.core.system.Affine(2.0)
+    assert read_about(tmp_path / name) == about
+    assert about.piezojax == pj.__version__
+    save(pj.core.system.Affine(2.0), tmp_path / name)
+    assert read_about(tmp_path / name) == pj.About(piezojax="unknown")
+
+
+@pytest.mark.parametrize(
+    ("alarms", "message"),
+    [
+        (ALARMS[:1], "a.toml was written with an alarm: Ms 3.1 is above its limit 2; "),
+        (ALARMS, "a.toml was written with 2 alarms: Ms 3.1 is above its limit 2; SW30"),
+    ],
+)
+def test_an_unsafe_file_is_refused(tmp_path, alarms, message):
+    save(pj.core.system.Affine(2.0), tmp_path / "a.toml", pj.About(unsafe=alarms))
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        load(tmp_path / "a.toml")
+    assert str(caught.value).endswith("pass accept_unsafe=True to load it all the same")
+    assert load(tmp_path / "a.toml", accept_unsafe=True) == pj.core.system.Affine(2.0)
+
+
+@pytest.mark.parametrize(
+    ("about", "message"),
+    [
+        ('about = "me"', "a.toml: about is 'me'; it must be a table"),
+        ('about.unsafe = "railed"', "a.toml: about.unsafe: Input should be a valid"),
+    ],
+)
+def test_a_damaged_origin_is_refused(tmp_path, about, message):
+    (tmp_path / "a.toml").write_text(f'type = "Affine"\n{about}\n')
+    for read in (load, read_about):
+        with pytest.raises(ValueError, match=re.escape(message)) as caught:
+            read(tmp_path / "a.toml")
+        assert "\n" not in str(caught.value)
 
 
 # The tests run with every type checked; a user's run is not. What a file of wrong types

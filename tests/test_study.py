@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from piezojax import (
-    save,
-)
+from piezojax import About, save
 from piezojax.catalog import CONTROLLERS, p753
 from piezojax.control import PID, DisturbanceObserverControl
 from piezojax.core.parameter import declarations
@@ -49,6 +47,7 @@ BASE = {
     "optimiser": {"method": "bfgs", "starts": 2, "candidates": 4, "steps": 6},
 }
 GONE = object()
+UNSAFE = About(unsafe=["Ms 3 is above 2"])
 
 
 def changed(changes):
@@ -326,6 +325,21 @@ def test_files_lie_beside_the_study(study, tmp_path, monkeypatch):
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
     assert get(read(path).loop, "plant.hysteresis.a") == 0.0077
+
+
+@pytest.mark.parametrize("where", ["plant", "controller"])
+def test_an_unsafe_file_is_refused_unless_the_study_accepts_it(study, refusal, where):
+    path = study({}).parent / "a.json"
+    save({"plant": p753.plant, "controller": p753.pid}[where](), path, UNSAFE)
+    assert refusal({where: {"file": "a.json"}}) == (
+        f"{where}.file: a.json was written with an alarm: Ms 3 is above 2; "
+        f"set {where}.accept_unsafe = true to use it all the same"
+    )
+    loop = read(study({where: {"file": "a.json", "accept_unsafe": True}})).loop
+    assert get(loop, "actuator.limits.upper") == 120.0
+    assert refusal({where: {"file": "a.json", "accept_unsafe": "yes"}}) == (
+        f"{where}.accept_unsafe is 'yes'; it must be true or false"
+    )
 
 
 def test_a_design_for_the_plant_at_hand(study):

@@ -11,10 +11,15 @@ from typing import Any, get_args, get_origin
 import equinox as eqx
 import numpy as np
 import tomli_w
+from pydantic import ValidationError
 
+from .about import About
 from .files import write_text
 from .registry import kinds
 from .system import System
+
+_ABOUT = "about"
+"""Key of the table in a file that describes the origin of its System."""
 
 
 def to_data(system: System) -> dict[str, Any]:
@@ -132,27 +137,61 @@ _PLAIN: dict[Any, tuple[Any, str]] = {
 """Accepted types, and their names in errors; any other field takes a number."""
 
 
-def save(system: System, path: str | Path) -> None:
+def save(system: System, path: str | Path, about: About | None = None) -> None:
     """Write ``system`` to ``path`` (``.toml`` or ``.json``) atomically.
 
-    Raises ValueError for a System that ``load`` would reject: its class is not
-    registered, or a parameter is outside its limits.
+    ``about`` is written beside it, as the table of that name. Raises ValueError for a
+    System that ``load`` would reject: its class is not registered, or a parameter is
+    outside its limits.
     """
     path, data = Path(path), to_data(system)
     from_data(data, path.name)
+    if about is not None:
+        data[_ABOUT] = about.model_dump(exclude_none=True)
     if _format(path) == "toml":
         write_text(path, tomli_w.dumps(data))
     else:
         write_text(path, json.dumps(data, indent=2) + "\n")
 
 
-def load(path: str | Path) -> System:
+def load(path: str | Path, *, accept_unsafe: bool = False) -> System:
     """Return the System in the file ``path``, written by ``save``.
 
     Raises ValueError for a file that is missing, is not TOML or JSON, or describes no
-    System.
+    System. A file that was written with an alarm (``About.unsafe``) is refused too,
+    unless ``accept_unsafe``.
     """
     path = Path(path)
+    data = _read(path)
+    about = _about_of(data.pop(_ABOUT, {}), path)
+    if not accept_unsafe:
+        about.require_safe(path.name, "pass accept_unsafe=True to load it all the same")
+    return from_data(data, path.name)
+
+
+def read_about(path: str | Path) -> About:
+    """Return the table ``about`` of a file written by ``save``.
+
+    A file without it gives an About of an unknown version. Raises ValueError for a file
+    that is missing, is not TOML or JSON, or holds another table of that name.
+    """
+    path = Path(path)
+    return _about_of(_read(path).get(_ABOUT, {}), path)
+
+
+def _about_of(table: Any, path: Path) -> About:
+    if not isinstance(table, dict):
+        raise ValueError(f"{path.name}: {_ABOUT} is {table!r}; it must be a table")
+    try:
+        return About.model_validate({"piezojax": "unknown"} | table)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, (_ABOUT, *first["loc"])))
+        raise ValueError(f"{path.name}: {key}: {first['msg']}") from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML or JSON file. Raises ValueError as ``load``."""
     kind = _format(path)
     try:
         text = path.read_text(encoding="utf-8")
@@ -163,7 +202,9 @@ def load(path: str | Path) -> System:
         raise ValueError(f"{path} is no {kind.upper()} file: nested too deep") from None
     except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is no {kind.upper()} file: {error}") from None
-    return from_data(data, path.name)
+    if not isinstance(data, dict):
+        raise ValueError(f"{path.name} needs a key 'type' and the fields of a System")
+    return data
 
 
 def _format(path: Path) -> str:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import AliasChoices, BaseModel, Field
 
+from ..core.about import About
 from ..core.progress import Progress, Silent
 from ..core.system import System
 from .chain import DEFAULT
@@ -98,6 +99,18 @@ class Fit:
     def error_over(self, part: slice) -> FitError:
         """Return the RMS of the errors over ``part``."""
         return _fit_error(self.records, self.simulations, part)
+
+    @property
+    def about(self) -> About:
+        """Origin of the fitted plant, for its file."""
+        record = self.record
+        channels = {"input": record.input_units, "output": record.output_units}
+        units = {
+            side if len(each) == 1 else f"{side} {i}": unit
+            for side, each in channels.items()
+            for i, unit in enumerate(each)
+        }
+        return About(rate_Hz=1.0 / record.dt, units=units)
 
     @property
     def record(self) -> Record:

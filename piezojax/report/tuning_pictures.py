@@ -67,7 +67,7 @@ def write_results(outcome: Outcome, folder: Path) -> None:
 def write_numbers(outcome: Outcome, folder: Path) -> None:
     """Write result.json and gains.toml into ``folder``."""
     write_text(folder / RESULT_FILE, outcome.result.model_dump_json(indent=2) + "\n")
-    save(outcome.controller, folder / GAINS_FILE)
+    save(outcome.controller, folder / GAINS_FILE, outcome.about)
 
 
 def _quantity(trace: Trace) -> str:

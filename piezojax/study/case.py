@@ -14,7 +14,7 @@ from ..control.design import DESIGNS
 from ..core.arrays import as_array
 from ..core.axes import PerAxis
 from ..core.paths import declared, static_fields
-from ..core.serial import from_data
+from ..core.serial import from_data, read_about
 from ..core.serial import load as load_system
 from ..core.space import Space
 from ..core.system import Feedback, Observation, System, rest_output, series
@@ -219,13 +219,14 @@ def _from_source(
     """
     sources = {
         "catalog": lambda: at_rate(catalog, one_of(table["catalog"], catalog), rate),
-        "file": lambda: load_system(folder / str(table["file"])),
+        "file": lambda: _from_file(table, where, folder),
         "type": lambda: from_data(table, where),
     }
     if design is not None:
         sources["design"] = lambda: design(table["design"])
     given = [source for source in sources if source in table]
-    extra = [key for key in table if key not in sources] if "type" not in table else []
+    known = {*sources, _ACCEPT} if "file" in table else set(sources)
+    extra = set() if "type" in table else set(table) - known
     if len(given) != 1 or extra:
         allowed = (*sources, *(["record"] if where == "plant" else []))
         raise _source_error(table, where, allowed)
@@ -234,3 +235,21 @@ def _from_source(
     except ValueError as error:
         prefix = "" if str(error).startswith(where) else f"{where}.{given[0]}: "
         raise ValueError(f"{prefix}{error}") from None
+
+
+_ACCEPT = "accept_unsafe"
+"""Key beside ``file`` that accepts a System written with an alarm."""
+
+
+def _from_file(table: dict[str, Any], where: str, folder: Path) -> System:
+    """Load the System of ``table["file"]``.
+
+    Raises ValueError for a file written with an alarm, unless the table accepts it.
+    """
+    path, accept = folder / str(table["file"]), table.get(_ACCEPT, False)
+    if not isinstance(accept, bool):
+        raise ValueError(f"{where}.{_ACCEPT} is {accept!r}; it must be true or false")
+    if not accept:
+        remedy = f"set {where}.{_ACCEPT} = true to use it all the same"
+        read_about(path).require_safe(path.name, remedy)
+    return load_system(path, accept_unsafe=True)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..analysis.limit import LimitReport, performance_limit
 from ..analysis.stability import StabilityReports, stability_reports
+from ..core.about import About
 from ..core.rollout import simulate
 from ..core.system import Feedback, LoopSample, System, loop_inputs
 from ..study import Case
@@ -45,6 +46,19 @@ class Outcome:
     def controller(self) -> System:
         """Tuned controller."""
         return self.after.controller
+
+    @property
+    def about(self) -> About:
+        """Origin of the tuned controller, for its file."""
+        study = self.case.study
+        axes = study.axes
+        channels = zip(axes.names, axes.units, strict=True) if axes else ()
+        return About(
+            study=self.case.name,
+            seed=study.seed,
+            rate_Hz=study.rate,
+            units=dict(channels) or {"measured": "um", "command": "V"},
+        )
 
     @cached_property
     def stability(self) -> StabilityReports:

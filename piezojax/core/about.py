@@ -1,0 +1,30 @@
+"""Origin of a saved System: the table ``about`` of its file."""
+
+from importlib.metadata import version
+
+from pydantic import BaseModel, Field
+
+
+class About(BaseModel):
+    """Origin of a saved System, and the reasons not to use it.
+
+    ``piezojax`` is the version that wrote the file. ``study`` is the name of the study
+    with its ``seed``, ``rate_Hz`` the sampling rate. ``units`` maps the channels of the
+    System to their units. ``unsafe`` lists the alarms raised when the System was made;
+    ``load`` refuses a file with any. Keys of later versions are ignored.
+    """
+
+    piezojax: str = Field(default_factory=lambda: version("piezojax"))
+    study: str | None = None
+    seed: int | None = None
+    rate_Hz: float | None = None  # noqa: N815
+    units: dict[str, str] = {}
+    unsafe: list[str] = []
+
+    def require_safe(self, name: str, remedy: str) -> None:
+        """Raise ValueError, ending in ``remedy``, if the System ``name`` is unsafe."""
+        if self.unsafe:
+            count = len(self.unsafe)
+            alarms = "an alarm" if count == 1 else f"{count} alarms"
+            reasons = "; ".join(self.unsafe)
+            raise ValueError(f"{name} was written with {alarms}: {reasons}; {remedy}")
