@@ -1,0 +1,137 @@
+"""Model error bound of a plant, and the worst margins of a loop under it.
+
+The stage is ``G (1 + D)``, where G is the model and ``|D| <= l`` at every frequency.
+Then S becomes ``S / (1 + D T)`` with ``T = 1 - S``, and its magnitude is at most
+``|S| / (1 - l |T|)``. The loop can be unstable where ``l |T| >= 1`` (Skogestad and
+Postlethwaite, Multivariable Feedback Control, 2nd ed., 7.5).
+"""
+
+from typing import Annotated, Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from .differentiable import UNREACHED
+
+UNSEEN = 25.0
+"""Relative error assumed at frequencies that a record does not excite.
+
+A mode of damping zeta that is not in the model changes the response by the factor
+``1 / (2 zeta)`` at its resonance: 25 for a lightly damped stage of 2 %.
+"""
+
+NEAR_ONE = 0.99
+"""``l |T|`` above which the worst sensitivity goes on along its tangent."""
+
+_SMALLEST = 1e-12
+
+Share = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
+class ErrorBound(BaseModel):
+    """Upper bound of the relative error of a model, by frequency.
+
+    ``relative`` bounds ``|G_true / G_model - 1|`` at ``frequency`` (Hz, increasing up
+    to the Nyquist frequency). ``excited`` tells for each line whether the record holds
+    enough power there; where it does not, ``relative`` is an assumption (``UNSEEN``).
+    ``inputs`` is the range of the record's input, V, within which the bound holds.
+    Raises ValueError for lists of different length, and for frequencies that are
+    negative or do not increase.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    frequency: tuple[Share, ...] = Field(min_length=1)
+    relative: tuple[Share, ...]
+    excited: tuple[bool, ...]
+    inputs: tuple[float, float] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "ErrorBound":
+        lines = len(self.frequency)
+        for name in ("relative", "excited"):
+            if len(getattr(self, name)) != lines:
+                raise ValueError(
+                    f"{name} has {len(getattr(self, name))} lines and frequency "
+                    f"{lines}; they must have the same"
+                )
+        if np.any(np.diff(self.frequency) <= 0.0):
+            raise ValueError("frequency must increase from line to line")
+        return self
+
+    def at(self, frequency: Any) -> np.ndarray:
+        """Return the bound at ``frequency`` (Hz): the larger of both neighbours.
+
+        Below the first and above the last line it is that of the line.
+        """
+        below, above = self._neighbours(frequency)
+        relative = np.asarray(self.relative)
+        return np.maximum(relative[below], relative[above])
+
+    def excited_at(self, frequency: Any) -> np.ndarray:
+        """Return whether both neighbours of ``frequency`` (Hz) are excited."""
+        below, above = self._neighbours(frequency)
+        excited = np.asarray(self.excited)
+        return excited[below] & excited[above]
+
+    def _neighbours(self, frequency: Any) -> tuple[np.ndarray, np.ndarray]:
+        lines = np.asarray(self.frequency)
+        last = lines.size - 1
+        below = np.searchsorted(lines, frequency, side="right") - 1
+        above = np.searchsorted(lines, frequency, side="left")
+        return np.clip(below, 0, last), np.clip(above, 0, last)
+
+
+def worst_sensitivity(
+    sensitivity: Complex[Array, "*batch lines"], bound: Float[Array, " lines"]
+) -> Float[Array, "*batch lines"]:
+    """Return the largest ``|S|`` of a loop under a relative error of its plant.
+
+    ``|S| / (1 - l |T|)``, reached by some error. From ``l |T| = NEAR_ONE`` on it goes
+    on along the tangent of ``1 / (1 - x)``: the loop can be unstable there, and the
+    value grows, is finite and has a slope. Differentiable.
+    """
+    share = bound * jnp.abs(1.0 - sensitivity)
+    inside = 1.0 / (1.0 - jnp.minimum(share, NEAR_ONE))
+    steep = 1.0 / (1.0 - NEAR_ONE) ** 2
+    beyond = steep * jnp.maximum(share - NEAR_ONE, 0.0)
+    # Where the loop can be unstable, a small |S| is no merit.
+    size = jnp.abs(sensitivity)
+    size = jnp.where(share > NEAR_ONE, jnp.maximum(size, 1.0), size)
+    return size * (inside + beyond)
+
+
+def worst_delay_margin(
+    sensitivity: Complex[Array, "*batch lines"],
+    bound: Float[Array, " lines"],
+    angle: Float[Array, " lines"],
+) -> Float[Array, "*batch lines"]:
+    """Return the smallest delay (samples) at which the loop can be unstable, by line.
+
+    ``bound`` is the relative error of the plant, ``angle`` the frequency in rad/sample.
+    A delay of tau samples makes ``1 + L (1 + D) exp(-j w tau) = 0`` for an error
+    ``|D| <= l`` if ``rho exp(j (phi + w tau))`` lies within l of 1, where
+    ``rho exp(j phi) = -1/L``: if ``cos(phi + w tau) >= (rho^2 + 1 - l^2) / (2 rho)``.
+    The value is 0 where no delay is needed, and ``UNREACHED`` where none suffices.
+    Differentiable.
+    """
+    complementary = 1.0 - sensitivity
+    known = (jnp.abs(sensitivity) > _SMALLEST) & (jnp.abs(complementary) > _SMALLEST)
+    # -1/L = -S/T: infinite without a loop gain, 0 with an infinite one.
+    S, T = (jnp.where(known, x, _SMALLEST) for x in (sensitivity, complementary))
+    start = jnp.angle(-S * jnp.conj(T))
+    size, gain = jnp.abs(S), jnp.abs(T)
+    cosine = (size**2 + (1.0 - bound**2) * gain**2) / (2.0 * size * gain)
+    # Keep off the ends, where the slope of the arc cosine is infinite.
+    inside = jnp.abs(cosine) < 1.0 - 1e-9
+    half = jnp.arccos(jnp.where(inside, cosine, 0.0))
+    half = jnp.where(inside, half, jnp.where(cosine < 0.0, jnp.pi, 0.0))
+    unstable = jnp.where(
+        known, jnp.abs(start) <= half, bound * jnp.abs(complementary) >= 1.0
+    )
+    turn = jnp.mod(-half - start, 2.0 * jnp.pi)
+    moving = (angle > 0.0) & known & (cosine < 1.0)
+    delay = turn / jnp.where(moving, angle, 1.0)
+    return jnp.where(unstable, 0.0, jnp.where(moving, delay, UNREACHED))
