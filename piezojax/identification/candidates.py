@@ -13,7 +13,12 @@ from ..core.recipe import Extent
 from ..core.registry import parts as known_parts
 from .chain import extent_of, is_dynamic
 from .estimators.estimate import Options
-from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, TOO_FEW, cells_told_apart
+from .estimators.model_preisach import (
+    PLAIN,
+    RATE_DEPENDENT,
+    TOO_FEW,
+    distinguishable_cells,
+)
 from .methods import METHODS
 from .records.checks import lines
 from .records.record import Record
@@ -277,7 +282,7 @@ def _objection_to_preisach(
     del options
     if objection := _objection_to_single(records):
         return objection
-    return None if cells_told_apart(records[0], train, model) else TOO_FEW[model]
+    return None if distinguishable_cells(records[0], train, model) else TOO_FEW[model]
 
 
 def _objection_to_single(records: Sequence[Record]) -> str | None:

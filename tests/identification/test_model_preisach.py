@@ -19,7 +19,7 @@ from piezojax.identification.candidates import whole_models
 from piezojax.identification.estimators.estimate import Options
 from piezojax.identification.estimators.model_preisach import (
     RATE_DEPENDENT,
-    cells_told_apart,
+    distinguishable_cells,
 )
 from piezojax.report.fit_pictures import write_fit
 from piezojax.study import shipped
@@ -114,7 +114,7 @@ def test_one_pace_does_not_tell_two_densities_apart():
     steps = np.where(np.arange(1200) // 50 % 2, -2.0, 2.0)
     input = np.concatenate([[0.0], np.cumsum(steps)])
     record = Record(input, 0.1 * input, DT)
-    assert cells_told_apart(record, slice(0, 900), RATE_DEPENDENT) == 0
+    assert distinguishable_cells(record, slice(0, 900), RATE_DEPENDENT) == 0
 
 
 def test_what_is_written_is_the_plant(fit, tmp_path):
@@ -129,7 +129,7 @@ def test_cells_are_as_fine_as_the_turning_points_tell():
     once = 50.0 - 50.0 * np.cos(np.linspace(0.0, 6.0 * np.pi, 600))
     twice = np.concatenate([once, np.interp(once, [0.0, 100.0], [0.0, 55.0])])
     found = [
-        cells_told_apart(Record(u, 0.1 * u, DT), slice(0, u.size))
+        distinguishable_cells(Record(u, 0.1 * u, DT), slice(0, u.size))
         for u in (once, twice, INPUT)
     ]
     assert found[0] == 0
@@ -144,10 +144,10 @@ def test_the_way_from_a_virgin_start_is_not_relied_upon(monkeypatch):
         input="input_V",
         output="displacement_um",
     )
-    assert cells_told_apart(record, slice(0, 1200)) == 0
-    module = sys.modules[cells_told_apart.__module__]
+    assert distinguishable_cells(record, slice(0, 1200)) == 0
+    module = sys.modules[distinguishable_cells.__module__]
     monkeypatch.setattr(module, "STARTS", ("virgin",))
-    assert cells_told_apart(record, slice(0, 1200)) == 4
+    assert distinguishable_cells(record, slice(0, 1200)) == 4
 
 
 def test_a_record_of_one_loop_supports_none():

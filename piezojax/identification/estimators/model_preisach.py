@@ -98,7 +98,7 @@ class PreisachFit(NamedTuple):
     warnings: list[str]
 
 
-def cells_told_apart(record: Record, train: slice, model: str = PLAIN) -> int:
+def distinguishable_cells(record: Record, train: slice, model: str = PLAIN) -> int:
     """Return the number of cells a side that the samples ``train`` determine, or 0.
 
     It holds for any of the histories STARTS before the record.
@@ -108,15 +108,13 @@ def cells_told_apart(record: Record, train: slice, model: str = PLAIN) -> int:
         (
             cells
             for cells in reversed(CELLS)
-            if all(
-                _distinguishable(seen, train, model, cells, start) for start in STARTS
-            )
+            if all(_determines(seen, train, model, cells, start) for start in STARTS)
         ),
         0,
     )
 
 
-def _distinguishable(
+def _determines(
     record: Record, train: slice, model: str, cells: int, start: str
 ) -> bool:
     shape = empty(record, cells, None, start)
@@ -138,7 +136,7 @@ def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:
     both histories before the record, virgin and saturated, the better is taken. Raises
     ValueError as those functions do, and if the record determines too few cells.
     """
-    cells = cells_told_apart(record, train, model)
+    cells = distinguishable_cells(record, train, model)
     if not cells:
         raise ValueError(TOO_FEW[model])
     seen = record.until(train.stop)
