@@ -60,7 +60,7 @@ class LockstepDescent:
         """Return loss and verdict of any number of points."""
         program = self._clock.compiled(
             lambda problem, units: in_blocks(
-                lambda unit: problem.both(unit), units, size=self._at_once
+                lambda unit: problem.value_and_verdict(unit), units, size=self._at_once
             ),
             self._problem,
             as_array(units),

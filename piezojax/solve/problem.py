@@ -69,7 +69,7 @@ class Problem(Protocol):
         """Return the augmented Lagrangian; ``HOPELESS`` where it is not finite."""
         ...
 
-    def both(self, unit: Unit) -> tuple[Float[Array, ""], Verdict]:
+    def value_and_verdict(self, unit: Unit) -> tuple[Float[Array, ""], Verdict]:
         """Return ``loss`` and ``verdict`` of one evaluation."""
         ...
 

@@ -183,7 +183,7 @@ class Objective(eqx.Module):
             return jnp.mean(jnp.sort(joined)[-worst:])
         return jnp.mean(joined)
 
-    def _judged(self, loop: LoopFigures) -> tuple[Array, Array]:
+    def _error_and_violations(self, loop: LoopFigures) -> tuple[Array, Array]:
         prices = [weight * value for weight, value in self._prices(loop.tracking)]
         return self._error(loop.tracking) + sum(prices), violations(self.limits, loop)
 
@@ -195,15 +195,17 @@ class Objective(eqx.Module):
 
     def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
         """Return the loss; ``HOPELESS`` where the loop diverges or rails."""
-        return self.both(unit)[0]
+        return self.value_and_verdict(unit)[0]
 
-    def both(self, unit: Float[Array, " n"]) -> tuple[Float[Array, ""], Verdict]:
+    def value_and_verdict(
+        self, unit: Float[Array, " n"]
+    ) -> tuple[Float[Array, ""], Verdict]:
         """Return ``loss`` and ``verdict`` from one simulation."""
-        return self._whole(self.figures(unit))[:2]
+        return self._evaluate(self.figures(unit))[:2]
 
-    def _whole(self, figures: LoopFigures) -> tuple[Array, Verdict, Array]:
+    def _evaluate(self, figures: LoopFigures) -> tuple[Array, Verdict, Array]:
         """Return the loss, the verdict, and the square roots of the penalty terms."""
-        total, violation = self._judged(figures)
+        total, violation = self._error_and_violations(figures)
         added = self._added(violation)
         loss, alone = (
             jnp.where(jnp.isfinite(x), x, HOPELESS)
@@ -220,17 +222,17 @@ class Objective(eqx.Module):
             tracking.rms_error
         )
         weights = slope / jnp.maximum(tracking.rms_error, _FLOOR)
-        loss, verdict, added = self._whole(loop)
+        loss, verdict, added = self._evaluate(loop)
         flat = errors.reshape(-1, errors.shape[-1])
         return Errors(loss, verdict, flat, added, weights.ravel())
 
     def verdict(self, unit: Float[Array, " n"]) -> Verdict:
         """Return the objective without constraints, and the largest violation."""
-        return self.both(unit)[1]
+        return self.value_and_verdict(unit)[1]
 
     def violated(self, unit: Float[Array, " n"]) -> Float[Array, " constraints"]:
         """Return all violations, as ``constraints.violations`` does."""
-        return self._judged(self.figures(unit))[1]
+        return self._error_and_violations(self.figures(unit))[1]
 
     def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " residuals"]:
         """Return residuals whose squares sum to the loss.
