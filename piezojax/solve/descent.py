@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .gauss_newton import EDGE, Quadratic, boxed_step, damped_solution
-from .problem import HOPELESS, Verdict
+from .problem import FAILED_LOSS, Verdict
 
 MOST = 0.5
 """Largest accepted correction as a share of its step."""
@@ -178,7 +178,7 @@ class LocalModel(NamedTuple):
         parts = (slopes * scale).reshape(slopes.shape[0], -1), _ADDED * here.added
         jacobian = np.concatenate(parts, axis=1)
         usable = np.all(np.isfinite(jacobian)) and np.all(np.isfinite(gradient))
-        if not usable or here.loss >= HOPELESS:
+        if not usable or here.loss >= FAILED_LOSS:
             return None
         return cls(Quadratic(gradient, jacobian @ jacobian.T), jacobian, scale)
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .problem import HOPELESS
+from .problem import FAILED_LOSS
 
 
 @jax.custom_vjp
@@ -41,7 +41,7 @@ def with_finite_gradient(loss, *, forward: bool):
             )(jnp.eye(fixed.shape[0]))
         else:
             value, gradient = jax.value_and_grad(loss)(fixed)
-        usable = jnp.all(jnp.isfinite(gradient)) & (value < HOPELESS)
+        usable = jnp.all(jnp.isfinite(gradient)) & (value < FAILED_LOSS)
         gradient = jnp.where(usable, jnp.nan_to_num(gradient), 0.0)
         return _guarded(value, gradient, unit)
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 Unit = Float[Array, " n"]
 """A point of the unit box [0, 1]^n."""
 
-HOPELESS = 1e6
+FAILED_LOSS = 1e6
 """Loss in place of a value that is not finite, so that a line search can step back."""
 
 TOLERANCE = 1e-3
@@ -66,7 +66,7 @@ class Problem(Protocol):
         ...
 
     def loss(self, unit: Unit) -> Float[Array, ""]:
-        """Return the augmented Lagrangian; ``HOPELESS`` where it is not finite."""
+        """Return the augmented Lagrangian; ``FAILED_LOSS`` where it is not finite."""
         ...
 
     def value_and_verdict(self, unit: Unit) -> tuple[Float[Array, ""], Verdict]:

@@ -6,11 +6,11 @@ from typing import Literal
 import numpy as np
 
 from .history import History
-from .problem import HOPELESS, TOLERANCE, Verdict
+from .problem import FAILED_LOSS, TOLERANCE, Verdict
 
 Status = Literal["converged", "step limit", "interrupted"]
 
-VIOLATED = 0.5 * HOPELESS
+VIOLATED = 0.5 * FAILED_LOSS
 """Least rank of a point that violates a constraint."""
 
 
@@ -76,4 +76,4 @@ def rank(verdict: Verdict) -> np.ndarray:
     loss, violation = np.asarray(verdict.loss), np.asarray(verdict.violation)
     loss = np.where(np.isfinite(loss), loss, np.inf)
     violated = VIOLATED + np.minimum(violation, VIOLATED - 1.0)
-    return np.where((violation <= TOLERANCE) | (loss >= HOPELESS), loss, violated)
+    return np.where((violation <= TOLERANCE) | (loss >= FAILED_LOSS), loss, violated)

@@ -18,7 +18,7 @@ from ..core.metrics import Extremes, TrackingFigures
 from ..core.space import Space
 from ..core.system import Feedback
 from ..solve.augmented_lagrangian import PENALTY, augmented
-from ..solve.problem import HOPELESS, Errors, Verdict
+from ..solve.problem import FAILED_LOSS, Errors, Verdict
 from ..study import Stage
 from .runs import Signals, sampled
 
@@ -194,7 +194,7 @@ class Objective(eqx.Module):
         return augmented(violation, multipliers, self.penalty)
 
     def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
-        """Return the loss; ``HOPELESS`` where the loop diverges or rails."""
+        """Return the loss; ``FAILED_LOSS`` where the loop diverges or rails."""
         return self.value_and_verdict(unit)[0]
 
     def value_and_verdict(
@@ -208,7 +208,7 @@ class Objective(eqx.Module):
         total, violation = self._error_and_violations(figures)
         added = self._added(violation)
         loss, alone = (
-            jnp.where(jnp.isfinite(x), x, HOPELESS)
+            jnp.where(jnp.isfinite(x), x, FAILED_LOSS)
             for x in (total + jnp.sum(added**2), total)
         )
         return loss, Verdict(alone, jnp.max(violation, initial=0.0)), added
@@ -251,4 +251,4 @@ class Objective(eqx.Module):
         parts.append(self._added(violations(self.limits, loop)))
         every = jnp.concatenate(parts)
         finite = jnp.all(jnp.isfinite(every))
-        return jnp.where(finite, every, jnp.sqrt(HOPELESS / every.size))
+        return jnp.where(finite, every, jnp.sqrt(FAILED_LOSS / every.size))

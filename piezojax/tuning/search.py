@@ -10,7 +10,7 @@ from ..solve.descent import spacing
 from ..solve.lockstep import LockstepDescent
 from ..solve.multi_start import Strategy, minimise
 from ..solve.optimisers import GAUSS_NEWTON
-from ..solve.problem import HOPELESS
+from ..solve.problem import FAILED_LOSS
 from ..solve.search_state import SearchState
 from ..solve.successive_halving import SuccessiveHalving
 from ..study import Case
@@ -90,7 +90,7 @@ def _starts(losses: np.ndarray, count: int, search: SearchState) -> np.ndarray:
     There are at most ``count``; the own start is left out if it is not stable. Raises
     ValueError if no point is stable.
     """
-    stable = losses < HOPELESS
+    stable = losses < FAILED_LOSS
     if not stable.any():
         raise ValueError(
             f"the loop diverges or rails at the start and all {losses.size - 1} points "

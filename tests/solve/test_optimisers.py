@@ -10,7 +10,7 @@ import pytest
 from piezojax.solve.gauss_newton import damped_gauss_newton
 from piezojax.solve.gradient import with_finite_gradient
 from piezojax.solve.optimisers import METHODS
-from piezojax.solve.problem import HOPELESS, linearised
+from piezojax.solve.problem import FAILED_LOSS, linearised
 
 STEPS = 160
 TOLERANCE = 1e-8
@@ -150,12 +150,12 @@ def test_the_others_come_close_to_a_minimum_on_a_bound(method):
 
 
 def diverging_beyond(edge, problem):
-    """The loss as an Objective has it: HOPELESS, with a NaN slope, beyond ``edge``."""
+    """The loss as an Objective has it: FAILED_LOSS, with a NaN slope, beyond ``edge``."""
 
     def loss(unit):
         blown_up = jnp.sqrt(edge - unit[0])  # NaN beyond the edge, and so is its slope
         total = problem.loss(unit) + 0.0 * blown_up
-        return jnp.where(jnp.isfinite(total), total, HOPELESS)
+        return jnp.where(jnp.isfinite(total), total, FAILED_LOSS)
 
     return loss
 
@@ -175,7 +175,7 @@ def test_a_diverging_start_does_not_stop_the_others(method, forward):
     )
     assert np.isfinite(views.unit).all()
     assert np.all((views.unit >= 0.0) & (views.unit <= 1.0))
-    assert views.loss[-1][2] == HOPELESS
+    assert views.loss[-1][2] == FAILED_LOSS
 
 
 def test_levenberg_marquardt_survives_a_diverging_start():
@@ -184,7 +184,7 @@ def test_levenberg_marquardt_survives_a_diverging_start():
     def residuals(unit):
         # As in Objective.residuals: a finite constant where the run diverged.
         every = problem.residuals(unit) + 0.0 * jnp.sqrt(0.9 - unit[0])
-        return jnp.where(jnp.all(jnp.isfinite(every)), every, jnp.sqrt(HOPELESS / 3.0))
+        return jnp.where(jnp.all(jnp.isfinite(every)), every, jnp.sqrt(FAILED_LOSS / 3.0))
 
     units = starts_of(problem).at[2, 0].set(0.95)
     views = run("levenberg_marquardt", problem._replace(residuals=residuals), units)
@@ -225,7 +225,7 @@ def test_a_diverged_run_has_no_slope(forward):
     loss = diverging_beyond(0.5, PROBLEMS["quadratic"])
     guarded = jax.value_and_grad(with_finite_gradient(loss, forward=forward))
     value, slope = guarded(jnp.array([0.6, 0.2, 0.2]))
-    assert value == HOPELESS
+    assert value == FAILED_LOSS
     np.testing.assert_array_equal(slope, 0.0)
     value, slope = guarded(jnp.array([0.4, 0.2, 0.2]))
     assert value < 50.0

@@ -12,7 +12,7 @@ from piezojax.solve.clock import Clock
 from piezojax.study import Study, build
 from piezojax.tuning.data import make_data
 from piezojax.tuning.evaluator import Evaluator
-from piezojax.tuning.objective import HOPELESS, Objective
+from piezojax.tuning.objective import FAILED_LOSS, Objective
 from piezojax.tuning.runs import Signals
 
 STUDY = {
@@ -160,4 +160,4 @@ def test_one_run_that_rails_is_enough(heights, lost):
     references = jnp.asarray(heights)[:, None] * jnp.ones(400)
     signals = Signals(references, jnp.zeros((2, 1, 400)))
     loss = objective_of(case, signals).loss(case.space.start(case.loop))
-    assert bool(loss == HOPELESS) is lost
+    assert bool(loss == FAILED_LOSS) is lost

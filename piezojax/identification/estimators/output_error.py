@@ -37,7 +37,7 @@ STALLED = Patience(14, share=1e-6)
 """Steps within which the best mean square must fall by this share; otherwise the fit
 ends. A point with a parameter that tends to its bound does not converge by itself."""
 
-HOPELESS = 1e11
+FAILED_LOSS = 1e11
 """Mean square from which on a simulation counts as not finite."""
 
 UNDETERMINED = 1e-12
@@ -181,7 +181,7 @@ def output_error(
     )
     order = np.argsort(standing.losses)[:width]
     losses, units = standing.losses[order], standing.units[order]
-    if losses[0] >= HOPELESS:
+    if losses[0] >= FAILED_LOSS:
         raise ValueError("no start led to a finite simulation of the record")
     values, deviations = _with_errors(problem, as_array(units[0]), losses[0])
     return Optimum(problem, names, units, losses, values, deviations, finished)

@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 from ...core.arrays import as_array, check
 from ...hysteresis import HystereticARMA
 from ..records.record import Record
-from .output_error import HOPELESS, free_run
+from .output_error import FAILED_LOSS, free_run
 from .regressors import Orders, operated, row_matrix, rows
 
 GRID = 9
@@ -286,7 +286,7 @@ def _search(
     def loss(c: float, theta: np.ndarray) -> float:
         mean_square = float(np.mean(problem.error(c, theta) ** 2))
         # The search computes with the loss, so it must be finite.
-        return mean_square if mean_square < HOPELESS else HOPELESS
+        return mean_square if mean_square < FAILED_LOSS else FAILED_LOSS
 
     grid = -np.geomspace(-lowest, -highest, GRID)
     fits, theta = [], None
@@ -295,7 +295,7 @@ def _search(
         fits.append(theta)
     losses = [loss(value, theta) for value, theta in zip(grid, fits, strict=True)]
     best = int(np.argmin(losses))
-    if losses[best] >= HOPELESS:
+    if losses[best] >= FAILED_LOSS:
         raise ValueError("no c in its bounds led to a finite simulation of the record")
     found: Any = minimize_scalar(
         lambda value: loss(value, fit(value, fits[best])),

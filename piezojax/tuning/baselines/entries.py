@@ -7,7 +7,7 @@ from pydantic import BaseModel
 
 from ...core.files import read_model
 from ...solve.history import History
-from ...solve.problem import HOPELESS
+from ...solve.problem import FAILED_LOSS
 
 BASELINES_FILE = "baselines.json"
 
@@ -102,7 +102,7 @@ def contestant(
     assert near is not None
     return Contestant(
         method=method,
-        loss=history.loss if history.loss < HOPELESS else None,
+        loss=history.loss if history.loss < FAILED_LOSS else None,
         holdout_geomean_um=holdout_um,
         evaluations=history.evaluations[-1],
         wall_s=history.times_s[-1],
