@@ -131,7 +131,7 @@ class Extremes(Metric):
         return ExtremeFigures(total["slew"], jnp.where(moves, overshoot, 0.0))
 
 
-class Both(Metric):
+class MetricPair(Metric):
     """Two metrics of one run; the result is the tuple of their figures."""
 
     first: Metric

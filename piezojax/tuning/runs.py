@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..core.axes import PerAxisMetric
-from ..core.metrics import Both, Tracking
+from ..core.metrics import MetricPair, Tracking
 from ..core.rollout import Metric, simulate
 from ..core.system import Feedback, loop_inputs
 
@@ -66,7 +66,7 @@ def sampled(
     """
     metric: Metric = Tracking(start=start)
     if beside is not None:
-        metric = Both(metric, beside)
+        metric = MetricPair(metric, beside)
     if signals.references.ndim > 2:
         metric = PerAxisMetric(metric, signals.references.shape[2])
 
