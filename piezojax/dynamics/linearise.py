@@ -42,20 +42,20 @@ def linearise(
     dt = sample_time(system) if dt is None else dt
     input = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), input)
     state = system.init(input) if state is None else state
-    moving, held = parted(state)
+    moving, held = split_static(state)
     x, unravel_state = ravel_pytree(moving)
     u, unravel_input = ravel_pytree(input)
 
     def step(x: Array, u: Array) -> tuple[Array, Array]:
         state = eqx.combine(unravel_state(x), held)
         state, output = system.step(state, unravel_input(u))
-        return ravel_pytree(parted(state)[0])[0], ravel_pytree(output)[0]
+        return ravel_pytree(split_static(state)[0])[0], ravel_pytree(output)[0]
 
     (A, B), (C, D) = jax.jacfwd(step, argnums=(0, 1))(x, u)
     return StateSpace(A, B, C, D, dt)
 
 
-def parted(state: State) -> tuple[State, State]:
+def split_static(state: State) -> tuple[State, State]:
     """Split ``state`` into the part that small motions change and the part they do not.
 
     The second holds counters, which have no derivative, and ``Learned`` states.

@@ -23,7 +23,7 @@ from jaxtyping import Array, Complex, Float
 from ...core.arrays import Scalar, ScalarLike, State, as_array
 from ...core.rollout import simulate
 from ...core.system import Feedback, LoopState, System
-from ...dynamics.linearise import parted
+from ...dynamics.linearise import split_static
 from .broken_loop import BrokenLoop, cut, open_loop
 from .operating_point import BRANCHES, OperatingPoint
 
@@ -61,11 +61,11 @@ class SmallMotion(System):
 
 
 def _tangent(broken: BrokenLoop, state: State, input: Scalar) -> tuple[State, Scalar]:
-    moving, held = parted(broken.init())
+    moving, held = split_static(broken.init())
 
     def step(moving: State, voltage: Scalar) -> tuple[State, Scalar]:
         state, output = broken.step(eqx.combine(moving, held), voltage)
-        return parted(state)[0], output
+        return split_static(state)[0], output
 
     return jax.jvp(step, (moving, broken.start.voltage), (state, input))[1]
 
@@ -126,7 +126,7 @@ def _sensitivity(
     duration: float,
 ) -> Sensitivity:
     broken = cut(loop, reference, side, state)
-    rest = jax.tree.map(jnp.zeros_like, parted(broken.init())[0])
+    rest = jax.tree.map(jnp.zeros_like, split_static(broken.init())[0])
     push, _ = _tangent(broken, rest, jnp.ones(()))
     impulse = jnp.zeros(round(duration / dt)).at[0].set(1.0)
     _, response = simulate(SmallMotion(broken, push), impulse)
