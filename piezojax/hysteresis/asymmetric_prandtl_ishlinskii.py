@@ -8,7 +8,7 @@ from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
 from ..core.parameter import parameter
 from ..core.recipe import Extent, Fittable, Part, Recipe, around, rests
 from .inverse import Inverse, InverseHysteresis
-from .model import Hysteresis, Laws, remembers
+from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
     PLAYS,
     Memory,
@@ -32,7 +32,7 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     """
 
     before: ClassVar[str | None] = "rest_input"
-    laws: ClassVar[Laws] = remembers()
+    laws: ClassVar[Laws] = turning_point_laws()
     part: ClassVar[Part] = Part(
         "asymmetric_prandtl_ishlinskii",
         "hysteresis",

@@ -9,7 +9,7 @@ from ..core.parameter import parameter
 from ..core.recipe import Extent, Fittable, Part, Recipe
 from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
-from .model import Hysteresis, Laws, remembers
+from .model import Hysteresis, Laws, turning_point_laws
 
 Points = tuple[Scalar, ...]
 
@@ -66,7 +66,7 @@ class BashashJalili(Hysteresis, Fittable):
     extreme is not above the lower one.
     """
 
-    laws: ClassVar[Laws] = remembers(but=("congruency",))
+    laws: ClassVar[Laws] = turning_point_laws(without=("congruency",))
     part: ClassVar[Part] = Part(
         "bashash_jalili",
         "hysteresis",

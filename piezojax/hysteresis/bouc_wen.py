@@ -8,7 +8,7 @@ from ..core.arrays import Scalar, ScalarLike, as_array
 from ..core.parameter import parameter
 from ..core.runge_kutta import runge_kutta
 from .inverse import Inverse, InverseHysteresis
-from .model import Hysteresis, Laws, fades
+from .model import Hysteresis, Laws, differential_laws
 
 
 class BoucWenState(NamedTuple):
@@ -37,7 +37,7 @@ class BoucWen(Hysteresis):
     Raises ValueError for parameters outside their limits.
     """
 
-    laws: ClassVar[Laws] = fades(but=("counter-clockwise",))
+    laws: ClassVar[Laws] = differential_laws(without=("counter-clockwise",))
 
     alpha: Scalar = parameter("N/m", "slope from z = 0")
     beta_gamma: Scalar = parameter("N^(1 - nu)/m", "bend against the velocity's sign")

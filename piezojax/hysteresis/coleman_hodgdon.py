@@ -13,7 +13,7 @@ from ..core.recipe import Extent, Fittable, Part, Recipe, around, rest_bounds, r
 from ..core.space import Range
 from ..core.system import holding_input
 from .inverse import Inverse, InverseHysteresis, check_rising
-from .model import Hysteresis, Laws, fades
+from .model import Hysteresis, Laws, differential_laws
 
 
 class HysteresisState(NamedTuple):
@@ -49,7 +49,7 @@ class ColemanHodgdon(Hysteresis, Fittable):
     """
 
     before: ClassVar[str | None] = "rest_input"
-    laws: ClassVar[Laws] = fades()
+    laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "coleman_hodgdon",
         "hysteresis",

@@ -14,7 +14,7 @@ from ..core.runge_kutta import runge_kutta
 from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
 from .loading import loaded
-from .model import Hysteresis, Laws, fades
+from .model import Hysteresis, Laws, differential_laws
 
 Surface: TypeAlias = tuple[tuple[Scalar, ...], ...]
 
@@ -58,7 +58,7 @@ class Duhem(Hysteresis, Fittable):
     """
 
     before: ClassVar[str | None] = "rest_input"
-    laws: ClassVar[Laws] = fades()
+    laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "duhem",
         "hysteresis",

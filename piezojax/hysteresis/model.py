@@ -35,15 +35,15 @@ not matter; loops run in the sense of a piezo.
 """
 
 
-def remembers(*, but: tuple[str, ...] = ()) -> Laws:
-    """Return the laws of a model that remembers extrema, without those in ``but``."""
-    return {law: share for law, share in LAWS.items() if law not in but}
+def turning_point_laws(*, without: tuple[str, ...] = ()) -> Laws:
+    """Return the laws of a model that remembers extrema, less those in ``without``."""
+    return {law: share for law, share in LAWS.items() if law not in without}
 
 
-def fades(*, but: tuple[str, ...] = ()) -> Laws:
+def differential_laws(*, without: tuple[str, ...] = ()) -> Laws:
     """Return the laws of a differential model, whose memory fades with the path."""
     kept = {"rate independence": STEP, "pauses": EXACT, "counter-clockwise": STEP}
-    return {law: share for law, share in kept.items() if law not in but}
+    return {law: share for law, share in kept.items() if law not in without}
 
 
 class Hysteresis(System):

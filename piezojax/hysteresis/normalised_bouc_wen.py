@@ -12,7 +12,7 @@ from ..core.space import Range
 from .bouc_wen import BoucWen, BoucWenState
 from .inverse import Inverse, InverseHysteresis
 from .loading import loaded
-from .model import Hysteresis, Laws, fades
+from .model import Hysteresis, Laws, differential_laws
 
 SCHEMES = ("runge_kutta", "exact")
 
@@ -53,7 +53,7 @@ class NormalisedBoucWen(Hysteresis, Fittable):
     """
 
     before: ClassVar[str | None] = "rest_input"
-    laws: ClassVar[Laws] = fades()
+    laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "normalised_bouc_wen",
         "hysteresis",

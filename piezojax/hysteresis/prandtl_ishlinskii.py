@@ -6,7 +6,7 @@ from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
 from ..core.parameter import parameter
 from ..core.recipe import Extent, Fittable, Part, Recipe, rests
 from .inverse import Inverse, check_rising
-from .model import Hysteresis, Laws, remembers
+from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
     Memory,
     check_invertible,
@@ -33,7 +33,7 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
     """
 
     before: ClassVar[str | None] = "rest_input"
-    laws: ClassVar[Laws] = remembers()
+    laws: ClassVar[Laws] = turning_point_laws()
     part: ClassVar[Part] = Part(
         "prandtl_ishlinskii",
         "hysteresis",

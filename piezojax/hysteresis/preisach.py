@@ -21,7 +21,7 @@ from ..core.arrays import (
 from ..core.parameter import parameter
 from ..core.system import Designed, System
 from .inverse import Inverse
-from .model import Hysteresis, Laws, remembers
+from .model import Hysteresis, Laws, turning_point_laws
 
 Levels = Float[Array, " cells"]
 Rows = tuple[Float[Array, " cells"], ...]
@@ -63,7 +63,7 @@ class Preisach(Hysteresis, Designed):
     """
 
     before: ClassVar[str | None] = "rest_input"
-    laws: ClassVar[Laws] = remembers()
+    laws: ClassVar[Laws] = turning_point_laws()
 
     weights: Matrix = parameter("um", "weights", least=0.0, converter=as_matrix)
     low: Scalar = parameter("V", "lowest input")

@@ -10,7 +10,7 @@ from ..core.parameter import parameter
 from ..core.recipe import Extent, Fittable, Part, Recipe, rest_bounds, rests
 from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
-from .model import Hysteresis, Laws, fades
+from .model import Hysteresis, Laws, differential_laws
 
 
 class LastPoint(NamedTuple):
@@ -37,7 +37,7 @@ class ShapedColemanHodgdon(Hysteresis, Fittable):
     """
 
     before: ClassVar[str | None] = "rest_input"
-    laws: ClassVar[Laws] = fades()
+    laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "shaped_coleman_hodgdon",
         "hysteresis",

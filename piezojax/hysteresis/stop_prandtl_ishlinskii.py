@@ -8,7 +8,7 @@ from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
 from ..core.parameter import parameter
 from ..core.recipe import Extent, Fittable, Part, Recipe, rests
 from .inverse import Inverse
-from .model import Hysteresis, Laws, remembers
+from .model import Hysteresis, Laws, turning_point_laws
 from .plays import Memory, check_plays, memoryless, plays_recipe, stopped, weighted
 from .prandtl_ishlinskii import PrandtlIshlinskii
 
@@ -35,7 +35,7 @@ class StopPrandtlIshlinskii(Hysteresis, Fittable):
     """
 
     before: ClassVar[str | None] = "rest_input"
-    laws: ClassVar[Laws] = remembers()
+    laws: ClassVar[Laws] = turning_point_laws()
     part: ClassVar[Part] = Part(
         "stop_prandtl_ishlinskii",
         "hysteresis",

@@ -150,7 +150,7 @@ def test_the_others_come_close_to_a_minimum_on_a_bound(method):
 
 
 def diverging_beyond(edge, problem):
-    """The loss as an Objective has it: FAILED_LOSS, with a NaN slope, beyond ``edge``."""
+    """The loss of an Objective: FAILED_LOSS, with a NaN slope, beyond ``edge``."""
 
     def loss(unit):
         blown_up = jnp.sqrt(edge - unit[0])  # NaN beyond the edge, and so is its slope
@@ -184,7 +184,9 @@ def test_levenberg_marquardt_survives_a_diverging_start():
     def residuals(unit):
         # As in Objective.residuals: a finite constant where the run diverged.
         every = problem.residuals(unit) + 0.0 * jnp.sqrt(0.9 - unit[0])
-        return jnp.where(jnp.all(jnp.isfinite(every)), every, jnp.sqrt(FAILED_LOSS / 3.0))
+        return jnp.where(
+            jnp.all(jnp.isfinite(every)), every, jnp.sqrt(FAILED_LOSS / 3.0)
+        )
 
     units = starts_of(problem).at[2, 0].set(0.95)
     views = run("levenberg_marquardt", problem._replace(residuals=residuals), units)
