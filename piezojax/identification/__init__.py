@@ -14,7 +14,7 @@ from .estimators.preisach_density import (
 from .estimators.recursive import Measured as Measured
 from .estimators.recursive import RecursiveLeastSquares as RecursiveLeastSquares
 from .estimators.recursive import recursive_least_squares as recursive_least_squares
-from .estimators.regression import Estimate as Estimate
+from .estimators.regression import RegressionFit as RegressionFit
 from .estimators.regression import instrumental_variables as instrumental_variables
 from .estimators.regression import least_squares as least_squares
 from .estimators.regressors import Orders as Orders

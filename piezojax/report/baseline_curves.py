@@ -11,7 +11,7 @@ from rich.text import Text
 from ..core.files import write_text
 from ..tuning.baselines import Baselines, Contestant
 from ..tuning.baselines.entries import BASELINES_FILE
-from .comparison_map import COLOURS, MARKERS
+from .comparison_map import MARKERS, SERIES_COLOURS
 from .figures import AFTER, figure, headed, styled, ticks_in_full, write
 
 
@@ -84,7 +84,7 @@ def baselines_figure(baselines: Baselines) -> Figure:
     geometric = baselines.aggregate == "geometric_mean"
     picture = figure(7.6, 4.0)
     ax = picture.subplots()
-    colours = [colour for colour in COLOURS if colour != AFTER]
+    colours = [colour for colour in SERIES_COLOURS if colour != AFTER]
     for i, entry in enumerate(e for e in baselines.rivals if e.loss is not None):
         style: dict[str, Any] = {
             "color": colours[i % len(colours)],

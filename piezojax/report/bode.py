@@ -13,7 +13,7 @@ from matplotlib.ticker import MultipleLocator
 from ..analysis.stability import AxesStability, StabilityReport, StabilityReports
 from ..analysis.stability.assess import LoopCurves
 from ..core.files import write_text
-from .figures import COLOURS, MEASURED, REFERENCE, figure, headed, styled, write
+from .figures import LOOP_COLOURS, MEASURED, REFERENCE, figure, headed, styled, write
 
 STABILITY_FILE, STABILITY_PICTURE = "stability.json", "stability.png"
 
@@ -46,7 +46,7 @@ def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
         branches = stability.curves(name, _DECADES)
         for branch, curves in branches.items():
             style: dict[str, Any] = {
-                "color": COLOURS.get(name, REFERENCE),
+                "color": LOOP_COLOURS.get(name, REFERENCE),
                 "ls": LINES[branch],
             }
             report = stability.reports[name][branch]
@@ -127,7 +127,7 @@ def axes_figure(
         report = stability.report
         if not report.stable:
             continue
-        colour, curves = COLOURS.get(name, REFERENCE), stability.curves()
+        colour, curves = LOOP_COLOURS.get(name, REFERENCE), stability.curves()
         for axis, (axis_name, size) in enumerate(zip(names, curves.each, strict=True)):
             left.loglog(
                 curves.frequency,

@@ -15,7 +15,7 @@ from ..tuning.comparison import COMPARISON_FILE, ComparisonResult, TunedStudy
 from .figures import AFTER, BEFORE, MEASURED, figure, styled, write
 
 MARKERS = "osD^vPX*<>hp"
-COLOURS = (
+SERIES_COLOURS = (
     "#1f6f8b",
     "#c9753d",
     "#5b8c3a",
@@ -94,7 +94,7 @@ def comparison_figure(comparison: ComparisonResult) -> Figure:
         rows = [row for row in _rows_of(comparison, controller) if row.after_um]
         every.plot(
             *_curve(rows, "after_um"),
-            color=COLOURS[i % len(COLOURS)],
+            color=SERIES_COLOURS[i % len(SERIES_COLOURS)],
             marker=MARKERS[i % len(MARKERS)],
             ms=3.5,
             label=controller,

@@ -16,7 +16,7 @@ from ..core.files import write_bytes
 REFERENCE, BEFORE, AFTER, MEASURED = "#222222", "#c9753d", "#1f6f8b", "#8a8a8a"
 """Colours with one meaning in every picture."""
 
-COLOURS = {"before": BEFORE, "after": AFTER}
+LOOP_COLOURS = {"before": BEFORE, "after": AFTER}
 """Colours of a loop by its name."""
 
 UNITS = {"um": ("µm", "nm"), "urad": ("µrad", "nrad")}

@@ -13,7 +13,7 @@ from ..dynamics import StateSpace
 from ..hysteresis import ColemanHodgdon
 from ..identification.estimators.subspace import (
     PRIOR,
-    Estimate,
+    Estimator,
     identify_channel,
     least_squares,
     simulation_errors,
@@ -29,7 +29,7 @@ ORDERS = (7, 4, 4)
 class Method:
     """An estimator of the Hankel-Toeplitz parameters, and p of each channel."""
 
-    estimate: Estimate
+    estimate: Estimator
     p: tuple[int, int, int]
 
 

@@ -36,7 +36,7 @@ CONVERGED = 1e-7
 
 
 @dataclass(frozen=True)
-class Estimate:
+class RegressionFit:
     """A fitted model, um from V.
 
     ``simulation_rms`` and ``one_step_rms`` (unit of the output) are the errors of the
@@ -56,7 +56,7 @@ def least_squares(
     *,
     train: slice | None = None,
     c: float | tuple[float, float] | None = None,
-) -> Estimate:
+) -> RegressionFit:
     """Fit by ordinary least squares (3.35) over the samples ``train`` (all by default).
 
     ``c`` (1/V) is a fixed number or a pair of search bounds. By default the bounds span
@@ -77,7 +77,7 @@ def instrumental_variables(
     *,
     train: slice | None = None,
     c: float | tuple[float, float] | None = None,
-) -> Estimate:
+) -> RegressionFit:
     """Fit by refined instrumental variables; arguments as in ``least_squares``.
 
     Rows and outputs are filtered by the inverse denominator. The instruments are the
@@ -155,10 +155,10 @@ class _Problem:
 
     def estimate(
         self, c: float, theta: np.ndarray, standard_errors: HystereticARMA
-    ) -> Estimate:
+    ) -> RegressionFit:
         matrix = rows(self.record, c, self.structure, self.record.output)[self.part]
         one_step = matrix @ theta - self.record.output[self.part]
-        return Estimate(
+        return RegressionFit(
             self.structure.model(c, theta),
             _rms(self.error(c, theta)),
             _rms(one_step),

@@ -25,7 +25,7 @@ from ..records.record import Record
 Theta = Float[np.ndarray, "outputs regressors"]
 Rows = Float[np.ndarray, "rows regressors"]
 Targets = Float[np.ndarray, "rows outputs"]
-Estimate = Callable[[Rows, Targets], Theta]
+Estimator = Callable[[Rows, Targets], Theta]
 
 
 def least_squares(X: Rows, Y: Targets, tolerance: float = 1e-15) -> Theta:
@@ -179,7 +179,7 @@ def identify_channel(
     record: Record,
     p: int,
     order: int,
-    estimate: Estimate = PRIOR,
+    estimate: Estimator = PRIOR,
 ) -> ChannelFit:
     """Fit a model with ``order`` states to a record with one input.
 
@@ -247,7 +247,7 @@ def choose(
     validate: Record,
     ps: Sequence[int],
     orders: Sequence[int],
-    estimate: Estimate = PRIOR,
+    estimate: Estimator = PRIOR,
 ) -> Choice:
     """Choose p and the order by the free-run error on the record ``validate``.
 
