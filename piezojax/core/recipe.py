@@ -11,8 +11,20 @@ PLACES = ("hysteresis", "creep", "dynamics", "lag", "delay")
 """Places of the parts of a chain, in the order in which parts are listed."""
 
 
+class Resonance(NamedTuple):
+    """Natural frequency (Hz) and damping ratio (1) of a resonance."""
+
+    frequency: float
+    damping: float
+
+
 class Extent(NamedTuple):
-    """Ranges of the signals of a record, from which a recipe computes bounds."""
+    """Ranges of the signals of a record, from which a recipe computes bounds.
+
+    ``modes``, ``lags`` and ``delay`` are the linear dynamics that the record shows,
+    from which a recipe takes its starting values; the strongest comes first. They are
+    empty, and the delay None, where nothing was found or looked for.
+    """
 
     low: float  # V
     high: float  # V
@@ -22,6 +34,9 @@ class Extent(NamedTuple):
     span: float  # um
     dt: float  # s
     duration: float  # s
+    modes: tuple[Resonance, ...] = ()
+    lags: tuple[float, ...] = ()  # s, time constants
+    delay: float | None = None  # s
 
     @property
     def width(self) -> float:

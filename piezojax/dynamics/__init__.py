@@ -17,6 +17,7 @@ from .linear_map import LinearMap as LinearMap
 from .linearise import linearise as linearise
 from .matrix_arma import MatrixARMA as MatrixARMA
 from .matrix_arma import observability_form as observability_form
+from .mode import Mode as Mode
 from .neural_state_space import NeuralStateSpace as NeuralStateSpace
 from .reduction import Reduction as Reduction
 from .reduction import balanced_reduction as balanced_reduction

@@ -1,0 +1,133 @@
+"""Empirical frequency response between two measured signals, and its variance."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+EXCITED = 1e-6
+"""Least input power of a returned line, as a share of the strongest line."""
+
+AVERAGES = 8
+"""Number of segments without overlap into which a record is divided by default."""
+
+SHORTEST = 32
+"""Least number of samples in a segment."""
+
+OVERLAP = 1.0 / (1.0 + 2.0 / 36.0)
+"""Independent averages for each half-overlapping segment under a Hann window: the
+windows have the correlation 1/6 (Welch 1967, IEEE Trans. Audio Electroacoustics 15)."""
+
+
+class SpectralResponse(NamedTuple):
+    """A measured frequency response of one input and one output, line by line.
+
+    ``frequency`` [lines] in Hz; ``response`` [lines], complex, output over input;
+    ``variance`` [lines], the expected square of the modulus of its error; ``coherence``
+    [lines], the share of the output power that the input explains linearly, 0 to 1;
+    ``power`` [lines], the power of the input in each line, in its unit squared.
+    """
+
+    frequency: np.ndarray
+    response: np.ndarray
+    variance: np.ndarray
+    coherence: np.ndarray
+    power: np.ndarray
+
+
+def spectral_response(
+    input: np.ndarray,
+    output: np.ndarray,
+    dt: float,
+    *,
+    period: int | None = None,
+    segment: int | None = None,
+) -> SpectralResponse:
+    """Estimate the frequency response from ``input`` to ``output`` [samples].
+
+    With a ``period`` (samples) it is the ratio of the discrete Fourier transforms,
+    averaged over the whole periods at the end of the record: exact in steady state.
+    Without one it is that of Welch, from half-overlapping segments of ``segment``
+    samples under a Hann window, without their means and slopes. Lines that the input
+    does not excite are left out. ``dt`` in s. Source of the variance: Bendat and
+    Piersol, Random Data, 4th ed., section 9.2.
+
+    Raises ValueError for signals of different length, fewer than two whole periods or
+    segments, or an input that never changes.
+    """
+    input, output = np.asarray(input, float), np.asarray(output, float)
+    if input.ndim != 1 or input.shape != output.shape:
+        raise ValueError(
+            f"input has the shape {input.shape} and output {output.shape}; "
+            "both must be [samples]"
+        )
+    if np.ptp(input) == 0.0:
+        raise ValueError("the input never changes; it excites no frequency")
+    if period is not None:
+        return _periodic(input, output, dt, period)
+    return _welch(input, output, dt, segment)
+
+
+def _periodic(
+    input: np.ndarray, output: np.ndarray, dt: float, period: int
+) -> SpectralResponse:
+    whole = input.size // period if period > 1 else 0
+    if whole < 2:
+        raise ValueError(
+            f"the period is {period} samples; {input.size} samples must hold two"
+        )
+    inputs, outputs = (
+        np.fft.rfft(signal[-whole * period :].reshape(whole, period), axis=1) / period
+        for signal in (input, output)
+    )
+    frequency = np.fft.rfftfreq(period, dt)
+    mean, total = outputs.mean(axis=0), np.mean(np.abs(outputs) ** 2, axis=0)
+    noise = np.var(outputs, axis=0, ddof=1) / whole
+    driven = inputs.mean(axis=0)
+    power = np.abs(driven) ** 2
+    kept = _excited(power)
+    return SpectralResponse(
+        frequency[kept],
+        mean[kept] / driven[kept],
+        noise[kept] / power[kept],
+        np.abs(mean[kept]) ** 2 / np.maximum(total[kept], np.finfo(float).tiny),
+        power[kept],
+    )
+
+
+def _welch(
+    input: np.ndarray, output: np.ndarray, dt: float, segment: int | None
+) -> SpectralResponse:
+    import scipy.signal  # takes long to import
+
+    size = segment or max(SHORTEST, 2 ** int(np.log2(max(1, input.size // AVERAGES))))
+    count = (2 * input.size) // size - 1
+    if size < SHORTEST or count < 2:
+        raise ValueError(
+            f"the segment is {size} samples; it must be at least {SHORTEST} and "
+            f"{input.size} samples must hold two that overlap by half"
+        )
+    settings = {"fs": 1.0 / dt, "nperseg": size, "detrend": "linear"}
+    settings["scaling"] = "spectrum"
+    frequency, power = scipy.signal.welch(input, **settings)
+    _, total = scipy.signal.welch(output, **settings)
+    _, cross = scipy.signal.csd(input, output, **settings)
+    kept = _excited(power)
+    frequency, power, total, cross = (
+        values[kept] for values in (frequency, power, total, cross)
+    )
+    explained = np.abs(cross) ** 2 / power
+    coherence = np.clip(explained / np.maximum(total, np.finfo(float).tiny), 0.0, 1.0)
+    averages = OVERLAP * count
+    return SpectralResponse(
+        frequency,
+        cross / power,
+        (total - explained).clip(0.0) / power / averages,
+        coherence,
+        power,
+    )
+
+
+def _excited(power: np.ndarray) -> np.ndarray:
+    """Return the lines, without that at frequency zero, which the input excites."""
+    alternating = np.r_[0.0, power[1:]]
+    return np.flatnonzero(alternating > EXCITED * alternating.max())

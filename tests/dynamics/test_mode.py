@@ -1,0 +1,111 @@
+"""The resonance: response, rest, gradients, and the values that a fit starts from."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from piezojax import Record, load, save, simulate
+from piezojax.core.recipe import Extent, Resonance
+from piezojax.core.registry import parts
+from piezojax.dynamics import Mode
+from piezojax.identification.chain import structure
+
+DT = 1e-4
+INPUT = np.random.default_rng(3).normal(size=400)
+
+
+@jax.jit
+def response(system, inputs, start=0.0):
+    return simulate(system, inputs, system.init(start))[1]
+
+
+def by_matrix_exponential(frequency, damping, inputs, rest):
+    """The state at the end of each sample under a held input, by scipy's expm."""
+    w = 2.0 * np.pi * frequency
+    matrix = np.zeros((3, 3))
+    matrix[:2] = [[0.0, 1.0, 0.0], [-(w**2), -2.0 * damping * w, w**2]]
+    held = scipy.linalg.expm(matrix * DT)
+    state, outputs = np.array([rest, 0.0]), []
+    for value in inputs:
+        state = held[:2, :2] @ state + held[:2, 2] * value
+        outputs.append(state[0])
+    return np.array(outputs)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "damping"),
+    [(300.0, 0.005), (780.0, 0.02), (4000.0, 0.1), (7000.0, 0.3), (50.0, 1.5)],
+)
+def test_it_is_the_held_oscillator(frequency, damping):
+    expected = by_matrix_exponential(frequency, damping, INPUT, 2.0)
+    found = response(Mode(frequency, damping, DT), INPUT, 2.0)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+
+
+def test_it_rests_at_its_input():
+    np.testing.assert_array_equal(
+        response(Mode(780.0, 0.02, DT), np.full(50, 7.0), 7.0), 7.0
+    )
+
+
+def test_its_gradient_is_that_of_differences():
+    def last(parameters):
+        return jnp.sum(response(Mode(*parameters, DT), INPUT) ** 2)
+
+    point = np.array([780.0, 0.02])
+    steps = np.diag(1e-5 * point)
+    differences = [(last(point + h) - last(point - h)) / (2 * h.sum()) for h in steps]
+    np.testing.assert_allclose(jax.grad(last)(point), differences, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0.0, 0.1, DT), "frequency in Hz is 0; it must be finite and above 0"),
+        ((780.0, 0.0, DT), "damping is 0; it must be finite and above 0"),
+        ((780.0, np.nan, DT), "damping is nan"),
+        ((780.0, 0.1, 0.0), "dt in s is 0"),
+    ],
+)
+def test_bad_parameters_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Mode(*arguments)
+
+
+def test_a_saved_mode_is_the_same(tmp_path):
+    save(Mode(780.0, 0.02, DT), tmp_path / "mode.json")
+    back = load(tmp_path / "mode.json")
+    assert (float(back.frequency), float(back.damping), back.dt) == (780.0, 0.02, DT)
+
+
+EXTENT = Extent(0.0, 100.0, (0.0, 0.0), 0.12, 0.0, 12.0, DT, 2.0)
+
+
+def test_a_fit_starts_from_the_resonances_of_the_record():
+    found = (Resonance(780.0, 0.02), Resonance(1900.0, 0.05))
+    recipe = parts()["mode"].recipe(EXTENT._replace(modes=found))
+    assert float(recipe.system.frequency) == 780.0
+    assert recipe.alternatives == [
+        {"frequency": 780.0, "damping": 0.02},
+        {"frequency": 1900.0, "damping": 0.05},
+    ]
+
+
+def test_without_a_resonance_a_fit_starts_from_guesses_inside_the_bounds():
+    recipe = parts()["mode"].recipe(EXTENT)
+    for start in recipe.alternatives:
+        for path, value in start.items():
+            bound = recipe.bounds[path]
+            assert bound.lower < value < bound.upper
+
+
+def test_a_chain_holds_a_mode_a_lag_and_a_delay():
+    shape = structure(
+        "coleman_hodgdon+exponential_creep+mode+lag+delay",
+        Record(INPUT, 0.12 * INPUT, DT),
+    )
+    places = ("hysteresis", "creep", "dynamics", "lag", "delay", "calibration")
+    assert shape.system.names == places
+    assert {"dynamics.frequency", "dynamics.damping"} <= set(shape.space.paths)
