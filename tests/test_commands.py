@@ -285,7 +285,7 @@ def test_tune_bad_studies(tmp_path):
     failed(call("tune", "p754", *out), "study 'p754' is unknown; there are ")
     failed(call("tune", tmp_path / "no.toml", *out), "No such file or directory")
     (tmp_path / "a.toml").write_text("title = = 3")
-    failed(call("tune", tmp_path / "a.toml", *out), "a.toml is no TOML file")
+    failed(call("tune", tmp_path / "a.toml", *out), "a.toml is not a TOML file")
     path = write_study(tmp_path, sead=3)
     failed(call("tune", path, *out), "sead is unknown; allowed are title, rate, seed")
     path = write_study(tmp_path, rate=-3.0)

@@ -61,7 +61,7 @@ def violations(package):
     for parts, (path, is_package) in modules(package).items():
         room, where = parts[0], ".".join(parts)
         if room not in (*ROOMS, *ENTRIES):
-            found.append(f"{where}: {room} is no room")
+            found.append(f"{where}: {room} is not a room")
             continue
         if not is_package and parts[-1] != "__init__" and len(parts) > 1:
             places[parts[-1]].add(room)
@@ -167,7 +167,7 @@ LEGAL = {
             ["core.paths:1 imports simulate from the top"],
         ),
         ({"core/pid.py": ""}, ["pid is a module of control and core"]),
-        ({"utils/pid.py": ""}, ["utils.pid: utils is no room"]),
+        ({"utils/pid.py": ""}, ["utils.pid: utils is not a room"]),
     ],
 )
 def test_a_planted_violation_is_found(tmp_path, planted, expected):

@@ -90,7 +90,7 @@ WHOLE_MODELS = {
     ),
     "neural_state_space": lambda: neural_start(record(), 2, 4),
 }
-"""Models that are no chains of parts, of sizes that a fit gives them."""
+"""Models that are not chains of parts, of sizes that a fit gives them."""
 
 
 @cache

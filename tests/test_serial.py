@@ -371,11 +371,11 @@ def test_messages_lead_to_the_nested_table(part, message):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.toml", b"gain = = 2", "a.toml is no TOML file"),
-        ("a.json", b'{"type": ', "a.json is no JSON file"),
-        ("a.json", b"", "a.json is no JSON file"),
-        ("a.json", bytes(range(256)), "a.json is no JSON file"),
-        ("a.toml", bytes(range(128, 256)), "a.toml is no TOML file"),
+        ("a.toml", b"gain = = 2", "a.toml is not a TOML file"),
+        ("a.json", b'{"type": ', "a.json is not a JSON file"),
+        ("a.json", b"", "a.json is not a JSON file"),
+        ("a.json", bytes(range(256)), "a.json is not a JSON file"),
+        ("a.toml", bytes(range(128, 256)), "a.toml is not a TOML file"),
         ("a.toml", b"", "a.toml needs a key 'type'"),
         ("a.toml", b'type = "Affine"\ngian = 2.0', "a.toml.gian is unknown"),
     ],
@@ -540,7 +540,7 @@ def test_wrong_types_as_users_meet_them(outcomes, name, key):
 
 def test_a_file_nested_without_end(tmp_path):
     (tmp_path / "a.json").write_text("[" * 100_000)
-    with pytest.raises(ValueError, match="is no JSON file"):
+    with pytest.raises(ValueError, match="is not a JSON file"):
         load(tmp_path / "a.json")
 
 

@@ -796,8 +796,8 @@ def test_a_design_that_does_not_fit_the_plant(refusal):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"title = = 3", "is no TOML file: Invalid value (at line 1, column 9)"),
-        (bytes(range(256)), "is no TOML file"),
+        (b"title = = 3", "is not a TOML file: Invalid value (at line 1, column 9)"),
+        (bytes(range(256)), "is not a TOML file"),
         (b"", "title is missing"),
     ],
 )

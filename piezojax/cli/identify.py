@@ -30,22 +30,22 @@ class _SampleRange(click.ParamType):
     "--model",
     default="shaped_coleman_hodgdon+exponential_creep+lag",
     show_default=True,
-    help="Model to fit, parts joined by '+'; 'help' lists them, 'all' tries all.",
+    help="Model to fit, parts joined by '+'; 'help' lists all, 'all' compares all.",
 )
-@click.option("--among", help="With 'all': these and linear models only, by commas.")
+@click.option("--among", help="With 'all': compare only these and linear models.")
 @click.option("--time", help="Time column, by name or number from zero.")
 @click.option("--input", default="0", show_default=True, help="Input column.")
 @click.option("--output", default="1", show_default=True, help="Output column.")
-@click.option("--rate", type=float, help="Sampling rate, Hz, if no time column.")
-@click.option("--period", type=int, help="Samples in a period of a periodic input.")
-@click.option("--resample", type=float, help="Put the record on this rate, Hz.")
-@click.option("--method", help="How to fit it (default: the first that can).")
+@click.option("--rate", type=float, help="Sampling rate, Hz, without a time column.")
+@click.option("--period", type=int, help="Samples per period of a periodic input.")
+@click.option("--resample", type=float, help="Resample the record to this rate, Hz.")
+@click.option("--method", help="Method of the fit (default: the first to apply).")
 @click.option(
     "--order",
     type=click.IntRange(min=1),
     default=4,
     show_default=True,
-    help="States of a linear or neural model.",
+    help="Number of states of a linear or neural model.",
 )
 @click.option(
     "--window",
@@ -59,23 +59,23 @@ class _SampleRange(click.ParamType):
     type=click.IntRange(min=1),
     default=8,
     show_default=True,
-    help="Steps of bouc_wen in a sample.",
+    help="Steps of bouc_wen per sample.",
 )
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
     default=200,
     show_default=True,
-    help="Most steps of a descent.",
+    help="Largest number of optimiser steps.",
 )
 @click.option(
     "--train", type=_SampleRange(), help="Samples to fit (default: first half)."
 )
 @click.option(
-    "--validate", type=_SampleRange(), help="Samples to judge on (default: rest)."
+    "--validate", type=_SampleRange(), help="Samples to validate on (default: rest)."
 )
 @click.option(
-    "--test", type=_SampleRange(), help="With 'all': samples kept from the choice."
+    "--test", type=_SampleRange(), help="With 'all': samples held back from the choice."
 )
 @common
 def main(

@@ -26,7 +26,7 @@ NAMES = (
     "tables",
     multiple=True,
     metavar="T",
-    help=f"Table to redo, repeatable (default: all): {', '.join(NAMES)}.",
+    help=f"Table to reproduce, repeatable (default: all): {', '.join(NAMES)}.",
 )
 @click.option(
     "--calibrate",
@@ -36,7 +36,7 @@ NAMES = (
 )
 @common
 def main(tables, calibrate, out, seed, quiet):
-    """Redo result tables of the thesis in simulation, with the printed gains."""
+    """Reproduce result tables of the thesis in simulation, with the printed gains."""
     del seed  # the simulated noise has its own seeds
 
     # JAX and its users are imported here, so that --help does not wait for them.

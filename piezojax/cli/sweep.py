@@ -32,19 +32,19 @@ def _shard(context: click.Context, option: click.Parameter, text: str) -> tuple:
     default="1/1",
     callback=_shard,
     metavar="i/n",
-    help="Do the i-th of n parts; who finishes the last one merges them all.",
+    help="Run the i-th of n parts; the part that finishes last merges all.",
 )
 @click.option(
     "--samples",
     type=click.IntRange(min=1),
     default=None,
-    help="Number of points drawn; of the study's [parameters] if it has no [sweep].",
+    help="Number of points; without [sweep], of the study's [parameters].",
 )
 @click.option(
     "--dask",
     metavar="WHERE",
     default=None,
-    help="Simulate on Dask workers: a scheduler's address, or how many to start here.",
+    help="Simulate on Dask workers: address of a scheduler, or number to start here.",
 )
 @common
 def main(
@@ -59,8 +59,8 @@ def main(
     """Simulate every point of the [sweep] of STUDY into one labelled data set.
 
     STUDY is a TOML file or the name of a study that comes with piezojax; without it,
-    two gains of the P-753's controller are mapped. A sweep that was interrupted, or
-    killed, goes on where it was when called again with the same --out.
+    two gains of the P-753's controller are mapped. A sweep that was interrupted
+    or killed resumes when called again with the same --out.
     """
     simulate_side_by_side()
 
@@ -91,7 +91,7 @@ def main(
                 raise
             click.echo(
                 "interrupted; what is done is kept, and the same command with "
-                f"--out {folder} goes on from there",
+                f"--out {folder} resumes it",
                 err=True,
             )
             raise SystemExit(INTERRUPTED) from None

@@ -31,7 +31,7 @@ def register(kind: type[S]) -> type[S]:
 
 def _add(kind: type[S]) -> type[S]:
     if not (isinstance(kind, type) and issubclass(kind, System)):
-        raise TypeError(f"{kind!r} is no System; only a System can be registered")
+        raise TypeError(f"{kind!r} is not a System; only a System can be registered")
     other = _registered.get(kind.__name__, kind)
     if not _same(other, kind):
         raise ValueError(

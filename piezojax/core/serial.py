@@ -199,9 +199,11 @@ def _read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}") from None
     except RecursionError:
-        raise ValueError(f"{path} is no {kind.upper()} file: nested too deep") from None
+        raise ValueError(
+            f"{path} is not a {kind.upper()} file: nested too deep"
+        ) from None
     except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no {kind.upper()} file: {error}") from None
+        raise ValueError(f"{path} is not a {kind.upper()} file: {error}") from None
     if not isinstance(data, dict):
         raise ValueError(f"{path.name} needs a key 'type' and the fields of a System")
     return data

@@ -38,7 +38,7 @@ DYNAMICS = ("arma", "lag")
 
 
 LINEAR = "state_space"
-"""Name of the linear model, which is no chain of parts."""
+"""Name of the linear model, which is not a chain of parts."""
 
 
 class Candidate(NamedTuple):
@@ -132,16 +132,19 @@ def first_round(
     """Return the candidates of the first round, and the models that are not tried.
 
     The candidates are a linear chain, a chain with each hysteresis, and the whole
-    models (those that are no chains of parts). ``hysteresis`` names the parts and whole
-    models to try beside the linear ones; all of them if left out. Raises ValueError for
-    a name that is not a hysteresis, or if none of the named ones can be tried.
+    models (those that are not chains of parts). ``hysteresis`` names the parts and
+    whole models to try beside the linear ones; all of them if left out. Raises
+    ValueError for a name that is not a hysteresis, or if none of the named ones can be
+    tried.
     """
     parts = at("hysteresis")
     known = [*parts, *(name for name in whole_names() if name != LINEAR)]
     names = known if hysteresis is None else list(hysteresis)
     for name in names:
         if name not in known:
-            raise ValueError(f"{name!r} is no hysteresis; there are {', '.join(known)}")
+            raise ValueError(
+                f"{name!r} is not a hysteresis model; there are {', '.join(known)}"
+            )
     parts = [name for name in names if name in parts]
     whole, untried = whole_models(records, train, options)
     whole = [c for c in whole if c.model in (LINEAR, *names)]
@@ -218,7 +221,7 @@ def _not_single_channel(records: Sequence[Record]) -> str | None:
 
 
 def whole_names() -> list[str]:
-    """Return the names of the models that are no chains of parts."""
+    """Return the names of the models that are not chains of parts."""
     return list(
         dict.fromkeys(model for method in METHODS.values() for model in method.models)
     )

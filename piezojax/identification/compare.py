@@ -31,7 +31,7 @@ def identify_all(
 
     The first round fits each hysteresis (only the named ones, if any are named) with
     the richest creep and dynamics that the records support, a linear model, and the
-    models that are no chains of parts. Further rounds fit the best few with other
+    models that are not chains of parts. Further rounds fit the best few with other
     creeps or none, and with simpler dynamics. Failed and unsupported models are rows of
     the report. ``train`` and ``validate`` are as in ``identify``; left out, they are
     the halves of the samples before ``test``. Ctrl-C ends the search and keeps the

@@ -165,7 +165,7 @@ class _Estimates(BaseModel):
 def _standard_errors(path: Path, nominal: Stage) -> dict[str, float]:
     """Read the standard errors of a fit file; return them by path in the Stage."""
     try:
-        estimates = read_model(_Estimates, path, "is no fit")
+        estimates = read_model(_Estimates, path, "is not a fit file")
     except ValueError as error:
         raise ValueError(f"ensemble.standard_errors: {error}") from None
     errors = {

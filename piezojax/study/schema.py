@@ -316,5 +316,5 @@ def load(path: str | Path) -> Study:
     except OSError as error:
         raise ValueError(f"study {path}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"study {path} is no TOML file: {error}") from None
+        raise ValueError(f"study {path} is not a TOML file: {error}") from None
     return validated(Study, data, "")

@@ -36,7 +36,7 @@ class SweptTable(RangeTable):
             if not self.values:
                 raise ValueError("values must hold at least one number")
             if list(self.values) != sorted(set(self.values)):
-                raise ValueError("values must rise")
+                raise ValueError("values must increase")
         return self
 
 

@@ -100,7 +100,7 @@ class Store:
             self._compare(manifest)
         elif others:
             raise ValueError(
-                f"--out {self.folder} already holds results that are no sweep; "
+                f"--out {self.folder} already holds results that are not of a sweep; "
                 "name a new folder"
             )
         else:

@@ -247,4 +247,4 @@ def load_result(path: str | Path) -> Result:
     """
     path = Path(path)
     path = path / RESULT_FILE if path.is_dir() else path
-    return read_model(Result, path, "is no result of tuning")
+    return read_model(Result, path, "is not a result of tuning")

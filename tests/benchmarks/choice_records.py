@@ -186,7 +186,7 @@ DRIVES = {"rate_dependent_preisach": loops((*AGAIN, *MORE))}
 """Inputs of those for which LOOPS does not do."""
 
 WHOLE = {"preisach": preisach, "rate_dependent_preisach": rate_dependent_preisach}
-"""Models that are no part of a chain."""
+"""Models that are not part of a chain."""
 
 NAMES = (*TRUTHS, *WHOLE)
 

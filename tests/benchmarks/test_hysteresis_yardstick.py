@@ -1,6 +1,6 @@
 """The hysteresis models that hysteresis.c has compute the same there and in piezojax.
 
-A model without a function in C is no failure.
+A model without a function in C is not a failure.
 """
 
 import importlib

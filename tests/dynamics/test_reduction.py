@@ -1,4 +1,4 @@
-"""Models of fewer states, and models whose n is no multiple of q."""
+"""Models of fewer states, and models whose n is not a multiple of q."""
 
 import jax.numpy as jnp
 import numpy as np

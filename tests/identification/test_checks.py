@@ -300,5 +300,5 @@ def test_a_validation_part_within_the_training_part():
     text = record_warnings(record, slice(0, 2000), slice(1999, SAMPLES))
     assert text == [
         "the validation part shares samples with the training part: "
-        "its error is no measure of prediction"
+        "its error does not measure prediction"
     ]

@@ -33,7 +33,7 @@ RICH = Record(TONES, 0.1 * TONES + 1.0, 1e-3, source="made up")
 
 
 def test_a_name_that_is_no_hysteresis():
-    with pytest.raises(ValueError, match="'lag' is no hysteresis; there are coleman"):
+    with pytest.raises(ValueError, match="'lag' is not a hysteresis model; there"):
         identify_all(RICH, hysteresis=["lag"])
 
 

@@ -103,13 +103,13 @@ def test_a_comma_before_a_blank_separates():
 def test_thousands_are_not_taken_for_decimals():
     columns = parsed("t;u\n0,5;1,5\n1,5;1.234\n2,5;2,5\n")
     assert columns["t"].fault is None
-    assert columns["u"].fault == "sample 1: '1.234' is no number"
+    assert columns["u"].fault == "sample 1: '1.234' is not a number"
 
 
 def test_a_column_of_text_leaves_the_others_alone():
     columns = parsed("t;state;u\n0,5;on;1,5\n1,5;off;2,5\n")
     np.testing.assert_array_equal(columns["u"].values, [1.5, 2.5])
-    assert columns["state"].fault == "sample 0: 'on' is no number"
+    assert columns["state"].fault == "sample 0: 'on' is not a number"
 
 
 def test_empty_cells_are_missing_numbers_and_empty_names_are_counted():
@@ -125,7 +125,7 @@ def test_separators_at_the_ends_of_lines_are_no_columns():
 
 def test_a_row_of_broken_numbers_is_no_row_of_units():
     columns = parsed("t;u;y\n1;overload;2\n3;4;5\n")
-    assert columns["u"].fault == "sample 0: 'overload' is no number"
+    assert columns["u"].fault == "sample 0: 'overload' is not a number"
     assert columns["u"].unit is None
 
 
@@ -300,7 +300,7 @@ def test_a_file_cut_short_is_one_clear_error(tmp_path, name, share):
 def test_a_file_of_another_kind_is_one_clear_error(tmp_path, suffix):
     path = tmp_path / f"record{suffix}"
     path.write_bytes(np.random.default_rng(0).bytes(4096))
-    refused(path, f"cannot be read: it is no {FORMATS[suffix].content}")
+    refused(path, f"cannot be read: it is not {FORMATS[suffix].content}")
 
 
 @pytest.mark.parametrize(
@@ -323,14 +323,14 @@ def test_a_wrong_suffix_is_one_clear_error(tmp_path, suffix, other):
     else:
         WRITERS[other](tmp_path / other)
     path = (tmp_path / other).rename(tmp_path / f"wrong{suffix}")
-    refused(path, f"cannot be read: it is no {FORMATS[suffix].content}")
+    refused(path, f"cannot be read: it is not {FORMATS[suffix].content}")
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".mat", ".h5", ".tdms", ".lvm", ".xlsx"])
 def test_a_text_table_of_another_name_is_one_clear_error(tmp_path, suffix):
     path = tmp_path / f"record{suffix}"
     path.write_text(table_text(",", ".", ["t", "u", "y"]))
-    refused(path, f"cannot be read: it is no {FORMATS[suffix].content}")
+    refused(path, f"cannot be read: it is not {FORMATS[suffix].content}")
 
 
 def test_an_unknown_suffix_lists_those_known(tmp_path):
@@ -365,7 +365,7 @@ def test_a_pickle_is_not_opened(tmp_path):
 
     path = tmp_path / "record.npz"
     np.savez(path, u=np.array([Trap()] * 60, dtype=object))
-    refused(path, "cannot be read: it is no NPZ archive of plain arrays")
+    refused(path, "cannot be read: it is not an NPZ archive of plain arrays")
     # A cached pickle beside an LVM file is what its library would trust.
     lvm = tmp_path / "record.lvm"
     expected = write_lvm(lvm)
@@ -443,7 +443,7 @@ def test_an_excel_sheet_with_units_gaps_and_errors(tmp_path):
     columns = read_columns(path)
     assert [column.unit for column in columns.values()] == ["s", "V", "nm"]
     assert np.flatnonzero(np.isnan(columns["u"].values)).tolist() == [4]
-    assert columns["y"].fault == "sample 6: '#DIV/0!' is no number"
+    assert columns["y"].fault == "sample 6: '#DIV/0!' is not a number"
 
 
 @pytest.mark.parametrize(

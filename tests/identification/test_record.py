@@ -230,7 +230,7 @@ def test_missing_numbers_in_other_columns_do_not_matter(write):
 def test_text_names_column_sample_and_cell(write, cell):
     refused(
         write(text_of(changed(3, 1, cell), delimiter=";")),
-        f"column 'drive_V', sample 3: {cell!r} is no number",
+        f"column 'drive_V', sample 3: {cell!r} is not a number",
     )
 
 
@@ -247,7 +247,7 @@ def test_a_title_above_the_header(write):
     refused(
         write("my record\n" + text_of(ROWS)),
         "sample 0 has 3 columns; the first line has 1 "
-        "(lines that are no data begin with # or %)",
+        "(lines that are not data begin with # or %)",
     )
 
 

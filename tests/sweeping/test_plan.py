@@ -139,7 +139,7 @@ LAG = "plant.time_constant"
         (["parameters", LAG, "values"], [1.0], "either values, or lower and upper"),
         (["parameters", LAG, "lower"], 3e-3, "the lower below the upper"),
         (["parameters", LAG, "lower"], -1.0, "scale 'log' it must be above 0"),
-        (["parameters", PID, "values"], [2.0, 1.0], "values must rise"),
+        (["parameters", PID, "values"], [2.0, 1.0], "values must increase"),
         (["parameters", PID, "values"], [], "at least one number"),
         (
             ["parameters", "controller.proportonal"],

@@ -289,7 +289,7 @@ def test_foreign_folders_and_chunks_are_refused(case_of, write, tmp_path):
         run_sweep(case, tmp_path / "a")
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "result.json").touch()
-    with pytest.raises(ValueError, match="already holds results that are no sweep"):
+    with pytest.raises(ValueError, match="holds results that are not of a sweep"):
         run_sweep(case, tmp_path / "c")
 
 

@@ -171,7 +171,7 @@ def test_results_that_are_none(tmp_path):
         load_result(tmp_path)
     for content in ("", "{", "{}", '{"study": 3}'):
         (tmp_path / "result.json").write_text(content)
-        with pytest.raises(ValueError, match=r"result.json is no result of tuning: "):
+        with pytest.raises(ValueError, match=r"json is not a result of tuning: "):
             load_result(tmp_path)
 
 

@@ -97,7 +97,7 @@ def worst_sensitivity(
     inside = 1.0 / (1.0 - jnp.minimum(share, NEAR_ONE))
     steep = 1.0 / (1.0 - NEAR_ONE) ** 2
     beyond = steep * jnp.maximum(share - NEAR_ONE, 0.0)
-    # Where the loop can be unstable, a small |S| is no merit.
+    # Where the loop can be unstable, a small |S| proves nothing.
     size = jnp.abs(sensitivity)
     size = jnp.where(share > NEAR_ONE, jnp.maximum(size, 1.0), size)
     return size * (inside + beyond)

@@ -50,7 +50,7 @@ def record_warnings(
     if validate.start < train.stop and train.start < validate.stop:
         warnings.append(
             "the validation part shares samples with the training part: "
-            "its error is no measure of prediction"
+            "its error does not measure prediction"
         )
     return warnings
 

@@ -49,7 +49,7 @@ def decoded(content: bytes) -> str:
     except UnicodeDecodeError:
         text = content.decode("cp1252")  # "µ" is one byte there
     if "\0" in text:
-        raise ValueError("a zero byte is no text")
+        raise ValueError("a zero byte is not text")
     return text
 
 
@@ -90,7 +90,7 @@ def table(rows: Sequence[Sequence[str]], decimal: str = ".") -> Columns:
         if len(row) < width or any(row[width:]):
             raise ContentError(
                 f"sample {i} has {len(row)} columns; the first line has {width} "
-                f"(lines that are no data begin with {' or '.join(COMMENT)})"
+                f"(lines that are not data begin with {' or '.join(COMMENT)})"
             )
     return {
         name: _column([row[j] for row in rows], units[j].strip() or None, decimal)
@@ -152,5 +152,5 @@ def _column(cells: Sequence[str], unit: str | None, decimal: str) -> Column:
             for i, cell in enumerate(cells)
             if cell and not _numeric(cell, decimal)
         )
-        fault = f"sample {sample}: {cell!r} is no number"
+        fault = f"sample {sample}: {cell!r} is not a number"
         return Column(np.full(len(cells), np.nan), unit, fault=fault)

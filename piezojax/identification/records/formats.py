@@ -45,7 +45,7 @@ def read_columns(path: Path) -> Columns:
             raise ValueError(f"record {path}: {error.strerror}") from None
         # A library may raise any exception on a broken file.
         raise ValueError(
-            f"record {path} cannot be read: it is no {form.content}"
+            f"record {path} cannot be read: it is not {form.content}"
         ) from error
     return columns
 
@@ -154,20 +154,20 @@ class _Format(NamedTuple):
     read: Callable[[BinaryIO], Columns]
 
 
-_TEXT = _Format("text table", _delimited)
-_HDF5 = _Format("HDF5 file of plain arrays", _hdf5)
+_TEXT = _Format("a text table", _delimited)
+_HDF5 = _Format("an HDF5 file of plain arrays", _hdf5)
 
 FORMATS = {
     ".csv": _TEXT,
     ".txt": _TEXT,
     ".dat": _TEXT,
-    ".npz": _Format("NPZ archive of plain arrays", _npz),
-    ".mat": _Format("MATLAB file of plain arrays", _mat),
+    ".npz": _Format("an NPZ archive of plain arrays", _npz),
+    ".mat": _Format("a MATLAB file of plain arrays", _mat),
     ".h5": _HDF5,
     ".hdf5": _HDF5,
-    ".tdms": _Format("TDMS file", _tdms),
-    ".lvm": _Format("LabVIEW measurement file", _lvm),
-    ".xlsx": _Format("Excel workbook", _xlsx),
+    ".tdms": _Format("a TDMS file", _tdms),
+    ".lvm": _Format("a LabVIEW measurement file", _lvm),
+    ".xlsx": _Format("an Excel workbook", _xlsx),
 }
 """File formats by suffix; of a workbook the first sheet is read."""
 
