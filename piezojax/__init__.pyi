@@ -15,6 +15,9 @@ from . import tuning as tuning
 from .analysis.stability import stability_report as stability_report
 from .core.about import About as About
 from .core.axes import PerAxis as PerAxis
+from .core.feedback import Feedback as Feedback
+from .core.feedback import Observation as Observation
+from .core.feedback import loop_inputs as loop_inputs
 from .core.metrics import Tracking as Tracking
 from .core.registry import register as register
 from .core.rollout import Metric as Metric
@@ -24,12 +27,9 @@ from .core.serial import read_about as read_about
 from .core.serial import save as save
 from .core.system import Affine as Affine
 from .core.system import Delay as Delay
-from .core.system import Feedback as Feedback
-from .core.system import Observation as Observation
 from .core.system import Parallel as Parallel
 from .core.system import Series as Series
 from .core.system import System as System
-from .core.system import loop_inputs as loop_inputs
 from .core.system import series as series
 from .hardware import Saturation as Saturation
 from .hardware import Sensor as Sensor

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from .core.arrays import Scalar, ScalarLike, State, as_array, check_order
+from .core.feedback import holding_input
 from .core.parameter import parameter, sample_time
-from .core.system import System, holding_input, rest_output
+from .core.system import System, rest_output
 
 
 class Saturation(System):

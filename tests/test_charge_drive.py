@@ -15,9 +15,7 @@ from piezojax import (
     simulate,
 )
 from piezojax.catalog import p753, p753_survey
-from piezojax.core.system import (
-    Affine,
-)
+from piezojax.core.system import Affine
 from piezojax.hardware import (
     ChargeDrive,
     Sensor,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.core.system import LoopSample
+from piezojax.core.feedback import LoopSample
 from piezojax.signals import (
     ContourError,
     contours,

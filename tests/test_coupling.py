@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.core.system import LoopSample
+from piezojax.core.feedback import LoopSample
 from piezojax.report import tuning_pictures as tuning
 from piezojax.report.contour_path import contour_figure
 from piezojax.report.coupling_map import coupling_figure

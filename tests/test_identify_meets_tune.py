@@ -131,7 +131,7 @@ def test_every_model_has_every_design_or_the_reason_why_not(model, design):
     state, reference = started(loop)
     span = abs(float(rest_output(plant(model), 60.0) - reference))
     if model in SLOW_TO_COMPILE or design == "inversion_sliding_mode":
-        inputs = pj.core.system.LoopInput(reference, jnp.asarray(0.0))
+        inputs = pj.core.feedback.LoopInput(reference, jnp.asarray(0.0))
         for _ in range(2):
             state, sample = loop.step(state, inputs)
             assert abs(float(sample.voltage) - 50.0) < 1e-6

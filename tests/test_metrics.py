@@ -3,10 +3,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from piezojax.core.feedback import LoopSample
 from piezojax.core.metrics import (
     Tracking,
 )
-from piezojax.core.system import LoopSample
 
 SAMPLES = 300
 

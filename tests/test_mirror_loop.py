@@ -10,7 +10,7 @@ import pytest
 import piezojax as pj
 from piezojax.catalog import mirror
 from piezojax.core.axes import packed
-from piezojax.core.system import loop_inputs
+from piezojax.core.feedback import loop_inputs
 
 REST = (0.0, 0.0, 0.0)
 

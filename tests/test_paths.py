@@ -30,11 +30,7 @@ from piezojax.core.paths import (
     replace,
     static_fields,
 )
-from piezojax.core.system import (
-    Affine,
-    Delay,
-    System,
-)
+from piezojax.core.system import Affine, Delay, System
 from piezojax.dynamics import (
     FirstOrderLag,
 )

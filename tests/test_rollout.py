@@ -11,16 +11,14 @@ from piezojax import (
 )
 from piezojax.catalog import p753
 from piezojax.core import paths
+from piezojax.core.feedback import LoopInput
 from piezojax.core.metrics import (
     Tracking,
 )
 from piezojax.core.rollout import (
     in_blocks,
 )
-from piezojax.core.system import (
-    Affine,
-    LoopInput,
-)
+from piezojax.core.system import Affine
 from piezojax.hysteresis import (
     ColemanHodgdon,
 )

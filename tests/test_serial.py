@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import piezojax as pj
 from piezojax.catalog import CONTROLLERS, PLANTS, p753
+from piezojax.core.feedback import Observation
 from piezojax.core.serial import from_data, load, read_about, save, to_data
-from piezojax.core.system import Observation
 
 SCALAR = {
     "affine": pj.core.system.Affine(2.0, -0.5),

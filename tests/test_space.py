@@ -14,9 +14,7 @@ from piezojax.control import (
 )
 from piezojax.core.paths import replace
 from piezojax.core.space import INSIDE, SCALES, Range, space_of, squash, unsquash
-from piezojax.core.system import (
-    Affine,
-)
+from piezojax.core.system import Affine
 
 UNIT = st.floats(0.0, 1.0)
 SIDES = {

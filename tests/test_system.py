@@ -20,14 +20,8 @@ from piezojax.control import (
     DisturbanceObserverControl,
     InversionControl,
 )
-from piezojax.core.system import (
-    Affine,
-    Delay,
-    Parallel,
-    Series,
-    holding_input,
-    rest_output,
-)
+from piezojax.core.feedback import holding_input
+from piezojax.core.system import Affine, Delay, Parallel, Series, rest_output
 from piezojax.dynamics import (
     ARMA,
     FirstOrderLag,

@@ -28,7 +28,8 @@ from ..control.anticipation import Anticipation
 from ..control.multi_axis import MultiAxisSlidingMode
 from ..control.switching import SwitchingPID
 from ..core.axes import PerAxis, as_matrices, as_rows, diagonal
-from ..core.system import Feedback, System
+from ..core.feedback import Feedback
+from ..core.system import System
 from ..dynamics import MatrixARMA, SecondOrderLag, StateSpace, observability_form
 from ..hardware import Saturation, Sensor
 

@@ -16,7 +16,8 @@ from ..control.nominal import NominalSlidingMode
 from ..control.pid import PID
 from ..control.switching import SwitchingPID
 from ..core.axes import PerAxis, diagonal
-from ..core.system import Feedback, System
+from ..core.feedback import Feedback
+from ..core.system import System
 from ..dynamics import ARMA, Channels, SecondOrderLag, channels_of, observability_form
 from ..hardware import Saturation, Sensor
 from . import p558

@@ -22,7 +22,8 @@ from ..control import (
 )
 from ..control.kalman import model_kalman
 from ..core.arrays import ScalarLike
-from ..core.system import Feedback, Series, System, series
+from ..core.feedback import Feedback
+from ..core.system import Series, System, series
 from ..dynamics import ARMA, scaled_to_dc
 from ..hardware import Saturation, Sensor
 from ..hysteresis import ColemanHodgdon, InverseColemanHodgdon

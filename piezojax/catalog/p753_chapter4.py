@@ -18,7 +18,8 @@ from ..control import (
     SwitchingPID,
 )
 from ..core.arrays import ScalarLike
-from ..core.system import Feedback, Series, System, series
+from ..core.feedback import Feedback
+from ..core.system import Series, System, series
 from ..dynamics import ARMA, Held, SecondOrderLag, scaled_to_dc
 from ..hardware import Sensor
 from . import p753

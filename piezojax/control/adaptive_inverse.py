@@ -5,8 +5,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, State, as_array, as_scalars
+from ..core.feedback import Observation
 from ..core.parameter import parameter, sample_time
-from ..core.system import Observation, Series, System
+from ..core.system import Series, System
 from ..dynamics.lag import FirstOrderLag
 from .recursive_weights import RecursiveWeights
 

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, as_array
+from ..core.feedback import Observation
 from ..core.parameter import parameter, sample_time
-from ..core.system import Observation
 from .observer import Motion, Observer
 
 

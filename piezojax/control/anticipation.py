@@ -4,8 +4,9 @@ from typing import Any
 
 from ..core.arrays import Scalar, State, as_scalars
 from ..core.axes import Axes
+from ..core.feedback import Observation
 from ..core.parameter import parameter
-from ..core.system import Observation, System
+from ..core.system import System
 
 
 class Anticipation(System):

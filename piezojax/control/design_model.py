@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.arrays import Scalar, ScalarLike, as_array
-from ..core.system import Affine, Feedback, LoopInput, Series, System, rest_output
+from ..core.feedback import Feedback, LoopInput
+from ..core.system import Affine, Series, System, rest_output
 from ..dynamics import ARMA, StateSpace, fast_part, linearise, reduced, scaled_to_dc
 from ..hardware import Sensor
 from ..hysteresis import HystereticARMA

@@ -5,8 +5,9 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 
 from ..core.arrays import Scalar, State, check_not_zero
+from ..core.feedback import Observation
 from ..core.parameter import PartUnits, parameter, sample_time
-from ..core.system import Observation, System
+from ..core.system import System
 from ..dynamics.arma import ARMA
 from .output_tracking import check_second_order
 

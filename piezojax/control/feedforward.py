@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 from ..core.arrays import Scalar, State, as_array
-from ..core.system import Observation, System, rest_output
+from ..core.feedback import Observation
+from ..core.system import System, rest_output
 
 
 class FeedforwardState(NamedTuple):

@@ -5,7 +5,8 @@ from typing import Any
 import jax
 
 from ..core.arrays import State
-from ..core.system import Observation, System
+from ..core.feedback import Observation
+from ..core.system import System
 from .observer import Motion
 
 

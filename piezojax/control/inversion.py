@@ -3,8 +3,9 @@
 from typing import Any, ClassVar, NamedTuple
 
 from ..core.arrays import Scalar, ScalarLike, State, as_array, check_not_zero
+from ..core.feedback import Observation
 from ..core.parameter import PartUnits
-from ..core.system import Affine, Observation, System, rest_output
+from ..core.system import Affine, System, rest_output
 from ..hysteresis.inverse import Inverse
 
 

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..core.arrays import Scalar, as_array, as_scalars, check
+from ..core.feedback import Feedback, loop_inputs
 from ..core.metrics import root
 from ..core.parameter import check_declared, parameter
 from ..core.rollout import simulate
-from ..core.system import Feedback, System, loop_inputs
+from ..core.system import System
 
 Signal = Float[Array, " samples"]
 

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from scipy import linalg
 
 from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars, check
+from ..core.feedback import Observation
 from ..core.parameter import parameter, sample_time
-from ..core.system import Observation
 from ..dynamics.arma import ARMA
 from .observer import Motion, Observer
 

@@ -7,8 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, State, as_array, as_scalars
+from ..core.feedback import Observation
 from ..core.parameter import PartUnits, parameter
-from ..core.system import Observation, System
+from ..core.system import System
 from ..dynamics.arma import ARMA
 from .observer import Observer
 from .output_tracking import check_inversion, inversion_gain

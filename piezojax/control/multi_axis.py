@@ -19,8 +19,9 @@ from ..core.axes import (
     plus,
     product,
 )
+from ..core.feedback import Observation
 from ..core.parameter import PartUnits, declarations, parameter
-from ..core.system import Designed, Observation, System
+from ..core.system import Designed, System
 from ..dynamics.matrix_arma import MatrixARMA
 from .switching import SwitchingLaw
 

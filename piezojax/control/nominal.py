@@ -6,8 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, State, as_array
+from ..core.feedback import Observation
 from ..core.parameter import PartUnits, parameter
-from ..core.system import Observation, System
+from ..core.system import System
 from ..dynamics.arma import ARMA
 from .output_tracking import check_second_order
 from .switching import SwitchingLaw

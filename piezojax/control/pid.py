@@ -5,8 +5,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar
+from ..core.feedback import Observation
 from ..core.parameter import parameter, sample_time
-from ..core.system import Observation, System
+from ..core.system import System
 
 
 class PIDState(NamedTuple):

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..core.arrays import Scalar, State, as_array
+from ..core.feedback import Observation
 from ..core.parameter import parameter
-from ..core.system import Observation, System
+from ..core.system import System
 
 
 class RepetitiveState(NamedTuple):

@@ -5,8 +5,9 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 
 from ..core.arrays import Scalar, State, as_array
+from ..core.feedback import Observation
 from ..core.parameter import PartUnits, parameter
-from ..core.system import Observation, System
+from ..core.system import System
 from ..dynamics.arma import ARMA
 from .observer import Observer
 from .output_tracking import (

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..core.arrays import Scalar
-from ..core.system import Observation, System
+from ..core.feedback import Observation
+from ..core.system import System
 from ..dynamics.state_space import StateSpace
 
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .arrays import Scalar, State
+from .feedback import LoopSample
 from .rollout import Metric
-from .system import LoopSample
 
 
 class TrackingFigures(NamedTuple):

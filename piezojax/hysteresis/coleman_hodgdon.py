@@ -8,10 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array
+from ..core.feedback import holding_input
 from ..core.parameter import parameter
 from ..core.recipe import Extent, Fittable, Part, Recipe, around, rest_bounds, rests
 from ..core.space import Range
-from ..core.system import holding_input
 from .inverse import Inverse, InverseHysteresis, check_rising
 from .model import Hysteresis, Laws, differential_laws
 

@@ -11,9 +11,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..core.arrays import Scalar, ScalarLike, State, as_array, check_order
+from ..core.feedback import holding_input
 from ..core.parameter import parameter
 from ..core.rollout import simulate
-from ..core.system import System, holding_input
+from ..core.system import System
 
 
 class Inverse(System):

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..catalog import p753, p753_chapter4
+from ..core.feedback import loop_inputs
 from ..core.rollout import simulate
-from ..core.system import System, loop_inputs
+from ..core.system import System
 from ..signals import waveforms as signals
 from .cell import Cell, printed, window
 

@@ -4,9 +4,10 @@ import equinox as eqx
 import jax
 
 from ..catalog import p753
+from ..core.feedback import loop_inputs
 from ..core.metrics import Tracking
 from ..core.rollout import simulate
-from ..core.system import System, loop_inputs
+from ..core.system import System
 from ..signals import waveforms as signals
 from .cell import Cell, printed, window
 

@@ -11,9 +11,10 @@ from jaxtyping import Array, Bool, Float
 
 from ..catalog import p753
 from ..core.arrays import State
+from ..core.feedback import Feedback, LoopInput, loop_inputs
 from ..core.paths import parameters, replace
 from ..core.rollout import Metric, simulate
-from ..core.system import Feedback, LoopInput, System, loop_inputs
+from ..core.system import System
 from ..signals import waveforms as signals
 from . import chapter4, chapter5
 from .cell import Cell, window

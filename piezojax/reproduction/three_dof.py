@@ -13,9 +13,10 @@ from jaxtyping import Array, Float
 from ..catalog import p558, p558_control, p558_stage
 from ..core.arrays import State
 from ..core.axes import PerAxisMetric
+from ..core.feedback import LoopSample, loop_inputs
 from ..core.metrics import Tracking
 from ..core.rollout import Metric, simulate
-from ..core.system import LoopSample, System, loop_inputs
+from ..core.system import System
 from ..signals import waveforms as signals
 from .cell import Cell, printed
 

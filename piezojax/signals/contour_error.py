@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.arrays import Scalar, State
+from ..core.feedback import LoopSample
 from ..core.metrics import root
 from ..core.rollout import Metric
-from ..core.system import LoopSample
 
 _Point = tuple[Scalar, Scalar]
 

@@ -13,11 +13,12 @@ from ..catalog import CONTROLLERS, PLANTS, at_rate
 from ..control.design import DESIGNS
 from ..core.arrays import as_array
 from ..core.axes import PerAxis
+from ..core.feedback import Feedback, Observation
 from ..core.paths import declared, static_fields
 from ..core.serial import from_data, read_about
 from ..core.serial import load as load_system
 from ..core.space import Space
-from ..core.system import Feedback, Observation, System, rest_output, series
+from ..core.system import System, rest_output, series
 from ..hardware import Quantiser, Saturation, Sensor, SlewLimit
 from ..identification import Fit, identify, read_record
 from .ensemble import Ensemble, Stage, ensemble_of

@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from ..catalog import CONTROLLERS, at_rate
+from ..core.feedback import Feedback
 from ..core.paths import get
-from ..core.system import Affine, Feedback
+from ..core.system import Affine
 from .case import Case, build, read
 from .schema import ObjectiveTable, OptimiserTable, References, Study
 from .stage_tables import SensorTable

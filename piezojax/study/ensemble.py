@@ -14,9 +14,10 @@ from pydantic import BaseModel
 
 from ..catalog import PLANTS, deviations_of
 from ..core.arrays import as_array
+from ..core.feedback import Feedback
 from ..core.files import read_model
 from ..core.paths import get, replace
-from ..core.system import Feedback, System
+from ..core.system import System
 from .schema import Study
 
 Part = Literal["tune", "margins", "holdout"]

@@ -5,10 +5,11 @@ from collections.abc import Iterable
 
 import jax.numpy as jnp
 
+from ..core.feedback import Feedback
 from ..core.paths import declared, get, matching, replace
 from ..core.serial import from_data, to_data
 from ..core.space import Range, Space, space_of
-from ..core.system import Feedback, System
+from ..core.system import System
 from .schema import Study, TunedTable
 
 PART = "controller."

@@ -15,10 +15,11 @@ from ..analysis.stability.differentiable import peak_of, sensitivities
 from ..analysis.stability.operating_point import BRANCHES
 from ..core.arrays import State
 from ..core.axes import PerAxisMetric, packed
+from ..core.feedback import Feedback, LoopSample, loop_inputs
 from ..core.metrics import Tracking
 from ..core.paths import replace
 from ..core.rollout import Metric, simulate
-from ..core.system import Feedback, LoopSample, System, loop_inputs
+from ..core.system import System
 from ..signals.waveforms import time_grid
 from ..study import Case, Stage
 from ..study.sweep_table import SENSITIVITY

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.system import LoopSample
+from ..core.feedback import LoopSample
 from ..signals import motions
 from ..signals.contour_error import nearest_on
 from ..study import Study

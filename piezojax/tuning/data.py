@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..core.arrays import as_array, as_signal
-from ..core.system import holding_input
+from ..core.feedback import holding_input
 from ..signals import motions
 from ..signals import waveforms as signal_library
 from ..study import Case, Study

@@ -9,8 +9,8 @@ import jax
 from ..analysis.constraints import LoopFigures, uses
 from ..analysis.stability.differentiable import sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
+from ..core.feedback import Feedback
 from ..core.metrics import Extremes, TrackingFigures
-from ..core.system import Feedback
 from ..solve.clock import Clock
 from ..study import Case, Stage
 from .runs import Signals, evaluate

@@ -14,9 +14,9 @@ from ..analysis.constraints import LoopFigures, uses, violations
 from ..analysis.stability.differentiable import sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
 from ..core.arrays import as_array
+from ..core.feedback import Feedback
 from ..core.metrics import Extremes, TrackingFigures
 from ..core.space import Space
-from ..core.system import Feedback
 from ..solve.augmented_lagrangian import PENALTY, augmented
 from ..solve.problem import FAILED_LOSS, Errors, Verdict
 from ..study import Stage

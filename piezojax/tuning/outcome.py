@@ -11,8 +11,9 @@ import numpy as np
 from ..analysis.limit import LimitReport, performance_limit
 from ..analysis.stability import StabilityReports, stability_reports
 from ..core.about import About
+from ..core.feedback import Feedback, LoopSample, loop_inputs
 from ..core.rollout import simulate
-from ..core.system import Feedback, LoopSample, System, loop_inputs
+from ..core.system import System
 from ..study import Case
 from .baselines import Baselines
 from .coupling import Coupling, coupling_matrix

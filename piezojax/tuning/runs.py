@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..core.axes import PerAxisMetric
+from ..core.feedback import Feedback, loop_inputs
 from ..core.metrics import MetricPair, Tracking
 from ..core.rollout import Metric, simulate
-from ..core.system import Feedback, loop_inputs
 
 
 class Signals(eqx.Module):

@@ -9,9 +9,9 @@ import numpy as np
 
 from ..analysis.constraints import worst_by_plant
 from ..core.arrays import as_array
+from ..core.feedback import Feedback
 from ..core.metrics import TrackingFigures
 from ..core.progress import Progress, Silent
-from ..core.system import Feedback
 from ..solve.clock import Clock
 from ..solve.search_state import SearchState
 from ..study import Case, Stage, read, shipped

@@ -13,7 +13,7 @@ import piezojax as pj
 from piezojax.analysis.stability.conserved import LinearLoop
 from piezojax.analysis.stability.margins import linear_loop, report_of
 from piezojax.catalog import p753
-from piezojax.core.system import LoopInput
+from piezojax.core.feedback import LoopInput
 
 DT = 5e-5
 A, B = published.T2_P, published.T2_G

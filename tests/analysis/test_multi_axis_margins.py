@@ -26,7 +26,7 @@ from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
 from piezojax.analysis.stability.margins import _model, linear_axes
 from piezojax.analysis.stability.operating_point import OperatingPoint
 from piezojax.catalog import p558_control
-from piezojax.core.system import LoopInput
+from piezojax.core.feedback import LoopInput
 
 REST = (0.0, 0.0, 0.0)
 STATE = {

@@ -16,7 +16,7 @@ from piezojax.analysis.stability import (
     stability_reports,
 )
 from piezojax.catalog import p753
-from piezojax.core.system import LoopInput
+from piezojax.core.feedback import LoopInput
 from piezojax.dynamics import linearise
 from piezojax.report.bode import write_stability
 

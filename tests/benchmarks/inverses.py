@@ -34,8 +34,8 @@ from piezojax import (
     simulate,
 )
 from piezojax.catalog import p753, p753_inverses
+from piezojax.core.feedback import loop_inputs
 from piezojax.core.rollout import Metric
-from piezojax.core.system import loop_inputs
 from piezojax.hardware import (
     Sensor,
 )

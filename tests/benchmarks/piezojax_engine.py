@@ -13,7 +13,7 @@ from loop_three_dof import THREE_DOF_PID_SMC
 import piezojax
 from piezojax.catalog import p558_control, p753
 from piezojax.core.axes import PerAxisMetric
-from piezojax.core.system import LoopInput
+from piezojax.core.feedback import LoopInput
 
 BLOCK = 64  # lanes simulated at a time
 

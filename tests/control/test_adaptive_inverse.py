@@ -12,7 +12,7 @@ import piezojax as pj
 from piezojax.analysis.stability.differentiable import peak_of, sensitivity
 from piezojax.catalog import p753, p753_stage
 from piezojax.control.recursive_weights import RecursiveWeights
-from piezojax.core.system import LoopInput, Observation
+from piezojax.core.feedback import LoopInput, Observation
 
 SAMPLES = 10_000
 NOISE_RMS = 0.012

@@ -16,7 +16,8 @@ from piezojax.core.axes import (
     PerAxis,
     packed,
 )
-from piezojax.core.system import holding_input, rest_output, series
+from piezojax.core.feedback import holding_input
+from piezojax.core.system import rest_output, series
 from piezojax.dynamics import ARMA, LinearMap
 from piezojax.hysteresis import PrandtlIshlinskii
 from piezojax.signals import motions

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 import piezojax as pj
-from piezojax.core.system import Observation
+from piezojax.core.feedback import Observation
 
 
 class Echo(pj.System):

@@ -27,10 +27,10 @@ from piezojax.control import (
     SwitchingPID,
 )
 from piezojax.control.output_tracking import INVERSIONS
+from piezojax.core.feedback import LoopInput, Observation
 from piezojax.core.metrics import (
     Tracking,
 )
-from piezojax.core.system import LoopInput, Observation
 from piezojax.dynamics import (
     ARMA,
     SecondOrderLag,

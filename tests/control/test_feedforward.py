@@ -16,10 +16,8 @@ from piezojax.control import (
     FeedforwardFeedback,
     InverseFeedforward,
 )
-from piezojax.core.system import (
-    Affine,
-    Observation,
-)
+from piezojax.core.feedback import Observation
+from piezojax.core.system import Affine
 from piezojax.hardware import (
     Saturation,
     Sensor,

@@ -20,7 +20,7 @@ from piezojax.control import (
     KalmanFilter,
 )
 from piezojax.control.kalman import kinematic_kalman, model_kalman, steady_gain
-from piezojax.core.system import LoopInput, Observation
+from piezojax.core.feedback import LoopInput, Observation
 from piezojax.dynamics import (
     ARMA,
 )

@@ -20,11 +20,8 @@ from piezojax.control import (
     SlidingMode,
     SwitchingPID,
 )
-from piezojax.core.system import (
-    Delay,
-    LoopInput,
-    Observation,
-)
+from piezojax.core.feedback import LoopInput, Observation
+from piezojax.core.system import Delay
 from piezojax.dynamics import (
     ARMA,
 )

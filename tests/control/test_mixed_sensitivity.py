@@ -20,7 +20,7 @@ from piezojax.control import (
     first_order_weight,
     mixed_sensitivity,
 )
-from piezojax.core.system import Observation
+from piezojax.core.feedback import Observation
 from piezojax.dynamics import (
     ARMA,
     StateSpace,

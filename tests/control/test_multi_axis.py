@@ -28,10 +28,10 @@ from piezojax.core.axes import (
     packed,
     product,
 )
+from piezojax.core.feedback import LoopInput, Observation
 from piezojax.core.metrics import (
     Tracking,
 )
-from piezojax.core.system import LoopInput, Observation
 from piezojax.dynamics import (
     ARMA,
     Channel,

@@ -14,9 +14,7 @@ from piezojax.control import (
     PID,
     RepetitiveControl,
 )
-from piezojax.core.system import (
-    Affine,
-)
+from piezojax.core.system import Affine
 from piezojax.dynamics import (
     ARMA,
     FirstOrderLag,

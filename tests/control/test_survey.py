@@ -23,7 +23,7 @@ from piezojax.control import (
     RepetitiveControl,
 )
 from piezojax.core import paths
-from piezojax.core.system import LoopInput
+from piezojax.core.feedback import LoopInput
 from piezojax.dynamics import (
     FirstOrderLag,
 )

@@ -13,9 +13,7 @@ from scipy.integrate import solve_ivp
 from piezojax import (
     simulate,
 )
-from piezojax.core.system import (
-    Series,
-)
+from piezojax.core.system import Series
 from piezojax.hysteresis import (
     ColemanHodgdon,
     InverseColemanHodgdon,

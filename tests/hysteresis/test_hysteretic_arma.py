@@ -12,9 +12,7 @@ from piezojax import (
     series,
     simulate,
 )
-from piezojax.core.system import (
-    Affine,
-)
+from piezojax.core.system import Affine
 from piezojax.dynamics import (
     ARMA,
 )

@@ -12,11 +12,8 @@ from piezojax import (
 from piezojax.control import (
     InverseFeedforward,
 )
-from piezojax.core.system import (
-    Observation,
-    Series,
-    rest_output,
-)
+from piezojax.core.feedback import Observation
+from piezojax.core.system import Series, rest_output
 from piezojax.hysteresis import (
     InversePrandtlIshlinskii,
     InverseRateDependentPrandtlIshlinskii,

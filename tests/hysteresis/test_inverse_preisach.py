@@ -17,10 +17,8 @@ from piezojax.catalog import p753
 from piezojax.control import (
     InversionControl,
 )
-from piezojax.core.system import (
-    LoopInput,
-    Series,
-)
+from piezojax.core.feedback import LoopInput
+from piezojax.core.system import Series
 from piezojax.hardware import (
     Sensor,
 )

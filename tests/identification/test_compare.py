@@ -11,9 +11,7 @@ from piezojax import (
     load,
 )
 from piezojax.cli.identify import main
-from piezojax.core.system import (
-    Affine,
-)
+from piezojax.core.system import Affine
 from piezojax.identification import (
     compare,
     identify_all,

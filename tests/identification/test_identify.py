@@ -16,9 +16,7 @@ from piezojax import (
     series,
 )
 from piezojax.core.registry import parts
-from piezojax.core.system import (
-    Affine,
-)
+from piezojax.core.system import Affine
 from piezojax.dynamics import (
     FirstOrderLag,
 )

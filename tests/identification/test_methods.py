@@ -10,9 +10,7 @@ from piezojax import (
     identify,
     series,
 )
-from piezojax.core.system import (
-    Affine,
-)
+from piezojax.core.system import Affine
 from piezojax.dynamics import (
     ARMA,
     FirstOrderLag,

@@ -7,9 +7,7 @@ from piezojax import (
     Record,
 )
 from piezojax.core.space import Range, space_of
-from piezojax.core.system import (
-    Affine,
-)
+from piezojax.core.system import Affine
 from piezojax.dynamics import (
     ARMA,
     FirstOrderLag,

@@ -141,7 +141,7 @@ MUTATIONS = (
     # The loop and its hardware
     Mutation(
         "controller sees the command",
-        "core/system.py",
+        "core/feedback.py",
         "            displacement,\n            voltage,\n        )",
         "            displacement,\n            command,\n        )",
         ("tests/test_system.py", _LOOPS),

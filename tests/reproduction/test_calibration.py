@@ -10,9 +10,9 @@ import pytest
 
 from piezojax.catalog import p753
 from piezojax.control import ModelReferenceSlidingMode
+from piezojax.core.feedback import Feedback, loop_inputs
 from piezojax.core.paths import parameters
 from piezojax.core.rollout import simulate
-from piezojax.core.system import Feedback, loop_inputs
 from piezojax.hardware import Sensor
 from piezojax.reproduction import chapter4, lanes
 from piezojax.reproduction.calibration import EXPERIMENTS, HALVES, HalfFit

@@ -13,8 +13,8 @@ from swept_studies import GRID
 import piezojax as pj
 from piezojax.analysis.stability import OperatingPoint
 from piezojax.cli.sweep import main
+from piezojax.core.feedback import loop_inputs
 from piezojax.core.paths import replace
-from piezojax.core.system import loop_inputs
 from piezojax.report.sweep_maps import panels
 from piezojax.sweeping import run_sweep
 from piezojax.sweeping.local import local_chunks

@@ -12,7 +12,8 @@ from piezojax import (
     System,
 )
 from piezojax.catalog import p753_by_rate
-from piezojax.core.system import Delay, Observation, Series
+from piezojax.core.feedback import Observation
+from piezojax.core.system import Delay, Series
 from piezojax.hardware import (
     Saturation,
     Sensor,

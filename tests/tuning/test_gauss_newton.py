@@ -14,7 +14,7 @@ from piezojax import (
     simulate,
 )
 from piezojax.core.arrays import as_array
-from piezojax.core.system import loop_inputs
+from piezojax.core.feedback import loop_inputs
 from piezojax.solve.clock import Clock
 from piezojax.solve.descent import (
     PARALLEL,

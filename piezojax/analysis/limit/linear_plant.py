@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...core.arrays import Scalar, ScalarLike, as_array
+from ...core.feedback import Feedback
 from ...core.rollout import simulate
-from ...core.system import Feedback, System
+from ...core.system import System
 from ...dynamics import StateSpace
 from ...dynamics.linearise import linearise
 from ..stability.conserved import LinearLoop, without_conserved

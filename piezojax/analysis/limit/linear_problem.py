@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.system import Feedback, LoopSample
+from ...core.feedback import Feedback, LoopSample
 from .linear_plant import LinearPlant, gain_from_noise, linear_plant, plant_response
 from .spectra import ReferencePredictor, grid_size, spectra, windowed
 

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ...core.feedback import Feedback, LoopSample, loop_inputs
 from ...core.rollout import simulate
-from ...core.system import Feedback, LoopSample, loop_inputs
 from .linear_plant import LinearPlant
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from ...core.arrays import as_array
-from ...core.system import Feedback
+from ...core.feedback import Feedback
 from ..stability.operating_point import loop_sample_time
 from .limit_report import Curves, LimitComparison, LimitReport, Shares
 from .linear_problem import problem_of

@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...core.arrays import Scalar, State, as_array
+from ...core.feedback import Feedback, LoopSample
 from ...core.rollout import simulate
-from ...core.system import Feedback, LoopSample, System
+from ...core.system import System
 from ..stability.operating_point import loop_sample_time
 from .linear_plant import LinearPlant
 from .linear_problem import LinearProblem, problem_of

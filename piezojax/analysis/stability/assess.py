@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from ...core.arrays import ScalarLike
-from ...core.system import Feedback, LoopState
+from ...core.feedback import Feedback, LoopState
 from .axes_margins import MultiAxisReport, axes_report_of
 from .conserved import LinearAxes, LinearLoop
 from .crossings import angle_grid

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from ...core.arrays import ScalarLike, Signal, State, as_signal
-from ...core.system import Affine, Feedback, LoopState, Observation, System
+from ...core.feedback import Feedback, LoopState, Observation
+from ...core.system import Affine, System
 from ...dynamics import StateSpace
 from ...dynamics.linearise import linearise
 from ...hardware import Saturation

@@ -21,8 +21,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from ...core.arrays import Scalar, ScalarLike, State, as_array
+from ...core.feedback import Feedback, LoopState
 from ...core.rollout import simulate
-from ...core.system import Feedback, LoopState, System
+from ...core.system import System
 from ...dynamics.linearise import split_static
 from .broken_loop import BrokenLoop, cut, open_loop
 from .operating_point import BRANCHES, OperatingPoint

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from ...core.arrays import Scalar, Signal, as_array
-from ...core.system import Feedback, LoopState
+from ...core.feedback import Feedback, LoopState
 from ...dynamics import StateSpace
 from ...dynamics.linearise import linearise
 from .broken_loop import cut

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from ...core.arrays import Signal, as_signal
-from ...core.system import Feedback, LoopState
+from ...core.feedback import Feedback, LoopState
 from ...dynamics.linearise import sample_time
 
 BRANCHES = {"ascending": 1.0, "descending": -1.0}

@@ -4,8 +4,8 @@ import equinox as eqx
 import numpy as np
 
 from ...core.arrays import as_array
+from ...core.feedback import Feedback
 from ...core.progress import Progress
-from ...core.system import Feedback
 from ...solve.search_state import SearchState
 from ...study import Case
 from ..data import Data

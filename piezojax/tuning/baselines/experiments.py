@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from ...control import PID
 from ...core.arrays import Scalar, as_array, check
+from ...core.feedback import Feedback, Observation, loop_inputs
 from ...core.rollout import simulate
-from ...core.system import Feedback, Observation, System, loop_inputs
+from ...core.system import System
 from ...solve.clock import Clock
 from .rules import Ultimate
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from ...control import PID
 from ...core.arrays import as_array
+from ...core.feedback import Feedback
 from ...core.paths import get
 from ...core.space import Range, space_of
-from ...core.system import Feedback
 from ...solve.clock import Clock
 from ...solve.history import History, batch_loss
 from ...study import Case

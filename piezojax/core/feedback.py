@@ -1,0 +1,183 @@
+"""The feedback loop, its signals, and its start at rest."""
+
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from .arrays import Signal, State, as_array, as_signal
+from .parameter import PartUnits
+from .system import System, rest_output
+
+
+class Observation(NamedTuple):
+    """Input of a controller at sample k: scalars, or tuples with one scalar per axis.
+
+    ``reference`` r(k), ``next_reference`` r(k+1) and ``measured`` z(k) are in um;
+    ``applied`` is the voltage of the actuator at k-1, after its limits, in V.
+    """
+
+    reference: Signal
+    next_reference: Signal
+    measured: Signal
+    applied: Signal
+
+
+class LoopInput(NamedTuple):
+    """Input of a loop at sample k.
+
+    ``next_reference`` is r(k+1) in um, ``noise`` a unit-variance draw that the sensor
+    scales, ``disturbance`` an optional addition in um to the displacement at k+1.
+    """
+
+    next_reference: Signal
+    noise: Signal
+    disturbance: Signal | None = None
+
+
+class LoopSample(NamedTuple):
+    """Output of a loop at sample k, in um and V.
+
+    ``command`` is the output of the controller, ``voltage`` that of the actuator.
+    """
+
+    reference: Signal
+    displacement: Signal
+    measured: Signal
+    command: Signal
+    voltage: Signal
+
+
+class LoopState(NamedTuple):
+    """State of a Feedback loop between two samples."""
+
+    controller: State
+    actuator: State
+    plant: State
+    sensor: State
+    reference: Signal
+    displacement: Signal
+    voltage: Signal
+
+
+class Feedback(System):
+    """Feedback loop of a controller, an actuator, a plant and a sensor.
+
+    At sample k the sensor measures y(k), the controller receives r(k), r(k+1) and the
+    measurement, the actuator turns the command into u(k), and u(k) moves the plant to
+    y(k+1). The measured output lags the input by one sample, so no loop is algebraic.
+
+    With several axes every signal is a tuple with one scalar per axis, in the unit of
+    the axis.
+    """
+
+    part_units: ClassVar[PartUnits] = {"controller": {"u": "V"}}
+
+    controller: System
+    plant: System
+    actuator: System
+    sensor: System
+
+    def init(self, input: Any = 0.0, holding: Any = None) -> LoopState:
+        """Return the state at rest at the reference ``input`` (um): a bumpless start.
+
+        With several axes ``input`` is a vector or a tuple. ``holding`` is the result of
+        ``holding_input`` for it, if known; the solver takes longer to compile than the
+        rest.
+        """
+        reference = as_signal(input)
+        if holding is None:
+            holding = holding_input(self.plant, reference)
+        voltage = rest_output(self.actuator, as_signal(holding))
+        displacement = rest_output(self.plant, voltage)
+        quiet = (displacement, jax.tree.map(jnp.zeros_like, displacement))
+        measured = rest_output(self.sensor, quiet)
+        observation = Observation(reference, reference, measured, voltage)
+        return LoopState(
+            controller=self.controller.init(observation),
+            actuator=self.actuator.init(voltage),
+            plant=self.plant.init(voltage),
+            sensor=self.sensor.init(quiet),
+            reference=reference,
+            displacement=displacement,
+            voltage=voltage,
+        )
+
+    def step(self, state: LoopState, input: LoopInput) -> tuple[LoopState, LoopSample]:
+        sensor, measured = self.sensor.step(
+            state.sensor, (state.displacement, input.noise)
+        )
+        observation = Observation(
+            state.reference, input.next_reference, measured, state.voltage
+        )
+        controller, command = self.controller.step(state.controller, observation)
+        actuator, voltage = self.actuator.step(state.actuator, command)
+        plant, displacement = self.plant.step(state.plant, voltage)
+        if input.disturbance is not None:
+            displacement = jax.tree.map(jnp.add, displacement, input.disturbance)
+        sample = LoopSample(
+            state.reference, state.displacement, measured, command, voltage
+        )
+        state = LoopState(
+            controller,
+            actuator,
+            plant,
+            sensor,
+            jax.tree.map(as_array, input.next_reference),
+            displacement,
+            voltage,
+        )
+        return state, sample
+
+
+def loop_inputs(
+    reference: Float[Array, " samples"] | Float[Array, "samples axes"],
+    noise: Float[Array, " samples"] | Float[Array, "samples axes"] | None = None,
+    disturbance: Float[Array, " samples"] | Float[Array, "samples axes"] | None = None,
+) -> LoopInput:
+    """Return the inputs of a loop that follows ``reference`` (um).
+
+    ``noise`` holds unit-variance draws, zero if left out; ``disturbance`` (um) is added
+    to the output of the plant. The last reference is repeated as its own successor,
+    which acts only after the end of the record. Several axes are columns, each in the
+    unit of its axis.
+    """
+    reference = as_array(reference)
+    following = jnp.concatenate([reference[1:], reference[-1:]])
+    noise = jnp.zeros_like(reference) if noise is None else noise
+    return LoopInput(
+        _columns(following),
+        _columns(noise),
+        None if disturbance is None else _columns(disturbance),
+    )
+
+
+def _columns(signal: Array) -> Any:
+    if signal.ndim == 1:
+        return signal
+    return tuple(signal[:, axis] for axis in range(signal.shape[1]))
+
+
+def holding_input(plant: System, output: Signal) -> Signal:
+    """Return the constant input under which ``plant`` rests at ``output``.
+
+    Newton's method is applied to the loading curve from the rest point of the plant. If
+    no input reaches ``output``, the last iterate is returned and the loop starts with
+    an error. Limits belong in the actuator of the loop, not in the plant, because the
+    curve is flat beyond them. The iteration starts at 0. With several axes it starts at
+    ``output``, because commands have its unit and the pose 0 may be outside, or on the
+    edge of, the range of a stage with an allocation.
+    """
+    output = jax.tree.map(as_array, output)
+
+    def residual(input, _):
+        return jax.tree.map(jnp.subtract, rest_output(plant, input), output)
+
+    solver = optx.Newton(rtol=1e-12, atol=1e-12)
+    start = output if isinstance(output, tuple) else jnp.zeros_like(output)
+    solution = optx.root_find(residual, solver, start, max_steps=64, throw=False)
+    return jax.tree.map(
+        lambda value: jnp.where(jnp.isfinite(value), value, 0.0), solution.value
+    )
