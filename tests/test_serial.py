@@ -538,10 +538,44 @@ def test_wrong_types_as_users_meet_them(outcomes, name, key):
     assert key in message
 
 
-def test_a_file_nested_without_end(tmp_path):
-    (tmp_path / "a.json").write_text("[" * 100_000)
-    with pytest.raises(ValueError, match="is not a JSON file"):
+NESTED = {
+    "open.json": "[" * 100_000,
+    "lists.json": "[" * 900 + "]" * 900,
+    "lists.toml": "gain = " + "[" * 5000 + "]" * 5000,
+    "tables.toml": f"[{'.'.join(['a'] * 5000)}]\nb = 1",
+    "inline.toml": "a = " + "{ a = " * 200 + "1" + " }" * 200,
+}
+
+
+@pytest.mark.parametrize("name", NESTED)
+def test_a_file_nested_too_deep(tmp_path, name):
+    (tmp_path / name).write_text(NESTED[name], encoding="utf-8")
+    message = rf"{name} holds more than 64 tables or lists inside each other$"
+    with pytest.raises(ValueError, match=message):
+        load(tmp_path / name)
+
+
+def test_systems_nested_as_deep_as_allowed(tmp_path):
+    data = {"type": "Affine", "gain": 2.0}
+    for _ in range(31):  # a table and a list each
+        data = {"type": "Series", "parts": [data]}
+    (tmp_path / "a.json").write_text(json.dumps(data))
+    assert float(pj.core.paths.get(load(tmp_path / "a.json"), "0." * 31 + "gain")) == 2
+
+
+@pytest.mark.parametrize("digits", [309, 400, 5000])
+@pytest.mark.parametrize("form", ['{{"type": "Affine", "gain": {}}}', "[{}]"])
+def test_an_integer_too_large_for_a_float(tmp_path, digits, form):
+    (tmp_path / "a.json").write_text(form.format("9" * digits))
+    with pytest.raises(ValueError, match=r"a\.json") as caught:
         load(tmp_path / "a.json")
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 250
+
+
+def test_an_integer_of_more_than_64_bits_is_a_number(tmp_path):
+    (tmp_path / "a.json").write_text('{"type": "Affine", "gain": 1' + "0" * 30 + "}")
+    assert float(load(tmp_path / "a.json").gain) == 1e30
 
 
 def test_saving_into_a_folder_that_is_not_there(tmp_path):

@@ -20,7 +20,15 @@ from piezojax.core.space import Range
 from piezojax.dynamics import (
     FirstOrderLag,
 )
-from piezojax.study import DEFAULT, build, load, read, shipped
+from piezojax.study import (
+    DEFAULT,
+    build,
+    is_comparison_study,
+    load,
+    load_comparison_study,
+    read,
+    shipped,
+)
 
 SHIPPED = sorted(path.stem for path in shipped().parent.glob("*.toml"))
 
@@ -675,6 +683,36 @@ def test_values_of_another_type(refusal, place, value, message):
 )
 def test_what_must_not_be_missing(refusal, place):
     assert refusal({place: GONE}) == f"{place.replace('/', '.')} is missing"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a = " + "[" * 5000 + "]" * 5000, "holds more than 64 tables or lists insi"),
+        (f"[{'.'.join(['a'] * 2000)}]", "holds more than 64 tables or lists inside"),
+        ("rate = 1" + "0" * 400, "rate is 1000000"),
+        ("rate = 1" + "0" * 9000, "Exceeds the limit"),
+    ],
+)
+@pytest.mark.parametrize("reader", [load, load_comparison_study])
+def test_a_file_that_is_no_study(tmp_path, text, message, reader):
+    path = tmp_path / "stage.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        reader(path)
+    assert str(caught.value).startswith(f"study {path}")
+    assert "\n" not in str(caught.value)
+    assert not is_comparison_study(path)
+
+
+def test_more_samples_than_the_memory_holds(refusal, study):
+    # 3 references of 1 + 2 * 2 signals of 8 bytes: 1.2e-7 GB a sample.
+    assert refusal({"references/duration": 1e4}) == (
+        "references.duration is 10000 s: at 20000 Hz the signals of all references "
+        "have 2e+08 samples each and take 24 GB; the limit is 16 GB"
+    )
+    assert "inf samples" in refusal({"references/duration": 1e308})
+    assert load(study({"references/duration": 6e3})).references.duration == 6e3
 
 
 @pytest.mark.parametrize("settle", [0.05, 0.06])

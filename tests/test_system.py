@@ -57,7 +57,7 @@ def test_affine_scales_and_shifts():
     assert response(Affine(), 4.0 * np.ones(3), 0.0).tolist() == [4.0, 4.0, 4.0]
 
 
-@pytest.mark.parametrize("samples", [0, 1, 7])
+@pytest.mark.parametrize("samples", [0, 1, 16, 17, 400])
 def test_delay_shifts_and_starts_full(samples):
     expected = np.concatenate([np.full(samples, 9.0), rough()])[:500]
     np.testing.assert_array_equal(response(Delay(samples), rough(), 9.0), expected)
@@ -119,6 +119,29 @@ def test_names_must_match_the_parts():
 def test_negative_delay_is_refused():
     with pytest.raises(ValueError, match=r"samples is -1; .* at least 0"):
         Delay(-1)
+
+
+def test_a_long_delay_compiles_as_few_operations():
+    def operations(samples):
+        system = Delay(samples)
+        step = jax.make_jaxpr(system.step)(system.init(0.0), 1.0)
+        return len(jax.tree.leaves(system.init(0.0))), len(step.eqns)
+
+    assert operations(1000) == operations(17)
+    assert operations(17)[0] == 1
+
+
+@pytest.mark.parametrize("samples", [1001, 10**9, 10**30])
+def test_a_delay_beyond_reason_is_refused(samples):
+    with pytest.raises(ValueError, match=r"samples is 1.*; it must .*at most 1000"):
+        Delay(samples)
+
+
+def test_an_integer_too_large_for_a_float_is_refused():
+    message = r"an integer is too large; the largest number is 1\.8e308"
+    for wrong in (lambda: Affine(10**400), lambda: Delay(10**400)):
+        with pytest.raises(ValueError, match=message):
+            wrong()
 
 
 def test_fractional_delay_is_refused():

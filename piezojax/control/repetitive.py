@@ -50,7 +50,12 @@ class RepetitiveControl(System):
     filter: System
     gain: Scalar = parameter("1", "learning gain", least=0.0, typical=(0.0, 1.0))
     period: int = parameter(
-        "samples", "period of the reference", least=2.0, whole=True, static=True
+        "samples",
+        "period of the reference",
+        least=2.0,
+        most=1e6,
+        whole=True,
+        static=True,
     )
     lead: int = parameter(
         "samples",

@@ -25,8 +25,17 @@ State = Any  # a pytree of arrays; every System defines its own
 
 
 def as_array(value: Any) -> Array:
-    """Return ``value`` as a float64 array."""
-    return jnp.asarray(value, dtype=jnp.float64)
+    """Return ``value`` as a float64 array.
+
+    Raises ValueError for an integer beyond the range of a float.
+    """
+    try:
+        return jnp.asarray(value, dtype=jnp.float64)
+    except OverflowError:
+        raise ValueError(_TOO_LARGE) from None
+
+
+_TOO_LARGE = "an integer is too large; the largest number is 1.8e308"
 
 
 def as_scalars(values: Iterable[Any]) -> tuple[Array, ...]:
@@ -60,7 +69,15 @@ def as_matrix(value: Any) -> Array:
 
 def _concrete(value: Any) -> np.ndarray | None:
     """Return ``value`` as a NumPy array, or None for a JAX tracer."""
-    return None if isinstance(value, Tracer) else np.asarray(value)
+    if isinstance(value, Tracer):
+        return None
+    number = np.asarray(value)
+    if number.dtype != object:
+        return number
+    try:
+        return number.astype(float)  # integers of more than 64 bits
+    except OverflowError:
+        raise ValueError(_TOO_LARGE) from None
 
 
 def check(

@@ -2,11 +2,10 @@
 
 import dataclasses
 import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from types import UnionType
-from typing import Any, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import equinox as eqx
 import numpy as np
@@ -15,6 +14,7 @@ from pydantic import ValidationError
 
 from .about import About
 from .files import write_text
+from .plain import read_plain, shown
 from .registry import kinds
 from .system import System
 
@@ -61,7 +61,7 @@ def from_data(data: Any, where: str = "system") -> System:
     kind = known.get(data["type"]) if isinstance(data["type"], str) else None
     if kind is None:
         raise ValueError(
-            f"{where}.type is {data['type']!r}; it must be one of {allowed}"
+            f"{where}.type is {shown(data['type'])}; it must be one of {allowed}"
         )
     fields = {field.name: field for field in dataclasses.fields(kind)}
     arguments = {key: value for key, value in data.items() if key != "type"}
@@ -97,7 +97,7 @@ def _value_from_data(value: Any, kind: Any, where: str) -> Any:
         )
     if get_origin(kind) is tuple:
         if not isinstance(value, list | tuple):
-            raise ValueError(f"{where} is {value!r}; it must be a list")
+            raise ValueError(f"{where} is {shown(value)}; it must be a list")
         (item, _) = get_args(kind)
         return tuple(
             _value_from_data(v, item, f"{where}.{i}") for i, v in enumerate(value)
@@ -115,18 +115,18 @@ def _value_from_data(value: Any, kind: Any, where: str) -> Any:
         return _array_from_data(value, rank, where)
     accepted, name = _PLAIN.get(kind, ((int, float), "a number"))
     if not isinstance(value, accepted) or isinstance(value, bool):
-        raise ValueError(f"{where} is {value!r}; it must be {name}")
+        raise ValueError(f"{where} is {shown(value)}; it must be {name}")
     return value
 
 
 def _array_from_data(value: Any, rank: int, where: str) -> np.ndarray:
     try:
         array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.array(np.nan)
     if array.ndim != rank:
         kind = "a list" if rank == 1 else "lists of one length in a list"
-        raise ValueError(f"{where} is {value!r}; it must be numbers in {kind}")
+        raise ValueError(f"{where} is {shown(value)}; it must be numbers in {kind}")
     return array
 
 
@@ -192,25 +192,16 @@ def _about_of(table: Any, path: Path) -> About:
 
 def _read(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML or JSON file. Raises ValueError as ``load``."""
-    kind = _format(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-        data = tomllib.loads(text) if kind == "toml" else json.loads(text)
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}") from None
-    except RecursionError:
-        raise ValueError(
-            f"{path} is not a {kind.upper()} file: nested too deep"
-        ) from None
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not a {kind.upper()} file: {error}") from None
+    data = read_plain(path, _format(path), str(path))
     if not isinstance(data, dict):
         raise ValueError(f"{path.name} needs a key 'type' and the fields of a System")
     return data
 
 
-def _format(path: Path) -> str:
-    suffix = path.suffix.lower().lstrip(".")
-    if suffix not in ("toml", "json"):
-        raise ValueError(f"{path}: the name must end in .toml or .json")
-    return suffix
+def _format(path: Path) -> Literal["toml", "json"]:
+    match path.suffix.lower():
+        case ".toml":
+            return "toml"
+        case ".json":
+            return "json"
+    raise ValueError(f"{path}: the name must end in .toml or .json")

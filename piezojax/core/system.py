@@ -6,6 +6,7 @@ from typing import Any, ClassVar, dataclass_transform
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 from .arrays import Scalar, ScalarLike, State, as_array
 from .parameter import PartUnits, check_declared, parameter, sample_time
@@ -178,15 +179,25 @@ class Affine(System):
 
 
 class Delay(System):
-    """Delay by a whole number of samples."""
+    """Delay by a whole number of samples, at most 1000."""
 
     samples: int = parameter(
-        "1", "number of samples", least=0.0, whole=True, static=True
+        "1", "number of samples", least=0.0, most=1000.0, whole=True, static=True
     )
 
     def init(self, input: ScalarLike = 0.0) -> State:
-        return (as_array(input),) * self.samples
+        value = as_array(input)
+        # The compile time of separate scalars rises with the cube of their number.
+        if self.samples > _SCALARS:
+            return jnp.broadcast_to(value, self.samples)
+        return (value,) * self.samples
 
     def step(self, state: State, input: ScalarLike) -> tuple[State, Scalar]:
+        if self.samples > _SCALARS:
+            return jnp.append(state[1:], input), state[0]
         line = (*state, as_array(input))
         return line[1:], line[0]
+
+
+_SCALARS = 16
+"""Longest Delay whose state is a tuple of scalars, the fastest in a batch."""

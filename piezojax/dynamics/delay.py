@@ -13,17 +13,19 @@ from ..core.space import Range
 class FractionalDelay(Fittable):
     """``y(t) = x(t - delay)``, interpolated linearly between samples.
 
-    ``delay`` lies between 0 and ``longest`` samples; y has the unit of x. The output is
-    differentiable with respect to the delay, through the weights of the two adjacent
-    samples. For a whole number of samples it equals Delay. Raises ValueError for a
-    delay outside 0 to longest * dt.
+    ``delay`` lies between 0 and ``longest`` (1 to 64) samples; y has the unit of x. The
+    output is differentiable with respect to the delay, through the weights of the two
+    adjacent samples. For a whole number of samples it equals Delay. Raises ValueError
+    for a delay outside 0 to longest * dt.
     """
 
     part: ClassVar[Part] = Part("delay", "delay", "Delay of up to five samples")
 
     delay: Scalar = parameter("s", "delay", least=0.0, typical=(0.0, 1e-2))
     dt: float = sample_time()
-    longest: int = parameter("samples", "longest delay", least=1.0, static=True)
+    longest: int = parameter(
+        "samples", "longest delay", least=1.0, most=64.0, whole=True, static=True
+    )
 
     def __check_init__(self):
         check("delay in s", self.delay, most=self.longest * self.dt)

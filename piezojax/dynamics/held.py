@@ -11,15 +11,13 @@ class Held(System):
     """``system`` stepped ``samples`` times under each input; returns the last output.
 
     It models a stage behind a converter that holds the voltage of a slower loop. Raises
-    ValueError unless ``samples`` is a whole number of at least 1.
+    ValueError unless ``samples`` is a whole number from 1 to 64.
     """
 
     system: System
-    samples: int = parameter("1", "samples held", least=1.0, static=True)
-
-    def __check_init__(self):
-        if not isinstance(self.samples, int):
-            raise ValueError(f"samples is {self.samples!r}; it must be whole")
+    samples: int = parameter(
+        "1", "samples held", least=1.0, most=64.0, whole=True, static=True
+    )
 
     def init(self, input: Any = 0.0) -> State:
         return self.system.init(input)

@@ -87,7 +87,13 @@ class BashashJalili(Hysteresis, Fittable):
     )
     falling_tau: Scalar = parameter("1/V", "decay of that bend", least=0.0)
     depth: int = parameter(
-        "1", "turning points remembered", least=1.0, static=True, default=8
+        "1",
+        "turning points remembered",
+        least=1.0,
+        most=64.0,
+        whole=True,
+        static=True,
+        default=8,
     )
 
     def __check_init__(self):

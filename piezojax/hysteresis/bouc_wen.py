@@ -43,7 +43,15 @@ class BoucWen(Hysteresis):
     beta_gamma: Scalar = parameter("N^(1 - nu)/m", "bend against the velocity's sign")
     beta_delta: Scalar = parameter("N^(1 - nu)/m", "bend with the velocity")
     nu: Scalar = parameter("1", "sharpness of the bend", above=0.0, default=1.0)
-    substeps: int = parameter("1", "parts of a step", least=1.0, static=True, default=1)
+    substeps: int = parameter(
+        "1",
+        "parts of a step",
+        least=1.0,
+        most=1000.0,
+        whole=True,
+        static=True,
+        default=1,
+    )
 
     def rate(self, force: Scalar, velocity: Scalar) -> Scalar:
         """Return z' at force z and velocity y'; along a path, dz from dy."""

@@ -85,7 +85,15 @@ class Duhem(Hysteresis, Fittable):
     )
     rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
     rest_memory: Scalar = parameter("1", "x in the virgin state", default=0.0)
-    substeps: int = parameter("1", "parts of a step", least=1.0, static=True, default=1)
+    substeps: int = parameter(
+        "1",
+        "parts of a step",
+        least=1.0,
+        most=1000.0,
+        whole=True,
+        static=True,
+        default=1,
+    )
 
     def __check_init__(self):
         if not any(self.output):

@@ -68,7 +68,9 @@ class InverseHysteresis(Inverse):
     model: System
     lower: Scalar = parameter("V", "lowest voltage")
     upper: Scalar = parameter("V", "highest voltage")
-    iterations: int = parameter("1", "Newton steps", least=1.0, static=True, default=8)
+    iterations: int = parameter(
+        "1", "Newton steps", least=1.0, most=100.0, whole=True, static=True, default=8
+    )
 
     def __check_init__(self):
         check_order("lower", self.lower, "upper", self.upper)

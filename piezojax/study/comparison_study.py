@@ -1,6 +1,5 @@
 """Comparison studies: several controllers and sampling rates, tuned alike."""
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -12,6 +11,7 @@ from pydantic import Field, model_validator
 from ..catalog import CONTROLLERS, at_rate
 from ..core.feedback import Feedback
 from ..core.paths import get
+from ..core.plain import read_plain
 from ..core.system import Affine
 from .case import Case, build, read
 from .schema import ObjectiveTable, OptimiserTable, References, Study
@@ -148,8 +148,9 @@ def read_compared(
             case = read(path, seed)
             cases.append(ComparedCase(case.study.title, case, "own"))
     names = [compared.name for compared in cases]
+    folded = [name.casefold() for name in names]
     for name in names:
-        if names.count(name) > 1:
+        if folded.count(name.casefold()) > 1:
             raise ValueError(f"two studies are named {name}; each takes its own name")
     return ", ".join(titles) or "Comparison of studies", cases
 
@@ -157,8 +158,8 @@ def read_compared(
 def is_comparison_study(path: Path) -> bool:
     """Return whether ``path`` is a readable file with a comparison study."""
     try:
-        return "controllers" in tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return "controllers" in read_plain(path, "toml", str(path))
+    except ValueError:
         return False
 
 
@@ -167,7 +168,7 @@ def load_comparison_study(path: str | Path) -> ComparisonStudy:
 
     Raises ValueError: one line with the key, the value and the allowed values.
     """
-    data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    data = read_plain(Path(path), "toml", f"study {path}")
     return validated(ComparisonStudy, data, "")
 
 

@@ -1,12 +1,12 @@
 """Tables of a study file, and their validation."""
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from ..analysis.constraints import CONSTRAINTS
+from ..core.plain import read_plain
 from ..core.registry import discover
 from ..signals import motions
 from ..signals import waveforms as signals
@@ -26,6 +26,9 @@ from .tables import (
     validated,
 )
 
+MEMORY_GB = 16.0
+"""Largest memory of the signals of a study, GB."""
+
 
 class AxesTable(Table):
     """Names and units of the axes of a multi-axis stage."""
@@ -37,6 +40,11 @@ class AxesTable(Table):
     def _consistent(self) -> "AxesTable":
         if len(self.units) != len(self.names) or len(set(self.names)) < len(self.names):
             raise ValueError("names must differ and have one unit each")
+        if len({name.casefold() for name in self.names}) < len(self.names):
+            raise ValueError(
+                f"names are {', '.join(self.names)}; they must differ in more than "
+                "upper and lower case, because files are named after them"
+            )
         for unit in self.units:
             one_of(unit, ("um", "urad"))
         for name in self.names:
@@ -178,6 +186,7 @@ class Study(Table):
     @model_validator(mode="after")
     def _sampled(self) -> "Study":
         table = self.references
+        self._check_memory()
         samples = round(table.duration * self.rate)
         if samples < 2:
             raise ValueError(
@@ -202,6 +211,21 @@ class Study(Table):
                 f"references.settle is {table.settle:g} s; no sample is left after it"
             )
         return self
+
+    def _check_memory(self) -> None:
+        """Raise ValueError if the signals of the runs would not fit in the memory."""
+        table = self.references
+        runs = (len(table.tune) + len(table.unseen)) * self.axis_count
+        draws = self.objective.noise_draws + self.holdout_draws
+        # A reference, and in each draw its noise and its drift, of 8 bytes a sample.
+        samples = table.duration * self.rate
+        gigabytes = samples * runs * (1 + 2 * draws) * 8e-9
+        if not gigabytes <= MEMORY_GB:
+            raise ValueError(
+                f"references.duration is {table.duration:g} s: at {self.rate:g} Hz "
+                f"the signals of all references have {samples:.3g} samples each and "
+                f"take {gigabytes:.3g} GB; the limit is {MEMORY_GB:g} GB"
+            )
 
     @model_validator(mode="after")
     def _least_squares(self) -> "Study":
@@ -311,10 +335,4 @@ def load(path: str | Path) -> Study:
     """
     path = Path(path)
     discover()  # constraints and stages of other packages
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"study {path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"study {path} is not a TOML file: {error}") from None
-    return validated(Study, data, "")
+    return validated(Study, read_plain(path, "toml", f"study {path}"), "")

@@ -43,6 +43,7 @@ def test_its_gradient_is_a_central_difference():
         ((5e-3, DT, 4), "at most 0.004"),
         ((0.0, 0.0, 4), "dt in s is 0"),
         ((0.0, DT, 0), "longest in samples is 0"),
+        ((0.0, DT, 65), "longest in samples is 65; .* at most 64"),
     ],
 )
 def test_bad_parameters(arguments, message):

@@ -34,6 +34,7 @@ def test_rest_stays_at_rest():
     ("samples", "message"),
     [
         (0, "samples is 0; it must be finite and at least 1"),
+        (65, "samples is 65; it must be finite .* at most 64"),
     ],
 )
 def test_bad_numbers_of_samples_are_refused(samples, message):

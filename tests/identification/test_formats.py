@@ -417,6 +417,26 @@ def test_what_a_tdms_file_says_of_its_channels(tmp_path):
     assert (record.input_unit, record.output_unit) == ("mV", "um")
 
 
+def tdms_step(path, step):
+    with TdmsWriter(path) as writer:
+        for name, values in (("u", DRIVE), ("y", SENSOR)):
+            channel = ChannelObject("a", name, values, {"wf_increment": step})
+            writer.write_segment([channel])
+
+
+@pytest.mark.parametrize("step", [5e-5, "0.00005"])
+def test_a_tdms_increment_as_number_and_as_text(tmp_path, step):
+    tdms_step(tmp_path / "record.tdms", step)
+    assert read_record(tmp_path / "record.tdms").dt == pytest.approx(5e-5, rel=1e-12)
+
+
+@pytest.mark.parametrize("step", ["fast", -1.0, float("inf")])
+def test_a_tdms_increment_that_is_no_time(tmp_path, step):
+    tdms_step(tmp_path / "record.tdms", step)
+    message = f"the time step of 'u' is {step!r}; it must be a number above 0"
+    refused(tmp_path / "record.tdms", message)
+
+
 @pytest.mark.parametrize("attribute", ["unit", "units"])
 @pytest.mark.parametrize("kind", [str, np.bytes_])
 def test_units_from_the_attributes_of_an_hdf5_file(tmp_path, attribute, kind):

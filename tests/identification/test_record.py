@@ -584,6 +584,16 @@ def test_impossible_resampling(write, rate):
     )
 
 
+@pytest.mark.parametrize(("rate", "samples"), [(1e11, "5.9e+09"), (1e300, "5.9e+298")])
+def test_resampling_to_more_samples_than_a_memory_holds(write, rate, samples):
+    refused(
+        write(text_of(ROWS)),
+        f"resample is {rate:g} Hz: 0.059 s would be {samples} samples; at most 1e+08",
+        **COLUMNS,
+        resample=rate,
+    )
+
+
 def test_resampling_does_not_sort_time(write):
     rows = list(ROWS)
     rows[20], rows[21] = rows[21], rows[20]

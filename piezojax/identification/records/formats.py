@@ -103,7 +103,7 @@ def _tdms(file: BinaryIO) -> Columns:
                     channel.name,
                     channel[:],
                     _text(channel.properties.get("unit_string")),
-                    channel.properties.get("wf_increment") or None,
+                    _step(channel.properties.get("wf_increment"), channel.name),
                 )
                 for channel in group.channels()
             )
@@ -210,6 +210,19 @@ def _prefixed(groups: dict[str, Columns]) -> Columns:
         for group, columns in groups.items()
         for name, column in columns.items()
     }
+
+
+def _step(value: Any, name: str) -> float | None:
+    """Return the time step in s of channel ``name``, or None if the file has none."""
+    try:
+        step = float(value or 0.0)
+    except (TypeError, ValueError):
+        step = np.nan
+    if not (np.isfinite(step) and step >= 0.0):
+        raise ContentError(
+            f"the time step of {name!r} is {value!r}; it must be a number above 0"
+        )
+    return step or None
 
 
 def _text(value: Any) -> str | None:

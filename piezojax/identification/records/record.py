@@ -21,6 +21,9 @@ SHORTEST = 50
 IS_TIME = re.compile(r"time\b|time_", re.IGNORECASE)
 """Pattern of the names of time columns."""
 
+LONGEST = 100_000_000
+"""Most samples of a resampled record."""
+
 UNIFORM = 1e-3
 """Largest relative difference of time steps that count as one sample time."""
 
@@ -320,6 +323,11 @@ def _resampled(
     """Return ``values`` on a uniform grid of ``rate`` (Hz), and the step in s."""
     dt = 1.0 / _above_zero(rate, "resample")
     # The factor keeps the last sample despite rounding.
-    count = int((instants[-1] - instants[0]) / dt * (1.0 + 1e-12)) + 1
-    grid = instants[0] + dt * np.arange(count)
+    steps = (instants[-1] - instants[0]) / dt * (1.0 + 1e-12)
+    if not steps < LONGEST:
+        raise ContentError(
+            f"resample is {rate:g} Hz: {instants[-1] - instants[0]:g} s would be "
+            f"{steps:.3g} samples; at most {LONGEST:g} are allowed"
+        )
+    grid = instants[0] + dt * np.arange(int(steps) + 1)
     return {name: np.interp(grid, instants, v) for name, v in values.items()}, dt
