@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..core.files import write_text
-from ..tuning.baselines import Baselines, Contestant
+from ..tuning.baselines import BaselineEntry, Baselines
 from ..tuning.baselines.entries import BASELINES_FILE
 from .comparison_map import MARKERS, SERIES_COLOURS
 from .figures import AFTER, figure, headed, styled, ticks_in_full, write
@@ -31,7 +31,7 @@ def baselines_table(baselines: Baselines) -> Table:
     table.add_column("method")
     for title in ("loss", "error", "runs", "time", "as good", "sooner"):
         table.add_column(title, justify="right")
-    for entry in (baselines.ours, *baselines.rivals):
+    for entry in (baselines.ours, *baselines.entries):
         error = entry.holdout_geomean_um
         table.add_row(
             entry.method,
@@ -52,14 +52,14 @@ def baselines_text(baselines: Baselines) -> str:
     """Return one line that compares the search of piezojax with the best baseline."""
     if baselines.best is None:
         return "no baseline has a stable loop"
-    rival, ours = baselines.rival(baselines.best), baselines.ours
-    if rival.ratio is None or rival.reached_s is None:
-        return f"{ours.method} never was as good as {rival.method}, the best baseline"
-    running, near = _times(rival.ratio_running), _times(rival.ratio_best)
+    best, ours = baselines.entry(baselines.best), baselines.ours
+    if best.ratio is None or best.reached_s is None:
+        return f"{ours.method} never was as good as {best.method}, the best baseline"
+    running, near = _times(best.ratio_running), _times(best.ratio_best)
     return (
-        f"as good as {rival.method}, the best baseline, after {rival.reached_s:.1f} s "
-        f"instead of {rival.wall_s:.1f} s: {_times(rival.ratio)} sooner, {running} "
-        f"without compiling, {_times(rival.ratio_cpu)} in processor time, {near} "
+        f"as good as {best.method}, the best baseline, after {best.reached_s:.1f} s "
+        f"instead of {best.wall_s:.1f} s: {_times(best.ratio)} sooner, {running} "
+        f"without compiling, {_times(best.ratio_cpu)} in processor time, {near} "
         "sooner than it came within 0.001 of its end"
     )
 
@@ -85,7 +85,7 @@ def baselines_figure(baselines: Baselines) -> Figure:
     picture = figure(7.6, 4.0)
     ax = picture.subplots()
     colours = [colour for colour in SERIES_COLOURS if colour != AFTER]
-    for i, entry in enumerate(e for e in baselines.rivals if e.loss is not None):
+    for i, entry in enumerate(e for e in baselines.entries if e.loss is not None):
         style: dict[str, Any] = {
             "color": colours[i % len(colours)],
             "label": entry.method,
@@ -120,6 +120,6 @@ def baselines_figure(baselines: Baselines) -> Figure:
     return picture
 
 
-def _as_drawn(entry: Contestant, geometric: bool) -> np.ndarray:
+def _as_drawn(entry: BaselineEntry, geometric: bool) -> np.ndarray:
     """Return the losses as drawn: the logarithm of a geometric mean is undone."""
     return np.exp(entry.losses) if geometric else np.array(entry.losses)

@@ -13,7 +13,7 @@ from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
 from ..core.space import Space
 from ..solve.gauss_newton import damped_gauss_newton
-from ..solve.multi_start import InStep, descend
+from ..solve.multi_start import BatchedDescents, descend
 from ..solve.optimisers import Optimiser, View
 from ..solve.problem import Verdict
 from .lanes import Lanes, mean_squares
@@ -155,7 +155,7 @@ def fit(
     progress = Silent() if progress is None else progress
     places = jnp.asarray(free)
     # One start at a time: a batch of all cells already keeps the processor busy.
-    descents = InStep(
+    descents = BatchedDescents(
         lambda starts: _begin(problem, starts, places),
         lambda carry: _advance(problem, places, carry),
         np.stack([np.asarray(start) for start in starts]),

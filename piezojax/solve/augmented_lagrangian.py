@@ -48,7 +48,7 @@ def with_zero_multipliers(problem: Problem, size: int) -> Problem:
     if not problem.limits:
         return problem
     middle = jnp.full(size, 0.5)
-    count = jax.eval_shape(lambda p: p.violated(middle), problem).shape[0]
+    count = jax.eval_shape(lambda p: p.violations(middle), problem).shape[0]
     return problem.with_multipliers(jnp.zeros(count))
 
 

@@ -14,7 +14,7 @@ from .augmented_lagrangian import with_zero_multipliers
 from .clock import Clock
 from .descent import Patience
 from .gradient import with_finite_gradient
-from .multi_start import InStep
+from .multi_start import BatchedDescents
 from .optimisers import METHODS
 from .problem import Problem, Verdict
 
@@ -103,7 +103,7 @@ class LockstepDescent:
             return jax.vmap(advance_one)(carry, multipliers)
 
         def violated(problem, units):
-            return jax.vmap(lambda unit: problem.violated(unit))(units)
+            return jax.vmap(lambda unit: problem.violations(unit))(units)
 
         problem = self._problem
         units = jnp.full((starts, self._size), 0.5)
@@ -118,11 +118,11 @@ class LockstepDescent:
 
     def begin(
         self, problem: Problem, units: np.ndarray, multipliers: Array
-    ) -> tuple[InStep, int]:
+    ) -> tuple[BatchedDescents, int]:
         """Return descents from ``units``, and the number of evaluations used."""
         begin, advance, _ = self._programs[len(units)]
         problem = problem.with_multipliers(self._problem.multipliers)
-        descents = InStep(
+        descents = BatchedDescents(
             lambda units: begin(problem, units, multipliers),
             lambda carry: advance(problem, carry, multipliers),
             units,
@@ -130,7 +130,7 @@ class LockstepDescent:
         )
         return descents, 0
 
-    def violated(self, problem: Problem, units: np.ndarray) -> Array:
+    def violations(self, problem: Problem, units: np.ndarray) -> Array:
         """Return the violations [starts, constraints] at ``units``."""
         violated = self._programs[len(units)][2]
         problem = problem.with_multipliers(self._problem.multipliers)

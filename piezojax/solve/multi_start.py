@@ -1,8 +1,8 @@
-"""Multi-start: descents from many starts, of which a Cut may drop the worse.
+"""Multi-start: descents from many starts; a Cut may drop the worse ones.
 
 One loop, ``descend``, serves every search. Descents advance in one compiled program
-(``InStep``) or in threads (``InThreads``). ``minimise`` adds the rounds of the
-augmented Lagrangian; its strategies are ``successive_halving`` and ``lockstep``.
+(``BatchedDescents``) or in threads (``ThreadedDescents``). ``minimise`` adds the rounds
+of the augmented Lagrangian; its strategies are ``successive_halving`` and ``lockstep``.
 """
 
 import os
@@ -28,7 +28,7 @@ Cut = Callable[[int, int], int | None]
 keep all."""
 
 
-class Standing(NamedTuple):
+class DescentStatus(NamedTuple):
     """State of the running descents, one entry each, and the evaluations of a step.
 
     ``places`` are their indices among the starts.
@@ -46,28 +46,28 @@ class Standing(NamedTuple):
 class Descents(Protocol):
     """Descents from several starts that advance side by side."""
 
-    def advance(self) -> Standing:
-        """Move every descent by one step; return where they stand."""
+    def advance(self) -> DescentStatus:
+        """Move every descent by one step; return their status."""
         ...
 
     def keep(self, rows: np.ndarray) -> None:
-        """Go on with the descents at ``rows`` of the last Standing alone."""
+        """Keep only the descents at ``rows`` of the last DescentStatus."""
         ...
 
 
 def descend(
     descents: Descents,
     steps: int,
-    watch: Callable[[Standing], None],
+    watch: Callable[[DescentStatus], None],
     *,
     cut: Cut | None = None,
     patience: Patience | None = None,
-) -> tuple[Standing, bool]:
+) -> tuple[DescentStatus, bool]:
     """Advance ``descents`` by at least one and at most ``steps`` steps.
 
     The loop ends when all are done or ``patience`` with the best is exhausted, which
-    restarts after each cut. ``watch`` receives the Standing of every step. Returns the
-    last Standing, and whether the descents ended before the step limit.
+    restarts after each cut. ``watch`` receives the DescentStatus of every step. Returns
+    the last DescentStatus, and whether the descents ended before the step limit.
     """
     step, bests = 0, []
     while True:
@@ -85,7 +85,7 @@ def descend(
             bests = []
 
 
-class InStep:
+class BatchedDescents:
     """Descents of an Optimiser, up to ``width`` of them in one compiled program.
 
     ``begin(units)`` returns a carry, ``advance(carry)`` the next carry, Views and
@@ -106,19 +106,19 @@ class InStep:
     def _parts(self) -> np.ndarray:
         return self._places.reshape(-1, self._width)
 
-    def advance(self) -> Standing:
-        """Move every descent by one step; return where they stand."""
+    def advance(self) -> DescentStatus:
+        """Move every descent by one step; return their status."""
         advanced = [self._advance(carry) for carry in self._carries]
         self._carries = [carry for carry, _, _ in advanced]
         view, verdict = jax.tree.map(
             lambda *parts: np.concatenate(parts), *(rest for _, *rest in advanced)
         )
-        return Standing(
+        return DescentStatus(
             view.unit, view.loss, verdict, view.done, self._places, len(view.loss)
         )
 
     def keep(self, rows: np.ndarray) -> None:
-        """Go on with the descents at ``rows`` of the last Standing alone."""
+        """Keep only the descents at ``rows`` of the last DescentStatus."""
         rows = _filled(rows, self._width)
         self._places = self._places[rows]
         every = jax.tree.map(lambda *parts: jnp.concatenate(parts), *self._carries)
@@ -133,7 +133,7 @@ def _filled(places: np.ndarray, width: int) -> np.ndarray:
     return np.resize(places, -(-len(places) // width) * width)
 
 
-class InThreads:
+class ThreadedDescents:
     """Descents stepped from Python, each in its own thread.
 
     Threads run in parallel, because an evaluation uses one processor and releases the
@@ -144,13 +144,13 @@ class InThreads:
         self._descents = list(descents)
         self._places = np.arange(len(descents))
 
-    def advance(self) -> Standing:
-        """Move every descent by one step; return where they stand."""
+    def advance(self) -> DescentStatus:
+        """Move every descent by one step; return their status."""
         moving = [descent for descent in self._descents if not descent.done]
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             taken = sum(pool.map(Descent.step, moving))
         every = self._descents
-        return Standing(
+        return DescentStatus(
             np.array([descent.unit for descent in every]),
             np.array([descent.loss for descent in every]),
             jax.tree.map(lambda *parts: np.stack(parts), *(d.verdict for d in every)),
@@ -160,7 +160,7 @@ class InThreads:
         )
 
     def keep(self, rows: np.ndarray) -> None:
-        """Go on with the descents at ``rows`` of the last Standing alone."""
+        """Keep only the descents at ``rows`` of the last DescentStatus."""
         self._descents = [self._descents[row] for row in rows]
         self._places = self._places[rows]
 
@@ -213,7 +213,7 @@ class Strategy(Protocol):
         """
         ...
 
-    def violated(self, problem: Problem, units: np.ndarray) -> Array:
+    def violations(self, problem: Problem, units: np.ndarray) -> Array:
         """Return the violations [starts, constraints] at ``units``."""
         ...
 
@@ -237,7 +237,7 @@ def minimise(
     multipliers = jnp.zeros((len(starts), strategy.constraints))
     for penalty, share, last in rounds(problem, steps):
 
-        def watch(standing: Standing, places: np.ndarray = places) -> None:
+        def watch(standing: DescentStatus, places: np.ndarray = places) -> None:
             state.add_step(standing.verdict, places[standing.places])
             state.update_best(standing.units, standing.verdict, standing.evaluations)
             progress.advance(state.loss)
@@ -255,5 +255,7 @@ def minimise(
             units, best = standing.units[best], standing.places[best]
             places = places[best]
             multipliers = updated(
-                strategy.violated(problem, units), multipliers[best], as_array(penalty)
+                strategy.violations(problem, units),
+                multipliers[best],
+                as_array(penalty),
             )

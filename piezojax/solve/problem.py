@@ -77,7 +77,7 @@ class Problem(Protocol):
         """Return the objective without constraints, and the largest violation."""
         ...
 
-    def violated(self, unit: Unit) -> Float[Array, " constraints"]:
+    def violations(self, unit: Unit) -> Float[Array, " constraints"]:
         """Return the violation of every constraint, positive where it is violated."""
         ...
 

@@ -20,10 +20,10 @@ from .descent import (
     derivatives_at,
     trials_at,
 )
-from .multi_start import InThreads
+from .multi_start import ThreadedDescents
 from .problem import Problem, Verdict
 
-LAP = 3
+HALVING_STEPS = 3
 """Steps after which the worse half of the descents is dropped."""
 
 PATIENCE = 5
@@ -34,12 +34,12 @@ POINTS = len(PARALLEL.multiples)
 
 
 def better_half(step: int, running: int) -> int | None:
-    """Return the number of descents kept: half, rounded up, at the end of a lap."""
-    return (running + 1) // 2 if step % LAP == 0 else None
+    """Return the number of descents kept: half, rounded up, every HALVING_STEPS."""
+    return (running + 1) // 2 if step % HALVING_STEPS == 0 else None
 
 
 class SuccessiveHalving:
-    """Gauss-Newton descents on the errors of ``problem``; a lap drops the worse half.
+    """Gauss-Newton descents on the errors of ``problem``, halved in number in turn.
 
     The curvature is computed from one of ``every`` errors. A descent ends when it gains
     less than ``tolerance`` in PATIENCE steps. ``size`` is the number of unknowns. After
@@ -70,9 +70,9 @@ class SuccessiveHalving:
         )
         # A problem without limits has one round, which needs no violations.
         self._violated: Callable = (
-            clock.compiled(lambda p, unit: p.violated(unit), problem, units[0])
+            clock.compiled(lambda p, unit: p.violations(unit), problem, units[0])
             if problem.limits
-            else problem.violated
+            else problem.violations
         )
 
     @property
@@ -105,7 +105,7 @@ class SuccessiveHalving:
 
     def begin(
         self, problem: Problem, units: np.ndarray, multipliers: Array
-    ) -> tuple[InThreads, int]:
+    ) -> tuple[ThreadedDescents, int]:
         """Return descents from ``units``, and the number of evaluations used."""
         # All 0 in the first round; later there is only one descent.
         problem = problem.with_multipliers(multipliers[0])
@@ -129,9 +129,9 @@ class SuccessiveHalving:
             )
             for i, unit in enumerate(units)
         ]
-        return InThreads(descents), len(descents)
+        return ThreadedDescents(descents), len(descents)
 
-    def violated(self, problem: Problem, units: np.ndarray) -> Array:
+    def violations(self, problem: Problem, units: np.ndarray) -> Array:
         """Return the violations [starts, constraints] at ``units``."""
         problem = problem.with_multipliers(self._problem.multipliers)
         return jnp.stack([self._violated(problem, as_array(unit)) for unit in units])

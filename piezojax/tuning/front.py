@@ -51,7 +51,7 @@ def trace_front(
         table.limits, reverse=CONSTRAINTS[table.constraint].sense == "at most"
     )
 
-    def solved(limit: float, unit: np.ndarray) -> Place:
+    def solve(limit: float, unit: np.ndarray) -> Place:
         limited = objective.with_limits(limits | {table.constraint: limit})
         state = SearchState(unit, starts=unit[None])
         minimise(strategy, limited, unit[None], state, table.steps, progress)
@@ -75,22 +75,22 @@ def trace_front(
 
     found, unit = [], search.unit
     for limit in loosest_first:
-        unit, point = solved(limit, unit)
+        unit, point = solve(limit, unit)
         found.append((unit, point))
-    return [point for _, point in undominated(found, solved)]
+    return [point for _, point in non_dominated(found, solve)]
 
 
-def undominated(
-    found: Sequence[Place], solved: Callable[[float, np.ndarray], Place]
+def non_dominated(
+    found: Sequence[Place], solve: Callable[[float, np.ndarray], Place]
 ) -> list[Place]:
     """Return the points ``found`` on the front, without dominated ones.
 
     ``found`` runs from the loosest limit to the tightest. Each point that is worse than
-    the next tighter one is replaced by ``solved``, which starts from that one's gains.
+    the next tighter one is replaced by ``solve``, which starts from that one's gains.
     """
     found = list(found)
     for i in reversed(range(len(found) - 1)):
         (_, looser), (unit, tighter) = found[i : i + 2]
         if tighter.kept and not (looser.kept and looser.loss <= tighter.loss):
-            found[i] = solved(looser.limit, unit)
+            found[i] = solve(looser.limit, unit)
     return found

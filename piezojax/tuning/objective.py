@@ -230,7 +230,7 @@ class Objective(eqx.Module):
         """Return the objective without constraints, and the largest violation."""
         return self.value_and_verdict(unit)[1]
 
-    def violated(self, unit: Float[Array, " n"]) -> Float[Array, " constraints"]:
+    def violations(self, unit: Float[Array, " n"]) -> Float[Array, " constraints"]:
         """Return all violations, as ``constraints.violations`` does."""
         return self._error_and_violations(self.figures(unit))[1]
 

@@ -16,7 +16,7 @@ from ..solve.clock import Clock
 from ..solve.search_state import SearchState
 from ..study import Case, Stage, read, shipped
 from ..study.ensemble import Part
-from .baselines import Budget, contest
+from .baselines import Budget, compare_baselines
 from .data import Data, make_data
 from .evaluator import Evaluator
 from .front import trace_front
@@ -98,12 +98,12 @@ def tune(
         # The gains found are kept; only a second interrupt ends the report too.
         search.status = "interrupted"
         result = _report(case, data, evaluator, before, after, search, clock, {}, None)
-    rivals = (
-        contest(objective, case, data, search, baselines, progress)
+    comparison = (
+        compare_baselines(objective, case, data, search, baselines, progress)
         if baselines and search.status != "interrupted"
         else None
     )
-    return Outcome(result, case.loop, after, case, data.holdout, rivals)
+    return Outcome(result, case.loop, after, case, data.holdout, comparison)
 
 
 def _scale(

@@ -1,4 +1,4 @@
-"""Baselines that search, on a known minimum, and a contest on a small study."""
+"""Baselines that search, on a known minimum, and a comparison on a small study."""
 
 import copy
 import dataclasses
@@ -20,8 +20,8 @@ from piezojax.solve.clock import Clock
 from piezojax.solve.history import History
 from piezojax.study import Study, build
 from piezojax.tuning.baselines import Budget, cma_es, load_baselines, nelder_mead
-from piezojax.tuning.baselines.contest import holdout_geomean
-from piezojax.tuning.baselines.entries import Contestant, against
+from piezojax.tuning.baselines.baseline_runs import holdout_geomean
+from piezojax.tuning.baselines.entries import BaselineEntry, with_ratios
 from piezojax.tuning.data import make_data
 
 METHODS = {
@@ -111,7 +111,7 @@ def entry(**changes):
         method="m", loss=1.0, holdout_geomean_um=0.1, evaluations=10, wall_s=20.0,
         compile_s=2.0, cpu_s=30.0, best_s=15.0, stop="", gains={},
     )  # fmt: skip
-    return Contestant(**(numbers | changes))
+    return BaselineEntry(**(numbers | changes))
 
 
 def test_the_ratio_is_of_the_time_to_the_same_loss():
@@ -122,12 +122,12 @@ def test_the_ratio_is_of_the_time_to_the_same_loss():
         used_s=[1.0, 6.0, 7.0],
         evaluated=[5, 6, 7],
     )
-    found = against(entry(), ours)
+    found = with_ratios(entry(), ours)
     assert (found.reached_s, found.reached_evaluations) == (4.0, 6)
     assert (found.ratio, found.ratio_running, found.ratio_best) == (5.0, 18.0, 3.75)
     assert found.ratio_cpu == 5.0
-    assert against(entry(loss=0.4), ours).ratio is None
-    assert against(entry(loss=None), ours).reached_s == 2.0
+    assert with_ratios(entry(loss=0.4), ours).ratio is None
+    assert with_ratios(entry(loss=None), ours).reached_s == 2.0
 
 
 STUDY = {
@@ -163,7 +163,7 @@ def outcome():
 
 def test_a_contest_on_one_objective(outcome):
     found = outcome.baselines
-    names = [rival.method for rival in found.rivals]
+    names = [entry.method for entry in found.entries]
     assert names[:2] == ["Ziegler-Nichols PI", "Ziegler-Nichols PID"]
     assert names[-3:] == ["CMA-ES", "CMA-ES, population 12", "Nelder-Mead"]
     assert found.notes == []
@@ -171,17 +171,17 @@ def test_a_contest_on_one_objective(outcome):
     assert found.ours.holdout_geomean_um == pytest.approx(
         outcome.result.holdout.geomean_rms_um, rel=1e-9
     )
-    for rival in found.rivals[-3:]:
-        assert rival.loss == pytest.approx(found.ours.loss, abs=0.05)
+    for entry in found.entries[-3:]:
+        assert entry.loss == pytest.approx(found.ours.loss, abs=0.05)
     # A PI by a rule lies in the box of this study: the searches can only be better.
-    rule = found.rival("Ziegler-Nichols PI")
+    rule = found.entry("Ziegler-Nichols PI")
     assert rule.loss > found.ours.loss
     assert rule.unit is None
 
 
 def test_a_rule_is_judged_like_the_gains_of_the_box(outcome):
     """Its PI put into the study by hand has the loss and the error of its entry."""
-    rule = outcome.baselines.rival("Ziegler-Nichols PI")
+    rule = outcome.baselines.entry("Ziegler-Nichols PI")
     table = {"type": "PID", "dt": 5e-5}
     table |= {path.split(".")[1]: value for path, value in rule.gains.items()}
     case = case_of(controller=table)
@@ -208,8 +208,8 @@ def test_files_and_table(outcome, tmp_path, capsys):
     assert (tmp_path / "baselines.png").read_bytes().startswith(b"\x89PNG")
     console(False).print(baselines_table(outcome.baselines))
     printed = capsys.readouterr().out
-    for rival in outcome.baselines.rivals:
-        assert rival.method.split()[-1] in printed
+    for entry in outcome.baselines.entries:
+        assert entry.method.split()[-1] in printed
     assert "best baseline" in baselines_text(outcome.baselines)
 
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from piezojax.tuning.front import undominated
+from piezojax.tuning.front import non_dominated
 from piezojax.tuning.result import FrontPoint
 
 
@@ -42,7 +42,7 @@ def test_a_limit_is_solved_again_from_a_tighter_one_that_is_better(losses, kept,
         asked.append(limit)
         return place(limit, -2.5 if limit == 1.3 else -5.0, unit=float(unit[0]))
 
-    front = undominated(found, solved)
+    front = non_dominated(found, solved)
     assert asked == again
     assert [point.limit for _, point in front] == [1.4, 1.3, 1.2]
     for i, limit in enumerate((1.4, 1.3)):

@@ -26,7 +26,7 @@ from piezojax.solve.descent import (
     trials_at,
 )
 from piezojax.solve.gauss_newton import Quadratic, boxed_step
-from piezojax.solve.multi_start import InThreads, descend
+from piezojax.solve.multi_start import ThreadedDescents, descend
 from piezojax.solve.problem import Errors, Verdict
 from piezojax.solve.successive_halving import POINTS, better_half
 from piezojax.study import Study, build
@@ -152,7 +152,7 @@ def test_the_better_half_goes_on():
     places = np.random.default_rng(1).uniform(0.1, 0.9, (9, 2))
     seen = []
     standing, ended = descend(
-        InThreads([descent_on("valley", place) for place in places]),
+        ThreadedDescents([descent_on("valley", place) for place in places]),
         7,
         seen.append,
         cut=better_half,

@@ -18,7 +18,7 @@ from ...core.system import System, rest_output
 from ...hysteresis.model import input_before
 from ...solve.descent import Patience
 from ...solve.gauss_newton import damped_gauss_newton
-from ...solve.multi_start import InStep, descend
+from ...solve.multi_start import BatchedDescents, descend
 from ...solve.optimisers import Optimiser, View
 from ...solve.problem import Verdict, linearised
 from ..records.record import Record
@@ -165,7 +165,7 @@ def output_error(
     starts = _starts_for_records(structure, problem)
     width = min(PARALLEL_STARTS, len(starts))
     progress.stage(f"compiling the fit of {len(names)} parameters")
-    descents = InStep(
+    descents = BatchedDescents(
         lambda units: _begin(problem, units),
         lambda carry: _advance(problem, carry),
         starts,

@@ -12,7 +12,7 @@ from scipy import linalg, special
 from ...dynamics import StateSpace, reflected
 from ...solve.descent import SEQUENTIAL, Descent, LocalModel, Patience, Trials
 from ...solve.gauss_newton import Quadratic
-from ...solve.multi_start import InThreads, descend
+from ...solve.multi_start import ThreadedDescents, descend
 from ...solve.problem import Verdict
 from .frequency import EmpiricalResponse
 
@@ -284,7 +284,7 @@ def _descend(modes: _Modes, data: _Data, steps: int) -> tuple[_Modes, list[float
         box=(-np.inf, np.inf),
         losses=losses,
     )
-    descend(InThreads([descent]), steps, lambda standing: None)
+    descend(ThreadedDescents([descent]), steps, lambda standing: None)
     # A last step without a decrease does not count.
     costs = losses[:-1] if len(losses) > 1 and losses[-1] == losses[-2] else losses
     return _moved(modes, descent.unit), costs

@@ -14,7 +14,7 @@ from ...core.rollout import simulate
 from ...core.space import INSIDE, Space, squash, unsquash
 from ...core.system import System
 from ...solve.gauss_newton import TrustRegion, damped_gauss_newton
-from ...solve.multi_start import InStep, descend
+from ...solve.multi_start import BatchedDescents, descend
 from ...solve.optimisers import Optimiser, View
 from ...solve.problem import Verdict, linearised
 from ..records.record import Record
@@ -79,7 +79,7 @@ def fit_steady_state(
         for columns in (record.inputs, record.outputs)
     )
     problem = _Problem(put, input, output, settle)
-    descents = InStep(
+    descents = BatchedDescents(
         lambda starts: _begin(problem, starts),
         lambda carry: _advance(problem, carry),
         np.asarray(starts),

@@ -1,8 +1,8 @@
 """Baselines of tuning: rules for a PID, and searches without gradients."""
 
-from .contest import contest as contest
+from .baseline_runs import compare_baselines as compare_baselines
+from .entries import BaselineEntry as BaselineEntry
 from .entries import Baselines as Baselines
-from .entries import Contestant as Contestant
 from .entries import load_baselines as load_baselines
 from .rules import Rule as Rule
 from .rules import Ultimate as Ultimate

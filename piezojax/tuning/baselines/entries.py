@@ -1,4 +1,4 @@
-"""Result of a contest of baselines: the content of ``baselines.json``."""
+"""Comparison of tuning with its baselines: the content of ``baselines.json``."""
 
 from pathlib import Path
 
@@ -15,8 +15,8 @@ NEAR = 1e-3
 """Distance from its last loss within which a search counts as finished."""
 
 
-class Contestant(BaseModel):
-    """Method of a contest: its gains, loss and times.
+class BaselineEntry(BaseModel):
+    """A method of the comparison: its gains, loss and times.
 
     ``loss`` is the objective, ``holdout_geomean_um`` the geometric mean of the RMS
     errors on held-out noise; both are None where the loop diverges. ``wall_s`` is the
@@ -58,9 +58,9 @@ class Contestant(BaseModel):
 
 
 class Baselines(BaseModel):
-    """Content of ``baselines.json``: the search of piezojax and its rivals.
+    """Content of ``baselines.json``: the search of piezojax and the baselines.
 
-    ``rivals`` are in the order in which they were run. ``best`` names the rival with
+    ``entries`` are in the order in which they were run. ``best`` names the one with
     the lowest loss, None if none has a stable loop. ``notes`` lists the baselines that
     could not be run, with the reasons.
     """
@@ -69,14 +69,14 @@ class Baselines(BaseModel):
     title: str
     seed: int
     aggregate: str
-    ours: Contestant
-    rivals: list[Contestant]
+    ours: BaselineEntry
+    entries: list[BaselineEntry]
     best: str | None
     notes: list[str]
 
-    def rival(self, method: str) -> Contestant:
-        """Return the rival named ``method``. Raises KeyError if there is none."""
-        return {rival.method: rival for rival in self.rivals}[method]
+    def entry(self, method: str) -> BaselineEntry:
+        """Return the entry of ``method``. Raises KeyError if there is none."""
+        return {entry.method: entry for entry in self.entries}[method]
 
 
 def load_baselines(path: str | Path) -> Baselines:
@@ -89,18 +89,18 @@ def load_baselines(path: str | Path) -> Baselines:
     return read_model(Baselines, path, "holds no baselines")
 
 
-def contestant(
+def baseline_entry(
     method: str,
     history: History,
     stop: str,
     holdout_um: float | None,
     gains: dict[str, float],
     unit: np.ndarray | None,
-) -> Contestant:
-    """Return the Contestant of a method from its history."""
+) -> BaselineEntry:
+    """Return the BaselineEntry of a method from its history."""
     near = history.reached(history.loss + NEAR)
     assert near is not None
-    return Contestant(
+    return BaselineEntry(
         method=method,
         loss=history.loss if history.loss < FAILED_LOSS else None,
         holdout_geomean_um=holdout_um,
@@ -120,21 +120,21 @@ def contestant(
     )
 
 
-def against(rival: Contestant, ours: Contestant) -> Contestant:
-    """Return ``rival`` with the time at which ``ours`` reached its loss, and ratios."""
-    loss = np.inf if rival.loss is None else rival.loss
+def with_ratios(entry: BaselineEntry, ours: BaselineEntry) -> BaselineEntry:
+    """Return ``entry`` with the time at which ``ours`` reached its loss, and ratios."""
+    loss = np.inf if entry.loss is None else entry.loss
     place = next((i for i, own in enumerate(ours.losses) if own <= loss), None)
     if place is None:
-        return rival
+        return entry
     reached = ours.times_s[place]
     running = reached - ours.compiled_s[place]
-    return rival.model_copy(
+    return entry.model_copy(
         update={
             "reached_s": reached,
             "reached_evaluations": ours.evaluated[place],
-            "ratio": rival.wall_s / reached,
-            "ratio_running": (rival.wall_s - rival.compile_s) / running,
-            "ratio_best": rival.best_s / reached,
-            "ratio_cpu": rival.cpu_s / ours.used_s[place],
+            "ratio": entry.wall_s / reached,
+            "ratio_running": (entry.wall_s - entry.compile_s) / running,
+            "ratio_best": entry.best_s / reached,
+            "ratio_cpu": entry.cpu_s / ours.used_s[place],
         }
     )

@@ -30,7 +30,7 @@ PATHS = tuple(
 )
 
 
-class ByRule(NamedTuple):
+class RulePID(NamedTuple):
     """PID by a rule: its name, its history, its loop, and its gains by path."""
 
     name: str
@@ -39,7 +39,7 @@ class ByRule(NamedTuple):
     gains: dict[str, float]
 
 
-def by_rules(objective: Objective, case: Case) -> tuple[list[ByRule], list[str]]:
+def rule_pids(objective: Objective, case: Case) -> tuple[list[RulePID], list[str]]:
     """Return the PIDs by rules for a case with their losses, and notes on failures.
 
     The ultimate gain gives the rules of Ziegler and Nichols. The relay gives theirs and
@@ -57,7 +57,7 @@ def by_rules(objective: Objective, case: Case) -> tuple[list[ByRule], list[str]]
             | _named("relay, Tyreus-Luyben", TYREUS_LUYBEN),
         ),
     }
-    found: list[ByRule] = []
+    found: list[RulePID] = []
     notes: list[str] = []
     for name, (experiment, rules) in experiments.items():
         clock = Clock()
@@ -66,7 +66,7 @@ def by_rules(objective: Objective, case: Case) -> tuple[list[ByRule], list[str]]
         except ValueError as error:
             notes.append(f"{name}: {error}")
             continue
-        found += judged(objective, ultimate, rules, case.study.dt, clock)
+        found += evaluate_rules(objective, ultimate, rules, case.study.dt, clock)
     return found, notes
 
 
@@ -97,13 +97,13 @@ def _by_relay(objective: Objective, case: Case, clock: Clock) -> Ultimate:
     )
 
 
-def judged(
+def evaluate_rules(
     objective: Objective,
     ultimate: Ultimate,
     rules: Mapping[str, Rule],
     dt: float,
     clock: Clock,
-) -> list[ByRule]:
+) -> list[RulePID]:
     """Return the PID of each rule with its loss, from one batch of simulations."""
     loops = {
         name: _around(objective.loop, rule.pid(ultimate, dt))
@@ -124,7 +124,7 @@ def judged(
         history = History(clock)
         history.add(1, float(loss))
         gains = dict(zip(PATHS, map(float, row), strict=True))
-        found.append(ByRule(name, history, loop, gains))
+        found.append(RulePID(name, history, loop, gains))
     return found
 
 

@@ -29,7 +29,7 @@ class Budget(NamedTuple):
     tolerance: float = 1e-4
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """Result of a search: best point in [0, 1]^n, history, and reason to stop."""
 
     unit: np.ndarray
@@ -37,8 +37,8 @@ class Found(NamedTuple):
     stop: str
 
 
-Method = Callable[[Any, np.ndarray, Budget, Progress], Found]
-"""Function ``method(objective, starts, budget, progress)`` that returns a Found.
+Method = Callable[[Any, np.ndarray, Budget, Progress], SearchResult]
+"""Function ``method(objective, starts, budget, progress)`` that returns a SearchResult.
 
 ``starts`` [starts, n] are points of the unit box, the best one first. ``objective`` has
 a method ``loss(unit)``."""
@@ -50,7 +50,7 @@ class _SpentError(Exception):
 
 def nelder_mead(
     objective: Any, starts: np.ndarray, budget: Budget, progress: Progress
-) -> Found:
+) -> SearchResult:
     """Search with Nelder and Mead's simplex (SciPy, adaptive, bounded).
 
     The search runs from each start in turn; each later start has the rest of the
@@ -93,7 +93,7 @@ def nelder_mead(
         except _SpentError:
             stop = "evaluations"
             break
-    return Found(best[1], history, stop)
+    return SearchResult(best[1], history, stop)
 
 
 def cma_es(population: int | None = None, seed: int = 1) -> Method:
@@ -106,7 +106,7 @@ def cma_es(population: int | None = None, seed: int = 1) -> Method:
 
     def search(
         objective: Any, starts: np.ndarray, budget: Budget, progress: Progress
-    ) -> Found:
+    ) -> SearchResult:
         history = History()
         strategy = _strategy(starts[0], population, seed, budget)
         some = as_array(np.zeros((strategy.popsize, starts.shape[1])))
@@ -118,7 +118,7 @@ def cma_es(population: int | None = None, seed: int = 1) -> Method:
             history.add(len(units), float(losses.min()))
             progress.advance(history.loss)
         stop = ", ".join(strategy.stop() or ())
-        return Found(np.asarray(strategy.result.xbest), history, stop)
+        return SearchResult(np.asarray(strategy.result.xbest), history, stop)
 
     return search
 

@@ -12,8 +12,8 @@ from ..data import Data
 from ..objective import Objective
 from ..result import scores
 from ..runs import evaluate
-from .entries import Baselines, Contestant, against, contestant
-from .pids import by_rules
+from .entries import BaselineEntry, Baselines, baseline_entry, with_ratios
+from .pids import rule_pids
 from .searches import Budget, Method, cma_es, nelder_mead
 
 LARGER = 2
@@ -30,7 +30,7 @@ def methods(seed: int, size: int) -> dict[str, Method]:
     }
 
 
-def contest(
+def compare_baselines(
     objective: Objective,
     case: Case,
     data: Data,
@@ -41,7 +41,7 @@ def contest(
     """Run every baseline on the objective of ``search`` and return the comparison.
 
     The baselines' searches have the same starts and the same box as ``search``.
-    ``Ctrl-C`` ends the contest and keeps the methods that have finished.
+    ``Ctrl-C`` ends the comparison and keeps the methods that have finished.
     """
 
     def entry_of(name, history, stop, unit):
@@ -49,34 +49,34 @@ def contest(
         loop = case.space.put(case.loop, place)
         gains = {path: float(x) for path, x in case.space.named(place).items()}
         held = holdout_geomean(loop, data, objective.start)
-        return contestant(name, history, stop, held, gains, unit)
+        return baseline_entry(name, history, stop, held, gains, unit)
 
     name = f"piezojax ({case.study.optimiser.method})"
     ours = entry_of(name, search.history, search.status, search.unit)
-    rivals: list[Contestant] = []
+    entries: list[BaselineEntry] = []
     notes: list[str] = []
     try:
         progress.stage("baselines: ultimate gain and relay")
-        found, skipped = by_rules(objective, case)
+        found, skipped = rule_pids(objective, case)
         notes += skipped
         for name, history, loop, gains in found:
             held = holdout_geomean(loop, data, objective.start)
-            rivals.append(contestant(name, history, "rule", held, gains, None))
+            entries.append(baseline_entry(name, history, "rule", held, gains, None))
         size = len(case.space.paths)
         for name, method in methods(case.study.seed, size).items():
             progress.stage(f"baseline: {name}")
             end = method(objective, search.starts, budget, progress)
-            rivals.append(entry_of(name, end.history, end.stop, end.unit))
+            entries.append(entry_of(name, end.history, end.stop, end.unit))
     except KeyboardInterrupt:
         notes.append("interrupted: baselines after the last one shown were not run")
-    stable = {r.method: r.loss for r in rivals if r.loss is not None}
+    stable = {r.method: r.loss for r in entries if r.loss is not None}
     return Baselines(
         study=case.name,
         title=case.study.title,
         seed=case.study.seed,
         aggregate=case.study.objective.aggregate,
         ours=ours,
-        rivals=[against(rival, ours) for rival in rivals],
+        entries=[with_ratios(entry, ours) for entry in entries],
         best=min(stable, key=lambda name: stable[name], default=None),
         notes=notes,
     )
