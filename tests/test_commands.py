@@ -17,6 +17,7 @@ from rich.console import Console
 
 import piezojax as pj
 from piezojax.analysis.stability import OperatingPoint
+from piezojax.cli.command import results_folder
 from piezojax.cli.reproduce import NAMES
 from piezojax.cli.terminal import Bar, console
 from piezojax.core.registry import parts
@@ -349,6 +350,81 @@ def test_ctrl_c_while_judging_loses_nothing(study, tmp_path, monkeypatch):
     assert result.exit_code == 0, result.output
     assert pj.load_result(tmp_path / "out").status != "interrupted"
     assert (tmp_path / "out" / "stability.json").exists()
+
+
+def terminate():
+    """Send SIGTERM to a command, as ``timeout`` and batch systems do."""
+    signal.raise_signal(signal.SIGTERM)
+
+
+def test_sigterm_acts_as_ctrl_c(study, tmp_path, monkeypatch):
+    advance = Bar.advance
+
+    def send(self, best, note=""):
+        if not sent:
+            sent.append(terminate())
+        advance(self, best, note)
+
+    sent = []
+    monkeypatch.setattr(Bar, "advance", send)
+    before = signal.getsignal(signal.SIGTERM)
+    result = call("tune", study, "--out", tmp_path / "out")
+    assert result.exit_code == 143
+    assert "Traceback" not in result.output
+    assert "interrupted after" in " ".join(result.stdout.split())
+    assert_interrupted(tmp_path / "out")
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_the_second_sigterm_is_left_to_the_system():
+    with Bar(console(quiet=True)) as bar:
+        terminate()
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+        with pytest.raises(KeyboardInterrupt):
+            bar.stage("judging")
+
+
+def test_reproduce_keeps_the_tables_that_are_finished(made_up, tmp_path, monkeypatch):
+    stage = Bar.stage
+
+    def send(self, text, steps=0):
+        if text == "simulating Table 5-5":
+            terminate()
+        stage(self, text, steps)
+
+    monkeypatch.setattr(Bar, "stage", send)
+    tables = ("--table", "5-3", "--table", "5-5", "--table", FIGURE)
+    result = call("reproduce", *tables, "--out", tmp_path / "out")
+    assert result.exit_code == 143
+    assert made_up == ["5-3"]
+    assert names(tmp_path / "out") == ["cells.csv", "cells.png", "summary.json"]
+    assert list(json.loads((tmp_path / "out" / "summary.json").read_text())) == ["5-3"]
+    assert "interrupted" in result.stdout
+
+
+def test_identify_all_keeps_the_models_that_are_fitted(record, tmp_path, monkeypatch):
+    advance = Bar.stage
+
+    def send(self, text, steps=0):
+        if text.startswith("2 of about"):
+            terminate()
+        advance(self, text, steps)
+
+    monkeypatch.setattr(Bar, "stage", send)
+    among = ("--model", "all", "--among", "coleman_hodgdon", "--steps", 1)
+    result = call("identify", record, *COLUMNS, *among, "--out", tmp_path / "out")
+    assert result.exit_code == 143, result.output
+    report = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert report["interrupted"]
+    assert [row["status"] for row in report["rows"]].count("fitted") == 1
+    assert pj.load(tmp_path / "out" / "model.json")
+    assert not (tmp_path / "out" / "models").exists()
+
+
+def test_a_folder_in_use_is_refused(study, tmp_path):
+    with results_folder(tmp_path / "out", "tune"):
+        result = call("tune", study, "--out", tmp_path / "out")
+    failed(result, "out is in use by a running command")
 
 
 def test_ctrl_c_twice_acts_at_once():

@@ -2,11 +2,14 @@
 
 import os
 import stat
+import subprocess
+import sys
 
 import pytest
 
 from piezojax.core import files
 from piezojax.core.files import fresh_folder, numbered_folder, write_bytes, write_text
+from piezojax.core.temporaries import FOREIGN, claimed, remove_stale, temporary
 
 
 def names(folder):
@@ -42,7 +45,7 @@ def interrupt(*_):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("step", ["fdopen", "chmod", "replace"])
+@pytest.mark.parametrize("step", ["write_bytes", "chmod", "replace"])
 @pytest.mark.parametrize(
     ("fault", "kind"), [(disk_full, DiskFullError), (interrupt, KeyboardInterrupt)]
 )
@@ -51,24 +54,13 @@ def test_a_fault_in_the_middle_leaves_the_old_file(
 ):
     path = tmp_path / "result.json"
     write_text(path, "old")
-    if step == "fdopen":
-        opened = os.fdopen
+    if step == "write_bytes":
 
-        class HalfWritten:
-            def __init__(self, handle, mode):
-                self.file = opened(handle, mode)
+        def half_written(file, content):
+            file.write_text(content[:1].decode())
+            fault()
 
-            def __enter__(self):
-                return self
-
-            def __exit__(self, *_):
-                self.file.close()
-
-            def write(self, content):
-                self.file.write(content[:1])
-                fault()
-
-        monkeypatch.setattr(files.os, "fdopen", HalfWritten)
+        monkeypatch.setattr(files.Path, "write_bytes", half_written)
     else:
         monkeypatch.setattr(files.os, step, fault)
     with pytest.raises(kind):
@@ -147,3 +139,106 @@ def test_numbered_folders(tmp_path):
     (tmp_path / "p753-2").write_text("a file of that name is in the way")
     assert numbered_folder(stem) == tmp_path / "p753-3"
     assert numbered_folder(stem) == fresh_folder(numbered_folder(stem))
+
+
+# Temporary files of killed runs
+
+LEAVE = """
+import os, signal, sys
+from pathlib import Path
+from piezojax.core.temporaries import claimed, temporary
+folder = Path(sys.argv[1])
+with claimed(folder), temporary(folder / "result.json") as file:
+    file.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.fixture(scope="module")
+def litter_names(tmp_path_factory):
+    """Kill a process that has claimed a folder and writes; return what it leaves."""
+    folder = tmp_path_factory.mktemp("out")
+    subprocess.run([sys.executable, "-c", LEAVE, folder], check=False)
+    found = names(folder)
+    assert [name.split(".")[1] for name in found] == ["result", "running"]
+    return found
+
+
+@pytest.fixture
+def litter(litter_names, tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    for name in litter_names:
+        (folder / name).touch()
+    return folder
+
+
+def test_a_killed_run_leaves_nothing_after_the_next(litter):
+    assert numbered_folder(litter) == litter
+    assert names(litter) == []
+
+
+def test_a_folder_of_a_killed_run_is_taken_again(litter):
+    assert fresh_folder(litter) == litter
+    assert names(litter) == []
+
+
+def test_results_of_a_killed_run_are_kept_and_its_litter_is_not(litter, litter_names):
+    inner = litter / "models" / "lag"
+    inner.mkdir(parents=True)
+    (inner / "fit.json").write_text("{}")
+    for name in litter_names:
+        (inner / name).touch()
+    with pytest.raises(ValueError, match="already holds results"):
+        fresh_folder(litter)
+    assert names(litter) == ["models"]
+    assert names(inner) == ["fit.json"]
+
+
+def test_files_in_use_are_left_alone(tmp_path):
+    with temporary(tmp_path / "result.json") as own:
+        # The parent of this process runs for as long as this one.
+        process, parent = f".{os.getpid()}.", f".{os.getppid()}."
+        other = tmp_path / own.name.replace(process, parent)
+        other.touch()
+        remove_stale(tmp_path)
+        assert names(tmp_path) == sorted([own.name, other.name])
+    assert names(tmp_path) == [other.name]
+
+
+def test_a_file_of_an_earlier_process_with_our_number_is_stale(tmp_path):
+    with temporary(tmp_path / "result.json") as own:
+        name = own.name
+    (tmp_path / name).touch()
+    remove_stale(tmp_path)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize(("age", "left"), [(0.0, 1), (2.0 * FOREIGN, 0)])
+def test_files_of_another_machine_are_judged_by_their_age(tmp_path, age, left):
+    path = tmp_path / ".result.json.elsewhere.1.0123abcd.part"
+    path.touch()
+    then = path.stat().st_mtime - age
+    os.utime(path, (then, then))
+    remove_stale(tmp_path)
+    assert len(names(tmp_path)) == left
+
+
+@pytest.mark.parametrize("name", [".hidden.part", "a.host.1.0123abcd.part", ".nfs01"])
+def test_files_of_others_are_left_alone(tmp_path, name):
+    (tmp_path / name).touch()
+    remove_stale(tmp_path)
+    assert names(tmp_path) == [name]
+
+
+def test_a_folder_in_use_is_not_taken(tmp_path):
+    stem = tmp_path / "p753"
+    stem.mkdir()
+    with claimed(stem) as alone:
+        assert alone
+        assert numbered_folder(stem) == tmp_path / "p753-2"
+        with pytest.raises(ValueError, match=r"p753 is in use by a running command"):
+            fresh_folder(stem)
+        with claimed(stem) as second:
+            assert not second
+    assert fresh_folder(stem) == stem

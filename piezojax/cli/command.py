@@ -1,7 +1,7 @@
 """Common parts of all commands: options, the results folder, one-line errors."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +9,12 @@ import click
 from rich.console import Console
 
 from ..core.files import fresh_folder, numbered_folder
+from ..core.temporaries import claimed
+from .stopping import exit_interrupted, terminable
 from .terminal import console
 
 RESULTS = Path("results")
 """Parent folder of the results if ``--out`` is not given."""
-
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as in a shell."""
 
 
 def common(function: Callable) -> Callable:
@@ -54,30 +53,37 @@ class Command(click.Command):
 def results_folder(out: Path | None, name: str) -> Iterator[Path]:
     """Yield an empty folder for results: ``out``, or a numbered one named ``name``.
 
-    The folder is removed if the work fails while it is empty. Raises ValueError if
-    ``out`` is in use or cannot be written.
+    No other command takes the folder while this one runs. The folder is removed if the
+    work fails while it is empty. Raises ValueError if ``out`` is in use or cannot be
+    written.
     """
-    folder = fresh_folder(out if out is not None else numbered_folder(RESULTS / name))
-    try:
-        yield folder
-    except BaseException:
-        if not any(folder.iterdir()):
-            folder.rmdir()
-        raise
+    with ExitStack() as stack:
+        folder = fresh_folder(out or numbered_folder(RESULTS / name))
+        while not stack.enter_context(claimed(folder)):  # another command was faster
+            stack.close()
+            folder = fresh_folder(out or numbered_folder(RESULTS / name))
+        try:
+            yield folder
+        except BaseException:
+            stack.close()
+            if not any(folder.iterdir()):
+                folder.rmdir()
+            raise
 
 
 def run(quiet: bool, body: Callable[[Console], Any]) -> None:
     """Run ``body``; report bad input in one line, with a non-zero exit status."""
     try:
-        body(console(quiet))
+        with terminable():
+            body(console(quiet))
     except ValueError as error:
         raise _one_line(str(error)) from None
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         raise _one_line(f"{where}{error.strerror or error}") from None
     except KeyboardInterrupt:
-        click.echo("interrupted before there was anything to keep", err=True)
-        raise SystemExit(INTERRUPTED) from None
+        click.echo("interrupted; files that were finished are kept", err=True)
+        exit_interrupted()
 
 
 def _one_line(message: str) -> click.ClickException:

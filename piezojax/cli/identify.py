@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from .command import Command, common, results_folder, run
+from .stopping import exit_interrupted
 from .terminal import Bar
 
 ALL = "all"
@@ -147,6 +148,7 @@ def main(
             ranking_notes,
             ranking_table,
             write_ranking,
+            write_ranking_so_far,
         )
 
         with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
@@ -158,6 +160,7 @@ def main(
                 test=test,
                 options=options,
                 progress=bar,
+                done=lambda ranking: write_ranking_so_far(ranking, folder),
             )
             bar.finish()
             bar.stage("drawing")
@@ -171,5 +174,7 @@ def main(
         ]:
             console.print(note, soft_wrap=True)
         console.print(f"{report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
+        if report.interrupted:
+            exit_interrupted()
 
     run(quiet, body)

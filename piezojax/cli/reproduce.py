@@ -6,6 +6,7 @@ import click
 
 from ..core.files import write_text
 from .command import Command, common, results_folder, run
+from .stopping import exit_interrupted
 from .terminal import Bar
 
 NAMES = (
@@ -53,33 +54,42 @@ def main(tables, calibrate, out, seed, quiet):
                 raise ValueError(
                     f"--table {table} is unknown; there are {', '.join(NAMES)}"
                 )
-        tabulated = [table for table in requested if table != FIGURE]
         cells = []
-        with (
-            results_folder(out, "reproduce") as folder,
-            console.status("simulating") as status,
-        ):
-            for table in tabulated:
-                status.update(f"simulating Table {table}")
-                cells += reproduce(table)
-            summary = summarise(cells)
-            write_text(folder / "cells.csv", as_csv(cells))
-            plain = {table: entry.model_dump() for table, entry in summary.items()}
-            write_text(folder / "summary.json", json.dumps(plain, indent=2) + "\n")
-            if cells:
-                write_picture(cells, folder)
-            if FIGURE in requested:  # printed as a curve: no cells to compare
-                status.update("simulating Figure 4.10")
+
+        def simulate(table, bar, folder):
+            if table == FIGURE:  # printed as a curve: no cells to compare
+                bar.stage("simulating Figure 4.10")
                 errors = errors_by_rate()
                 write_text(folder / f"{FIGURE}.csv", rates_as_csv(errors))
                 write_rates(errors, folder)
-        for table in tabulated:
+                return
+            bar.stage(f"simulating Table {table}")
+            cells.extend(reproduce(table))
+            write_text(folder / "cells.csv", as_csv(cells))
+            plain = {t: entry.model_dump() for t, entry in summarise(cells).items()}
+            write_text(folder / "summary.json", json.dumps(plain, indent=2) + "\n")
+
+        interrupted = False
+        with Bar(console) as bar, results_folder(out, "reproduce") as folder:
+            try:
+                for table in sorted(requested, key=lambda table: table == FIGURE):
+                    simulate(table, bar, folder)
+            except KeyboardInterrupt:
+                interrupted = True
+                if not cells:
+                    raise
+            bar.finish()
+            if cells:
+                bar.stage("drawing")
+                write_picture(cells, folder)
+        for table, entry in summarise(cells).items():
             console.print(
-                reproduction_table(
-                    table, [c for c in cells if c.table == table], summary[table]
-                )
+                reproduction_table(table, [c for c in cells if c.table == table], entry)
             )
         console.print(f"results in {folder}", soft_wrap=True)
+        if interrupted:
+            console.print("interrupted: the tables that were finished by then")
+            exit_interrupted()
 
     def calibration(console):
         from ..report.calibrated_cells import (
@@ -95,17 +105,19 @@ def main(tables, calibrate, out, seed, quiet):
 
         if tables:
             raise ValueError("--calibrate has tables of its own; leave --table out")
-        with results_folder(out, "calibrate") as folder:
-            with Bar(console) as bar:
-                fits = {n: calibrate(n, progress=bar) for n in EXPERIMENTS}
-            plain = {n: calibration_report(n, both) for n, both in fits.items()}
-            held_out = held_out_ratios(fits)
-            text = json.dumps(plain | {"together": held_out}, indent=2)
-            write_text(folder / "calibration.json", text + "\n")
+        fits, plain = {}, {}
+        with Bar(console) as bar, results_folder(out, "calibrate") as folder:
+            for name in EXPERIMENTS:
+                fits[name] = calibrate(name, progress=bar)
+                plain[name] = calibration_report(name, fits[name])
+                together = {"together": held_out_ratios(fits)}
+                text = json.dumps(plain | together, indent=2)
+                write_text(folder / "calibration.json", text + "\n")
+            bar.finish()
             write_calibration(fits, plain, folder)
         for name, both in fits.items():
             console.print(calibration_table(name, both, plain[name]))
-        console.print(together_table(held_out))
+        console.print(together_table(held_out_ratios(fits)))
         console.print(f"results in {folder}", soft_wrap=True)
 
     run(quiet, calibration if calibrate else body)

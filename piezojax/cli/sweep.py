@@ -10,7 +10,8 @@ from rich.console import Console
 
 from ..core.files import numbered_folder
 from ..core.runtime import simulate_side_by_side
-from .command import INTERRUPTED, RESULTS, Command, common, run
+from .command import RESULTS, Command, common, run
+from .stopping import exit_interrupted
 from .terminal import Bar
 
 # The bodies import JAX and its users, so that --help does not wait for them.
@@ -94,7 +95,7 @@ def main(
                 f"--out {folder} resumes it",
                 err=True,
             )
-            raise SystemExit(INTERRUPTED) from None
+            exit_interrupted()
         _report(result, folder, shard, console)
 
     run(quiet, body)

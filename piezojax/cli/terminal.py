@@ -1,10 +1,9 @@
 """Terminal output of a command: console and progress."""
 
-import signal
 import sys
-import threading
 import time
-from typing import Any
+from contextlib import ExitStack
+from types import FrameType
 
 from rich.console import Console
 from rich.progress import (
@@ -16,6 +15,8 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from .stopping import SIGNALS, handled, remember
+
 NOTE_EVERY = 30.0
 """Least time between two notes without a terminal, s."""
 
@@ -23,8 +24,9 @@ NOTE_EVERY = 30.0
 class Bar:
     """Progress bar on a terminal; plain lines without one.
 
-    While it runs, the first ``Ctrl-C`` waits for the next report of progress, because
-    an exception inside JAX's compiler can be lost or crash it; the second acts at once.
+    While it runs, the first Ctrl-C or SIGTERM waits for the next report of progress,
+    because an exception inside JAX's compiler can be lost or crash it; the second acts
+    at once.
     """
 
     def __init__(self, console: Console):
@@ -43,22 +45,20 @@ class Bar:
         self._task = None
         self._interrupted = False
         self._finishing = False
-        self._handler: Any = None
+        self._stack = ExitStack()
         self._noted = time.monotonic()
 
     def __enter__(self) -> "Bar":
-        # Only the main thread may handle signals.
-        if threading.current_thread() is threading.main_thread():
-            self._handler = signal.signal(signal.SIGINT, self._interrupt)
+        self._stack.enter_context(handled(dict.fromkeys(SIGNALS, self._interrupt)))
         self._progress.start()
         return self
 
     def __exit__(self, *exception) -> None:
         self._progress.stop()
-        if self._handler is not None:
-            signal.signal(signal.SIGINT, self._handler)
+        self._stack.close()
 
-    def _interrupt(self, number: int, frame: object) -> None:
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        remember(number)
         if self._interrupted:
             raise KeyboardInterrupt
         self._interrupted = True
@@ -66,9 +66,9 @@ class Bar:
             self._progress.update(self._task, note="stopping; Ctrl-C again: at once")
 
     def finish(self) -> None:
-        """Ignore the first ``Ctrl-C`` from here on, while results are written.
+        """Ignore the first Ctrl-C or SIGTERM from here on, while results are written.
 
-        A pending ``Ctrl-C`` is ignored too: the work is complete.
+        A pending one is ignored too: the work is complete.
         """
         self._finishing = True
 

@@ -8,7 +8,8 @@ import click
 from rich.console import Console
 
 from ..core.files import write_text
-from .command import INTERRUPTED, Command, common, results_folder, run
+from .command import Command, common, results_folder, run
+from .stopping import exit_interrupted
 from .terminal import Bar
 
 # The bodies import JAX and its users, so that --help does not wait for them.
@@ -125,7 +126,7 @@ def _tune(
         soft_wrap=True,
     )
     if result.status == "interrupted":
-        raise SystemExit(INTERRUPTED)
+        exit_interrupted()
 
 
 def _compare(
@@ -166,7 +167,7 @@ def _compare(
         soft_wrap=True,
     )
     if comparison.status == "interrupted":
-        raise SystemExit(INTERRUPTED)
+        exit_interrupted()
 
 
 def _study_path(study: Path) -> Path:

@@ -1,13 +1,14 @@
 """Atomic writing of files, reading of models, and new folders for results."""
 
 import os
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
+
+from .temporaries import is_claimed, remove_stale, temporary
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -24,40 +25,35 @@ def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
     it survives a power cut. Raises ValueError if the folder of ``path`` is missing or
     cannot be written.
     """
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror}") from None
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            if durable:
-                file.flush()
-                os.fsync(file.fileno())
-        os.chmod(name, 0o644)  # mkstemp allows only the owner
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    if durable:
-        _sync_folder(path.parent)
+    with _moved_to(path, durable) as file:
+        file.write_bytes(content)
 
 
 @contextmanager
 def written_elsewhere(path: Path) -> Iterator[Path]:
-    """Yield a temporary file; at the end, sync it and move it to ``path``."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    try:
-        yield Path(name)
-        with open(name, "rb+") as file:
-            os.fsync(file.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    _sync_folder(path.parent)
+    """Yield a temporary file; at the end, sync it and move it to ``path``.
+
+    Raises ValueError as ``write_bytes`` does.
+    """
+    with _moved_to(path, durable=True) as file:
+        yield file
+
+
+@contextmanager
+def _moved_to(path: Path, durable: bool) -> Iterator[Path]:
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(temporary(path))
+        except OSError as error:
+            raise ValueError(f"{path}: {error.strerror}") from None
+        yield file
+        if durable:
+            with open(file, "rb+") as written:
+                os.fsync(written.fileno())
+        os.chmod(file, 0o644)  # until here only the owner may read it
+        os.replace(file, path)
+    if durable:
+        _sync_folder(path.parent)
 
 
 def _sync_folder(folder: Path) -> None:
@@ -91,10 +87,14 @@ def read_model(kind: type[Model], path: Path, wrong: str) -> Model:
 def fresh_folder(path: Path) -> Path:
     """Create the folder ``path`` for new results and return it.
 
-    Raises ValueError if the folder is not empty or cannot be written.
+    Temporary files of killed runs in it are deleted. Raises ValueError if the folder is
+    not empty, is claimed by a running process, or cannot be written.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
+        remove_stale(path)
+        if is_claimed(path):
+            raise ValueError(f"--out {path} is in use by a running command")
         occupied = any(path.iterdir())
         if not occupied:
             (path / ".probe").touch()
@@ -108,10 +108,15 @@ def fresh_folder(path: Path) -> Path:
 
 def numbered_folder(stem: Path) -> Path:
     """Return the first empty or missing folder of ``stem``, ``stem-2``, ``stem-3``,
-    ..."""
+    ...
+
+    Temporary files of killed runs in these folders are deleted.
+    """
     number = 1
     while True:
         path = stem if number == 1 else stem.with_name(f"{stem.name}-{number}")
+        if path.is_dir():
+            remove_stale(path)
         if not path.exists() or (path.is_dir() and not any(path.iterdir())):
             return path
         number += 1

@@ -1,7 +1,7 @@
 """Comparison of all models that the records support."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -26,6 +26,7 @@ def identify_all(
     test: slice | None = None,
     options: Options | None = None,
     progress: Progress | None = None,
+    done: Callable[[ModelRanking], None] | None = None,
 ) -> ModelRanking:
     """Fit every model that ``records`` support, and choose one by RULE.
 
@@ -34,8 +35,9 @@ def identify_all(
     models that are not chains of parts. Further rounds fit the best few with other
     creeps or none, and with simpler dynamics. Failed and unsupported models are rows of
     the report. ``train`` and ``validate`` are as in ``identify``; left out, they are
-    the halves of the samples before ``test``. Ctrl-C ends the search and keeps the
-    models fitted so far.
+    the halves of the samples before ``test``. ``done`` receives the ranking so far,
+    marked as interrupted, after each fit. Ctrl-C ends the search and keeps the models
+    fitted so far.
 
     Raises ValueError as ``identify`` does for records and parts, for a ``test`` that
     shares samples with the other parts, and if no model can be fitted.
@@ -48,9 +50,17 @@ def identify_all(
     options = options or Options()
     first, untried = first_round(records, train, options, hysteresis)
     search = _Search(records, train, validate, options, progress or Silent())
+
+    def so_far() -> ModelRanking:
+        left = [Untried(c.model, "interrupted before") for c in search.waiting]
+        return _ranking_of(
+            search, [*untried, *left], test, True, time.perf_counter() - began
+        )
+
+    if done is not None:
+        search.fitted = lambda: done(so_far())
     rounds = later_rounds(records, train)
     total = len(first) + sum(len(later(_chains(first)[:KEPT])) for later in rounds)
-    interrupted = False
     try:
         search.fit(first, total)
         for later in rounds:
@@ -68,14 +78,13 @@ def identify_all(
     except KeyboardInterrupt:
         if not search.fits:
             raise
-        interrupted = True
-        untried += [Untried(c.model, "interrupted before") for c in search.waiting]
+        return so_far()
     if not search.fits:
         why = "; ".join(f"{row.model}: {row.note}" for row in search.failed) or (
             "; ".join(f"{one.model}: {one.reason}" for one in untried)
         )
         raise ValueError(f"no model could be fitted ({why})")
-    return _ranking_of(search, untried, test, interrupted, time.perf_counter() - began)
+    return _ranking_of(search, untried, test, False, time.perf_counter() - began)
 
 
 def _chains(candidates: Sequence[Candidate]) -> list[str]:
@@ -121,7 +130,10 @@ class _LabelledProgress:
 
 
 class _Search:
-    """Search state: fits, failed models and waiting candidates."""
+    """Search state: fits, failed models and waiting candidates.
+
+    ``fitted`` is called after each fit.
+    """
 
     def __init__(
         self,
@@ -136,6 +148,7 @@ class _Search:
         self.fits: dict[str, Fit] = {}
         self.failed: list[RankedModel] = []
         self.waiting: list[Candidate] = []
+        self.fitted: Callable[[], None] = lambda: None
 
     def fit(self, candidates: Sequence[Candidate], total: int) -> None:
         self.waiting = list(candidates)
@@ -171,6 +184,8 @@ class _Search:
             else:
                 self.fits[candidate.model] = fit
             self.waiting.remove(candidate)
+            if candidate.model in self.fits:
+                self.fitted()
 
     def samples(self) -> np.ndarray:
         """Return the effective number of training samples [p] for the best fit."""

@@ -2,6 +2,8 @@
 
 import csv
 import io
+import shutil
+from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
 
@@ -12,7 +14,12 @@ from rich.table import Table
 
 from ..core.files import write_text
 from ..identification.fit import Fit
-from ..identification.ranking import ModelRanking, RankedModel, RankingReport
+from ..identification.ranking import (
+    ModelRanking,
+    RankedModel,
+    RankingReport,
+    file_name,
+)
 from .figures import (
     AFTER,
     BEFORE,
@@ -24,10 +31,12 @@ from .figures import (
     ticks_in_full,
     write,
 )
-from .fit_pictures import loop_panel, shown_unit, write_fit, write_model
+from .fit_pictures import FIT_FILE, loop_panel, shown_unit, write_fit, write_model
 
 RANKING_FILE, TABLE_FILE = "comparison.json", "comparison.csv"
 RANKING_PICTURE = "comparison.png"
+
+_MODELS = "models"
 
 SHOWN = 3
 """Number of models with drawn residuals."""
@@ -40,18 +49,44 @@ def write_ranking(ranking: ModelRanking, folder: Path) -> None:
 
     The other models are in the folders that their rows name, under models/.
     """
-    report = ranking.report
-    for row in report.rows:
-        if row.folder is None or row.model == report.best:
-            continue
-        place = folder / row.folder
-        place.mkdir(parents=True)
-        write_model(ranking.fits[row.model], place)
-    write_text(folder / RANKING_FILE, report.model_dump_json(indent=2) + "\n")
-    write_text(folder / TABLE_FILE, _csv(report))
+    write_fit(ranking.best, folder)
+    _write_table(ranking, ranking.report, folder)
     with styled():
         write(ranking_figure(ranking), folder / RANKING_PICTURE)
-    write_fit(ranking.best, folder)
+    # The ranking so far held the best model with the others.
+    shutil.rmtree(folder / _place(ranking.report.best), ignore_errors=True)
+    with suppress(OSError):  # the folder holds other models, or is missing
+        (folder / _MODELS).rmdir()
+
+
+def write_ranking_so_far(ranking: ModelRanking, folder: Path) -> None:
+    """Write the ranking of an unfinished search, with all its models under models/.
+
+    Models that are in ``folder`` already are not written again.
+    """
+    rows = [
+        row if row.folder is None else row.model_copy(update={"folder": place})
+        for row in ranking.report.rows
+        for place in [_place(row.model)]
+    ]
+    report = ranking.report.model_copy(update={"rows": rows})
+    _write_table(ranking, report, folder)
+
+
+def _place(model: str) -> str:
+    return f"{_MODELS}/{file_name(model)}"
+
+
+def _write_table(ranking: ModelRanking, report: RankingReport, folder: Path) -> None:
+    """Write the models in the folders that ``report`` names, then the table."""
+    for row in report.rows:
+        if row.folder not in (None, "."):
+            place = folder / row.folder
+            if not (place / FIT_FILE).exists():
+                place.mkdir(parents=True, exist_ok=True)
+                write_model(ranking.fits[row.model], place)
+    write_text(folder / RANKING_FILE, report.model_dump_json(indent=2) + "\n")
+    write_text(folder / TABLE_FILE, _csv(report))
 
 
 def _csv(report: RankingReport) -> str:

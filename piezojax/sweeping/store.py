@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-import time
 from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 
 from ..core.files import write_bytes, write_text
 from ..core.serial import to_data
+from ..core.temporaries import remove_stale
 from .simulator import Simulator
 
 MANIFEST, CHUNKS, RESULT = "manifest.json", "chunks", "sweep.nc"
@@ -23,8 +23,6 @@ VERSIONED = ("piezojax", "jax", "jaxlib", "numpy", "scipy")
 
 # Digits of numbers in the fingerprint; the last digits differ between machines.
 _DIGITS = 9
-# Age (s) at which a partial file no longer belongs to a running process.
-_STALE = 3600.0
 
 
 def identity_of(simulator: Simulator) -> dict[str, Any]:
@@ -86,7 +84,8 @@ class Store:
         """
         manifest = self.folder / MANIFEST
         try:
-            (self.folder / CHUNKS).mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            remove_stale(self.folder)
             others = [
                 path.name
                 for path in self.folder.iterdir()
@@ -106,16 +105,7 @@ class Store:
         else:
             content = {"fingerprint": self.fingerprint, **self.identity}
             write_text(manifest, json.dumps(content, indent=2) + "\n")
-        for path in (*self.folder.glob(".*"), *(self.folder / CHUNKS).glob(".*")):
-            self._delete_if_stale(path)
-
-    def _delete_if_stale(self, path: Path) -> None:
-        """Delete a partial file of a killed process."""
-        try:
-            if time.time() - path.stat().st_mtime > _STALE:
-                path.unlink(missing_ok=True)
-        except OSError:
-            pass  # another process deleted it, or it is not ours
+        (self.folder / CHUNKS).mkdir(exist_ok=True)
 
     def _compare(self, manifest: Path) -> None:
         try:

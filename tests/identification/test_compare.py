@@ -18,10 +18,12 @@ from piezojax.identification import (
 )
 from piezojax.identification.candidates import at
 from piezojax.identification.fit import Fit, FitError, FitReport
+from piezojax.identification.ranking import RankingReport
 from piezojax.report.model_ranking import (
     ranking_notes,
     ranking_table,
     write_ranking,
+    write_ranking_so_far,
 )
 
 HYSTERESIS = at("hysteresis")
@@ -147,6 +149,35 @@ def test_ctrl_c_keeps_what_is_fitted(made):
     left = [row.model for row in report.rows if row.note == "interrupted before"]
     assert any(model.startswith("prandtl_ishlinskii") for model in left)
     assert "interrupted" in " ".join(ranking_notes(report))
+
+
+def test_a_killed_search_leaves_a_ranking_of_the_finished_fits(made, tmp_path):
+    made()
+    seen = []
+
+    def done(ranking):
+        write_ranking_so_far(ranking, tmp_path)
+        text = (tmp_path / "comparison.json").read_text()
+        seen.append(RankingReport.model_validate_json(text))
+
+    found = identify_all(RICH, done=done)
+    assert len(seen) == len(found.fits)
+    for count, report in enumerate(seen, start=1):
+        assert report.interrupted
+        fitted = [row for row in report.rows if row.status == "fitted"]
+        assert len(fitted) == count
+        for row in fitted:
+            assert load(tmp_path / row.folder / "model.json")
+    assert any(row.note == "interrupted before" for row in seen[0].rows)
+    assert [row.model for row in seen[-1].rows if row.status == "fitted"] == list(
+        found.fits
+    )
+    write_ranking(found, tmp_path)
+    best = next(row for row in found.report.rows if row.model == found.report.best)
+    assert best.folder == "."
+    assert (tmp_path / "model.json").exists()
+    places = {row.folder for row in found.report.rows if row.folder not in (None, ".")}
+    assert {f"models/{p.name}" for p in (tmp_path / "models").iterdir()} == places
 
 
 def test_ctrl_c_before_anything_is_fitted(made):
