@@ -48,35 +48,35 @@ class Candidate(NamedTuple):
     method: str | None = None
 
 
-class Untried(NamedTuple):
+class UntriedModel(NamedTuple):
     """A model that is not tried, and the reason."""
 
     model: str
     reason: str
 
 
-class Companions(NamedTuple):
+class SupportedParts(NamedTuple):
     """Creeps ("" for none) and dynamics that follow a hysteresis, richest first."""
 
     creeps: tuple[str, ...]
     dynamics: tuple[str, ...]
 
 
-def at(place: str) -> list[str]:
+def parts_at(place: str) -> list[str]:
     """Return the names of the parts for ``place`` in a chain."""
     return [name for name, kind in known_parts().items() if kind.part.place == place]
 
 
-def companions(
+def supported_parts(
     records: Sequence[Record], train: slice
-) -> tuple[Companions, list[Untried]]:
+) -> tuple[SupportedParts, list[UntriedModel]]:
     """Return the creeps and dynamics that single-channel ``records`` support."""
     untried = []
     seconds = max(_train_duration(record, train) for record in records)
-    creeps = [CREEP, *(name for name in at("creep") if name != CREEP), ""]
+    creeps = [CREEP, *(name for name in parts_at("creep") if name != CREEP), ""]
     if seconds < CREEP_SECONDS:
         untried += [
-            Untried(
+            UntriedModel(
                 name,
                 f"the training part lasts {seconds:.3g} s; creep is looked for from "
                 f"{CREEP_SECONDS:g} s on",
@@ -91,8 +91,8 @@ def companions(
         if 2 * found >= needed or name == DYNAMICS[-1]:
             dynamics.append(name)
         else:
-            untried.append(Untried(name, _too_few(found, needed)))
-    return Companions(tuple(creeps), tuple(dynamics)), untried
+            untried.append(UntriedModel(name, _too_few(found, needed)))
+    return SupportedParts(tuple(creeps), tuple(dynamics)), untried
 
 
 def _parameter_count(part: str, extent: Extent) -> int:
@@ -116,7 +116,7 @@ def _train_duration(record: Record, train: slice) -> float:
     return (min(train.stop, record.samples) - train.start) * record.dt
 
 
-def chained(hysteresis: str, creep: str, dynamics: str) -> str:
+def chain_name(hysteresis: str, creep: str, dynamics: str) -> str:
     """Return the name of the chain of the given parts; a part may be empty."""
     alone = hysteresis != "" and is_dynamic(hysteresis)
     parts = [hysteresis, creep, "" if alone else dynamics]
@@ -128,7 +128,7 @@ def first_round(
     train: slice,
     options: Options,
     hysteresis: Sequence[str] | None = None,
-) -> tuple[list[Candidate], list[Untried]]:
+) -> tuple[list[Candidate], list[UntriedModel]]:
     """Return the candidates of the first round, and the models that are not tried.
 
     The candidates are a linear chain, a chain with each hysteresis, and the whole
@@ -137,7 +137,7 @@ def first_round(
     ValueError for a name that is not a hysteresis, or if none of the named ones can be
     tried.
     """
-    parts = at("hysteresis")
+    parts = parts_at("hysteresis")
     known = [*parts, *(name for name in whole_names() if name != LINEAR)]
     names = known if hysteresis is None else list(hysteresis)
     for name in names:
@@ -158,10 +158,10 @@ def first_round(
         raise ValueError(f"none of them can be tried: {reasons}")
     several = _not_single_channel(records)
     if several:
-        return whole, [*(Untried(name, several) for name in parts), *untried]
-    found, missing = companions(records, train)
+        return whole, [*(UntriedModel(name, several) for name in parts), *untried]
+    found, missing = supported_parts(records, train)
     creep, dynamics = found.creeps[0], found.dynamics[0]
-    chains = [Candidate(chained(name, creep, dynamics)) for name in ("", *parts)]
+    chains = [Candidate(chain_name(name, creep, dynamics)) for name in ("", *parts)]
     return [*chains, *whole], [*missing, *untried]
 
 
@@ -174,7 +174,7 @@ def later_rounds(
     """
     if _not_single_channel(records):
         return []
-    found, _ = companions(records, train)
+    found, _ = supported_parts(records, train)
 
     def creeps(best: Sequence[str]) -> list[Candidate]:
         return _untried_chains(best, found.creeps[1:], found.dynamics[:1])
@@ -198,14 +198,14 @@ def _untried_chains(
         Candidate(model)
         for name in dict.fromkeys(model.split("+")[0] for model in best)
         for model in dict.fromkeys(
-            chained(name, creep, behind) for behind in dynamics for creep in creeps
+            chain_name(name, creep, behind) for behind in dynamics for creep in creeps
         )
         if model not in best
     ]
 
 
 def _creep_of(model: str) -> str:
-    return next((part for part in model.split("+") if part in at("creep")), "")
+    return next((part for part in model.split("+") if part in parts_at("creep")), "")
 
 
 def _not_single_channel(records: Sequence[Record]) -> str | None:
@@ -229,7 +229,7 @@ def whole_names() -> list[str]:
 
 def whole_models(
     records: Sequence[Record], train: slice, options: Options
-) -> tuple[list[Candidate], list[Untried]]:
+) -> tuple[list[Candidate], list[UntriedModel]]:
     """Return the whole models of METHODS as candidates or as untried."""
     found, untried = [], []
     for model in whole_names():
@@ -240,7 +240,7 @@ def whole_models(
         if objection is None:
             found.append(Candidate(model, method))
         else:
-            untried.append(Untried(model, objection))
+            untried.append(UntriedModel(model, objection))
     return found, untried
 
 

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..core.progress import Progress, Silent
-from .candidates import Candidate, Untried, at, first_round, later_rounds
-from .criteria import Criteria, criteria, effective_samples, first_alike, ranking
+from .candidates import Candidate, UntriedModel, first_round, later_rounds, parts_at
+from .criteria import Criteria, criteria, effective_samples, first_equivalent, ranking
 from .estimators.estimate import Options
-from .fit import Fit, check_together, identify, parts_of
+from .fit import Fit, check_compatible, identify, train_and_validation
 from .ranking import RULE, ModelRanking, RankedModel, RankingReport, file_name
 from .records.record import Record
 
@@ -44,7 +44,7 @@ def identify_all(
     """
     began = time.perf_counter()
     records = (records,) if isinstance(records, Record) else tuple(records)
-    check_together(records)
+    check_compatible(records)
     samples = min(record.samples for record in records)
     train, validate, test = _split(samples, train, validate, test)
     options = options or Options()
@@ -52,7 +52,7 @@ def identify_all(
     search = _Search(records, train, validate, options, progress or Silent())
 
     def so_far() -> ModelRanking:
-        left = [Untried(c.model, "interrupted before") for c in search.waiting]
+        left = [UntriedModel(c.model, "interrupted before") for c in search.waiting]
         return _ranking_of(
             search, [*untried, *left], test, True, time.perf_counter() - began
         )
@@ -89,7 +89,7 @@ def identify_all(
 
 def _chains(candidates: Sequence[Candidate]) -> list[str]:
     """Return the names of the candidates that are chains with a hysteresis."""
-    names = at("hysteresis")
+    names = parts_at("hysteresis")
     return [c.model for c in candidates if c.model.split("+")[0] in names]
 
 
@@ -97,7 +97,7 @@ def _split(
     samples: int, train: slice | None, validate: slice | None, test: slice | None
 ) -> tuple[slice, slice, slice | None]:
     if test is None:
-        return *parts_of(samples, train, validate), None
+        return *train_and_validation(samples, train, validate), None
     test = slice(test.start or 0, samples if test.stop is None else test.stop)
     if not 0 <= test.start < test.stop <= samples:
         raise ValueError(
@@ -106,7 +106,7 @@ def _split(
         )
     train = train or slice(0, test.start // 2)
     validate = validate or slice(train.stop, test.start)
-    train, validate = parts_of(samples, train, validate)
+    train, validate = train_and_validation(samples, train, validate)
     for name, part in (("train", train), ("validate", validate)):
         if part.start < test.stop and test.start < part.stop:
             raise ValueError(
@@ -213,7 +213,7 @@ class _Search:
             return {}
         models = self._listed()
         worth = self.criteria()
-        alike = first_alike(
+        alike = first_equivalent(
             [worth[model].bic for model in models],
             [self.fits[model].count for model in models],
             [self.fits[model].errors(slice(None)) for model in models],
@@ -241,7 +241,7 @@ class _Search:
         return {models[i]: well[i] for i in order}
 
     def _listed(self) -> list[str]:
-        names = at("hysteresis")
+        names = parts_at("hysteresis")
         places = {name: place for place, name in enumerate(names)}
         return sorted(
             self.fits, key=lambda model: places.get(model.split("+")[0], len(names))
@@ -250,7 +250,7 @@ class _Search:
 
 def _ranking_of(
     search: _Search,
-    untried: Sequence[Untried],
+    untried: Sequence[UntriedModel],
     test: slice | None,
     interrupted: bool,
     wall_s: float,
@@ -271,7 +271,7 @@ def _ranking_of(
             validation_rmse_percent_of_span=fit.report.validation.rmse_percent_of_span,
             aic=worth[model].aic,
             bic=worth[model].bic,
-            as_good=ranked[model],
+            validates_as_well=ranked[model],
             wall_s=fit.report.wall_s,
             warnings=fit.report.warnings,
             folder="." if model == best else f"models/{file_name(model)}",

@@ -16,11 +16,11 @@ import numpy as np
 MARGIN = 2.0
 """Difference above which a validation error counts as worse, in standard errors."""
 
-BARE_MENTION = 2.0
+EQUIVALENT_BIC = 2.0
 """BIC difference "not worth more than a bare mention" (Kass and Raftery 1995, JASA
 90(430))."""
 
-SAME_RUN = 0.1
+EQUIVALENT_RUN = 0.1
 """Largest difference of equivalent free runs, as a share of the rms error."""
 
 Errors = Sequence[np.ndarray]
@@ -80,7 +80,7 @@ def criteria(mean_squares: np.ndarray, samples: np.ndarray, count: int) -> Crite
     return Criteria(misfit + 2.0 * count, misfit + each * count)
 
 
-def as_good(errors: Errors, best: Errors) -> bool:
+def validates_as_well(errors: Errors, best: Errors) -> bool:
     """Return whether ``errors`` are not significantly larger than the ``best``.
 
     The test takes the mean difference of the squared errors, sample by sample. It must
@@ -102,27 +102,27 @@ def as_good(errors: Errors, best: Errors) -> bool:
 def ranking(
     bics: Sequence[float], validation: Sequence[Errors]
 ) -> tuple[list[int], list[bool]]:
-    """Return the order of the fits, best first, and whether each is ``as_good``.
+    """Return the order of the fits, best first, and whether each validates as well.
 
     Fits whose ``validation`` errors are as good as the smallest come first. Both groups
     are sorted by BIC, lowest first.
     """
     squares = [float(np.mean(np.concatenate(errors) ** 2)) for errors in validation]
     best = validation[int(np.argmin(squares))]
-    well = [as_good(errors, best) for errors in validation]
+    well = [validates_as_well(errors, best) for errors in validation]
     order = sorted(range(len(bics)), key=lambda i: (not well[i], bics[i]))
     return order, well
 
 
-def first_alike(
+def first_equivalent(
     bics: Sequence[float], counts: Sequence[int], errors: Sequence[Errors]
 ) -> list[int]:
     """Return for each fit the index of the first fit that is equivalent to it.
 
     Two forms of one model, such as stops and plays, have the same number of parameters
     and the same free run, except for the points at which their descents ended. Fits are
-    equivalent if their runs differ by less than SAME_RUN of the smaller rms error and
-    their BIC by less than BARE_MENTION. No record distinguishes such fits, so the
+    equivalent if their runs differ by less than EQUIVALENT_RUN of the smaller rms error
+    and their BIC by less than EQUIVALENT_BIC. No record distinguishes such fits, so the
     choice between them must not depend on rounding.
     """
     joined = [np.concatenate(one) for one in errors]
@@ -133,8 +133,8 @@ def first_alike(
             least = min(np.mean(own**2), np.mean(joined[j] ** 2))
             if (
                 counts[i] == counts[j]
-                and abs(bics[i] - bics[j]) < BARE_MENTION
-                and np.mean((own - joined[j]) ** 2) < SAME_RUN**2 * least
+                and abs(bics[i] - bics[j]) < EQUIVALENT_BIC
+                and np.mean((own - joined[j]) ** 2) < EQUIVALENT_RUN**2 * least
             ):
                 alike = j
                 break

@@ -150,8 +150,10 @@ def identify(
     began = time.perf_counter()
     chosen = method_for(model, method)
     records = (records,) if isinstance(records, Record) else tuple(records)
-    check_together(records)
-    train, validate = parts_of(min(r.samples for r in records), train, validate)
+    check_compatible(records)
+    train, validate = train_and_validation(
+        min(r.samples for r in records), train, validate
+    )
     estimate = chosen.estimate(
         model, records, train, options or Options(), progress or Silent()
     )
@@ -187,11 +189,11 @@ def identify(
         train,
         validate,
         estimate.linear,
-        estimate.counted(),
+        estimate.parameter_count(),
     )
 
 
-def check_together(records: tuple[Record, ...]) -> None:
+def check_compatible(records: tuple[Record, ...]) -> None:
     """Raise ValueError unless all records have the same sample time and units."""
     if not records:
         raise ValueError("no record to fit a model to")
@@ -210,7 +212,7 @@ def check_together(records: tuple[Record, ...]) -> None:
                 )
 
 
-def parts_of(
+def train_and_validation(
     samples: int, train: slice | None, validate: slice | None
 ) -> tuple[slice, slice]:
     """Return the parts to fit and to validate on; left out, they are halves.

@@ -12,7 +12,7 @@ from ..core.progress import Progress
 from ..core.system import System
 from ..hysteresis.model import hystereses
 from .chain import structure
-from .estimators.estimate import Estimate, FittedParameter, Options, at_edge
+from .estimators.estimate import Estimate, FittedParameter, Options, bound_warning
 from .estimators.linear import by_frequency_response, by_subspace
 from .estimators.model_bouc_wen import bouc_wen
 from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
@@ -23,7 +23,7 @@ from .estimators.steady_state import fit_structure, steady_response
 from .records.record import Record
 from .records.resample import average_periods, resample, whole_periods
 
-AS_GOOD = 1e-3
+EQUAL_LOSS = 1e-3
 """Relative excess of the mean square below which a fit equals the best one."""
 
 AMBIGUOUS = 0.01
@@ -76,10 +76,10 @@ def _optimum_warnings(optimum: Optimum, steps: int) -> list[str]:
         found.append(
             f"the fit was still getting better when its {steps} steps were used up"
         )
-    as_good = optimum.units[optimum.losses <= optimum.losses[0] * (1.0 + AS_GOOD)]
-    spread = np.ptp(as_good, axis=0)
+    equal = optimum.units[optimum.losses <= optimum.losses[0] * (1.0 + EQUAL_LOSS)]
+    spread = np.ptp(equal, axis=0)
     for i, name in enumerate(optimum.names):
-        found += at_edge(name, optimum.units[0, i])
+        found += bound_warning(name, optimum.units[0, i])
         if optimum.deviations[i] is None:
             found.append(f"{name} is not determined by this record")
         elif spread[i] > AMBIGUOUS:

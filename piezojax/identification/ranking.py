@@ -20,8 +20,9 @@ RULE = (
 class RankedModel(BaseModel):
     """Errors of a model of the ranking, or the reason why it has none.
 
-    ``parameters`` is the number of fitted parameters, ``as_good`` whether the model
-    validates as well as the best, ``folder`` the place of its model.json and fit.json.
+    ``parameters`` is the number of fitted parameters, ``validates_as_well`` whether the
+    model validates as well as the best, ``folder`` the place of its model.json and
+    fit.json.
     """
 
     model: str
@@ -33,7 +34,7 @@ class RankedModel(BaseModel):
     validation_rmse_percent_of_span: float | None = None
     aic: float | None = None
     bic: float | None = None
-    as_good: bool | None = None
+    validates_as_well: bool | None = None
     wall_s: float | None = None
     warnings: list[str] = []
     folder: str | None = None

@@ -12,7 +12,7 @@ from ..core.files import write_text
 from ..tuning.baselines import BaselineEntry, Baselines
 from ..tuning.baselines.entries import BASELINES_FILE
 from .comparison_map import MARKERS, SERIES_COLOURS
-from .figures import AFTER, figure, headed, styled, ticks_in_full, write
+from .figures import AFTER, add_title, figure, plain_tick_labels, plot_style, write
 
 
 def baselines_table(baselines: Baselines) -> Table:
@@ -75,7 +75,7 @@ def _times(value: float | None) -> str:
 def write_baselines(baselines: Baselines, folder: Path) -> None:
     """Write baselines.json and baselines.png into ``folder``."""
     write_text(folder / BASELINES_FILE, baselines.model_dump_json(indent=2) + "\n")
-    with styled():
+    with plot_style():
         write(baselines_figure(baselines), folder / "baselines.png")
 
 
@@ -106,14 +106,14 @@ def baselines_figure(baselines: Baselines) -> Figure:
         zorder=3,
     )
     ax.set(xscale="log", xlabel="wall time, compiling included (s)")
-    headed(picture, baselines.title)
-    ticks_in_full(ax.xaxis)
+    add_title(picture, baselines.title)
+    plain_tick_labels(ax.xaxis)
     if geometric:
         ax.set(
             yscale="log",
             ylabel="error, geometric mean of all\nreferences, relative to before (-)",
         )
-        ticks_in_full(ax.yaxis)
+        plain_tick_labels(ax.yaxis)
     else:
         ax.set(ylabel="objective (-)")
     picture.legend(loc="outside right upper", fontsize=7.5)

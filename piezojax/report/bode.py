@@ -13,7 +13,15 @@ from matplotlib.ticker import MultipleLocator
 from ..analysis.stability import AxesStability, StabilityReport, StabilityReports
 from ..analysis.stability.assess import LoopCurves
 from ..core.files import write_text
-from .figures import LOOP_COLOURS, MEASURED, REFERENCE, figure, headed, styled, write
+from .figures import (
+    LOOP_COLOURS,
+    MEASURED,
+    REFERENCE,
+    add_title,
+    figure,
+    plot_style,
+    write,
+)
 
 STABILITY_FILE, STABILITY_PICTURE = "stability.json", "stability.png"
 
@@ -26,7 +34,7 @@ def write_stability(stability: StabilityReports, folder: Path, title: str = "") 
     """Write stability.json and stability.png into ``folder``."""
     text = json.dumps(stability.as_dict(), indent=2, allow_nan=False)
     write_text(folder / STABILITY_FILE, text + "\n")
-    with styled():
+    with plot_style():
         if stability.loops:
             write(stability_figure(stability, title), folder / STABILITY_PICTURE)
         if stability.axes:
@@ -79,7 +87,7 @@ def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
     if sensitivity.get_legend_handles_labels()[1]:
         sensitivity.legend(fontsize=7.5, loc="upper left")
     if title:
-        headed(picture, title)
+        add_title(picture, title)
     return picture
 
 
@@ -156,5 +164,5 @@ def axes_figure(
         ax.set_ylim(bottom=1e-3)
         if ax.get_legend_handles_labels()[1]:
             ax.legend(fontsize=7.5, loc="lower right")
-    headed(picture, title)
+    add_title(picture, title)
     return picture

@@ -10,7 +10,7 @@ from rich.table import Table
 from ..reproduction.calibration import EXPERIMENTS, HalfFit
 from ..reproduction.calibration_report import TARGET
 from ..reproduction.selection import Round
-from .figures import AFTER, BEFORE, REFERENCE, figure, styled, write
+from .figures import AFTER, BEFORE, REFERENCE, figure, plot_style, write
 
 Report = Mapping[str, Mapping[str, Any]]
 """Report of an experiment by its fitted half, from ``calibration_report``."""
@@ -20,7 +20,7 @@ def write_calibration(
     fits: Mapping[str, Sequence[HalfFit]], reports: Mapping[str, Report], folder: Path
 ) -> None:
     """Write calibration.png into ``folder``."""
-    with styled():
+    with plot_style():
         write(calibration_figure(fits, reports), folder / "calibration.png")
 
 

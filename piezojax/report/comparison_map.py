@@ -12,7 +12,7 @@ from rich.text import Text
 
 from ..core.files import write_text
 from ..tuning.comparison import COMPARISON_FILE, ComparisonResult, TunedStudy
-from .figures import AFTER, BEFORE, MEASURED, figure, styled, write
+from .figures import AFTER, BEFORE, MEASURED, figure, plot_style, write
 
 MARKERS = "osD^vPX*<>hp"
 SERIES_COLOURS = (
@@ -68,7 +68,7 @@ def write_comparison(comparison: ComparisonResult, folder: Path) -> None:
     text = comparison.model_dump_json(indent=2)
     write_text(folder / COMPARISON_FILE, text + "\n")
     if any(row.after_um for row in comparison.rows):
-        with styled():
+        with plot_style():
             write(comparison_figure(comparison), folder / "comparison.png")
 
 

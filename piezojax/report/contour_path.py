@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from ..study import Study
 from ..tuning.contouring import ContourErrors
-from .figures import AFTER, BEFORE, REFERENCE, UNITS, figure, headed, legend_above
+from .figures import AFTER, BEFORE, REFERENCE, UNITS, add_title, figure, legend_above
 
 _SHARE = 0.2  # largest error as drawn, as a share of the contour's extent
 
@@ -58,7 +58,7 @@ def contour_figure(
         right.set(xlabel="time (s)", ylabel=f"distance from the contour ({small})")
         legend_above(left)
         legend_above(right)
-    headed(picture, f"{title}: contours, hold-out runs")
+    add_title(picture, f"{title}: contours, hold-out runs")
     return picture
 
 

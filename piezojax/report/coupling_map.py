@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from ..tuning.coupling import Coupling
-from .figures import UNITS, figure, headed
+from .figures import UNITS, add_title, figure
 
 _LEAST = 1e-6  # %; smaller shares have the colour of this one
 
@@ -43,7 +43,7 @@ def coupling_figure(
         label="rms error, % of the driven amplitude\n"
         "(of unlike units: µm per 100 µrad, µrad per 100 µm)",
     )
-    headed(picture, f"{title}: rms errors with one axis driven, hold-out")
+    add_title(picture, f"{title}: rms errors with one axis driven, hold-out")
     return picture
 
 

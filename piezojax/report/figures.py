@@ -45,7 +45,7 @@ def figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def headed(picture: Figure, title: str) -> None:
+def add_title(picture: Figure, title: str) -> None:
     """Put ``title`` above all panels, with long lines wrapped to the width."""
     width = int(11.0 * picture.get_figwidth())
     picture.suptitle("\n".join(fill(line, width) for line in title.splitlines()))
@@ -63,14 +63,14 @@ def legend_above(ax: Axes) -> None:
     )
 
 
-def ticks_in_full(axis: Axis) -> None:
+def plain_tick_labels(axis: Axis) -> None:
     """Label a short logarithmic ``axis`` at 1, 2 and 5 with numbers, not powers."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_formatter(NullFormatter())
 
 
-def styled():
+def plot_style():
     """Return a context manager that applies ``STYLE``."""
     return mpl.rc_context(STYLE)
 

@@ -14,10 +14,10 @@ from .figures import (
     AFTER,
     BEFORE,
     MEASURED,
+    add_title,
     figure,
-    headed,
     legend_above,
-    styled,
+    plot_style,
     write,
 )
 from .frequency_response import response_figure, singular_values_figure
@@ -31,7 +31,7 @@ MODEL_FILE, FIT_FILE, PICTURE_FILE = "model.json", "fit.json", "fit.png"
 def write_fit(fit: Fit, folder: Path) -> None:
     """Write model.json, fit.json and the pictures into ``folder``."""
     write_model(fit, folder)
-    with styled():
+    with plot_style():
         single = fit.simulations[0].shape[1] == 1
         picture = fit_figure(fit) if single else outputs_figure(fit)
         write(picture, folder / PICTURE_FILE)
@@ -72,7 +72,7 @@ def outputs_figure(fit: Fit) -> Figure:
     picture = figure(9.0, 2.4 * run.shape[1] + 0.8)
     panels = picture.subplots(run.shape[1], 2, squeeze=False)
     for i, (course, spectrum) in enumerate(panels):
-        unit = shown_unit(record.output_units[i])
+        unit = display_unit(record.output_units[i])
         time = record.time[shown]
         course.plot(time, record.outputs[shown, i], color=MEASURED, label="measured")
         course.plot(time, run[shown, i], color=AFTER, lw=0.9, label="simulated")
@@ -94,7 +94,7 @@ def outputs_figure(fit: Fit) -> Figure:
             spectrum.legend()
     panels[-1, 0].set(xlabel="time (s)")
     panels[-1, 1].set(xlabel="frequency (Hz)")
-    headed(picture, f"{fit.report.model} fitted to {record.source}")
+    add_title(picture, f"{fit.report.model} fitted to {record.source}")
     return picture
 
 
@@ -112,7 +112,7 @@ def loop_panel(ax: Axes, fit: Fit, label: str) -> None:
     ax.plot(record.input[part], fit.simulated[part], color=AFTER, label=label)
     ax.set(
         xlabel=f"input ({record.input_unit})",
-        ylabel=f"output ({shown_unit(record.output_unit)})",
+        ylabel=f"output ({display_unit(record.output_unit)})",
         title="Hysteresis loop, validation part",
     )
     ax.legend()
@@ -122,7 +122,7 @@ def fit_figure(fit: Fit) -> Figure:
     """Draw the loop, the output over time, and the residual with its spectrum."""
     record, report = fit.record, fit.report
     time, error = record.time, fit.simulated - record.output
-    unit = shown_unit(record.output_unit)
+    unit = display_unit(record.output_unit)
     picture = figure(9.0, 5.6)
     (loop, course), (residual, spectrum) = picture.subplots(2, 2)
     part = fit.validate
@@ -146,10 +146,10 @@ def fit_figure(fit: Fit) -> Figure:
         ylabel=f"amplitude ({unit})",
         title="Spectrum of the validation residual",
     )
-    headed(picture, f"{report.model} fitted to {record.source}")
+    add_title(picture, f"{report.model} fitted to {record.source}")
     return picture
 
 
-def shown_unit(unit: str) -> str:
+def display_unit(unit: str) -> str:
     """Return ``unit`` as written in pictures."""
     return unit.replace("um", "µm") if unit in ("um", "um/s") else unit

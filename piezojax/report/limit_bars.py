@@ -9,7 +9,16 @@ from matplotlib.figure import Figure
 
 from ..analysis.limit import NEAR, LimitReport
 from ..core.files import write_text
-from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, headed, styled, write
+from .figures import (
+    AFTER,
+    BEFORE,
+    MEASURED,
+    REFERENCE,
+    add_title,
+    figure,
+    plot_style,
+    write,
+)
 
 LIMIT_FILE, LIMIT_PICTURE = "limit.json", "limit.png"
 
@@ -28,7 +37,7 @@ def write_limit(report: LimitReport | str, folder: Path, title: str = "") -> Non
     text = json.dumps(content, indent=2, allow_nan=False)
     write_text(folder / LIMIT_FILE, text + "\n")
     if not isinstance(report, str):
-        with styled():
+        with plot_style():
             write(limit_figure(report, title), folder / LIMIT_PICTURE)
 
 
@@ -73,7 +82,7 @@ def limit_figure(report: LimitReport, title: str = "") -> Figure:
     _errors(left, report)
     _spectra(right, report)
     if title:
-        headed(picture, title)
+        add_title(picture, title)
     return picture
 
 

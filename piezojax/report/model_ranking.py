@@ -25,13 +25,13 @@ from .figures import (
     BEFORE,
     MEASURED,
     REFERENCE,
+    add_title,
     figure,
-    headed,
-    styled,
-    ticks_in_full,
+    plain_tick_labels,
+    plot_style,
     write,
 )
-from .fit_pictures import FIT_FILE, loop_panel, shown_unit, write_fit, write_model
+from .fit_pictures import FIT_FILE, display_unit, loop_panel, write_fit, write_model
 
 RANKING_FILE, TABLE_FILE = "comparison.json", "comparison.csv"
 RANKING_PICTURE = "comparison.png"
@@ -51,7 +51,7 @@ def write_ranking(ranking: ModelRanking, folder: Path) -> None:
     """
     write_fit(ranking.best, folder)
     _write_table(ranking, ranking.report, folder)
-    with styled():
+    with plot_style():
         write(ranking_figure(ranking), folder / RANKING_PICTURE)
     # The ranking so far held the best model with the others.
     shutil.rmtree(folder / _place(ranking.report.best), ignore_errors=True)
@@ -120,7 +120,7 @@ def ranking_table(report: RankingReport) -> Table:
             continue
         table.add_row(
             _folded(row.model),
-            f"{row.validation_rmse:.3g} {' ' if row.as_good else '*'}",
+            f"{row.validation_rmse:.3g} {' ' if row.validates_as_well else '*'}",
             str(row.parameters),
             f"+{row.bic - least:.0f}",
             f"{row.wall_s:.1f}",
@@ -179,7 +179,7 @@ def ranking_figure(ranking: ModelRanking) -> Figure:
     if single:
         loop_panel(picture.add_subplot(grid[0, 1]), best[0], "chosen")
     _residual_panel(picture.add_subplot(grid[1 if single else slice(None), 1]), best)
-    headed(picture, f"Models fitted to {record.source}")
+    add_title(picture, f"Models fitted to {record.source}")
     return picture
 
 
@@ -205,9 +205,9 @@ def _errors_panel(ax: Axes, report: RankingReport) -> None:
     ax.margins(x=0.12)
     if errors.max() > 5.0 * errors.min():
         ax.set_xscale("log")
-        ticks_in_full(ax.xaxis)
+        plain_tick_labels(ax.xaxis)
     ax.set(
-        xlabel=f"validation error ({shown_unit(report.unit)} rms)",
+        xlabel=f"validation error ({display_unit(report.unit)} rms)",
         title="Error and number of parameters; chosen in blue",
     )
 
@@ -220,7 +220,7 @@ def _residual_panel(ax: Axes, fits: list[Fit]) -> None:
         ax.plot(time, fit.errors(part)[0][:, 0], color=colour, lw=0.7, label=label)
     ax.set(
         xlabel="time (s)",
-        ylabel=f"residual ({shown_unit(fits[0].record.output_unit)})",
+        ylabel=f"residual ({display_unit(fits[0].record.output_unit)})",
         title="Residuals of the best, validation part",
     )
     ax.legend(fontsize=6, loc="upper left", bbox_to_anchor=(0.0, -0.25))

@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from ..sweeping.metric_maps import MetricMap
-from .figures import figure, headed
+from .figures import add_title, figure
 from .sweep_scale import COLOUR_MAP, LOST, Parameter, colour_bar, scale_of
 
 MOST_LINES = 1500
@@ -58,7 +58,7 @@ def parallel_coordinates(
             fontweight="normal",
             pad=20,
         )
-    headed(picture, title)
+    add_title(picture, title)
     return picture
 
 

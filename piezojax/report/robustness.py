@@ -9,7 +9,7 @@ from rich.table import Table
 
 from ..analysis.constraints import CONSTRAINTS
 from ..tuning.result import FrontPoint, Perturbed, Result
-from .figures import AFTER, BEFORE, figure, headed, ticks_in_full
+from .figures import AFTER, BEFORE, add_title, figure, plain_tick_labels
 
 
 def constraints_table(result: Result) -> Table:
@@ -68,7 +68,7 @@ def perturbed_figure(perturbed: Perturbed | None, title: str) -> Figure | None:
         label = f"{name}, unstable on {lost}" if lost else name
         _distribution(panel, errors, perturbed.plants, color=colour, label=label)
     panel.set_xscale("log")
-    ticks_in_full(panel.xaxis)
+    plain_tick_labels(panel.xaxis)
     panel.set_xlabel("rms error, geometric mean over references, nm")
     panel.set_ylabel(f"share of {perturbed.plants} held-out plants, %")
     panel.legend()
@@ -79,7 +79,7 @@ def perturbed_figure(perturbed: Perturbed | None, title: str) -> Figure | None:
         panel.axvline(kept.limit, color="0.3", ls="--", label=f"limit, {kept.sense}")
         panel.set_xlabel(_constraint_label(name))
         panel.legend()
-    headed(picture, title)
+    add_title(picture, title)
     return picture
 
 
@@ -110,7 +110,7 @@ def front_figure(
     panel.set_xlabel(f"{_constraint_label(constraint)} on the worst plant tuned on")
     panel.set_ylabel("rms error on the nominal plant,\ngeometric mean, nm")
     panel.legend()
-    headed(picture, title)
+    add_title(picture, title)
     return picture
 
 

@@ -17,7 +17,7 @@ from ..sweeping.metric_maps import (
     metrics_in,
     opened,
 )
-from .figures import AFTER, UNITS, figure, headed, styled, write
+from .figures import AFTER, UNITS, add_title, figure, plot_style, write
 from .parallel_coordinates import parallel_coordinates
 from .sweep_scale import COLOUR_MAP, LOST, Parameter, colour_bar, scale_of
 
@@ -29,7 +29,7 @@ MOST_PANELS = 12
 
 def write_pictures(path: Path, folder: Path) -> None:
     """Write a picture of each metric of the data set ``path`` into ``folder``."""
-    with opened(path) as dataset, styled():
+    with opened(path) as dataset, plot_style():
         for name in metrics_in(dataset):
             write(metric_figure(dataset, name), folder / f"{name}.png")
 
@@ -61,7 +61,7 @@ def metric_figure(dataset: "Dataset", name: str) -> Figure:
             ax.set_title(panel.title)
     for ax in places[len(shown) :]:
         ax.remove()
-    headed(picture, title)
+    add_title(picture, title)
     return picture
 
 

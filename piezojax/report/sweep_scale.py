@@ -8,7 +8,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from .figures import ticks_in_full
+from .figures import plain_tick_labels
 
 LOST = "#d9d9d9"  # colour of unstable and lost points
 COLOUR_MAP = "viridis_r"  # dark for large values, so that large errors stand out
@@ -40,5 +40,5 @@ def colour_bar(
     bar = picture.colorbar(mapped, ax=ax)
     bar.set_label("; ".join(part for part in (unit, note) if part))
     if isinstance(mapped.norm, LogNorm):
-        ticks_in_full(bar.ax.yaxis)
+        plain_tick_labels(bar.ax.yaxis)
         bar.minorticks_off()

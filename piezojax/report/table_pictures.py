@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from ..reproduction.cell import Cell, title_of
 from ..reproduction.rates import FIGURE, RateError
-from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, styled, write
+from .figures import AFTER, BEFORE, MEASURED, REFERENCE, figure, plot_style, write
 
 ACROSS = 4
 """Largest number of panels in a row."""
@@ -17,7 +17,7 @@ _MARKS = (("o", BEFORE), ("s", AFTER), ("^", MEASURED), ("x", REFERENCE))
 
 def write_picture(cells: Sequence[Cell], folder: Path) -> None:
     """Write cells.png into ``folder``."""
-    with styled():
+    with plot_style():
         write(cells_figure(cells), folder / "cells.png")
 
 
@@ -81,7 +81,7 @@ def _series(cell: Cell) -> str:
 
 def write_rates(errors: Sequence[RateError], folder: Path) -> None:
     """Write figure-4-10.png into ``folder``."""
-    with styled():
+    with plot_style():
         write(rates_figure(errors), folder / f"{FIGURE}.png")
 
 

@@ -21,10 +21,10 @@ from .figures import (
     BEFORE,
     REFERENCE,
     UNITS,
+    add_title,
     figure,
-    headed,
     legend_above,
-    styled,
+    plot_style,
     write,
 )
 from .robustness import front_figure, perturbed_figure
@@ -45,7 +45,7 @@ def write_results(outcome: Outcome, folder: Path) -> None:
     chosen = {trace.run for trace in shown} | {c.run for c in contours_in(study)}
     runs = outcome.logs(chosen)
     logs = {trace: _axis_logs(study, trace, runs[trace.run]) for trace in shown}
-    with styled():
+    with plot_style():
         pictures = {
             "tracking": tracking_figure(outcome, logs),
             "hysteresis": hysteresis_figure(outcome, logs),
@@ -153,7 +153,7 @@ def tracking_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
         legend_above(right)
     for ax in axes[-1]:
         ax.set_xlabel("time (s)")
-    headed(picture, f"{outcome.result.title}: hold-out runs")
+    add_title(picture, f"{outcome.result.title}: hold-out runs")
     return picture
 
 

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 import piezojax
-from piezojax.report.figures import AFTER, BEFORE, figure, headed, styled, write
+from piezojax.report.figures import AFTER, BEFORE, add_title, figure, plot_style, write
 
 CORNERS = (0, 100, 0, *4 * (65, 35), 100, 0)
 SLOW, FAST = 4.0, 0.1  # samples a volt
@@ -73,7 +73,9 @@ def picture():
         ax.set_ylabel("force (N)" if force else "displacement (µm)", fontsize=7.0)
         ax.set_xlabel("displacement (µm)" if force else "input (V)", fontsize=7.0)
         ax.tick_params(labelbottom=True)
-    headed(drawn, "Loops of the hysteresis models, a small loop four times on the way")
+    add_title(
+        drawn, "Loops of the hysteresis models, a small loop four times on the way"
+    )
     return drawn
 
 
@@ -81,7 +83,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, metavar="FILE")
     chosen = parser.parse_args()
-    with styled():
+    with plot_style():
         write(picture(), chosen.out)
 
 

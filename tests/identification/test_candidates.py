@@ -9,10 +9,15 @@ from piezojax import (
 from piezojax.core.recipe import PLACES
 from piezojax.core.registry import parts
 from piezojax.identification import METHODS
-from piezojax.identification.candidates import at, companions, first_round, later_rounds
+from piezojax.identification.candidates import (
+    first_round,
+    later_rounds,
+    parts_at,
+    supported_parts,
+)
 from piezojax.identification.estimators.estimate import Options
 
-HYSTERESIS = at("hysteresis")
+HYSTERESIS = parts_at("hysteresis")
 OWN_DYNAMICS = [name for name in HYSTERESIS if parts()[name].dynamic]
 OPTIONS = Options()
 HALF = slice(0, 1000)
@@ -91,8 +96,8 @@ def test_a_short_record_shows_no_creep():
 
 def test_later_rounds_try_other_creeps_and_simpler_dynamics():
     best = ["coleman_hodgdon+exponential_creep+arma"]
-    behind, _ = companions([RICH], HALF)
-    assert set(behind.creeps) == {*at("creep"), ""}
+    behind, _ = supported_parts([RICH], HALF)
+    assert set(behind.creeps) == {*parts_at("creep"), ""}
     creeps, dynamics = later_rounds([RICH], HALF)
     others = [name for name in behind.creeps if name != "exponential_creep"]
     chains = ["+".join(p for p in ("coleman_hodgdon", c, "arma") if p) for c in others]

@@ -16,7 +16,7 @@ from piezojax.identification import (
     compare,
     identify_all,
 )
-from piezojax.identification.candidates import at
+from piezojax.identification.candidates import parts_at
 from piezojax.identification.fit import Fit, FitError, FitReport
 from piezojax.identification.ranking import RankingReport
 from piezojax.report.model_ranking import (
@@ -26,7 +26,7 @@ from piezojax.report.model_ranking import (
     write_ranking_so_far,
 )
 
-HYSTERESIS = at("hysteresis")
+HYSTERESIS = parts_at("hysteresis")
 TIME = np.arange(2000) * 1e-3
 TONES = sum(np.sin(2 * np.pi * f * TIME + f) for f in (2.0, 9.0, 31.0, 77.0))
 RICH = Record(TONES, 0.1 * TONES + 1.0, 1e-3, source="made up")
@@ -104,7 +104,7 @@ def test_the_best_is_chosen_and_the_others_are_there(made):
     assert found.best is found.fits[report.best]
     fitted = [row for row in report.rows if row.status == "fitted"]
     assert fitted[0].model == report.best
-    assert fitted[0].as_good
+    assert fitted[0].validates_as_well
     assert len(fitted) == len(found.fits)
     assert {row.model.split("+")[0] for row in fitted} >= set(HYSTERESIS)
     assert report.samples == 1000

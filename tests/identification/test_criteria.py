@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from piezojax.identification.criteria import (
-    as_good,
     correlation_time,
     criteria,
     effective_samples,
-    first_alike,
+    first_equivalent,
     ranking,
+    validates_as_well,
 )
 
 
@@ -78,9 +78,9 @@ def test_noise_that_both_share_does_not_hide_a_worse_model():
     worse = [noise + 0.2 * rng.standard_normal((4000, 1))]
     # 4 % in mean square, within twice the scatter of either taken by itself.
     assert np.std(noise**2) * np.sqrt(2.0 / 4000) * 2.0 > 0.04
-    assert not as_good(worse, [noise])
-    assert as_good([noise], worse)
-    assert as_good([noise], [noise])
+    assert not validates_as_well(worse, [noise])
+    assert validates_as_well([noise], worse)
+    assert validates_as_well([noise], [noise])
 
 
 def test_a_slow_difference_is_not_taken_for_many():
@@ -88,9 +88,9 @@ def test_a_slow_difference_is_not_taken_for_many():
     drift = (drift - np.mean(drift)) / np.std(drift) + 0.3
     best = 2.0 * np.ones((2000, 1))
     # 0.3 deviations are 13 standard errors of white noise, and one of this.
-    assert as_good([np.sqrt(best**2 + 0.5 * drift[:, None])], [best])
+    assert validates_as_well([np.sqrt(best**2 + 0.5 * drift[:, None])], [best])
     shuffled = np.random.default_rng(5).permutation(drift)
-    assert not as_good([np.sqrt(best**2 + 0.5 * shuffled[:, None])], [best])
+    assert not validates_as_well([np.sqrt(best**2 + 0.5 * shuffled[:, None])], [best])
 
 
 def test_more_parameters_do_not_win_by_themselves():
@@ -118,11 +118,11 @@ def test_two_ways_to_write_one_model_are_one():
     bics = [-10.0, -10.9, -10.0, -10.0, -12.1, -10.0]
     counts = [5, 5, 5, 6, 5, 5]
     # Beside the second, one has another run, one another count, one another BIC.
-    assert first_alike(bics, counts, errors) == [0, 0, 2, 3, 4, 0]
+    assert first_equivalent(bics, counts, errors) == [0, 0, 2, 3, 4, 0]
 
 
 def test_alike_is_said_of_the_first_not_of_a_neighbour():
     # Each comes close to the one before, but the last not to the first.
     noise = np.random.default_rng(8).standard_normal((500, 1))
     errors = [[noise * (1.0 + share)] for share in (0.0, 0.08, 0.16)]
-    assert first_alike([0.0, 0.0, 0.0], [5, 5, 5], errors) == [0, 0, 2]
+    assert first_equivalent([0.0, 0.0, 0.0], [5, 5, 5], errors) == [0, 0, 2]

@@ -5,7 +5,7 @@ import pytest
 
 from piezojax.catalog import p558
 from piezojax.identification.estimators.frequency import EmpiricalResponse
-from piezojax.report.figures import styled, write
+from piezojax.report.figures import plot_style, write
 from piezojax.report.frequency_response import response_figure, singular_values_figure
 
 
@@ -19,7 +19,7 @@ def measured():
 
 def test_the_order_divides_the_singular_values(tmp_path):
     values = 10.0 * 0.5 ** np.arange(80)
-    with styled():
+    with plot_style():
         picture = singular_values_figure(values, 5, "title")
         write(picture, tmp_path / "values.png")
     (ax,) = picture.axes
@@ -32,7 +32,7 @@ def test_the_order_divides_the_singular_values(tmp_path):
 
 def test_a_bode_plot_has_a_panel_an_entry_and_a_band(measured, tmp_path):
     model = p558.model("7")
-    with styled():
+    with plot_style():
         fitted = np.asarray(model.frequency_response(measured.frequency))
         picture = response_figure(measured, fitted, "abc", p558.OUTPUTS, "um/um")
         write(picture, tmp_path / "response.png")

@@ -22,7 +22,7 @@ EDGE = 1e-3
 """Distance to a bound, as a share of the range, below which a parameter is at it."""
 
 
-def at_edge(name: str, place: float) -> list[str]:
+def bound_warning(name: str, place: float) -> list[str]:
     """Return a warning if ``place``, from 0 to 1 in the range, is at a bound."""
     inside = EDGE <= place <= 1.0 - EDGE
     return [] if inside else [f"{name} lies at the edge of its bounds"]
@@ -83,6 +83,6 @@ class Estimate(NamedTuple):
     linear: LinearDetail | None = None
     count: int | None = None
 
-    def counted(self) -> int:
+    def parameter_count(self) -> int:
         """Return the number of fitted parameters."""
         return len(self.parameters) if self.count is None else self.count

@@ -15,7 +15,7 @@ from ...dynamics import FirstOrderLag
 from ...hysteresis import Preisach, RateDependentPreisach
 from ...hysteresis.preisach import STARTS
 from ..records.record import Record
-from .estimate import at_edge
+from .estimate import bound_warning
 from .output_error import from_rest, standard_errors
 from .preisach_density import (
     empty,
@@ -81,7 +81,7 @@ class Chain(NamedTuple):
         return series(hysteresis=self.hysteresis, lag=self.lag)
 
 
-class Unknown(NamedTuple):
+class SearchParameter(NamedTuple):
     """A positive search parameter: name, range and candidate starting values."""
 
     name: str
@@ -195,7 +195,7 @@ class _Problem(NamedTuple):
         moved = [self.reduced(logs + s, start) for s in STEP * np.eye(logs.size)]
         return (np.column_stack(moved) - here[:, None]) / STEP
 
-    def end(self, unknowns: list[Unknown], start: str) -> OptimizeResult:
+    def end(self, unknowns: list[SearchParameter], start: str) -> OptimizeResult:
         """Return the result of the search with one of the histories."""
 
         def loss(logs: np.ndarray) -> float:
@@ -227,10 +227,10 @@ class _Problem(NamedTuple):
         return standard_errors(jacobian, float(np.sum(left**2)) / freedom)
 
 
-def _unknowns(record: Record, model: str) -> list[Unknown]:
+def _unknowns(record: Record, model: str) -> list[SearchParameter]:
     """Return the parameters to search for, in the order of ``fitted``."""
     found = [
-        Unknown(
+        SearchParameter(
             "lag.time_constant",
             Range(LAGS[0] * record.dt, LAGS[1] * record.dt, "log", unit="s"),
             (LAG * record.dt,),
@@ -240,7 +240,7 @@ def _unknowns(record: Record, model: str) -> list[Unknown]:
         rate = _rms_rate(record)
         firsts = tuple(rate * first for first in FIRST_RATES)
         found.append(
-            Unknown(
+            SearchParameter(
                 "hysteresis.rate",
                 Range(RATES[0] * rate, RATES[1] * rate, "log", unit="V/s"),
                 firsts,
@@ -263,13 +263,13 @@ def _named(hysteresis: Model, cells: int) -> dict[str, float]:
     }
 
 
-def _at_edges(unknowns: list[Unknown], logs: np.ndarray) -> list[str]:
+def _at_edges(unknowns: list[SearchParameter], logs: np.ndarray) -> list[str]:
     space = space_of({u.name: u.range for u in unknowns})
     places = space.to_unit(as_array(np.exp(logs)))
     return [
         text
         for name, place in zip(space.paths, places, strict=True)
-        for text in at_edge(name, float(place))
+        for text in bound_warning(name, float(place))
     ]
 
 

@@ -23,7 +23,7 @@ from ...core.arrays import as_array, check
 from ...hysteresis import HystereticARMA
 from ..records.record import Record
 from .output_error import FAILED_LOSS, free_run
-from .regressors import Orders, operated, row_matrix, rows
+from .regressors import Orders, operator_outputs, row_matrix, rows
 
 GRID = 9
 """Number of values of c on the coarse grid, in equal ratios between its bounds."""
@@ -122,7 +122,7 @@ class _Problem:
         """Return theta for c, iterated from ``theta`` or from least squares."""
         theta = self.least_squares(c) if theta is None else theta
         order = self.structure.autoregressive
-        hysteresis = operated(self.record, c, self.structure)
+        hysteresis = operator_outputs(self.record, c, self.structure)
         for _ in range(PASSES):
             previous = theta[:order]
             theta = _stable(theta, order)

@@ -65,10 +65,10 @@ def rows(
     has y(k-1) where (3.33) has y(k). The record begins at rest: samples before it equal
     its first sample.
     """
-    return row_matrix(structure, output, operated(record, c, structure))
+    return row_matrix(structure, output, operator_outputs(record, c, structure))
 
 
-def operated(record: Record, c: ScalarLike, structure: Orders) -> np.ndarray:
+def operator_outputs(record: Record, c: ScalarLike, structure: Orders) -> np.ndarray:
     """Return the outputs y_1 and y_2 of both operators, [2, samples]."""
     return np.asarray(_run(structure, as_array(c), jnp.asarray(record.input)))
 
