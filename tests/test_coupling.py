@@ -8,7 +8,7 @@ from piezojax.core.feedback import LoopSample
 from piezojax.report import tuning_pictures as tuning
 from piezojax.report.contour_path import contour_figure
 from piezojax.report.coupling_map import coupling_figure
-from piezojax.report.figures import styled
+from piezojax.report.figures import plot_style
 from piezojax.signals import waveforms as signals
 from piezojax.study import Study, build
 from piezojax.tuning import coupling_matrix
@@ -143,7 +143,7 @@ def texts(ax):
 
 def test_coupling_picture_says_shares_and_amounts_with_units():
     study = study_of()
-    with styled():
+    with plot_style():
         picture = coupling_figure(outcome_of(study).coupling, study.title)
     before, tuned = picture.axes[:2]
     expected = [
@@ -174,7 +174,7 @@ def test_contour_picture_magnifies_the_distance_not_the_lag():
         points = (0.0 * angles, *(middle[:, None] + on + shrunk * inwards))
         return LoopSample(points, points, points, points, points)
 
-    with styled():
+    with plot_style():
         found = contour_errors(study, {5: (log(0.0, 0.3), log(0.1, 0.0))})
         picture = contour_figure(study, "t", found)
     left, right = picture.axes
@@ -190,7 +190,7 @@ def test_contour_picture_magnifies_the_distance_not_the_lag():
 
     lost = log(1e8, 0.0)
     lost.displacement[1][60:] = np.nan  # as a run beyond all bounds is drawn
-    with styled():
+    with plot_style():
         found = contour_errors(study, {5: (lost, log(0.1, 0.0))})
         picture = contour_figure(study, "t", found)
     assert "magnified 100 times" in picture.axes[0].get_title()

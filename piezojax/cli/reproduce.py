@@ -94,7 +94,7 @@ def main(tables, calibrate, out, seed, quiet):
     def calibration(console):
         from ..report.calibrated_cells import (
             calibration_table,
-            together_table,
+            held_out_table,
             write_calibration,
         )
         from ..reproduction.calibration import EXPERIMENTS, calibrate
@@ -117,7 +117,7 @@ def main(tables, calibrate, out, seed, quiet):
             write_calibration(fits, plain, folder)
         for name, both in fits.items():
             console.print(calibration_table(name, both, plain[name]))
-        console.print(together_table(held_out_ratios(fits)))
+        console.print(held_out_table(held_out_ratios(fits)))
         console.print(f"results in {folder}", soft_wrap=True)
 
     run(quiet, calibration if calibrate else body)

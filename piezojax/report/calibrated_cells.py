@@ -101,7 +101,7 @@ def calibration_table(name: str, fits: Sequence[HalfFit], report: Report) -> Tab
     return table
 
 
-def together_table(halves: Mapping[str, Mapping[str, Any]]) -> Table:
+def held_out_table(halves: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return the ratio of all held-out cells, one column for each half.
 
     ``halves`` is the result of ``calibration_report.held_out_ratios``.
