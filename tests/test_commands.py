@@ -521,7 +521,7 @@ def test_fit_json_has_the_agreed_keys(identified):
     fit = json.loads((out / "fit.json").read_text(encoding="utf-8"))
     assert set(fit) >= {"model", "parameters", "train", "warnings", "wall_s"}
     assert fit["model"] == "coleman_hodgdon"
-    for part in ("train", "validate"):
+    for part in ("train", "validation"):
         assert set(fit[part]) >= {"rmse", "rmse_percent_of_span", "unit"}
         assert fit[part]["unit"] == "um"
         assert fit[part]["rmse_percent_of_span"] < 5.0

@@ -136,7 +136,7 @@ def test_a_model_is_saved_inverted_listed_fitted_tried_and_drawn(lab, tmp_path):
     )
     assert fit.returncode == 0, fit.stderr
     report = json.loads((tmp_path / "fit" / "fit.json").read_text())
-    assert report["validate"]["rmse"] < 0.006
+    assert report["validation"]["rmse"] < 0.006
     for name, true in (("slope", 0.1), ("height", 0.2), ("rate", 0.2)):
         found = report["parameters"][f"hysteresis.{name}"]
         assert abs(found["value"] - true) < 5.0 * found["standard_error"]

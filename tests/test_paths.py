@@ -163,7 +163,7 @@ class Bank(System):
 def test_declarations_are_found_by_path():
     loop = p753.loop(p753.pid())
     known = dict(declarations(PID))
-    assert declared(loop, "controller.integral") is known["integral"]
+    assert declared(loop, "controller.anti_windup") is known["anti_windup"]
     assert declared(loop, "controller.dt") is known["dt"]
     inner = series(bank=Bank((1.0, 2.0), 5.0, 3.0, 1e-3), lag=FirstOrderLag(1e-3, 1e-3))
     assert declared(inner, "bank.gains.1").unit == "V/um"
@@ -260,6 +260,15 @@ def test_units_come_from_the_systems_around():
 def test_units_of_switching_laws(controller, path, unit):
     loop = p753.loop(CONTROLLERS[controller]())
     assert declared(loop, f"controller.{path}").unit == unit
+
+
+def test_units_of_a_pid_behind_an_inverse():
+    behind = eqx.tree_at(lambda c: c.feedback, p753.inversion(), p753.pid())
+    units = {"proportional": "1", "integral": "1/s", "derivative": "s"}
+    for name, unit in units.items():
+        assert declared(p753.loop(behind), f"controller.feedback.{name}").unit == unit
+        outside = declared(p753.loop(p753.pid()), f"controller.{name}").unit
+        assert outside == {"1": "V/um", "1/s": "V/(um s)", "s": "V s/um"}[unit]
 
 
 @pytest.mark.parametrize("controller", sorted(CONTROLLERS))

@@ -215,6 +215,27 @@ def test_a_pattern_takes_every_parameter_below(study):
     assert float(get(case.loop, "controller.anti_windup")) == 10.0
 
 
+def test_a_pattern_starts_what_is_switched_off_at_its_lower_bound(study):
+    stock = {"type": "PID", "proportional": 1.0, "integral": 9.0, "dt": 5e-5}
+    changes = {"controller": stock, "parameters": GONE, "tune": ["controller.*"]}
+    case = read(study(changes))
+    names = ("anti_windup", "derivative", "derivative_filter")
+    off = [f"controller.{name}" for name in names]
+    for path in off:
+        lower = declared_range(path).lower
+        assert float(get(case.loop, path)) == lower > 0.0
+        assert any(
+            n.startswith(f"{path} is 0") and f"{lower:g}" in n for n in case.notes
+        )
+    assert len(case.notes) == len(off)
+    assert read(study({})).notes == ()
+
+
+def test_a_table_does_not_move_a_start_of_zero(refusal):
+    message = refusal({"parameters": {"controller.derivative": {}}})
+    assert message.startswith("controller.derivative starts at 0; its bounds")
+
+
 def test_patterns_and_paths_name_a_parameter_once(study):
     case = read(
         study({"tune": ["controller.i*", INTEGRAL, "controller.*_weight"]}),

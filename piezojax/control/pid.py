@@ -11,8 +11,8 @@ from ..core.system import System
 
 
 class PIDState(NamedTuple):
-    """Integral part in V, filtered rate in um/s, last error of the derivative in um,
-    last command in V."""
+    """Integral part and last command in the unit of u, filtered rate in um/s, last
+    error of the derivative in um."""
 
     integral: Scalar
     rate: Scalar
@@ -23,9 +23,10 @@ class PIDState(NamedTuple):
 class PID(System):
     """``u = P (b r - z) + I int (r - z) dt + D d(c r - z)/dt`` for reference r.
 
-    The derivative acts through a first-order filter. ``anti_windup`` drives the
-    integral by the difference of the applied and the commanded voltage. The integral is
-    rectangular and in V, so a change of I causes no jump.
+    The command u is a voltage (V), or a displacement (um) behind an inverse of the
+    plant. The derivative acts through a first-order filter. ``anti_windup`` drives the
+    integral by the difference of the applied and the last commanded u. The integral is
+    rectangular and has the unit of u, so a change of I causes no jump.
 
     ``proportional_weight`` b and ``derivative_weight`` c are the set-point weights of
     Astrom and Hagglund (Advanced PID Control, 2006). With 1 the PID acts on the error
@@ -37,13 +38,13 @@ class PID(System):
     """
 
     proportional: Scalar = parameter(
-        "V/um", "proportional gain P", scale="log", typical=(1e-3, 1e2)
+        "[u]/um", "proportional gain P", scale="log", typical=(1e-3, 1e2)
     )
     integral: Scalar = parameter(
-        "V/(um s)", "integral gain I", scale="log", typical=(1e-1, 1e5)
+        "[u]/(um s)", "integral gain I", scale="log", typical=(1e-1, 1e5)
     )
     derivative: Scalar = parameter(
-        "V s/um", "derivative gain D", scale="log", typical=(1e-8, 1e-1), default=0.0
+        "[u] s/um", "derivative gain D", scale="log", typical=(1e-8, 1e-1), default=0.0
     )
     derivative_filter: Scalar = parameter(
         "s",

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import AliasChoices, BaseModel, Field
+from pydantic import BaseModel
 
 from ..core.about import About
 from ..core.progress import Progress, Silent
@@ -39,10 +39,7 @@ class FitReport(BaseModel):
     model: str
     parameters: dict[str, FittedParameter]
     train: FitError
-    validation: FitError = Field(
-        serialization_alias="validate",
-        validation_alias=AliasChoices("validate", "validation"),
-    )
+    validation: FitError
     warnings: list[str]
     wall_s: float
 

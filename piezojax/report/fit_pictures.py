@@ -42,7 +42,7 @@ def write_fit(fit: Fit, folder: Path) -> None:
 def write_model(fit: Fit, folder: Path) -> None:
     """Write model.json and fit.json into ``folder``."""
     save(fit.system, folder / MODEL_FILE, fit.about)
-    text = fit.report.model_dump_json(indent=2, by_alias=True)
+    text = fit.report.model_dump_json(indent=2)
     write_text(folder / FIT_FILE, text + "\n")
 
 

@@ -107,7 +107,10 @@ def perturbed_text(perturbed: Perturbed) -> str:
 
 
 def gains_table(result: Result) -> Table:
-    """Return the table of the parameters before and after tuning."""
+    """Return the table of the parameters before and after tuning.
+
+    The unit of a pure number is 1; a dash stands for a unit that is not declared.
+    """
     # The common start of the paths is in the title: long paths would crowd the numbers.
     parents = zip(*(path.split(".")[:-1] for path in result.gains), strict=False)
     common = takewhile(lambda names: len(set(names)) == 1, parents)
@@ -118,9 +121,8 @@ def gains_table(result: Result) -> Table:
     table.add_column("tuned", justify="right", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     for path, value in result.gains.items():
-        name, unit = path.removeprefix(f"{shared}."), result.gain_units.get(path, "")
-        shown = "" if unit == "1" else unit
-        table.add_row(name, f"{result.start[path]:.4g}", f"{value:.4g}", shown)
+        name, unit = path.removeprefix(f"{shared}."), result.gain_units.get(path)
+        table.add_row(name, f"{result.start[path]:.4g}", f"{value:.4g}", unit or "-")
     return table
 
 

@@ -33,7 +33,8 @@ class Case:
     """A study with its loop and its search space.
 
     ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
-    names to the plants of a sweep, which replace the plant of the loop.
+    names to the plants of a sweep, which replace the plant of the loop. ``notes`` name
+    the starts that differ from the controller of the study.
     """
 
     study: Study
@@ -43,6 +44,7 @@ class Case:
     fit: Fit | None = None
     ensemble: Ensemble | None = None
     plants: Mapping[str, System] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def unit(self, path: str) -> str:
         """Return the declared unit of the parameter at ``path`` in the loop.
@@ -80,12 +82,12 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     observation = Observation(zero, zero, zero, zero)
     _check_role(controller, observation, "controller", "an Observation to a command")
     loop = Feedback(controller, plant, _actuator(study), _sensor(study))
-    loop, space = search_space(study, loop)
+    loop, space, notes = search_space(study, loop)
     _check_rates(study, loop, "the controller or plant")
     stage = Stage(loop.plant, loop.sensor)
     ensemble = ensemble_of(study, stage, path.parent)
     plants = _swept_plants(study, zero)
-    return Case(study, path.stem, loop, space, fit, ensemble, plants)
+    return Case(study, path.stem, loop, space, fit, ensemble, plants, notes)
 
 
 def read(path: str | Path, seed: int | None = None) -> Case:

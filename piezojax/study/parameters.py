@@ -16,14 +16,20 @@ PART = "controller."
 """Prefix of every tuned path; parameters of the stage are not tuned."""
 
 
-def search_space(study: Study, loop: Feedback) -> tuple[Feedback, Space]:
-    """Return ``loop`` with the starts of the study, and the Space of its parameters.
+def search_space(
+    study: Study, loop: Feedback
+) -> tuple[Feedback, Space, tuple[str, ...]]:
+    """Return ``loop`` with the starts of the study, its Space, and notes on starts.
+
+    A parameter that only a pattern of ``tune`` matches may be 0 in the controller,
+    switched off, although 0 lies outside its logarithmic range. The search then
+    starts from the lower bound of the range, and a note says so.
 
     Raises ValueError, naming the path, for a path that is not a scalar of the
     controller, for a parameter without a range or with a start outside it, and for a
     start or a bound that the controller refuses.
     """
-    ranges = _ranges(study, loop)
+    ranges, notes = _ranges(study, loop)
     starts = {path: r.start for path, r in ranges.items() if r.start is not None}
     loop, space = replace(loop, starts), space_of(ranges)
     space.start(loop)
@@ -33,11 +39,11 @@ def search_space(study: Study, loop: Feedback) -> tuple[Feedback, Space]:
             if value is not None:
                 inner, where = path.removeprefix(PART), f"parameters.{path}.{name}"
                 check_value(loop.controller, inner, value, where)
-    return loop, space
+    return loop, space, notes
 
 
-def _ranges(study: Study, loop: Feedback) -> dict[str, Range]:
-    """Return the Range of each tuned parameter by path.
+def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, ...]]:
+    """Return the Range of each tuned parameter by path, and notes on their starts.
 
     The parameters of ``[parameters]`` come first. Those that only ``tune`` names
     follow; the matches of a pattern are in the order of the loop.
@@ -48,12 +54,27 @@ def _ranges(study: Study, loop: Feedback) -> dict[str, Range]:
     for pattern in study.tune:
         for path in _tuned_paths(loop, pattern):
             tables.setdefault(path, TunedTable())
-    return {
+    ranges = {
         path: dataclasses.replace(
             table.range(declared(loop, path), f"parameters.{path}"), start=table.start
         )
         for path, table in tables.items()
     }
+    switched_off = [
+        path
+        for path in tables.keys() - {*study.parameters, *study.tune}
+        if ranges[path].scale != "linear" and float(get(loop, path)) == 0.0
+    ]
+    ranges |= {
+        path: dataclasses.replace(ranges[path], start=ranges[path].lower)
+        for path in switched_off
+    }
+    notes = tuple(
+        f"{path} is 0 in the controller, outside its {ranges[path].scale} scale; "
+        f"the search starts from its lower bound, {ranges[path].lower:g}"
+        for path in sorted(switched_off)
+    )
+    return ranges, notes
 
 
 def check_value(system: System, path: str, value: float, where: str) -> None:

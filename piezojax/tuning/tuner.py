@@ -247,7 +247,11 @@ def _report(
         perturbed=_perturbed(case, data, evaluator, case.loop, after),
         units={trace.name: trace.unit for trace in data.traces},
         gain_units={path: case.unit(path) for path in case.space.paths},
-        warnings=[*search.warnings, *_warnings(case, at_bound, after_scores, holdout)],
+        warnings=[
+            *case.notes,
+            *search.warnings,
+            *_warnings(case, at_bound, after_scores, holdout),
+        ],
         history=search.losses_by_start,
         times_s=search.times_s,
         evaluations=search.evaluations,
