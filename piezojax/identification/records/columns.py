@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .preamble import split
+
 SEPARATORS = (";", "\t", ",", None)
 """Separators of cells, None for blanks. Of equally good ones the first is taken."""
 
@@ -76,13 +78,14 @@ def table(rows: Sequence[Sequence[str]], decimal: str = ".") -> Columns:
     rows = [row for row in rows if any(row)]
     if not rows:
         raise ContentError("the file is empty")
-    width = len(rows[0])
-    names = [str(i) for i in range(width)]
-    units: Sequence[str] = [""] * width
-    if _mostly_text(rows[0], decimal):
-        names = [cell.strip() or str(i) for i, cell in enumerate(rows.pop(0))]
-        if rows and len(rows[0]) == width and _mostly_text(rows[0], decimal):
-            units = rows.pop(0)
+    head, rows = split(
+        [[cell.strip() for cell in row] for row in rows],
+        lambda cell: _numeric(cell, decimal),
+        lambda row: _mostly_text(row, decimal),
+    )
+    header = head.names or [""] * (len(rows[0]) if rows else 0)
+    names = [cell or str(i) for i, cell in enumerate(header)]
+    units, width = head.units or [""] * len(names), len(names)
     for name in names:
         if names.count(name) > 1:
             raise ContentError(f"two columns are called {name!r}")
@@ -92,10 +95,25 @@ def table(rows: Sequence[Sequence[str]], decimal: str = ".") -> Columns:
                 f"sample {i} has {len(row)} columns; the first line has {width} "
                 f"(lines that are not data begin with {' or '.join(COMMENT)})"
             )
-    return {
-        name: _column([row[j] for row in rows], units[j].strip() or None, decimal)
+    columns = {
+        name: _column([row[j] for row in rows], units[j] or None, decimal)
         for j, name in enumerate(names)
     }
+    return {
+        name: _checked_scale(column, head.scaled)._replace(dt=head.dt)
+        for name, column in columns.items()
+    }
+
+
+def _checked_scale(column: Column, scaled: bool) -> Column:
+    """Return ``column``, with a fault if it seems to hold codes of a converter."""
+    values = column.values
+    if scaled and np.any(values) and np.all(values == np.round(values)):
+        return column._replace(
+            fault="its header gives a scale, and all its samples are whole numbers: "
+            "export volts instead of the codes of the converter"
+        )
+    return column
 
 
 def _dialect(lines: Sequence[str]) -> tuple[str | None, str]:

@@ -11,6 +11,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from .columns import Column, Columns, ContentError, decoded, parsed, table
+from .steps import stated_step
 
 
 def read_columns(path: Path) -> Columns:
@@ -51,12 +52,17 @@ def read_columns(path: Path) -> Columns:
 
 
 def _delimited(file: BinaryIO) -> Columns:
-    return parsed(decoded(file.read()))
+    text = decoded(file.read())
+    if text.startswith(_LVM_HEAD):
+        return _lvm_columns(text)
+    return parsed(text)
 
 
 def _npz(file: BinaryIO) -> Columns:
     with np.load(file, allow_pickle=False) as archive:
-        return _merged(_spread(name, archive[name]) for name in archive.files)
+        arrays = {name: archive[name] for name in archive.files}
+    step = stated_step(arrays)
+    return _merged(_spread(name, values, dt=step) for name, values in arrays.items())
 
 
 def _mat(file: BinaryIO) -> Columns:
@@ -65,11 +71,9 @@ def _mat(file: BinaryIO) -> Columns:
 
     if matfile_version(file)[0] == 2:  # version 7.3: HDF5 behind a text header
         return _hdf5(file, separator=".")
-    return _merged(
-        _spread(name, values)
-        for name, values in loadmat(file).items()
-        if not name.startswith("__")
-    )
+    arrays = {n: v for n, v in loadmat(file).items() if not n.startswith("__")}
+    step = stated_step(arrays)
+    return _merged(_spread(name, values, dt=step) for name, values in arrays.items())
 
 
 def _hdf5(file: BinaryIO, separator: str = "/") -> Columns:
@@ -83,11 +87,28 @@ def _hdf5(file: BinaryIO, separator: str = "/") -> Columns:
         text = "MATLAB_empty" in attributes or attributes.get("MATLAB_class") == b"char"
         if isinstance(item, h5py.Dataset) and not text and not path.startswith("#"):
             unit = _text(attributes.get("units", attributes.get("unit")))
-            found.append(_spread(path.replace("/", separator), item[()], unit))
+            name, step = path.replace("/", separator), _hdf5_step(item)
+            found.append(_spread(name, item[()], unit, step))
 
     with h5py.File(file, "r") as tree:
         tree.visititems(visit)
     return _merged(found)
+
+
+def _hdf5_step(item: Any) -> float | None:
+    """Return the sample time of a data set: its own, or that of the nearest group."""
+    import h5py
+
+    step = stated_step(item.attrs)
+    while step is None and item.name != "/":
+        item = item.parent
+        scalars = {
+            name: inner[()]
+            for name, inner in item.items()
+            if isinstance(inner, h5py.Dataset) and inner.size == 1
+        }
+        step = stated_step(scalars | dict(item.attrs))
+    return step
 
 
 def _tdms(file: BinaryIO) -> Columns:
@@ -112,11 +133,18 @@ def _tdms(file: BinaryIO) -> Columns:
     )
 
 
+_LVM_HEAD = "LabVIEW Measurement"
+
+
 def _lvm(file: BinaryIO) -> Columns:
+    return _lvm_columns(decoded(file.read()))
+
+
+def _lvm_columns(text: str) -> Columns:
     # `lvm_read.read` would write a pickle beside the file and load it later.
     from lvm_read import read_str
 
-    content = read_str(decoded(file.read()))
+    content = read_str(text)
     first = 0 if content.get("X_Columns") == "No" else -1
     return _prefixed(
         {str(i): _segment(content[i], first=first) for i in range(content["Segments"])}

@@ -18,8 +18,11 @@ Key = str | int
 SHORTEST = 50
 """Least number of samples in a record."""
 
-IS_TIME = re.compile(r"time\b|time_", re.IGNORECASE)
+IS_TIME = re.compile(r"time\b|time_|x[-_ ](axis|value)\b", re.IGNORECASE)
 """Pattern of the names of time columns."""
+
+COUNTED = ("s", "ms", "us", "ns", "sequence")
+"""Units, in lower case, of columns that count time or samples."""
 
 LONGEST = 100_000_000
 """Most samples of a resampled record."""
@@ -189,6 +192,8 @@ def read_record(
         clock = _column_names(columns, [] if time is None else [time], "time")
         inputs = _column_names(columns, input, "input")
         outputs = _column_names(columns, output, "output")
+        for role, names in (("input", inputs), ("output", outputs)):
+            _check_signals(columns, names, role)
         values = _numbers(columns, {"time": clock, "input": inputs, "output": outputs})
         steps = {f"column {n!r}": columns[n].dt for n in inputs + outputs}
         if rate is not None:
@@ -199,8 +204,6 @@ def read_record(
             step = _time_step(instants, even=resample is None)
             steps = {f"column {name!r}": step} | steps
         dt = _common_step(steps)
-        for role, names in (("input", inputs), ("output", outputs)):
-            _check_signals(names, role)
         if resample is not None:
             if instants is None:
                 instants = dt * np.arange(values[inputs[0]].size)
@@ -218,11 +221,13 @@ def read_record(
     )
 
 
-def _check_signals(names: list[str], role: str) -> None:
+def _check_signals(columns: Columns, names: list[str], role: str) -> None:
     for name in names:
-        if IS_TIME.match(name):
+        unit = (unit_of(name, columns[name]) or "").lower()
+        if IS_TIME.match(name) or unit in COUNTED:
             raise ContentError(
-                f"the {role} column is {name!r}; name the columns of input and output"
+                f"the {role} column is {name!r}; name the columns of input and output: "
+                f"there are {', '.join(columns)}"
             )
 
 

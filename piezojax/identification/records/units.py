@@ -11,7 +11,11 @@ _UNIT = re.compile(
     r"|[_\s]([fpnumk]?(?:V|A|m|N|g|s|rad|deg|Hz)|sec|min|h|d|arcsec|counts)$"
 )
 
-_SYMBOLS = {"Volts": "V", "Seconds": "s", "seconds": "s", "sec": "s"}
+_SYMBOLS = {
+    **dict.fromkeys(("volt", "volts", "v"), "V"),
+    **dict.fromkeys(("second", "seconds", "sec", "s"), "s"),
+    **dict.fromkeys(("amp", "amps", "ampere", "a"), "A"),
+}
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
@@ -22,7 +26,7 @@ def unit_of(name: str, column: Column) -> str | None:
     if not unit:
         found = _UNIT.search(_ascii(re.sub(r"\[\d+\]$", "", name)))
         unit = found[1] or found[2] if found else None
-    return _SYMBOLS.get(unit, unit) if unit else None
+    return _SYMBOLS.get(unit.lower(), unit) if unit else None
 
 
 def _ascii(text: str) -> str:
