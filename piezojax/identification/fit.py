@@ -14,8 +14,10 @@ from ..core.system import System
 from .chain import DEFAULT
 from .estimators.estimate import FittedParameter, LinearDetail, Options
 from .methods import method_for
+from .plausibility import plausibility_warnings
 from .records.checks import record_warnings
 from .records.record import Record
+from .residuals.report import ResidualReport, residual_report
 
 POOR = 0.2
 """Validation error, as a share of the output's deviation, above which to warn."""
@@ -34,12 +36,16 @@ class FitError(BaseModel):
 
 
 class FitReport(BaseModel):
-    """Report of a fit, the content of ``fit.json``."""
+    """Report of a fit, the content of ``fit.json``.
+
+    ``residuals`` is the analysis of the free-run error; None in files of old versions.
+    """
 
     model: str
     parameters: dict[str, FittedParameter]
     train: FitError
     validation: FitError
+    residuals: ResidualReport | None = None
     warnings: list[str]
     wall_s: float
 
@@ -157,23 +163,29 @@ def identify(
     warnings = [
         f"{record.source}: {text}" if len(records) > 1 else text
         for record in records
-        for text in record_warnings(
-            record,
-            train,
-            validate,
-            order=estimate.order,
-            hysteresis=estimate.hysteresis,
+        for text in (
+            *plausibility_warnings(record),
+            *record_warnings(
+                record,
+                train,
+                validate,
+                order=estimate.order,
+                hysteresis=estimate.hysteresis,
+            ),
         )
     ]
     runs = estimate.simulations
+    residuals, unexplained = residual_report(records, runs, train, validate)
     report = FitReport(
         model=model,
         parameters=estimate.parameters,
         train=_fit_error(records, runs, train),
         validation=_fit_error(records, runs, validate),
+        residuals=residuals,
         warnings=[
             *warnings,
             *estimate.warnings,
+            *unexplained,
             *_error_warnings(records, runs, validate),
         ],
         wall_s=time.perf_counter() - began,

@@ -36,7 +36,6 @@ class ErrorBound(BaseModel):
     ``relative`` bounds ``|G_true / G_model - 1|`` at ``frequency`` (Hz, increasing up
     to the Nyquist frequency). ``excited`` tells for each line whether the record holds
     enough power there; where it does not, ``relative`` is an assumption (``UNSEEN``).
-    ``inputs`` is the range of the record's input, V, within which the bound holds.
     Raises ValueError for lists of different length, and for frequencies that are
     negative or do not increase.
     """
@@ -46,7 +45,6 @@ class ErrorBound(BaseModel):
     frequency: tuple[Share, ...] = Field(min_length=1)
     relative: tuple[Share, ...]
     excited: tuple[bool, ...]
-    inputs: tuple[float, float] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> "ErrorBound":

@@ -1,0 +1,106 @@
+"""Checks that the columns of a record are the input and output of a piezo stage."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from .estimators.welch import spectral_response
+from .records.record import Record
+
+EVEN = 1e-3
+"""Largest scatter of the steps of a time axis, as a share of their mean."""
+
+FOLLOWS = 0.5
+"""Least share of the output's power that the input explains."""
+
+CLEAR = 0.9
+"""Coherence from which on a line tells the phase."""
+
+AHEAD = 0.02
+"""Lead of the output (rad, weighted by power) from which on it runs ahead."""
+
+GAIN = (1e-3, 100.0)
+"""Usual gains of piezo stages, um/V."""
+
+MOST = {"V": 1500.0, "um": 5000.0}
+"""Largest usual range of a piezo stage's input and output."""
+
+IN_UM = {"nm": 1e-3, "um": 1.0, "mm": 1e3, "m": 1e6}
+
+
+def plausibility_warnings(record: Record) -> list[str]:
+    """Return warnings about columns and units that are probably wrong.
+
+    Records of several inputs or outputs are checked for a time axis only.
+    """
+    clocks = [*_clocks(record)]
+    if clocks or record.inputs.shape[1] != 1 or record.outputs.shape[1] != 1:
+        return clocks
+    return [*_relation(record), *_units(record)]
+
+
+def _clocks(record: Record) -> Iterator[str]:
+    for side, columns in (("input", record.inputs), ("output", record.outputs)):
+        for column in columns.T:
+            steps = np.diff(column)
+            if np.all(steps > 0.0) and np.std(steps) < EVEN * np.mean(steps):
+                yield (
+                    f"the {side} column looks like a time axis: it rises steadily from "
+                    f"{column[0]:.4g} to {column[-1]:.4g}; name the column of the "
+                    f"{side} (--{side})"
+                )
+
+
+def _relation(record: Record) -> Iterator[str]:
+    try:
+        found = spectral_response(record.input, record.output, record.dt)
+    except ValueError:
+        return
+    explained = found.power * np.abs(found.response) ** 2
+    total = explained / np.maximum(found.coherence, np.finfo(float).tiny)
+    share = float(np.sum(explained) / max(np.sum(total), np.finfo(float).tiny))
+    correlation = float(np.corrcoef(record.input, record.output)[0, 1])
+    if share < FOLLOWS:
+        yield (
+            f"the output does not follow the input: it explains {100.0 * share:.0f} % "
+            f"of the output's power (correlation {correlation:.2f}); is a column "
+            "wrong? Name them with --input and --output"
+        )
+        return
+    clear = (found.coherence > CLEAR) & (found.power > 1e-2 * found.power.max())
+    if not clear.any():
+        return
+    response, power = found.response[clear], explained[clear]
+    sign = np.sign(response[0].real)
+    if sign < 0.0 and correlation < 0.0:
+        yield (
+            f"input and output move in opposite directions (correlation "
+            f"{correlation:.2f}): check the sign of the sensor and the columns; a "
+            "controller of the usual sign is unstable on this model"
+        )
+    lead = np.sum(power * np.sin(np.angle(sign * response))) / np.sum(power)
+    if lead > AHEAD:
+        yield (
+            f"the output runs ahead of the input by {np.degrees(np.arcsin(lead)):.1f} "
+            "degrees, and a stage can only follow: are the columns swapped? Name them "
+            "with --input and --output"
+        )
+
+
+def _units(record: Record) -> Iterator[str]:
+    if record.input_unit != "V" or record.output_unit not in IN_UM:
+        return
+    moved = record.span * IN_UM[record.output_unit]
+    drive = float(np.ptp(record.input))
+    for name, range_, unit in (("input", drive, "V"), ("output", moved, "um")):
+        if range_ > MOST[unit]:
+            yield (
+                f"the {name} spans {range_:.4g} {unit}, more than any piezo stage: "
+                "check the unit of its column"
+            )
+            return
+    if not GAIN[0] < moved / drive < GAIN[1]:
+        yield (
+            f"the output moves {moved / drive:.3g} um/V; piezo stages move {GAIN[0]:g} "
+            f"to {GAIN[1]:g} um/V: check the units of the columns"
+        )

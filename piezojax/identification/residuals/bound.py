@@ -1,0 +1,142 @@
+"""Error bound of a model, from the residual of its free run.
+
+The residual ``e = y - y_model`` and the model's own output answer the same input. Both
+go through the same empirical frequency response, so that the model needs no
+linearisation: the relative error is ``|G_eu| / |G_mu|``. What the residual holds beside
+its linear response (noise, and hysteresis that the model does not follow) widens the
+confidence interval.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ...analysis.stability.model_error import UNSEEN, ErrorBound
+from ..estimators.welch import SHORTEST, spectral_response
+from ..records.record import Record
+
+CONFIDENCE = 2.3
+"""Bound of an estimated response's error, in standard deviations of its modulus: 99 %
+for 15 averages (Bendat and Piersol, Random Data, 4th ed., 9.2)."""
+
+
+AVERAGES = 8
+"""Segments without overlap into which a record is divided."""
+
+
+class RelativeError(NamedTuple):
+    """Relative error of a model [lines] at the ``frequency`` (Hz) of excited lines.
+
+    ``error`` is the estimate, ``margin`` the half-width of its 99 % interval, ``gain``
+    that of the model, output over input. ``resolution`` (Hz) is the distance of two
+    lines if both are excited.
+    """
+
+    frequency: np.ndarray
+    error: np.ndarray
+    margin: np.ndarray
+    gain: np.ndarray
+    resolution: float
+
+    @property
+    def upper(self) -> np.ndarray:
+        """Upper end of the interval [lines]."""
+        return self.error + self.margin
+
+    @property
+    def lower(self) -> np.ndarray:
+        """Lower end of the interval [lines], at least 0."""
+        return np.maximum(self.error - self.margin, 0.0)
+
+
+def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeError:
+    """Return the relative error of the free ``run`` [samples] over ``part``.
+
+    Raises ValueError as ``spectral_response`` does.
+    """
+    part = slice(part.start, min(part.stop, record.samples))
+    samples, period = part.stop - part.start, record.period
+    if period is not None and samples < 2 * period:
+        period = None
+    segment = max(SHORTEST, 2 ** int(np.log2(max(1, samples // AVERAGES))))
+    residual, own = (
+        spectral_response(
+            record.input[part], signal, record.dt, period=period, segment=segment
+        )
+        for signal in ((record.output - run)[part], run[part])
+    )
+    size = np.maximum(np.abs(own.response), np.finfo(float).tiny)
+    return RelativeError(
+        residual.frequency,
+        np.abs(residual.response) / size,
+        CONFIDENCE * np.sqrt(residual.variance) / size,
+        size,
+        1.0 / ((period or segment) * record.dt),
+    )
+
+
+def error_bound(
+    records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
+) -> ErrorBound:
+    """Return the error bound of a model from its free ``runs`` over ``records``.
+
+    Every record has one input and one output, and so has its run. At lines that several
+    records excite the largest bound counts. Raises ValueError as ``relative_error``.
+    """
+    bounds = [
+        _completed(relative_error(record, run, part), record)
+        for record, run in zip(records, runs, strict=True)
+    ]
+    if len(bounds) == 1:
+        return bounds[0]
+    lines = max(bounds, key=lambda bound: len(bound.frequency)).frequency
+    excited = np.array([bound.excited_at(lines) for bound in bounds])
+    relative = np.array([bound.at(lines) for bound in bounds])
+    known = np.where(excited, relative, 0.0).max(axis=0)
+    anywhere = excited.any(axis=0)
+    relative = np.where(anywhere, known, relative.min(axis=0))
+    return _bound(np.asarray(lines), relative, anywhere)
+
+
+def _completed(found: RelativeError, record: Record) -> ErrorBound:
+    """Return the bound on all lines up to the Nyquist frequency.
+
+    A mode that the model lacks, of frequency f and of the share k of the static gain,
+    has the relative error ``k / (1 - (f_i / f)^2) - k`` at an excited line f_i off its
+    resonance. The bounds at the nearest excited lines limit k, which is 1 at most. At
+    its resonance a lightly damped mode has the error ``UNSEEN k``. No mode is assumed
+    below the lowest excited line.
+    """
+    # Where the interval is wider than the assumption, the record says nothing.
+    kept = found.margin < UNSEEN
+    known, upper = found.frequency[kept], found.upper[kept]
+    lines = round(0.5 / (record.dt * found.resolution)) + 1
+    frequency = found.resolution * np.arange(1, lines)
+    places = np.round(known / found.resolution).astype(int) - 1
+    excited = np.zeros(frequency.size, bool)
+    excited[places] = True
+    relative = np.full(frequency.size, UNSEEN)
+    if known.size:
+        after = np.searchsorted(known, frequency)
+        below, above = np.maximum(after - 1, 0), np.minimum(after, known.size - 1)
+        with np.errstate(divide="ignore"):
+            share = upper[below] * ((frequency / known[below]) ** 2 - 1.0)
+            other = upper[above] * (1.0 - (frequency / known[above]) ** 2)
+        share = np.where(after < known.size, np.minimum(share, other), share)
+        share = np.where(after == 0, 0.0, np.minimum(share, 1.0))
+        near = np.maximum(upper[below], upper[above])
+        relative = np.maximum(near, UNSEEN * share)
+        relative[places] = upper
+    return _bound(frequency, relative, excited)
+
+
+def _bound(
+    frequency: np.ndarray, relative: np.ndarray, excited: np.ndarray
+) -> ErrorBound:
+    """Return the ErrorBound, with no more digits than the estimate has."""
+    return ErrorBound(
+        frequency=tuple(float(f"{f:.8g}") for f in frequency),
+        relative=tuple(float(f"{bound:.4g}") for bound in relative),
+        excited=tuple(excited.tolist()),
+    )

@@ -1,0 +1,50 @@
+"""Resonances that a model lacks, from its relative error by frequency."""
+
+import numpy as np
+from pydantic import BaseModel
+
+from .bound import RelativeError
+
+LEAST = 1.0
+"""Relative error from which on a peak counts: as large as the model's own gain."""
+
+SHARP = 3.0
+"""Height of a peak over its surroundings, as a factor."""
+
+VISIBLE = 0.01
+"""Least amplitude of a peak, as a share of the model's gain at the lowest line."""
+
+MOST = 3
+"""Largest number of peaks in a report."""
+
+
+class Peak(BaseModel):
+    """A resonance that the model lacks: frequency (Hz), error over the model's gain."""
+
+    frequency_Hz: float  # noqa: N815
+    times_gain: float
+
+
+def unmodelled_peaks(found: RelativeError) -> list[Peak]:
+    """Return the resonances that the model lacks, the highest first.
+
+    A peak is significant (the lower end of its interval is above ``LEAST``), and above
+    the median within an octave by the factor ``SHARP``.
+    """
+    frequency, error = found.frequency, found.error
+    seen = found.lower * found.gain / max(found.gain[0], np.finfo(float).tiny)
+    kept: list[int] = []
+    for i in np.argsort(error)[::-1]:
+        ratio = frequency / frequency[i]
+        around = (ratio > 0.5) & (ratio < 2.0)
+        near = (ratio > 0.8) & (ratio < 1.25)
+        outside = error[around & ~near]
+        if found.lower[i] < LEAST or seen[i] < VISIBLE or outside.size < 4:
+            continue
+        taken = any(0.8 < frequency[i] / frequency[j] < 1.25 for j in kept)
+        if not taken and error[i] > SHARP * np.median(outside):
+            kept.append(int(i))
+    return [
+        Peak(frequency_Hz=float(frequency[i]), times_gain=float(error[i]))
+        for i in kept[:MOST]
+    ]

@@ -1,0 +1,173 @@
+"""Residual analysis of a fit: report and warnings."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from pydantic import BaseModel
+
+from ...analysis.stability.model_error import ErrorBound
+from ..records.record import Record
+from .bound import RelativeError, error_bound, relative_error
+from .correlation import Correlation, autocorrelation, cross_correlation
+from .coverage import Coverage, Unseen, coverage_of, unseen_in
+from .peaks import LEAST, VISIBLE, Peak, unmodelled_peaks
+
+NARROW = 0.1
+"""Excited band, as a share of the Nyquist frequency, below which to warn."""
+
+OTHER_GAIN = 1.25
+"""Factor between the motions of stage and model from which on to warn."""
+
+WIDE = 0.5
+"""Share of the lines in an octave with an error above the model's gain that counts as
+a wrong response."""
+
+
+class ResidualReport(BaseModel):
+    """Analysis of the free-run error over the validation part.
+
+    ``whiteness`` holds the autocorrelation of each output's residual,
+    ``input_correlation`` its correlation with each input (outputs vary slowest).
+    ``peaks`` are resonances that the model lacks. ``coverage`` is the band and range of
+    the whole records, ``unseen`` what the training part lacks of them. ``error_bound``
+    bounds the relative error of the model over frequency; it is None, and ``peaks`` is
+    empty, for records of several inputs or outputs, and for records that are too short.
+    """
+
+    whiteness: list[Correlation]
+    input_correlation: list[Correlation]
+    peaks: list[Peak]
+    coverage: Coverage
+    unseen: Unseen
+    error_bound: ErrorBound | None
+
+
+def residual_report(
+    records: Sequence[Record],
+    runs: Sequence[np.ndarray],
+    train: slice,
+    validate: slice,
+) -> tuple[ResidualReport, list[str]]:
+    """Return the analysis of the free ``runs`` [samples, p], and its warnings.
+
+    ``train`` and ``validate`` are the samples of each record that the model was fitted
+    and validated on.
+    """
+    errors = np.concatenate(
+        [(r.outputs - run)[validate] for r, run in zip(records, runs, strict=True)]
+    )
+    inputs = np.concatenate([record.inputs[validate] for record in records])
+    bound, relative = _relative(records, runs, validate)
+    report = ResidualReport(
+        whiteness=[autocorrelation(error) for error in errors.T],
+        input_correlation=[
+            cross_correlation(error, input) for error in errors.T for input in inputs.T
+        ],
+        peaks=[] if relative is None else unmodelled_peaks(relative),
+        coverage=coverage_of(records, bound),
+        unseen=unseen_in(records[0].inputs[:, 0], records[0].dt, train, validate),
+        error_bound=bound,
+    )
+    return report, [
+        *_peak_warnings(report),
+        *_response_warnings(report, relative),
+        *_gain_warnings(records, runs, validate),
+        *_coverage_warnings(report.coverage, records[0].dt),
+        *_unseen_warnings(report),
+    ]
+
+
+def _relative(
+    records: Sequence[Record], runs: Sequence[np.ndarray], validate: slice
+) -> tuple[ErrorBound | None, RelativeError | None]:
+    """Return the bound over the whole records and the error over validation.
+
+    Both are None for records of several channels, and for short or constant ones.
+    """
+    channels = {(r.inputs.shape[1], r.outputs.shape[1]) for r in records}
+    if channels != {(1, 1)}:
+        return None, None
+    single = [run[:, 0] for run in runs]
+    try:
+        return (
+            error_bound(records, single, slice(0, max(r.samples for r in records))),
+            relative_error(records[0], single[0], validate),
+        )
+    except ValueError:
+        return None, None
+
+
+def _peak_warnings(report: ResidualReport) -> Iterator[str]:
+    for peak in report.peaks:
+        yield (
+            f"the model leaves a peak at {peak.frequency_Hz:.4g} Hz, "
+            f"{peak.times_gain:.3g} times its own gain there: a resonance is missing "
+            "or wrong; fit a model with a mode (--model ...+mode+lag) before tuning"
+        )
+
+
+def _response_warnings(
+    report: ResidualReport, found: RelativeError | None
+) -> Iterator[str]:
+    """Warn of an octave in which the response is wrong by more than the gain."""
+    if found is None or report.peaks:
+        return
+    seen = found.gain > VISIBLE * found.gain[0]
+    wrong = (found.lower > LEAST) & seen
+    for i in np.flatnonzero(wrong):
+        ratio = found.frequency / found.frequency[i]
+        octave = (ratio >= 1.0) & (ratio < 2.0)
+        if octave.sum() >= 4 and wrong[octave].mean() > WIDE:
+            yield (
+                f"from {found.frequency[i]:.4g} Hz on the model is wrong by more than "
+                "its own gain: its dynamics are too simple; fit a model with a mode, a "
+                "lag or a delay (--model ...+mode+lag+delay) before tuning"
+            )
+            return
+
+
+def _gain_warnings(
+    records: Sequence[Record], runs: Sequence[np.ndarray], validate: slice
+) -> Iterator[str]:
+    for output in range(runs[0].shape[1]):
+        measured, modelled = (
+            np.concatenate([signal[validate, output] for signal in signals])
+            for signals in ([record.outputs for record in records], runs)
+        )
+        moved = modelled - modelled.mean()
+        power = float(moved @ moved)
+        factor = float(moved @ (measured - measured.mean())) / max(power, 1e-300)
+        if not 1.0 / OTHER_GAIN < factor < OTHER_GAIN:
+            yield (
+                f"output {output} moves {factor:.3g} times as far as the model: "
+                "the model is that of another stage or unit, or the fit failed; fit a "
+                "model to this record"
+            )
+
+
+def _coverage_warnings(coverage: Coverage, dt: float) -> Iterator[str]:
+    if coverage.band_Hz is not None and coverage.band_Hz[1] < NARROW * 0.5 / dt:
+        yield (
+            f"the record excites nothing above {coverage.band_Hz[1]:.3g} Hz: a "
+            "resonance above it stays unseen, and gains tuned on this model are not "
+            f"validated there; record a chirp or noise up to {0.2 / dt:.3g} Hz"
+        )
+
+
+def _unseen_warnings(report: ResidualReport) -> Iterator[str]:
+    unseen = report.unseen
+    if unseen.band_Hz is not None:
+        low, high = unseen.band_Hz
+        yield (
+            f"the validation part holds frequencies from {low:.3g} to {high:.3g} Hz "
+            "that the training part does not: the model was not fitted there; choose "
+            "parts that hold the same frequencies (--train, --validate)"
+        )
+    if unseen.input_range is not None:
+        low, high = unseen.input_range
+        yield (
+            f"the validation part's input goes from {low:.3g} to {high:.3g} "
+            f"{report.coverage.input_unit}, beyond that of the training part: the "
+            "model was not fitted there; choose parts of the same range "
+            "(--train, --validate)"
+        )

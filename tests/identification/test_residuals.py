@@ -1,0 +1,350 @@
+"""Residual analysis on stages made with NumPy and SciPy: alarms, bound, statistics."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from piezojax import Record, identify
+from piezojax.analysis.stability.model_error import UNSEEN
+from piezojax.identification import FitReport
+from piezojax.identification.plausibility import plausibility_warnings
+from piezojax.identification.residuals.bound import error_bound, relative_error
+from piezojax.identification.residuals.correlation import (
+    autocorrelation,
+    cross_correlation,
+)
+from piezojax.identification.residuals.report import residual_report
+
+RATE = 10e3
+DT = 1.0 / RATE
+SAMPLES = 16384
+HALVES = slice(0, SAMPLES // 2), slice(SAMPLES // 2, SAMPLES)
+WHOLE = slice(0, SAMPLES)
+GAIN = 0.12  # um/V
+NOISE = 0.002  # um
+
+
+def discrete(numerator, denominator):
+    b, a, _ = scipy.signal.cont2discrete((numerator, denominator), DT, "zoh")
+    return np.ravel(b), a
+
+
+def lag(seconds):
+    return [1.0], [seconds, 1.0]
+
+
+def mode(frequency, damping):
+    w = 2.0 * np.pi * frequency
+    return [w**2], [1.0, 2.0 * damping * w, w**2]
+
+
+def product(*parts):
+    top, bottom = [1.0], [1.0]
+    for b, a in parts:
+        top, bottom = np.polymul(top, b), np.polymul(bottom, a)
+    return discrete(GAIN * top, bottom)
+
+
+SLOW = product(lag(1e-3))
+STAGE = product(lag(1e-3), mode(780.0, 0.02))
+
+
+def excitation(seed=0, top=4000.0, samples=SAMPLES):
+    """Noise up to ``top`` Hz on two slow sines."""
+    draw = np.random.default_rng(seed).standard_normal(samples)
+    if top < 0.5 * RATE:
+        band = scipy.signal.cheby2(12, 80.0, 1.15 * top, fs=RATE, output="sos")
+        draw = scipy.signal.sosfilt(band, draw)
+    time = np.arange(samples) * DT
+    slow = np.sin(2 * np.pi * 7.0 * time) + np.sin(2 * np.pi * 19.0 * time)
+    return 40.0 + 10.0 * slow + 5.0 * draw / draw.std()
+
+
+def answer(stage, input):
+    """Return the output from rest at the first input."""
+    b, a = stage
+    state = scipy.signal.lfilter_zi(b, a) * input[0]
+    return scipy.signal.lfilter(b, a, input, zi=state)[0]
+
+
+def noisy(output, seed=0):
+    draw = np.random.default_rng([1, seed]).standard_normal(output.size)
+    return output + NOISE * draw
+
+
+def analysed(input, output, run, **more):
+    record = Record(input, output, DT, source="made up", **more)
+    return residual_report([record], [run[:, None]], *HALVES)
+
+
+INPUT = excitation()
+OUTPUT = noisy(answer(STAGE, INPUT))
+
+
+# Alarms of the residual
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_right_model_gives_no_alarm(seed):
+    input = excitation(seed)
+    run = answer(STAGE, input)
+    report, warnings = analysed(input, noisy(run, seed), run)
+    assert warnings == []
+    assert report.peaks == []
+    assert not report.whiteness[0].significant
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_missing_mode_is_named_by_frequency_and_size(seed):
+    input = excitation(seed)
+    output = noisy(answer(STAGE, input), seed)
+    report, warnings = analysed(input, output, answer(SLOW, input))
+    (peak,) = report.peaks
+    assert peak.frequency_Hz == pytest.approx(780.0, rel=0.02)
+    # |1 / (2 zeta j) - 1| = 25, less what a line of 10 Hz misses of a 30 Hz peak.
+    assert 15.0 < peak.times_gain < 27.0
+    assert report.whiteness[0].significant
+    assert report.input_correlation[0].significant
+    (warning,) = warnings
+    assert "leaves a peak at 7" in warning
+    assert "fit a model with a mode" in warning
+
+
+def test_a_mode_at_the_wrong_frequency_is_named():
+    run = answer(product(lag(1e-3), mode(650.0, 0.02)), INPUT)
+    report, _ = analysed(INPUT, OUTPUT, run)
+    assert report.peaks[0].frequency_Hz == pytest.approx(780.0, rel=0.02)
+
+
+def test_wrong_dynamics_without_a_peak_are_named():
+    run = answer(product(lag(1e-2)), INPUT)
+    output = noisy(answer(product(lag(1e-3)), INPUT))
+    _, warnings = analysed(INPUT, output, run)
+    assert any("its dynamics are too simple" in text for text in warnings)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 1000.0])
+def test_the_model_of_another_stage_is_named(factor):
+    _, warnings = analysed(INPUT, factor * OUTPUT, answer(STAGE, INPUT))
+    assert any("is that of another stage or unit" in text for text in warnings)
+
+
+def test_frequencies_that_only_validation_holds_are_named():
+    input = np.concatenate([excitation(1, 200.0), excitation(2, 1500.0)])[
+        SAMPLES // 2 : 3 * SAMPLES // 2
+    ]
+    report, warnings = analysed(input, answer(STAGE, input), answer(STAGE, input))
+    low, high = report.unseen.band_Hz
+    assert 200.0 < low < 400.0
+    assert 1300.0 < high < 2000.0
+    assert any("frequencies from" in text and "--train" in text for text in warnings)
+
+
+def test_amplitudes_that_only_validation_holds_are_named():
+    input = INPUT.copy()
+    input[HALVES[1]] = 40.0 + 1.5 * (input[HALVES[1]] - 40.0)
+    report, warnings = analysed(input, answer(STAGE, input), answer(STAGE, input))
+    assert report.unseen.input_range == (
+        input[HALVES[1]].min(),
+        input[HALVES[1]].max(),
+    )
+    assert any("beyond that of the training part" in text for text in warnings)
+
+
+def test_a_narrow_record_is_named_and_its_band_given():
+    input = excitation(top=100.0)
+    report, warnings = analysed(
+        input, noisy(answer(STAGE, input)), answer(STAGE, input)
+    )
+    assert 80.0 < report.coverage.band_Hz[1] < 200.0
+    assert report.coverage.input_range == (input.min(), input.max())
+    assert any("excites nothing above 1" in text for text in warnings)
+
+
+def test_records_of_several_channels_have_no_bound():
+    inputs = np.stack([excitation(1), excitation(2)], axis=1)
+    run = answer(STAGE, inputs[:, 0])[:, None]
+    record = Record(inputs, noisy(run[:, 0]), DT)
+    report, _ = residual_report([record], [run], *HALVES)
+    assert report.error_bound is None
+    assert len(report.input_correlation) == 2
+
+
+# The bound
+
+
+def true_error(stage, model, frequency):
+    each = [scipy.signal.freqz(*s, worN=frequency, fs=RATE)[1] for s in (stage, model)]
+    return np.abs(each[0] / each[1] - 1.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_bound_holds_the_true_error(seed):
+    model = product(lag(1.2e-3), mode(760.0, 0.03))
+    input = excitation(seed)
+    record = Record(input, noisy(answer(STAGE, input), seed), DT)
+    bound = error_bound([record], [answer(model, input)], WHOLE)
+    frequency = np.array(bound.frequency)
+    excited = np.array(bound.excited) & (frequency < 3500.0)
+    expected = true_error(STAGE, model, frequency)
+    ratio = (np.array(bound.relative) / expected)[excited]
+    assert excited.sum() > 400
+    # A light peak between two lines is missed by a few percent.
+    assert np.mean(ratio > 0.97) > 0.97
+    assert np.median(ratio) < 1.5
+
+
+def test_what_is_not_excited_is_limited_by_its_neighbour():
+    input = excitation(top=400.0)
+    record = Record(input, noisy(answer(STAGE, input)), DT)
+    bound = error_bound([record], [answer(STAGE, input)], WHOLE)
+    frequency, relative, excited = map(
+        np.array, (bound.frequency, bound.relative, bound.excited)
+    )
+    top = np.flatnonzero(excited)[-1]
+    assert 350.0 < frequency[top] < 700.0
+    beyond = frequency > frequency[top]
+    share = relative[top] * ((frequency[beyond] / frequency[top]) ** 2 - 1.0)
+    expected = np.maximum(relative[top], UNSEEN * np.minimum(share, 1.0))
+    np.testing.assert_allclose(relative[beyond], expected, rtol=2e-3)
+    assert relative[-1] == UNSEEN
+    assert frequency[-1] == pytest.approx(0.5 * RATE)
+
+
+def test_a_hidden_mode_of_the_allowed_share_stays_below_the_bound():
+    """The rule beyond the band, against modes placed there."""
+    input = excitation(top=400.0)
+    record = Record(input, noisy(answer(STAGE, input)), DT)
+    bound = error_bound([record], [answer(STAGE, input)], WHOLE)
+    top = np.array(bound.frequency)[np.array(bound.excited)].max()
+    for hidden in (1.3 * top, 2.0 * top, 3.0 * top):
+        # Its largest share k that shows no error above the bound at the last line.
+        share = float(bound.at([top])[0]) * ((hidden / top) ** 2 - 1.0)
+        lines = np.linspace(1.05 * top, 0.49 * RATE, 400)
+        b, a = mode(hidden, 0.02)
+        response = scipy.signal.freqs(b, a, 2.0 * np.pi * lines)[1]
+        error = min(share, 1.0) * np.abs(response - 1.0)
+        below = lines < 1.02 * hidden
+        assert np.all(error[below] <= 1.05 * np.maximum(bound.at(lines)[below], share))
+
+
+def test_periodic_records_give_their_own_lines():
+    period = 2048
+    input = np.tile(excitation(samples=period), 8)
+    runs = [answer(stage, input) for stage in (STAGE, SLOW)]
+    record = Record(input, noisy(runs[0]), DT, period=period)
+    found = relative_error(record, runs[1], HALVES[1])
+    assert found.resolution == pytest.approx(RATE / period)
+    seen = found.frequency < 3000.0
+    expected = true_error(STAGE, SLOW, found.frequency[seen])
+    np.testing.assert_allclose(found.error[seen], expected, rtol=0.2, atol=0.05)
+    assert np.mean(found.upper[seen] > expected) > 0.95
+
+
+def test_of_several_records_the_larger_error_counts():
+    inputs = [excitation(1), excitation(2, 400.0)]
+    models = (product(lag(1e-3), mode(780.0, 0.02)), product(lag(1.3e-3)))
+    records = [Record(x, noisy(answer(STAGE, x)), DT) for x in inputs]
+    runs = [answer(model, x) for model, x in zip(models, inputs, strict=True)]
+    alone = [error_bound([r], [y], WHOLE) for r, y in zip(records, runs, strict=True)]
+    both = error_bound(records, runs, WHOLE)
+    low, high = np.array([50.0, 200.0]), np.array([2000.0, 3000.0])
+    np.testing.assert_array_equal(both.at(low), alone[1].at(low))
+    np.testing.assert_array_equal(both.at(high), alone[0].at(high))
+    assert np.all(both.excited_at(high))
+
+
+# Statistics
+
+
+def test_autocorrelation_is_that_of_the_sums():
+    signal = scipy.signal.lfilter(
+        [1.0], [1.0, 0.5], np.random.default_rng(0).normal(size=300)
+    )
+    centred = signal - signal.mean()
+    sums = [
+        sum(centred[k] * centred[k - lag] for k in range(lag, 300)) for lag in range(26)
+    ]
+    found = autocorrelation(signal)
+    values = np.array(sums[1:]) / sums[0]
+    place = np.argmax(np.abs(values))
+    assert (found.lag, found.value) == (place + 1, pytest.approx(values[place]))
+    assert found.bound == pytest.approx(3.54 / np.sqrt(300))
+
+
+def test_cross_correlation_looks_at_earlier_inputs():
+    input = np.random.default_rng(0).normal(size=2000)
+    found = cross_correlation(np.roll(input, 7), input)
+    assert found.lag == 7
+    assert found.value > 0.95
+    assert found.significant
+
+
+def test_the_bound_of_the_correlation_counts_the_colour_of_both():
+    """Independent coloured signals seldom exceed it; the bound for white ones often."""
+    random = np.random.default_rng(4)
+    exceeded = naive = 0
+    for _ in range(400):
+        white = random.standard_normal((2, 1200))
+        error, input = scipy.signal.lfilter([1.0], [1.0, -0.95], white)[:, 200:]
+        found = cross_correlation(error, input)
+        at_zero = np.corrcoef(error, input)[0, 1]
+        exceeded += abs(at_zero) > found.bound
+        naive += abs(at_zero) > 3.54 / np.sqrt(1000)
+    assert exceeded <= 0.01 * 400
+    assert naive > 0.2 * 400
+
+
+# Columns and units
+
+TIME = DT * np.arange(SAMPLES)
+OTHER = np.cumsum(np.random.default_rng(8).standard_normal(SAMPLES)) / 50.0
+"""Drift of another sensor."""
+
+
+@pytest.mark.parametrize(
+    ("input", "output", "message"),
+    [
+        (TIME, OUTPUT, "the input column looks like a time axis: it rises steadily"),
+        (INPUT, TIME, "the output column looks like a time axis"),
+        (INPUT, -OUTPUT, "move in opposite directions"),
+        (INPUT, OTHER, "the output does not follow the input"),
+        (OUTPUT, INPUT, "are the columns swapped"),
+        (INPUT, 1e3 * OUTPUT, "spans .* more than any piezo stage: check the unit"),
+        (1e3 * INPUT, OUTPUT, "input spans .* more than any piezo stage"),
+        (INPUT, 1e-3 * OUTPUT, "um/V; piezo stages move"),
+    ],
+)
+def test_implausible_columns_are_named(input, output, message):
+    warnings = plausibility_warnings(Record(input, output, DT))
+    assert len(warnings) == 1
+    with pytest.raises(ValueError, match=message):
+        raise ValueError(warnings[0])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_plausible_columns_pass(seed):
+    input = excitation(seed)
+    output = noisy(answer(STAGE, input), seed)
+    assert plausibility_warnings(Record(input, output, DT)) == []
+    nanometres = Record(input, 1e3 * output, DT, output_units="nm")
+    assert plausibility_warnings(nanometres) == []
+
+
+# In a fit
+
+
+@pytest.fixture(scope="module")
+def short():
+    return Record(INPUT[:6000], OUTPUT[:6000], DT, source="made up")
+
+
+def test_a_fit_without_the_mode_is_alarmed_and_one_with_it_is_not(short):
+    poor, right = (identify(short, model).report for model in ("lag", "mode+lag"))
+    assert any("leaves a peak at 7" in text for text in poor.warnings)
+    assert right.warnings == []
+    bounds = [report.residuals.error_bound.at([780.0])[0] for report in (poor, right)]
+    assert bounds[0] > 10.0
+    assert bounds[1] < 0.3
+    again = FitReport.model_validate_json(right.model_dump_json(by_alias=True))
+    assert again.residuals == right.residuals
