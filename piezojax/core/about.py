@@ -4,14 +4,18 @@ from importlib.metadata import version
 
 from pydantic import BaseModel, Field
 
+from .error_bound import ErrorBound
+
 
 class About(BaseModel):
     """Origin of a saved System, and the reasons not to use it.
 
     ``piezojax`` is the version that wrote the file. ``study`` is the name of the study
     with its ``seed``, ``rate_Hz`` the sampling rate. ``units`` maps the channels of the
-    System to their units. ``unsafe`` lists the alarms raised when the System was made;
-    ``load`` refuses a file with any. Keys of later versions are ignored.
+    System to their units. ``error_bound`` bounds the error of a fitted model, and
+    ``standard_errors`` are those of its parameters, by path. ``unsafe`` lists the
+    alarms raised when the System was made; ``load`` refuses a file with any. Keys of
+    later versions are ignored.
     """
 
     piezojax: str = Field(default_factory=lambda: version("piezojax"))
@@ -19,6 +23,8 @@ class About(BaseModel):
     seed: int | None = None
     rate_Hz: float | None = None  # noqa: N815
     units: dict[str, str] = {}
+    error_bound: ErrorBound | None = None
+    standard_errors: dict[str, float] = {}
     unsafe: list[str] = []
 
     def require_safe(self, name: str, remedy: str) -> None:

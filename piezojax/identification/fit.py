@@ -113,7 +113,17 @@ class Fit:
             for side, each in channels.items()
             for i, unit in enumerate(each)
         }
-        return About(rate_Hz=1.0 / record.dt, units=units)
+        residuals = self.report.residuals
+        return About(
+            rate_Hz=1.0 / record.dt,
+            units=units,
+            error_bound=None if residuals is None else residuals.error_bound,
+            standard_errors={
+                path: found.standard_error
+                for path, found in self.report.parameters.items()
+                if found.standard_error is not None
+            },
+        )
 
     @property
     def record(self) -> Record:

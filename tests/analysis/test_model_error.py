@@ -8,10 +8,10 @@ import pytest
 from piezojax.analysis.stability.differentiable import UNREACHED
 from piezojax.analysis.stability.model_error import (
     NEAR_ONE,
-    ErrorBound,
     worst_delay_margin,
     worst_sensitivity,
 )
+from piezojax.core.error_bound import ErrorBound
 
 RANDOM = np.random.default_rng(3)
 LINES = 40

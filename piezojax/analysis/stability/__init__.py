@@ -22,7 +22,6 @@ from .differentiable import sensitivity as sensitivity
 from .differentiable import sensitivity_peak as sensitivity_peak
 from .margins import StabilityReport as StabilityReport
 from .margins import report_of as report_of
-from .model_error import ErrorBound as ErrorBound
 from .model_error import worst_delay_margin as worst_delay_margin
 from .model_error import worst_sensitivity as worst_sensitivity
 from .operating_point import OperatingPoint as OperatingPoint

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...analysis.stability.model_error import UNSEEN, ErrorBound
+from ...core.error_bound import UNSEEN, ErrorBound
 from ..estimators.welch import SHORTEST, spectral_response
 from ..records.record import Record
 
@@ -23,6 +23,10 @@ for 15 averages (Bendat and Piersol, Random Data, 4th ed., 9.2)."""
 
 AVERAGES = 8
 """Segments without overlap into which a record is divided."""
+
+
+WIDTH = 0.01
+"""Relative width of the bands of a bound: half the width of a peak of 1 % damping."""
 
 
 class RelativeError(NamedTuple):
@@ -94,7 +98,7 @@ def error_bound(
     excited = np.array([bound.excited_at(lines) for bound in bounds])
     relative = np.array([bound.at(lines) for bound in bounds])
     known = np.where(excited, relative, 0.0).max(axis=0)
-    anywhere = excited.any(axis=0)
+    anywhere = np.asarray(excited.any(axis=0))
     relative = np.where(anywhere, known, relative.min(axis=0))
     return _bound(np.asarray(lines), relative, anywhere)
 
@@ -134,9 +138,14 @@ def _completed(found: RelativeError, record: Record) -> ErrorBound:
 def _bound(
     frequency: np.ndarray, relative: np.ndarray, excited: np.ndarray
 ) -> ErrorBound:
-    """Return the ErrorBound, with no more digits than the estimate has."""
+    """Return the ErrorBound on bands of ``WIDTH``, with the largest value of each."""
+    band = np.floor(np.log(frequency / frequency[0]) / np.log1p(WIDTH))
+    first = np.flatnonzero(np.diff(band, prepend=-1.0))
+    last = np.append(first[1:], band.size) - 1
+    middle = np.sqrt(frequency[first] * frequency[last])
+    middle[-1] = frequency[-1]
     return ErrorBound(
-        frequency=tuple(float(f"{f:.8g}") for f in frequency),
-        relative=tuple(float(f"{bound:.4g}") for bound in relative),
-        excited=tuple(excited.tolist()),
+        frequency=tuple(float(f"{f:.8g}") for f in middle),
+        relative=tuple(float(f"{x:.4g}") for x in np.maximum.reduceat(relative, first)),
+        excited=tuple(np.logical_and.reduceat(excited, first).tolist()),
     )

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.signal
 from pydantic import BaseModel
 
-from ...analysis.stability.model_error import ErrorBound
+from ...core.error_bound import ErrorBound
 from ..records.record import Record
 
 STRONG = 1e-3

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pydantic import BaseModel
 
-from ...analysis.stability.model_error import ErrorBound
+from ...core.error_bound import ErrorBound
 from ..records.record import Record
 from .bound import RelativeError, error_bound, relative_error
 from .correlation import Correlation, autocorrelation, cross_correlation

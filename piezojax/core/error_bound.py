@@ -1,0 +1,67 @@
+"""Model error bound of a plant over frequency."""
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+UNSEEN = 25.0
+"""Relative error assumed at frequencies that a record does not excite.
+
+A mode of damping zeta that is not in the model changes the response by the factor
+``1 / (2 zeta)`` at its resonance: 25 for a lightly damped stage of 2 %.
+"""
+
+Share = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+
+
+class ErrorBound(BaseModel):
+    """Upper bound of the relative error of a model, by frequency.
+
+    ``relative`` bounds ``|G_true / G_model - 1|`` at ``frequency`` (Hz, increasing up
+    to the Nyquist frequency). ``excited`` tells for each line whether the record holds
+    enough power there; where it does not, ``relative`` is an assumption (``UNSEEN``).
+    Raises ValueError for lists of different length, and for frequencies that are
+    negative or do not increase.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    frequency: tuple[Share, ...] = Field(min_length=1)
+    relative: tuple[Share, ...]
+    excited: tuple[bool, ...]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "ErrorBound":
+        lines = len(self.frequency)
+        for name in ("relative", "excited"):
+            if len(getattr(self, name)) != lines:
+                raise ValueError(
+                    f"{name} has {len(getattr(self, name))} lines and frequency "
+                    f"{lines}; they must have the same"
+                )
+        if np.any(np.diff(self.frequency) <= 0.0):
+            raise ValueError("frequency must increase from line to line")
+        return self
+
+    def at(self, frequency: Any) -> np.ndarray:
+        """Return the bound at ``frequency`` (Hz): the larger of both neighbours.
+
+        Below the first and above the last line it is that of the line.
+        """
+        below, above = self._neighbours(frequency)
+        relative = np.asarray(self.relative)
+        return np.maximum(relative[below], relative[above])
+
+    def excited_at(self, frequency: Any) -> np.ndarray:
+        """Return whether both neighbours of ``frequency`` (Hz) are excited."""
+        below, above = self._neighbours(frequency)
+        excited = np.asarray(self.excited)
+        return excited[below] & excited[above]
+
+    def _neighbours(self, frequency: Any) -> tuple[np.ndarray, np.ndarray]:
+        lines = np.asarray(self.frequency)
+        last = lines.size - 1
+        below = np.searchsorted(lines, frequency, side="right") - 1
+        above = np.searchsorted(lines, frequency, side="left")
+        return np.clip(below, 0, last), np.clip(above, 0, last)
