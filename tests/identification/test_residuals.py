@@ -366,5 +366,5 @@ def test_a_fit_without_the_mode_is_alarmed_and_one_with_it_is_not(short, tmp_pat
     assert about.error_bound == fits[1].about.error_bound
     assert about.error_bound is not None
     assert about.standard_errors["dynamics.frequency"] > 0.0
-    again = FitReport.model_validate_json(right.model_dump_json(by_alias=True))
+    again = FitReport.model_validate_json(right.model_dump_json())
     assert again.residuals == right.residuals
