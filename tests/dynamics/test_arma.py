@@ -109,34 +109,6 @@ def test_published_dynamics_at_unit_gain():
     np.testing.assert_allclose(scaled.moving, T2_G, rtol=1e-14)
 
 
-def test_gradient_of_every_coefficient_is_that_of_differences():
-    weights = np.random.default_rng(6).normal(size=50)
-
-    @jax.jit
-    @jax.value_and_grad
-    def loss(coefficients):
-        model = ARMA(tuple(coefficients[:2]), tuple(coefficients[2:]))
-        return weights @ response(model, rough(50), 1.0)
-
-    nominal = np.array([*MODEL_533_A, *MODEL_533_B])
-    found = loss(nominal)[1]
-    for k, step in enumerate(np.diag(1e-5 * nominal)):
-        near = loss(nominal + step)[0] - loss(nominal - step)[0]
-        far = loss(nominal + 2 * step)[0] - loss(nominal - 2 * step)[0]
-        expected = (8.0 * near - far) / (12.0 * step[k])
-        np.testing.assert_allclose(found[k], expected, rtol=1e-7)
-
-
-def test_a_batch_of_models_is_a_loop_over_them():
-    gains = jnp.array([0.5, 1.0, 2.0])
-    model = ARMA(MODEL_533_A, MODEL_533_B)
-    models = jax.vmap(lambda gain: scaled_to_dc(model, gain))(gains)
-    batch = jax.vmap(response, in_axes=(0, None, None))(models, rough(), 0.0)
-    for gain, row in zip(gains, batch, strict=True):
-        alone = response(scaled_to_dc(model, gain), rough(), 0.0)
-        np.testing.assert_allclose(row, alone, rtol=0.0, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("a", "b", "message"),
     [

@@ -48,17 +48,6 @@ def test_a_step_creeps_with_the_logarithm_of_time(decades):
     assert np.max(np.abs(ripple)) < 0.03 * 0.02
 
 
-def test_creep_that_has_ended_is_at_rest():
-    for system in (
-        ExponentialCreep((0.1,), (0.5,), DT),
-        LogarithmicCreep(0.1, 0.1, 10.0, DT),
-        SpringDamperCreep((20.0,), (5.0,), 10.0, 11.0, DT),
-    ):
-        y = response(system, np.full(50, 3.0), 3.0)
-        np.testing.assert_allclose(y, y[0], atol=1e-13)
-        assert y[0] > 3.0
-
-
 def test_a_held_force_stretches_damped_springs_exactly():
     stiffness, damping, spring, force = (40.0, 90.0), (8.0, 300.0), 6.0, 2.5
     levels = np.array([0.0, 30.0, -10.0, 55.0])

@@ -23,13 +23,6 @@ def test_output_is_every_nth_of_the_stage_under_a_held_input(samples):
     )
 
 
-def test_rest_stays_at_rest():
-    held = Held(STAGE, 4)
-    output = simulate(held, jnp.full(20, 30.0), held.init(30.0))[1]
-    np.testing.assert_allclose(output, output[0], rtol=0.0, atol=1e-12)
-    assert output[0] > 3.0
-
-
 @pytest.mark.parametrize(
     ("samples", "message"),
     [

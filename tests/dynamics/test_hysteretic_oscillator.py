@@ -90,16 +90,6 @@ def test_finer_samples_of_the_same_held_force_change_nothing():
     np.testing.assert_allclose(fine[3::4], coarse, rtol=0.0, atol=1e-15)
 
 
-@pytest.mark.parametrize("held", [-30.0, 0.0, 80.0])
-def test_rest_stays_at_rest(held):
-    system = model()
-    state = system.init(held)
-    assert float(state.displacement) == held / TRUE["stiffness"]
-    after, output = system.step(state, held)
-    np.testing.assert_allclose(after, state, rtol=0.0, atol=1e-15)
-    np.testing.assert_allclose(output, state.displacement, rtol=1e-15)
-
-
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

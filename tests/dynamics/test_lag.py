@@ -93,22 +93,6 @@ def test_second_order_is_the_held_transfer_function(damping):
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("damping", [0.7, 1.0, 1.5])
-def test_gradient_of_second_order_is_that_of_differences(damping):
-    def last(parameters):
-        return response(SecondOrderLag(*parameters, DT), np.ones(40), 0.0)[-1]
-
-    point = np.array([1000.0, damping])
-    steps = np.diag(1e-5 * point)
-    differences = [(last(point + h) - last(point - h)) / (2 * h.sum()) for h in steps]
-    np.testing.assert_allclose(jax.grad(last)(point), differences, rtol=1e-6)
-
-
-def test_second_order_rests_at_its_input():
-    lag = SecondOrderLag(1000.0, 0.7, DT)
-    np.testing.assert_array_equal(response(lag, np.full(50, 7.0), 7.0), 7.0)
-
-
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [

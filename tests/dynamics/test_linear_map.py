@@ -29,11 +29,6 @@ def test_it_stands_in_a_chain():
     np.testing.assert_allclose(found, MATRIX @ np.arange(3.0), rtol=1e-12)
 
 
-def test_its_slope_is_the_input():
-    slope = jax.grad(lambda m: m.step((), jnp.arange(3.0))[1].sum())(LinearMap(MATRIX))
-    np.testing.assert_allclose(slope.matrix, np.tile(np.arange(3.0), (2, 1)))
-
-
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
