@@ -224,9 +224,10 @@ def line_of(setup):
 
 
 def sensitivity_peak(outcome):
-    """Return Ms of the tuned loop as reported, None without margins."""
+    """Return Ms of the tuned loop: infinite if unstable, None without margins."""
     reports = outcome.stability.reports.get("after", {}).values()
-    return max((float(report.sensitivity_peak) for report in reports), default=None)
+    peaks = [report.sensitivity_peak for report in reports]
+    return max((np.inf if peak is None else peak for peak in peaks), default=None)
 
 
 def warned(line):
@@ -323,7 +324,7 @@ def main():
     parser.add_argument("--poor", action="store_true", help="cases that are too poor")
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 120)
     first, stop = (int(number) for number in chosen.stages.split(":"))
     setups = poor_cases(chosen.design) if chosen.poor else healthy_cases(chosen)
     lines = []

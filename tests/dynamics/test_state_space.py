@@ -59,7 +59,7 @@ def test_the_response_is_scipy_s(both):
 
 def test_gain_at_rest_is_the_closed_form(both):
     (A, B, C, D), model = both
-    level = np.arange(1.0, 1.0 + B.shape[1])
+    level = jnp.arange(1.0, 1.0 + B.shape[1])
     gain = C @ np.linalg.solve(np.eye(len(A)) - A, B) + D
     np.testing.assert_allclose(rest_output(model, level), gain @ level, rtol=1e-9)
     np.testing.assert_allclose(model.dc_gain(), gain, rtol=1e-9, atol=1e-12)
