@@ -47,7 +47,8 @@ CLOSE, FAR, KEPT, FALSE = 1.3, 2.0, 36, 2
 """The bar: ratios, stages within the first, false alarms."""
 
 LOST = 0.2
-"""Error of a lost loop, as a share of the deviation of its reference."""
+"""Error of a lost loop, as a share of the deviation of its reference, if it is also
+above FAR times the promise."""
 
 RAILED = 0.02
 """Share of samples at a limit of the voltage above which a run rails."""
@@ -177,7 +178,7 @@ def judged(outcome, setup, seed=100):
             "obtained": error,
             "tip": float(np.sqrt(np.mean((tip - r) ** 2))),
             "railed": float(np.mean((u <= limits[0]) | (u >= limits[1]))),
-            "lost": not error < LOST * np.std(r),
+            "lost": not error < max(LOST * np.std(r), FAR * (promises[name] or 0.0)),
         }
     return figures
 

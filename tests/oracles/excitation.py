@@ -8,7 +8,7 @@ CHIRP, MULTISINE, RAMP = 0.4, 0.35, 0.02
 SMALL = 0.02
 """Amplitude of chirp and multisine, in spans, unless the amplifier is too slow."""
 
-CYCLES = ((6.0, 0.85, 2), (15.0, 0.45, 3), (40.0, 0.15, 4))
+CYCLES = ((6.0, 0.96, 2), (15.0, 0.5, 3), (40.0, 0.15, 4))
 """Frequency in Hz, height in spans and number of the large cycles of a half."""
 
 
@@ -28,12 +28,12 @@ def _fade(count):
 
 
 def large_cycles(p, random):
-    """Return cycles of three heights and frequencies, each from its own place."""
+    """Return cycles of three heights and frequencies, the first over all the span."""
     dt, place, parts = 1.0 / p.rate, 0.0, []
     for frequency, height, count in CYCLES:
         frequency *= random.uniform(0.85, 1.2)
-        height *= random.uniform(0.8, 1.0)
-        base = p.lower + p.span * (0.05 + random.uniform(0.0, 0.9 - height))
+        height *= random.uniform(0.8, 1.0) if height < 0.9 else 1.0
+        base = p.lower + p.span * (0.02 + random.uniform(0.0, 0.96 - height))
         time = _time(count / frequency, dt)
         cycle = 0.5 * p.span * height * (1.0 - np.cos(2.0 * np.pi * frequency * time))
         parts += [_ramp(place, base, dt), base + cycle]
