@@ -100,7 +100,8 @@ class ChargeDrive(System):
 
     where q is the charge of the load and u its voltage. For a linear load u = q/C_L
     this is (2.12) with leakage, ``q / v = C_s (s + 1/(C_s R_s)) / (s + 1/(C_L R_L))``:
-    the charge follows the command above 1 / (C_L R_L), the voltage follows it below.
+    the charge follows the command at frequencies above 1 / (C_L R_L), the voltage at
+    frequencies below.
 
     ``load`` is a System from q / C_L in V to u in V; a linear load is ``Affine()``. In
     a piezo the hysteresis lies between voltage and charge, and the displacement is

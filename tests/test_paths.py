@@ -20,7 +20,7 @@ from piezojax.core.parameter import (
     declarations,
     parameter,
     sample_time,
-    substituted,
+    substitute_units,
 )
 from piezojax.core.paths import (
     declared,
@@ -196,7 +196,7 @@ def test_declarations_know_the_nyquist_frequency():
     ],
 )
 def test_units_are_substituted_and_cancelled(unit, units, expected):
-    assert substituted(unit, units) == expected
+    assert substitute_units(unit, units) == expected
 
 
 class Gain(System):

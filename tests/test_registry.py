@@ -10,9 +10,9 @@ import pytest
 
 import piezojax as pj
 from piezojax.core import registry
-from piezojax.core.recipe import Extent, Fittable, Part, Recipe, around
+from piezojax.core.recipe import Extent, Fittable, Part, Recipe, scaled_range
 from piezojax.core.serial import to_data
-from piezojax.identification.candidates import at
+from piezojax.identification.candidates import parts_at
 from piezojax.identification.chain import structure
 
 
@@ -29,7 +29,9 @@ def line(name="straight", place="hysteresis", base=pj.hysteresis.Hysteresis):
         @classmethod
         def recipe(cls, extent: Extent) -> Recipe:
             return Recipe(
-                cls(extent.slope), {"slope": around(extent.slope, 0.0, 3.0)}, ({},)
+                cls(extent.slope),
+                {"slope": scaled_range(extent.slope, 0.0, 3.0)},
+                ({},),
             )
 
         def init(self, input=0.0):
@@ -53,8 +55,8 @@ def fresh(monkeypatch):
 
 def test_a_registered_class_is_listed_and_tried_and_fitted(fresh):
     kind = pj.register(line())
-    assert list(registry.parts()).index("straight") == len(at("hysteresis")) - 1
-    assert at("hysteresis")[-1] == "straight"
+    assert list(registry.parts()).index("straight") == len(parts_at("hysteresis")) - 1
+    assert parts_at("hysteresis")[-1] == "straight"
     x = np.sin(0.1 * np.arange(100))
     shape = structure("straight", pj.Record(x, 2.0 * x, 1e-3))
     assert shape.system.names == ("hysteresis", "calibration")

@@ -37,7 +37,7 @@ def test_signals_are_of_one_type(kind, second):
         (np.inf, RATE, "duration in s is inf"),
         (1.0, 0.0, "rate in Hz is 0; it must be finite and above 0"),
         (1.0, np.nan, "rate in Hz is nan"),
-        (5e-5, RATE, "5e-05 s at 20000 Hz hold 1 samples; it takes 2 or more"),
+        (5e-5, RATE, "5e-05 s at 20000 Hz hold 1 samples; at least 2 are needed"),
     ],
 )
 def test_bad_time_grids_are_refused(duration, rate, message):

@@ -78,10 +78,10 @@ def _resampled(stage: Series, rate: int) -> Series:
     hysteresis, dynamics = stage.parts
     assert isinstance(dynamics, ARMA)
     # At a constant voltage the hysteresis is static; only the dynamics move.
-    return series(hysteresis=hysteresis, dynamics=held(dynamics, samples))
+    return series(hysteresis=hysteresis, dynamics=slower(dynamics, samples))
 
 
-def held(model: ARMA, samples: int) -> ARMA:
+def slower(model: ARMA, samples: int) -> ARMA:
     """Return the second-order ``model`` at a rate ``samples`` times lower.
 
     The input is held for ``samples`` steps and the output taken at the last of them.

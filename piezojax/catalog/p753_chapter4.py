@@ -20,7 +20,7 @@ from ..control import (
 from ..core.arrays import ScalarLike
 from ..core.feedback import Feedback
 from ..core.system import Series, System, series
-from ..dynamics import ARMA, Held, SecondOrderLag, scaled_to_dc
+from ..dynamics import ARMA, Oversampled, SecondOrderLag, scaled_to_dc
 from ..hardware import Sensor
 from . import p753
 
@@ -231,7 +231,9 @@ def loop(
     if rest:
         raise ValueError(f"rate in Hz is {rate}; it must divide {p753.RATE:g}")
     stage = plant() if stage is None else stage
-    return Feedback(controller, Held(stage, held), p753.actuator(), Sensor(noise_rms))
+    return Feedback(
+        controller, Oversampled(stage, held), p753.actuator(), Sensor(noise_rms)
+    )
 
 
 def _printed(name: str, values: Mapping[Any, Any], key: Any) -> Any:

@@ -1,7 +1,7 @@
 """Signals of several axes: tuples with one scalar per axis.
 
-In batches a packed array would be two to seven times slower, because XLA keeps scalars
-in registers, with the lanes side by side. Matrices are therefore rows of scalars, and
+In batches a packed array would be two to seven times slower: XLA keeps scalars in
+registers, with the lanes side by side. Matrices are therefore rows of scalars, and
 their products are written out.
 """
 
@@ -19,8 +19,8 @@ from .system import System
 Axes: TypeAlias = tuple[Scalar, ...]
 Rows: TypeAlias = tuple[tuple[Scalar, ...], ...]
 Plain: TypeAlias = tuple[Any, ...]
-"""Axes or Rows in a product. The type says less than they do, because checking the type
-of every scalar in every product would take most of the time of a traced test."""
+"""Axes or Rows in a product, as plain tuples: checking the type of every scalar in
+every product would take most of the time of a traced test."""
 
 T = TypeVar("T")
 
@@ -52,7 +52,7 @@ def diagonal(values: Iterable[Any]) -> Rows:
     )
 
 
-def as_matrix_of(rows: Rows) -> jax.Array:
+def packed_matrix(rows: Rows) -> jax.Array:
     """Return rows of scalars as a packed matrix [rows, columns]."""
     return jnp.stack([jnp.stack(row) for row in rows])
 
@@ -87,12 +87,12 @@ def minus(left: T, right: T) -> T:
 def inverse(matrix: Plain) -> Plain:
     """Return the inverse of a square matrix.
 
-    Up to 3 rows the closed form is used, beyond that a linear solve, which is slow
-    inside a loop over time.
+    A matrix of up to 3 rows is inverted in closed form, a larger one by a linear solve,
+    which is slow inside a loop over time.
     """
     size = len(matrix)
     if size > 3:
-        return as_rows(jnp.linalg.inv(as_matrix_of(matrix)))
+        return as_rows(jnp.linalg.inv(packed_matrix(matrix)))
     cofactors = tuple(
         tuple((-1.0) ** (i + j) * _minor(matrix, i, j) for j in range(size))
         for i in range(size)

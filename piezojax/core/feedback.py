@@ -84,8 +84,8 @@ class Feedback(System):
         """Return the state at rest at the reference ``input`` (um): a bumpless start.
 
         With several axes ``input`` is a vector or a tuple. ``holding`` is the result of
-        ``holding_input`` for it, if known; the solver takes longer to compile than the
-        rest.
+        ``holding_input`` for it. Pass it if it is known: the solver takes longer to
+        compile than the rest.
         """
         reference = as_signal(input)
         if holding is None:

@@ -30,7 +30,7 @@ def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:
 
 
 @contextmanager
-def written_elsewhere(path: Path) -> Iterator[Path]:
+def atomic_replacement(path: Path) -> Iterator[Path]:
     """Yield a temporary file; at the end, sync it and move it to ``path``.
 
     Raises ValueError as ``write_bytes`` does.

@@ -14,12 +14,12 @@ from .rollout import Metric
 class TrackingFigures(NamedTuple):
     """Tracking error, effort and saturation of one run of a loop.
 
-    Over the window of the Tracking metric: ``rms_error`` and ``peak_error`` of the true
-    displacement against the reference in um; ``rms_effort`` of the voltage in V;
-    ``rms_slew`` of the change of the voltage per sample in V. Over the whole run,
-    because saturation during the start-up counts too: ``saturated``, the share of
-    samples (0 to 1) at which the voltage differs from the command, and ``peak_voltage``
-    in V.
+    Four figures are over the window of the Tracking metric: ``rms_error`` and
+    ``peak_error`` of the true displacement against the reference in um, ``rms_effort``
+    of the voltage in V, and ``rms_slew`` of the change of the voltage per sample in V.
+    Two are over the whole run, because saturation during the start-up counts too:
+    ``saturated``, the share of samples (0 to 1) at which the voltage differs from the
+    command, and ``peak_voltage`` in V.
     """
 
     rms_error: Scalar

@@ -51,9 +51,9 @@ class Parameter:
             return self
         return dataclasses.replace(self, below=min(self.below, math.pi / dt))
 
-    def inside(self, units: Mapping[str, str]) -> "Parameter":
+    def with_units(self, units: Mapping[str, str]) -> "Parameter":
         """Return the declaration with the names in brackets replaced by ``units``."""
-        unit = substituted(self.unit, units)
+        unit = substitute_units(self.unit, units)
         return self if unit == self.unit else dataclasses.replace(self, unit=unit)
 
     def check(self, name: str, value: Any) -> None:
@@ -110,7 +110,7 @@ def sample_time(**options: Any) -> Any:
     return parameter("s", "sample time", above=0.0, static=True, **options)
 
 
-def substituted(unit: str, units: Mapping[str, str]) -> str:
+def substitute_units(unit: str, units: Mapping[str, str]) -> str:
     """Return ``unit`` with the names in brackets replaced by ``units`` and cancelled.
 
     "[v]/[s]" becomes "V s/um" for v in V and s in um/s. A unit without such a name is

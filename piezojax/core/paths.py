@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from .arrays import as_array
 from .axes import PerAxis
-from .parameter import Parameter, declarations, substituted
+from .parameter import Parameter, declarations, substitute_units
 from .system import Series, System
 
 S = TypeVar("S", bound=eqx.Module)
@@ -71,10 +71,13 @@ def declared(system: Any, path: str) -> Parameter | None:
             if declaration is not None and declaration.below_nyquist:
                 declaration = declaration.at(children["dt"])
             if declaration is not None:
-                declaration = declaration.inside(units)
+                declaration = declaration.with_units(units)
         if isinstance(node, System):
             inner = node.part_units.get(name, {})
-            units = {**units, **{k: substituted(u, units) for k, u in inner.items()}}
+            units = {
+                **units,
+                **{k: substitute_units(u, units) for k, u in inner.items()},
+            }
         node = children[name]
     return declaration
 

@@ -87,8 +87,8 @@ class Fittable(System):
         """
 
 
-def around(value: float, below: float, above: float) -> Range:
-    """Return the Range from ``below`` to ``above`` times ``value``, in rising order."""
+def scaled_range(value: float, below: float, above: float) -> Range:
+    """Return the Range from ``below`` to ``above`` times ``value``, lower end first."""
     low, high = sorted((below * value, above * value))
     return Range(low, high)
 
@@ -99,6 +99,6 @@ def rest_bounds(extent: Extent) -> dict[str, Range]:
     return {"rest_input": Range(extent.low - margin, extent.high + margin)}
 
 
-def rests(extent: Extent) -> list[dict[str, float]]:
+def rest_starts(extent: Extent) -> list[dict[str, float]]:
     """Return starting values of ``rest_input``: the first and the lowest input (V)."""
     return [{"rest_input": extent.first[0]}, {"rest_input": extent.low}]

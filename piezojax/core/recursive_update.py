@@ -2,8 +2,8 @@
 
 The relation is ``target = weights @ row + error``. Both updates give the posterior mean
 of the weights and its covariance P. ``update`` carries P, so that a term may be added
-to it between rows. ``update_root`` carries a root S of P, P = S S^T, which stays
-positive semidefinite where P loses its symmetry to rounding: under exponential
+to it between rows. ``update_root`` carries a root S of P, P = S S^T. S S^T stays
+positive semidefinite where rounding would destroy the symmetry of P: under exponential
 forgetting over long runs, and after a prior many decades above the posterior.
 """
 

@@ -9,9 +9,9 @@ from .recipe import PLACES, Fittable
 from .system import System
 
 ENTRY_POINTS = "piezojax.extensions"
-"""Group of entry points that name Systems, modules that export Systems, or modules that
-add to a table of piezojax such as its constraints. piezojax registers its own models
-and controllers through it."""
+"""Group of entry points. Each names a System, a module that exports Systems, or a
+module that adds to a table of piezojax, such as its constraints. piezojax registers its
+own models and controllers through it."""
 
 S = TypeVar("S", bound=System)
 

@@ -53,17 +53,18 @@ def simulate(
     The run starts from ``state``, or from rest without one. Returns the last state and
 
     - without ``metric``, every ``every``-th output from the first on, stacked in time
-      (a dense log costs about twice the run, every 20th sample a tenth); or
+      (a dense log takes about twice the time of the run itself, a log of every 20th
+      sample a tenth); or
     - with ``metric``, its result, accumulated during the run: memory does not grow with
       time; or
     - with ``metric`` and ``every`` above 1, the pair of the result and the last output
       of each whole block of ``every`` samples, stacked in time; not for reverse mode.
 
     With ``metric``, reverse-mode differentiation stores one state per ``segment``
-    samples and repeats the samples between them, so that its memory stays small too. A
-    ``segment`` as long as the run makes one plain loop, for runs without reverse mode;
-    it is a third faster for a batch of inputs with time first (``in_axes=1``). Use
-    ``jax.vmap`` for batches, or ``in_blocks`` for many lanes.
+    samples and simulates the samples between them again, so that its memory stays small
+    too. A ``segment`` as long as the run makes one plain loop, for runs without reverse
+    mode; it is a third faster for a batch of inputs with time first (``in_axes=1``).
+    Use ``jax.vmap`` for batches, or ``in_blocks`` for many lanes.
 
     Raises ValueError for empty or ragged inputs, ``every`` or ``segment`` below 1, or,
     with ``metric``, ``every`` longer than the run.

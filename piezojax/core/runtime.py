@@ -40,7 +40,7 @@ def _set(option: str, value: Any) -> None:
 
 
 def _backend_is_running() -> bool:
-    # Every public function of JAX that tells this starts the backend.
+    # Every public function of JAX that returns this starts the backend.
     if "jax" not in sys.modules:
         return False
     try:

@@ -10,7 +10,6 @@ from .creep import LogarithmicCreep as LogarithmicCreep
 from .creep import SpringDamperCreep as SpringDamperCreep
 from .delay import FractionalDelay as FractionalDelay
 from .drift import ThermalDrift as ThermalDrift
-from .held import Held as Held
 from .lag import FirstOrderLag as FirstOrderLag
 from .lag import SecondOrderLag as SecondOrderLag
 from .linear_map import LinearMap as LinearMap
@@ -19,6 +18,7 @@ from .matrix_arma import MatrixARMA as MatrixARMA
 from .matrix_arma import observability_form as observability_form
 from .mode import Mode as Mode
 from .neural_state_space import NeuralStateSpace as NeuralStateSpace
+from .oversampled import Oversampled as Oversampled
 from .reduction import Reduction as Reduction
 from .reduction import balanced_reduction as balanced_reduction
 from .reduction import fast_part as fast_part

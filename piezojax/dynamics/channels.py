@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..core.arrays import Scalar, ScalarLike, as_scalars
-from ..core.axes import Axes, Rows, as_matrix_of, as_rows, check_square, plus, product
+from ..core.axes import Axes, Rows, as_rows, check_square, packed_matrix, plus, product
 from ..core.parameter import parameter, sample_time
 from ..core.system import System
 from .state_space import StateSpace
@@ -35,7 +35,7 @@ class Channel(System):
             )
 
     def init(self, input: ScalarLike = 0.0) -> Axes:
-        A = as_matrix_of(self.A)
+        A = packed_matrix(self.A)
         gain = jnp.linalg.solve(jnp.eye(len(A)) - A, jnp.stack(self.B))
         return tuple(gain[i] * input for i in range(len(self.B)))
 
@@ -60,7 +60,7 @@ class Channels(System):
         if len(kinds) != 1:
             raise ValueError(
                 f"channels differ in (outputs, sample time): {sorted(kinds)}; "
-                "there must be at least one, and all the same"
+                "there must be at least one, and all must be the same"
             )
 
     def init(self, input: Axes) -> tuple[Axes, ...]:

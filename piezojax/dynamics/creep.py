@@ -41,12 +41,13 @@ class ExponentialCreep(Fittable):
 
     After a step of x, y grows further by ``gains[i]`` (a share of the step) with the
     time constant ``time_constants[i]``; y has the unit of x. This is the linear creep
-    model of section 2.4.1 (springs and dampers in series). At rest the creep is
-    complete: the gain is ``direct`` + sum of gains. ``direct`` is the share of x that
-    passes at once. With 0 the output is the creep alone, to be added to a hysteresis of
-    the same input, as in ``hysteresis + creep >> dynamics``; the gains are then in
-    um/V. Raises ValueError for time constants that are not positive, gains that are not
-    finite, or different numbers of gains and time constants.
+    model of section 2.4.1 (springs and dampers in series). ``direct`` is the share of x
+    that passes at once; the gain at rest, when the creep is complete, is ``direct``
+    plus the sum of ``gains``. With ``direct`` 0 the output is the creep alone, to be
+    added to a hysteresis of the same input, as in ``hysteresis + creep >> dynamics``;
+    the gains are then in um/V. Raises ValueError for time constants that are not
+    positive, gains that are not finite, or different numbers of gains and time
+    constants.
     """
 
     part: ClassVar[Part] = Part(
@@ -66,7 +67,7 @@ class ExponentialCreep(Fittable):
         if len(self.gains) != len(self.time_constants):
             raise ValueError(
                 f"{len(self.gains)} gains and {len(self.time_constants)} time "
-                "constants; each exponential needs one of both"
+                "constants; each exponential needs one of each"
             )
 
     @classmethod
@@ -90,14 +91,14 @@ class ExponentialCreep(Fittable):
 
 
 class LogarithmicCreep(Fittable):
-    """Creep by ``gain_per_decade`` of a step with each decade of time.
+    """Creep that grows by ``gain_per_decade`` of a step in each decade of time.
 
     After a step of x at t = 0, y grows in proportion to log10(t) from t = ``shortest``
-    to ``longest``: the logarithmic law of section 2.4.1. Equal exponentials extend it
-    to any input: two per decade, from a decade before ``shortest`` to a decade after
-    ``longest``. They follow the law within 3 % of the creep in a decade. y has the unit
-    of x; ``direct`` as in ``ExponentialCreep``. Raises ValueError unless 0 < shortest <
-    longest.
+    to ``longest``: the logarithmic law of section 2.4.1. A sum of exponentials of equal
+    gain extends the law to any input: two per decade, from a decade before ``shortest``
+    to a decade after ``longest``. They follow it within 3 % of the creep in a decade. y
+    has the unit of x; ``direct`` as in ``ExponentialCreep``. Raises ValueError unless 0
+    < shortest < longest.
     """
 
     part: ClassVar[Part] = Part(
@@ -176,7 +177,7 @@ class SpringDamperCreep(Fittable):
         if len(self.stiffness) != len(self.damping):
             raise ValueError(
                 f"{len(self.stiffness)} springs and {len(self.damping)} dampers; each "
-                "element of the cascade needs one of both"
+                "element of the cascade needs one of each"
             )
 
     @classmethod

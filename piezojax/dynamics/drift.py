@@ -20,7 +20,7 @@ class ThermalDrift(System):
     expansion: Scalar = parameter("um/K", "thermal expansion")
     time_constant: Scalar = parameter(
         "s",
-        "time the stage takes to follow the room",
+        "time constant with which the stage follows the room",
         above=0.0,
         scale="log",
         typical=(1.0, 1e5),

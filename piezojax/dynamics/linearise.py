@@ -24,17 +24,16 @@ def linearise(
     """Return ``system`` linearised around ``state`` and ``input``.
 
     The matrices are the exact derivatives of one step: A [n, n], B [n, m], C [p, n], D
-    [p, m] for the n numbers of the raveled state, the m of the input and the p of the
-    output, in the order in which ``jax.tree.leaves`` lists them and in the units of the
-    system; they map deviations from the operating point to deviations. Counters and
-    ``Learned`` states are held constant and are not states of the model.
+    [p, m] for a state of n numbers, an input of m and an output of p, each in the order
+    of ``jax.tree.leaves`` and in the units of the system. They map deviations from the
+    operating point to deviations. Counters and ``Learned`` states are held constant and
+    are not states of the model.
 
     Without ``state``, the state at rest under ``input`` is used. Without ``dt`` (s),
     the sample time of the parts of the system is used. At a kink of the step, such as
-    that of a hysteresis at rest, the derivative is the one that JAX takes at that
-    point: that of the ascending branch for Coleman-Hodgdon models, the mean of both
-    branches for a play operator. An ``input`` slightly to one side of the point selects
-    the branch.
+    that of a hysteresis at rest, the derivative is the one that JAX takes there: that
+    of the ascending branch for Coleman-Hodgdon models, the mean of both branches for a
+    play operator. To select a branch, move ``input`` slightly to one side.
 
     The function works inside ``jax.jit`` and is differentiable. Raises ValueError if
     ``dt`` is not given and the parts of the system have no sample time or several.
@@ -56,9 +55,9 @@ def linearise(
 
 
 def split_static(state: State) -> tuple[State, State]:
-    """Split ``state`` into the part that small motions change and the part they do not.
+    """Return the part of ``state`` that moves, and the part held constant.
 
-    The second holds counters, which have no derivative, and ``Learned`` states.
+    The second part holds counters, which have no derivative, and ``Learned`` states.
     """
 
     def is_learned(part: Any) -> bool:

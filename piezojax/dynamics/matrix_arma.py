@@ -8,9 +8,9 @@ from ..core.axes import (
     Axes,
     Rows,
     as_matrices,
-    as_matrix_of,
     check_square,
     matrix_product,
+    packed_matrix,
     plus,
     product,
 )
@@ -27,7 +27,7 @@ class MatrixARMA(System):
     last q rows of B_c1, Gamma_1, Gamma_0). A step maps u(k) to y(k+1). Inputs and
     outputs are tuples of q scalars; the state is the contribution of past samples to
     the outputs 1, 2, ... samples ahead. Raises ValueError for different numbers of
-    matrices or other sizes.
+    matrices, or matrices that are not [q, q].
     """
 
     autoregressive: tuple[Rows, ...] = parameter(
@@ -42,7 +42,7 @@ class MatrixARMA(System):
         if not self.moving or len(self.autoregressive) != len(self.moving):
             raise ValueError(
                 f"{len(self.autoregressive)} autoregressive and {len(self.moving)} "
-                "moving matrices; there must be as many of both, at least 1"
+                "moving matrices; the numbers must be equal and at least 1"
             )
         for name in ("autoregressive", "moving"):
             for index, matrix in enumerate(getattr(self, name)):
@@ -66,8 +66,8 @@ class MatrixARMA(System):
 
     def dc_gain(self) -> jax.Array:
         """Return outputs over inputs at rest [q, q]."""
-        fed_back = as_matrix_of(plus(*self.autoregressive))
-        fed_forward = as_matrix_of(plus(*self.moving))
+        fed_back = packed_matrix(plus(*self.autoregressive))
+        fed_forward = packed_matrix(plus(*self.moving))
         return jnp.linalg.solve(jnp.eye(self.axes) - fed_back, fed_forward)
 
     def init(self, input: Axes) -> tuple[Axes, ...]:
@@ -108,13 +108,13 @@ def observability_form(model: StateSpace, lags: int | None = None) -> MatrixARMA
     input excites. More lags than needed improve the condition of F.
 
     Raises ValueError for a model that is not square, has D other than zero or is not
-    observable in p samples. Raises it also if a stable model would get additional modes
-    on or outside the unit circle, which rounding would excite.
+    observable in p samples, and for a stable model whose additional modes would lie on
+    or outside the unit circle, where rounding would excite them.
     """
     (n, inputs), q = model.B.shape, len(model.C)
     if inputs != q:
         raise ValueError(
-            f"the model has {inputs} inputs and {q} outputs; as many it must be"
+            f"the model has {inputs} inputs and {q} outputs; the numbers must be equal"
         )
     if np.any(np.asarray(model.D)):
         raise ValueError("D is not zero; an input must not reach its own sample")

@@ -11,8 +11,8 @@ from ..core.system import Designed
 from .lag import LinearOscillator, SecondOrderLag
 
 GUESSES = (Resonance(0.05, 0.1), Resonance(0.2, 0.1))
-"""Starts for a record in which no resonance was found; frequencies in cycles per
-sample."""
+"""Starting values for a record in which no resonance was found; frequencies in cycles
+per sample."""
 
 
 class Mode(Designed, Fittable):

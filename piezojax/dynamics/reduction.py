@@ -10,7 +10,7 @@ from .state_space import StateSpace
 
 NEGLIGIBLE = 1e-7
 """Hankel singular values below this share of the largest may be rounding errors: they
-are computed from roots of the Gramians, which hold half the digits."""
+are computed from roots of the Gramians, which have half the digits."""
 
 
 class Reduction(NamedTuple):
@@ -70,13 +70,13 @@ def fast_part(model: StateSpace, angle: float, share: float = 0.1) -> StateSpace
     """Return ``model`` without the slow modes that contribute little at ``angle``.
 
     A mode is slow if its natural frequency abs(log z) is below a tenth of ``angle``
-    (rad per sample), as of creep, or of an integrator with its pole at z = 1. The
-    largest set of slowest modes is removed that changes the response at ``angle`` by at
-    most the share ``share``. The gain at rest of the result differs from that of
+    (rad per sample): a mode of creep, or an integrator with its pole at z = 1. The
+    slowest modes are removed, as many as change the response at ``angle`` by at most
+    the share ``share``. The gain at rest of the result differs from that of
     ``model``.
     """
     A, B, C = (np.asarray(matrix) for matrix in (model.A, model.B, model.C))
-    rates = natural_rates(np.linalg.eigvals(A))
+    rates = natural_frequencies(np.linalg.eigvals(A))
     whole = _response(A, B, C, angle) + np.asarray(model.D)
     for rate in np.unique(rates[rates < 0.1 * angle])[::-1]:
         fast, slow = _split(A, B, C, float(rate))
@@ -85,7 +85,7 @@ def fast_part(model: StateSpace, angle: float, share: float = 0.1) -> StateSpace
     return model
 
 
-def natural_rates(poles: Sequence[complex] | np.ndarray) -> np.ndarray:
+def natural_frequencies(poles: Sequence[complex] | np.ndarray) -> np.ndarray:
     """Return the natural frequencies abs(log z) (rad per sample) of ``poles`` z.
 
     The natural frequency of a pole at 0, a pure delay, is infinite.
@@ -144,7 +144,7 @@ def _split(
     ordered: Any = linalg.schur(
         A,
         output="real",
-        sort=lambda x, y: bool(natural_rates([complex(x, y)])[0] > above),
+        sort=lambda x, y: bool(natural_frequencies([complex(x, y)])[0] > above),
     )
     schur, basis, count = ordered
     fast, slow = slice(0, count), slice(count, None)

@@ -17,12 +17,13 @@ class AmplitudeScheduled(System):
     have the same meaning (as those that ``refined`` returns from one start). ``levels``
     are their rms inputs over all channels, ascending, in the unit of the input.
     ``time_constant`` (s) is that of the mean square that measures the level. Between
-    two levels the matrices are interpolated linearly in the level; beyond them the
-    nearest model holds. If every A consists of scaled rotations, no step enlarges a
-    state, for any course of the level: the interpolation is as stable as its models.
+    two levels the matrices are interpolated linearly in the level; beyond the first and
+    the last level the nearest model applies. If every A consists of scaled rotations,
+    no step enlarges a state, however the level changes: the interpolation is as stable
+    as its models.
 
     Raises ValueError for fewer than two models, models that differ in size or sample
-    time, levels that do not rise, or a time constant shorter than a sample.
+    time, levels that do not ascend, or a time constant shorter than a sample.
     """
 
     models: tuple[StateSpace, ...]
@@ -35,7 +36,7 @@ class AmplitudeScheduled(System):
         if not 2 <= len(self.models) == len(self.levels):
             raise ValueError(
                 f"{len(self.models)} models for {len(self.levels)} levels; "
-                "there must be one a level, and two or more"
+                "there must be one model per level, and two or more"
             )
         kinds = {(model.order, *model.D.shape, model.dt) for model in self.models}
         if len(kinds) > 1:

@@ -13,7 +13,7 @@ from ..core.parameter import parameter, sample_time
 from ..core.system import System
 from .arma import ARMA
 
-INNERMOST = 1.0 - 1e-6
+STABILISED_MODULUS = 1.0 - 1e-6
 """Largest modulus of a pole that ``stabilised`` has moved."""
 
 
@@ -22,11 +22,11 @@ class StateSpace(System):
 
     ``A`` [n, n], ``B`` [n, m], ``C`` [p, n], ``D`` [p, m] for n states, m inputs and p
     outputs in the units of the neighbours in the chain. Inputs and outputs are vectors,
-    also where there is only one.
+    even with a single element.
 
-    A loop and ``free_run`` expect a plant that maps u(k) to y(k+1): see ``ahead``.
-    Raises ValueError for matrices whose shapes do not match or numbers that are not
-    finite.
+    A loop and ``free_run`` expect a plant that maps u(k) to y(k+1), which
+    ``one_step_ahead`` returns. Raises ValueError for matrices whose shapes do not match
+    or numbers that are not finite.
     """
 
     A: Matrix = parameter("1", "state matrix", converter=as_matrix)
@@ -73,7 +73,7 @@ class StateSpace(System):
         resolvent = z[:, None, None] * jnp.eye(self.order) - self.A
         return self.C @ jnp.linalg.solve(resolvent, self.B + 0j) + self.D
 
-    def ahead(self) -> "StateSpace":
+    def one_step_ahead(self) -> "StateSpace":
         """Return the model that maps u(k) to y(k+1), as a loop expects of its plant.
 
         Raises ValueError if D is not zero, because the loop would be algebraic.
@@ -175,7 +175,7 @@ def reflected(
         block = slice(first, first + 1 + pair)
         modulus = np.abs(linalg.eigvals(schur[block, block])).max()
         if modulus >= 1.0:
-            schur[block, block] *= min(modulus**-2, INNERMOST / modulus)
+            schur[block, block] *= min(modulus**-2, STABILISED_MODULUS / modulus)
             moved += 1 + pair
         first = block.stop
     return (basis @ schur @ basis.T, moved) if moved else (A, 0)

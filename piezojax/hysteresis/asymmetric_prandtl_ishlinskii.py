@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
 from ..core.parameter import parameter
-from ..core.recipe import Extent, Fittable, Part, Recipe, around, rests
+from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts, scaled_range
 from .inverse import Inverse, InverseHysteresis
 from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
@@ -81,11 +81,13 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
         fields, bounds = plays_recipe(extent)
-        skews = {f"skew.{i}": around(extent.slope, -2.0, 2.0) for i in range(PLAYS)}
+        skews = {
+            f"skew.{i}": scaled_range(extent.slope, -2.0, 2.0) for i in range(PLAYS)
+        }
         return Recipe(
             cls(**fields, skew=(0.0,) * PLAYS, origin=extent.low, scale=extent.width),
             {**bounds, **skews},
-            rests(extent),
+            rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
         )

@@ -10,7 +10,15 @@ import jax.numpy as jnp
 from ..core.arrays import Scalar, ScalarLike, as_array
 from ..core.feedback import holding_input
 from ..core.parameter import parameter
-from ..core.recipe import Extent, Fittable, Part, Recipe, around, rest_bounds, rests
+from ..core.recipe import (
+    Extent,
+    Fittable,
+    Part,
+    Recipe,
+    rest_bounds,
+    rest_starts,
+    scaled_range,
+)
 from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis, check_rising
 from .model import Hysteresis, Laws, differential_laws
@@ -99,8 +107,8 @@ class ColemanHodgdon(Hysteresis, Fittable):
                 rest_output=rest,
             ),
             {
-                "a": around(slope / width, 0.0, 20.0),
-                "b": around(slope, 0.0, 3.0),
+                "a": scaled_range(slope / width, 0.0, 20.0),
+                "b": scaled_range(slope, 0.0, 3.0),
                 "c": Range(-20.0 / width, -0.01 / width),
                 **rest_bounds(extent),
                 "rest_output": Range(rest - reach, rest + reach),
@@ -109,7 +117,7 @@ class ColemanHodgdon(Hysteresis, Fittable):
             [
                 {"c": -steep / width, "a": steep * slope / width, **before}
                 for steep in (0.3, 1.0, 3.0, 8.0)
-                for before in rests(extent)
+                for before in rest_starts(extent)
             ],
             gain="b",
             own=("rest_input", "rest_output"),

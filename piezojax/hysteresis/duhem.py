@@ -9,7 +9,15 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, as_scalars
 from ..core.parameter import parameter
-from ..core.recipe import Extent, Fittable, Part, Recipe, around, rest_bounds, rests
+from ..core.recipe import (
+    Extent,
+    Fittable,
+    Part,
+    Recipe,
+    rest_bounds,
+    rest_starts,
+    scaled_range,
+)
 from ..core.runge_kutta import runge_kutta
 from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
@@ -135,7 +143,7 @@ class Duhem(Hysteresis, Fittable):
                 "reversible.0.0": Range(-10.0 * size, 10.0 * size),
                 "reversible.0.1": Range(-20.0 * size / width, 20.0 * size / width),
                 "reversible.1.0": Range(-10.0 / width, 10.0 / width),
-                "irreversible.0.1": around(pull, -1.0, 50.0),
+                "irreversible.0.1": scaled_range(pull, -1.0, 50.0),
                 "irreversible.1.0": Range(-50.0 / width, -0.01 / width),
                 **rest_bounds(extent),
                 "rest_memory": Range(rest - reach, rest + reach),
@@ -144,7 +152,7 @@ class Duhem(Hysteresis, Fittable):
                 {"irreversible.1.0": -steep / width, "irreversible.0.1": steep * pull}
                 | before
                 for steep in (1.0, 3.0, 10.0)
-                for before in rests(extent)
+                for before in rest_starts(extent)
             ],
             gain="reversible.0.0",
             own=("rest_input", "rest_memory"),

@@ -7,7 +7,15 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array, check
 from ..core.parameter import parameter
-from ..core.recipe import Extent, Fittable, Part, Recipe, around, rest_bounds, rests
+from ..core.recipe import (
+    Extent,
+    Fittable,
+    Part,
+    Recipe,
+    rest_bounds,
+    rest_starts,
+    scaled_range,
+)
 from ..core.space import Range
 from .bouc_wen import BoucWen, BoucWenState
 from .inverse import Inverse, InverseHysteresis
@@ -125,8 +133,8 @@ class NormalisedBoucWen(Hysteresis, Fittable):
                 rest_input=extent.first[0],
             ),
             {
-                "k_x": around(slope, 0.0, 3.0),
-                "k_w": around(slope * width, -1.0, 1.0),
+                "k_x": scaled_range(slope, 0.0, 3.0),
+                "k_w": scaled_range(slope * width, -1.0, 1.0),
                 "rho": Range(0.3 / width, 100.0 / width, "log"),
                 "sigma": Range(0.51, 20.0, "log"),
                 "n": Range(1.0, 5.0),
@@ -136,7 +144,7 @@ class NormalisedBoucWen(Hysteresis, Fittable):
                 {"rho": steep / width, "n": bend, **before}
                 for steep in (2.0, 8.0)
                 for bend in (1.2, 2.0)
-                for before in rests(extent)
+                for before in rest_starts(extent)
             ],
             gain="k_x",
             own=("rest_input",),

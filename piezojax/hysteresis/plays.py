@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..core.arrays import Scalar, as_array, check, check_order
-from ..core.recipe import Extent, around, rest_bounds
+from ..core.recipe import Extent, rest_bounds, scaled_range
 from ..core.space import Range
 
 Memory = tuple[Scalar, ...]
@@ -53,7 +53,7 @@ def check_plays(thresholds: Memory, weights: Memory, name: str = "weights") -> N
     if len(thresholds) != len(weights):
         raise ValueError(
             f"{len(thresholds)} thresholds and {len(weights)} {name}; "
-            "each play operator needs one of both"
+            "each play operator needs one of each"
         )
 
 
@@ -71,8 +71,11 @@ def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
             "rest_input": extent.first[0],
         },
         {
-            **{f"polynomial.{i}": around(s, -10.0, 10.0) for i, s in enumerate(scales)},
-            **{f"weights.{i}": around(slope, 0.0, 1.0) for i in range(PLAYS)},
+            **{
+                f"polynomial.{i}": scaled_range(s, -10.0, 10.0)
+                for i, s in enumerate(scales)
+            },
+            **{f"weights.{i}": scaled_range(slope, 0.0, 1.0) for i in range(PLAYS)},
             **rest_bounds(extent),
         },
     )

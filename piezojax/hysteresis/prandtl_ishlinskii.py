@@ -4,7 +4,7 @@ from typing import ClassVar
 
 from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
 from ..core.parameter import parameter
-from ..core.recipe import Extent, Fittable, Part, Recipe, rests
+from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts
 from .inverse import Inverse, check_rising
 from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
@@ -67,7 +67,7 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
         return Recipe(
             cls(**fields),
             bounds,
-            rests(extent),
+            rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
         )

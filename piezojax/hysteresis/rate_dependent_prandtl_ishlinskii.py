@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
 from ..core.parameter import parameter, sample_time
-from ..core.recipe import Extent, Fittable, Part, Recipe, rests
+from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts
 from ..core.space import Range
 from .inverse import Inverse, check_rising
 from .model import STEP, Hysteresis, Laws
@@ -95,7 +95,7 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
         return Recipe(
             cls(**fields, growth=0.01 * most, dt=extent.dt),
             {**bounds, "growth": Range(0.0, most)},
-            rests(extent),
+            rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
         )

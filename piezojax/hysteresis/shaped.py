@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
 from ..core.parameter import parameter
-from ..core.recipe import Extent, Fittable, Part, Recipe, rest_bounds, rests
+from ..core.recipe import Extent, Fittable, Part, Recipe, rest_bounds, rest_starts
 from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
 from .model import Hysteresis, Laws, differential_laws
@@ -117,7 +117,7 @@ class ShapedColemanHodgdon(Hysteresis, Fittable):
             [
                 {"c": -steep / width, "pull.1": steep * slope / width, **before}
                 for steep in (1.0, 3.0, 10.0)
-                for before in rests(extent)
+                for before in rest_starts(extent)
             ],
             gain="slope.0",
             own=("rest_input", "rest_output"),

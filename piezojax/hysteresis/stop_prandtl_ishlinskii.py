@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
 from ..core.parameter import parameter
-from ..core.recipe import Extent, Fittable, Part, Recipe, rests
+from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts
 from .inverse import Inverse
 from .model import Hysteresis, Laws, turning_point_laws
 from .plays import Memory, check_plays, memoryless, plays_recipe, stopped, weighted
@@ -83,7 +83,7 @@ class StopPrandtlIshlinskii(Hysteresis, Fittable):
         return Recipe(
             cls(**fields),
             bounds,
-            rests(extent),
+            rest_starts(extent),
             gain="polynomial.0",
             own=("rest_input",),
         )

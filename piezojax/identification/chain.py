@@ -7,7 +7,7 @@ import numpy as np
 
 from ..core.arrays import as_array
 from ..core.paths import get, replace
-from ..core.recipe import Extent, Recipe, around
+from ..core.recipe import Extent, Recipe, scaled_range
 from ..core.registry import parts as known_parts
 from ..core.space import INSIDE, Range, Space, space_of
 from ..core.system import Affine, Series, series
@@ -82,7 +82,7 @@ def structure(name: str, record: Record) -> Structure:
     parts["calibration"] = Recipe(
         Affine(slope, extent.centre),
         {
-            **({} if scaled else {"gain": around(slope, 0.0, 3.0)}),
+            **({} if scaled else {"gain": scaled_range(slope, 0.0, 3.0)}),
             "offset": Range(extent.centre - reach, extent.centre + reach),
         },
     )

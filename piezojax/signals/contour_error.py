@@ -31,7 +31,7 @@ class ContourError(Metric):
 
     The distance is measured from the circle through three successive points of the
     reference, or from their straight line if they lie on one. It is exact on circles
-    and lines for any lag, and elsewhere as long as error and curvature change little
+    and lines for any lag; elsewhere it is accurate if error and curvature change little
     over the lag. (The usual estimate, the component of the error across the velocity of
     the reference, counts lag on a curve as contour error.) At rest and at a sharp
     corner the path is a point, and the whole distance from it counts. The last sample

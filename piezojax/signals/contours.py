@@ -129,8 +129,8 @@ def signals_of(name: str) -> tuple[str, str]:
             slow = second or str(Fraction(first) / LINES * 1.0)
             return f"SCAN{first}", f"TRI{slow}"
     raise ValueError(
-        f"contour {name!r} is unknown; it must be as one of {', '.join(FORMS)}, with "
-        "frequencies in Hz above 0"
+        f"contour {name!r} is unknown; it must have the form of one of "
+        f"{', '.join(FORMS)}, with frequencies in Hz above 0"
     )
 
 

@@ -27,7 +27,8 @@ def parse(name: str, axes: Sequence[str]) -> dict[str, str]:
         if not colon or len(on) > 2 or any(axis not in axes for axis in on):
             raise ValueError(
                 f"motion {name!r}: {word!r} must be an axis, one of {', '.join(axes)}, "
-                "and a signal, as in Z:SIN10, or two and a contour, as in X+Y:CIRCLE5"
+                "and a signal, as in Z:SIN10, or two axes and a contour, as in "
+                "X+Y:CIRCLE5"
             )
         kinds = (kind,) if len(on) == 1 else contours.signals_of(kind)
         for axis, each in zip(on, kinds, strict=True):

@@ -25,7 +25,8 @@ def time_grid(duration: float, rate: float) -> Time:
     samples = round(duration * rate)
     if samples < 2:
         raise ValueError(
-            f"{duration:g} s at {rate:g} Hz hold {samples} samples; it takes 2 or more"
+            f"{duration:g} s at {rate:g} Hz hold {samples} samples; "
+            "at least 2 are needed"
         )
     return jnp.arange(samples, dtype=jnp.float64) / rate
 

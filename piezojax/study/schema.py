@@ -191,7 +191,7 @@ class Study(Table):
         if samples < 2:
             raise ValueError(
                 f"references.duration is {table.duration:g} s, {samples} samples; "
-                "it takes 2 or more"
+                "at least 2 are needed"
             )
         for name in (*table.tune, *table.unseen):
             try:

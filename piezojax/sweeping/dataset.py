@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.files import written_elsewhere
+from ..core.files import atomic_replacement
 from ..study.sweep_table import SENSITIVITY
 from .plan import TRAJECTORIES
 from .simulator import Simulator
@@ -97,7 +97,7 @@ class Merger:
         import h5netcdf
 
         store, damaged = self._store, []
-        with written_elsewhere(store.folder / RESULT) as path:
+        with atomic_replacement(store.folder / RESULT) as path:
             with h5netcdf.File(path, "w") as file:
                 self._write_frame(file)
                 for chunk in range(self._simulator.plan.chunks):

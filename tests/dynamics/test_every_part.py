@@ -18,9 +18,9 @@ from piezojax.dynamics import (
     ExponentialCreep,
     FirstOrderLag,
     FractionalDelay,
-    Held,
     LinearMap,
     NeuralStateSpace,
+    Oversampled,
     SecondOrderLag,
     SpringDamperCreep,
     StateSpace,
@@ -82,7 +82,7 @@ MODELS |= {
     for damping in (0.7, 1.0, 1.5)
 }
 MODELS |= {
-    "held": lambda: Held(FirstOrderLag(2 * DT, DT), 4),
+    "held": lambda: Oversampled(FirstOrderLag(2 * DT, DT), 4),
     "linear map": lambda: LinearMap([[1.0, -0.5], [0.2, 2.0]]),
     "state_space": state_space,
     "scheduled": scheduled,

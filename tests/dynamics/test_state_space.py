@@ -104,17 +104,17 @@ def test_ahead_answers_with_the_next_output():
     model = p558.model("7")
     u = jnp.asarray(inputs(3, 50))
     _, now = simulate(model, u, model.init())
-    _, ahead = simulate(model.ahead(), u, model.init())
+    _, ahead = simulate(model.one_step_ahead(), u, model.init())
     np.testing.assert_allclose(ahead[:-1], now[1:], rtol=0, atol=1e-13)
     level = jnp.array([1.0, -2.0, 3.0])
     np.testing.assert_allclose(
-        rest_output(model.ahead(), level), model.dc_gain() @ level, rtol=1e-10
+        rest_output(model.one_step_ahead(), level), model.dc_gain() @ level, rtol=1e-10
     )
 
 
 def test_an_algebraic_loop_is_refused(both):
     with pytest.raises(ValueError, match="D is not zero; an input must not reach its"):
-        both[1].ahead()
+        both[1].one_step_ahead()
 
 
 def test_stacked_channels_answer_as_their_sum():

@@ -22,7 +22,7 @@ from oracles.bouc_wen import BENCHMARK
 
 from piezojax.core import registry
 from piezojax.core.parameter import parameter
-from piezojax.core.recipe import Fittable, Part, Recipe, around
+from piezojax.core.recipe import Fittable, Part, Recipe, scaled_range
 from piezojax.core.system import resolve
 from piezojax.hysteresis import (
     BoucWen,
@@ -55,8 +55,8 @@ class Bowed(Hysteresis, Fittable):
 
     @classmethod
     def recipe(cls, extent):
-        slope = around(extent.slope, 0.1, 3.0)
-        pull = around(0.01, 0.1, 5.0)
+        slope = scaled_range(extent.slope, 0.1, 3.0)
+        pull = scaled_range(0.01, 0.1, 5.0)
         return Recipe(cls(0.6 * extent.slope, 0.01), {"slope": slope, "pull": pull})
 
     def init(self, input=0.0):

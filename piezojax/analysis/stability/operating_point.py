@@ -91,8 +91,9 @@ class OperatingPoint:
 def loop_sample_time(loop: Feedback) -> float:
     """Return the controller's sample time (s), or that of the rest of the loop.
 
-    The controller's comes first because a plant may run faster inside (``Held``).
-    Raises ValueError if no part has a sample time, or if several differ.
+    The controller's comes first because a plant may run faster inside
+    (``Oversampled``). Raises ValueError if no part has a sample time, or if several
+    differ.
     """
     try:
         return sample_time(loop.controller)

@@ -159,7 +159,7 @@ def _linear(
         ]
         plant = stage
     else:
-        plant = stage.ahead()
+        plant = stage.one_step_ahead()
     poles = np.abs(stage.poles())
     named = {
         "largest pole modulus": FittedParameter(

@@ -7,7 +7,7 @@ from piezojax import (
 )
 from piezojax.catalog import p753
 from piezojax.dynamics import (
-    Held,
+    Oversampled,
 )
 
 STAGE = p753.plant()
@@ -16,7 +16,7 @@ STAGE = p753.plant()
 @pytest.mark.parametrize("samples", [1, 4, 20])
 def test_output_is_every_nth_of_the_stage_under_a_held_input(samples):
     inputs = 40.0 + 40.0 * np.random.default_rng(3).uniform(-1.0, 1.0, 50)
-    found = simulate(Held(STAGE, samples), jnp.asarray(inputs))[1]
+    found = simulate(Oversampled(STAGE, samples), jnp.asarray(inputs))[1]
     repeated = simulate(STAGE, jnp.asarray(np.repeat(inputs, samples)))[1]
     np.testing.assert_allclose(
         found, repeated[samples - 1 :: samples], rtol=0.0, atol=1e-12
@@ -32,4 +32,4 @@ def test_output_is_every_nth_of_the_stage_under_a_held_input(samples):
 )
 def test_bad_numbers_of_samples_are_refused(samples, message):
     with pytest.raises(ValueError, match=message):
-        Held(STAGE, samples)
+        Oversampled(STAGE, samples)

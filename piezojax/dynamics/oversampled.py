@@ -7,7 +7,7 @@ from ..core.parameter import parameter
 from ..core.system import System
 
 
-class Held(System):
+class Oversampled(System):
     """``system`` stepped ``samples`` times under each input; returns the last output.
 
     It models a stage behind a converter that holds the voltage of a slower loop. Raises
