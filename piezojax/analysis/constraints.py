@@ -16,6 +16,9 @@ from .stability.differentiable import (
     peak_of,
 )
 
+OFF = "off"
+"""Limit in a study that switches a constraint off."""
+
 CAP = 3.0
 """ln(value/limit) above which a violation is compressed: the loop is unstable there,
 and the size of the violation has no meaning."""
@@ -25,9 +28,9 @@ class LoopFigures(NamedTuple):
     """Figures of a loop from which constraints are evaluated.
 
     ``tracking`` and ``extremes`` hold arrays [plants, references, draws];
-    ``sensitivity`` is S [plants, branches, lines] on the plants on which margins are
-    constrained. ``extremes`` and ``sensitivity`` are None unless a limit needs them.
-    ``dt`` in s.
+    ``sensitivity`` is S [plants, branches, lines, axes, axes] on the plants on which
+    margins are constrained. ``extremes`` and ``sensitivity`` are None unless a limit
+    needs them. ``dt`` in s.
     """
 
     tracking: TrackingFigures
@@ -45,7 +48,8 @@ class Constraint(NamedTuple):
 
     ``values(source, dt)`` returns the values of the figure, with the plants on the
     first axis, from the field ``source`` of the LoopFigures and dt in s. A limit must
-    lie above ``above`` and below ``below``.
+    lie above ``above`` and below ``below``. ``default`` is the limit of a study that
+    names none.
     """
 
     unit: str
@@ -54,14 +58,18 @@ class Constraint(NamedTuple):
     values: Callable[[Any, float], Array]
     above: float = 0.0
     below: float = math.inf
+    default: float | None = None
 
     def check(self, name: str, limit: Any) -> None:
-        """Raise ValueError unless ``limit`` is a number within its allowed limits."""
+        """Raise ValueError unless ``limit`` is a number in its bounds, or ``OFF``."""
+        if limit == OFF:
+            return
         number = isinstance(limit, int | float) and not isinstance(limit, bool)
         if not (number and self.above < limit < self.below):
             bound = f" and below {self.below:g}" if math.isfinite(self.below) else ""
             raise ValueError(
                 f"{name} is {limit!r}; it must be a number above {self.above:g}{bound}"
+                f", or {OFF!r}"
             )
 
     def read(self, loop: LoopFigures) -> Array:
@@ -80,13 +88,13 @@ def _margin(figure: Callable[[Array], Array]) -> Callable[[Array, float], Array]
 
 CONSTRAINTS: dict[str, Constraint] = {
     "sensitivity_peak": Constraint(
-        "1", "at most", "sensitivity", _margin(peak_of), above=1.0
+        "1", "at most", "sensitivity", _margin(peak_of), above=1.0, default=2.0
     ),
     "disk_margin": Constraint(
         "1", "at least", "sensitivity", _margin(disk_margin_of), below=2.0
     ),
     "delay_margin": Constraint(
-        "samples", "at least", "sensitivity", _margin(delay_margin_of)
+        "samples", "at least", "sensitivity", _margin(delay_margin_of), default=1.0
     ),
     "peak_voltage": Constraint(
         "V", "at most", "tracking", lambda figures, dt: _largest(figures.peak_voltage)
@@ -103,9 +111,26 @@ CONSTRAINTS: dict[str, Constraint] = {
 }
 """Constraints by their name in a study; each holds for every plant and reference of
 the objective. The sensitivity peak, disk margin and delay margin (samples) are those of
-the loop, linearised at the highest reference on both branches of the hysteresis. The
+the loop, linearised at the highest reference on both branches of the hysteresis. On
+several axes they are the largest singular value of S, a lower bound of the disk margin
+of all axes at once, and the least delay margin of one axis with the others closed. The
 others are the largest values in the runs; ``overshoot`` is a share of the reference's
 range."""
+
+
+def limits_of(written: Mapping[str, Any]) -> dict[str, float]:
+    """Return the limits in force: those ``written`` in a study, and the defaults.
+
+    A limit that is written as ``OFF`` is left out, so that a default applies unless the
+    study says otherwise.
+    """
+    defaults = {
+        name: kind.default
+        for name, kind in CONSTRAINTS.items()
+        if kind.default is not None
+    }
+    chosen = defaults | dict(written)
+    return {name: limit for name, limit in chosen.items() if limit != OFF}
 
 
 def uses(names: Iterable[str], source: Source) -> bool:

@@ -103,6 +103,7 @@ class ComparisonStudy(Table):
     references: References
     objective: ObjectiveTable = ObjectiveTable()
     optimiser: OptimiserTable = OptimiserTable()
+    constraints: dict[str, Any] = Field(default_factory=dict)
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
     bounds: dict[str, RateRange] = Field(default_factory=dict)
     controllers: dict[str, ControllerTable] = Field(min_length=1)

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from ..analysis.constraints import CONSTRAINTS
+from ..analysis.constraints import CONSTRAINTS, limits_of
 from ..core.plain import read_plain
 from ..core.registry import discover
 from ..signals import motions
@@ -246,17 +246,11 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _constrained(self) -> "Study":
-        limits = self.constraints
-        for name, limit in limits.items():
+        for name, limit in self.constraints.items():
             if name not in CONSTRAINTS:
                 raise ValueError(unknown_key(f"constraints.{name}", name, CONSTRAINTS))
             CONSTRAINTS[name].check(f"constraints.{name}", limit)
-        if self.axes and limits:
-            raise ValueError(
-                f"constraints.{next(iter(limits))}: constraints are for one axis; "
-                f"this stage has {self.axis_count}"
-            )
-        if self.pareto and self.pareto.constraint not in limits:
+        if self.pareto and self.pareto.constraint not in self.limits:
             raise ValueError(
                 f"pareto.constraint is {self.pareto.constraint!r}; "
                 "it must be one of the study's constraints"
@@ -296,6 +290,11 @@ class Study(Table):
     def dt(self) -> float:
         """Sample time, s."""
         return 1.0 / self.rate
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Limits in force by constraint: those of the study, and the defaults."""
+        return limits_of(self.constraints)
 
     @property
     def axis_count(self) -> int:

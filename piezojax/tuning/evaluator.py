@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 
 from ..analysis.constraints import LoopFigures, uses
-from ..analysis.stability.differentiable import sensitivities
+from ..analysis.stability.differentiable import Sensitivity, sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
 from ..core.feedback import Feedback
-from ..core.metrics import Extremes, TrackingFigures
+from ..core.metrics import ExtremeFigures, Extremes, TrackingFigures
 from ..solve.clock import Clock
 from ..study import Case, Stage
 from .runs import Signals, evaluate
@@ -19,11 +19,15 @@ from .runs import Signals, evaluate
 class Evaluator:
     """Simulator of loops on signals, compiled once per shape of signals.
 
-    ``start`` is the first sample that counts; ``clock`` measures the compile time.
+    ``start`` is the first sample that counts, ``limits`` are those of the study;
+    ``clock`` measures the compile time.
     """
 
-    def __init__(self, clock: Clock, case: Case, start: int):
-        self._clock, self._case, self._start = clock, case, start
+    def __init__(self, clock: Clock, case: Case):
+        self._clock, self._case = clock, case
+        study = case.study
+        self.start = round(study.references.settle * study.rate)
+        self.limits = study.limits
         self._programs: dict[str, Callable] = {}
 
     def _compiled(self, key: str, function: Callable, *arguments: Any) -> Callable:
@@ -33,41 +37,71 @@ class Evaluator:
 
     def figures(self, loop: Feedback, signals: Signals) -> TrackingFigures:
         """Return the figures [references, draws] of ``loop``."""
-        program = self._compiled(
-            f"figures {signals.noise.shape}",
-            lambda loop, signals: evaluate(lambda x: x, loop, signals, self._start),
-            loop,
-            signals,
-        )
-        return program(loop, signals)
+        return jax.tree.map(lambda x: x[0], self._runs(loop, signals, None)[0])
 
-    def on_stages(self, loop: Feedback, stages: Stage, signals: Signals) -> LoopFigures:
-        """Return the figures of ``loop`` on ``stages``, both with a leading axis."""
+    def limited(
+        self,
+        loop: Feedback,
+        signals: Signals,
+        stages: Stage | None = None,
+        margin_stages: Stage | None = None,
+    ) -> LoopFigures:
+        """Return the figures of the study's limits, with the plants on the first axis.
+
+        The runs are on ``stages``, the margins on ``margin_stages``, both stacked; None
+        means the plant of the loop alone.
+        """
+        tracking, extremes = self._runs(loop, signals, stages)
+        sensitivity = self._sensitivity(loop, margin_stages)
+        return LoopFigures(tracking, extremes, sensitivity, dt=self._case.study.dt)
+
+    def _runs(
+        self, loop: Feedback, signals: Signals, stages: Stage | None
+    ) -> tuple[TrackingFigures, ExtremeFigures | None]:
+        beside = Extremes() if uses(self.limits, "extremes") else None
         dynamic, static = eqx.partition(stages, eqx.is_array)
-        signals = signals.for_another_plant()
-        limits = self._case.study.constraints
-        beside = Extremes() if uses(limits, "extremes") else None
+        if stages is not None:
+            signals = signals.for_another_plant()
 
         def run(loop, dynamic, signals):
-            def around(part):
-                return eqx.combine(part, static).around(loop)
-
             def one(part):
-                return evaluate(lambda x: x, around(part), signals, self._start, beside)
+                around = _around(loop, eqx.combine(part, static))
+                return evaluate(lambda x: x, around, signals, self.start, beside)
 
-            figures = jax.lax.map(one, dynamic)
-            figures, extremes = figures if beside else (figures, None)
-            margins = None
-            if uses(limits, "sensitivity"):
-                study = self._case.study
-                point = OperatingPoint(study.highest, dt=study.dt)
-                margins = jax.vmap(lambda part: sensitivities(around(part), point))(
-                    dynamic
-                )
-            return figures, extremes, margins
+            return jax.lax.map(one, dynamic) if _count(stages) else _stacked(one(None))
 
-        count = jax.tree.leaves(dynamic)[0].shape[0]
-        program = self._compiled(
-            f"{count} stages {signals.noise.shape}", run, loop, dynamic, signals
-        )
-        return LoopFigures(*program(loop, dynamic, signals), dt=self._case.study.dt)
+        key = f"{_count(stages)} stages {signals.noise.shape}"
+        found = self._compiled(key, run, loop, dynamic, signals)(loop, dynamic, signals)
+        return found if beside else (found, None)
+
+    def _sensitivity(self, loop: Feedback, stages: Stage | None) -> Sensitivity | None:
+        """Return S on each of ``stages``, or None if no limit needs it."""
+        study = self._case.study
+        if not uses(self.limits, "sensitivity"):
+            return None
+        dynamic, static = eqx.partition(stages, eqx.is_array)
+        point = OperatingPoint(study.highest, dt=study.dt)
+
+        def margins(loop, dynamic):
+            def one(part):
+                around = _around(loop, eqx.combine(part, static))
+                return sensitivities(around, point)
+
+            return jax.vmap(one)(dynamic) if _count(stages) else _stacked(one(None))
+
+        key = f"margins of {_count(stages)} stages"
+        return self._compiled(key, margins, loop, dynamic)(loop, dynamic)
+
+
+def _count(stages: Stage | None) -> int:
+    """Return the number of stacked ``stages``, 0 for None."""
+    return 0 if stages is None else jax.tree.leaves(stages)[0].shape[0]
+
+
+def _around(loop: Feedback, stage: Stage | None) -> Feedback:
+    return loop if stage is None else stage.around(loop)
+
+
+def _stacked(figures: Any) -> Any:
+    """Return the figures of one plant with a leading axis."""
+    return jax.tree.map(lambda x: x[None], figures)

@@ -38,7 +38,7 @@ def trace_front(
     """
     table = case.study.pareto
     assert table is not None
-    limits = case.study.constraints
+    limits = case.study.limits
 
     def worst_and_errors(
         objective: Objective, unit: Array

@@ -16,6 +16,7 @@ from ..analysis.stability.operating_point import OperatingPoint
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import Extremes, TrackingFigures
+from ..core.rollout import in_blocks
 from ..core.space import Space
 from ..solve.augmented_lagrangian import PENALTY, augmented
 from ..solve.problem import FAILED_LOSS, Errors, Verdict
@@ -34,11 +35,21 @@ _SHARPNESS = 20.0  # of the smooth maximum in "worst"
 _FLOOR = 1e-9  # um: errors below a femtometre count as equal
 
 
-def _on_each(function: Callable[[Stage | None], T], stages: Stage | None) -> T:
-    """Return ``function`` of each of the stacked ``stages``, or of None, stacked."""
+def _on_each(
+    function: Callable[[Stage | None], T], stages: Stage | None, size: int | None = None
+) -> T:
+    """Return ``function`` of each of the stacked ``stages``, or of None, stacked.
+
+    ``size`` of them are evaluated at a time, by default all.
+    """
     if stages is None:
         return jax.tree.map(lambda x: x[None], function(None))
-    return eqx.filter_vmap(function)(stages)
+    dynamic, static = eqx.partition(stages, eqx.is_array)
+    return in_blocks(
+        lambda part: function(eqx.combine(part, static)),
+        dynamic,
+        size=size or len(jax.tree.leaves(dynamic)[0]),
+    )
 
 
 class Objective(eqx.Module):
@@ -138,7 +149,9 @@ class Objective(eqx.Module):
         figures, errors = _on_each(run, self.stages)
         figures, extremes = figures if beside else (figures, None)
         known = uses(self.limits, "sensitivity")
-        found = _on_each(margins, self.margin_stages) if known else None
+        # Of several axes a whole batch of matrices would not fit into memory.
+        size = None if self.highest is None or self.highest.ndim == 0 else 1
+        found = _on_each(margins, self.margin_stages, size) if known else None
         return LoopFigures(figures, extremes, found, dt=self.dt), errors
 
     def _normalised(self, figures: TrackingFigures) -> Array:

@@ -44,10 +44,15 @@ def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:
 
 
 def search_box(
-    objective: Objective, case: Case, clock: Clock, progress: Progress
+    objective: Objective,
+    case: Case,
+    clock: Clock,
+    progress: Progress,
+    also: np.ndarray | None = None,
 ) -> tuple[SearchState, Strategy | None]:
     """Return the search with the best point of the case's box, and its strategy.
 
+    ``also`` are further points [points, n] that may become starts.
     ``Ctrl-C`` ends the search with the best point so far; the strategy is None if it
     was not compiled yet. Raises ValueError if the loop diverges or rails at every point
     tried.
@@ -57,6 +62,7 @@ def search_box(
     inner, strategy = search.history.clock, None
     try:
         points = candidates(case)
+        points = points if also is None else np.concatenate([points, also])
         progress.stage(f"screening {len(points)} points of the box")
         strategy = make_strategy(objective, case, inner)
         try:

@@ -4,23 +4,23 @@ from importlib.metadata import version
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ..analysis.constraints import worst_by_plant
+from ..analysis.constraints import uses, worst_by_plant
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import TrackingFigures
 from ..core.progress import Progress, Silent
 from ..solve.clock import Clock
+from ..solve.multi_start import Strategy
 from ..solve.search_state import SearchState
-from ..study import Case, Stage, read, shipped
-from ..study.ensemble import Part
+from ..study import Case, read, shipped
 from .baselines import Budget, compare_baselines
 from .data import Data, make_data
 from .evaluator import Evaluator
 from .front import trace_front
-from .objective import RAILED, Objective
+from .make_objective import make_objective
+from .objective import Objective
 from .outcome import Outcome
 from .result import (
     ConstraintOutcome,
@@ -52,42 +52,16 @@ def tune(
     case = study if isinstance(study, Case) else read(study or shipped())
     table, space = case.study, case.space
     data = make_data(case)
-    first = round(table.references.settle * table.rate)
 
     progress.stage("simulating the start")
-    evaluator = Evaluator(clock, case, first)
+    evaluator = Evaluator(clock, case)
     before = evaluator.figures(case.loop, data.tuning)
-    stages = _stages(case, "tune")
-    scale = _scale(before, data)[None]
-    if stages is not None:
-        found = evaluator.on_stages(case.loop, stages, data.tuning).tracking
-        scale = jax.vmap(lambda one: _scale(one, data, scale[0]))(found)
-    objective = Objective(
-        loop=case.loop,
-        space=space,
-        signals=data.tuning,
-        scale=scale,
-        voltage_span=as_array(
-            np.mean(np.subtract(table.actuator.upper, table.actuator.lower))
-        ),
-        start=first,
-        aggregate=table.objective.aggregate,
-        effort_weight=table.objective.effort_weight,
-        slew_weight=table.objective.slew_weight,
-        weights=_weights(case, data),
-        resting=tuple(not trace.driven for trace in data.traces[: data.tuned]),
-        stages=stages,
-        margin_stages=_stages(case, "margins"),
-        over=table.ensemble.aggregate if table.ensemble else "mean",
-        tail=table.ensemble.tail if table.ensemble else 1.0,
-        highest=as_array(table.highest),
-        dt=table.dt,
-    ).with_limits(table.constraints)
-    search, strategy = search_box(objective, case, clock, progress)
+    objective = make_objective(case, data, evaluator, before)
+    objective, search, strategy = _search(objective, case, evaluator, clock, progress)
 
     after = space.put(case.loop, as_array(search.unit))
     try:
-        front, kept = None, _constraint_outcomes(objective, search, clock)
+        front, kept = None, _constraint_outcomes(objective, evaluator, after)
         if table.pareto is not None and strategy and search.status != "interrupted":
             front = trace_front(objective, case, search, strategy, clock, progress)
         progress.stage("judging on held-out noise")
@@ -106,57 +80,41 @@ def tune(
     return Outcome(result, case.loop, after, case, data.holdout, comparison)
 
 
-def _scale(
-    before: TrackingFigures, data: Data, otherwise: jax.Array | None = None
-) -> jax.Array:
-    """Return the scale (um) of the error of each trace: its RMS error before tuning.
+def _search(
+    objective: Objective,
+    case: Case,
+    evaluator: Evaluator,
+    clock: Clock,
+    progress: Progress,
+) -> tuple[Objective, SearchState, Strategy | None]:
+    """Return the objective with its limits, the search, and its strategy.
 
-    If the start diverges or rails, the scale is ``otherwise``, or, without it, the
-    standard deviation of the reference.
+    The defaults among the limits are rarely active, and margins in every loss cost time
+    to compile. Unless the study limits a margin itself, the box is searched without
+    them first, and again with them if the result violates any.
     """
-    rms = jnp.sqrt(jnp.mean(jnp.asarray(before.rms_error) ** 2, axis=1))
-    usable = jnp.all(jnp.isfinite(rms)) & (jnp.max(before.saturated) <= RAILED)
-    own = jnp.where(rms > 0.0, rms, 1e-9)
-    return jnp.where(usable, own, _swing(data) if otherwise is None else otherwise)
-
-
-def _swing(data: Data) -> jax.Array:
-    swing = jnp.maximum(jnp.std(data.tuning.references, axis=1), 1e-3)
-    if swing.ndim == 1:
-        return swing
-    largest = jnp.max(swing, axis=1)
-    return jnp.stack(
-        [
-            swing[trace.run, trace.axis] if trace.driven else largest[trace.run]
-            for trace in data.traces[: data.tuned]
-        ]
-    )
-
-
-def _weights(case: Case, data: Data) -> jax.Array | None:
-    """Return the weights of the traces: the coupling weight for axes that should rest.
-
-    None for one axis.
-    """
-    if case.study.axes is None:
-        return None
-    coupling = case.study.objective.coupling_weight
-    tuned = data.traces[: data.tuned]
-    return as_array([1.0 if trace.driven else coupling for trace in tuned])
-
-
-def _stages(case: Case, part: Part) -> Stage | None:
-    """Return the nominal stage and the drawn stages of ``part``, stacked.
-
-    None if no stages are drawn.
-    """
-    others = case.ensemble.stages(part) if case.ensemble else None
-    if others is None:
-        return None
-    own = Stage(case.loop.plant, case.loop.sensor)
-    return jax.tree.map(
-        lambda own, drawn: jnp.concatenate([own[None], drawn]), own, others
-    )
+    study = case.study
+    own = {
+        name: study.limits[name] for name in study.constraints if name in study.limits
+    }
+    every = objective.with_limits(study.limits)
+    if uses(own, "sensitivity") or study.pareto or own == study.limits:
+        return every, *search_box(every, case, clock, progress)
+    objective = objective.with_limits(own)
+    search, strategy = search_box(objective, case, clock, progress)
+    if search.status == "interrupted":
+        return objective, search, strategy
+    try:
+        after = case.space.put(case.loop, as_array(search.unit))
+        kept = _constraint_outcomes(every, evaluator, after)
+    except KeyboardInterrupt:
+        search.status = "interrupted"
+        return objective, search, strategy
+    if all(outcome.kept for outcome in kept.values()):
+        return objective, search, strategy
+    again, strategy = search_box(every, case, clock, progress, search.unit[None])
+    again.evaluations += search.evaluations
+    return every, again, strategy
 
 
 def _perturbed(
@@ -167,25 +125,23 @@ def _perturbed(
         return None
     driven = np.array([trace.driven for trace in data.traces])
     figures = [
-        evaluator.on_stages(loop, stages, data.holdout) for loop in (before, after)
+        evaluator.limited(loop, data.holdout, stages, stages)
+        for loop in (before, after)
     ]
-    return Perturbed.of(figures[0], figures[1], driven, case.study.constraints)
+    return Perturbed.of(figures[0], figures[1], driven, case.study.limits)
 
 
 def _constraint_outcomes(
-    objective: Objective, search: SearchState, clock: Clock
+    objective: Objective, evaluator: Evaluator, after: Feedback
 ) -> dict[str, ConstraintOutcome]:
     """Return the outcomes of the limits on the plants that were tuned on."""
-    if not objective.limits:
-        return {}
-    unit = as_array(search.unit)
-    worst_values = clock.compiled(
-        lambda o, u: worst_by_plant(o.limits, o.figures(u)), objective, unit
+    limits = evaluator.limits
+    figures = evaluator.limited(
+        after, objective.signals, objective.stages, objective.margin_stages
     )
-    values = jax.tree.map(np.asarray, worst_values(objective, unit))
     return {
-        name: ConstraintOutcome.of_values(name, float(limit), values[name])
-        for name, limit in objective.limits.items()
+        name: ConstraintOutcome.of_values(name, limits[name], np.asarray(values))
+        for name, values in worst_by_plant(limits, figures).items()
     }
 
 

@@ -23,11 +23,15 @@ from piezojax.analysis.stability.differentiable import (
     sensitivities,
 )
 from piezojax.analysis.stability.margins import report_of
-from piezojax.catalog import p753, p753_stage
+from piezojax.catalog import p558_control, p753, p753_stage
 from piezojax.core.paths import replace
 
 INTEGRAL = "controller.integral"
 BRANCHES = ("ascending", "descending")
+
+
+def one_axis(sensitivity):
+    return jnp.asarray(sensitivity)[:, None, None]
 
 
 def pid_loop(integral=3000.0):
@@ -96,7 +100,7 @@ def test_a_crossing_with_phase_lead_limits_the_delay_too():
         p753.DT,
     )
     assert math.floor(report_of(system).delay_margin_samples) == whole
-    assert math.floor(delay_margin_of(jnp.asarray(1.0 / (1.0 + loop)))) == whole
+    assert math.floor(delay_margin_of(one_axis(1.0 / (1.0 + loop)))) == whole
 
 
 @pytest.mark.parametrize("integral", [6000.0, 20_000.0, 30_000.0])
@@ -147,3 +151,94 @@ def test_an_unstable_loop_is_a_barrier_with_a_slope():
 def test_an_unknown_branch_is_refused():
     with pytest.raises(ValueError, match=r"branch 'up'; it must be one of"):
         sensitivity(pid_loop(), OperatingPoint(branch="up"))
+
+
+# Several axes
+
+FIGURES = (peak_of, disk_margin_of, delay_margin_of)
+ANGLES = np.linspace(0.0, np.pi, 4001)
+
+
+def coupled(gains, coupling=0.4):
+    """S of two integrating axes, L = K [[1, c], [c/2, 1]] z^-3 / (z - 1), by NumPy."""
+    z = np.exp(1j * ANGLES[1:])[:, None, None]
+    mixing = jnp.array([[1.0, coupling], [0.5 * coupling, 1.0]])
+    L = gains[:, None] * mixing * z**-3 / (z - 1.0)
+    S = jnp.linalg.inv(jnp.eye(2) + L)
+    return jnp.concatenate([jnp.zeros((1, 2, 2)), S])
+
+
+def test_figures_of_two_axes_are_those_of_numpy():
+    S = coupled(jnp.array([0.12, 0.2]))
+    largest = np.linalg.svd(S, compute_uv=False)[:, 0].max()
+    disk = np.linalg.svd(S - 0.5 * np.eye(2), compute_uv=False)[:, 0].max()
+    assert largest > 1.02 * np.abs(np.einsum("kii->ki", S)).max()
+    assert peak_of(S) == pytest.approx(largest, rel=1e-7)
+    assert disk_margin_of(S) == pytest.approx(1.0 / disk, rel=1e-7)
+    alone = [float(delay_margin_of(one_axis(S[:, i, i]))) for i in range(2)]
+    assert delay_margin_of(S) == pytest.approx(min(alone))
+    assert alone[1] < 0.9 * alone[0]
+
+
+def test_a_delay_beyond_the_margin_of_one_axis_makes_two_axes_unstable():
+    gains, mixing = np.array([0.12, 0.2]), np.array([[1.0, 0.4], [0.2, 1.0]])
+
+    def stable(delay):
+        """Simulate the loop with ``delay`` further samples on the second axis."""
+        x, past = np.array([1.0, 1.0]), [np.zeros(2)] * 60
+        for _ in range(3000):
+            acted = np.array([mixing[0] @ past[-4], mixing[1] @ past[-4 - delay]])
+            x = x - gains * acted
+            past.append(x)
+        return bool(np.abs(x).max() < 1e-3)
+
+    whole = next(n for n in range(40) if not stable(n + 1))
+    second = delay_margin_of(one_axis(coupled(jnp.array(gains))[:, 1, 1]))
+    assert math.floor(second) == whole
+
+
+def test_slopes_of_two_axes_are_those_of_differences():
+    @jax.jit
+    def figures(gains):
+        return jnp.stack([figure(coupled(gains)) for figure in FIGURES])
+
+    at = jnp.array([0.12, 0.2])
+    steps = 1e-6 * np.eye(2)
+    difference = [(figures(at + e) - figures(at - e)) / 2e-6 for e in steps]
+    forward = jax.jit(jax.jacfwd(figures))(at)
+    np.testing.assert_allclose(forward, np.transpose(difference), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(figures))(at), forward, rtol=1e-9)
+
+
+def test_equal_singular_values_have_a_slope():
+    """Two equal axes: the slope along both gains is that of one axis."""
+
+    def peak(gain):
+        return peak_of(coupled(gain * jnp.ones(2), coupling=0.0))
+
+    def one(gain):
+        return peak_of(one_axis(coupled(gain * jnp.ones(2), coupling=0.0)[:, 0, 0]))
+
+    value, slope = jax.value_and_grad(peak)(0.2)
+    assert value == pytest.approx(float(one(0.2)), rel=1e-7)
+    assert slope == pytest.approx(float(jax.grad(one)(0.2)), rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def three_axes():
+    """S of a loop of three axes on both branches, and its exact reports."""
+    loop, rest = p558_control.loop(p558_control.pid()), (5.0, 5.0, 5.0)
+    exact = [stability_report(loop, OperatingPoint(rest, b)) for b in BRANCHES]
+    return jax.jit(lambda loop: sensitivities(loop, rest))(loop), exact
+
+
+def test_three_axes_are_those_of_the_exact_report(three_axes):
+    found, exact = three_axes
+    assert found.shape[0] == len(exact)
+    for S, report in zip(found, exact, strict=True):
+        assert peak_of(S) == pytest.approx(report.sensitivity_peak, rel=5e-3)
+        least = min(axis.delay_margin_samples for axis in report.axes)
+        assert delay_margin_of(S) == pytest.approx(least, rel=2e-2)
+        # The bound without scaling of the axes is below the structured one.
+        assert disk_margin_of(S) < report.disk_margin * (1.0 + 5e-3)
+        assert disk_margin_of(S) > 0.8 * report.disk_margin

@@ -130,7 +130,7 @@ def still():
 
 def test_a_perturbed_plant_starts_at_rest_where_it_is_judged(still):
     case, stages, data = still
-    seen = Evaluator(Clock(), case, 0).on_stages(case.loop, stages, data.holdout)
+    seen = Evaluator(Clock(), case).limited(case.loop, data.holdout, stages)
     np.testing.assert_allclose(seen.tracking.rms_error, 0.0, atol=1e-12)
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import tomllib
 
 import equinox as eqx
 import jax
@@ -19,7 +18,7 @@ from piezojax.core.metrics import TrackingFigures
 from piezojax.core.paths import replace
 from piezojax.core.system import rest_output
 from piezojax.solve.augmented_lagrangian import augmented, updated
-from piezojax.study import Stage, read, shipped
+from piezojax.study import Stage, load, read
 from piezojax.tuning.data import make_data
 from piezojax.tuning.objective import Objective
 
@@ -391,11 +390,21 @@ def test_a_bad_study_is_refused(tables, message, tmp_path):
         read(written(tmp_path, changed(**tables)))
 
 
-def test_limits_are_for_one_axis(tmp_path):
-    text = shipped("three_dof_sliding_mode").read_text(encoding="utf-8")
-    study = tomllib.loads(text) | {"constraints": {"disk_margin": 0.5}}
-    with pytest.raises(ValueError, match=r"disk_margin: constraints are for"):
-        read(written(tmp_path, study))
+def test_every_study_has_limits_unless_it_says_otherwise(tmp_path):
+    def limits(constraints):
+        return load(written(tmp_path, STUDY | {"constraints": constraints})).limits
+
+    study = {key: STUDY[key] for key in STUDY if key != "pareto"}
+    assert load(written(tmp_path, study | {"constraints": {}})).limits == {
+        "sensitivity_peak": 2.0,
+        "delay_margin": 1.0,
+    }
+    assert limits({"sensitivity_peak": 1.5, "delay_margin": "off", "effort": 9.0}) == {
+        "sensitivity_peak": 1.5,
+        "effort": 9.0,
+    }
+    with pytest.raises(ValueError, match=r"delay_margin is 'of'; .* above 0, or 'off'"):
+        limits({"delay_margin": "of"})
 
 
 @pytest.mark.parametrize("name", CONSTRAINTS)

@@ -1,0 +1,102 @@
+"""Objective of a case: signals, scales of the errors, and the stages drawn."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..core.arrays import as_array
+from ..core.metrics import TrackingFigures
+from ..study import Case, Stage
+from ..study.ensemble import Part
+from .data import Data
+from .evaluator import Evaluator
+from .objective import RAILED, Objective
+
+
+def make_objective(
+    case: Case, data: Data, evaluator: Evaluator, before: TrackingFigures
+) -> Objective:
+    """Return the objective of ``case`` on its tuning signals, without limits.
+
+    ``before`` are the figures of the study's own gains; they scale the errors.
+    """
+    table = case.study
+    stages = drawn_stages(case, "tune")
+    scale = _scale(before, data)[None]
+    if stages is not None:
+        found = evaluator.limited(case.loop, data.tuning, stages).tracking
+        scale = jax.vmap(lambda one: _scale(one, data, scale[0]))(found)
+    return Objective(
+        loop=case.loop,
+        space=case.space,
+        signals=data.tuning,
+        scale=scale,
+        voltage_span=as_array(
+            np.mean(np.subtract(table.actuator.upper, table.actuator.lower))
+        ),
+        start=evaluator.start,
+        aggregate=table.objective.aggregate,
+        effort_weight=table.objective.effort_weight,
+        slew_weight=table.objective.slew_weight,
+        weights=_weights(case, data),
+        resting=tuple(not trace.driven for trace in data.traces[: data.tuned]),
+        stages=stages,
+        margin_stages=drawn_stages(case, "margins"),
+        over=table.ensemble.aggregate if table.ensemble else "mean",
+        tail=table.ensemble.tail if table.ensemble else 1.0,
+        highest=as_array(table.highest),
+        dt=table.dt,
+    )
+
+
+def _scale(
+    before: TrackingFigures, data: Data, otherwise: jax.Array | None = None
+) -> jax.Array:
+    """Return the scale (um) of the error of each trace: its RMS error before tuning.
+
+    If the start diverges or rails, the scale is ``otherwise``, or, without it, the
+    standard deviation of the reference.
+    """
+    rms = jnp.sqrt(jnp.mean(jnp.asarray(before.rms_error) ** 2, axis=1))
+    usable = jnp.all(jnp.isfinite(rms)) & (jnp.max(before.saturated) <= RAILED)
+    own = jnp.where(rms > 0.0, rms, 1e-9)
+    return jnp.where(usable, own, _swing(data) if otherwise is None else otherwise)
+
+
+def _swing(data: Data) -> jax.Array:
+    swing = jnp.maximum(jnp.std(data.tuning.references, axis=1), 1e-3)
+    if swing.ndim == 1:
+        return swing
+    largest = jnp.max(swing, axis=1)
+    return jnp.stack(
+        [
+            swing[trace.run, trace.axis] if trace.driven else largest[trace.run]
+            for trace in data.traces[: data.tuned]
+        ]
+    )
+
+
+def _weights(case: Case, data: Data) -> jax.Array | None:
+    """Return the weights of the traces: the coupling weight for axes that should rest.
+
+    None for one axis.
+    """
+    if case.study.axes is None:
+        return None
+    coupling = case.study.objective.coupling_weight
+    tuned = data.traces[: data.tuned]
+    return as_array([1.0 if trace.driven else coupling for trace in tuned])
+
+
+def drawn_stages(case: Case, part: Part) -> Stage | None:
+    """Return the nominal stage and the drawn stages of ``part``, stacked.
+
+    None if no stages are drawn.
+    """
+    others = case.ensemble.stages(part) if case.ensemble else None
+    if others is None:
+        return None
+    own = Stage(case.loop.plant, case.loop.sensor)
+    return jax.tree.map(
+        lambda own, drawn: jnp.concatenate([own[None], drawn]), own, others
+    )
