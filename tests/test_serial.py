@@ -581,3 +581,11 @@ def test_an_integer_of_more_than_64_bits_is_a_number(tmp_path):
 def test_saving_into_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(ValueError, match=r"nowhere.a.json: No such file"):
         save(pj.core.system.Affine(), tmp_path / "nowhere" / "a.json")
+
+
+@pytest.mark.parametrize("key", ["gain\n", "a\x1bb"])
+def test_a_key_with_control_characters_is_refused_in_one_line(tmp_path, key):
+    (tmp_path / "a.json").write_text(json.dumps({"type": "Affine", key: 1.0}))
+    with pytest.raises(ValueError, match="which holds control characters") as caught:
+        load(tmp_path / "a.json")
+    assert str(caught.value).isprintable()

@@ -17,7 +17,8 @@ def read_plain(path: Path, kind: Literal["toml", "json"], name: str) -> Any:
 
     ``name`` is the name of the file in errors. Raises ValueError, one line, for a file
     that cannot be read or has other content, for more than DEEPEST tables inside each
-    other, and for an integer beyond the range of a float.
+    other, for an integer beyond the range of a float, and for a key with control
+    characters, such as a line end.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -50,12 +51,21 @@ def _check(data: Any, name: str) -> None:
         for place, value in level.items():
             if isinstance(value, dict | list):
                 pairs = value.items() if isinstance(value, dict) else enumerate(value)
+                _check_keys(value, f"{name}: {place.lstrip('.')}")
                 inner |= {f"{place}.{key}": item for key, item in pairs}
             elif isinstance(value, int):
                 _check_integer(value, f"{name}: {place.lstrip('.')}")
         level = inner
     if level:
         raise ValueError(_too_deep(name))
+
+
+def _check_keys(table: dict | list, where: str) -> None:
+    for key in table if isinstance(table, dict) else ():
+        if not key.isprintable():
+            raise ValueError(
+                f"{where} has the key {shown(key)}, which holds control characters"
+            )
 
 
 def _check_integer(value: int, where: str) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.arrays import ScalarLike, check
+from ..core.plain import shown
 
 Time = Float[Array, " samples"]
 
@@ -237,7 +238,7 @@ def parse(name: str) -> tuple[str, float | None]:
     digits = name[len(kind) :]
     if kind not in SIGNALS or digits.count(".") > 1 or digits == ".":
         raise ValueError(
-            f"signal {name!r} is unknown; it must be one of {', '.join(SIGNALS)}, "
+            f"signal {shown(name)} is unknown; it must be one of {', '.join(SIGNALS)}, "
             "followed by its frequency in Hz, as in SIN10"
         )
     return kind, float(digits) if digits else None

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ..core.parameter import Parameter, Scale
+from ..core.plain import shown
 from ..core.space import Range
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
@@ -63,7 +64,7 @@ ByAxis = Each | tuple[Each, ...]
 def one_of(name: str, allowed: Any) -> str:
     """Return ``name``; raise ValueError, listing ``allowed``, if it is not in it."""
     if not isinstance(name, str) or name not in allowed:
-        raise ValueError(f"{name!r} is unknown; there are {', '.join(allowed)}")
+        raise ValueError(f"{shown(name)} is unknown; there are {', '.join(allowed)}")
     return name
 
 
@@ -111,5 +112,5 @@ def _message(error: ValidationError, kind: type[BaseModel], where: str) -> str:
         return f"{key} is missing"
     message = first["msg"].removeprefix("Value error, ")
     value = first["input"]
-    shown = f" is {value!r}" if isinstance(value, str | int | float) else ""
-    return f"{key}{shown}: {message}" if key else message
+    is_value = f" is {shown(value)}" if isinstance(value, str | int | float) else ""
+    return f"{key}{is_value}: {message}" if key else message

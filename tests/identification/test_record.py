@@ -612,3 +612,11 @@ def test_a_column_of_time_is_no_signal(tmp_path):
         path.write_text("\n".join([header, *rows]), encoding="utf-8")
         with pytest.raises(ValueError, match=r"the input column is '[Tt]ime"):
             read_record(path, rate=10.0)
+
+
+@pytest.mark.parametrize("value", ["1e101", "-3e300"])
+def test_values_whose_squares_are_not_finite(write, value):
+    rows = list(ROWS)
+    rows[7] = [rows[7][0], value, *rows[7][2:]]
+    reached = f"input reaches {abs(float(value)):g}; it must stay below 1e+100"
+    refused(write(text_of(rows)), reached, **COLUMNS)

@@ -4,6 +4,7 @@ Libraries are imported in the reader that needs them, so that a file of one form
 not need the libraries of the others.
 """
 
+import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -11,6 +12,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from .columns import Column, Columns, ContentError, decoded, parsed, table
+from .mat_elements import check_elements
 from .steps import stated_step
 
 
@@ -71,6 +73,8 @@ def _mat(file: BinaryIO) -> Columns:
 
     if matfile_version(file)[0] == 2:  # version 7.3: HDF5 behind a text header
         return _hdf5(file, separator=".")
+    check_elements(file.read())
+    file.seek(0)
     arrays = {n: v for n, v in loadmat(file).items() if not n.startswith("__")}
     step = stated_step(arrays)
     return _merged(_spread(name, values, dt=step) for name, values in arrays.items())
@@ -113,7 +117,10 @@ def _hdf5_step(item: Any) -> float | None:
 
 def _tdms(file: BinaryIO) -> Columns:
     from nptdms import TdmsFile
+    from nptdms.log import log_manager
 
+    # It logs what it makes of a broken file, pages of bytes included.
+    log_manager.set_level(logging.CRITICAL)
     content = TdmsFile.read(file)
     if content.file_status.incomplete_final_segment:
         raise ContentError("the file is cut short")

@@ -27,6 +27,9 @@ COUNTED = ("s", "ms", "us", "ns", "sequence")
 LONGEST = 100_000_000
 """Most samples of a resampled record."""
 
+LARGEST = 1e100
+"""Largest value of a signal; the squares of much larger ones are not finite."""
+
 UNIFORM = 1e-3
 """Largest relative difference of time steps that count as one sample time."""
 
@@ -90,6 +93,11 @@ class Record:
                     raise ValueError(
                         f"{self.source}: {name} is missing or not finite at sample "
                         f"{bad[0]} ({bad.size} in all)"
+                    )
+                if np.abs(column).max() > LARGEST:
+                    raise ValueError(
+                        f"{self.source}: {name} reaches {np.abs(column).max():g}; "
+                        f"it must stay below {LARGEST:g}"
                     )
                 if np.ptp(column) == 0:
                     raise ValueError(f"{self.source}: {name} never changes")
