@@ -178,7 +178,11 @@ def fit_table(report: FitReport) -> Table:
             ("validation", report.validation),
         )
     )
-    table = Table(title=f"{report.model}: free-run rms error\n{errors}")
+    table = Table(
+        title=f"{report.model}: free-run rms error\n{errors}",
+        caption="\n".join([*_scope(report), *_place_of_the_lag(report)]) or None,
+        caption_justify="left",
+    )
     table.add_column("parameter", no_wrap=True)
     table.add_column("value", justify="right")
     table.add_column("standard error", justify="right")
@@ -187,6 +191,37 @@ def fit_table(report: FitReport) -> Table:
         shown = "-" if deviation is None else f"{deviation:.2g}"
         table.add_row(path, f"{parameter.value:.5g}", shown)
     return table
+
+
+def _scope(report: FitReport) -> list[str]:
+    """Return a line on the band, the range and the error of a model."""
+    residuals = report.residuals
+    if residuals is None or residuals.error_bound is None:
+        return []
+    coverage, bound = residuals.coverage, residuals.error_bound
+    if coverage.band_Hz is None:
+        return ["the record excites no frequency that can be told from noise"]
+    low, high = coverage.input_range
+    inside = [
+        error
+        for error, excited in zip(bound.relative, bound.excited, strict=True)
+        if excited
+    ]
+    return [
+        f"known from {coverage.band_Hz[0]:.3g} to {coverage.band_Hz[1]:.3g} Hz and "
+        f"from {low:.3g} to {high:.3g} {coverage.input_unit}; there the response is "
+        f"known within a factor of {1.0 + sorted(inside)[len(inside) // 2]:.3g} in the "
+        f"median, {1.0 + max(inside):.3g} at worst"
+    ]
+
+
+def _place_of_the_lag(report: FitReport) -> list[str]:
+    if report.model.split("+")[-1] != "lag":
+        return []
+    return [
+        "a record cannot tell the lag of the sensor from that of the stage; a "
+        "controller holds the sensor's reading, and the tip may move differently"
+    ]
 
 
 WIDE = 3

@@ -11,7 +11,11 @@ from piezojax.core.error_bound import UNSEEN
 from piezojax.core.serial import read_about
 from piezojax.identification import FitReport
 from piezojax.identification.plausibility import plausibility_warnings
-from piezojax.identification.residuals.bound import error_bound, relative_error
+from piezojax.identification.residuals.bound import (
+    ABSORBED,
+    error_bound,
+    relative_error,
+)
 from piezojax.identification.residuals.correlation import (
     autocorrelation,
     cross_correlation,
@@ -146,7 +150,7 @@ def test_frequencies_that_only_validation_holds_are_named():
 
 def test_amplitudes_that_only_validation_holds_are_named():
     input = INPUT.copy()
-    input[HALVES[1]] = 40.0 + 1.5 * (input[HALVES[1]] - 40.0)
+    input[HALVES[1]] = 40.0 + 2.0 * (input[HALVES[1]] - 40.0)
     report, warnings = analysed(input, answer(STAGE, input), answer(STAGE, input))
     assert report.unseen.input_range == (
         input[HALVES[1]].min(),
@@ -161,9 +165,9 @@ def test_a_narrow_record_is_named_and_its_band_given():
         input, noisy(answer(STAGE, input)), answer(STAGE, input)
     )
     assert report.coverage.band_Hz is not None
-    assert 80.0 < report.coverage.band_Hz[1] < 200.0
+    assert 80.0 < report.coverage.band_Hz[1] < 300.0
     assert report.coverage.input_range == (input.min(), input.max())
-    assert any("excites nothing above 1" in text for text in warnings)
+    assert any("excites nothing above" in text for text in warnings)
 
 
 def test_records_of_several_channels_have_no_bound():
@@ -190,7 +194,7 @@ def test_the_bound_holds_the_true_error(seed):
     record = Record(input, noisy(answer(STAGE, input), seed), DT)
     run = answer(model, input)
     found = relative_error(record, run, WHOLE)
-    clear = found.frequency < 3500.0
+    clear = (found.frequency < 3500.0) & (found.margin < 1.0)
     ratio = (found.upper / true_error(STAGE, model, found.frequency))[clear]
     assert clear.sum() > 400
     # A light peak between two lines is missed by a few percent.
@@ -198,7 +202,7 @@ def test_the_bound_holds_the_true_error(seed):
     assert np.median(ratio) < 1.5
     # The bound's bands lower no line.
     bound = error_bound([record], [run], WHOLE).at(found.frequency)
-    assert np.all(bound >= 0.999 * np.minimum(found.upper, UNSEEN))
+    assert np.all((bound >= 0.999 * found.upper)[clear])
 
 
 def test_what_is_not_excited_is_limited_by_its_neighbour():
@@ -210,13 +214,17 @@ def test_what_is_not_excited_is_limited_by_its_neighbour():
     )
     top = np.flatnonzero(excited)[-1]
     assert 350.0 < frequency[top] < 700.0
-    beyond = frequency > frequency[top]
-    share = relative[top] * ((frequency[beyond] / frequency[top]) ** 2 - 1.0)
-    expected = np.maximum(relative[top], UNSEEN * np.minimum(share, 1.0))
-    # A band holds its largest value.
-    ratio = relative[beyond][1:] / expected[1:]
-    assert np.all((ratio > 0.9) & (ratio < 1.25))
-    assert relative[-1] == UNSEEN
+    found = relative_error(record, answer(STAGE, input), WHOLE)
+    weak = found.frequency[found.margin > 1.0]
+    for i in range(top + 2, frequency.size, 20):
+        if np.min(np.abs(weak - frequency[i])) < 0.02 * frequency[i]:
+            continue  # it limits the bound too
+        seen = (frequency[i] / frequency[: top + 1]) ** 2 - 1.0
+        share = min(1.0, np.min(np.maximum(relative[: top + 1], ABSORBED) * seen))
+        expected = max(relative[top], UNSEEN * share)
+        # A band holds its largest value.
+        assert expected * 0.9 < relative[i] < expected * 1.25
+    assert relative.max() == UNSEEN
     assert frequency[-1] == pytest.approx(0.5 * RATE)
 
 
@@ -225,10 +233,12 @@ def test_a_hidden_mode_of_the_allowed_share_stays_below_the_bound():
     input = excitation(top=400.0)
     record = Record(input, noisy(answer(STAGE, input)), DT)
     bound = error_bound([record], [answer(STAGE, input)], WHOLE)
-    top = np.array(bound.frequency)[np.array(bound.excited)].max()
+    excited = np.array(bound.excited)
+    known = np.array(bound.frequency)[excited]
+    upper, top = np.array(bound.relative)[excited], known.max()
     for hidden in (1.3 * top, 2.0 * top, 3.0 * top):
-        # Its largest share k that shows no error above the bound at the last line.
-        share = float(bound.at([top])[0]) * ((hidden / top) ** 2 - 1.0)
+        # Its largest share k that shows no error above the bound at any line.
+        share = np.min(np.maximum(upper, ABSORBED) * ((hidden / known) ** 2 - 1.0))
         lines = np.linspace(1.05 * top, 0.49 * RATE, 400)
         b, a = mode(hidden, 0.02)
         response = scipy.signal.freqs(b, a, 2.0 * np.pi * lines)[1]

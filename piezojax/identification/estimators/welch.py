@@ -41,14 +41,16 @@ def spectral_response(
     *,
     period: int | None = None,
     segment: int | None = None,
+    least: float = EXCITED,
 ) -> SpectralResponse:
     """Estimate the frequency response from ``input`` to ``output`` [samples].
 
     With a ``period`` (samples) it is the ratio of the discrete Fourier transforms,
     averaged over the whole periods at the end of the record: exact in steady state.
     Without one it is that of Welch, from half-overlapping segments of ``segment``
-    samples under a Hann window, without their means and slopes. Lines that the input
-    does not excite are left out. ``dt`` in s. Source of the variance: Bendat and
+    samples under a Hann window, without their means and slopes. Lines in which the
+    input has less than the share ``least`` of the power of its strongest line are left
+    out. ``dt`` in s. Source of the variance: Bendat and
     Piersol, Random Data, 4th ed., section 9.2.
 
     Raises ValueError for signals of different length, fewer than two whole periods or
@@ -63,12 +65,12 @@ def spectral_response(
     if np.ptp(input) == 0.0:
         raise ValueError("the input never changes; it excites no frequency")
     if period is not None:
-        return _periodic(input, output, dt, period)
-    return _welch(input, output, dt, segment)
+        return _periodic(input, output, dt, period, least)
+    return _welch(input, output, dt, segment, least)
 
 
 def _periodic(
-    input: np.ndarray, output: np.ndarray, dt: float, period: int
+    input: np.ndarray, output: np.ndarray, dt: float, period: int, least: float
 ) -> SpectralResponse:
     whole = input.size // period if period > 1 else 0
     if whole < 2:
@@ -84,7 +86,7 @@ def _periodic(
     noise = np.var(outputs, axis=0, ddof=1) / whole
     driven = inputs.mean(axis=0)
     power = np.abs(driven) ** 2
-    kept = _excited(power)
+    kept = _excited(power, least)
     return SpectralResponse(
         frequency[kept],
         mean[kept] / driven[kept],
@@ -95,7 +97,11 @@ def _periodic(
 
 
 def _welch(
-    input: np.ndarray, output: np.ndarray, dt: float, segment: int | None
+    input: np.ndarray,
+    output: np.ndarray,
+    dt: float,
+    segment: int | None,
+    least: float,
 ) -> SpectralResponse:
     import scipy.signal  # takes long to import
 
@@ -111,7 +117,7 @@ def _welch(
     frequency, power = scipy.signal.welch(input, **settings)
     _, total = scipy.signal.welch(output, **settings)
     _, cross = scipy.signal.csd(input, output, **settings)
-    kept = _excited(power)
+    kept = _excited(power, least)
     frequency, power, total, cross = (
         values[kept] for values in (frequency, power, total, cross)
     )
@@ -127,7 +133,7 @@ def _welch(
     )
 
 
-def _excited(power: np.ndarray) -> np.ndarray:
+def _excited(power: np.ndarray, least: float) -> np.ndarray:
     """Return the lines, without that at frequency zero, which the input excites."""
     alternating = np.r_[0.0, power[1:]]
-    return np.flatnonzero(alternating > EXCITED * alternating.max())
+    return np.flatnonzero(alternating > least * alternating.max())

@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.signal
 
 from ...core.error_bound import UNSEEN, ErrorBound
-from ..estimators.welch import SHORTEST, spectral_response
+from ..estimators.welch import SHORTEST, SpectralResponse, spectral_response
 from ..records.record import Record
 
 CONFIDENCE = 2.3
@@ -21,9 +22,24 @@ CONFIDENCE = 2.3
 for 15 averages (Bendat and Piersol, Random Data, 4th ed., 9.2)."""
 
 
+LEAST = 1e-10
+"""Least input power of a line, as a share of the strongest line. The confidence
+interval tells whether it suffices."""
+
+LEAKAGE = 4.0
+"""Power that a line leaks through a Hann window into one at a distance of d lines,
+times d^6, with a factor of ten to spare."""
+
+CERTAIN = 1.0
+"""Half-width of the interval of the relative error from which on a line counts as not
+excited, unless the error itself is sure."""
+
 AVERAGES = 8
 """Segments without overlap into which a record is divided."""
 
+
+ABSORBED = 0.05
+"""Smooth error that the fitted parameters of a model may hide in a band."""
 
 WIDTH = 0.01
 """Relative width of the bands of a bound: half the width of a peak of 1 % damping."""
@@ -49,6 +65,11 @@ class RelativeError(NamedTuple):
         return self.error + self.margin
 
     @property
+    def sure(self) -> np.ndarray:
+        """Whether an error is there [lines], with a certainty for all lines at once."""
+        return self.error > 2.0 * self.margin
+
+    @property
     def lower(self) -> np.ndarray:
         """Lower end of the interval [lines], at least 0."""
         return np.maximum(self.error - self.margin, 0.0)
@@ -66,18 +87,36 @@ def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeErro
     segment = max(SHORTEST, 2 ** int(np.log2(max(1, samples // AVERAGES))))
     residual, own = (
         spectral_response(
-            record.input[part], signal, record.dt, period=period, segment=segment
+            record.input[part],
+            signal,
+            record.dt,
+            period=period,
+            segment=segment,
+            least=LEAST,
         )
         for signal in ((record.output - run)[part], run[part])
     )
     size = np.maximum(np.abs(own.response), np.finfo(float).tiny)
+    resolution = 1.0 / ((period or segment) * record.dt)
+    kept = slice(None) if period else _stands_out(own, resolution)
     return RelativeError(
-        residual.frequency,
-        np.abs(residual.response) / size,
-        CONFIDENCE * np.sqrt(residual.variance) / size,
-        size,
-        1.0 / ((period or segment) * record.dt),
+        residual.frequency[kept],
+        (np.abs(residual.response) / size)[kept],
+        (CONFIDENCE * np.sqrt(residual.variance) / size)[kept],
+        size[kept],
+        resolution,
     )
+
+
+def _stands_out(found: SpectralResponse, resolution: float) -> np.ndarray:
+    """Return whether the input's power in each line exceeds the leakage of others."""
+    places = np.round(found.frequency / resolution).astype(int)
+    power = np.zeros(places.max() + 1)
+    power[places] = found.power
+    distance = np.arange(1, power.size)
+    kernel = np.where(distance > 2, LEAKAGE / distance.astype(float) ** 6, 0.0)
+    leaked = scipy.signal.fftconvolve(power, np.r_[kernel[::-1], 0.0, kernel])
+    return found.power > leaked[places + power.size - 1]
 
 
 def error_bound(
@@ -108,31 +147,35 @@ def _completed(found: RelativeError, record: Record) -> ErrorBound:
 
     A mode that the model lacks, of frequency f and of the share k of the static gain,
     has the relative error ``k / (1 - (f_i / f)^2) - k`` at an excited line f_i off its
-    resonance. The bounds at the nearest excited lines limit k, which is 1 at most. At
+    resonance. The bounds at all excited lines limit k, which is 1 at most. At
     its resonance a lightly damped mode has the error ``UNSEEN k``. No mode is assumed
-    below the lowest excited line.
+    below the lowest excited line. A weakly excited line limits the bound too.
     """
-    # Where the interval is wider than the assumption, the record says nothing.
-    kept = found.margin < UNSEEN
+    kept = (found.margin < CERTAIN) | found.sure
     known, upper = found.frequency[kept], found.upper[kept]
     lines = round(0.5 / (record.dt * found.resolution)) + 1
     frequency = found.resolution * np.arange(1, lines)
-    places = np.round(known / found.resolution).astype(int) - 1
+    places = np.round(found.frequency / found.resolution).astype(int) - 1
     excited = np.zeros(frequency.size, bool)
-    excited[places] = True
+    excited[places[kept]] = True
     relative = np.full(frequency.size, UNSEEN)
     if known.size:
         after = np.searchsorted(known, frequency)
         below, above = np.maximum(after - 1, 0), np.minimum(after, known.size - 1)
-        with np.errstate(divide="ignore"):
-            share = upper[below] * ((frequency / known[below]) ** 2 - 1.0)
-            other = upper[above] * (1.0 - (frequency / known[above]) ** 2)
-        share = np.where(after < known.size, np.minimum(share, other), share)
-        share = np.where(after == 0, 0.0, np.minimum(share, 1.0))
-        near = np.maximum(upper[below], upper[above])
-        relative = np.maximum(near, UNSEEN * share)
-        relative[places] = upper
+        hidden = UNSEEN * np.array([_share(f, known, upper) for f in frequency])
+        relative = np.maximum(np.maximum(upper[below], upper[above]), hidden)
+        relative[places[kept]] = upper
+        weak = places[~kept]
+        relative[weak] = np.clip(relative[weak], found.lower[~kept], found.upper[~kept])
     return _bound(frequency, relative, excited)
+
+
+def _share(frequency: float, known: np.ndarray, upper: np.ndarray) -> float:
+    """Return the largest share of a mode at ``frequency`` that no line contradicts."""
+    if frequency < known[0]:
+        return 0.0
+    seen = np.abs((frequency / known) ** 2 - 1.0)
+    return float(min(1.0, np.min(np.maximum(upper, ABSORBED) * seen)))
 
 
 def _bound(

@@ -16,7 +16,7 @@ NEW = 1e-3
 """Largest power of a line in training, as a share of that in validation, at which the
 line counts as new."""
 
-BEYOND = 0.05
+BEYOND = 0.15
 """Part of the input's training range by which a sample lies outside of it."""
 
 OFTEN = 0.01

@@ -28,18 +28,21 @@ class Peak(BaseModel):
 def unmodelled_peaks(found: RelativeError) -> list[Peak]:
     """Return the resonances that the model lacks, the highest first.
 
-    A peak is significant (the lower end of its interval is above ``LEAST``), and above
-    the median within an octave by the factor ``SHARP``.
+    The lower end of its interval is above ``LEAST``, a line of its flanks is sure (at
+    the top leakage widens the interval), and it exceeds the median within an octave by
+    the factor ``SHARP``.
     """
     frequency, error = found.frequency, found.error
     seen = found.lower * found.gain / max(found.gain[0], np.finfo(float).tiny)
+    sure = found.sure & (found.lower > LEAST)
     kept: list[int] = []
     for i in np.argsort(error)[::-1]:
         ratio = frequency / frequency[i]
         around = (ratio > 0.5) & (ratio < 2.0)
         near = (ratio > 0.8) & (ratio < 1.25)
         outside = error[around & ~near]
-        if found.lower[i] < LEAST or seen[i] < VISIBLE or outside.size < 4:
+        large = found.lower[i] > LEAST and seen[i] > VISIBLE
+        if not large or not sure[near].any() or outside.size < 4:
             continue
         taken = any(0.8 < frequency[i] / frequency[j] < 1.25 for j in kept)
         if not taken and error[i] > SHARP * np.median(outside):

@@ -113,7 +113,7 @@ def _response_warnings(
     if found is None or report.peaks:
         return
     seen = found.gain > VISIBLE * found.gain[0]
-    wrong = (found.lower > LEAST) & seen
+    wrong = found.sure & (found.lower > LEAST) & seen
     for i in np.flatnonzero(wrong):
         ratio = found.frequency / found.frequency[i]
         octave = (ratio >= 1.0) & (ratio < 2.0)
