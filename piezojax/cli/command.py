@@ -1,17 +1,21 @@
 """Common parts of all commands: options, the results folder, one-line errors."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
+from rich.text import Text
 
 from ..core.files import fresh_folder, numbered_folder
 from ..core.temporaries import claimed
 from .stopping import exit_interrupted, terminable
 from .terminal import console
+
+UNSAFE = 3
+"""Exit status of a command that finished with an alarm."""
 
 RESULTS = Path("results")
 """Parent folder of the results if ``--out`` is not given."""
@@ -84,6 +88,19 @@ def run(quiet: bool, body: Callable[[Console], Any]) -> None:
     except KeyboardInterrupt:
         click.echo("interrupted; files that were finished are kept", err=True)
         exit_interrupted()
+
+
+def print_alarms(console: Console, alarms: Sequence[str]) -> None:
+    """Print ``alarms`` in red, on standard error if the console is quiet."""
+    shown = Console(stderr=True, highlight=False) if console.quiet else console
+    for alarm in alarms:
+        shown.print(Text(f"ALARM: {alarm}", style="bold red"), soft_wrap=True)
+
+
+def exit_unsafe(alarms: Sequence[str]) -> None:
+    """End the command with the status ``UNSAFE`` if there are any ``alarms``."""
+    if alarms:
+        raise SystemExit(UNSAFE)
 
 
 def _one_line(message: str) -> click.ClickException:

@@ -8,7 +8,14 @@ import click
 from rich.console import Console
 
 from ..core.files import write_text
-from .command import Command, common, results_folder, run
+from .command import (
+    Command,
+    common,
+    exit_unsafe,
+    print_alarms,
+    results_folder,
+    run,
+)
 from .stopping import exit_interrupted
 from .terminal import Bar
 
@@ -39,6 +46,10 @@ def main(
     the DOB-based PID-SMC of the P-753 stage is tuned. Several studies, or a comparison
     (controllers and rates in one file, as comparison/p753), are tuned one after
     another, each into its own folder, and end in one table and picture.
+
+    Exit status 3 means that the run finished with an alarm: the gains violate a limit,
+    rail, diverge or rest on a model that is not validated. The alarms are printed
+    first, and gains.toml loads with accept_unsafe only.
     """
 
     def body(console: Console) -> None:
@@ -95,11 +106,11 @@ def _tune(
             write_results(outcome, folder)
             if case.fit is not None:
                 write_fit(case.fit, folder)
-            bar.stage("computing margins")
-            write_stability(outcome.stability, folder, outcome.result.title)
+            write_stability(outcome.stability, folder, outcome.result.heading)
             bar.stage("computing the limit of linear control")
-            write_limit(outcome.limit, folder, outcome.result.title)
+            write_limit(outcome.limit, folder, outcome.result.heading)
     result = outcome.result
+    print_alarms(console, result.alarms)
     console.print(tuning_table(result))
     console.print(gains_table(result))
     console.print(stability_table(outcome.stability))
@@ -127,6 +138,7 @@ def _tune(
     )
     if result.status == "interrupted":
         exit_interrupted()
+    exit_unsafe(result.alarms)
 
 
 def _compare(
@@ -157,6 +169,10 @@ def _compare(
             bar.finish()
             bar.stage("drawing")
             write_comparison(comparison, folder)
+    alarms = [
+        f"{row.study}: {alarm}" for row in comparison.rows for alarm in row.alarms
+    ]
+    print_alarms(console, alarms)
     console.print(comparison_table(comparison))
     for row in comparison.rows:
         for note in row.notes:
@@ -168,6 +184,7 @@ def _compare(
     )
     if comparison.status == "interrupted":
         exit_interrupted()
+    exit_unsafe(alarms)
 
 
 def _study_path(study: Path) -> Path:

@@ -1,10 +1,12 @@
 """Atomic writing of files, reading of models, and new folders for results."""
 
+import json
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -16,6 +18,24 @@ Model = TypeVar("Model", bound=BaseModel)
 def write_text(path: Path, text: str) -> None:
     """Write ``text`` to ``path`` atomically: a killed run leaves the old file."""
     write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write ``content`` to ``path`` as JSON, atomically.
+
+    A number that JSON cannot hold, NaN or infinity, is written as null.
+    """
+    write_text(path, json.dumps(_for_json(content), indent=2, allow_nan=False) + "\n")
+
+
+def _for_json(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(name): _for_json(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_for_json(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def write_bytes(path: Path, content: bytes, *, durable: bool = False) -> None:

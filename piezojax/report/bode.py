@@ -1,6 +1,5 @@
 """Pictures and files of a stability report."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from matplotlib.ticker import MultipleLocator
 
 from ..analysis.stability import AxesStability, StabilityReport, StabilityReports
 from ..analysis.stability.assess import LoopCurves
-from ..core.files import write_text
+from ..core.files import write_json
 from .figures import (
     LOOP_COLOURS,
     MEASURED,
@@ -32,8 +31,7 @@ _HALF_SIDE = 2.5  # half the side of the Nyquist plot
 
 def write_stability(stability: StabilityReports, folder: Path, title: str = "") -> None:
     """Write stability.json and stability.png into ``folder``."""
-    text = json.dumps(stability.as_dict(), indent=2, allow_nan=False)
-    write_text(folder / STABILITY_FILE, text + "\n")
+    write_json(folder / STABILITY_FILE, stability.as_dict())
     with plot_style():
         if stability.loops:
             write(stability_figure(stability, title), folder / STABILITY_PICTURE)

@@ -34,7 +34,7 @@ def comparison_table(comparison: ComparisonResult) -> Table:
         title=Text(
             f"{comparison.title}\nrms tracking error, nm: geometric mean over the "
             "references, noise not tuned on\n(new: references not tuned on either; "
-            "* before: gains scaled from another rate)"
+            "* before: gains scaled from another rate; ! tuned: with an alarm)"
         )
     )
     table.add_column("controller")
@@ -47,7 +47,7 @@ def comparison_table(comparison: ComparisonResult) -> Table:
                 controller,
                 f"{row.rate_Hz / 1000:g}",
                 _nanometres(row.before_um) + ("*" if row.start == "scaled" else ""),
-                "failed" if row.status == "failed" else _nanometres(row.after_um),
+                "failed" if row.status == "failed" else _tuned(row),
                 _times(row.ratio),
                 _nanometres(row.unseen_before_um),
                 _nanometres(row.unseen_um),
@@ -61,6 +61,10 @@ def comparison_table(comparison: ComparisonResult) -> Table:
         )
         table.add_section()
     return table
+
+
+def _tuned(row: TunedStudy) -> str:
+    return _nanometres(row.after_um) + ("!" if row.alarms else "")
 
 
 def write_comparison(comparison: ComparisonResult, folder: Path) -> None:

@@ -1,6 +1,5 @@
 """File, picture and text on the limit of linear control."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..analysis.limit import NEAR, LimitReport
-from ..core.files import write_text
+from ..core.files import write_json
 from .figures import (
     AFTER,
     BEFORE,
@@ -34,8 +33,7 @@ CAUSES: dict[str | None, str] = {
 def write_limit(report: LimitReport | str, folder: Path, title: str = "") -> None:
     """Write limit.json, and limit.png if there is a limit, into ``folder``."""
     content = {"problem": report} if isinstance(report, str) else report.as_dict()
-    text = json.dumps(content, indent=2, allow_nan=False)
-    write_text(folder / LIMIT_FILE, text + "\n")
+    write_json(folder / LIMIT_FILE, content)
     if not isinstance(report, str):
         with plot_style():
             write(limit_figure(report, title), folder / LIMIT_PICTURE)

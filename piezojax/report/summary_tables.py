@@ -41,7 +41,7 @@ def tuning_table(result: Result) -> Table:
     """Return the before/after table on held-out noise, in nm rms."""
     unit = " or ".join(dict.fromkeys(_SMALL[u] for u in result.units.values())) or "nm"
     table = Table(
-        title=Text(f"{result.title}\nrms tracking error on held-out noise, {unit}")
+        title=Text(f"{result.heading}\nrms tracking error on held-out noise, {unit}")
     )
     table.add_column("reference")
     for title in ("before", "tuned", "better", "peak, tuned"):

@@ -50,13 +50,15 @@ def write_results(outcome: Outcome, folder: Path) -> None:
             "tracking": tracking_figure(outcome, logs),
             "hysteresis": hysteresis_figure(outcome, logs),
             "convergence": convergence_figure(outcome) if result.history else None,
-            "coupling": coupling_figure(outcome.coupling, result.title),
-            "contour": contour_figure(study, result.title, contour_errors(study, runs)),
-            "robustness": perturbed_figure(result.perturbed, result.title),
+            "coupling": coupling_figure(outcome.coupling, result.heading),
+            "contour": contour_figure(
+                study, result.heading, contour_errors(study, runs)
+            ),
+            "robustness": perturbed_figure(result.perturbed, result.heading),
             "pareto": front_figure(
                 result.front,
                 study.pareto.constraint if study.pareto else None,
-                result.title,
+                result.heading,
             ),
         }
         for name, picture in pictures.items():
@@ -153,7 +155,7 @@ def tracking_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
         legend_above(right)
     for ax in axes[-1]:
         ax.set_xlabel("time (s)")
-    add_title(picture, f"{outcome.result.title}: hold-out runs")
+    add_title(picture, f"{outcome.result.heading}: hold-out runs")
     return picture
 
 
@@ -193,7 +195,9 @@ def convergence_figure(outcome: Outcome) -> Figure:
     history = np.array(outcome.result.history, dtype=float)
     geometric = outcome.case.study.objective.aggregate == "geometric_mean"
     shown = np.exp(history) if geometric else history
-    best = int(np.nanargmin(history[-1]))
+    # No start may have met the limits: then none is the best.
+    last = history[-1]
+    best = int(np.nanargmin(last)) if np.isfinite(last).any() else -1
     picture = figure(6.0, 3.6)
     ax = picture.subplots()
     steps = np.arange(1, len(shown) + 1)

@@ -21,8 +21,8 @@ class TunedStudy(BaseModel):
 
     ``before_um`` and ``after_um`` are those on held-out noise, ``unseen_before_um`` and
     ``unseen_um`` those on held-out references with held-out noise; None where a run
-    diverges or rails. A study that could not be tuned has the status "failed" and the
-    reason in ``notes``.
+    diverges or rails. ``alarms`` are the reasons not to use the gains. A study that
+    could not be tuned has the status "failed" and the reason in ``alarms``.
     """
 
     study: str
@@ -35,6 +35,7 @@ class TunedStudy(BaseModel):
     unseen_before_um: float | None = None
     unseen_um: float | None = None
     notes: list[str] = []
+    alarms: list[str] = []
     wall_s: float = 0.0
 
     @property
@@ -91,7 +92,7 @@ def compare(
         try:
             outcome = tune(entry.case, progress=progress)
         except ValueError as error:
-            rows.append(_row(entry, "failed", notes=[str(error)]))
+            rows.append(_row(entry, "failed", alarms=[str(error)]))
             continue
         rows.append(_row_of(entry, outcome.result))
         versions = outcome.result.versions
@@ -135,6 +136,7 @@ def _row_of(entry: ComparedCase, result: Result) -> TunedStudy:
         unseen_before_um=geomean(result.unseen_before),
         unseen_um=geomean(result.unseen),
         notes=result.warnings,
+        alarms=result.alarms,
         wall_s=result.wall_s,
     )
 

@@ -1,7 +1,7 @@
 """Outcome of tuning: the result with its loops, their stability and their limit."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from ..analysis.limit import LimitReport, performance_limit
-from ..analysis.stability import StabilityReports, stability_reports
+from ..analysis.stability import StabilityReports
 from ..core.about import About
 from ..core.feedback import Feedback, LoopSample, loop_inputs
 from ..core.rollout import simulate
@@ -32,8 +32,9 @@ class Outcome:
 
     ``before`` and ``after`` are the loops with the study's own gains and the tuned
     gains; ``holdout`` are the held-out signals. ``baselines`` is None unless a budget
-    for them was given. ``stability``, ``limit`` and ``coupling`` are computed when they
-    are first read, so that many studies can be tuned without them.
+    for them was given. ``stability`` is that of both loops at the highest reference.
+    ``limit`` and ``coupling`` are computed when they are first read, so that many
+    studies can be tuned without them.
     """
 
     result: Result
@@ -42,6 +43,7 @@ class Outcome:
     case: Case
     holdout: Signals
     baselines: Baselines | None = None
+    stability: StabilityReports = field(default_factory=StabilityReports)
 
     @property
     def controller(self) -> System:
@@ -58,22 +60,8 @@ class Outcome:
             study=self.case.name,
             seed=study.seed,
             rate_Hz=study.rate,
+            unsafe=self.result.alarms,
             units=dict(channels) or {"measured": "um", "command": "V"},
-        )
-
-    @cached_property
-    def stability(self) -> StabilityReports:
-        """Stability of the loops "before" and "after" at the highest reference.
-
-        The branches of a hysteresis differ most there. A loop that cannot be linearised
-        is listed with the reason.
-        """
-        study = self.case.study
-        return stability_reports(
-            {"before": self.before, "after": self.after},
-            study.highest,
-            study.dt,
-            study.axes.names if study.axes else (),
         )
 
     @cached_property
@@ -88,7 +76,7 @@ class Outcome:
         names, signals = study.references.tune, self.holdout
         count, disturbance = len(names), signals.disturbance
         try:
-            return performance_limit(
+            report = performance_limit(
                 self.after,
                 names,
                 signals.references[:count],
@@ -100,6 +88,7 @@ class Outcome:
         # A failed analysis must not lose the tuned gains.
         except Exception as error:
             return str(error).partition("\n")[0] or type(error).__name__
+        return report if np.isfinite(report.over) else "its figures are not finite"
 
     @cached_property
     def coupling(self) -> tuple[Coupling, Coupling] | None:

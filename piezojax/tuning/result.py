@@ -203,6 +203,8 @@ class Result(BaseModel):
     gain_units: dict[str, str] = {}
     """Declared units of ``gains``; "" without a declaration."""
     warnings: list[str]
+    alarms: list[str] = []
+    """Reasons not to use the gains; with any, ``load`` refuses their file."""
     history: list[list[float | None]]
     times_s: list[float] = []
     evaluations: int
@@ -210,6 +212,14 @@ class Result(BaseModel):
     wall_s: float
     versions: dict[str, str]
     seed: int
+
+    @property
+    def heading(self) -> str:
+        """Title of tables and pictures, which tells of any alarm."""
+        if not self.alarms:
+            return self.title
+        count = "an alarm" if len(self.alarms) == 1 else f"{len(self.alarms)} alarms"
+        return f"UNSAFE, {count}: {self.title}"
 
 
 def scores(figures: TrackingFigures, names: tuple[str, ...]) -> Scores:

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from ..analysis.constraints import uses, worst_by_plant
+from ..analysis.stability import StabilityReports, stability_reports
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import TrackingFigures
@@ -15,6 +16,7 @@ from ..solve.clock import Clock
 from ..solve.multi_start import Strategy
 from ..solve.search_state import SearchState
 from ..study import Case, read, shipped
+from .alarms import alarms_of
 from .baselines import Budget, compare_baselines
 from .data import Data, make_data
 from .evaluator import Evaluator
@@ -72,12 +74,39 @@ def tune(
         # The gains found are kept; only a second interrupt ends the report too.
         search.status = "interrupted"
         result = _report(case, data, evaluator, before, after, search, clock, {}, None)
+    try:
+        stability = _stability(case, after)
+    except KeyboardInterrupt:
+        result.status = "interrupted"
+        stability = StabilityReports(problems={"after": "they were interrupted"})
+    result.alarms = alarms_of(result, stability, table.limits, _model_alarms(case))
+    result.wall_s = clock.wall_s()
     comparison = (
         compare_baselines(objective, case, data, search, baselines, progress)
         if baselines and search.status != "interrupted"
         else None
     )
-    return Outcome(result, case.loop, after, case, data.holdout, comparison)
+    return Outcome(result, case.loop, after, case, data.holdout, comparison, stability)
+
+
+def _model_alarms(case: Case) -> list[str]:
+    """Return the alarms of the fit of the plant: what its record does not support."""
+    return list(getattr(case.fit.report, "alarms", ())) if case.fit else []
+
+
+def _stability(case: Case, after: Feedback) -> StabilityReports:
+    """Return the exact stability of the loops "before" and "after".
+
+    The operating point is the highest reference, where the branches of a hysteresis
+    differ most.
+    """
+    study = case.study
+    return stability_reports(
+        {"before": case.loop, "after": after},
+        study.highest,
+        study.dt,
+        study.axes.names if study.axes else (),
+    )
 
 
 def _search(
@@ -253,6 +282,4 @@ def _warnings(
             found.append(
                 f"the actuator saturates on {where} runs of {', '.join(railed)}"
             )
-        if not figures.stable:
-            found.append(f"the tuned loop diverges or rails on {where} runs")
     return found

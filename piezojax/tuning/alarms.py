@@ -1,0 +1,159 @@
+"""Alarms of tuned gains: reasons not to use them, each with a next step."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..analysis.constraints import CONSTRAINTS
+from ..analysis.stability import StabilityReport, StabilityReports
+from .objective import RAILED
+from .result import ConstraintOutcome, Perturbed, Result, Scores
+
+EXACT = 1e-2
+"""Relative error of the margins of the search, by which exact ones may miss a limit."""
+
+_TIGHTEN = "lower the upper bounds of the gains, or raise 'candidates' and 'steps'"
+
+
+def alarms_of(
+    result: Result,
+    stability: StabilityReports,
+    limits: Mapping[str, float],
+    model: Sequence[str] = (),
+) -> list[str]:
+    """Return the alarms of a tuned study, the most serious first.
+
+    ``stability`` holds the exact margins of the loop "after" tuning, ``limits`` are
+    those of the study, ``model`` the alarms of the fit of its plant.
+    """
+    scores = {
+        "tuning": result.after,
+        "hold-out": result.holdout,
+        "unseen": result.unseen,
+        "resting": result.coupling,
+    }
+    others = _not_exact(result.constraints, stability)
+    return [
+        *_run_alarms(scores),
+        *_stability_alarms(stability, limits),
+        *_limit_alarms(others, result.perturbed),
+        *_plant_alarms(result.perturbed),
+        *model,
+    ]
+
+
+def _run_alarms(scores: Mapping[str, Scores | None]) -> Iterable[str]:
+    for where, part in scores.items():
+        if part is None:
+            continue
+        lost = [name for name, rms in part.per_reference_rms_um.items() if rms is None]
+        railed = [
+            name
+            for name, share in part.saturated_percent.items()
+            if share > 100.0 * RAILED and name not in lost
+        ]
+        for names, what in ((lost, "diverges"), (railed, "rails")):
+            if names:
+                yield (
+                    f"the tuned loop {what} on {where} runs of {', '.join(names)}: "
+                    f"reduce the amplitude of the references, or {_TIGHTEN}"
+                )
+
+
+def _stability_alarms(
+    stability: StabilityReports, limits: Mapping[str, float]
+) -> Iterable[str]:
+    why = stability.problems.get("after")
+    if why is not None and any(name in limits for name in _EXACT_FIGURES):
+        yield (
+            f"the margins of the tuned loop are unknown, because {why}: test the gains "
+            "with little amplitude first, or switch the limits off in [constraints]"
+        )
+    for where, figures in _exact_figures(stability).items():
+        if figures is None:
+            yield f"the tuned loop is unstable for small motions{where}: {_TIGHTEN}"
+            continue
+        for name, value in figures.items():
+            if name in limits and _misses(name, value, limits[name]):
+                yield _missed(name, value, limits[name], f"the nominal plant{where}")
+
+
+_EXACT_FIGURES = ("sensitivity_peak", "delay_margin", "disk_margin")
+
+
+def _exact_figures(
+    stability: StabilityReports,
+) -> dict[str, dict[str, float | None] | None]:
+    """Return the exact figures by branch, None where the loop is unstable."""
+    found: dict[str, dict[str, float | None] | None] = {}
+    for branch, report in stability.reports.get("after", {}).items():
+        found[f" on the {branch} branch"] = _figures(report, [report])
+    if "after" in stability.axes:
+        report = stability.axes["after"].report
+        found[""] = _figures(report, report.axes)
+    return found
+
+
+def _figures(
+    report: Any, axes: Iterable[StabilityReport]
+) -> dict[str, float | None] | None:
+    if not report.stable:
+        return None
+    delays = [axis.delay_margin_samples for axis in axes]
+    return {
+        "sensitivity_peak": report.sensitivity_peak,
+        "delay_margin": min((d for d in delays if d is not None), default=None),
+        "disk_margin": report.disk_margin,
+    }
+
+
+def _misses(name: str, value: float | None, limit: float) -> bool:
+    if value is None or np.isnan(value):
+        return True
+    if CONSTRAINTS[name].sense == "at most":
+        return value > limit * (1.0 + EXACT)
+    return value < limit * (1.0 - EXACT)
+
+
+def _not_exact(
+    limits: Mapping[str, ConstraintOutcome], stability: StabilityReports
+) -> dict[str, ConstraintOutcome]:
+    """Return the outcomes that the exact margins of the nominal plant do not cover."""
+    exact = {} if "after" in stability.problems else _EXACT_FIGURES
+    return {
+        name: outcome
+        for name, outcome in limits.items()
+        if outcome.of > 1 or name not in exact
+    }
+
+
+def _limit_alarms(
+    limits: Mapping[str, ConstraintOutcome], perturbed: Perturbed | None
+) -> Iterable[str]:
+    held_out = perturbed.constraints if perturbed else {}
+    for where, outcomes in (("tuned", limits), ("held-out", held_out)):
+        for name, outcome in outcomes.items():
+            if not outcome.kept:
+                plants = f"{outcome.of - outcome.on} of {outcome.of} {where} plants"
+                yield _missed(name, outcome.value, outcome.limit, plants)
+
+
+def _missed(name: str, value: float | None, limit: float, where: str) -> str:
+    kind = CONSTRAINTS[name]
+    unit = "" if kind.unit == "1" else f" {kind.unit}"
+    side = "above" if kind.sense == "at most" else "below"
+    shown = "not known" if value is None else f"{value:.3g}{unit}"
+    return (
+        f"{name} is {shown} on {where}, {side} its limit {limit:g}{unit}: {_TIGHTEN}, "
+        f"or change constraints.{name}"
+    )
+
+
+def _plant_alarms(perturbed: Perturbed | None) -> Iterable[str]:
+    if perturbed is not None and perturbed.unstable:
+        yield (
+            f"the tuned loop diverges or rails on {perturbed.unstable} of "
+            f"{perturbed.plants} perturbed plants: raise ensemble.tune, or tighten "
+            "constraints.sensitivity_peak"
+        )

@@ -1,0 +1,204 @@
+"""Alarms: every reason not to use tuned gains is named, and reaches user and file."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tomli_w
+from click.testing import CliRunner
+
+import piezojax as pj
+from piezojax.analysis.stability import StabilityReports, report_of
+from piezojax.analysis.stability.conserved import LinearLoop
+from piezojax.cli.tune import main
+from piezojax.core.files import write_json
+from piezojax.tuning.alarms import alarms_of
+from piezojax.tuning.result import ConstraintOutcome, Perturbed, Result, Scores
+
+LIMITS = {"sensitivity_peak": 2.0, "delay_margin": 1.0}
+
+
+def integrator(gain, delay=2):
+    """L = gain z^-delay / (z - 1), as matrices."""
+    A = np.zeros((delay + 1, delay + 1))
+    A[0, 0], A[0, 1] = 1.0, 1.0
+    A[range(1, delay), range(2, delay + 1)] = 1.0
+    B, C = np.zeros(delay + 1), np.zeros(delay + 1)
+    B[-1], C[0] = 1.0, gain
+    return LinearLoop(A, B, C, 1e-4)
+
+
+def peak(gain, delay=2):
+    """max |S| of ``integrator`` on a grid, by NumPy."""
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 200_001))
+    return np.abs(1.0 / (1.0 + gain * z**-delay / (z - 1.0))).max()
+
+
+def reports(gain):
+    report = report_of(integrator(gain))
+    return StabilityReports(reports={"after": {"ascending": report}})
+
+
+def scores(rms=1.0, saturated=0.0):
+    return Scores(
+        per_reference_rms_um={"SIN1": 1.0, "SW30": rms},
+        geomean_rms_um=rms,
+        worst_rms_um=rms,
+        peak_error_um={"SIN1": 1.0, "SW30": rms},
+        saturated_percent={"SIN1": 0.0, "SW30": saturated},
+        peak_voltage_V=1.0,
+    )
+
+
+def result(**changes):
+    nothing = dict.fromkeys(("study", "title", "method"), "")
+    return Result.model_construct(
+        **nothing | {"after": scores(), "holdout": scores()} | changes
+    )
+
+
+def outcome(name, values, limit):
+    return ConstraintOutcome.of_values(name, limit, np.array(values))
+
+
+def perturbed(unstable=0, **constraints):
+    return Perturbed.model_construct(
+        plants=9, unstable=unstable, constraints=constraints
+    )
+
+
+def alarms(result=None, stability=None, limits=LIMITS, model=()):
+    return alarms_of(result or RESULT, stability or reports(0.1), limits, model)
+
+
+RESULT = result(unseen=None, coupling=None, constraints={}, perturbed=None)
+
+
+def changed(**changes):
+    return RESULT.model_copy(update=changes)
+
+
+def test_safe_gains_raise_no_alarm():
+    kept = {"sensitivity_peak": outcome("sensitivity_peak", [1.4, 1.9], 2.0)}
+    assert alarms(changed(constraints=kept, perturbed=perturbed(**kept))) == []
+    # The margins of the search differ from the exact ones by less than 1 %.
+    exact = report_of(integrator(0.2)).sensitivity_peak
+    assert alarms(stability=reports(0.2), limits={"sensitivity_peak": exact}) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"after": scores(rms=None)}, "diverges on tuning runs of SW30: reduce the"),
+        ({"holdout": scores(saturated=91.0)}, "rails on hold-out runs of SW30: reduce"),
+        ({"unseen": scores(rms=None)}, "diverges on unseen runs of SW30"),
+        ({"coupling": scores(rms=None)}, "diverges on resting runs of SW30"),
+        (
+            {"constraints": {"effort": outcome("effort", [99.0], 50.0)}},
+            "effort is 99 V rms on 1 of 1 tuned plants, above its limit 50 V rms: low",
+        ),
+        (
+            {"perturbed": perturbed(effort=outcome("effort", [1.0, math.nan], 50.0))},
+            "effort is not known on 1 of 2 held-out plants, above its limit",
+        ),
+        (
+            {"perturbed": perturbed(unstable=2)},
+            "diverges or rails on 2 of 9 perturbed plants: raise ensemble.tune",
+        ),
+    ],
+)
+def test_a_cause_and_a_next_step(changes, message):
+    (alarm,) = alarms(changed(**changes))
+    assert message in alarm
+
+
+@pytest.mark.parametrize(
+    ("stability", "message"),
+    [
+        (
+            reports(0.45),
+            f"sensitivity_peak is {peak(0.45):.3g} on the nominal plant on the ascendi",
+        ),
+        (reports(2.0), "the tuned loop is unstable for small motions on the ascending"),
+        (
+            StabilityReports(problems={"after": "the loop has no finite derivative"}),
+            "the margins of the tuned loop are unknown, because the loop has no finite",
+        ),
+    ],
+)
+def test_exact_margins(stability, message):
+    found = alarms(stability=stability)
+    assert message in found[0]
+    # Without limits on margins only an unstable loop is an alarm.
+    unlimited = alarms(stability=stability, limits={})
+    assert [alarm for alarm in unlimited if "unstable" not in alarm] == []
+    assert bool(unlimited) == ("unstable" in message)
+
+
+def test_a_margin_that_is_not_a_number_is_an_alarm():
+    report = replace(report_of(integrator(0.1)), sensitivity_peak=math.nan)
+    stability = StabilityReports(reports={"after": {"descending": report}})
+    (alarm,) = alarms(stability=stability)
+    assert alarm.startswith("sensitivity_peak is nan on the nominal plant on the desc")
+
+
+def test_alarms_of_a_fit_are_those_of_the_gains():
+    missed = ["the model misses a mode at 780 Hz: add it"]
+    assert alarms(model=missed) == missed
+
+
+def test_json_holds_null_for_what_is_no_number(tmp_path):
+    content = {"a": [1.0, math.nan], "b": (math.inf,), "c": {"d": "x", "e": None}}
+    write_json(tmp_path / "a.json", content)
+    assert json.loads((tmp_path / "a.json").read_text()) == {
+        "a": [1.0, None],
+        "b": [None],
+        "c": {"d": "x", "e": None},
+    }
+
+
+STUDY = {
+    "title": "gains that cannot keep their limit",
+    "rate": 20_000.0,
+    "plant": {
+        "type": "Series",
+        "parts": [
+            {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
+            {"type": "Delay", "samples": 4},
+        ],
+    },
+    "actuator": {"lower": -20.0, "upper": 120.0},
+    "controller": {"type": "PID", "proportional": 0.0, "integral": 3e3, "dt": 5e-5},
+    "references": {
+        "tune": ["SW50"],
+        "amplitude": 2.0,
+        "duration": 0.06,
+        "settle": 0.02,
+    },
+    "parameters": {"controller.integral": {"lower": 2e3, "upper": 4e3, "scale": "log"}},
+    "optimiser": {"method": "gauss_newton", "starts": 1, "candidates": 2, "steps": 2},
+    "constraints": {"sensitivity_peak": 1.2},
+}
+
+
+def test_the_command_ends_with_the_alarm(tmp_path):
+    study, out = tmp_path / "study.toml", tmp_path / "out"
+    study.write_text(tomli_w.dumps(STUDY), encoding="utf-8")
+    ended = CliRunner().invoke(main, [str(study), "--out", str(out)])
+    assert ended.exit_code == 3
+    printed = [
+        line for line in ended.output.splitlines() if "sensitivity_peak is" in line
+    ]
+    assert printed[0].startswith("ALARM: sensitivity_peak is ")
+    assert ended.output.index("ALARM") < ended.output.index("rms tracking error")
+    assert "UNSAFE" in ended.output
+    kept = json.loads((out / "result.json").read_text())
+    assert kept["alarms"][0] == printed[0].removeprefix("ALARM: ")
+    with pytest.raises(
+        ValueError, match=r"gains.toml was written with .*: sensitivity"
+    ):
+        pj.load(out / "gains.toml")
+    assert pj.load(out / "gains.toml", accept_unsafe=True).integral > 1.9e3
+    assert pj.read_about(out / "gains.toml").unsafe == kept["alarms"]
