@@ -1,8 +1,9 @@
 """Identification of a plant from records: ``identify``, its report and warnings."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +40,8 @@ class FitReport(BaseModel):
     """Report of a fit, the content of ``fit.json``.
 
     ``residuals`` is the analysis of the free-run error; None in files of old versions.
+    ``alarms`` are those of ``warnings`` that speak against any use of the model:
+    columns or units that are probably wrong, and a model that explains little.
     """
 
     model: str
@@ -47,6 +50,7 @@ class FitReport(BaseModel):
     validation: FitError
     residuals: ResidualReport | None = None
     warnings: list[str]
+    alarms: list[str] = []
     wall_s: float
 
 
@@ -123,6 +127,7 @@ class Fit:
                 for path, found in self.report.parameters.items()
                 if found.standard_error is not None
             },
+            unsafe=self.report.alarms,
         )
 
     @property
@@ -170,21 +175,24 @@ def identify(
     estimate = chosen.estimate(
         model, records, train, options or Options(), progress or Silent()
     )
-    warnings = [
-        f"{record.source}: {text}" if len(records) > 1 else text
-        for record in records
-        for text in (
-            *plausibility_warnings(record),
-            *record_warnings(
-                record,
-                train,
-                validate,
-                order=estimate.order,
-                hysteresis=estimate.hysteresis,
-            ),
-        )
-    ]
+
+    def of_each(check: Callable[[Record], Iterable[str]]) -> list[str]:
+        return [
+            f"{record.source}: {text}" if len(records) > 1 else text
+            for record in records
+            for text in check(record)
+        ]
+
     runs = estimate.simulations
+    alarms = of_each(plausibility_warnings)
+    alarms += _error_warnings(records, runs, validate)
+    checked = partial(
+        record_warnings,
+        train=train,
+        validate=validate,
+        order=estimate.order,
+        hysteresis=estimate.hysteresis,
+    )
     residuals, unexplained = residual_report(records, runs, train, validate)
     report = FitReport(
         model=model,
@@ -193,11 +201,12 @@ def identify(
         validation=_fit_error(records, runs, validate),
         residuals=residuals,
         warnings=[
-            *warnings,
+            *alarms,
+            *of_each(checked),
             *estimate.warnings,
             *unexplained,
-            *_error_warnings(records, runs, validate),
         ],
+        alarms=alarms,
         wall_s=time.perf_counter() - began,
     )
     return Fit(

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..catalog import CONTROLLERS, PLANTS, at_rate
 from ..control.design import DESIGNS
+from ..core.about import About
 from ..core.arrays import as_array
 from ..core.axes import PerAxis
 from ..core.feedback import Feedback, Observation
@@ -34,7 +35,8 @@ class Case:
 
     ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
     names to the plants of a sweep, which replace the plant of the loop. ``notes`` name
-    the starts that differ from the controller of the study.
+    the starts that differ from the controller of the study. ``plant_about`` is the
+    origin of a plant from a record or a file, with the bound on its error.
     """
 
     study: Study
@@ -45,6 +47,7 @@ class Case:
     ensemble: Ensemble | None = None
     plants: Mapping[str, System] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    plant_about: About = field(default_factory=About)
 
     def unit(self, path: str) -> str:
         """Return the declared unit of the parameter at ``path`` in the loop.
@@ -68,7 +71,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     path = Path(path)
     if seed is not None:
         study = study.model_copy(update={"seed": seed})
-    plant, fit = _plant(study, path.parent)
+    plant, fit, about = _plant(study, path.parent)
     controller = _from_source(
         study.controller,
         "controller",
@@ -87,7 +90,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     stage = Stage(loop.plant, loop.sensor)
     ensemble = ensemble_of(study, stage, path.parent)
     plants = _swept_plants(study, zero)
-    return Case(study, path.stem, loop, space, fit, ensemble, plants, notes)
+    return Case(study, path.stem, loop, space, fit, ensemble, plants, notes, about)
 
 
 def read(path: str | Path, seed: int | None = None) -> Case:
@@ -98,10 +101,14 @@ def read(path: str | Path, seed: int | None = None) -> Case:
     return build(load(path), path, seed)
 
 
-def _plant(study: Study, folder: Path) -> tuple[System, Fit | None]:
+def _plant(study: Study, folder: Path) -> tuple[System, Fit | None, About]:
+    """Return the plant, its fit if it has one, and its origin."""
     table = study.plant
     if "record" not in table:
-        return _from_source(table, "plant", folder, PLANTS, study.rate), None
+        plant = _from_source(table, "plant", folder, PLANTS, study.rate)
+        known = "file" in table
+        about = read_about(folder / str(table["file"])) if known else About()
+        return plant, None, about
     if set(table) & {"catalog", "file", "type"}:
         raise _source_error(table, "plant", ("catalog", "file", "type", "record"))
     description = validated(RecordPlant, table, "plant")
@@ -114,7 +121,7 @@ def _plant(study: Study, folder: Path) -> tuple[System, Fit | None]:
     )
     train = slice(*description.train) if description.train else None
     fit = identify(record, description.model, train=train)
-    return fit.system, fit
+    return fit.system, fit, fit.about
 
 
 def _swept_plants(study: Study, zero: Any) -> dict[str, System]:

@@ -1,0 +1,78 @@
+"""Alarms of the model of a plant: what its record does not support."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..analysis.stability import StabilityReports
+from ..core.error_bound import ErrorBound
+from ..identification.fit import FitReport
+
+DECADES = 5.0
+"""Decades below the Nyquist frequency in which the model error is compared."""
+
+SLACK = 0.01
+"""Relative excess over the limit of Ms that does not count."""
+
+
+def model_alarms(
+    report: FitReport | None,
+    bound: ErrorBound | None,
+    limit: float,
+    stability: StabilityReports,
+) -> Iterator[str]:
+    """Yield the alarms of the model of a plant, each with a next step.
+
+    They are those of its fit (``report``; None for other plants), and one if the tuned
+    loop can be unstable, or its Ms can exceed ``limit``, within the ``bound`` on the
+    model's error. ``stability`` holds the linear loops "after".
+    """
+    if report is not None:
+        yield from report.alarms
+        if bound is None:
+            yield (
+                "the record does not tell how wrong the fitted plant is: use a longer "
+                "record with one input and one output"
+            )
+    if bound is not None and "after" in stability.loops:
+        yield from _error_alarm(bound, limit, stability)
+
+
+def _error_alarm(
+    bound: ErrorBound, limit: float, stability: StabilityReports
+) -> Iterator[str]:
+    """Yield an alarm if the model's error can make Ms exceed ``limit``.
+
+    The worst |S| under a relative error l of the plant is |S| / (1 - l |T|).
+    """
+    worst, at = 0.0, 0.0
+    for curves in stability.curves("after", DECADES).values():
+        share = bound.at(curves.frequency) * np.abs(curves.T)
+        peak = int(np.argmax(share))
+        reached = np.inf
+        if share[peak] < 1.0:
+            size = np.abs(curves.S) / (1.0 - share)
+            peak = int(np.argmax(size))
+            reached = float(size[peak])
+        if reached > worst:
+            worst, at = reached, float(curves.frequency[peak])
+    if np.isfinite(worst) and worst <= limit * (1.0 + SLACK):
+        return
+    here = np.array([at])
+    result = (
+        f"raise Ms to {worst:.3g} (limit {limit:g})"
+        if np.isfinite(worst)
+        else "make the loop unstable"
+    )
+    if bound.excited_at(here).all():
+        yield (
+            f"at {at:.4g} Hz the model may be wrong by {bound.at(here)[0]:.2g} times "
+            f"its own gain, which could {result}: fit a better model (--model all), "
+            "or tune for a lower bandwidth"
+        )
+    else:
+        yield (
+            f"the record excites nothing at {at:.4g} Hz, where the loop still acts; a "
+            f"resonance that the model lacks could {result}: record a chirp of small "
+            "amplitude up to half the rate, or tune for a lower bandwidth"
+        )

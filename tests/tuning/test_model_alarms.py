@@ -1,0 +1,76 @@
+"""Alarms of a model: its error under the closed loop, and those of its fit."""
+
+import numpy as np
+import pytest
+
+import piezojax as pj
+from piezojax.analysis.stability import stability_reports
+from piezojax.core.error_bound import ErrorBound
+from piezojax.identification.fit import FitReport
+from piezojax.tuning.model_alarms import model_alarms
+
+RATE, GAIN = 1000.0, 0.1
+
+
+@pytest.fixture(scope="module")
+def stability():
+    """L = GAIN / (z - 1): integral action on a stage of gain 1 and one sample."""
+    controller = pj.control.PID(
+        proportional=0.0, integral=GAIN * RATE, derivative=0.0, dt=1.0 / RATE
+    )
+    plant = pj.Affine(1.0, 0.0)
+    limits = pj.hardware.Saturation(-10.0, 10.0)
+    loop = pj.Feedback(controller, plant, limits, pj.hardware.Sensor(0.0))
+    return stability_reports({"after": loop}, 0.0, 1.0 / RATE)
+
+
+def bound(relative, excited):
+    return ErrorBound(
+        frequency=(1.0, 100.0, 101.0, 500.0), relative=relative, excited=excited
+    )
+
+
+def worst_by_sampling(relative_at):
+    """Return the largest |1/(1 + L (1 + D))| over errors D on the circle |D| = l."""
+    angle = np.linspace(1e-3, np.pi, 4000)
+    L = GAIN / (np.exp(1j * angle) - 1.0)
+    turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 360))[:, None]
+    D = relative_at(angle * RATE / (2.0 * np.pi)) * turn
+    return np.max(np.abs(1.0 / (1.0 + L * (1.0 + D))))
+
+
+def test_a_small_error_raises_no_alarm(stability):
+    assert (
+        list(model_alarms(None, bound((0.05,) * 4, (True,) * 4), 2.0, stability)) == []
+    )
+    assert list(model_alarms(None, None, 2.0, stability)) == []
+
+
+def test_an_unexcited_band_under_the_loop_is_named(stability):
+    # |T| is 0.16 at 100 Hz: a hidden resonance of 25 times the gain is too much.
+    unseen = bound((0.05, 0.05, 25.0, 25.0), (True, True, False, False))
+    (alarm,) = model_alarms(None, unseen, 2.0, stability)
+    assert "the record excites nothing at 10" in alarm
+    assert "make the loop unstable" in alarm
+    assert "record a chirp" in alarm
+
+
+def test_the_worst_peak_is_that_of_sampled_errors(stability):
+    (alarm,) = model_alarms(None, bound((0.6,) * 4, (True,) * 4), 1.05, stability)
+    expected = worst_by_sampling(lambda frequency: 0.6)
+    assert f"raise Ms to {expected:.3g} (limit 1.05)" in alarm
+    assert "0.6 times its own gain" in alarm
+
+
+def test_without_a_limit_on_the_peak_instability_still_counts(stability):
+    often, always = (bound((share,) * 4, (True,) * 4) for share in (0.6, 1.5))
+    assert list(model_alarms(None, often, np.inf, stability)) == []
+    (alarm,) = model_alarms(None, always, np.inf, stability)
+    assert "make the loop unstable" in alarm
+
+
+def test_alarms_of_the_fit_and_a_missing_bound_are_alarms(stability):
+    report = FitReport.model_construct(alarms=["wrong column"])
+    first, second = model_alarms(report, None, 2.0, stability)
+    assert first == "wrong column"
+    assert "does not tell how wrong" in second
