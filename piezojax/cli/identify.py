@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from .command import Command, common, results_folder, run
+from .command import Command, common, print_alarms, results_folder, run
 from .stopping import exit_interrupted
 from .terminal import Bar
 
@@ -137,6 +137,7 @@ def main(
             )
             bar.stage("drawing")
             write_fit(fit, folder)
+        print_alarms(console, fit.report.alarms)
         console.print(fit_table(fit.report))
         for warning in fit.report.warnings:
             console.print(f"note: {warning}", soft_wrap=True)
@@ -166,6 +167,7 @@ def main(
             bar.stage("drawing")
             write_ranking(ranking, folder)
         report = ranking.report
+        print_alarms(console, ranking.best.report.alarms)
         console.print(ranking_table(report))
         notes = ranking_notes(report)
         for note in [

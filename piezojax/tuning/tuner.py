@@ -1,5 +1,7 @@
 """Tuning of a study: search of the box, and evaluation on the hold-out."""
 
+import math
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from .data import Data, make_data
 from .evaluator import Evaluator
 from .front import trace_front
 from .make_objective import make_objective
+from .model_alarms import model_alarms
 from .objective import Objective
 from .outcome import Outcome
 from .result import (
@@ -79,7 +82,9 @@ def tune(
     except KeyboardInterrupt:
         result.status = "interrupted"
         stability = StabilityReports(problems={"after": "they were interrupted"})
-    result.alarms = alarms_of(result, stability, table.limits, _model_alarms(case))
+    limits = table.limits
+    doubts = _model_alarms(case, limits, stability)
+    result.alarms = alarms_of(result, stability, limits, doubts)
     result.wall_s = clock.wall_s()
     comparison = (
         compare_baselines(objective, case, data, search, baselines, progress)
@@ -89,9 +94,18 @@ def tune(
     return Outcome(result, case.loop, after, case, data.holdout, comparison, stability)
 
 
-def _model_alarms(case: Case) -> list[str]:
-    """Return the alarms of the fit of the plant: what its record does not support."""
-    return list(getattr(case.fit.report, "alarms", ())) if case.fit else []
+def _model_alarms(
+    case: Case, limits: Mapping[str, float], stability: StabilityReports
+) -> list[str]:
+    """Return the alarms of the plant's model: what its record does not support."""
+    return list(
+        model_alarms(
+            case.fit.report if case.fit else None,
+            case.plant_about.error_bound,
+            limits.get("sensitivity_peak", math.inf),
+            stability,
+        )
+    )
 
 
 def _stability(case: Case, after: Feedback) -> StabilityReports:
