@@ -11,6 +11,15 @@ settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
 
+# Most programs of the tests run once: compiling them well takes longer than running
+# them badly. Commands that tests start inherit this.
+jax.config.update("jax_disable_most_optimizations", True)
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
+
+# Tracing makes many small objects, of which few are garbage.
+gc.set_threshold(100_000, 20, 20)
+
+
 ONE_THREAD = "--xla_cpu_parallel_codegen_split_count=1"
 
 
