@@ -88,8 +88,8 @@ class AdaptiveInverse(System):
     margins at rest are those of ``controller``. While the stage moves, learning forms a
     second, slow loop that these margins do not include.
 
-    ``weights`` are in V/um, V s/um and V s^2/um, then V/um for each stop. The offset of
-    the voltage is set by the start. Input an Observation, output V, one axis.
+    ``weights`` are in V/um, V s/um and V s^2/um, then V/um for each stop. The start
+    fixes the offset of the voltage. Input an Observation, output V, one axis.
 
     Raises ValueError for a parameter outside its limits or counts that do not match.
     """
@@ -151,7 +151,7 @@ class AdaptiveInverse(System):
         if len(self.weights) != 3 + len(self.thresholds):
             raise ValueError(
                 f"{len(self.weights)} weights for {len(self.thresholds)} thresholds; "
-                "it must be three and one for each"
+                "there must be three weights and one more for each threshold"
             )
 
     def _learning(self, offset: Scalar) -> RecursiveWeights:

@@ -11,9 +11,20 @@ from jaxtyping import Array, ArrayLike, Float
 from ..core.arrays import ScalarLike, State, as_array, check, check_order
 from ..core.parameter import parameter
 from ..core.system import System
-from .box import MOST_ACTUATORS, Numbers, Problem, clipped, null_space, within
+from .box import (
+    MOST_ACTUATORS,
+    Numbers,
+    Problem,
+    bounded_commands,
+    clipped_commands,
+    null_space,
+)
 
-METHODS = {"minimum_norm": clipped, "weighted": clipped, "bounded": within}
+METHODS = {
+    "minimum_norm": clipped_commands,
+    "weighted": clipped_commands,
+    "bounded": bounded_commands,
+}
 """Allocation methods by name."""
 
 
@@ -27,7 +38,7 @@ def _rows(value: Any) -> tuple[Numbers, ...]:
     except ValueError:
         matrix = np.empty(0)
     if matrix.ndim != 2:
-        raise ValueError("geometry must be numbers in rows of one length, one an axis")
+        raise ValueError("geometry must be numbers in rows of one length, one per axis")
     return tuple(_numbers(row) for row in matrix)
 
 
@@ -114,7 +125,7 @@ class Allocation(System):
         if rank < min(axes, actuators):
             raise ValueError(
                 f"geometry has rank {rank}; it must have {min(axes, actuators)}, "
-                "every axis moved on its own"
+                "so that every axis can move alone"
             )
         if self.method not in METHODS:
             raise ValueError(

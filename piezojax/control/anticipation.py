@@ -22,7 +22,7 @@ class Anticipation(System):
     controller: System
     lead: tuple[Scalar, ...] = parameter(
         "samples",
-        "advance of the reference, one number an axis",
+        "advance of the reference, one number per axis",
         typical=(-5.0, 30.0),
         converter=as_scalars,
     )

@@ -33,7 +33,7 @@ class Problem(NamedTuple):
     weights: Numbers
 
 
-def clipped(
+def clipped_commands(
     problem: Problem, bounds: Bounds, pose: Float[Array, " axes"]
 ) -> Float[Array, " actuators"]:
     """Return the pseudo-inverse commands of the free actuators, clipped."""
@@ -48,7 +48,7 @@ def clipped(
     return jnp.where(commands > upper, upper, commands)
 
 
-def within(
+def bounded_commands(
     problem: Problem, bounds: Bounds, pose: Float[Array, " axes"]
 ) -> Float[Array, " actuators"]:
     """Return the commands within bounds with the least error, then the least effort."""

@@ -1,4 +1,4 @@
-"""Initial controllers for an identified plant: stable and slow, a start for tuning.
+"""Initial controllers for an identified plant: stable, slow, and a start for tuning.
 
 A design is a function of a plant, the sample time of the loop in s and the limits of
 the actuator in V. Studies select it by its name in ``DESIGNS``. Each design is based on
@@ -30,7 +30,9 @@ def inversion_sliding_mode(
     """
     model = design_model(plant, dt, limits)
     inverse = model.inverse()
-    feedback = model.slowed(lambda pace: _sliding_mode(model.dynamics, dt, pace))
+    feedback = model.fastest_stable(
+        lambda pace: _sliding_mode(model.dynamics, dt, pace)
+    )
     return InversionControl(feedback, inverse)
 
 
@@ -60,7 +62,7 @@ def disturbance_observer_sliding_mode(
             dt,
         )
 
-    return model.slowed(observed, Affine(slope))
+    return model.fastest_stable(observed, Affine(slope))
 
 
 def inversion_pid(plant: System, dt: float, limits: Limits) -> InversionControl:
@@ -78,7 +80,7 @@ def inversion_pid(plant: System, dt: float, limits: Limits) -> InversionControl:
             0.05 * scale, 0.05 * scale / dt, 1e-3 * scale * dt, dt, 0.1 / dt, dt=dt
         )
 
-    return InversionControl(model.slowed(pid), inverse)
+    return InversionControl(model.fastest_stable(pid), inverse)
 
 
 def _sliding_mode(model: ARMA, dt: float, pace: float) -> SlidingMode:

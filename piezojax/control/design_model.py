@@ -25,8 +25,8 @@ CROSSOVER = 0.1
 GAIN_MARGIN = 3.0
 """Factor by which the plant's gain may rise before a designed loop is unstable."""
 
-SLOWEST = 1e-4
-"""Smallest pace that ``DesignModel.slowed`` tries."""
+SMALLEST_PACE = 1e-4
+"""Smallest pace that ``DesignModel.fastest_stable`` tries."""
 
 
 class DesignModel(NamedTuple):
@@ -70,18 +70,20 @@ class DesignModel(NamedTuple):
         rise = rest_output(self.static, upper) - rest_output(self.static, lower)
         return rise / (upper - lower)
 
-    def slowed(self, make: Callable[[float], S], static: System | None = None) -> S:
+    def fastest_stable(
+        self, make: Callable[[float], S], static: System | None = None
+    ) -> S:
         """Return ``make(pace)`` for the largest pace 1, 1/2, ... with a stable loop.
 
         The loop contains all of ``linear``, behind ``static`` if given. It must stay
         stable with ``GAIN_MARGIN`` times the gain, because a resonance or a delay
         beyond second order limits the crossover. Raises ValueError if no pace down to
-        ``SLOWEST`` gives a stable loop.
+        ``SMALLEST_PACE`` gives a stable loop.
         """
         plant = self.linear if static is None else static >> self.linear
         held = self.rest if static is None else as_array(np.mean(self.limits))
         pace = 1.0
-        while pace >= SLOWEST:
+        while pace >= SMALLEST_PACE:
             controller = make(pace)
             if all(
                 _radius(controller, plant >> Affine(gain), held) <= 1.0 + 1e-9
@@ -91,7 +93,8 @@ class DesignModel(NamedTuple):
             pace /= 2.0
         raise ValueError(
             "the loop around the plant's linear part is unstable at any crossover down "
-            f"to {SLOWEST * CROSSOVER / self.dt:g} rad/s; a design needs slower control"
+            f"to {SMALLEST_PACE * CROSSOVER / self.dt:g} rad/s; "
+            "a design needs slower control"
         )
 
 

@@ -53,7 +53,7 @@ class KalmanFilter(Observer):
     def __check_init__(self):
         if not self.model.autoregressive:
             raise ValueError("the model has no a coefficient; it must have at least 1")
-        needed = positions_of(self.model) + 1
+        needed = position_count(self.model) + 1
         if len(self.gain) != needed:
             raise ValueError(
                 f"gain holds {len(self.gain)} numbers; it must hold {needed} for this "
@@ -65,7 +65,7 @@ class KalmanFilter(Observer):
         moved = sum(self.model.autoregressive) * measured
         forced = sum(self.model.moving) * applied
         return KalmanState(
-            positions=(measured,) * positions_of(self.model),
+            positions=(measured,) * position_count(self.model),
             drift=measured - moved - forced,
             inputs=(applied,) * (len(self.model.moving) - 1),
         )
@@ -97,7 +97,7 @@ class KalmanFilter(Observer):
         return state, Motion(newest, (newest - older) / self.dt)
 
 
-def positions_of(model: ARMA) -> int:
+def position_count(model: ARMA) -> int:
     """Return the number of estimated positions: that of a coefficients, at least 2."""
     return max(len(model.autoregressive), 2)
 
@@ -146,7 +146,7 @@ def model_kalman(
     check("noise_rms in um", noise_rms, above=0.0)
     check("process_rms in um", process_rms, least=0.0)
     check("drift_rms in um", drift_rms, above=0.0)
-    n = positions_of(model)
+    n = position_count(model)
     A = np.zeros((n + 1, n + 1))
     A[0, : len(model.autoregressive)] = [float(a) for a in model.autoregressive]
     A[0, n] = A[n, n] = 1.0

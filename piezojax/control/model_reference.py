@@ -35,15 +35,14 @@ class ModelReferenceSlidingMode(System):
     """Sliding mode control of a model of any order n along a reference model.
 
     The error is e = y - y_d, with y from ``filter`` and y_d the output of
-    ``reference_model``. The sliding variable is
-    ``s(k) = surface[0] e(k-n+1) + ... + surface[n-2] e(k-1) + e(k)`` in um: (4.41) at
-    the last n known errors, because the printed one contains e(k+1), which is not
-    known. The voltage is u1 + u_eq + du: u1 moves ``model`` (a_1, ..., a_n | b_0, ...,
-    b_0 not zero) along y_d (4.32), u_eq takes s to zero (4.42) and du is the output of
-    ``law`` in V, a ``SwitchingPID`` in (4.43). Both u1 and u_eq divide by b_0, in the
-    form ``inversion`` of ``INVERSIONS``; du does not. ``reference_model`` maps r(k) to
-    y_d(k+1), so y_d lags r by a sample and by the lag of the reference model;
-    ``Anticipation`` compensates both.
+    ``reference_model``. The sliding variable is ``s(k) = surface[0] e(k-n+1) + ... +
+    surface[n-2] e(k-1) + e(k)`` in um: (4.41) at the last n known errors, because the
+    printed form contains the unknown e(k+1). The voltage is u1 + u_eq + du: u1 moves
+    ``model`` (a_1, ..., a_n | b_0, ..., b_0 not zero) along y_d (4.32), u_eq takes s to
+    zero (4.42) and du is the output of ``law`` in V, a ``SwitchingPID`` in (4.43). Both
+    u1 and u_eq divide by b_0, in the form ``inversion`` of ``INVERSIONS``; du does not.
+    ``reference_model`` maps r(k) to y_d(k+1), so y_d lags r by a sample and by the lag
+    of the reference model; ``Anticipation`` compensates both.
 
     Input an Observation, whose next reference is not used; output in V. Raises
     ValueError for a model without a_1, a surface of another length than n - 1, b_0 = 0

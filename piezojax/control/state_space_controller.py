@@ -23,7 +23,7 @@ class StateSpaceController(System):
 
     The law acts on the error in um. Its state starts at zero, and ``bias`` is the
     applied command at the start less the direct part of the law, so the start does not
-    jump, also for a law with an integrator. There is no anti-windup. Input an
+    jump, even with an integrator in the law. There is no anti-windup. Input an
     Observation, output in the unit of the law's output. Raises ValueError for a law of
     several inputs or outputs.
     """

@@ -51,7 +51,7 @@ class SwitchingPID(SwitchingLaw):
     """PID as switching part: ``v = -(P s + I int s dt + D ds/dt)``.
 
     The law of (4.43), (5.18), (7.33) and (8.34). With several axes s and v are tuples
-    of one scalar an axis, and a gain is a matrix or a scalar for all axes.
+    of one scalar per axis, and a gain is a matrix or a scalar for all axes.
     """
 
     proportional: Gain = parameter(

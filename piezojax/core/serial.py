@@ -125,8 +125,8 @@ def _array_from_data(value: Any, rank: int, where: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         array = np.array(np.nan)
     if array.ndim != rank:
-        kind = "a list" if rank == 1 else "lists of one length in a list"
-        raise ValueError(f"{where} is {shown(value)}; it must be numbers in {kind}")
+        kind = "numbers" if rank == 1 else "rows of numbers, all of one length"
+        raise ValueError(f"{where} is {shown(value)}; it must be a list of {kind}")
     return array
 
 

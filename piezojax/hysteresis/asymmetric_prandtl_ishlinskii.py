@@ -12,11 +12,11 @@ from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
     PLAYS,
     Memory,
+    advance_plays,
     check_plays,
-    memoryless,
-    played,
     plays_recipe,
-    weighted,
+    polynomial_part,
+    weighted_sum,
 )
 
 
@@ -31,7 +31,7 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     remaining parameters and errors as in PrandtlIshlinskii.
     """
 
-    before: ClassVar[str | None] = "rest_input"
+    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = turning_point_laws()
     part: ClassVar[Part] = Part(
         "asymmetric_prandtl_ishlinskii",
@@ -62,8 +62,8 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
         input, virgin = as_array(input), self.rest_input
         count = len(self.thresholds)
         return (
-            played(input, (virgin,) * count, self.thresholds),
-            played(
+            advance_plays(input, (virgin,) * count, self.thresholds),
+            advance_plays(
                 self._square(input), (self._square(virgin),) * count, self.thresholds
             ),
         )
@@ -72,10 +72,12 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
         self, state: tuple[Memory, Memory], input: ScalarLike
     ) -> tuple[tuple[Memory, Memory], Scalar]:
         input = as_array(input)
-        plain = played(input, state[0], self.thresholds)
-        skewed = played(self._square(input), state[1], self.thresholds)
-        output = memoryless(self.polynomial, input)
-        output = output + weighted(self.weights, plain) + weighted(self.skew, skewed)
+        plain = advance_plays(input, state[0], self.thresholds)
+        skewed = advance_plays(self._square(input), state[1], self.thresholds)
+        output = polynomial_part(self.polynomial, input)
+        output = (
+            output + weighted_sum(self.weights, plain) + weighted_sum(self.skew, skewed)
+        )
         return (plain, skewed), output
 
     @classmethod

@@ -52,9 +52,9 @@ class BashashJalili(Hysteresis, Fittable):
     negative alphas a branch starts flat, and loops run counter-clockwise, as for a
     piezo; with positive alphas they run clockwise.
 
-    The model remembers ``depth`` turning points inside the reference loop. Without room
-    for a further one, the input moves back on its present branch: a loop nested deeper
-    has no width, the output stays continuous, and the stored points stay valid.
+    The model remembers ``depth`` turning points inside the reference loop. When all are
+    in use, a further turn moves back along the present branch: a loop nested deeper has
+    no width, the output stays continuous, and the stored points stay valid.
 
     Return-point memory, wiping-out and rate independence hold exactly. Congruency does
     not, because the height of a minor loop depends on its two extrema, which differ
@@ -185,8 +185,8 @@ class BashashJalili(Hysteresis, Fittable):
         width, slope = extent.width, extent.slope
         if slope <= 0.0:
             raise ValueError(
-                "the output falls while the input rises; the curves of bashash_jalili "
-                "rise"
+                "the output falls while the input rises; bashash_jalili needs one that "
+                "rises"
             )
         # The reference loop spans the range of the record. The offset of the output
         # fixes one of its ends, so only the other is fitted.

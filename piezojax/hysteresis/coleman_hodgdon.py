@@ -56,7 +56,7 @@ class ColemanHodgdon(Hysteresis, Fittable):
     Raises ValueError for parameters outside their limits or an unknown scheme.
     """
 
-    before: ClassVar[str | None] = "rest_input"
+    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "coleman_hodgdon",

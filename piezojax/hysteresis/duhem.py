@@ -21,7 +21,7 @@ from ..core.recipe import (
 from ..core.runge_kutta import runge_kutta
 from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
-from .loading import loaded
+from .loading import load_to
 from .model import Hysteresis, Laws, differential_laws
 
 Surface: TypeAlias = tuple[tuple[Scalar, ...], ...]
@@ -65,7 +65,7 @@ class Duhem(Hysteresis, Fittable):
     Raises ValueError for parameters outside their limits or an empty ``output``.
     """
 
-    before: ClassVar[str | None] = "rest_input"
+    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "duhem",
@@ -121,7 +121,7 @@ class Duhem(Hysteresis, Fittable):
 
     def init(self, input: ScalarLike = 0.0) -> DuhemState:
         virgin = DuhemState(self.rest_input, self.rest_memory)
-        return loaded(self, virgin, as_array(input))
+        return load_to(self, virgin, as_array(input))
 
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:

@@ -46,7 +46,7 @@ class HystereticARMA(Hysteresis):
         if len(self.moving_1) != len(self.moving_2):
             raise ValueError(
                 f"moving_1 holds {len(self.moving_1)} and moving_2 "
-                f"{len(self.moving_2)} coefficients; they must be of one length"
+                f"{len(self.moving_2)} coefficients; they must have equal length"
             )
         self.expanded()  # the parts check the rest
 
@@ -87,7 +87,9 @@ class HystereticARMA(Hysteresis):
         numerators = np.array([self.moving_1, self.moving_2], dtype=float)
         lengths = np.linalg.norm(numerators, axis=1, keepdims=True)
         if not lengths.any():
-            raise ValueError("moving_1 and moving_2 are zero; there is no dynamics")
+            raise ValueError(
+                "moving_1 and moving_2 are zero; the model has no dynamics"
+            )
         rows = numerators / np.where(lengths > 0.0, lengths, 1.0)
         # The area that the two unit rows span; 1 - cos^2 would lose half the digits.
         sine = float(np.prod(np.linalg.svd(rows, compute_uv=False)[:2]))

@@ -58,10 +58,10 @@ class InverseHysteresis(Inverse):
     NormalisedBoucWen with ``k_x + 2 sigma rho k_w <= 0``, a ColemanHodgdon with ``a > 2
     b |c|``, and plays without a memoryless part, whose output is constant after a turn.
     The constructor simulates large and small reversals over the whole range and raises
-    ValueError, naming the place, if the output does not rise. This is a probe, not a
-    proof.
+    ValueError, naming the place, if the output does not rise. The reversals are
+    samples: the test does not prove that every branch rises.
 
-    Raises ValueError for that, for parameters outside their limits or ``lower >=
+    Raises ValueError in this case, for parameters outside their limits or ``lower >=
     upper``.
     """
 

@@ -12,7 +12,7 @@ from ..core.recipe import Extent, Fittable, Part, Recipe, rest_bounds
 from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
 from .model import Hysteresis
-from .plays import Memory, played
+from .plays import Memory, advance_plays
 
 LEARNED_PLAYS, NEURONS = 5, 4
 """Play operators and neurons of a fitted learned operator."""
@@ -49,10 +49,11 @@ class LearnedOperator(Hysteresis, Fittable):
     without memory at ``rest_input``.
 
     Raises ValueError for parameters outside their limits, sizes that do not match, or
-    autoregressive coefficients whose sum is 1 or more, with no output at rest.
+    autoregressive coefficients whose sum is 1 or more: the model then has no output at
+    rest.
     """
 
-    before: ClassVar[str | None] = "rest_input"
+    rest_field: ClassVar[str | None] = "rest_input"
     dynamic: ClassVar[bool] = True
     part: ClassVar[Part] = Part(
         "learned_operator",
@@ -109,7 +110,7 @@ class LearnedOperator(Hysteresis, Fittable):
     def init(self, input: ScalarLike = 0.0) -> LearnedState:
         input = as_array(input)
         virgin = (self._scaled(self.rest_input),) * len(self.thresholds)
-        plays = played(self._scaled(input), virgin, self.thresholds)
+        plays = advance_plays(self._scaled(input), virgin, self.thresholds)
         rest = self._driven(input, plays, jnp.zeros_like(input)) / (1.0 - self._held())
         return LearnedState(input, plays, (rest,) * len(self.autoregressive))
 
@@ -117,7 +118,7 @@ class LearnedOperator(Hysteresis, Fittable):
         self, state: LearnedState, input: ScalarLike
     ) -> tuple[LearnedState, Scalar]:
         input = as_array(input)
-        plays = played(self._scaled(input), state.plays, self.thresholds)
+        plays = advance_plays(self._scaled(input), state.plays, self.thresholds)
         output = self._driven(input, plays, input - state.input)
         output = output + _dot(self.autoregressive, state.outputs)
         outputs = (output, *state.outputs)[: len(state.outputs)]

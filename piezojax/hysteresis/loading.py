@@ -11,7 +11,7 @@ from ..core.system import System
 PARTS = 64
 
 
-def loaded(system: System, state: Any, input: Scalar) -> State:
+def load_to(system: System, state: Any, input: Scalar) -> State:
     """Return ``state`` after its input has moved to ``input`` in 64 equal steps.
 
     ``state`` has the field ``input``, the last input.

@@ -51,17 +51,17 @@ class Hysteresis(System):
 
     Input in V and output in um, unless the model says otherwise.
 
-    ``before`` is the name of the field with the input before a record, or None. A free
-    run starts at rest under that input; with None it starts at rest under the first
-    input of the record. ``laws`` are those that the model keeps with the parameters of
-    a piezo, such as those its recipe starts from.
+    ``rest_field`` is the name of the field with the input before a record, or None. A
+    free run starts at rest under that input; with None it starts at rest under the
+    first input of the record. ``laws`` are those that the model keeps with the
+    parameters of a piezo, such as those its recipe starts from.
 
     ``dynamic`` is True if the output can change while the input rests: the model
     contains dynamics that cannot be separated from the hysteresis, and needs no lag
     after it.
     """
 
-    before: ClassVar[str | None] = None
+    rest_field: ClassVar[str | None] = None
     dynamic: ClassVar[bool] = False
     laws: ClassVar[Laws] = {}
 
@@ -91,6 +91,6 @@ def input_before(system: Any, otherwise: ScalarLike) -> Scalar | ScalarLike:
     ``otherwise`` is returned if no hysteresis has a field for it.
     """
     for model in hystereses(system):
-        if model.before is not None:
-            return getattr(model, model.before)
+        if model.rest_field is not None:
+            return getattr(model, model.rest_field)
     return otherwise

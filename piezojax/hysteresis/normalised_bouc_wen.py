@@ -19,7 +19,7 @@ from ..core.recipe import (
 from ..core.space import Range
 from .bouc_wen import BoucWen, BoucWenState
 from .inverse import Inverse, InverseHysteresis
-from .loading import loaded
+from .loading import load_to
 from .model import Hysteresis, Laws, differential_laws
 
 SCHEMES = ("runge_kutta", "exact")
@@ -60,7 +60,7 @@ class NormalisedBoucWen(Hysteresis, Fittable):
     with n other than 1.
     """
 
-    before: ClassVar[str | None] = "rest_input"
+    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = differential_laws()
     part: ClassVar[Part] = Part(
         "normalised_bouc_wen",
@@ -105,7 +105,7 @@ class NormalisedBoucWen(Hysteresis, Fittable):
 
     def init(self, input: ScalarLike = 0.0) -> NormalisedBoucWenState:
         virgin = NormalisedBoucWenState(self.rest_input, jnp.zeros(()))
-        return loaded(self, virgin, as_array(input))
+        return load_to(self, virgin, as_array(input))
 
     def step(
         self, state: NormalisedBoucWenState, input: ScalarLike

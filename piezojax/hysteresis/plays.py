@@ -20,7 +20,7 @@ PLAYS = 10
 """Operators of a fitted Prandtl-Ishlinskii model."""
 
 
-def played(input: Scalar, memory: Memory, thresholds: Memory) -> Memory:
+def advance_plays(input: Scalar, memory: Memory, thresholds: Memory) -> Memory:
     """Advance play operators (backlashes) of half-width ``thresholds`` by one sample.
 
     w <- max(x - r, min(x + r, w)), Kuhnen 2003, eq. (3).
@@ -31,7 +31,7 @@ def played(input: Scalar, memory: Memory, thresholds: Memory) -> Memory:
     )
 
 
-def stopped(change: Scalar, memory: Memory, thresholds: Memory) -> Memory:
+def advance_stops(change: Scalar, memory: Memory, thresholds: Memory) -> Memory:
     """Advance stop operators (spring and slider) by a change of the input.
 
     e <- min(r, max(-r, e + dx)), Brokate and Sprekels 1996, section 2.1: an elastic
@@ -81,7 +81,7 @@ def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
     )
 
 
-def memoryless(polynomial: Memory, x: Scalar) -> Scalar:
+def polynomial_part(polynomial: Memory, x: Scalar) -> Scalar:
     """Return ``polynomial[0] x + polynomial[1] x^2 + ...``."""
     total = jnp.zeros_like(x)
     for coefficient in reversed(polynomial):
@@ -89,13 +89,13 @@ def memoryless(polynomial: Memory, x: Scalar) -> Scalar:
     return total
 
 
-def weighted(weights: Memory, plays: Memory) -> Scalar:
+def weighted_sum(weights: Memory, plays: Memory) -> Scalar:
     """Return the weighted sum of ``plays``."""
     return sum((w * p for w, p in zip(weights, plays, strict=True)), as_array(0.0))
 
 
 def check_invertible(polynomial: Memory, thresholds: Memory, weights: Memory) -> None:
-    """Raise ValueError unless ``solved`` can find a unique input for any output."""
+    """Raise ValueError unless ``invert_plays`` finds a unique input for any output."""
     if not polynomial:
         raise ValueError("the polynomial is empty; an inverse needs its linear term")
     for i, (low, high) in enumerate(itertools.pairwise(thresholds)):
@@ -105,7 +105,7 @@ def check_invertible(polynomial: Memory, thresholds: Memory, weights: Memory) ->
         check("slope of the model in um/V", tuple(slopes), above=0.0)
 
 
-def solved(
+def invert_plays(
     polynomial: Memory,
     thresholds: Memory,
     weights: Memory,
@@ -120,15 +120,17 @@ def solved(
     slope, constant = as_array(0.0), as_array(0.0)
     low, high = as_array(-jnp.inf), as_array(jnp.inf)
     # Where the i-th play begins to move, all plays before it move and none after it.
-    moving, reach, resting = slope, slope, weighted(weights, memory)
+    moving, reach, resting = slope, slope, weighted_sum(weights, memory)
     for r, w, m in zip(thresholds, weights, memory, strict=True):
         moving, reach, resting = moving + w, reach + w * r, resting - w * m
         upper, lower = m + r, m - r
         rises = (
-            wanted > memoryless(polynomial, upper) + moving * upper - reach + resting
+            wanted
+            > polynomial_part(polynomial, upper) + moving * upper - reach + resting
         )
         falls = (
-            wanted < memoryless(polynomial, lower) + moving * lower + reach + resting
+            wanted
+            < polynomial_part(polynomial, lower) + moving * lower + reach + resting
         )
         slope = slope + jnp.where(rises | falls, w, 0.0)
         constant = constant + w * jnp.where(rises, -r, jnp.where(falls, r, m))
@@ -147,7 +149,7 @@ def _root(polynomial: Memory, value: Scalar, low: Scalar, high: Scalar) -> Scala
     fixed, target, low, high = jax.lax.stop_gradient((polynomial, value, low, high))
     x = jnp.clip(target / jnp.where(fixed[0] > 0.0, fixed[0], jnp.inf), low, high)
     for _ in range(ITERATIONS):
-        error = memoryless(fixed, x) - target
+        error = polynomial_part(fixed, x) - target
         low, high = jnp.where(error < 0.0, x, low), jnp.where(error > 0.0, x, high)
         newton = x - error / _rising(fixed, x)
         middle = 0.5 * (low + high)
@@ -157,7 +159,7 @@ def _root(polynomial: Memory, value: Scalar, low: Scalar, high: Scalar) -> Scala
         inside = (newton >= low) & (newton <= high)
         x = jnp.where(inside | arrived, newton, middle)
     # A further step, differentiated at constant slope, has the implicit derivative.
-    return x - (memoryless(polynomial, x) - value) / _rising(fixed, x)
+    return x - (polynomial_part(polynomial, x) - value) / _rising(fixed, x)
 
 
 def _rising(polynomial: Memory, x: Scalar) -> Scalar:

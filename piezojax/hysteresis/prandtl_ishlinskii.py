@@ -9,13 +9,13 @@ from .inverse import Inverse, check_rising
 from .model import Hysteresis, Laws, turning_point_laws
 from .plays import (
     Memory,
+    advance_plays,
     check_invertible,
     check_plays,
-    memoryless,
-    played,
+    invert_plays,
     plays_recipe,
-    solved,
-    weighted,
+    polynomial_part,
+    weighted_sum,
 )
 
 
@@ -32,7 +32,7 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
     thresholds and weights.
     """
 
-    before: ClassVar[str | None] = "rest_input"
+    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = turning_point_laws()
     part: ClassVar[Part] = Part(
         "prandtl_ishlinskii",
@@ -54,12 +54,14 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
 
     def init(self, input: ScalarLike = 0.0) -> Memory:
         virgin = (self.rest_input,) * len(self.thresholds)
-        return played(as_array(input), virgin, self.thresholds)
+        return advance_plays(as_array(input), virgin, self.thresholds)
 
     def step(self, state: Memory, input: ScalarLike) -> tuple[Memory, Scalar]:
         input = as_array(input)
-        state = played(input, state, self.thresholds)
-        return state, memoryless(self.polynomial, input) + weighted(self.weights, state)
+        state = advance_plays(input, state, self.thresholds)
+        return state, polynomial_part(self.polynomial, input) + weighted_sum(
+            self.weights, state
+        )
 
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
@@ -111,7 +113,7 @@ class InversePrandtlIshlinskii(Inverse):
     def solve(self, state: Memory, wanted: ScalarLike) -> Scalar:
         """Return the voltage (V) for which the model's next output is ``wanted``."""
         model = self.model
-        return solved(
+        return invert_plays(
             model.polynomial, model.thresholds, model.weights, state, as_array(wanted)
         )
 

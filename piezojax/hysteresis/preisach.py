@@ -62,7 +62,7 @@ class Preisach(Hysteresis, Designed):
     or lie above the diagonal, ``low >= high`` or an unknown start.
     """
 
-    before: ClassVar[str | None] = "rest_input"
+    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = turning_point_laws()
 
     weights: Matrix = parameter("um", "weights", least=0.0, converter=as_matrix)
@@ -200,7 +200,7 @@ class PlayLines(System):
         """Return ``input`` (V) in cells from ``low``."""
         return (as_array(input) - self.low) / self.size
 
-    def played(self, levels: Levels, input: ScalarLike) -> Levels:
+    def advance(self, levels: Levels, input: ScalarLike) -> Levels:
         """Return the ``levels`` after a step to ``input``."""
         x = self.position(input)
         # Relays with beta above x are down, those with alpha below it are up. A level
@@ -211,10 +211,10 @@ class PlayLines(System):
         return jnp.where(levels >= x, x, raised)
 
     def init(self, input: ScalarLike = 0.0) -> Levels:
-        return self.played(self.rest(), input)
+        return self.advance(self.rest(), input)
 
     def step(self, state: Levels, input: ScalarLike) -> tuple[Levels, Scalar]:
-        state = self.played(state, input)
+        state = self.advance(state, input)
         (lines,) = outputs(state, self.rows)
         return state, self.lowest + jnp.sum(lines)
 

@@ -12,13 +12,13 @@ from .inverse import Inverse, check_rising
 from .model import STEP, Hysteresis, Laws
 from .plays import (
     Memory,
+    advance_plays,
     check_invertible,
     check_plays,
-    memoryless,
-    played,
+    invert_plays,
     plays_recipe,
-    solved,
-    weighted,
+    polynomial_part,
+    weighted_sum,
 )
 from .prandtl_ishlinskii import PrandtlIshlinskii
 
@@ -46,7 +46,7 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
     Raises ValueError as ``PrandtlIshlinskii``.
     """
 
-    before: ClassVar[str | None] = "rest_input"
+    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = {"counter-clockwise": STEP}
     part: ClassVar[Part] = Part(
         "rate_dependent_prandtl_ishlinskii",
@@ -71,13 +71,15 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
     def init(self, input: ScalarLike = 0.0) -> RateState:
         input = as_array(input)
         virgin = (self.rest_input,) * len(self.thresholds)
-        plays = played(input, virgin, self.thresholds)
+        plays = advance_plays(input, virgin, self.thresholds)
         return RateState(plays, input, jnp.zeros_like(input))
 
     def step(self, state: RateState, input: ScalarLike) -> tuple[RateState, Scalar]:
         input = as_array(input)
-        plays = played(input, state.plays, self.widths(state))
-        output = memoryless(self.polynomial, input) + weighted(self.weights, plays)
+        plays = advance_plays(input, state.plays, self.widths(state))
+        output = polynomial_part(self.polynomial, input) + weighted_sum(
+            self.weights, plays
+        )
         rate = (input - state.input) / self.dt
         return RateState(plays, input, rate), output
 
@@ -133,7 +135,7 @@ class InverseRateDependentPrandtlIshlinskii(Inverse):
     def solve(self, state: RateState, wanted: ScalarLike) -> Scalar:
         """Return the voltage (V) for which the model's next output is ``wanted``."""
         model = self.model
-        return solved(
+        return invert_plays(
             model.polynomial,
             model.widths(state),
             model.weights,

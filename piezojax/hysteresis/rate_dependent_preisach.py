@@ -28,14 +28,14 @@ class RateDependentPreisach(Hysteresis, Designed):
     fast_weights: Matrix = parameter(
         "um", "weights of fast inputs", least=0.0, converter=as_matrix
     )
-    rate: Scalar = parameter("V/s", "rate at which both densities count", above=0.0)
+    rate: Scalar = parameter("V/s", "rate at which the shares are equal", above=0.0)
     dt: float = sample_time()
 
     def __check_init__(self):
         check_weights("fast_weights", self.fast_weights)
         if self.fast_weights.shape[0] != self.slow.cells:
             raise ValueError(
-                f"fast_weights have {self.fast_weights.shape[0]} cells a side; "
+                f"fast_weights have {self.fast_weights.shape[0]} cells per side; "
                 f"the slow ones have {self.slow.cells}"
             )
 
@@ -53,13 +53,13 @@ class RateDependentPreisach(Hysteresis, Designed):
 class _Blend(System):
     slow: PlayLines
     fast: Rows
-    half_way: Scalar  # cells a sample at which both densities count alike
+    half_way: Scalar  # cells per sample at which the shares are equal
 
     def init(self, input: ScalarLike = 0.0) -> Levels:
         return self.slow.init(input)
 
     def step(self, state: Levels, input: ScalarLike) -> tuple[Levels, Scalar]:
-        levels = self.slow.played(state, input)
+        levels = self.slow.advance(state, input)
         slow, fast = outputs(levels, self.slow.rows, self.fast)
         # In both, element 0 is the input.
         share = fast_share((levels[0] - state[0]) / self.half_way)

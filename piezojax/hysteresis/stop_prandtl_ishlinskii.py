@@ -9,7 +9,14 @@ from ..core.parameter import parameter
 from ..core.recipe import Extent, Fittable, Part, Recipe, rest_starts
 from .inverse import Inverse
 from .model import Hysteresis, Laws, turning_point_laws
-from .plays import Memory, check_plays, memoryless, plays_recipe, stopped, weighted
+from .plays import (
+    Memory,
+    advance_stops,
+    check_plays,
+    plays_recipe,
+    polynomial_part,
+    weighted_sum,
+)
 from .prandtl_ishlinskii import PrandtlIshlinskii
 
 
@@ -34,7 +41,7 @@ class StopPrandtlIshlinskii(Hysteresis, Fittable):
     thresholds and weights.
     """
 
-    before: ClassVar[str | None] = "rest_input"
+    rest_field: ClassVar[str | None] = "rest_input"
     laws: ClassVar[Laws] = turning_point_laws()
     part: ClassVar[Part] = Part(
         "stop_prandtl_ishlinskii",
@@ -58,13 +65,15 @@ class StopPrandtlIshlinskii(Hysteresis, Fittable):
         input = as_array(input)
         virgin = (jnp.zeros_like(input),) * len(self.thresholds)
         return StopState(
-            input, stopped(input - self.rest_input, virgin, self.thresholds)
+            input, advance_stops(input - self.rest_input, virgin, self.thresholds)
         )
 
     def step(self, state: StopState, input: ScalarLike) -> tuple[StopState, Scalar]:
         input = as_array(input)
-        stops = stopped(input - state.input, state.stops, self.thresholds)
-        output = memoryless(self.polynomial, input) - weighted(self.weights, stops)
+        stops = advance_stops(input - state.input, state.stops, self.thresholds)
+        output = polynomial_part(self.polynomial, input) - weighted_sum(
+            self.weights, stops
+        )
         return StopState(input, stops), output
 
     def as_plays(self) -> PrandtlIshlinskii:

@@ -119,11 +119,11 @@ def test_without_a_rest_it_starts_from_zero():
         (
             "input_matrix",
             "[1.0, 2.0, 3.0]",
-            "must be numbers in lists of one length in",
+            "must be a list of rows of numbers",
         ),
         ("input_matrix", "[[1.0], [2.0, 3.0], []]", "model.json.input_matrix is"),
-        ("neuron_bias", "3.0", "must be numbers in a list"),
-        ("neuron_bias", '["a", "b"]', "must be numbers in a list"),
+        ("neuron_bias", "3.0", "must be a list of numbers"),
+        ("neuron_bias", '["a", "b"]', "must be a list of numbers"),
         ("input_matrix", "[[1.0]]", r"model.json: input_matrix has shape \(1, 1\)"),
     ],
 )

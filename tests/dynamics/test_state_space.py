@@ -187,10 +187,10 @@ def test_bad_models_are_refused(matrices, dt, message):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (3.0, "system.A is 3.0; it must be numbers in lists of one length in a list"),
-        ([["a"]], "it must be numbers in lists of one length in a list"),
-        ([[1.0], [1.0, 2.0]], "it must be numbers in lists of one length in a list"),
-        ([1.0], "it must be numbers in lists of one length in a list"),
+        (3.0, "system.A is 3.0; it must be a list of rows of numbers"),
+        ([["a"]], "it must be a list of rows of numbers"),
+        ([[1.0], [1.0, 2.0]], "it must be a list of rows of numbers"),
+        ([1.0], "it must be a list of rows of numbers"),
     ],
 )
 def test_a_file_with_a_bad_matrix_is_refused(value, message):

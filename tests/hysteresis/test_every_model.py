@@ -193,4 +193,4 @@ def test_it_is_a_hysteresis_that_names_known_laws(kind):
     assert set(kind.laws) <= set(LAWS)
     system = recipe_of(kind)
     assert hystereses(system) == [system]
-    assert kind.before is None or float(input_before(system, np.nan)) == 0.0
+    assert kind.rest_field is None or float(input_before(system, np.nan)) == 0.0

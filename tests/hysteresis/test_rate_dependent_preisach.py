@@ -60,7 +60,7 @@ def test_at_rest_it_is_the_slow_one_and_stays():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fast_weights": np.eye(3)}, "fast_weights have 3 cells a side; .* have 4"),
+        ({"fast_weights": np.eye(3)}, "fast_weights have 3 cells per side; .* have 4"),
         ({"fast_weights": -np.eye(4)}, "fast_weights in um is"),
         ({"rate": 0.0}, "rate in V/s is 0; it must be finite and above 0"),
         ({"dt": 0.0}, "dt in s is 0"),

@@ -170,7 +170,7 @@ class _Memory(System):
         return self.lines.init(input)
 
     def step(self, state: Levels, input: Any) -> tuple[State, Any]:
-        state = self.lines.played(state, input)
+        state = self.lines.advance(state, input)
         return state, state
 
 
