@@ -1,7 +1,7 @@
 """Least-squares fit of one stage to cells: residuals, Jacobian, optimiser."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,11 +11,10 @@ from jaxtyping import Array, Float, Int
 
 from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
-from ..core.space import Space
-from ..solve.gauss_newton import damped_gauss_newton
-from ..solve.multi_start import BatchedDescents, descend
-from ..solve.optimisers import Optimiser, View
-from ..solve.problem import Verdict
+from ..core.space import Space, squash, unsquash
+from ..solve.gauss_newton import TRUST_REGION, Descent, GaussNewton, trials_with_models
+from ..solve.local_model import normal_equations
+from ..solve.multi_start import descend
 from .lanes import Lanes, mean_squares
 from .stage_parameters import sensor_of, stage_of
 
@@ -94,38 +93,19 @@ class Problem(eqx.Module):
         slope, value = jax.jacfwd(residuals_twice, has_aux=True)(point[free])
         return jnp.where(jnp.abs(slope) < STEEPEST, slope, 0.0), value
 
-    def optimiser(self, point: Point, free: Free) -> Optimiser:
-        """Return damped Gauss-Newton on the quantities ``free`` alone."""
-        return damped_gauss_newton(
-            lambda part: self.jacobian(point.at[free].set(part), free), TOLERANCE
-        )
-
-
-class _Carry(NamedTuple):
-    start: Point
-    state: Any
-
 
 @eqx.filter_jit
-def _begin(problem: Problem, starts: Float[Array, "starts n"], free: Free) -> _Carry:
-    def begin_at(start):
-        return _Carry(start, problem.optimiser(start, free).start(start[free]))
+def _normal_equations(
+    problem: Problem, base: Point, free: Free, points: Float[Array, "points free"]
+) -> tuple[Array, Array, Array]:
+    """Return those of the quantities ``free``, the others as in ``base``."""
 
-    return jax.vmap(begin_at)(starts)
+    def linearise(point):
+        part = squash(point)
+        slope, value = problem.jacobian(base.at[free].set(part), free)
+        return slope * part * (1.0 - part), value
 
-
-@eqx.filter_jit
-def _advance(
-    problem: Problem, free: Free, carry: _Carry
-) -> tuple[_Carry, View, Verdict]:
-    def step_from(carry):
-        optimiser = problem.optimiser(carry.start, free)
-        carry = carry._replace(state=optimiser.step(carry.state))
-        part, loss, done = optimiser.view(carry.state)
-        view = View(carry.start.at[free].set(part), loss, done)
-        return carry, view, Verdict(loss, jnp.zeros_like(loss))
-
-    return jax.vmap(step_from)(carry)
+    return normal_equations(linearise, points)
 
 
 @eqx.filter_jit
@@ -149,20 +129,24 @@ def fit(
 ) -> tuple[Point, float]:
     """Return the point with the least cost, from all starts, and this cost.
 
-    Only the quantities ``free`` are varied. A trial step into instability has a larger
-    cost and is rejected; the damping grows.
+    Only the quantities ``free`` are varied; the others are those of the first start. A
+    trial step into instability has a larger cost and is rejected; the damping grows.
     """
     progress = Silent() if progress is None else progress
-    places = jnp.asarray(free)
+    base, places = starts[0], jnp.asarray(free)
     # One start at a time: a batch of all cells already keeps the processor busy.
-    descents = BatchedDescents(
-        lambda starts: _begin(problem, starts, places),
-        lambda carry: _advance(problem, places, carry),
-        np.stack([np.asarray(start) for start in starts]),
-        width=1,
+    evaluate = trials_with_models(
+        lambda points: _normal_equations(problem, base, places, points), width=1
     )
+    descents = [
+        Descent(np.asarray(unsquash(start[places])), TRUST_REGION, tolerance=TOLERANCE)
+        for start in starts
+    ]
     standing, _ = descend(
-        descents, steps, lambda standing: progress.advance(float(standing.losses.min()))
+        GaussNewton(descents, evaluate),
+        steps,
+        lambda standing: progress.advance(2.0 * float(standing.losses.min())),
     )
     best = int(np.argmin(standing.losses))
-    return as_array(standing.units[best]), float(standing.losses[best])
+    part = squash(as_array(standing.units[best]))
+    return base.at[places].set(part), 2.0 * float(standing.losses[best])

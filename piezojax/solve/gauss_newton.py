@@ -1,172 +1,258 @@
-"""Damped Gauss-Newton: the quadratic model, its damped step and the trust region.
+"""Damped Gauss-Newton: descents from several starts that advance side by side.
 
-``descent`` runs it from Python, with several dampings at once and bounds as active
-sets. ``damped_gauss_newton`` runs it in a compiled program, with many starts by
-``jax.vmap``.
+The loss of a control loop has long, narrow, curved valleys, in which gradient methods
+zigzag. It is a sum of squared errors, so that their derivatives also give its
+curvature. A step along a curved valley leaves its floor; the errors at its end and the
+same derivatives correct it (simplified Newton method: Deuflhard, Newton Methods for
+Nonlinear Problems, 2004).
+
+One driver serves tuning and every fit. A search differs in its ``Damping``, in its box
+(a problem searched through a sigmoid has none) and in the functions that return trials
+and models.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from ..core.arrays import as_array
-from ..core.space import squash, unsquash
-from .optimisers import Carry, Optimiser, View, frozen_when_done, settled
-
-EDGE = 1e-9
-"""Distance from a bound, as a share of the unit box, that counts as on it."""
+from .local_model import UNBOUNDED, Box, LocalModel
+from .multi_start import DescentStatus, Patience, in_batches
 
 
-class Quadratic(NamedTuple):
-    """Gauss-Newton model of half a sum of squares: ``gradient`` J'r, ``curvature`` J'J.
+class Damping(NamedTuple):
+    """Rule that proposes steps, accepts them and adapts the damping.
 
-    ``metric`` [n] weights the damping of each unknown; 1 damps all equally.
+    Each attempt tries the ``multiples`` of the present damping at once, and each point
+    is corrected ``corrections`` times. The best point is accepted if it achieves more
+    than the share ``enough`` of the predicted decrease of the loss. The damping becomes
+    that of this point, times ``shrink`` if it achieves more than the share ``good``,
+    but at least ``least``. If no point is accepted, the damping grows by the factor
+    ``grow``; a step makes up to ``attempts`` attempts. The descent ends when the
+    damping exceeds ``last``.
     """
 
-    gradient: Any
-    curvature: Any
-    metric: Any = 1.0
-
-
-class TrustRegion(NamedTuple):
-    """Rule that accepts steps and adapts the damping by the predicted decrease.
-
-    A step is taken if it achieves the share ``taken`` of the predicted decrease, else
-    the damping grows by the factor ``grow``; it shrinks by ``shrink`` after a step that
-    achieves the share ``good``. The constants are those of optimistix (Gould et al.
-    2005, 4OR 3).
-    """
-
-    taken: float = 0.01
-    good: float = 0.99
+    first: float = 1.0
+    multiples: tuple[float, ...] = (1.0,)
+    corrections: int = 0
+    enough: float = 0.0
+    good: float = 0.0
+    shrink: float = 1.0
+    least: float = 0.0
     grow: float = 4.0
-    shrink: float = 3.5
+    attempts: int = 1
+    last: float = np.inf
 
 
-class _Trial(NamedTuple):
-    """Next point to try, model at the present point, and damping."""
+PARALLEL = Damping(
+    multiples=tuple(10.0 ** np.linspace(-1.8, 0.9, 4)),
+    corrections=2,
+    grow=30.0,
+    last=1e8,
+)
+"""Rule for losses that cost as much at four points as at one, and for the unit box, in
+which the curvature of a control loop is 1 to 1e6."""
 
-    point: Array
-    model: Quadratic
-    damping: Array
-    predicted: Array  # change of half the sum of squares at `point`
+SEQUENTIAL = Damping(
+    first=1e-3, shrink=0.1, least=1e-9, grow=10.0, attempts=15, last=3e5
+)
+"""Rule for losses much cheaper than their derivatives, and a metric of unit
+diagonal."""
+
+TRUST_REGION = Damping(enough=0.01, good=0.99, shrink=1.0 / 3.5)
+"""Rule for losses that are computed together with their derivatives. The constants are
+those of optimistix (Gould et al. 2005, 4OR 3)."""
 
 
-def damped_gauss_newton(
-    linearise: Callable[[Array], tuple[Array, Array]],
-    tolerance: float,
-    rule: TrustRegion | None = None,
-    *,
-    bounded: bool = True,
-) -> Optimiser:
-    """Return Levenberg-Marquardt with a trust-region rule as an Optimiser.
+class Trials(NamedTuple):
+    """Losses [points] of points that a descent tries at once, and what comes with them.
 
-    ``linearise(unit)`` returns Jacobian [residuals, n] and residuals
-    (``problem.linearised``); it is evaluated once per step, and only J'J and J'r are
-    stored, which suits long residuals of few unknowns. With the default ``rule`` the
-    steps are those of optimistix, but compile in a third of the time. A ``bounded``
-    problem has the domain [0, 1]^n and is searched through a sigmoid; any other problem
-    is searched on the whole space.
+    These are Verdicts, ``residuals`` [points, residuals] for corrections, and
+    ``models`` of the points if the derivatives are computed together with the losses.
     """
-    rule = rule or TrustRegion()
 
-    def evaluated(free):
-        unit = squash(free) if bounded else free
-        jacobian, value = linearise(unit)
-        slope = unit * (1.0 - unit) if bounded else jnp.ones_like(free)
-        gradient = slope * (jacobian.T @ value)
-        curvature = jnp.outer(slope, slope) * (jacobian.T @ jacobian)
-        return Quadratic(gradient, curvature, jnp.ones(())), jnp.sum(value**2)
-
-    def start(unit):
-        free = unsquash(unit) if bounded else unit
-        curvature, one = jnp.zeros((free.size, free.size)), jnp.ones(())
-        blank = Quadratic(jnp.zeros_like(free), curvature, one)
-        first = _Trial(free, blank, one, jnp.zeros(()))
-        return settled(Carry(free, first, as_array(jnp.inf), jnp.asarray(False)))
-
-    def step(carry):
-        old, point = carry.state, carry.point
-        model, loss = evaluated(old.point)
-        first = jnp.isinf(carry.loss)
-        change = 0.5 * (loss - carry.loss)
-        accept = first | (change <= rule.taken * old.predicted)
-        good = accept & ~first & (change < rule.good * old.predicted)
-        good = good & (old.predicted < 0.0)
-        factor = jnp.where(good, 1.0 / rule.shrink, jnp.where(accept, 1.0, rule.grow))
-        damping = old.damping * factor
-        model = jax.tree.map(lambda n, o: jnp.where(accept, n, o), model, old.model)
-        reached = jnp.where(accept, old.point, point)
-        near = jnp.abs(old.point - point) < tolerance * (1.0 + jnp.abs(point))
-        level = jnp.abs(change) < tolerance * (1.0 + 0.5 * carry.loss)
-        done = accept & ~first & jnp.all(near) & level
-        # Without a finite slope no further step exists.
-        done = done | ~jnp.all(jnp.isfinite(model.curvature))
-        move = _damped_step(model, damping)
-        predicted = model.gradient @ move + 0.5 * move @ model.curvature @ move
-        state = _Trial(reached + move, model, damping, predicted)
-        kept = jnp.where(accept, loss, carry.loss)
-        return frozen_when_done(carry, Carry(reached, state, kept, carry.done | done))
-
-    def view(carry):
-        unit = squash(carry.point) if bounded else carry.point
-        return View(unit, carry.loss, carry.done)
-
-    return Optimiser(start, step, view)
+    losses: np.ndarray
+    verdicts: Any = None
+    residuals: Any = None
+    models: Sequence[LocalModel] | None = None
 
 
-def _damped_step(model: Quadratic, damping: Array) -> Array:
-    """Return the damped step; 0 where it is not finite."""
-    # The floor keeps the matrix regular if a direction has no slope.
-    floor = 1e-14 * jnp.max(jnp.diagonal(model.curvature))
-    damping = jnp.maximum(jnp.maximum(damping, floor), 1e-300)
-    damping = damping * model.metric * jnp.eye(model.gradient.size)
-    move = -jax.scipy.linalg.cho_solve(
-        jax.scipy.linalg.cho_factor(model.curvature + damping), model.gradient
-    )
-    return jnp.where(jnp.all(jnp.isfinite(move)), move, 0.0)
+@dataclass
+class Descent:
+    """Descent from one start: its settings, best point and state between steps.
 
-
-def boxed_step(
-    model: Quadratic,
-    point: Float[np.ndarray, " n"],
-    damping: float,
-    box: tuple[float, float] = (0.0, 1.0),
-) -> Float[np.ndarray, " n"]:
-    """Return the damped Gauss-Newton step from ``point`` within the box.
-
-    An unknown that would leave the box stops at its bound, and the others are solved
-    for again.
+    It is ``done`` when the damping exceeds its last value, ``patience`` is exhausted,
+    or a step and its change of the loss fall below ``tolerance``, relative to point and
+    loss. ``losses`` holds the loss after each step.
     """
-    gradient, curvature = model.gradient, model.curvature
-    lower, upper = box
-    low, high = point <= lower + EDGE, point >= upper - EDGE
-    free = ~((low & (gradient > 0.0)) | (high & (gradient < 0.0)))
-    step = np.zeros_like(point)
-    for _ in range(point.size):
-        force = -(gradient + curvature @ np.where(free, 0.0, step))
-        step[free] = damped_solution(model, force, damping, free)
-        outside = free & ((point + step < lower) | (point + step > upper))
-        if not outside.any():
-            break
-        step = np.where(outside, np.clip(point + step, lower, upper) - point, step)
-        free &= ~outside
-    return step
+
+    point: np.ndarray
+    rule: Damping
+    box: Box = UNBOUNDED
+    patience: Patience | None = None
+    tolerance: float = 0.0
+    loss: float = np.inf
+    verdict: Any = None
+    model: LocalModel | None = None
+    done: bool = False
+    losses: list[float] = field(default_factory=list)
+
+    def __post_init__(self):
+        self.damping = self.rule.first
+
+    def step(self) -> Generator[np.ndarray, Trials, None]:
+        """Yield points [points, n] to try, receive their Trials, move to the best.
+
+        Without a model the present point is the only one.
+        """
+        if self.model is None:
+            self._move(self.point, (yield self.point[None]), 0)
+            self.done = self.model is None
+        else:
+            yield from self._attempts(self.model)
+        self.losses.append(self.loss)
+        self.done |= self.damping > self.rule.last
+        self.done |= bool(self.patience and self.patience.exhausted(self.losses))
+
+    def _attempts(self, model: LocalModel) -> Generator[np.ndarray, Trials, None]:
+        """Try several dampings, and larger ones until a point is accepted."""
+        start, box = model.point, self.box
+        for _ in range(self.rule.attempts):
+            dampings = self.damping * np.array(self.rule.multiples)
+            steps = np.stack([model.step(damping, box) for damping in dampings])
+            steps = np.clip(start + steps, *box) - start
+            trials = yield start + steps
+            taken = self._take(model, steps, dampings, trials)
+            for _ in range(self.rule.corrections):
+                tried = zip(steps, trials.residuals, dampings, strict=True)
+                steps = np.stack([model.corrected(*one, box) for one in tried])
+                trials = yield start + steps
+                taken = self._take(model, steps, dampings, trials) or taken
+            if taken:
+                self.damping = max(taken, self.rule.least)
+                return
+            self.damping *= self.rule.grow
+            if self.damping > self.rule.last:
+                return
+
+    def _take(
+        self,
+        model: LocalModel,
+        steps: np.ndarray,
+        dampings: np.ndarray,
+        trials: Trials,
+    ) -> float | None:
+        """Move to the best trial if it is accepted; return the next damping, or None
+        otherwise."""
+        best = int(np.argmin(trials.losses))
+        step, predicted = steps[best], model.predicted(steps[best])
+        change = float(trials.losses[best]) - self.loss
+        size, place = np.sqrt(model.metric) * np.abs([step, model.point])
+        near = np.all(size < self.tolerance * (1.0 + place))
+        level = abs(change) < self.tolerance * (1.0 + self.loss)
+        self.done |= bool(near and level)
+        if not change < self.rule.enough * predicted:
+            return None
+        self._move(model.point + step, trials, best)
+        good = change < self.rule.good * predicted
+        return dampings[best] * (self.rule.shrink if good else 1.0)
+
+    def _move(self, point: np.ndarray, trials: Trials, best: int) -> None:
+        """Move to ``point``, the trial ``best``."""
+        self.point, self.loss = point, float(trials.losses[best])
+        self.verdict = jax.tree.map(lambda x: np.asarray(x)[best], trials.verdicts)
+        model = trials.models[best] if trials.models else None
+        if model and self.model:
+            # Derivatives that come with the losses keep the metric of the start.
+            model = model._replace(metric=self.model.metric)
+        self.model = model if model and model.finite else None
 
 
-def damped_solution(
-    model: Quadratic, force: np.ndarray, damping: float, free: np.ndarray
-) -> np.ndarray:
-    """Return the solution of the damped normal equations for the unknowns ``free``.
+class GaussNewton:
+    """Damped Gauss-Newton descents from several starts that advance side by side.
 
-    The unknowns are scaled by the root of the metric, so that the damping is a multiple
-    of the unit matrix.
+    ``evaluate`` returns the Trials of points [descents, points, n], one for each
+    descent. ``linearise`` returns the LocalModel at each of the points [descents, n],
+    or None if it is not finite; it is not needed if the Trials have models.
     """
-    scale = np.sqrt(np.broadcast_to(model.metric, force.shape))[free]
-    curvature = model.curvature[np.ix_(free, free)] / np.outer(scale, scale)
-    damped = curvature + damping * np.eye(scale.size)
-    return np.linalg.solve(damped, force[free] / scale) / scale
+
+    def __init__(
+        self,
+        descents: Sequence[Descent],
+        evaluate: Callable[[np.ndarray], Sequence[Trials]],
+        linearise: Callable[[np.ndarray], Sequence[LocalModel | None]] | None = None,
+    ):
+        self._descents, self._places = list(descents), np.arange(len(descents))
+        self._evaluate, self._linearise = evaluate, linearise
+
+    def advance(self) -> DescentStatus:
+        """Move every descent by one step; return their status."""
+        moving = [descent for descent in self._descents if not descent.done]
+        taken = self._update_models(moving)
+        steps = (descent.step() for descent in moving if not descent.done)
+        asked = {step: next(step) for step in steps}
+        while asked:
+            points = np.stack(list(asked.values()))
+            taken += len(points) * points.shape[1]
+            answers = zip(asked, self._evaluate(points), strict=True)
+            more = {step: _sent(step, trials) for step, trials in answers}
+            asked = {step: new for step, new in more.items() if new is not None}
+        every = self._descents
+        return DescentStatus(
+            np.array([descent.point for descent in every]),
+            np.array([descent.loss for descent in every]),
+            jax.tree.map(lambda *parts: np.stack(parts), *(d.verdict for d in every)),
+            np.array([descent.done for descent in every]),
+            self._places,
+            taken,
+        )
+
+    def _update_models(self, moving: Sequence[Descent]) -> int:
+        """Compute the missing models; return the number of evaluations."""
+        stale = [descent for descent in moving if descent.model is None]
+        if not stale or self._linearise is None:
+            return 0
+        models = self._linearise(np.stack([descent.point for descent in stale]))
+        for descent, model in zip(stale, models, strict=True):
+            descent.model, descent.done = model, model is None
+        return len(stale)
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Keep only the descents at ``rows`` of the last DescentStatus."""
+        self._descents = [self._descents[row] for row in rows]
+        self._places = self._places[rows]
+
+
+def _sent(
+    step: Generator[np.ndarray, Trials, None], trials: Trials
+) -> np.ndarray | None:
+    """Send ``trials`` to a step; return its next points, or None at its end."""
+    try:
+        return step.send(trials)
+    except StopIteration:
+        return None
+
+
+def trials_with_models(
+    program: Callable[[Array], tuple[Array, Array, Array]],
+    width: int,
+    metric: Callable[[np.ndarray], Any] = lambda curvature: 1.0,
+) -> Callable[[np.ndarray], list[Trials]]:
+    """Return the ``evaluate`` of descents that try one point at a time.
+
+    ``program`` returns the ``normal_equations`` at ``width`` points. ``metric`` returns
+    the metric of the models from the curvature.
+    """
+
+    def evaluate(points):
+        points = points[:, 0]
+        rows = zip(points, *in_batches(program, points, width), strict=True)
+        return [
+            Trials(loss[None], models=[LocalModel(point, slope, bend, metric(bend))])
+            for point, loss, slope, bend in rows
+        ]
+
+    return evaluate

@@ -12,9 +12,8 @@ from ..core.progress import Progress
 from ..core.rollout import in_blocks
 from .augmented_lagrangian import with_zero_multipliers
 from .clock import Clock
-from .descent import Patience
 from .gradient import with_finite_gradient
-from .multi_start import BatchedDescents
+from .multi_start import BatchedDescents, Patience
 from .optimisers import METHODS
 from .problem import Problem, Verdict
 
@@ -123,9 +122,8 @@ class LockstepDescent:
         begin, advance, _ = self._programs[len(units)]
         problem = problem.with_multipliers(self._problem.multipliers)
         descents = BatchedDescents(
-            lambda units: begin(problem, units, multipliers),
             lambda carry: advance(problem, carry, multipliers),
-            units,
+            begin(problem, as_array(units), multipliers),
             len(units),
         )
         return descents, 0

@@ -1,13 +1,11 @@
 """Multi-start: descents from many starts; a Cut may drop the worse ones.
 
-One loop, ``descend``, serves every search. Descents advance in one compiled program
-(``BatchedDescents``) or in threads (``ThreadedDescents``). ``minimise`` adds the rounds
-of the augmented Lagrangian; its strategies are ``successive_halving`` and ``lockstep``.
+One loop, ``descend``, serves every search: of ``GaussNewton`` descents, or of those of
+an Optimiser (``BatchedDescents``). ``minimise`` adds the rounds of the augmented
+Lagrangian; its strategies are ``successive_halving`` and ``lockstep``.
 """
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -18,7 +16,6 @@ from jaxtyping import Array
 from ..core.arrays import as_array
 from ..core.progress import Progress
 from .augmented_lagrangian import rounds, updated
-from .descent import Descent, Patience
 from .optimisers import View
 from .problem import Problem, Verdict
 from .search_state import SearchState
@@ -26,6 +23,25 @@ from .search_state import SearchState
 Cut = Callable[[int, int], int | None]
 """``cut(step, running)`` returns the number of descents kept after a step, or None to
 keep all."""
+
+
+class Patience(NamedTuple):
+    """Stopping rule: a descent ends if it gains too little in ``steps`` steps.
+
+    The gain is too small below ``gain`` plus the share ``share`` of the loss before
+    them.
+    """
+
+    steps: int
+    gain: float = 0.0
+    share: float = 0.0
+
+    def exhausted(self, losses: Sequence[float]) -> bool:
+        """Return whether ``losses``, one per step, have improved too little."""
+        if len(losses) <= self.steps:
+            return False
+        before = losses[-1 - self.steps]
+        return before - losses[-1] < self.gain + self.share * abs(before)
 
 
 class DescentStatus(NamedTuple):
@@ -85,84 +101,49 @@ def descend(
             bests = []
 
 
-class BatchedDescents:
-    """Descents of an Optimiser, up to ``width`` of them in one compiled program.
+def in_batches(program: Callable[[Array], Any], points: np.ndarray, width: int) -> Any:
+    """Return what ``program`` returns at ``width`` points, for any number of points.
 
-    ``begin(units)`` returns a carry, ``advance(carry)`` the next carry, Views and
-    Verdicts, all of ``width`` descents.
+    Leaves have a leading axis for the points. The last point fills up the last batch.
+    """
+    filler = np.repeat(points[-1:], -len(points) % width, axis=0)
+    batches = np.concatenate([points, filler]).reshape(-1, width, *points.shape[1:])
+    results = [program(as_array(batch)) for batch in batches]
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(points)], *results)
+
+
+class BatchedDescents:
+    """Descents of an Optimiser that advance in one compiled program.
+
+    ``advance(carry)`` returns the next carry, Views and Verdicts of all descents, of
+    which ``carry`` is the first.
     """
 
     def __init__(
         self,
-        begin: Callable[[Any], Any],
         advance: Callable[[Any], tuple[Any, View, Verdict]],
-        starts: np.ndarray,
-        width: int,
+        carry: Any,
+        starts: int,
     ):
-        self._advance, self._width = advance, width
-        self._places = _filled(np.arange(len(starts)), width)
-        self._carries = [begin(as_array(starts[part])) for part in self._parts()]
-
-    def _parts(self) -> np.ndarray:
-        return self._places.reshape(-1, self._width)
+        self._advance, self._carry, self._places = advance, carry, np.arange(starts)
 
     def advance(self) -> DescentStatus:
         """Move every descent by one step; return their status."""
-        advanced = [self._advance(carry) for carry in self._carries]
-        self._carries = [carry for carry, _, _ in advanced]
-        view, verdict = jax.tree.map(
-            lambda *parts: np.concatenate(parts), *(rest for _, *rest in advanced)
-        )
+        self._carry, *rest = self._advance(self._carry)
+        view, verdict = jax.tree.map(np.asarray, rest)
         return DescentStatus(
             view.unit, view.loss, verdict, view.done, self._places, len(view.loss)
         )
 
     def keep(self, rows: np.ndarray) -> None:
-        """Keep only the descents at ``rows`` of the last DescentStatus."""
-        rows = _filled(rows, self._width)
+        """Keep only the descents at ``rows`` of the last DescentStatus.
+
+        The program has a fixed number of descents, so the first of ``rows`` are
+        repeated.
+        """
+        rows = np.resize(rows, len(self._places))
         self._places = self._places[rows]
-        every = jax.tree.map(lambda *parts: jnp.concatenate(parts), *self._carries)
-        self._carries = [
-            jax.tree.map(lambda leaf, part=part: leaf[part], every)
-            for part in rows.reshape(-1, self._width)
-        ]
-
-
-def _filled(places: np.ndarray, width: int) -> np.ndarray:
-    """Return ``places``, the first repeated up to a multiple of ``width``."""
-    return np.resize(places, -(-len(places) // width) * width)
-
-
-class ThreadedDescents:
-    """Descents stepped from Python, each in its own thread.
-
-    Threads run in parallel, because an evaluation uses one processor and releases the
-    interpreter lock.
-    """
-
-    def __init__(self, descents: Sequence[Descent]):
-        self._descents = list(descents)
-        self._places = np.arange(len(descents))
-
-    def advance(self) -> DescentStatus:
-        """Move every descent by one step; return their status."""
-        moving = [descent for descent in self._descents if not descent.done]
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            taken = sum(pool.map(Descent.step, moving))
-        every = self._descents
-        return DescentStatus(
-            np.array([descent.unit for descent in every]),
-            np.array([descent.loss for descent in every]),
-            jax.tree.map(lambda *parts: np.stack(parts), *(d.verdict for d in every)),
-            np.array([descent.done for descent in every]),
-            self._places,
-            taken,
-        )
-
-    def keep(self, rows: np.ndarray) -> None:
-        """Keep only the descents at ``rows`` of the last DescentStatus."""
-        self._descents = [self._descents[row] for row in rows]
-        self._places = self._places[rows]
+        self._carry = jax.tree.map(lambda leaf: leaf[rows], self._carry)
 
 
 @runtime_checkable

@@ -1,7 +1,9 @@
 """Successive halving: every few steps the worse half of the descents is dropped."""
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -12,16 +14,13 @@ from ..core.arrays import as_array
 from ..core.progress import Progress
 from .augmented_lagrangian import with_zero_multipliers
 from .clock import Clock
-from .descent import (
-    PARALLEL,
-    Descent,
-    LocalModel,
-    Patience,
-    derivatives_at,
-    trials_at,
-)
-from .multi_start import ThreadedDescents
+from .gauss_newton import PARALLEL, Descent, GaussNewton
+from .local_model import UNIT_BOX
+from .multi_start import Patience, in_batches
 from .problem import Problem, Verdict
+from .sampled_errors import derivatives_at, errors_at, local_model, trials_of
+
+R = TypeVar("R")
 
 HALVING_STEPS = 3
 """Steps after which the worse half of the descents is dropped."""
@@ -36,6 +35,19 @@ POINTS = len(PARALLEL.multiples)
 def better_half(step: int, running: int) -> int | None:
     """Return the number of descents kept: half, rounded up, every HALVING_STEPS."""
     return (running + 1) // 2 if step % HALVING_STEPS == 0 else None
+
+
+def in_threads(function: Callable[[np.ndarray], R]) -> Callable[[np.ndarray], list[R]]:
+    """Return a function that calls ``function`` with each row, in parallel threads.
+
+    An evaluation uses one processor and releases the interpreter lock.
+    """
+
+    def of_all(rows: np.ndarray) -> list[R]:
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            return list(pool.map(function, rows))
+
+    return of_all
 
 
 class SuccessiveHalving:
@@ -65,8 +77,8 @@ class SuccessiveHalving:
                 .compile()
             )
         )
-        self._trials = clock.compiled(
-            lambda p, units: trials_at(p, units, every), problem, units
+        self._errors = clock.compiled(
+            lambda p, units: errors_at(p, units, every), problem, units
         )
         # A problem without limits has one round, which needs no violations.
         self._violated: Callable = (
@@ -87,12 +99,8 @@ class SuccessiveHalving:
     def _screened(
         self, problem: Problem, units: np.ndarray
     ) -> tuple[np.ndarray, Verdict]:
-        filler = np.repeat(units[-1:], -len(units) % POINTS, axis=0)
-        batches = np.concatenate([units, filler]).reshape(-1, POINTS, units.shape[1])
-        results = [self._trials(problem, as_array(batch))[:2] for batch in batches]
-        return jax.tree.map(
-            lambda *parts: np.concatenate(parts)[: len(units)], *results
-        )
+        points = in_batches(lambda batch: self._errors(problem, batch), units, POINTS)
+        return points.loss, points.verdict
 
     def wait(self) -> None:
         """Wait until the derivatives are compiled."""
@@ -105,31 +113,32 @@ class SuccessiveHalving:
 
     def begin(
         self, problem: Problem, units: np.ndarray, multipliers: Array
-    ) -> tuple[ThreadedDescents, int]:
+    ) -> tuple[GaussNewton, int]:
         """Return descents from ``units``, and the number of evaluations used."""
         # All 0 in the first round; later there is only one descent.
         problem = problem.with_multipliers(multipliers[0])
         losses, verdicts = self._screened(problem, units)
 
         def linearise(unit):
-            derivatives = self._derivatives.result()(problem, as_array(unit))
-            return LocalModel.of(derivatives)
+            derivatives = self._derivatives.result()
+            return local_model(unit, derivatives(problem, as_array(unit)))
 
         def evaluate(units):
-            return self._trials(problem, as_array(units))
+            return trials_of(self._errors(problem, as_array(units)))
 
         descents = [
             Descent(
                 unit,
-                float(losses[i]),
-                jax.tree.map(lambda x, i=i: x[i], verdicts),
-                linearise,
-                evaluate,
+                PARALLEL,
+                UNIT_BOX,
                 self._patience,
+                loss=float(losses[i]),
+                verdict=jax.tree.map(lambda x, i=i: x[i], verdicts),
             )
             for i, unit in enumerate(units)
         ]
-        return ThreadedDescents(descents), len(descents)
+        group = GaussNewton(descents, in_threads(evaluate), in_threads(linearise))
+        return group, len(descents)
 
     def violations(self, problem: Problem, units: np.ndarray) -> Array:
         """Return the violations [starts, constraints] at ``units``."""

@@ -6,11 +6,11 @@ import scipy
 from ..core.progress import Progress
 from ..core.rollout import BLOCK
 from ..solve.clock import Clock
-from ..solve.descent import spacing
 from ..solve.lockstep import LockstepDescent
 from ..solve.multi_start import Strategy, minimise
 from ..solve.optimisers import GAUSS_NEWTON
 from ..solve.problem import FAILED_LOSS
+from ..solve.sampled_errors import spacing
 from ..solve.search_state import SearchState
 from ..solve.successive_halving import SuccessiveHalving
 from ..study import Case

@@ -7,8 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.solve.gauss_newton import damped_gauss_newton
+from piezojax.core.space import squash, unsquash
+from piezojax.solve.gauss_newton import (
+    TRUST_REGION,
+    Descent,
+    GaussNewton,
+    trials_with_models,
+)
 from piezojax.solve.gradient import with_finite_gradient
+from piezojax.solve.local_model import normal_equations
 from piezojax.solve.optimisers import METHODS
 from piezojax.solve.problem import FAILED_LOSS, linearised
 
@@ -251,36 +258,63 @@ def _views(optimiser, unit, steps):
         carry = step(carry)
         view = optimiser.view(carry)
         found.append([*np.asarray(view.unit), float(view.loss)])
-    return np.array(found), bool(view.done)
+    return np.array(found)
 
 
-def solver_of(residuals):
-    return damped_gauss_newton(linearised(residuals), TOLERANCE)
+def _fit(residuals, start, steps):
+    """Points and sums of squares of a fit after each step, and whether it is done."""
+    program = jax.jit(lambda points: normal_equations(linearised(residuals), points))
+    descent = Descent(np.array(start), TRUST_REGION, tolerance=TOLERANCE)
+    descents, found = GaussNewton([descent], trials_with_models(program, 1)), []
+    for _ in range(steps):
+        standing = descents.advance()
+        found.append([*standing.units[0], 2.0 * standing.losses[0]])
+    return np.array(found), descent.done
+
+
+def _fit_in_unit_box(residuals, unit, steps):
+    start = unsquash(jnp.array(unit))
+    found, done = _fit(lambda free: residuals(squash(free)), start, steps)
+    return np.hstack([squash(jnp.array(found[:, :-1])), found[:, -1:]]), done
 
 
 @pytest.mark.parametrize(
     ("residuals", "unit"), [(_rosenbrock, (0.2, 0.8)), (_quadratic, (0.9, 0.1, 0.2))]
 )
-def test_damped_gauss_newton_takes_the_steps_of_optimistix(residuals, unit):
-    ours, done = _views(solver_of(residuals), unit, 60)
+def test_gauss_newton_takes_the_steps_of_optimistix(residuals, unit):
+    ours, done = _fit_in_unit_box(residuals, unit, 60)
     optimistix = METHODS["levenberg_marquardt"](residuals, residuals, TOLERANCE)
-    theirs, _ = _views(optimistix, unit, 60)
+    theirs = _views(optimistix, unit, 60)
     np.testing.assert_allclose(ours[:25], theirs[:25], rtol=1e-6, atol=1e-12)
     assert done
     np.testing.assert_array_equal(ours[-1], ours[-2])
     assert ours[-1, -1] < 1e-10
 
 
+def test_descents_side_by_side_take_the_steps_of_each_alone():
+    """Of three starts, two in a program; the second one ends before the others."""
+    starts = np.array([[0.9, 0.1, 0.2], [0.3, 0.7, 0.55], [0.2, 0.2, 0.9]])
+    program = jax.jit(lambda points: normal_equations(linearised(_quadratic), points))
+    descents = [Descent(s, TRUST_REGION, tolerance=TOLERANCE) for s in starts]
+    group = GaussNewton(descents, trials_with_models(program, 2))
+    together = [group.advance() for _ in range(8)]
+    for place, start in enumerate(starts):
+        alone, _ = _fit(_quadratic, start, 8)
+        found = np.array([standing.units[place] for standing in together])
+        np.testing.assert_allclose(found, alone[:, :-1], rtol=1e-9)
+    assert [standing.evaluations for standing in together[:3]] == [3, 3, 2]
+
+
 def test_a_parameter_that_does_nothing_stays_where_it_is():
     blind = lambda unit: _quadratic(unit.at[0].set(0.3))  # noqa: E731
-    found, done = _views(solver_of(blind), (0.9, 0.1, 0.2), 80)
+    found, done = _fit_in_unit_box(blind, (0.9, 0.1, 0.2), 80)
     assert done
     np.testing.assert_allclose(found[-1], [0.9, 0.7, 0.55, 0.0], atol=1e-6)
 
 
 def test_a_start_without_finite_slopes_is_done():
     blown = lambda unit: jnp.sqrt(unit - 0.5)  # noqa: E731
-    found, done = _views(solver_of(blown), (0.2, 0.3), 2)
+    found, done = _fit_in_unit_box(blown, (0.2, 0.3), 2)
     assert done
     np.testing.assert_allclose(found[-1][:2], (0.2, 0.3))
 
@@ -289,8 +323,7 @@ def test_without_bounds_the_step_of_a_line_is_the_minimum():
     """Linear residuals, almost no damping: one step leads to lstsq's solution."""
     matrix = np.random.default_rng(2).standard_normal((9, 3))
     target = 50.0 * np.random.default_rng(3).standard_normal(9)
-    residuals = linearised(lambda point: 1e6 * (matrix @ point - target))
-    solver = damped_gauss_newton(residuals, TOLERANCE, bounded=False)
-    found, _ = _views(solver, (0.0, 0.0, 0.0), 2)
+    residuals = lambda point: 1e6 * (matrix @ point - target)  # noqa: E731
+    found, _ = _fit(residuals, (0.0, 0.0, 0.0), 2)
     expected, *_ = np.linalg.lstsq(matrix, target)
     np.testing.assert_allclose(found[-1][:3], expected, rtol=1e-9)

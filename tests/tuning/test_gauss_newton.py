@@ -16,19 +16,18 @@ from piezojax import (
 from piezojax.core.arrays import as_array
 from piezojax.core.feedback import loop_inputs
 from piezojax.solve.clock import Clock
-from piezojax.solve.descent import (
-    PARALLEL,
-    Descent,
-    LocalModel,
-    Patience,
-    derivatives_at,
-    spacing,
-    trials_at,
-)
-from piezojax.solve.gauss_newton import Quadratic, boxed_step
-from piezojax.solve.multi_start import ThreadedDescents, descend
+from piezojax.solve.gauss_newton import PARALLEL, Descent, GaussNewton
+from piezojax.solve.local_model import UNIT_BOX, LocalModel
+from piezojax.solve.multi_start import Patience, descend
 from piezojax.solve.problem import Errors, Verdict
-from piezojax.solve.successive_halving import POINTS, better_half
+from piezojax.solve.sampled_errors import (
+    derivatives_at,
+    errors_at,
+    local_model,
+    spacing,
+    trials_of,
+)
+from piezojax.solve.successive_halving import POINTS, better_half, in_threads
 from piezojax.study import Study, build
 from piezojax.tuning.data import make_data
 from piezojax.tuning.objective import Objective
@@ -72,71 +71,94 @@ def programs_of(kind):
     problem = Problem(kind)
     return (
         jax.jit(lambda u: derivatives_at(problem, u, 1)),
-        jax.jit(lambda u: trials_at(problem, u, 1)),
+        jax.jit(lambda u: errors_at(problem, u, 1)),
     )
 
 
-def descent_on(kind, unit, tolerance=1e-14):
-    problem, unit = Problem(kind), np.array(unit)
-    derivatives, trials = programs_of(kind)
-    return Descent(
-        unit,
-        float(problem.loss(unit)),
-        problem.errors(unit, 1).verdict,
-        lambda u: LocalModel.of(derivatives(as_array(u))),
-        lambda u: trials(as_array(u)),
-        Patience(5, gain=tolerance),
-    )
+def descents_on(kind, units, linearise=None, tolerance=1e-14):
+    problem = Problem(kind)
+    derivatives, errors = programs_of(kind)
+    linearise = linearise or (lambda u: local_model(u, derivatives(as_array(u))))
+    descents = [
+        Descent(
+            np.array(unit),
+            PARALLEL,
+            UNIT_BOX,
+            Patience(5, gain=tolerance),
+            loss=float(problem.loss(np.array(unit))),
+            verdict=problem.errors(np.array(unit), 1).verdict,
+        )
+        for unit in units
+    ]
+    evaluate = in_threads(lambda u: trials_of(errors(as_array(u))))
+    return descents, GaussNewton(descents, evaluate, in_threads(linearise))
 
 
 @pytest.mark.parametrize("kind", PROBLEMS)
 @pytest.mark.parametrize("start", [(0.15, 0.9), (0.9, 0.2), (0.5, 0.5)])
 def test_descents_reach_the_minimum(kind, start):
-    descent = descent_on(kind, start)
+    (descent,), group = descents_on(kind, [start])
     for _ in range(60):
-        descent.step()
-        assert np.all((descent.unit >= 0.0) & (descent.unit <= 1.0))
+        group.advance()
+        assert np.all((descent.point >= 0.0) & (descent.point <= 1.0))
         if descent.done:
             break
     assert descent.done
-    np.testing.assert_allclose(descent.unit, PROBLEMS[kind], atol=1e-5)
+    np.testing.assert_allclose(descent.point, PROBLEMS[kind], atol=1e-5)
     assert np.all(np.diff(descent.losses) <= 0.0)
 
 
 def test_a_bent_valley_takes_few_steps():
     """A hundred times steeper across than Rosenbrock's is along; gradients zigzag."""
-    descent = descent_on("valley", (0.2, 0.56))
+    (descent,), group = descents_on("valley", [(0.2, 0.56)])
     taken = 0
     while descent.loss > 1e-8:
-        descent.step()
+        group.advance()
         taken += 1
     assert taken <= 12
 
 
 def test_a_point_without_slopes_ends_its_descent():
-    descent = descent_on("valley", (0.2, 0.5))
-    good = programs_of("valley")[0](as_array(descent.unit))
+    good = programs_of("valley")[0](as_array([0.2, 0.5]))
     bad = good._replace(jacobian=good.jacobian * jnp.nan)
-    descent.linearise = lambda unit: LocalModel.of(bad)
-    assert descent.step() == 1
-    assert descent.done
-    np.testing.assert_array_equal(descent.unit, (0.2, 0.5))
+    _, group = descents_on("valley", [(0.2, 0.5)], lambda unit: local_model(unit, bad))
+    standing = group.advance()
+    assert standing.evaluations == 1
+    assert standing.done
+    np.testing.assert_array_equal(standing.units, [(0.2, 0.5)])
+
+
+def test_a_rejected_step_keeps_the_model():
+    """Only a new point is linearised; the damping grows until a step is shorter."""
+    asked, zeros, ones = [], np.zeros((2, 2)), np.ones(2)
+
+    def wrong(unit):
+        asked.append(unit)
+        return LocalModel(unit, np.array([-1.0, 0.0]), np.eye(2), 1.0, zeros, ones)
+
+    (descent,), group = descents_on("bound", [(0.2, 0.3)], wrong)
+    taken = [group.advance().evaluations for _ in range(3)]
+    assert taken == [1 + 12, 12, 12]
+    assert len(asked) == 1
+    assert descent.damping == 30.0**3
+    np.testing.assert_array_equal(descent.point, (0.2, 0.3))
 
 
 def test_steps_stop_at_the_sides_of_the_box():
     curvature = np.array([[2.0, 1.9], [1.9, 2.0]])
-    target = np.array([-0.5, 0.9])
     unit = np.array([0.2, 0.5])
-    model = Quadratic(gradient=curvature @ (unit - target), curvature=curvature)
-    step = boxed_step(model, unit, 0.0)
+
+    def model(target):
+        return LocalModel(unit, curvature @ (unit - target), curvature)
+
+    step = model([-0.5, 0.9]).step(0.0, UNIT_BOX)
     # At x = 0 the best y solves 1.9 (0 + 0.5) + 2 (y - 0.9) = 0.
     np.testing.assert_allclose(unit + step, [0.0, 0.9 - 0.5 * 0.95], atol=1e-12)
-    inside = Quadratic(gradient=curvature @ (unit - [0.3, 0.6]), curvature=curvature)
-    np.testing.assert_allclose(unit + boxed_step(inside, unit, 0.0), [0.3, 0.6])
+    step = model([0.3, 0.6]).step(0.0, UNIT_BOX)
+    np.testing.assert_allclose(unit + step, [0.3, 0.6])
     # On the side, pushed outwards, it stays there.
-    edge = np.array([0.0, 0.5])
-    model = Quadratic(gradient=np.array([3.0, 0.0]), curvature=curvature)
-    assert boxed_step(model, edge, 0.1)[0] == 0.0
+    edge = LocalModel(np.array([0.0, 0.5]), np.array([3.0, 0.0]), curvature)
+    assert edge.step(0.1, UNIT_BOX)[0] == 0.0
 
 
 @pytest.mark.parametrize(("runs", "counted"), [(1, 10), (4, 600), (10, 10_000)])
@@ -152,7 +174,7 @@ def test_the_better_half_goes_on():
     places = np.random.default_rng(1).uniform(0.1, 0.9, (9, 2))
     seen = []
     standing, ended = descend(
-        ThreadedDescents([descent_on("valley", place) for place in places]),
+        descents_on("valley", places)[1],
         7,
         seen.append,
         cut=better_half,
@@ -280,9 +302,9 @@ def test_a_study_is_tuned(outcome):
     assert history.shape[1] == 3
     assert np.all(np.diff(history, axis=0) <= 0.0)
     assert len(result.times_s) == len(history)
-    # Each step of each descent: its derivatives, as many probes and trials as lanes.
-    steps = (result.evaluations - 9 - 3) / PARALLEL.evaluations
-    assert steps == int(steps)
+    # Each step of each descent: its derivatives, unless the last step was rejected, and
+    # three times as many points as dampings.
+    steps = (result.evaluations - 9 - 3) / (1 + 3 * POINTS)
     assert len(history) < steps <= 3 * len(history)
 
 

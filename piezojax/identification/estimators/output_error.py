@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,14 +13,18 @@ from jaxtyping import Array, Float, Int
 from ...core.arrays import ScalarLike, as_array
 from ...core.progress import Progress, Silent
 from ...core.rollout import simulate
-from ...core.space import Space
+from ...core.space import Space, squash, unsquash
 from ...core.system import System, rest_output
 from ...hysteresis.model import input_before
-from ...solve.descent import Patience
-from ...solve.gauss_newton import damped_gauss_newton
-from ...solve.multi_start import BatchedDescents, descend
-from ...solve.optimisers import Optimiser, View
-from ...solve.problem import Verdict, linearised
+from ...solve.gauss_newton import (
+    TRUST_REGION,
+    Descent,
+    GaussNewton,
+    trials_with_models,
+)
+from ...solve.local_model import normal_equations
+from ...solve.multi_start import Patience, descend
+from ...solve.problem import linearised
 from ..records.record import Record
 from .structure import Structure
 
@@ -165,22 +169,24 @@ def output_error(
     starts = _starts_for_records(structure, problem)
     width = min(PARALLEL_STARTS, len(starts))
     progress.stage(f"compiling the fit of {len(names)} parameters")
-    descents = BatchedDescents(
-        lambda units: _begin(problem, units),
-        lambda carry: _advance(problem, carry),
-        starts,
-        width,
-    )
+    evaluate = trials_with_models(lambda free: _normal_equations(problem, free), width)
+    descents = [
+        Descent(start, TRUST_REGION, tolerance=TOLERANCE)
+        for start in np.asarray(unsquash(as_array(starts)))
+    ]
     progress.stage(f"fitting from {len(starts)} starts", steps)
     standing, finished = descend(
-        descents,
+        GaussNewton(descents, evaluate),
         steps,
-        lambda standing: progress.advance(float(np.sqrt(np.min(standing.losses)))),
+        lambda standing: progress.advance(
+            float(np.sqrt(2.0 * np.min(standing.losses)))
+        ),
         cut=lambda step, running: width if step == TRIAL_STEPS else None,
         patience=STALLED,
     )
     order = np.argsort(standing.losses)[:width]
-    losses, units = standing.losses[order], standing.units[order]
+    losses = 2.0 * standing.losses[order]
+    units = np.asarray(squash(as_array(standing.units[order])))
     if losses[0] >= FAILED_LOSS:
         raise ValueError("no start led to a finite simulation of the record")
     values, deviations = _with_errors(problem, as_array(units[0]), losses[0])
@@ -196,23 +202,12 @@ def _starts_for_records(structure: Structure, problem: Problem) -> np.ndarray:
     return starts
 
 
-def _optimiser(problem: Problem) -> Optimiser:
-    # A lambda, because a bound method would be hashed with its arrays.
-    residuals = linearised(lambda unknown: problem.residuals(unknown))
-    return damped_gauss_newton(residuals, TOLERANCE)
-
-
 @eqx.filter_jit
-def _begin(problem: Problem, starts: Float[Array, "starts unknowns"]) -> Any:
-    return jax.vmap(_optimiser(problem).start)(starts)
-
-
-@eqx.filter_jit
-def _advance(problem: Problem, carry: Any) -> tuple[Any, View, Verdict]:
-    optimiser = _optimiser(problem)
-    carry = jax.vmap(optimiser.step)(carry)
-    view = jax.vmap(optimiser.view)(carry)
-    return carry, view, Verdict(view.loss, jnp.zeros_like(view.loss))
+def _normal_equations(
+    problem: Problem, free: Float[Array, "points unknowns"]
+) -> tuple[Array, Array, Array]:
+    residuals = linearised(lambda free: problem.residuals(squash(free)))
+    return normal_equations(residuals, free)
 
 
 @eqx.filter_jit

@@ -10,10 +10,9 @@ from jaxtyping import Array, Complex, Float
 from scipy import linalg, special
 
 from ...dynamics import StateSpace, reflected
-from ...solve.descent import SEQUENTIAL, Descent, LocalModel, Patience, Trials
-from ...solve.gauss_newton import Quadratic
-from ...solve.multi_start import ThreadedDescents, descend
-from ...solve.problem import Verdict
+from ...solve.gauss_newton import SEQUENTIAL, Descent, GaussNewton, Trials
+from ...solve.local_model import LocalModel
+from ...solve.multi_start import Patience, descend
 from .frequency import EmpiricalResponse
 
 STEPS = 20
@@ -259,35 +258,28 @@ def _moved(modes: _Modes, change: np.ndarray) -> _Modes:
 def _descend(modes: _Modes, data: _Data, steps: int) -> tuple[_Modes, list[float]]:
     """Fit the modes by damped Gauss-Newton steps on the normal equations."""
 
-    def linearise(change: np.ndarray) -> LocalModel:
-        equations = _normal_equations(_moved(modes, change), data)
+    def linearise(changes: np.ndarray) -> list[LocalModel]:
+        equations = _normal_equations(_moved(modes, changes[0]), data)
         gradient, curvature = map(np.asarray, equations)
         # Unit diagonal, but for unknowns of next to no effect, which then stay put.
         size = np.sqrt(np.diag(curvature))
         size = np.maximum(size, 1e-6 * size.max())
-        return LocalModel(Quadratic(gradient, curvature, size**2))
+        return [LocalModel(changes[0], gradient, curvature, size**2)]
 
-    def evaluate(changes: np.ndarray) -> Trials:
-        losses = np.array([float(_cost(_moved(modes, c), data)) for c in changes])
-        return Trials(losses, Verdict(losses, np.zeros_like(losses)))
+    def evaluate(changes: np.ndarray) -> list[Trials]:
+        costs = [float(_cost(_moved(modes, change), data)) for change in changes[0]]
+        return [Trials(0.5 * np.array(costs))]
 
     start = np.zeros(sum(part.size for part in modes) - modes.signs.size)
-    losses = [float(_cost(modes, data))]
-    descent = Descent(
-        start,
-        losses[0],
-        Verdict(losses[0], 0.0),
-        linearise,
-        evaluate,
-        ENOUGH,
-        rule=SEQUENTIAL,
-        box=(-np.inf, np.inf),
-        losses=losses,
-    )
-    descend(ThreadedDescents([descent]), steps, lambda standing: None)
+    half = 0.5 * float(_cost(modes, data))
+    descent = Descent(start, SEQUENTIAL, patience=ENOUGH, loss=half, losses=[half])
+    descents = GaussNewton([descent], evaluate, linearise)
+    descend(descents, steps, lambda standing: None)
+    losses = descent.losses
     # A last step without a decrease does not count.
-    costs = losses[:-1] if len(losses) > 1 and losses[-1] == losses[-2] else losses
-    return _moved(modes, descent.unit), costs
+    if len(losses) > 1 and losses[-1] == losses[-2]:
+        losses = losses[:-1]
+    return _moved(modes, descent.point), [2.0 * loss for loss in losses]
 
 
 def _model_of(modes: _Modes, dt: float) -> StateSpace:

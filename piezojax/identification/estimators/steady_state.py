@@ -1,7 +1,6 @@
 """Fit of a System to one period of its steady response to a periodic input."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,10 +12,15 @@ from ...core.arrays import as_array
 from ...core.rollout import simulate
 from ...core.space import INSIDE, Space, squash, unsquash
 from ...core.system import System
-from ...solve.gauss_newton import TrustRegion, damped_gauss_newton
-from ...solve.multi_start import BatchedDescents, descend
-from ...solve.optimisers import Optimiser, View
-from ...solve.problem import Verdict, linearised
+from ...solve.gauss_newton import (
+    TRUST_REGION,
+    Descent,
+    GaussNewton,
+    trials_with_models,
+)
+from ...solve.local_model import normal_equations
+from ...solve.multi_start import descend
+from ...solve.problem import linearised
 from ..records.record import Record
 from .structure import Structure
 
@@ -25,6 +29,10 @@ DIVERGED = 1e6
 
 TOLERANCE = 1e-9
 """Relative change of loss and parameters below which a descent ends."""
+
+RULE = TRUST_REGION._replace(good=0.75)
+"""Rule of the damping: a step with 3/4 of the predicted decrease may grow. The default
+0.99 keeps the steps through a curved valley short."""
 
 
 @eqx.filter_jit
@@ -79,14 +87,20 @@ def fit_steady_state(
         for columns in (record.inputs, record.outputs)
     )
     problem = _Problem(put, input, output, settle)
-    descents = BatchedDescents(
-        lambda starts: _begin(problem, starts),
-        lambda carry: _advance(problem, carry),
-        np.asarray(starts),
-        len(starts),
+
+    def metric(curvature: np.ndarray) -> np.ndarray:
+        # Marquardt's scaling; without it most starts stall half way.
+        size = np.diag(curvature)
+        return np.where(size > 0.0, size / output.size, 1.0)
+
+    descents = GaussNewton(
+        [Descent(start, RULE, tolerance=TOLERANCE) for start in np.asarray(starts)],
+        trials_with_models(
+            lambda points: _normal_equations(problem, points), len(starts), metric
+        ),
     )
     standing, _ = descend(descents, steps, lambda standing: None)
-    errors = np.sqrt(standing.losses / output.size)
+    errors = np.sqrt(2.0 * standing.losses / output.size)
     errors = np.where(np.isfinite(errors), errors, np.inf)
     best = int(np.argmin(errors))
     if errors[best] >= DIVERGED:
@@ -132,52 +146,9 @@ class _Problem(eqx.Module):
         error = (found - self.output) / jnp.std(self.output, axis=0)
         return jnp.where(jnp.isfinite(error), error, DIVERGED).ravel()
 
-    def unit(self, start: Array) -> Array:
-        """Return the change of each parameter that moves the output by one deviation.
-
-        This is Marquardt's scaling; without it most starts stall half way.
-        """
-        residuals = lambda parameters: self.residuals(parameters)  # noqa: E731
-        reach = jnp.linalg.norm(jax.jacfwd(residuals)(start), axis=0)
-        return jnp.where(reach > 0.0, jnp.sqrt(self.output.size) / reach, 1.0)
-
-    def optimiser(self, start: Array, unit: Array) -> Optimiser:
-        """Return the optimiser of the change from ``start`` in multiples of ``unit``.
-
-        A step with 3/4 of the predicted decrease may grow; the default 0.99 keeps the
-        steps through a curved valley short.
-        """
-        return damped_gauss_newton(
-            linearised(lambda by: self.residuals(start + unit * by)),
-            TOLERANCE,
-            TrustRegion(good=0.75),
-            bounded=False,
-        )
-
-
-class _Carry(NamedTuple):
-    start: Array
-    unit: Array
-    state: Any
-
 
 @eqx.filter_jit
-def _begin(problem: _Problem, starts: Array) -> _Carry:
-    def one(start):
-        unit = problem.unit(start)
-        state = problem.optimiser(start, unit).start(jnp.zeros_like(start))
-        return _Carry(start, unit, state)
-
-    return jax.vmap(one)(starts)
-
-
-@eqx.filter_jit
-def _advance(problem: _Problem, carry: _Carry) -> tuple[_Carry, View, Verdict]:
-    def one(carry):
-        optimiser = problem.optimiser(carry.start, carry.unit)
-        carry = carry._replace(state=optimiser.step(carry.state))
-        by, loss, done = optimiser.view(carry.state)
-        view = View(carry.start + carry.unit * by, loss, done)
-        return carry, view, Verdict(loss, jnp.zeros_like(loss))
-
-    return jax.vmap(one)(carry)
+def _normal_equations(
+    problem: _Problem, points: Float[Array, "points n"]
+) -> tuple[Array, Array, Array]:
+    return normal_equations(linearised(lambda p: problem.residuals(p)), points)

@@ -1,0 +1,89 @@
+"""Gauss-Newton model of a problem from a sample of its errors."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .gauss_newton import Trials
+from .local_model import LocalModel
+from .problem import FAILED_LOSS, Errors
+
+SAMPLES = 20_000
+"""Number of errors, over all runs, from which the curvature is computed."""
+
+SHORTEST = 5
+"""Least distance between two of these errors, in samples."""
+
+_ADDED = np.sqrt(2.0)  # the squares of the Lagrangian count fully, not half
+
+
+class Derivatives(NamedTuple):
+    """Loss, weights of the errors, and derivatives at a point.
+
+    ``gradient`` is that of the loss, ``jacobian`` that of the errors and ``added`` that
+    of the terms of the augmented Lagrangian.
+    """
+
+    loss: Float[Array, ""]
+    weights: Float[Array, " runs"]
+    gradient: Float[Array, " n"]
+    jacobian: Float[Array, "n runs samples"]
+    added: Float[Array, "n constraints"]
+
+
+def derivatives_at(problem, unit: Float[Array, " n"], every: int) -> Derivatives:
+    """Return value and derivatives at ``unit``, all in one forward pass."""
+
+    def values(unit):
+        point = problem.errors(unit, every)
+        return (point.loss, point.errors, point.added), point.weights
+
+    (loss, *_), (gradient, jacobian, added), weights = jax.vmap(
+        lambda direction: jax.jvp(values, (unit,), (direction,), has_aux=True),
+        out_axes=(None, 0, None),
+    )(jnp.eye(unit.shape[0]))
+    return Derivatives(loss, weights, gradient, jacobian, added)
+
+
+def local_model(unit: np.ndarray, here: Derivatives) -> LocalModel | None:
+    """Return the model of the weighted errors at ``unit``, or None if not finite."""
+    slopes, weights = np.asarray(here.jacobian), np.asarray(here.weights)
+    unknowns, _, samples = slopes.shape
+    scale = np.sqrt(np.maximum(weights, 0.0) / samples)[:, None]
+    jacobian = np.concatenate(
+        [(slopes * scale).reshape(unknowns, -1), _ADDED * here.added], axis=1
+    )
+    scales = np.append(np.repeat(scale, samples), np.full(here.added.shape[1], _ADDED))
+    model = LocalModel(
+        unit,
+        np.asarray(here.gradient),
+        jacobian @ jacobian.T,
+        jacobian=jacobian,
+        weights=scales,
+    )
+    return model if model.finite and here.loss < FAILED_LOSS else None
+
+
+def errors_at(problem, units: Float[Array, "points n"], every: int) -> Errors:
+    """Return the Errors of ``problem`` at ``units`` [points, n], without weights."""
+    at = lambda unit: problem.errors(unit, every)._replace(weights=None)  # noqa: E731
+    return jax.vmap(at)(units)
+
+
+def trials_of(points: Errors) -> Trials:
+    """Return the Trials of points, whose residuals are the errors and added terms."""
+    losses, verdicts, errors, added, _ = jax.tree.map(np.asarray, points)
+    flat = errors.reshape(len(losses), -1)
+    return Trials(losses, verdicts, np.concatenate([flat, added], axis=1))
+
+
+def spacing(runs: int, counted: int) -> int:
+    """Return the distance of the sampled errors, a prime number against aliasing."""
+    most = max(2, counted // SHORTEST)
+    wanted = min(max(SHORTEST, -(-runs * counted // SAMPLES)), most)
+    return next(
+        n for n in range(wanted, 2 * wanted + 1) if all(n % d for d in range(2, n))
+    )
