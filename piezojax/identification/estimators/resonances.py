@@ -1,0 +1,297 @@
+"""Linear dynamics that a record of a hysteretic stage shows: modes, lags, delay.
+
+The stage is taken as plays followed by a transfer function (a Hammerstein model), both
+fitted in turn to the signals above the slowest frequencies. The order is the lowest
+one whose errors are as white and small as those of the next; resonances and lags are
+read off from its poles.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.recipe import Resonance
+from .refined import TransferFunction, refined_instrumental_variables
+
+SHORTEST = 400
+"""Least number of samples in which dynamics are looked for."""
+
+LONGEST = 40_000
+"""Number of samples that are used, those in which the output moves fastest."""
+
+THRESHOLDS = (0.0, *np.geomspace(0.005, 0.4, 7))
+"""Thresholds of the plays of the Hammerstein model, shares of the input's range."""
+
+ROUNDS = 3
+"""Number of times that the plays and the transfer function are fitted in turn."""
+
+SLOWEST = 2e-3
+"""Corner of the high-pass filter against creep and drift, cycles per sample."""
+
+LAGS, DELAYS = 1, 6
+"""Most lags of a model, and longest delay in samples."""
+
+DROPS = (0.99, 0.95)
+"""Factors by which the first and the second mode must lower the white error to be
+shown. A harmonic of the hysteresis that meets the first resonance looks like another,
+weak one."""
+
+NEGLIGIBLE = 1e-6
+"""White error, as a share of the output, below which no mode is looked for."""
+
+LAG_DROP = 0.995
+"""Factor by which a lag or a sample of delay must lower it."""
+
+DIPOLE = 0.5
+"""Distance of a zero, as a share of a pole's distance from 1, that cancels a lag."""
+
+HIGHEST = 0.45
+"""Largest frequency of a mode, cycles per sample."""
+
+DAMPED = 0.5
+"""Damping ratio from which on a pair of poles is no resonance."""
+
+EXPLAINED = 0.02
+"""Least share of the output's power, in the octave around a mode, that the model of
+the record explains."""
+
+
+class LinearDynamics(NamedTuple):
+    """Resonances, strongest first, time constants of lags (s) and the delay (s).
+
+    ``delay`` is beyond the one sample between input and output. ``slope`` is that of
+    the output over the full range of the input, below the resonances. Both are None
+    where no dynamics could be looked for. ``whitening`` is the filter of the errors.
+    """
+
+    modes: tuple[Resonance, ...] = ()
+    lags: tuple[float, ...] = ()
+    delay: float | None = None
+    slope: float | None = None
+    whitening: tuple[float, ...] = ()
+
+    def __str__(self) -> str:
+        texts = [
+            f"a resonance at {mode.frequency:.4g} Hz with a damping of "
+            f"{100.0 * mode.damping:.2g} %"
+            for mode in self.modes
+        ]
+        texts += [f"a lag of {1e3 * lag:.2g} ms" for lag in self.lags]
+        return ", ".join(texts)
+
+
+def linear_dynamics(input: np.ndarray, output: np.ndarray, dt: float) -> LinearDynamics:
+    """Return the linear dynamics that ``input`` and ``output`` [samples] show.
+
+    ``dt`` in s. Signals that are too short or do not excite dynamics show none. The
+    last few results are kept, because several parts of a fit ask for the same.
+    """
+    return _found(
+        np.asarray(input, float).tobytes(), np.asarray(output, float).tobytes(), dt
+    )
+
+
+@lru_cache(maxsize=4)
+def _found(input: bytes, output: bytes, dt: float) -> LinearDynamics:
+    x, y = _liveliest(np.frombuffer(input), np.frombuffer(output))
+    if x.size < SHORTEST:
+        return LinearDynamics()
+    try:
+        model = _chosen(_Signals(_play_outputs(x), _above_slowest(y)))
+    except (ValueError, np.linalg.LinAlgError):
+        return LinearDynamics()
+    modes, lags = model.modes(dt), model.lags(dt)
+    delay = model.extra_delay(modes, lags, dt)
+    whitening = tuple(map(float, model.dynamics.noise))
+    return LinearDynamics(modes, lags, delay, model.slope(), whitening)
+
+
+def _liveliest(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the LONGEST consecutive samples in which the output moves fastest."""
+    if x.size <= LONGEST:
+        return x, y
+    energy = np.cumsum(np.r_[0.0, np.diff(y, prepend=y[0]) ** 2])
+    first = int(np.argmax(energy[LONGEST:] - energy[:-LONGEST]))
+    return x[first : first + LONGEST], y[first : first + LONGEST]
+
+
+def _play_outputs(x: np.ndarray) -> np.ndarray:
+    """Return the outputs of plays [plays, samples] above the slowest frequencies."""
+    thresholds = np.ptp(x) * np.array(THRESHOLDS)
+    memory = np.full(thresholds.size, x[0])
+    outputs = np.empty((x.size, thresholds.size))
+    for k, value in enumerate(x):
+        memory = np.clip(memory, value - thresholds, value + thresholds)
+        outputs[k] = memory
+    return np.stack([_above_slowest(column) for column in outputs.T])
+
+
+def _above_slowest(signal: np.ndarray) -> np.ndarray:
+    import scipy.signal  # takes long to import
+
+    numerator, denominator = scipy.signal.butter(2, 2.0 * SLOWEST, "high")
+    return scipy.signal.lfilter(numerator, denominator, signal - signal[0])
+
+
+class _Signals(NamedTuple):
+    """Outputs of the plays [plays, samples] and of the stage [samples], filtered."""
+
+    plays: np.ndarray
+    output: np.ndarray
+
+
+class _Hammerstein(NamedTuple):
+    """Plays with ``weights`` and a transfer function, fitted to the ``signals``."""
+
+    signals: _Signals
+    weights: np.ndarray
+    dynamics: TransferFunction
+
+    def modes(self, dt: float) -> tuple[Resonance, ...]:
+        """Return the resonances that the record shows, strongest first."""
+        found = []
+        for pole in self.dynamics.poles():
+            rate = np.log(pole) / dt if pole.imag > 0.0 else 0.0
+            frequency = abs(rate) / (2.0 * np.pi)
+            damping = -np.real(rate) / max(abs(rate), 1e-30)
+            if not (0.0 < frequency * dt < HIGHEST and damping < DAMPED):
+                continue
+            if self._explained(frequency * dt) > EXPLAINED:
+                peak = abs(self.dynamics.response(np.array([frequency * dt]))[0])
+                found.append((peak, Resonance(float(frequency), float(damping))))
+        return tuple(resonance for _, resonance in sorted(found, reverse=True))
+
+    def _explained(self, cycles: float) -> float:
+        """Return the explained share of the output in the octave around ``cycles``."""
+        model = self.dynamics.applied(self.weights @ self.signals.plays)
+        output = self.signals.output
+        line = np.fft.rfftfreq(output.size)
+        near = (line > cycles / np.sqrt(2.0)) & (line < cycles * np.sqrt(2.0))
+        left, all_ = (
+            np.sum(np.abs(np.fft.rfft(signal)[near]) ** 2)
+            for signal in (output - model, output)
+        )
+        return float(1.0 - left / all_)
+
+    def lags(self, dt: float) -> tuple[float, ...]:
+        """Return the time constants (s) of the real poles, longest first.
+
+        A pole with a zero beside it, or below the high-pass filter, is creep or an
+        error of the hysteresis.
+        """
+        poles, zeros = self.dynamics.poles(), np.roots(self.dynamics.numerator)
+        real = np.real(poles[(np.abs(poles.imag) < 1e-9) & (poles.real > 0.0)])
+        return tuple(
+            float(-dt / np.log(pole))
+            for pole in sorted(real, reverse=True)
+            if np.all(np.abs(zeros - pole) > DIPOLE * (1.0 - pole))
+            and 1.0 - pole > 2.0 * np.pi * SLOWEST
+        )
+
+    def slope(self) -> float:
+        """Return the mean slope over the full range at the slowest frequencies."""
+        moved = self.weights @ (1.0 - 2.0 * np.array(THRESHOLDS))
+        slow = self.dynamics.response(np.array([SLOWEST]))[0]
+        return float(moved * abs(slow) * np.sign(np.real(slow)))
+
+    def extra_delay(
+        self, modes: tuple[Resonance, ...], lags: tuple[float, ...], dt: float
+    ) -> float:
+        """Return the delay (s) that modes and lags, each held, leave in the phase."""
+        highest = max([0.2, *(1.2 * mode.frequency * dt for mode in modes)])
+        cycles = np.linspace(3.0 * SLOWEST, min(highest, HIGHEST), 400)
+        turn = np.exp(-2j * np.pi * cycles)
+        rates = [rate for mode in modes for rate in _rates(mode)]
+        rates += [complex(-1.0 / lag) for lag in lags]
+        rest = self.dynamics.response(cycles) / turn / _held(rates, dt, turn)
+        phase = np.unwrap(np.angle(rest * np.sign(np.real(rest[0]))))
+        return float(max(0.0, -(phase @ cycles) / (2.0 * np.pi * cycles @ cycles)) * dt)
+
+
+def _rates(mode: Resonance) -> tuple[complex, complex]:
+    """Return the poles of a mode in the s plane, 1/s."""
+    turning = 1j * np.sqrt(1.0 - mode.damping**2)
+    rate = 2.0 * np.pi * mode.frequency * (turning - mode.damping)
+    return rate, np.conj(rate)
+
+
+def _held(rates: Sequence[complex], dt: float, turn: np.ndarray) -> np.ndarray:
+    """Return the response to a held input at the end of the sample, unit DC gain.
+
+    ``rates`` are the poles in the s plane (1/s), ``turn`` is exp(-2 pi i f dt).
+    """
+    steps = 1.0 / (1.0 - turn)
+    for i, rate in enumerate(rates):
+        others = [other for j, other in enumerate(rates) if j != i]
+        residue = -np.prod([other / (other - rate) for other in others])
+        steps = steps + residue / (1.0 - np.exp(rate * dt) * turn)
+    return steps * (1.0 - turn) / turn
+
+
+def _fitted(
+    signals: _Signals, modes: int, lags: int, delay: int = 1
+) -> _Hammerstein | None:
+    """Return the model of this order, or None if the record does not determine it."""
+    weights = np.eye(len(THRESHOLDS))[0]
+    poles, dynamics = 2 * modes + lags, None
+    for _ in range(ROUNDS):
+        try:
+            dynamics = refined_instrumental_variables(
+                weights @ signals.plays,
+                signals.output,
+                poles,
+                max(1, poles),
+                delay,
+                dynamics,
+            )
+        except (ValueError, np.linalg.LinAlgError):
+            return None
+        last = weights
+        columns = [dynamics.whitened(dynamics.applied(play)) for play in signals.plays]
+        output = dynamics.whitened(signals.output)
+        weights = np.linalg.lstsq(np.stack(columns, 1), output, rcond=None)[0]
+    return _Hammerstein(signals, last, dynamics)
+
+
+def _cost(model: _Hammerstein | None) -> float:
+    """Return the rms of the white errors of a model."""
+    return np.inf if model is None else float(np.sqrt(model.dynamics.cost))
+
+
+def _with_lag(signals: _Signals, modes: int, delay: int = 1) -> _Hammerstein | None:
+    """Return the model with as many lags as lower the error."""
+    best = None
+    for lags in range(LAGS + 1):
+        model = _fitted(signals, modes, lags, delay)
+        if best is None or _cost(model) < LAG_DROP * _cost(best):
+            best = model
+    return best
+
+
+def _chosen(signals: _Signals) -> _Hammerstein:
+    """Return the model with as many modes as lower the error."""
+    best = _with_lag(signals, 0)
+    for modes, drop in enumerate(DROPS, 1):
+        if _cost(best) < NEGLIGIBLE * np.std(signals.output):
+            break
+        model = _with_lag(signals, modes)
+        shown = model is not None and len(model.modes(1.0)) == modes
+        if not shown or _cost(model) > drop * _cost(best):
+            break
+        best = model
+    if best is None:
+        raise ValueError("the record does not determine any dynamics")
+    return _delayed(signals, best)
+
+
+def _delayed(signals: _Signals, model: _Hammerstein) -> _Hammerstein:
+    """Return ``model`` with the delay that lowers its error most."""
+    best, poles = model, model.dynamics.poles().size
+    for delay in range(2, DELAYS + 1):
+        later = _fitted(signals, poles // 2, poles % 2, delay)
+        if later is None or _cost(later) > LAG_DROP * _cost(best):
+            break
+        best = later
+    return best
