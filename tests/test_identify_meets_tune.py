@@ -21,7 +21,7 @@ from piezojax.hysteresis import (
     RateDependentPreisach,
 )
 from piezojax.identification import METHODS
-from piezojax.identification.chain import DEFAULT, structure
+from piezojax.identification.chain import DEFAULT, automatic, structure
 from piezojax.identification.estimators.neural import neural_start
 from piezojax.study import read
 
@@ -104,7 +104,7 @@ def plant(model):
 
 def models():
     whole = {model for method in METHODS.values() for model in method.models}
-    return [DEFAULT, *parts(), *sorted(whole)]
+    return [automatic(record()), *parts(), *sorted(whole)]
 
 
 def loop_around(controller, system):

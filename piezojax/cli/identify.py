@@ -29,7 +29,7 @@ class _SampleRange(click.ParamType):
 )
 @click.option(
     "--model",
-    default="shaped_coleman_hodgdon+exponential_creep+lag",
+    default="auto",
     show_default=True,
     help="Model to fit, parts joined by '+'; 'help' lists all, 'all' compares all.",
 )
@@ -139,6 +139,7 @@ def main(
             write_fit(fit, folder)
         print_alarms(console, fit.report.alarms)
         console.print(fit_table(fit.report))
+        console.print(f"found: {fit.report.found or 'no resonance'}", soft_wrap=True)
         for warning in fit.report.warnings:
             console.print(f"note: {warning}", soft_wrap=True)
         console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..core.arrays import Scalar, ScalarLike, Scalars, as_array, as_scalars
 from ..core.parameter import parameter
-from ..core.recipe import Extent, Fittable, Part, Recipe
+from ..core.recipe import Extent, Fittable, Part, Recipe, Resonance
 from ..core.space import Range
 
 
@@ -36,7 +36,6 @@ class ARMA(Fittable):
 
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
-        del extent
         return Recipe(
             cls((0.9, -0.2), (0.3, 0.0, 0.0)),
             {
@@ -44,7 +43,8 @@ class ARMA(Fittable):
                 "autoregressive.1": Range(-1.0, 1.0),
                 **{f"moving.{i}": Range(-3.0, 3.0) for i in range(3)},
             },
-            [
+            [_sampled(mode, extent.dt) for mode in extent.modes]
+            or [
                 {"autoregressive.0": 2.0 * p, "autoregressive.1": -p * p, "moving.0": q}
                 for p, q in ((0.3, 0.49), (0.8, 0.04))
             ],
@@ -88,6 +88,19 @@ class ARMA(Fittable):
         longer, shorter = sorted((fed_back, fed_forward), key=len, reverse=True)
         both = [x + y for x, y in zip(longer, shorter, strict=False)]
         return both + longer[len(shorter) :]
+
+
+def _sampled(mode: Resonance, dt: float) -> dict[str, float]:
+    """Return the coefficients of a mode for a held input, by path."""
+    pulsation = 2.0 * np.pi * mode.frequency * dt
+    turn = np.sqrt(1.0 - mode.damping**2)
+    pole = np.exp(pulsation * (-mode.damping + 1j * turn))
+    # The first sample of the step response.
+    first = 1.0 - pole.real - mode.damping / turn * pole.imag
+    a1, a2 = 2.0 * pole.real, -(abs(pole) ** 2)
+    rest = 1.0 - a1 - a2 - first
+    paths = ("autoregressive.0", "autoregressive.1", "moving.0", "moving.1")
+    return dict(zip(paths, map(float, (a1, a2, first, rest)), strict=True))
 
 
 def scaled_to_dc(model: ARMA, gain: ScalarLike) -> ARMA:

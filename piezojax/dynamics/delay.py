@@ -33,10 +33,12 @@ class FractionalDelay(Fittable):
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
         dt = extent.dt
+        found = extent.delay
+        starts = [0.5 * dt, 2.5 * dt] if found is None else [min(found, 4.5 * dt)]
         return Recipe(
             cls(0.5 * dt, dt, 5),
             {"delay": Range(0.0, 5.0 * dt)},
-            [{"delay": n * dt} for n in (0.5, 2.5)],
+            [{"delay": delay} for delay in starts],
         )
 
     def init(self, input: ScalarLike = 0.0) -> tuple[Scalar, ...]:

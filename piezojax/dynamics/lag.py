@@ -29,9 +29,13 @@ class FirstOrderLag(Fittable):
 
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
-        dt = extent.dt
+        bounds = Range(0.05 * extent.dt, 50.0 * extent.dt, "log")
+        found = [lag for lag in extent.lags if bounds.lower < lag < bounds.upper]
+        starts = found or [extent.dt]
         return Recipe(
-            cls(dt, dt), {"time_constant": Range(0.05 * dt, 50.0 * dt, "log")}
+            cls(starts[0], extent.dt),
+            {"time_constant": bounds},
+            [{"time_constant": lag} for lag in starts],
         )
 
     def pole(self) -> Scalar:

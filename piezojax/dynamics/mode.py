@@ -1,14 +1,18 @@
-"""Resonance of a stage, which can be fitted."""
+"""Resonance of a stage, alone or behind a slow sensor, which can be fitted."""
 
 import math
 from typing import ClassVar
 
-from ..core.arrays import Scalar
+import jax.numpy as jnp
+import jax.scipy.linalg
+from jaxtyping import Array, Float
+
+from ..core.arrays import Scalar, ScalarLike, as_array
 from ..core.parameter import parameter, sample_time
 from ..core.recipe import Extent, Fittable, Part, Recipe, Resonance
 from ..core.space import Range
-from ..core.system import Designed
-from .lag import LinearOscillator, SecondOrderLag
+from ..core.system import Designed, System
+from .lag import FirstOrderLag, LinearOscillator, SecondOrderLag
 
 GUESSES = (Resonance(0.05, 0.1), Resonance(0.2, 0.1))
 """Starting values for a record in which no resonance was found; frequencies in cycles
@@ -41,20 +45,99 @@ class Mode(Designed, Fittable):
 
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
-        dt = extent.dt
-        found = extent.modes or [
-            Resonance(g.frequency / dt, g.damping) for g in GUESSES
-        ]
+        starts = _starts(extent)
         return Recipe(
-            cls(*found[0], dt),
-            {
-                "frequency": Range(0.5 / extent.duration, 0.499 / dt, "log"),
-                "damping": Range(1e-4, 2.0, "log"),
-            },
-            [resonance._asdict() for resonance in found],
+            cls(*starts[0], extent.dt),
+            _bounds(extent),
+            [resonance._asdict() for resonance in starts],
         )
 
     def resolved(self) -> LinearOscillator:
         """Return the LinearOscillator with the coefficients of one sample."""
         pulsation = 2.0 * math.pi * self.frequency
         return SecondOrderLag(pulsation, self.damping, self.dt).resolved()
+
+
+class SensedMode(Designed, Fittable):
+    """A resonance x -> y and a first-order sensor ``time_constant z' + z = y``.
+
+    The resonance is that of ``Mode``; z is the output, in the unit of x, with unit DC
+    gain. Both are discretised together, exactly for an input x held between samples. A
+    Mode followed by a FirstOrderLag holds y between samples too, and is half a sample
+    early. Raises ValueError for parameters outside their limits.
+    """
+
+    part: ClassVar[Part] = Part(
+        "sensed_mode", "dynamics", "Resonance seen by a sensor with a first-order lag"
+    )
+
+    frequency: Scalar = parameter(
+        "Hz",
+        "undamped natural frequency",
+        above=0.0,
+        scale="log",
+        typical=(1e1, 1e4),
+    )
+    damping: Scalar = parameter(
+        "1", "damping ratio", above=0.0, scale="log", typical=(1e-3, 1.0)
+    )
+    time_constant: Scalar = parameter(
+        "s", "time constant of the sensor", above=0.0, scale="log", typical=(1e-5, 1.0)
+    )
+    dt: float = sample_time()
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        lag = FirstOrderLag.recipe(extent)
+        starts = _starts(extent)
+        return Recipe(
+            cls(*starts[0], lag.system.time_constant, extent.dt),
+            {**_bounds(extent), **lag.bounds},
+            [resonance._asdict() for resonance in starts],
+        )
+
+    def resolved(self) -> "HeldLinear":
+        """Return the System with the transition matrix of one sample."""
+        w = 2.0 * math.pi * self.frequency * self.dt
+        sensor, zero = self.dt / self.time_constant, jnp.zeros(())
+        # The states are y, y' / w and z.
+        rates = (
+            (zero, w, zero),
+            (-w, -2.0 * self.damping * w, zero),
+            (sensor, zero, -sensor),
+        )
+        matrix = jnp.stack([jnp.stack(row) for row in rates])
+        return HeldLinear(jax.scipy.linalg.expm(matrix))
+
+
+class HeldLinear(System):
+    """Distance of the states y, y' / w, z from rest, times ``transition`` a sample."""
+
+    transition: Float[Array, "3 3"]
+
+    def init(self, input: ScalarLike = 0.0) -> Float[Array, " 3"]:
+        return _rest(as_array(input))
+
+    def step(
+        self, state: Float[Array, " 3"], input: ScalarLike
+    ) -> tuple[Float[Array, " 3"], Scalar]:
+        rest = _rest(as_array(input))
+        state = rest + self.transition @ (state - rest)
+        return state, state[2]
+
+
+def _rest(input: Scalar) -> Float[Array, " 3"]:
+    return jnp.stack([input, jnp.zeros_like(input), input])
+
+
+def _starts(extent: Extent) -> list[Resonance]:
+    """Return the resonances of the record, or guesses if it shows none."""
+    guesses = [Resonance(cycles / extent.dt, damping) for cycles, damping in GUESSES]
+    return list(extent.modes) or guesses
+
+
+def _bounds(extent: Extent) -> dict[str, Range]:
+    return {
+        "frequency": Range(0.5 / extent.duration, 0.499 / extent.dt, "log"),
+        "damping": Range(1e-4, 2.0, "log"),
+    }

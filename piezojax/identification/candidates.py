@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from ..core.recipe import Extent
 from ..core.registry import parts as known_parts
-from .chain import extent_of, is_dynamic
+from .chain import dynamics_parts, extent_of, is_dynamic, training_record
 from .estimators.estimate import Options
 from .estimators.model_preisach import (
     PLAIN,
@@ -34,7 +34,8 @@ CREEP = "exponential_creep"
 """The creep tried first: the most general one."""
 
 DYNAMICS = ("arma", "lag")
-"""Dynamics of a chain, richest first; the last is tried on any record."""
+"""Dynamics of a chain, richest first; the last is tried on any record. A resonance that
+the records show comes before them."""
 
 
 LINEAR = "state_space"
@@ -84,8 +85,10 @@ def supported_parts(
             for name in creeps[:-1]
         ]
         creeps = [""]
-    found, extent = excitation(records, train), extent_of(records[0])
-    dynamics = []
+    training = training_record(records, train)
+    found, extent = excitation(records, train), extent_of(training)
+    shown = dynamics_parts(training)
+    dynamics = [shown] if shown not in DYNAMICS else []
     for name in DYNAMICS:
         needed = _parameter_count(name, extent)
         if 2 * found >= needed or name == DYNAMICS[-1]:

@@ -1,6 +1,6 @@
 """Chains of parts in series with an offset, as structures to fit."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import product
 
 import numpy as np
@@ -12,14 +12,21 @@ from ..core.registry import parts as known_parts
 from ..core.space import INSIDE, Range, Space, space_of
 from ..core.system import Affine, Series, series
 from ..hysteresis.model import Hysteresis
+from .estimators.resonances import LinearDynamics, linear_dynamics
 from .estimators.structure import Structure
 from .records.record import Record
 
 LINEAR = ("dynamics", "lag", "delay")
 """Places of linear dynamics, whose parameters the record must excite."""
 
-DEFAULT = "shaped_coleman_hodgdon+exponential_creep+lag"
-"""Model that is fitted by default."""
+DEFAULT = "auto"
+"""Model that is fitted by default: SLOW and the dynamics that the record shows."""
+
+SLOW = "shaped_coleman_hodgdon+exponential_creep"
+"""Hysteresis and creep of the default model."""
+
+FRACTION = 0.2
+"""Shortest delay, in samples, for which a model with a mode has a delay."""
 
 
 def chain(name: str) -> list[str]:
@@ -50,19 +57,62 @@ def is_dynamic(part: str) -> bool:
     return issubclass(kind, Hysteresis) and kind.dynamic
 
 
+def training_record(records: Sequence[Record], train: slice) -> Record:
+    """Return the training samples of the record with the largest range.
+
+    Models, bounds and starts must not depend on the validation part.
+    """
+    return max(
+        (record.until(train.stop) for record in records), key=lambda record: record.span
+    )
+
+
+def dynamics_of(record: Record) -> LinearDynamics:
+    """Return the linear dynamics that a record of one input and one output shows."""
+    return linear_dynamics(record.input, record.output, record.dt)
+
+
+def shown_dynamics(records: Sequence[Record], train: slice) -> LinearDynamics:
+    """Return the dynamics that the training part shows, none for several channels."""
+    if any((r.inputs.shape[1], r.outputs.shape[1]) != (1, 1) for r in records):
+        return LinearDynamics()
+    return dynamics_of(training_record(records, train))
+
+
+def dynamics_parts(record: Record) -> str:
+    """Return the chain of linear dynamics that ``record`` shows, a lag if none."""
+    shown = dynamics_of(record)
+    if not shown.modes:
+        return "lag"
+    late = shown.delay is not None and shown.delay > FRACTION * record.dt
+    return ("sensed_mode" if shown.lags else "mode") + ("+delay" if late else "")
+
+
+def automatic(record: Record) -> str:
+    """Return the default chain for ``record``: SLOW and the dynamics it shows."""
+    return f"{SLOW}+{dynamics_parts(record)}"
+
+
 def extent_of(record: Record) -> Extent:
-    """Return the ranges of a record with one input and one output."""
+    """Return the ranges of a record with one input and one output, and its dynamics."""
     x, y = record.input, record.output
-    slope = record.span / float(np.ptp(x)) * float(np.sign(np.cov(x, y)[0, 1]) or 1.0)
+    shown, span = dynamics_of(record), record.span
+    slope = span / float(np.ptp(x)) * float(np.sign(np.cov(x, y)[0, 1]) or 1.0)
+    if shown.modes and shown.slope:
+        # Beside a resonance the range of the output says little about the slope.
+        slope, span = shown.slope, abs(shown.slope) * float(np.ptp(x))
     return Extent(
         low=float(x.min()),
         high=float(x.max()),
         first=(float(x[0]), float(y[0])),
         slope=slope,
         centre=float(np.mean(y) - slope * np.mean(x)),
-        span=record.span,
+        span=span,
         dt=record.dt,
         duration=record.dt * record.samples,
+        modes=shown.modes,
+        lags=shown.lags,
+        delay=shown.delay,
     )
 
 
@@ -71,7 +121,7 @@ def structure(name: str, record: Record) -> Structure:
 
     An offset of the output is always added. Raises ValueError as for ``chain``.
     """
-    extent = extent_of(record)
+    extent, shown = extent_of(record), dynamics_of(record)
     known = known_parts()
     kinds = [known[part] for part in chain(name)]
     parts = {kind.part.place: kind.recipe(extent) for kind in kinds}
@@ -101,7 +151,8 @@ def structure(name: str, record: Record) -> Structure:
         space,
         _starts(system, space, parts),
         tuple(f"{place}.{path}" for place, part in parts.items() for path in part.own),
-        sum(path.split(".")[0] in LINEAR for path in bounds),
+        tuple(path for path in bounds if path.split(".")[0] in LINEAR),
+        shown.whitening if shown.modes else (),
     )
 
 

@@ -12,8 +12,9 @@ from pydantic import BaseModel
 from ..core.about import About
 from ..core.progress import Progress, Silent
 from ..core.system import System
-from .chain import DEFAULT
+from .chain import DEFAULT, automatic, shown_dynamics, training_record
 from .estimators.estimate import FittedParameter, LinearDetail, Options
+from .estimators.resonances import LinearDynamics
 from .methods import method_for
 from .plausibility import plausibility_warnings
 from .records.checks import record_warnings
@@ -22,6 +23,10 @@ from .residuals.report import ResidualReport, residual_report
 
 POOR = 0.2
 """Validation error, as a share of the output's deviation, above which to warn."""
+
+
+MISSED = 0.1
+"""Relative distance of all poles from a resonance from which a model lacks it."""
 
 
 class FitError(BaseModel):
@@ -45,6 +50,7 @@ class FitReport(BaseModel):
     """
 
     model: str
+    found: str = ""
     parameters: dict[str, FittedParameter]
     train: FitError
     validation: FitError
@@ -158,7 +164,8 @@ def identify(
     """Fit ``model`` to one record or to several with the same sample time.
 
     ``model`` is a chain of parts such as ``"prandtl_ishlinskii+logarithmic_creep+lag"``
-    (see ``--model help``) or one of the models of ``identification.METHODS``.
+    (see ``--model help``) or one of the models of ``identification.METHODS``; the
+    default is a chain with the resonance, lag and delay that the record shows.
     ``method`` is a name in METHODS; left out, it is the first that can fit the model.
     The model is fitted over the samples ``train`` of each record (the first half if
     left out) and validated by its free run on ``validate`` (the rest if left out).
@@ -166,12 +173,15 @@ def identify(
     different sample time or units, or if no start leads to a finite fit.
     """
     began = time.perf_counter()
-    chosen = method_for(model, method)
     records = (records,) if isinstance(records, Record) else tuple(records)
     check_compatible(records)
     train, validate = train_and_validation(
         min(r.samples for r in records), train, validate
     )
+    if model == DEFAULT:
+        model = automatic(training_record(records, train))
+    shown = shown_dynamics(records, train)
+    chosen = method_for(model, method)
     estimate = chosen.estimate(
         model, records, train, options or Options(), progress or Silent()
     )
@@ -190,12 +200,14 @@ def identify(
         record_warnings,
         train=train,
         validate=validate,
-        order=estimate.order,
+        # A resonance that shows was excited.
+        order=0 if shown.modes else estimate.order,
         hysteresis=estimate.hysteresis,
     )
     residuals, unexplained = residual_report(records, runs, train, validate)
     report = FitReport(
         model=model,
+        found=str(shown),
         parameters=estimate.parameters,
         train=_fit_error(records, runs, train),
         validation=_fit_error(records, runs, validate),
@@ -204,6 +216,7 @@ def identify(
             *alarms,
             *of_each(checked),
             *estimate.warnings,
+            *_missed(shown, estimate.linear),
             *unexplained,
         ],
         alarms=alarms,
@@ -219,6 +232,20 @@ def identify(
         estimate.linear,
         estimate.parameter_count(),
     )
+
+
+def _missed(shown: LinearDynamics, linear: LinearDetail | None) -> list[str]:
+    """Return a warning for each resonance that a linear model lacks."""
+    if linear is None:
+        return []
+    poles = linear.model.poles().astype(complex)
+    rates = np.log(poles[np.abs(poles) > 1e-9]) / linear.model.dt
+    frequencies = np.abs(rates) / (2.0 * np.pi)
+    return [
+        f"the record shows a resonance at {mode.frequency:.4g} Hz that the model lacks"
+        for mode in shown.modes
+        if np.all(np.abs(frequencies / mode.frequency - 1.0) > MISSED)
+    ]
 
 
 def check_compatible(records: tuple[Record, ...]) -> None:

@@ -11,7 +11,7 @@ from ..core.paths import parameters
 from ..core.progress import Progress
 from ..core.system import System
 from ..hysteresis.model import hystereses
-from .chain import structure
+from .chain import structure, training_record
 from .estimators.estimate import Estimate, FittedParameter, Options, bound_warning
 from .estimators.linear import by_frequency_response, by_subspace
 from .estimators.model_bouc_wen import bouc_wen
@@ -44,9 +44,7 @@ def _free_runs(systems: Sequence[System], records: Records) -> tuple[np.ndarray,
 def _by_output_error(
     model: str, records: Records, train: slice, options: Options, progress: Progress
 ) -> Estimate:
-    # Bounds and starts must not depend on the validation part.
-    seen = [record.until(train.stop) for record in records]
-    shape = structure(model, max(seen, key=lambda record: record.span))
+    shape = structure(model, training_record(records, train))
     optimum = output_error(
         shape, records, train, steps=options.steps, progress=progress
     )

@@ -7,9 +7,10 @@ import pytest
 import scipy.linalg
 
 from piezojax import Record, load, save, simulate
+from piezojax.core.paths import replace
 from piezojax.core.recipe import Extent, Resonance
 from piezojax.core.registry import parts
-from piezojax.dynamics import Mode
+from piezojax.dynamics import ARMA, Mode, SensedMode
 from piezojax.identification.chain import structure
 
 DT = 1e-4
@@ -109,3 +110,60 @@ def test_a_chain_holds_a_mode_a_lag_and_a_delay():
     places = ("hysteresis", "creep", "dynamics", "lag", "delay", "calibration")
     assert shape.system.names == places
     assert {"dynamics.frequency", "dynamics.damping"} <= set(shape.space.paths)
+
+
+def by_three_states(frequency, damping, time_constant, inputs, rest):
+    """A resonance and a sensor in one exact discretisation, by scipy's expm."""
+    w = 2.0 * np.pi * frequency
+    matrix = np.zeros((4, 4))
+    matrix[0, 1] = 1.0
+    matrix[1] = [-(w**2), -2.0 * damping * w, 0.0, w**2]
+    matrix[2] = [1.0 / time_constant, 0.0, -1.0 / time_constant, 0.0]
+    held = scipy.linalg.expm(matrix * DT)
+    state, outputs = np.array([rest, 0.0, rest]), []
+    for value in inputs:
+        state = held[:3, :3] @ state + held[:3, 3] * value
+        outputs.append(state[2])
+    return np.array(outputs)
+
+
+@pytest.mark.parametrize("sensor", [1e-5, 1e-4, 3e-3])
+@pytest.mark.parametrize(("frequency", "damping"), [(300.0, 0.005), (4000.0, 0.1)])
+def test_a_sensed_mode_is_discretised_in_one(frequency, damping, sensor):
+    expected = by_three_states(frequency, damping, sensor, INPUT, 2.0)
+    found = response(SensedMode(frequency, damping, sensor, DT), INPUT, 2.0)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+
+
+def test_the_gradient_of_a_sensed_mode_is_that_of_differences():
+    @jax.jit
+    def last(parameters):
+        return jnp.sum(response(SensedMode(*parameters, DT), INPUT) ** 2)
+
+    point = np.array([780.0, 0.02, 1e-3])
+    steps = np.diag(1e-5 * point)
+    differences = [(last(point + h) - last(point - h)) / (2 * h.sum()) for h in steps]
+    np.testing.assert_allclose(jax.jit(jax.grad(last))(point), differences, rtol=1e-5)
+
+
+def test_a_bad_sensor_is_refused():
+    with pytest.raises(ValueError, match="time_constant in s is 0; it must be"):
+        SensedMode(780.0, 0.02, 0.0, DT)
+
+
+def test_a_sensed_mode_starts_from_the_lag_of_the_record():
+    extent = EXTENT._replace(modes=(Resonance(780.0, 0.02),), lags=(1e-3,))
+    found = parts()["sensed_mode"].recipe(extent).system
+    values = (found.frequency, found.damping, found.time_constant)
+    assert tuple(map(float, values)) == (780.0, 0.02, 1e-3)
+
+
+def test_an_arma_starts_as_the_resonance_of_the_record():
+    recipe = ARMA.recipe(EXTENT._replace(modes=(Resonance(780.0, 0.02),)))
+    (start,) = recipe.alternatives
+    start = start | {"moving.2": 0.0}
+    np.testing.assert_allclose(
+        response(replace(recipe.system, start), INPUT),
+        response(Mode(780.0, 0.02, DT), INPUT),
+        atol=1e-9,
+    )

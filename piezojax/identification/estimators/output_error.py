@@ -44,6 +44,9 @@ ends. A point with a parameter that tends to its bound does not converge by itse
 FAILED_LOSS = 1e11
 """Mean square from which on a simulation counts as not finite."""
 
+INSIDE = 1e-6
+"""Least distance of a repeated start from the faces of the unit box."""
+
 UNDETERMINED = 1e-12
 """Relative singular value of the Jacobian below which a direction is undetermined."""
 
@@ -70,7 +73,9 @@ class Problem(eqx.Module):
     """Fit of one System to several records, padded to one length with zero weights.
 
     ``which`` [records, n] holds the indices of each record's parameters among the
-    unknowns. All records share them, except for the initial conditions of each.
+    unknowns. All records share them, except for the initial conditions of each. The
+    errors behind the filter ``whitening``, if it has coefficients, count ``share``
+    times.
     """
 
     system: System
@@ -79,6 +84,8 @@ class Problem(eqx.Module):
     inputs: Float[Array, "records samples"]
     outputs: Float[Array, "records samples"]
     weights: Float[Array, "records samples"]
+    whitening: Float[Array, " taps"]
+    share: Float[Array, ""]
 
     def simulated(self, unknown: Float[Array, " unknowns"]) -> Float[Array, "..."]:
         """Return the free run of every record, [records, samples]."""
@@ -93,7 +100,29 @@ class Problem(eqx.Module):
         error = self.simulated(unknown) - self.outputs
         # A start that diverges must not affect the others of its batch.
         error = jnp.where(jnp.isfinite(error), jnp.clip(error, -1e6, 1e6), 1e6)
-        return (self.weights * error).ravel()
+        counted = [self.weights * error]
+        if self.whitening.size:
+            counted.append(self.share * self.weights * self.whitened(error))
+        return jnp.concatenate(counted, axis=None)
+
+    def whitened(
+        self, error: Float[Array, "records samples"]
+    ) -> Float[Array, "records samples"]:
+        """Return the errors behind the filter ``whitening``."""
+        padded = jnp.pad(error, ((0, 0), (self.whitening.size - 1, 0)))
+        samples = error.shape[1]
+        return sum(
+            tap * padded[:, padded.shape[1] - samples - i : padded.shape[1] - i]
+            for i, tap in enumerate(self.whitening)
+        )
+
+    def balanced(self, unknown: Float[Array, " unknowns"]) -> "Problem":
+        """Return the problem in which both kinds of errors at ``unknown`` weigh the
+        same."""
+        error = self.simulated(unknown) - self.outputs
+        plain = jnp.linalg.norm(self.weights * error)
+        white = jnp.linalg.norm(self.weights * self.whitened(error))
+        return eqx.tree_at(lambda problem: problem.share, self, plain / white)
 
 
 def free_run(
@@ -145,6 +174,8 @@ def problem_of(
         as_array(inputs),
         as_array(outputs),
         as_array(weights),
+        as_array(structure.whitening),
+        as_array(0.0),
     )
     return problem, tuple(names)
 
@@ -167,8 +198,29 @@ def output_error(
     progress = progress or Silent()
     problem, names = problem_of(structure, records, train)
     starts = _starts_for_records(structure, problem)
-    width = min(PARALLEL_STARTS, len(starts))
     progress.stage(f"compiling the fit of {len(names)} parameters")
+    units, losses, finished = _descended(problem, starts, steps, progress)
+    if structure.whitening:
+        # Errors of the hysteresis may have hidden a resonance from the first fit.
+        problem = _balanced(problem, as_array(units[0]))
+        dynamics = [names.index(path) for path in structure.dynamics]
+        again = units.copy()
+        again[:, dynamics] = starts[0, dynamics]
+        starts = np.concatenate([again, units])[: len(units) + 1]
+        starts = np.clip(starts, INSIDE, 1.0 - INSIDE)
+        units, losses, finished = _descended(problem, starts, steps, progress)
+    values, deviations = _with_errors(problem, as_array(units[0]), losses[0])
+    return Optimum(problem, names, units, losses, values, deviations, finished)
+
+
+def _descended(
+    problem: Problem, starts: np.ndarray, steps: int, progress: Progress
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return the best points, their losses, and whether the best ended by itself.
+
+    Raises ValueError when no start leads to a finite simulation.
+    """
+    width = min(PARALLEL_STARTS, len(starts))
     evaluate = trials_with_models(lambda free: _normal_equations(problem, free), width)
     descents = [
         Descent(start, TRUST_REGION, tolerance=TOLERANCE)
@@ -189,8 +241,12 @@ def output_error(
     units = np.asarray(squash(as_array(standing.units[order])))
     if losses[0] >= FAILED_LOSS:
         raise ValueError("no start led to a finite simulation of the record")
-    values, deviations = _with_errors(problem, as_array(units[0]), losses[0])
-    return Optimum(problem, names, units, losses, values, deviations, finished)
+    return units, losses, finished
+
+
+@eqx.filter_jit
+def _balanced(problem: Problem, unknown: Array) -> Problem:
+    return problem.balanced(unknown)
 
 
 def _starts_for_records(structure: Structure, problem: Problem) -> np.ndarray:
@@ -236,7 +292,8 @@ def _with_errors(
     """
     values, slopes, jacobian = map(np.asarray, _sensitivity(problem, unit))
     jacobian = jacobian / np.where(slopes == 0.0, 1.0, slopes)
-    counted = int(np.sum(np.asarray(problem.weights) > 0))
+    kinds = 2 if problem.whitening.size else 1
+    counted = kinds * int(np.sum(np.asarray(problem.weights) > 0))
     return values, standard_errors(jacobian, loss / max(counted - unit.size, 1))
 
 
