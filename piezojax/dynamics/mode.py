@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 
 from ..core.arrays import Scalar, ScalarLike, as_array
 from ..core.parameter import parameter, sample_time
-from ..core.recipe import Extent, Fittable, Part, Recipe, Resonance
+from ..core.paths import get
+from ..core.recipe import Extent, Fittable, Part, Recipe, Resonance, scaled_range
 from ..core.space import Range
 from ..core.system import Designed, System
 from .lag import FirstOrderLag, LinearOscillator, SecondOrderLag
@@ -17,6 +18,13 @@ from .lag import FirstOrderLag, LinearOscillator, SecondOrderLag
 GUESSES = (Resonance(0.05, 0.1), Resonance(0.2, 0.1))
 """Starting values for a record in which no resonance was found; frequencies in cycles
 per sample."""
+
+NEAR, NEAR_DAMPED, FADED = 0.002, 0.05, 0.1
+"""Largest relative change by a fit of a frequency that the record shows, the same as a
+multiple of its damping, and that of the damping."""
+
+LAG_SHARES = (0.5, 1.2)
+"""Bounds of the time constant of a sensor, as shares of the lag in the record."""
 
 
 class Mode(Designed, Fittable):
@@ -91,8 +99,8 @@ class SensedMode(Designed, Fittable):
         lag = FirstOrderLag.recipe(extent)
         starts = _starts(extent)
         return Recipe(
-            cls(*starts[0], lag.system.time_constant, extent.dt),
-            {**_bounds(extent), **lag.bounds},
+            cls(*starts[0], get(lag.system, "time_constant"), extent.dt),
+            {**_bounds(extent), **lag.bounds, **_sensor_bounds(extent)},
             [resonance._asdict() for resonance in starts],
         )
 
@@ -131,12 +139,34 @@ def _rest(input: Scalar) -> Float[Array, " 3"]:
 
 
 def _starts(extent: Extent) -> list[Resonance]:
-    """Return the resonances of the record, or guesses if it shows none."""
+    """Return the strongest resonance of the record, or guesses if it shows none."""
     guesses = [Resonance(cycles / extent.dt, damping) for cycles, damping in GUESSES]
-    return list(extent.modes) or guesses
+    return list(extent.modes[:1]) or guesses
+
+
+def _sensor_bounds(extent: Extent) -> dict[str, Range]:
+    """Return the bounds near the lag of the record, none if it shows no lag.
+
+    Hysteresis and creep make the lag that a record shows longer, rarely shorter.
+    """
+    if not (extent.modes and extent.lags):
+        return {}
+    return {"time_constant": scaled_range(extent.lags[0], *LAG_SHARES)}
 
 
 def _bounds(extent: Extent) -> dict[str, Range]:
+    """Return the bounds, close to the resonance if the record shows one.
+
+    Its values come from the errors at all frequencies. In a fit of a free run the
+    errors of the hysteresis, which are much larger, would pull it away.
+    """
+    if extent.modes:
+        frequency, damping = extent.modes[0]
+        off = max(NEAR, NEAR_DAMPED * damping)
+        return {
+            "frequency": scaled_range(frequency, 1.0 - off, 1.0 + off),
+            "damping": scaled_range(damping, 1.0 - FADED, 1.0 + FADED),
+        }
     return {
         "frequency": Range(0.5 / extent.duration, 0.499 / extent.dt, "log"),
         "damping": Range(1e-4, 2.0, "log"),

@@ -53,7 +53,7 @@ def test_the_named_stage_is_fitted_by_default():
     for name, truth, most in (
         ("frequency", case.frequency, FREQUENCY),
         ("damping", case.damping, DAMPING),
-        ("time_constant", case.lag, 0.5),
+        ("time_constant", case.lag, 0.3),
     ):
         parameter = found[f"dynamics.{name}"]
         assert parameter.value == pytest.approx(truth, rel=most)

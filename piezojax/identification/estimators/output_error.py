@@ -110,11 +110,10 @@ class Problem(eqx.Module):
     ) -> Float[Array, "records samples"]:
         """Return the errors behind the filter ``whitening``."""
         padded = jnp.pad(error, ((0, 0), (self.whitening.size - 1, 0)))
-        samples = error.shape[1]
-        return sum(
-            tap * padded[:, padded.shape[1] - samples - i : padded.shape[1] - i]
-            for i, tap in enumerate(self.whitening)
-        )
+        white, last = jnp.zeros_like(error), padded.shape[1]
+        for i, tap in enumerate(self.whitening):
+            white = white + tap * padded[:, last - error.shape[1] - i : last - i]
+        return white
 
     def balanced(self, unknown: Float[Array, " unknowns"]) -> "Problem":
         """Return the problem in which both kinds of errors at ``unknown`` weigh the

@@ -154,4 +154,4 @@ def _with_noise(
 def _filtered(numerator, denominator, signal: np.ndarray) -> np.ndarray:
     import scipy.signal  # takes long to import
 
-    return scipy.signal.lfilter(numerator, denominator, signal)
+    return np.asarray(scipy.signal.lfilter(numerator, denominator, signal))

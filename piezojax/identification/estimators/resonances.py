@@ -131,8 +131,8 @@ def _play_outputs(x: np.ndarray) -> np.ndarray:
 def _above_slowest(signal: np.ndarray) -> np.ndarray:
     import scipy.signal  # takes long to import
 
-    numerator, denominator = scipy.signal.butter(2, 2.0 * SLOWEST, "high")
-    return scipy.signal.lfilter(numerator, denominator, signal - signal[0])
+    sections = scipy.signal.butter(2, 2.0 * SLOWEST, "high", output="sos")
+    return np.asarray(scipy.signal.sosfilt(sections, signal - signal[0]))
 
 
 class _Signals(NamedTuple):
@@ -182,7 +182,7 @@ class _Hammerstein(NamedTuple):
         error of the hysteresis.
         """
         poles, zeros = self.dynamics.poles(), np.roots(self.dynamics.numerator)
-        real = np.real(poles[(np.abs(poles.imag) < 1e-9) & (poles.real > 0.0)])
+        real = np.real(poles[(np.abs(np.imag(poles)) < 1e-9) & (np.real(poles) > 0.0)])
         return tuple(
             float(-dt / np.log(pole))
             for pole in sorted(real, reverse=True)
@@ -234,25 +234,22 @@ def _fitted(
     signals: _Signals, modes: int, lags: int, delay: int = 1
 ) -> _Hammerstein | None:
     """Return the model of this order, or None if the record does not determine it."""
+    poles = 2 * modes + lags
+    orders = (poles, max(1, poles), delay)
+    model: _Hammerstein | None = None
     weights = np.eye(len(THRESHOLDS))[0]
-    poles, dynamics = 2 * modes + lags, None
     for _ in range(ROUNDS):
+        start = None if model is None else model.dynamics
+        x = weights @ signals.plays
         try:
-            dynamics = refined_instrumental_variables(
-                weights @ signals.plays,
-                signals.output,
-                poles,
-                max(1, poles),
-                delay,
-                dynamics,
-            )
+            found = refined_instrumental_variables(x, signals.output, *orders, start)
         except (ValueError, np.linalg.LinAlgError):
             return None
-        last = weights
-        columns = [dynamics.whitened(dynamics.applied(play)) for play in signals.plays]
-        output = dynamics.whitened(signals.output)
+        model = _Hammerstein(signals, weights, found)
+        columns = [found.whitened(found.applied(play)) for play in signals.plays]
+        output = found.whitened(signals.output)
         weights = np.linalg.lstsq(np.stack(columns, 1), output, rcond=None)[0]
-    return _Hammerstein(signals, last, dynamics)
+    return model
 
 
 def _cost(model: _Hammerstein | None) -> float:
