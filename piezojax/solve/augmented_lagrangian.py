@@ -21,7 +21,7 @@ GROWTH = 3.0
 """Factor of the penalty from one round to the next."""
 
 
-def augmented(
+def penalty_terms(
     violation: Float[Array, " constraints"],
     multipliers: Float[Array, " constraints"],
     penalty: Array,
@@ -34,7 +34,7 @@ def augmented(
     return jnp.sqrt(0.5 * penalty) * jnp.maximum(shifted, 0.0)
 
 
-def updated(
+def update_multipliers(
     violation: Float[Array, "*starts constraints"],
     multipliers: Float[Array, "*starts constraints"],
     penalty: Array,

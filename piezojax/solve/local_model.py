@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 EDGE = 1e-9
 """Distance from a bound, as a share of the unit box, that counts as on it."""
 
-MOST = 0.5
+LARGEST_CORRECTION = 0.5
 """Largest accepted correction as a share of its step."""
 
 FLOOR = 1e-14
@@ -86,7 +86,7 @@ class LocalModel(NamedTuple):
         force = -(self.jacobian @ (residuals * self.weights) + damping * step)
         change = np.zeros_like(step)
         change[free] = self._solution(force, damping, free)
-        if np.linalg.norm(change) > MOST * np.linalg.norm(step):
+        if np.linalg.norm(change) > LARGEST_CORRECTION * np.linalg.norm(step):
             return step
         return np.clip(end + change, lower, upper) - self.point
 

@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from ..core.arrays import as_array
 from ..core.progress import Progress
-from .augmented_lagrangian import rounds, updated
+from .augmented_lagrangian import rounds, update_multipliers
 from .optimisers import View
 from .problem import Problem, Verdict
 from .search_state import SearchState
@@ -235,7 +235,7 @@ def minimise(
             best = np.argsort(standing.losses, kind="stable")[: strategy.finalists]
             units, best = standing.units[best], standing.places[best]
             places = places[best]
-            multipliers = updated(
+            multipliers = update_multipliers(
                 strategy.violations(problem, units),
                 multipliers[best],
                 as_array(penalty),

@@ -49,7 +49,7 @@ class Carry(NamedTuple):
     done: Array
 
 
-def settled(carry: Carry) -> Carry:
+def strongly_typed(carry: Carry) -> Carry:
     """Return ``carry`` with strongly typed leaves."""
     # Weakly typed leaves would cause a second compilation of the step.
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), carry)
@@ -58,7 +58,7 @@ def settled(carry: Carry) -> Carry:
 def frozen_when_done(old: Carry, new: Carry) -> Carry:
     """Return ``new``, or ``old`` if that start had already finished."""
     kept = jax.tree.map(lambda o, n: jnp.where(old.done, o, n), old, new)
-    return settled(kept)
+    return strongly_typed(kept)
 
 
 def _optimistix(
@@ -84,7 +84,9 @@ def _optimistix(
     def start(unit):
         free = unsquash(unit)
         arrays = eqx.filter(initial(free), eqx.is_array)
-        return settled(Carry(free, arrays, as_array(jnp.inf), jnp.asarray(False)))
+        return strongly_typed(
+            Carry(free, arrays, as_array(jnp.inf), jnp.asarray(False))
+        )
 
     def step(carry):
         state = eqx.combine(carry.state, fixed(carry.point))
@@ -149,7 +151,7 @@ def lbfgsb(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
 
     def start(unit):
         state: Any = solver.init_state(unit, bounds(unit))
-        return settled(Carry(unit, state, state.value, jnp.asarray(False)))
+        return strongly_typed(Carry(unit, state, state.value, jnp.asarray(False)))
 
     def step(carry):
         point, state = solver.update(carry.point, carry.state, bounds(carry.point))

@@ -14,7 +14,7 @@ from .problem import FAILED_LOSS, Errors
 SAMPLES = 20_000
 """Number of errors, over all runs, from which the curvature is computed."""
 
-SHORTEST = 5
+LEAST_SPACING = 5
 """Least distance between two of these errors, in samples."""
 
 _ADDED = np.sqrt(2.0)  # the squares of the Lagrangian count fully, not half
@@ -82,8 +82,8 @@ def trials_of(points: Errors) -> Trials:
 
 def spacing(runs: int, counted: int) -> int:
     """Return the distance of the sampled errors, a prime number against aliasing."""
-    most = max(2, counted // SHORTEST)
-    wanted = min(max(SHORTEST, -(-runs * counted // SAMPLES)), most)
+    most = max(2, counted // LEAST_SPACING)
+    wanted = min(max(LEAST_SPACING, -(-runs * counted // SAMPLES)), most)
     return next(
         n for n in range(wanted, 2 * wanted + 1) if all(n % d for d in range(2, n))
     )

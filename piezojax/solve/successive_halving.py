@@ -51,7 +51,7 @@ def in_threads(function: Callable[[np.ndarray], R]) -> Callable[[np.ndarray], li
 
 
 class SuccessiveHalving:
-    """Gauss-Newton descents on the errors of ``problem``, halved in number in turn.
+    """Gauss-Newton descents on ``problem``; every few steps the worse half is dropped.
 
     The curvature is computed from one of ``every`` errors. A descent ends when it gains
     less than ``tolerance`` in PATIENCE steps. ``size`` is the number of unknowns. After

@@ -18,7 +18,7 @@ from ..core.feedback import Feedback
 from ..core.metrics import Extremes, TrackingFigures
 from ..core.rollout import in_blocks
 from ..core.space import Space
-from ..solve.augmented_lagrangian import PENALTY, augmented
+from ..solve.augmented_lagrangian import PENALTY, penalty_terms
 from ..solve.problem import FAILED_LOSS, Errors, Verdict
 from ..study import Stage
 from .runs import Signals, sampled
@@ -204,7 +204,7 @@ class Objective(eqx.Module):
         multipliers = self.multipliers
         if multipliers.size == 0:
             multipliers = jnp.zeros_like(violation)
-        return augmented(violation, multipliers, self.penalty)
+        return penalty_terms(violation, multipliers, self.penalty)
 
     def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
         """Return the loss; ``FAILED_LOSS`` where the loop diverges or rails."""

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax.analysis.stability.differentiable import UNREACHED
+from piezojax.analysis.stability.differentiable import UNLIMITED_DELAY
 from piezojax.analysis.stability.model_error import (
     NEAR_ONE,
     worst_delay_margin,
@@ -72,7 +72,7 @@ def test_worst_delay_margin_is_the_first_delay_that_can_be_unstable(line):
     delays = np.linspace(0.0, around, 241)
     # The grid of D misses a zero by its step times |L|.
     zero = closest(line, bound, delays) < 0.03 * bound * abs(L[line])
-    if found == UNREACHED:
+    if found == UNLIMITED_DELAY:
         assert not zero.any()
     else:
         assert delays[np.argmax(zero)] == pytest.approx(found, abs=0.03 * around)
@@ -81,21 +81,21 @@ def test_worst_delay_margin_is_the_first_delay_that_can_be_unstable(line):
 
 def test_all_three_outcomes_of_a_delay_are_tried():
     found = np.asarray(worst_delay_margin(*map(jnp.asarray, (S, BOUND, ANGLE))))[::4]
-    assert (found == UNREACHED).any()
+    assert (found == UNLIMITED_DELAY).any()
     assert (found == 0.0).any()
-    assert ((found > 0.0) & (found < UNREACHED)).any()
+    assert ((found > 0.0) & (found < UNLIMITED_DELAY)).any()
 
 
 def test_a_delay_reaches_the_point_exactly():
     found = np.asarray(worst_delay_margin(*map(jnp.asarray, (S, BOUND, ANGLE))))
-    finite = (found > 0.0) & (found < UNREACHED)
+    finite = (found > 0.0) & (found < UNLIMITED_DELAY)
     point = -1.0 / L[finite] * np.exp(1j * ANGLE[finite] * found[finite])
     np.testing.assert_allclose(np.abs(point - 1.0), BOUND[finite], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("sensitivity", "bound", "expected"),
-    [(0.0, 0.5, UNREACHED), (0.0, 1.5, 0.0), (1.0, 25.0, UNREACHED)],
+    [(0.0, 0.5, UNLIMITED_DELAY), (0.0, 1.5, 0.0), (1.0, 25.0, UNLIMITED_DELAY)],
 )
 def test_loops_of_infinite_gain_and_of_none(sensitivity, bound, expected):
     arguments = (jnp.asarray([sensitivity + 0j]), jnp.asarray([bound]))
@@ -110,7 +110,7 @@ def test_slopes_are_those_of_finite_differences(figure):
         if figure == "sensitivity":
             return jnp.log(worst_sensitivity(loop, jnp.asarray(BOUND)))
         delay = worst_delay_margin(loop, jnp.asarray(BOUND), jnp.asarray(ANGLE))
-        return jnp.where(delay < UNREACHED, delay, 0.0)
+        return jnp.where(delay < UNLIMITED_DELAY, delay, 0.0)
 
     slope = np.asarray(jax.jacfwd(value)(1.0))
     ends = (value(1.0 + 1e-6) - value(1.0 - 1e-6)) / 2e-6

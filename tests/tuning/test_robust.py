@@ -17,7 +17,7 @@ from piezojax.catalog import p753, p753_stage
 from piezojax.core.metrics import TrackingFigures
 from piezojax.core.paths import replace
 from piezojax.core.system import rest_output
-from piezojax.solve.augmented_lagrangian import augmented, updated
+from piezojax.solve.augmented_lagrangian import penalty_terms, update_multipliers
 from piezojax.study import Stage, load, read
 from piezojax.tuning.data import make_data
 from piezojax.tuning.objective import Objective
@@ -112,7 +112,7 @@ def test_multipliers_of_a_known_problem():
     """Minimise (x-3)^2 with ln x <= ln 2: x = 2, multiplier -df/dx / dg/dx = 4."""
 
     def total(x, multipliers, penalty):
-        added = augmented(jnp.log(x / 2.0)[None], multipliers, penalty)
+        added = penalty_terms(jnp.log(x / 2.0)[None], multipliers, penalty)
         return (x - 3.0) ** 2 + jnp.sum(added**2)
 
     @jax.jit
@@ -124,13 +124,13 @@ def test_multipliers_of_a_known_problem():
     for _ in range(30):
         for _ in range(10):
             x = newton(x, multipliers)
-        multipliers = updated(jnp.log(x / 2.0)[None], multipliers, penalty)
+        multipliers = update_multipliers(jnp.log(x / 2.0)[None], multipliers, penalty)
     assert x == pytest.approx(2.0, abs=1e-6)
     assert multipliers[0] == pytest.approx(4.0, rel=1e-4)
 
 
 def test_what_is_kept_costs_nothing():
-    added = augmented(jnp.array([-0.1, 0.2]), jnp.zeros(2), jnp.asarray(8.0))
+    added = penalty_terms(jnp.array([-0.1, 0.2]), jnp.zeros(2), jnp.asarray(8.0))
     np.testing.assert_allclose(added, [0.0, 2.0 * 0.2])
 
 

@@ -30,11 +30,12 @@ class LimitComparison:
     """Comparison of a loop with the limit on one reference; RMS figures in um.
 
     ``tuned`` is the error of the loop. ``limit`` is the least error of a linear
-    controller designed for this reference, ``one_controller`` the error here of the one
-    controller with the least geometric mean over all references. ``disturbance`` is the
-    whole of d, ``unpredicted`` the part that the reference does not predict. The
-    spectrum of that part lies above the noise's up to ``bandwidth`` (Hz).
-    ``tuned_shares`` is None where the loop is too nonlinear for shares of its error.
+    controller designed for this reference, ``one_controller`` the error on this
+    reference of the one controller with the least geometric mean over all references.
+    ``disturbance`` is the whole of d, ``unpredicted`` the part that the reference does
+    not predict. The spectrum of that part lies above the noise's up to ``bandwidth``
+    (Hz). ``tuned_shares`` is None if the loop is so nonlinear that its error has no
+    shares.
     """
 
     tuned: float

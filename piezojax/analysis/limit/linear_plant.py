@@ -89,7 +89,7 @@ class LinearPlant(System):
 def linear_plant(loop: Feedback, reference: ScalarLike, dt: float) -> LinearPlant:
     """Return the plant of ``loop`` linearised at rest at ``reference`` (um).
 
-    Conserved modes, such as the position of a hysteresis on its branch, are removed;
+    Conserved modes, such as the position of a hysteresis on its branch, are removed.
     ``dt`` in s. Raises ValueError for several axes, derivatives that are not finite,
     and a plant that is not stable.
     """
@@ -127,8 +127,8 @@ def plant_response(
 ) -> np.ndarray:
     """Return the response (um) of ``plant`` to ``voltage`` (V), both [runs, samples].
 
-    The plant starts at rest at 0 um under the voltages ``rest`` [runs]; sample k + 1
-    answers voltage k.
+    The plant starts at rest at 0 um under the voltages ``rest`` [runs]; sample k + 1 is
+    the response to voltage k.
     """
 
     moved = np.asarray(_answers(plant, voltage, rest))
@@ -147,7 +147,7 @@ def _answers(plant: LinearPlant, voltage: jax.Array, rest: jax.Array) -> jax.Arr
 def gain_from_noise(
     response: np.ndarray, displacement: np.ndarray, noise: np.ndarray
 ) -> float:
-    """Return the gain with which the stage answers voltage caused by sensor noise.
+    """Return the gain of the stage for voltage caused by sensor noise.
 
     All arguments are transforms [..., lines]. ``response`` is that of a plant of gain 1
     to the voltage and ``displacement`` that of the stage, both without the part that
@@ -156,9 +156,9 @@ def gain_from_noise(
     The gain is an instrumental-variable estimate with the noise as instrument: the
     residual displacement is then uncorrelated with the noise, as a disturbance must be.
     Lines are weighted by 1 / (power of the residual), updated in rounds. A hysteresis
-    answers small fast motions less than large slow ones. The reference predicts the
-    large ones, and feedback acts on the small ones. Raises ValueError if there is no
-    positive gain.
+    responds less to small fast motions than to large slow ones. The reference predicts
+    the large ones, and feedback acts on the small ones. Raises ValueError if there is
+    no positive gain.
     """
     runs = tuple(range(response.ndim - 1))
     driven = np.mean(response * np.conj(noise), axis=runs)

@@ -1,8 +1,8 @@
 """Limit of linear control for a loop and its references.
 
-The plant P is the linearised stage (``linear_plant``). Its gain is that with which the
-stage responds to voltage caused by sensor noise in the loop's own runs
-(``gain_from_noise``). The disturbance is the residual of the plant in those runs, d = y
+The plant P is the linearised stage (``linear_plant``). Its gain is that of the stage
+for voltage caused by sensor noise in the loop's own runs (``gain_from_noise``). The
+disturbance is the residual of the plant in those runs, d = y
 - P u: the effect of hysteresis, creep, drift and the study's own disturbance. It is
 taken from the assessed runs with their noise, because noise that reaches the voltage
 changes the state of a hysteresis: a run without noise has another disturbance. So does
@@ -15,9 +15,9 @@ leave: for each reference with a controller designed for it, and for all referen
 the one controller of least geometric mean. The first is the limit. The second is not a
 lower bound for one reference, but a fair comparison for a loop with one set of gains.
 
-The limit leaves out a price on voltage, the limits of the actuator, and plants other
-than this one. A nonlinear controller, or one that uses the period of the reference, may
-do better.
+The limit ignores the cost of voltage, the limits of the actuator, and plants other than
+this one. A nonlinear controller, or one that uses the period of the reference, may do
+better.
 """
 
 from typing import Any

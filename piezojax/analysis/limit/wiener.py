@@ -1,7 +1,7 @@
 """Least error of linear feedback under a disturbance and measurement noise.
 
-A stable plant P answers the voltage u with a displacement. A disturbance d of spectrum
-S is added to it, and the sum is measured with white noise of variance s^2:
+A stable plant P responds to the voltage u with a displacement. A disturbance d of
+spectrum S is added to it, and the sum is measured with white noise of variance s^2:
 
     y = P u + d,    z = y + n.
 
@@ -18,13 +18,14 @@ Write S + s^2 = |V|^2 with V and 1/V stable and causal, P = P_i P_o with |P_i| =
 delay and the zeros outside the circle) and P_o free of both. The minimum over Q
 (Wiener-Hopf; cheap-control LQG has the same) is reached by
 
-    T = P_i [conj(P_i) S / conj(V)]_causal / V,
+    T = P_i [conj(P_i) S / conj(V)]_causal / V.
 
-It is the sum of two terms: the error of the smoother, which uses past and future, mean
-of S s^2 / (S + s^2), and the mean square of the part that is not causal, the price of
-delay and zeros. For s = 0 it is that of minimum-variance control (Astrom, Introduction
-to Stochastic Control Theory, 1970, chapter 6), with which Harris' index compares loops
-(Can. J. Chem. Eng. 67 (1989) 856-861).
+The minimum is the sum of two terms. The first is the error of the smoother, which uses
+past and future: the mean of S s^2 / (S + s^2). The second is the mean square of the
+part that is not causal, the price of delay and zeros. For s = 0 the minimum is that of
+minimum-variance control (Astrom, Introduction to Stochastic Control Theory, 1970,
+chapter 6), with which Harris' index compares loops (Can. J. Chem. Eng. 67 (1989)
+856-861).
 
 All functions work on a grid of N points around the unit circle, z = exp(2 pi i k / N),
 N even, where multiplying by 1/z delays by a sample. V comes from the cepstrum. No model

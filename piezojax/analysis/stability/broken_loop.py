@@ -97,12 +97,13 @@ def broken_loop(loop: Feedback, at: Any = 0.0) -> BrokenLoop:
 
     ``at`` is an ``OperatingPoint``, or the reference (um) at which the loop rests. At
     rest the plant is on the virgin loading curve of its hysteresis. There the local
-    gain depends on the direction in which the voltage moves next. The point's
-    ``branch`` names it: "ascending" on, "descending" back. A push of about 1e-12 V
-    takes all kinks on the same side, those of an inverse hysteresis in the controller
-    too. For a Coleman-Hodgdon model at (x, y) the two slopes are b + h and b - h,
-    h = a x + c y. Their mean is b, and far along a branch b + h tends to -a/c, the
-    slope of the loop's axis. For a plant without kinks both branches are the same.
+    gain depends on the direction in which the voltage moves next. The ``branch`` of the
+    point selects it: "ascending" continues along the curve, "descending" turns back. A
+    push of about 1e-12 V selects the same side of all kinks, including those of an
+    inverse hysteresis in the controller. For a Coleman-Hodgdon model at (x, y) the two
+    slopes are b + h and b - h, h = a x + c y. Their mean is b, and far along a branch b
+    + h tends to -a/c, the slope of the loop's axis. For a plant without kinks both
+    branches are the same.
 
     Limits of the voltage (Saturation) are removed from the actuator, because margins
     hold for small motions. Slew limits and converters have their slope at rest, 1. A
@@ -156,7 +157,7 @@ def open_loop(loop: Feedback, at: Any = 0.0) -> StateSpace:
     """Return L of ``loop`` cut at the plant's input.
 
     L has one input and one output for each axis. The closed loop is ``A - B C``, since
-    D = 0: a plant answers one sample later. ``at`` as for ``broken_loop``; usable
+    D = 0: a plant responds one sample later. ``at`` as for ``broken_loop``; usable
     inside ``jax.jit``. Raises ValueError as ``loop_sample_time`` and ``linearise``.
     """
     point = OperatingPoint.at(at)

@@ -33,7 +33,7 @@ DURATION = 0.2
 """Length of the impulse response, s, if that is ``LEAST`` samples. Slower modes are
 truncated, and lines of the spectrum lie 1 / DURATION apart."""
 
-UNREACHED = 1e6
+UNLIMITED_DELAY = 1e6
 """Delay margin (samples) of a loop that no delay makes unstable: large, but finite so
 that its logarithm is."""
 
@@ -229,7 +229,7 @@ def _product(left: Array, right: Array) -> Array:
 
 
 def delay_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
-    """Return the delay margin in samples, ``UNREACHED`` if |L| never crosses 1.
+    """Return the delay margin in samples, ``UNLIMITED_DELAY`` if |L| never crosses 1.
 
     On several axes it is the smallest margin of one axis, with all others closed.
     """
@@ -249,4 +249,4 @@ def _delay_margin(sensitivity: Complex[Array, " lines"]) -> Float[Array, ""]:
     turn = jnp.mod(lag[1:] - lag[:-1] + jnp.pi, 2.0 * jnp.pi) - jnp.pi
     there = jnp.mod(lag[:-1] + share * turn, 2.0 * jnp.pi)
     place = angle[:-1] + share * (angle[1:] - angle[:-1])
-    return jnp.min(jnp.where(crosses, there / place, UNREACHED))
+    return jnp.min(jnp.where(crosses, there / place, UNLIMITED_DELAY))

@@ -252,7 +252,8 @@ def _gain_margins(
     places = roots(
         lambda x: np.imag(loop.response(x)), grid[:-1], np.imag(response)[:-1]
     )
-    # L is real at the Nyquist frequency and at 0; a pole can leave there too.
+    # L is real at the Nyquist frequency and at 0; a pole can leave the unit circle
+    # there too.
     places = np.append(places, np.pi)
     crossing = np.real(loop.response(places))
     if not loop.integrates():

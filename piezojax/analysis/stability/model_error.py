@@ -9,10 +9,10 @@ Postlethwaite, Multivariable Feedback Control, 2nd ed., 7.5).
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from .differentiable import UNREACHED
+from .differentiable import UNLIMITED_DELAY
 
 NEAR_ONE = 0.99
-"""``l |T|`` above which the worst sensitivity goes on along its tangent."""
+"""``l |T|`` above which the worst sensitivity continues along its tangent."""
 
 _SMALLEST = 1e-12
 
@@ -22,9 +22,9 @@ def worst_sensitivity(
 ) -> Float[Array, "*batch lines"]:
     """Return the largest ``|S|`` of a loop under a relative error of its plant.
 
-    ``|S| / (1 - l |T|)``, reached by some error. From ``l |T| = NEAR_ONE`` on it goes
-    on along the tangent of ``1 / (1 - x)``: the loop can be unstable there, and the
-    value grows, is finite and has a slope. Differentiable.
+    It is ``|S| / (1 - l |T|)``, which some error attains. From ``l |T| = NEAR_ONE`` it
+    continues along the tangent of ``1 / (1 - x)``: the loop can be unstable there, and
+    the value keeps growing, finite and with a slope. Differentiable.
     """
     share = bound * jnp.abs(1.0 - sensitivity)
     inside = 1.0 / (1.0 - jnp.minimum(share, NEAR_ONE))
@@ -44,11 +44,10 @@ def worst_delay_margin(
     """Return the smallest delay (samples) at which the loop can be unstable, by line.
 
     ``bound`` is the relative error of the plant, ``angle`` the frequency in rad/sample.
-    A delay of tau samples makes ``1 + L (1 + D) exp(-j w tau) = 0`` for an error
-    ``|D| <= l`` if ``rho exp(j (phi + w tau))`` lies within l of 1, where
-    ``rho exp(j phi) = -1/L``: if ``cos(phi + w tau) >= (rho^2 + 1 - l^2) / (2 rho)``.
-    The value is 0 where no delay is needed, and ``UNREACHED`` where none suffices.
-    Differentiable.
+    A delay of tau samples makes ``1 + L (1 + D) exp(-j w tau) = 0`` for an error ``|D|
+    <= l`` if ``rho exp(j (phi + w tau))`` lies within l of 1, where ``rho exp(j phi) =
+    -1/L``: if ``cos(phi + w tau) >= (rho^2 + 1 - l^2) / (2 rho)``. The value is 0 where
+    no delay is needed, and ``UNLIMITED_DELAY`` where none suffices. Differentiable.
     """
     complementary = 1.0 - sensitivity
     known = (jnp.abs(sensitivity) > _SMALLEST) & (jnp.abs(complementary) > _SMALLEST)
@@ -67,4 +66,4 @@ def worst_delay_margin(
     turn = jnp.mod(-half - start, 2.0 * jnp.pi)
     moving = (angle > 0.0) & known & (cosine < 1.0)
     delay = turn / jnp.where(moving, angle, 1.0)
-    return jnp.where(unstable, 0.0, jnp.where(moving, delay, UNREACHED))
+    return jnp.where(unstable, 0.0, jnp.where(moving, delay, UNLIMITED_DELAY))
