@@ -26,7 +26,7 @@ from .records.record import Record
 CREEP_SECONDS = 1.0
 """Shortest training part, in s, for which models with creep are tried.
 
-Creep goes with the logarithm of time from about 0.1 s on (Jung and Gweon 2000, Rev.
+Creep grows with the logarithm of time from about 0.1 s on (Jung and Gweon 2000, Rev.
 Sci. Instrum. 71(4)): a second covers one decade.
 """
 
@@ -79,8 +79,8 @@ def supported_parts(
         untried += [
             UntriedModel(
                 name,
-                f"the training part lasts {seconds:.3g} s; creep is looked for from "
-                f"{CREEP_SECONDS:g} s on",
+                f"the training part lasts {seconds:.3g} s; models with creep need at "
+                f"least {CREEP_SECONDS:g} s",
             )
             for name in creeps[:-1]
         ]
@@ -111,7 +111,7 @@ def excitation(records: Sequence[Record], train: slice) -> int:
 def _too_few(found: int, needed: int) -> str:
     return (
         f"{found} {'frequency' if found == 1 else 'frequencies'} in the training part "
-        f"can tell {2 * found} parameters of linear dynamics, and it has {needed}"
+        f"determine {2 * found} parameters of linear dynamics, and it has {needed}"
     )
 
 
@@ -268,7 +268,7 @@ def _objection_to_state_space(
             "several inputs at once need --period, or a record that drives each alone"
         )
     if len(records) > 1 and _not_single_channel(records) is None:
-        return "it takes each record for another input of the stage"
+        return "it treats each record as another input of the stage"
     found, needed = excitation(records, train), 2 * options.order
     return _too_few(found, needed) if 2 * found < needed else None
 
@@ -297,7 +297,7 @@ def _objection_to_single(records: Sequence[Record]) -> str | None:
 
 
 def _several_records(records: Sequence[Record]) -> str | None:
-    return f"{len(records)} records; it takes one" if len(records) > 1 else None
+    return f"{len(records)} records; the model takes one" if len(records) > 1 else None
 
 
 _OBJECTIONS = {

@@ -13,7 +13,7 @@ from .fit import Fit, check_compatible, identify, train_and_validation
 from .ranking import RULE, ModelRanking, RankedModel, RankingReport, file_name
 from .records.record import Record
 
-KEPT = 2
+CHAINS_KEPT = 2
 """Number of chains with a hysteresis that enter each further round."""
 
 
@@ -60,7 +60,9 @@ def identify_all(
     if done is not None:
         search.fitted = lambda: done(so_far())
     rounds = later_rounds(records, train)
-    total = len(first) + sum(len(later(_chains(first)[:KEPT])) for later in rounds)
+    total = len(first) + sum(
+        len(later(_chains(first)[:CHAINS_KEPT])) for later in rounds
+    )
     try:
         search.fit(first, total)
         for later in rounds:
@@ -73,7 +75,8 @@ def identify_all(
                 ]
             )
             search.fit(
-                [c for c in later(chains[:KEPT]) if c.model not in search.fits], total
+                [c for c in later(chains[:CHAINS_KEPT]) if c.model not in search.fits],
+                total,
             )
     except KeyboardInterrupt:
         if not search.fits:

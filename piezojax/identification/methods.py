@@ -71,9 +71,7 @@ def _by_output_error(
 def _optimum_warnings(optimum: Optimum, steps: int) -> list[str]:
     found = []
     if not optimum.finished:
-        found.append(
-            f"the fit was still getting better when its {steps} steps were used up"
-        )
+        found.append(f"the fit had not converged after its {steps} steps")
     equal = optimum.units[optimum.losses <= optimum.losses[0] * (1.0 + EQUAL_LOSS)]
     spread = np.ptp(equal, axis=0)
     for i, name in enumerate(optimum.names):
@@ -195,7 +193,7 @@ METHODS: dict[str, Method] = {
         _by_nonnegative_least_squares,
     ),
     "subspace": Method(
-        "Hankel-Toeplitz regression with a prior (MAP); a record an input channel",
+        "Hankel-Toeplitz regression with a prior (MAP); one record per input channel",
         ("state_space",),
         by_subspace,
     ),

@@ -14,10 +14,10 @@ FOLLOWS = 0.5
 """Least share of the output's power that the input explains."""
 
 CLEAR = 0.9
-"""Coherence from which on a line tells the phase."""
+"""Least coherence of a line whose phase is used."""
 
 AHEAD = 0.02
-"""Lead of the output (rad, weighted by power) from which on it runs ahead."""
+"""Least lead of the output (rad, mean weighted by power) that raises a warning."""
 
 GAIN = (1e-3, 100.0)
 """Usual gains of piezo stages, um/V."""

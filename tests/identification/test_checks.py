@@ -221,7 +221,7 @@ def test_a_sine_does_not_excite_dynamics(frequency, noise, hysteresis):
     drive[0] = 0.0
     text = "; ".join(warnings(record_of(drive), order=4, hysteresis=hysteresis))
     assert "input is not exciting enough: its 1 frequency in the training part" in text
-    assert "can tell 2 parameters of linear dynamics, and the model has 4" in text
+    assert "determine 2 parameters of linear dynamics, and the model has 4" in text
 
 
 @pytest.mark.parametrize("lines", [1, 2, 3, 5])
@@ -231,7 +231,7 @@ def test_each_frequency_tells_two_parameters(lines):
     record = record_of(drive)
     found = [t for t in warnings(record, order=2 * lines + 1) if "exciting" in t]
     assert len(found) == 1
-    assert f"can tell {2 * lines} parameters" in found[0]
+    assert f"determine {2 * lines} parameters" in found[0]
     # The autocorrelation matrix of order 2n + 1 of n sines is singular, that of 2n not.
     lagged = np.lib.stride_tricks.sliding_window_view(drive, 40 * lines + 1)[:, ::20]
     values = np.linalg.svd(lagged - drive.mean(), compute_uv=False)
@@ -242,7 +242,7 @@ def test_each_frequency_tells_two_parameters(lines):
 
 def test_one_frequency_says_little_of_hysteresis():
     text = "; ".join(warnings(record_of(SINE)))
-    assert "input has essentially one frequency: hysteresis and linear lag" in text
+    assert "input has essentially one frequency: only the shape of the loop" in text
     assert warnings(record_of(SINE), hysteresis=False) == []
 
 

@@ -234,7 +234,7 @@ def test_the_lag_of_the_shipped_record(shipped_fit):
 def test_every_hysteresis_is_warned_of_one_frequency(model):
     input = 50.0 - 50.0 * np.cos(0.05 * np.arange(400))
     fit = identify(record_of(input, 0.1 * input), model, options=Options(steps=1))
-    assert any("one frequency: hysteresis and" in w for w in fit.report.warnings)
+    assert any("one frequency: only the shape" in w for w in fit.report.warnings)
 
 
 # What is refused

@@ -156,9 +156,9 @@ def test_a_record_of_one_loop_supports_none():
     half = slice(0, 300)
     _, untried = whole_models([record], half, Options())
     reasons = {one.model: one.reason for one in untried}
-    assert "do not tell even the cells" in reasons["preisach"]
+    assert "do not distinguish even the cells" in reasons["preisach"]
     assert "of two Preisach triangles" in reasons["rate_dependent_preisach"]
-    with pytest.raises(ValueError, match="a Preisach triangle with 3 a side apart"):
+    with pytest.raises(ValueError, match="a Preisach triangle with 3 cells per side"):
         identify(record, "preisach", train=half)
 
 
@@ -166,7 +166,7 @@ def test_it_takes_one_record_of_one_input():
     record = Record(INPUT, 0.1 * INPUT, DT)
     both = np.stack([INPUT, INPUT[::-1]], axis=1)
     for records, reason in (
-        ([record, record], "2 records; it takes one"),
+        ([record, record], "2 records; the model takes one"),
         ([Record(both, both, DT)], "2 inputs and 2 outputs"),
     ):
         _, untried = whole_models(records, TRAIN, Options())

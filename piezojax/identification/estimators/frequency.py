@@ -137,7 +137,7 @@ def _check_alike(records: Sequence[Record], weights: Sequence[float]) -> None:
     channels = records[0].inputs.shape[1]
     if len(records) < channels:
         raise ValueError(
-            f"{len(records)} records for {channels} inputs; there must be as many"
+            f"{len(records)} records for {channels} inputs; there must be one for each"
         )
 
 
@@ -147,7 +147,7 @@ def _check_independent(power: np.ndarray, frequency: np.ndarray) -> None:
     if poor.size:
         raise ValueError(
             f"the inputs are not independent at {frequency[poor[0]]:g} Hz "
-            f"({poor.size} lines in all): a channel's own share cannot be told"
+            f"({poor.size} lines in all): the response to each cannot be separated"
         )
 
 

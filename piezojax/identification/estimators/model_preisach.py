@@ -33,17 +33,19 @@ PLAIN, RATE_DEPENDENT = "preisach", "rate_dependent_preisach"
 """The models' names; the second one has two densities, blended by the rate."""
 
 CELLS = range(3, 11)
-"""Allowed numbers of cells a side."""
+"""Allowed numbers of cells per side."""
 
 LEAST_EFFECT = 1e-3
-"""Least rms that the output changes by with weights moved by 1 um in all, shared out in
-whatever way shows least: below that, nanometres decide about tenths of a micrometre."""
+"""Least rms change of the output (um) for a change of the weights of norm 1 um, in the
+direction of least effect. Below it, nanometres of output would decide about tenths of a
+micrometre of weight."""
 
 TOO_FEW = {
-    PLAIN: "the turning points of the training part do not tell even the cells of a "
-    f"Preisach triangle with {CELLS[0]} a side apart",
-    RATE_DEPENDENT: "turning points and paces of the training part do not tell even "
-    f"the cells of two Preisach triangles with {CELLS[0]} a side apart",
+    PLAIN: "the turning points of the training part do not distinguish even the cells "
+    f"of a Preisach triangle with {CELLS[0]} cells per side",
+    RATE_DEPENDENT: "the turning points and rates of the training part do not "
+    "distinguish even the cells of two Preisach triangles with "
+    f"{CELLS[0]} cells per side",
 }
 """Reasons why a record supports no such model."""
 
@@ -54,16 +56,16 @@ LAG = 1.5
 """Start of the search for the lag, samples."""
 
 RATES = (0.1, 10.0)
-"""Bounds of the rate at which both densities count alike, over the input's own: how
-fast it moves in the root mean square."""
+"""Bounds of the rate at which both densities have equal shares, as multiples of the rms
+rate of the input."""
 
 FIRST_RATES = (0.3, 1.0, 3.0)
-"""The best of these is where the search for that rate begins, in the same way."""
+"""Candidate starting values of that rate, in the same unit."""
 
 STEP = 1e-4
-"""Share by which a lag or a rate is changed for the slope of the output by it."""
+"""Relative change of a lag or a rate in the finite differences of the output."""
 
-ENDED = 1e-5
+CONVERGED = 1e-5
 """Change of the logarithms at which the search ends, far below standard errors."""
 
 STEPS = 20
@@ -99,9 +101,9 @@ class PreisachFit(NamedTuple):
 
 
 def distinguishable_cells(record: Record, train: slice, model: str = PLAIN) -> int:
-    """Return the number of cells a side that the samples ``train`` determine, or 0.
+    """Return the number of cells per side that the samples ``train`` determine, or 0.
 
-    It holds for any of the histories STARTS before the record.
+    They determine the cells whichever of the histories STARTS came before the record.
     """
     seen = _delayed_input(record.until(train.stop))
     return next(
@@ -132,8 +134,8 @@ def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:
     """Return the Preisach model and lag whose free run fits ``record`` best.
 
     For each lag (and rate) the weights are those of ``fit_preisach`` (or
-    ``fit_rate_dependent_preisach``), so the search is over the lag (and rate) only. Of
-    both histories before the record, virgin and saturated, the better is taken. Raises
+    ``fit_rate_dependent_preisach``), so the search is over the lag (and rate) only. It
+    takes the better of both histories before the record, virgin and saturated. Raises
     ValueError as those functions do, and if the record determines too few cells.
     """
     cells = distinguishable_cells(record, train, model)
@@ -146,7 +148,7 @@ def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:
     start = min(STARTS, key=lambda start: ends[start].cost)
     logs, warnings = ends[start].x, _at_edges(unknowns, ends[start].x)
     if not ends[start].status:
-        warnings.append(f"lag and rate were still moving after {STEPS} steps")
+        warnings.append(f"lag and rate had not converged after {STEPS} steps")
     chain = problem.fitted(logs, start)
     searched = {u.name: float(v) for u, v in zip(unknowns, np.exp(logs), strict=True)}
     return PreisachFit(
@@ -158,7 +160,8 @@ def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:
 
 
 class _Problem(NamedTuple):
-    """A record up to the end of the part to fit, and with its input a sample later."""
+    """A record up to the end of the training part, and the same with its input
+    delayed."""
 
     seen: Record
     shifted: Record
@@ -190,7 +193,7 @@ class _Problem(NamedTuple):
         return self.errors(self.fitted(logs, start).system())
 
     def slopes(self, logs: np.ndarray, start: str) -> np.ndarray:
-        """Return the slopes of those errors, a column an unknown."""
+        """Return the slopes of those errors, one column per unknown."""
         here = self.reduced(logs, start)
         moved = [self.reduced(logs + s, start) for s in STEP * np.eye(logs.size)]
         return (np.column_stack(moved) - here[:, None]) / STEP
@@ -204,7 +207,7 @@ class _Problem(NamedTuple):
         firsts = map(np.log, itertools.product(*(u.firsts for u in unknowns)))
         bounds = np.log([[u.range.lower, u.range.upper] for u in unknowns]).T
         options = {"jac": self.slopes, "bounds": bounds, "args": (start,)}
-        ending = {"xtol": ENDED, "max_nfev": STEPS}
+        ending = {"xtol": CONVERGED, "max_nfev": STEPS}
         first = min(firsts, key=loss)
         return least_squares(self.reduced, first, **options, **ending)
 
@@ -274,7 +277,7 @@ def _at_edges(unknowns: list[SearchParameter], logs: np.ndarray) -> list[str]:
 
 
 def _rms_rate(record: Record) -> float:
-    """Return how fast the input moves in the root mean square, V/s."""
+    """Return the rms rate of the input, V/s."""
     return float(np.sqrt(np.mean(np.diff(record.input) ** 2))) / record.dt
 
 

@@ -42,7 +42,7 @@ STALLED = Patience(14, share=1e-6)
 ends. A point with a parameter that tends to its bound does not converge by itself."""
 
 FAILED_LOSS = 1e11
-"""Mean square from which on a simulation counts as not finite."""
+"""Least mean square of a simulation that counts as not finite."""
 
 INSIDE = 1e-6
 """Least distance of a repeated start from the faces of the unit box."""
@@ -190,9 +190,9 @@ def output_error(
     """Fit ``structure`` to ``records`` by the mean square of the free-run error.
 
     Levenberg-Marquardt with the forward Jacobian, from all starts of the structure;
-    after a few steps the best go on, to at most ``steps``. The error counts over the
-    samples ``train`` of each record; the model sees the input alone, from the first
-    sample on. Raises ValueError when no start leads to a finite simulation.
+    after a few steps only the best continue, to at most ``steps``. The error counts
+    over the samples ``train`` of each record; the model sees the input alone, from the
+    first sample on. Raises ValueError when no start leads to a finite simulation.
     """
     progress = progress or Silent()
     problem, names = problem_of(structure, records, train)
@@ -286,8 +286,8 @@ def _with_errors(
 ) -> tuple[np.ndarray, list[float | None]]:
     """Return values and Gauss-Newton standard errors, white residuals assumed.
 
-    The covariance is s^2 (J'J)^-1; a parameter in a direction that the record says
-    nothing about has no standard error.
+    The covariance is s^2 (J'J)^-1; a parameter in a direction that the record does not
+    determine has no standard error.
     """
     values, slopes, jacobian = map(np.asarray, _sensitivity(problem, unit))
     jacobian = jacobian / np.where(slopes == 0.0, 1.0, slopes)
@@ -299,7 +299,7 @@ def _with_errors(
 def standard_errors(jacobian: np.ndarray, variance: float) -> list[float | None]:
     """Return the square roots of the diagonal of ``variance`` (J'J)^-1.
 
-    None for a parameter in a direction that the ``jacobian`` says nothing about.
+    None for a parameter in a direction that the ``jacobian`` does not determine.
     """
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)

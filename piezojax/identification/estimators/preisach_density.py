@@ -31,7 +31,7 @@ def fit_preisach(
     smoothing: float = 0.0,
     start: str = "virgin",
 ) -> Preisach:
-    """Return the Preisach model, ``cells`` a side, that fits ``record`` best.
+    """Return the Preisach model, ``cells`` per side, that fits ``record`` best.
 
     For a given input the output (2.1) is linear in the weights. They are found by least
     squares over the samples ``train`` (all by default; a slice with a step takes only
@@ -42,9 +42,9 @@ def fit_preisach(
     ``"saturated"``.
 
     Cells that no turn of the input reaches are determined only by ``smoothing``. Its
-    square weighs the squared differences between neighbours against the mean squared
-    error; 0 stands for none. Weights on the diagonal give at least 1 % of the mean
-    slope of the record, so that the model has a continuous inverse.
+    square is the weight of the squared differences between neighbours relative to the
+    mean squared error; 0 stands for none. Weights on the diagonal give at least 1 % of
+    the mean slope of the record, so that the model has a continuous inverse.
 
     Raises ValueError for an empty ``train``, limits that do not hold the record's
     input, ``cells`` or ``smoothing`` out of range, or an output that falls while the
@@ -123,9 +123,7 @@ def _densities(
         )
     slope = float(np.cov(record.input, record.output)[0, 1] / np.var(record.input))
     if slope <= 0.0:
-        raise ValueError(
-            "the output falls while the input rises; give one with the other sign"
-        )
+        raise ValueError("the output falls while the input rises; reverse its sign")
     slow = _slow(shape)
     cells = slow.cells
     places = line_by_line(cells)
@@ -186,7 +184,7 @@ def responses(
     dynamics: ARMA | None,
     part: slice,
 ) -> np.ndarray:
-    """Return the output over ``part`` of 1 um in each cell, one column a cell.
+    """Return the output over ``part`` of 1 um in each cell, one column per cell.
 
     Cells ``line_by_line``, first those of the slow density, then of a fast one.
     """

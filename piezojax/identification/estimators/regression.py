@@ -236,8 +236,8 @@ def _solve(
     pivots = np.abs(np.diag(triangle))
     if not pivots.min() > 1e-14 * pivots.max():
         raise ValueError(
-            "the input does not tell the coefficients apart; "
-            "it must move at more frequencies or with fewer coefficients"
+            "the input does not determine the coefficients; "
+            "use more frequencies or fewer coefficients"
         )
     return np.linalg.lstsq(base.T @ (matrix / scale), base.T @ target)[0] / scale
 

@@ -28,8 +28,7 @@ class ResponseFit:
 
     ``singular_values``: those of the data, largest first; the order chosen should lie
     at a gap. ``costs``: the mean-square output error per step of the descent, the start
-    first. ``moved``: how many poles of the start had to be brought into the unit
-    circle.
+    first. ``moved``: number of poles of the start that were moved into the unit circle.
     """
 
     model: StateSpace
@@ -146,7 +145,7 @@ def _modes_of(model: StateSpace) -> _Modes:
     poles, vectors = map(np.asarray, np.linalg.eig(np.asarray(model.A)))
     left = np.asarray(model.C) @ vectors
     right = np.linalg.solve(vectors, np.asarray(model.B) + 0j)
-    # Both sides of a residue alike in size: the descent is then well scaled.
+    # Give both sides of a residue equal size, so that the descent is well scaled.
     scale = np.sqrt(np.linalg.norm(right, axis=1) / np.linalg.norm(left, axis=0))
     left, right = (left * scale).T, right / scale[:, None]
     size = special.logit(np.clip(np.abs(poles), 1e-9, 1.0 - 1e-9))[:, None]
@@ -261,7 +260,8 @@ def _descend(modes: _Modes, data: _Data, steps: int) -> tuple[_Modes, list[float
     def linearise(changes: np.ndarray) -> list[LocalModel]:
         equations = _normal_equations(_moved(modes, changes[0]), data)
         gradient, curvature = map(np.asarray, equations)
-        # Unit diagonal, but for unknowns of next to no effect, which then stay put.
+        # Unit diagonal, except for unknowns of almost no effect, which then do not
+        # move.
         size = np.sqrt(np.diag(curvature))
         size = np.maximum(size, 1e-6 * size.max())
         return [LocalModel(changes[0], gradient, curvature, size**2)]

@@ -157,7 +157,7 @@ UNEXCITED = 1e-3
 unexcited."""
 
 TOLERATED = 1.1
-"""Factor of the best error within which ``choose`` takes the smallest model."""
+"""Factor of the best error within which ``choose`` prefers the smallest model."""
 
 
 @dataclass(frozen=True)

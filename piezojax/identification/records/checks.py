@@ -158,13 +158,13 @@ def _poor_excitation(
             yield (
                 f"{name} is not exciting enough: its {count} "
                 f"{'frequency' if count == 1 else 'frequencies'} in the training part "
-                f"can tell {2 * count} parameters of linear dynamics, and the model "
-                f"has {order}; a multisine, a chirp or noise would do"
+                f"determine {2 * count} parameters of linear dynamics, and the model "
+                f"has {order}; a multisine, a chirp or noise would suffice"
             )
         elif count <= 1 and hysteresis:
             yield (
-                f"{name} has essentially one frequency: hysteresis and linear lag are "
-                "told apart by the shape of the loop alone, and the model says nothing "
+                f"{name} has essentially one frequency: only the shape of the loop "
+                "distinguishes hysteresis from linear lag, and the record says nothing "
                 "about other frequencies"
             )
 

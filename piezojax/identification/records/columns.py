@@ -11,7 +11,8 @@ import numpy as np
 from .preamble import split
 
 SEPARATORS = (";", "\t", ",", None)
-"""Separators of cells, None for blanks. Of equally good ones the first is taken."""
+"""Separators of cells, None for blanks. Of separators that fit equally well the first
+is taken."""
 
 DECIMALS = (".", ",")
 

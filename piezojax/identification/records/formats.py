@@ -1,7 +1,7 @@
 """Readers of lab file formats: columns of numbers by name.
 
-Libraries are imported in the reader that needs them, so that a file of one format does
-not need the libraries of the others.
+Each reader imports the library that it needs, so that a file of one format does not
+need the libraries of the others.
 """
 
 import logging

@@ -1,7 +1,7 @@
 """Lines above a table of samples: names, units, and the settings of an oscilloscope.
 
-Rigol, Keysight, Tektronix and LeCroy write one setting a line, or in the line of the
-units, or beside the first samples; all of them are read by the words of the settings.
+Rigol, Keysight, Tektronix and LeCroy write one setting per line, or in the line of the
+units, or beside the first samples. The settings are found by their names.
 """
 
 import re

@@ -39,7 +39,7 @@ class Record:
     """A measured record, uniformly sampled.
 
     ``inputs`` [samples, m] and ``outputs`` [samples, p] in ``input_units`` and
-    ``output_units``, one unit a column. A single column may be given as [samples] and
+    ``output_units``, one unit per column. A single column may be given as [samples] and
     its unit as one text. ``dt`` is the sample time in s, ``source`` the origin named in
     messages, ``period`` the number of samples in a period of a periodic input.
 

@@ -1,9 +1,9 @@
 """Error bound of a model, from the residual of its free run.
 
-The residual ``e = y - y_model`` and the model's own output answer the same input. Both
-go through the same empirical frequency response, so that the model needs no
-linearisation: the relative error is ``|G_eu| / |G_mu|``. What the residual holds beside
-its linear response (noise, and hysteresis that the model does not follow) widens the
+The residual ``e = y - y_model`` and the output of the model respond to the same input.
+The relative error is the ratio ``|G_eu| / |G_mu|`` of their empirical frequency
+responses, so that the model need not be linearised. The part of the residual that is
+not a linear response (noise, and hysteresis that the model does not follow) widens the
 confidence interval.
 """
 

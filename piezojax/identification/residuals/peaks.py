@@ -6,7 +6,7 @@ from pydantic import BaseModel
 from .bound import RelativeError
 
 LEAST = 1.0
-"""Relative error from which on a peak counts: as large as the model's own gain."""
+"""Least relative error of a peak: the error equals the gain of the model."""
 
 SHARP = 3.0
 """Height of a peak over its surroundings, as a factor."""

@@ -16,7 +16,7 @@ NARROW = 0.1
 """Excited band, as a share of the Nyquist frequency, below which to warn."""
 
 OTHER_GAIN = 1.25
-"""Factor between the motions of stage and model from which on to warn."""
+"""Least factor between the motions of stage and model that raises a warning."""
 
 WIDE = 0.5
 """Share of the lines in an octave with an error above the model's gain that counts as
