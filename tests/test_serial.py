@@ -444,7 +444,7 @@ def test_an_unsafe_file_is_refused(tmp_path, alarms, message):
     save(pj.core.system.Affine(2.0), tmp_path / "a.toml", pj.About(unsafe=alarms))
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         load(tmp_path / "a.toml")
-    assert str(caught.value).endswith("pass accept_unsafe=True to load it all the same")
+    assert str(caught.value).endswith("pass accept_unsafe=True to load it anyway")
     assert load(tmp_path / "a.toml", accept_unsafe=True) == pj.core.system.Affine(2.0)
 
 

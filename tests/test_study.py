@@ -362,7 +362,7 @@ def test_an_unsafe_file_is_refused_unless_the_study_accepts_it(study, refusal, w
     save({"plant": p753.plant, "controller": p753.pid}[where](), path, UNSAFE)
     assert refusal({where: {"file": "a.json"}}) == (
         f"{where}.file: a.json was written with an alarm: Ms 3 is above 2; "
-        f"set {where}.accept_unsafe = true to use it all the same"
+        f"set {where}.accept_unsafe = true to use it anyway"
     )
     loop = read(study({where: {"file": "a.json", "accept_unsafe": True}})).loop
     assert get(loop, "actuator.limits.upper") == 120.0

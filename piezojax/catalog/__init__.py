@@ -22,7 +22,7 @@ PLANTS: dict[str, Callable[..., System]] = {
 }
 """Plants by the name that a study uses. The positional arguments of a plant are the
 deviations that an ensemble may draw; the docstring of the plant states whether one is
-relative or absolute. On several axes each takes one value an axis."""
+relative or absolute. On several axes each takes one value per axis."""
 
 CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_pid": p753.pid,

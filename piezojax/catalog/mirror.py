@@ -110,7 +110,7 @@ def multi_axis() -> MultiAxisSlidingMode:
 
 
 def anticipating_multi_axis() -> Anticipation:
-    """Return ``multi_axis`` with room for a lead on its reference, 0."""
+    """Return ``multi_axis`` in an Anticipation of lead 0, for tuning."""
     return Anticipation(multi_axis(), (0.0, 0.0, 0.0))
 
 

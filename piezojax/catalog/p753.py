@@ -148,7 +148,7 @@ CUTOFF = 500.0
 """Q-filter cut-off, rad/s, section 5.5.6.2."""
 
 PROCESS_RMS, DRIFT_RMS = 1e-3, 1e-4
-"""Noise of a Kalman filter in um a sample: ours, a start for tuning."""
+"""Noise of a Kalman filter in um per sample: ours, a start for tuning."""
 
 SENSITIVITY_WEIGHT = {"low": 1e3, "crossover": 3000.0, "high": 0.5}
 EFFORT_WEIGHT = 0.1

@@ -28,10 +28,10 @@ from ..identification import Record, fit_preisach
 from . import p753
 
 CELLS = 20
-"""Cells a side of a fitted Preisach model: 7 V each."""
+"""Cells per side of a fitted Preisach model: 7 V each."""
 
 TRUE_CELLS = 28
-"""Cells a side of the stage: no multiple of ``CELLS``, so the two grids differ."""
+"""Cells per side of the stage: not a multiple of ``CELLS``, so the two grids differ."""
 
 DENSITY = {"reversible": 0.09, "density": 0.0028, "width": 25.0, "tilt": 0.004}
 """Density of the stage (ours) in um/V, um/V^2, V and 1/V; see ``preisach``."""

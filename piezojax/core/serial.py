@@ -165,7 +165,7 @@ def load(path: str | Path, *, accept_unsafe: bool = False) -> System:
     data = _read(path)
     about = _about_of(data.pop(_ABOUT, {}), path)
     if not accept_unsafe:
-        about.require_safe(path.name, "pass accept_unsafe=True to load it all the same")
+        about.require_safe(path.name, "pass accept_unsafe=True to load it anyway")
     return from_data(data, path.name)
 
 

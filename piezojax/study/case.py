@@ -260,6 +260,6 @@ def _from_file(table: dict[str, Any], where: str, folder: Path) -> System:
     if not isinstance(accept, bool):
         raise ValueError(f"{where}.{_ACCEPT} is {accept!r}; it must be true or false")
     if not accept:
-        remedy = f"set {where}.{_ACCEPT} = true to use it all the same"
+        remedy = f"set {where}.{_ACCEPT} = true to use it anyway"
         read_about(path).require_safe(path.name, remedy)
     return load_system(path, accept_unsafe=True)

@@ -41,7 +41,7 @@ class RateRange(RangeTable):
     def _consistent(self) -> "RateRange":
         both = self.lower is not None and self.upper is not None
         if both == (self.factor is not None):
-            raise ValueError("it takes lower and upper, or a factor")
+            raise ValueError("give lower and upper, or a factor")
         return self
 
     def at(self, start: float, rate: float, path: str) -> dict[str, Any]:
@@ -58,8 +58,8 @@ class RateRange(RangeTable):
         assert self.factor is not None
         if start <= 0.0:
             raise ValueError(
-                f"{path} starts at {start:g}; a factor takes a start above 0, "
-                "give it lower and upper"
+                f"{path} starts at {start:g}; a factor needs a start above 0: "
+                "give lower and upper instead"
             )
         return {
             "lower": start / self.factor,
@@ -113,7 +113,7 @@ class ComparisonStudy(Table):
         for name, table in self.controllers.items():
             for rates in (self.rates, table.rates or ()):
                 if len(set(rates)) < len(rates):
-                    raise ValueError(f"the rates of {name} hold one of them twice")
+                    raise ValueError(f"a rate of {name} is listed twice")
         return self
 
 
@@ -152,7 +152,7 @@ def read_compared(
     folded = [name.casefold() for name in names]
     for name in names:
         if folded.count(name.casefold()) > 1:
-            raise ValueError(f"two studies are named {name}; each takes its own name")
+            raise ValueError(f"two studies are named {name}; each needs its own name")
     return ", ".join(titles) or "Comparison of studies", cases
 
 

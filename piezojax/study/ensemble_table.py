@@ -11,11 +11,12 @@ from .tables import Finite, Positive, Table
 class EnsembleTable(Table):
     """Random stages: relative deviations, ranges and standard errors of parameters.
 
-    ``spread`` holds the largest relative deviations, drawn uniformly to both sides.
-    ``range`` holds intervals, from which values are drawn uniformly. The keys of both
-    are deviations of the catalogued plant or paths (``plant.hysteresis.a``,
-    ``sensor.noise.noise_rms``). ``standard_errors`` names a ``fit.json``, whose
-    parameters are drawn from normal distributions around their values.
+    ``spread`` holds the largest relative deviations; values are drawn uniformly on both
+    sides of the nominal one. ``range`` holds intervals, from which values are drawn
+    uniformly. The keys of both are deviations of the catalogued plant or paths
+    (``plant.hysteresis.a``, ``sensor.noise.noise_rms``). ``standard_errors`` names a
+    ``fit.json``, whose parameters are drawn from normal distributions around their
+    values.
 
     The objective includes the nominal stage and ``tune`` drawn stages. Margins are
     constrained on these and on further stages, ``margins`` in all, because margins are

@@ -122,7 +122,7 @@ def _has_range(loop: Feedback, path: str) -> bool:
 def _check_path(loop: Feedback, path: str, where: str) -> None:
     if not path.startswith(PART):
         raise ValueError(
-            f"{where}: the path must start with {PART!r}; the stage is not for tuning"
+            f"{where}: the path must start with {PART!r}; the stage is not tuned"
         )
     shape = jnp.shape(get(loop, path))
     if shape:

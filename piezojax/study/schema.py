@@ -49,7 +49,9 @@ class AxesTable(Table):
             one_of(unit, ("um", "urad"))
         for name in self.names:
             if not name.isidentifier():
-                raise ValueError(f"axis {name!r}: a name is letters, digits and _")
+                raise ValueError(
+                    f"axis {name!r}: a name consists of letters, digits and _"
+                )
         return self
 
 
@@ -217,7 +219,7 @@ class Study(Table):
         table = self.references
         runs = (len(table.tune) + len(table.unseen)) * self.axis_count
         draws = self.objective.noise_draws + self.holdout_draws
-        # A reference, and in each draw its noise and its drift, of 8 bytes a sample.
+        # A reference, and in each draw its noise and its drift, of 8 bytes per sample.
         samples = table.duration * self.rate
         gigabytes = samples * runs * (1 + 2 * draws) * 8e-9
         if not gigabytes <= MEMORY_GB:
@@ -263,7 +265,7 @@ class Study(Table):
         for name in self.sweep.references if self.sweep else ():
             if name not in known:
                 raise ValueError(
-                    f"sweep.references: {name} is none of the study's references, "
+                    f"sweep.references: {name} is not one of the study's references, "
                     f"{', '.join(known)}"
                 )
         return self

@@ -32,7 +32,7 @@ class SweptTable(RangeTable):
     def _consistent(self) -> "SweptTable":
         if self.values is not None:
             if not (self.lower is None and self.upper is None and self.count is None):
-                raise ValueError("it takes either values, or lower and upper")
+                raise ValueError("give either values, or lower and upper")
             if not self.values:
                 raise ValueError("values must hold at least one number")
             if list(self.values) != sorted(set(self.values)):
@@ -100,7 +100,7 @@ class SweepTable(Table):
             raise ValueError("a grid needs parameters, each with a count or values")
         if (self.samples is None) != (self.method == "grid"):
             problem = (
-                "a grid has its counts, and no samples"
+                "a grid takes counts, not samples"
                 if self.method == "grid"
                 else f"{self.method} needs samples, the number of points"
             )

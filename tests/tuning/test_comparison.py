@@ -225,7 +225,7 @@ def test_a_bound_gives_way_to_the_start():
         ({"tune": ["gain"]}, "pid at 5000 Hz: no parameter 'gain'; the nearest are"),
         (
             {"tune": ["controller.derivative"]},
-            "derivative starts at 0; a factor takes a start ab",
+            "derivative starts at 0; a factor needs a start ab",
         ),
     ],
 )
@@ -237,7 +237,7 @@ def test_bad_controllers(changes, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rates": [1e3, 1e3]}, "the rates of pid hold one of them twice"),
+        ({"rates": [1e3, 1e3]}, "a rate of pid is listed twice"),
         ({"bounds": {"integral": {"lower": 1.0}}}, "lower and upper, or a factor"),
         ({"controllers": {"pid": {"label": "PID"}}}, "controllers.pid.catalog is miss"),
         (
