@@ -639,7 +639,7 @@ def test_reproduce_all_tables_or_each_once(made_up, tmp_path):
 
 def test_calibration_takes_no_tables(tmp_path):
     result = call("reproduce", "--calibrate", "--table", "5-3", "--out", tmp_path / "a")
-    failed(result, "--calibrate has tables of its own; leave --table out")
+    failed(result, "--calibrate chooses its own tables; leave --table out")
 
 
 def test_quiet_reproduce_prints_nothing(made_up, tmp_path):

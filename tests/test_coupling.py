@@ -81,7 +81,7 @@ def test_what_is_not_driven_alone_is_not_known():
 
 def test_one_axis_has_no_coupling():
     study = study_of(ONE_AXIS)
-    with pytest.raises(ValueError, match="the study has one axis; coupling takes sev"):
+    with pytest.raises(ValueError, match="the study has one axis; coupling needs sev"):
         coupling_matrix(study, {})
     assert contours_in(study) == []
     assert outcome_of(study).coupling is None

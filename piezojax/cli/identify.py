@@ -115,11 +115,11 @@ def main(
             console.print(models_table())
             return
         if not records:
-            raise ValueError("name the RECORD to fit a model to")
+            raise ValueError("give a RECORD to fit a model to")
         if model == ALL and method is not None:
-            raise ValueError("--method goes with one model; 'all' takes each one's own")
+            raise ValueError("--method needs one model; 'all' uses the default of each")
         if model != ALL and (among is not None or test):
-            raise ValueError("--among and --test go with --model all")
+            raise ValueError("--among and --test need --model all")
         loaded = [read_record(record, **columns) for record in records]
         options = Options(order, window, oversample, steps)
         if model == ALL:

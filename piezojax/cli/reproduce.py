@@ -88,7 +88,7 @@ def main(tables, calibrate, out, seed, quiet):
             )
         console.print(f"results in {folder}", soft_wrap=True)
         if interrupted:
-            console.print("interrupted: the tables that were finished by then")
+            console.print("interrupted: the tables finished so far")
             exit_interrupted()
 
     def calibration(console):
@@ -104,7 +104,7 @@ def main(tables, calibrate, out, seed, quiet):
         )
 
         if tables:
-            raise ValueError("--calibrate has tables of its own; leave --table out")
+            raise ValueError("--calibrate chooses its own tables; leave --table out")
         fits, plain = {}, {}
         with Bar(console) as bar, results_folder(out, "calibrate") as folder:
             for name in EXPERIMENTS:

@@ -91,8 +91,8 @@ def main(
             if folder is None or not folder.exists():
                 raise
             click.echo(
-                "interrupted; what is done is kept, and the same command with "
-                f"--out {folder} resumes it",
+                "interrupted; finished chunks are kept, and the same command with "
+                f"--out {folder} resumes the sweep",
                 err=True,
             )
             exit_interrupted()
@@ -112,7 +112,7 @@ def _report(
         rate = result.lane_steps / result.core_s
         console.print(
             f"{result.lane_steps:.3g} samples in {result.wall_s:.1f} s, "
-            f"{result.core_s:.3g} core-seconds of simulating: {rate:.3g} samples a "
+            f"{result.core_s:.3g} core-seconds of simulation: {rate:.3g} samples per "
             "second and core",
             soft_wrap=True,
         )
@@ -120,8 +120,8 @@ def _report(
         console.print(f"results in {folder}, data set {result.path}", soft_wrap=True)
     else:
         console.print(
-            f"shard {shard[0]}/{shard[1]} is there, {result.chunks} chunks; the data "
-            f"set is merged when the other shards are in {folder}, too",
+            f"shard {shard[0]}/{shard[1]} is complete, {result.chunks} chunks; the "
+            f"data set is merged when all other shards are in {folder}",
             soft_wrap=True,
         )
 

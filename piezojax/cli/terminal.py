@@ -63,7 +63,9 @@ class Bar:
             raise KeyboardInterrupt
         self._interrupted = True
         if self._task is not None:
-            self._progress.update(self._task, note="stopping; Ctrl-C again: at once")
+            self._progress.update(
+                self._task, note="stopping; Ctrl-C again stops at once"
+            )
 
     def finish(self) -> None:
         """Ignore the first Ctrl-C or SIGTERM from here on, while results are written.

@@ -25,7 +25,7 @@ def parallel_coordinates(
     picture = figure(max(5.5, 1.6 * len(axes) + 2.0), 0.7 + 3.4 * len(shown))
     places = picture.subplots(len(shown), 1, squeeze=False)[:, 0]
     for panel, ax in zip(shown, places, strict=True):
-        values = panel.kept().ravel()
+        values = panel.finite().ravel()
         norm = scale_of(values)
         chosen = _chosen(values)
         heights = [

@@ -15,7 +15,7 @@ from ..sweeping.metric_maps import (
     averaging,
     metric_maps,
     metrics_in,
-    opened,
+    open_dataset,
 )
 from .figures import AFTER, UNITS, add_title, figure, plot_style, write
 from .parallel_coordinates import parallel_coordinates
@@ -29,7 +29,7 @@ MOST_PANELS = 12
 
 def write_pictures(path: Path, folder: Path) -> None:
     """Write a picture of each metric of the data set ``path`` into ``folder``."""
-    with opened(path) as dataset, plot_style():
+    with open_dataset(path) as dataset, plot_style():
         for name in metrics_in(dataset):
             write(metric_figure(dataset, name), folder / f"{name}.png")
 
@@ -121,7 +121,7 @@ def _flattened(dataset: "Dataset", axes: list[Parameter]) -> list[Parameter]:
 def _heat_map(
     picture: Figure, ax: Axes, panel: MetricMap, axes: list[Parameter]
 ) -> None:
-    values = panel.kept()
+    values = panel.finite()
     horizontal, vertical = axes[1], axes[0]
     ax.set_facecolor(LOST)
     mesh = ax.pcolormesh(
@@ -139,7 +139,7 @@ def _heat_map(
     ax.set(xlabel=horizontal.label, ylabel=vertical.label)
     ax.grid(False)
     colour_bar(picture, ax, mesh, panel.unit)
-    least = panel.least()
+    least = panel.argmin()
     if least is not None and np.sum(values == values[least]) == 1:
         row, column = least
         ax.plot(
@@ -164,7 +164,7 @@ def _heat_map(
 
 
 def _curve(ax: Axes, panel: MetricMap, axis: Parameter) -> None:
-    values = panel.kept()
+    values = panel.finite()
     ax.plot(axis.values, values, "o-", ms=3, color=AFTER)
     if axis.logarithmic:
         ax.set_xscale("log")
@@ -175,7 +175,7 @@ def _curve(ax: Axes, panel: MetricMap, axis: Parameter) -> None:
 
 def best_table(path: Path) -> Table:
     """Return the point where the first metric is least, for each plant and axis."""
-    with opened(path) as dataset:
+    with open_dataset(path) as dataset:
         name = metrics_in(dataset)[0]
         axes = parameters(dataset)
         grid = dataset.attrs["method"] == "grid"
@@ -188,10 +188,10 @@ def best_table(path: Path) -> Table:
         table.add_column("least", justify="right")
         table.add_column("diverged", justify="right")
         for panel in panels(dataset, name):
-            values = panel.kept()
+            values = panel.finite()
             lost = int(np.isnan(values).sum())
             share = f"{lost} of {values.size}"
-            place = panel.least()
+            place = panel.argmin()
             if place is None:
                 table.add_row(panel.title, *("-" for _ in axes), "-", share)
                 continue

@@ -48,7 +48,7 @@ def dask_client(where: str) -> Iterator["Client"]:
             yield client
         return
     if int(where) < 1:
-        raise ValueError(f"--dask {where}: it takes at least 1 worker")
+        raise ValueError(f"--dask {where}: at least 1 worker is needed")
     # Spawned, because JAX has threads and a forked copy of them may hang.
     with (
         dask_option({"distributed.worker.multiprocessing-method": "spawn"}),

@@ -18,7 +18,7 @@ LONG_NAMES = {
     "rms_error": "rms tracking error",
     "peak_error": "peak tracking error",
     "rms_effort": "rms voltage",
-    "rms_slew": "rms change of the voltage a sample",
+    "rms_slew": "rms change of the voltage per sample",
     "saturated": "share of saturated samples",
     "peak_voltage": "peak voltage",
     SENSITIVITY: "peak of the sensitivity",

@@ -16,7 +16,7 @@ _BEYOND = 1e3  # times the median: the loop is lost
 class MetricMap(NamedTuple):
     """A metric by point for one plant and axis, averaged over references and draws.
 
-    ``values`` are in ``unit``, with a dimension a parameter for a grid and one for
+    ``values`` are in ``unit``, with one dimension per parameter for a grid, or one for
     samples. ``title`` names the plant and the axis.
     """
 
@@ -24,7 +24,7 @@ class MetricMap(NamedTuple):
     values: np.ndarray
     unit: str
 
-    def kept(self) -> np.ndarray:
+    def finite(self) -> np.ndarray:
         """Return the values with NaN for lost points: not finite, or far beyond."""
         finite = np.where(np.isfinite(self.values), self.values, np.nan)
         if not np.isfinite(finite).any():
@@ -33,16 +33,16 @@ class MetricMap(NamedTuple):
         far = (finite > _BEYOND * middle) if middle > 0.0 else False
         return np.where(far, np.nan, finite)
 
-    def least(self) -> tuple[int, ...] | None:
+    def argmin(self) -> tuple[int, ...] | None:
         """Return the index of the smallest value, None if every point is lost."""
-        values = self.kept()
+        values = self.finite()
         if np.isnan(values).all():
             return None
         place = np.unravel_index(np.nanargmin(values), values.shape)
         return tuple(int(i) for i in place)
 
 
-def opened(path: Path) -> "Dataset":
+def open_dataset(path: Path) -> "Dataset":
     """Open the data set of a sweep, to be read lazily and closed by the caller."""
     import xarray as xr
 

@@ -62,7 +62,7 @@ class Simulator:
         self.metrics, self.every = table.metrics, table.every
         if SENSITIVITY in self.metrics and study.axes:
             raise ValueError(
-                f"sweep.metrics: {SENSITIVITY} is there for a stage with one axis"
+                f"sweep.metrics: {SENSITIVITY} needs a stage with one axis"
             )
         data = make_data(case).holdout
         names = (*study.references.tune, *study.references.unseen)

@@ -123,7 +123,7 @@ class Store:
             tables = [k for k in {**old, **own} if old.get(k) != own.get(k)]
             differing = [f"study.{key}" for key in tables]
         raise ValueError(
-            f"--out {self.folder} holds another sweep (other in "
+            f"--out {self.folder} holds another sweep (it differs in "
             f"{', '.join(differing) or 'its fingerprint'}); name a new folder"
         )
 

@@ -118,7 +118,7 @@ def _sampled(study: Study, samples: int) -> Study:
         table = study.sweep.model_dump(exclude_unset=True)
         if study.sweep.method == "grid":
             raise ValueError(
-                "--samples: the study sweeps a grid, whose points its counts say; set "
+                "--samples: the study sweeps a grid, whose counts fix its points; set "
                 'sweep.method to "sobol" or "latin_hypercube"'
             )
     new = validated(SweepTable, table | {"samples": samples}, "sweep")
@@ -164,7 +164,10 @@ def run_sweep(
             continue
         result.finished = True
         return result
-    raise ValueError(f"{folder}: chunks {todo[:5]} keep being damaged; see to the disk")
+    raise ValueError(
+        f"{folder}: chunks {todo[:5]} are damaged after {ATTEMPTS} attempts; "
+        "check the disk"
+    )
 
 
 def _simulate(

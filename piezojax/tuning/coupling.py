@@ -43,7 +43,7 @@ def coupling_matrix(study: Study, errors: Mapping[str, float | None]) -> Couplin
     The diagonal holds the tracking errors. Raises ValueError for a study of one axis.
     """
     if study.axes is None:
-        raise ValueError("the study has one axis; coupling takes several")
+        raise ValueError("the study has one axis; coupling needs several")
     names, units = study.axes.names, study.axes.units
     squares = np.zeros((len(names), len(names)))
     counts = np.zeros_like(squares)

@@ -57,21 +57,21 @@ class Objective(eqx.Module):
 
     The RMS error of each reference over its noise draws is divided by ``scale`` (um),
     which has one value for each stage and reference. ``aggregate`` joins the
-    references: ``geometric_mean`` (mean of logarithms: a tenfold improvement counts
-    the same on every reference), ``mean_square``, or ``worst`` (a smooth maximum of the
+    references: ``geometric_mean`` (mean of logarithms: a tenfold improvement counts the
+    same on every reference), ``mean_square``, or ``worst`` (a smooth maximum of the
     logarithms). ``weights`` are those of the references (equal if left out). A
-    ``resting`` trace, of an axis that should not move, counts only as far as its error
-    exceeds its scale.
+    ``resting`` trace, of an axis that should not move, counts only for the part of its
+    error above its scale.
 
     ``stages``, stacked on a leading axis, replace the loop's own. ``over`` joins them:
     their mean, the worst, or the mean of the worst share ``tail``. ``effort_weight``
     and ``slew_weight`` weight the mean RMS voltage and the mean RMS change of voltage
     per sample, both as a share of ``voltage_span``, which are added to the error.
 
-    ``limits`` are the limits of constraints by name (``constraints.CONSTRAINTS``).
-    They must be kept on every stage, those on margins on every one of ``margin_stages``
-    at the reference ``highest`` (um). ``loss`` is an augmented Lagrangian with
-    ``multipliers`` and ``penalty``.
+    ``limits`` are the limits of constraints by name (``constraints.CONSTRAINTS``). They
+    must hold on every stage; limits on margins must hold on every one of
+    ``margin_stages``, at the reference ``highest`` (um). ``loss`` is an augmented
+    Lagrangian with ``multipliers`` and ``penalty``.
     """
 
     loop: Feedback

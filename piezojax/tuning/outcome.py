@@ -30,11 +30,11 @@ Logs = tuple[LoopSample, LoopSample]
 class Outcome:
     """Result of tuning with its loops and signals.
 
-    ``before`` and ``after`` are the loops with the study's own gains and the tuned
-    gains; ``holdout`` are the held-out signals. ``baselines`` is None unless a budget
-    for them was given. ``stability`` is that of both loops at the highest reference.
-    ``limit`` and ``coupling`` are computed when they are first read, so that many
-    studies can be tuned without them.
+    ``before`` and ``after`` are the loops with the gains of the study and with the
+    tuned gains; ``holdout`` are the held-out signals. ``baselines`` is None unless a
+    budget for them was given. ``stability`` is that of both loops at the highest
+    reference. ``limit`` and ``coupling`` are computed when they are first read, so that
+    many studies can be tuned without them.
     """
 
     result: Result
@@ -88,7 +88,7 @@ class Outcome:
         # A failed analysis must not lose the tuned gains.
         except Exception as error:
             return str(error).partition("\n")[0] or type(error).__name__
-        return report if np.isfinite(report.over) else "its figures are not finite"
+        return report if np.isfinite(report.ratio) else "its figures are not finite"
 
     @cached_property
     def coupling(self) -> tuple[Coupling, Coupling] | None:

@@ -69,7 +69,7 @@ def tune(
         front, kept = None, _constraint_outcomes(objective, evaluator, after)
         if table.pareto is not None and strategy and search.status != "interrupted":
             front = trace_front(objective, case, search, strategy, clock, progress)
-        progress.stage("judging on held-out noise")
+        progress.stage("evaluating on held-out noise")
         result = _report(
             case, data, evaluator, before, after, search, clock, kept, front
         )
@@ -202,19 +202,19 @@ def _report(
     driven = np.array([trace.driven for trace in data.traces])
     tuned_on = np.arange(len(data.traces)) < data.tuned
 
-    def held(figures: TrackingFigures, chosen: np.ndarray) -> Scores | None:
+    def scores_of(figures: TrackingFigures, chosen: np.ndarray) -> Scores | None:
         return _chosen(figures, data.names, chosen) if chosen.any() else None
 
-    def both(figures: TrackingFigures) -> tuple[Scores, Scores | None, Scores | None]:
+    def split(figures: TrackingFigures) -> tuple[Scores, Scores | None, Scores | None]:
         return (
             _chosen(figures, data.names, driven & tuned_on),
-            held(figures, driven & ~tuned_on),
-            held(figures, ~driven),
+            scores_of(figures, driven & ~tuned_on),
+            scores_of(figures, ~driven),
         )
 
     on_holdout = [evaluator.figures(loop, data.holdout) for loop in (case.loop, after)]
-    holdout_before, unseen_before, coupling_before = both(on_holdout[0])
-    holdout, unseen_after, coupling = both(on_holdout[1])
+    holdout_before, unseen_before, coupling_before = split(on_holdout[0])
+    holdout, unseen_after, coupling = split(on_holdout[1])
     tuned = driven[: data.tuned]
     names = data.names[: data.tuned]
     after_scores = _chosen(evaluator.figures(after, data.tuning), names, tuned)
@@ -285,8 +285,8 @@ def _warnings(
         part = case.fit.report.validation
         found.append(
             f"the fitted plant leaves {part.rmse:.3g} {part.unit} rms of its record "
-            "unexplained; that acts on the loop as a disturbance, the training part's "
-            "while tuning, the validation part's in the hold-out"
+            "unexplained; this residual is a disturbance of the loop, that of the "
+            "training part while tuning, that of the validation part in the hold-out"
         )
     if at_bound:
         found.append(f"at the edge of its bounds: {', '.join(at_bound)}")

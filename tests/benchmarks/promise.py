@@ -53,7 +53,7 @@ above FAR times the promise."""
 RAILED = 0.02
 """Share of samples at a limit of the voltage above which a run rails."""
 
-ROUTINE = ("that acts on the loop as a disturbance", "at the edge of its bounds")
+ROUTINE = ("this residual is a disturbance of the loop", "at the edge of its bounds")
 """Parts of notes that every run has and that warn of nothing."""
 
 MODEL = inspect.signature(pj.identify).parameters["model"].default

@@ -311,10 +311,10 @@ def test_the_command(made, file, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--model", "all", "--method", "subspace"), "--method goes with one model"),
-        (("--test", "0:5"), "--among and --test go with --model all"),
-        (("--among", "coleman_hodgdon"), "--among and --test go with --model all"),
-        (("--among", ""), "--among and --test go with --model all"),
+        (("--model", "all", "--method", "subspace"), "--method needs one model"),
+        (("--test", "0:5"), "--among and --test need --model all"),
+        (("--among", "coleman_hodgdon"), "--among and --test need --model all"),
+        (("--among", ""), "--among and --test need --model all"),
     ],
 )
 def test_options_that_do_not_go_together(file, arguments, message):

@@ -195,7 +195,7 @@ def test_several_axes_have_a_dimension(case_of, tmp_path):
     )
     # A picture has a panel for each axis, each in its own unit.
     assert [panel.unit for panel in panels(found, "rms_error")] == ["nm", *["nrad"] * 2]
-    with pytest.raises(ValueError, match="for a stage with one axis"):
+    with pytest.raises(ValueError, match="needs a stage with one axis"):
         Simulator(case_of(table | {"metrics": ["sensitivity_peak"]}, **AXES))
 
 
@@ -269,7 +269,7 @@ def test_foreign_folders_and_chunks_are_refused(case_of, write, tmp_path):
     run_sweep(case, tmp_path / "a")
     other = case_of(SAMPLED | {"samples": 151})
     with pytest.raises(
-        ValueError, match=r"holds another sweep \(other in study\.sweep"
+        ValueError, match=r"holds another sweep \(it differs in study\.sweep"
     ):
         run_sweep(other, tmp_path / "a")
     run_sweep(other, tmp_path / "b")
@@ -282,7 +282,7 @@ def test_foreign_folders_and_chunks_are_refused(case_of, write, tmp_path):
     stale = json.loads(manifest.read_text())
     stale["versions"]["piezojax"] = stale["fingerprint"] = "0"
     manifest.write_text(json.dumps(stale))
-    with pytest.raises(ValueError, match="other in versions"):
+    with pytest.raises(ValueError, match="differs in versions"):
         run_sweep(case, tmp_path / "a")
     manifest.write_text("{")
     with pytest.raises(ValueError, match=r"manifest\.json is damaged"):
@@ -319,7 +319,7 @@ def test_command_by_shards(write, tmp_path):
     path = write(SAMPLED)
     first = call(path, "--out", tmp_path / "a", "--shard", "2/2")
     assert first.exit_code == 0
-    assert "shard 2/2 is there, 1 chunks" in first.stdout
+    assert "shard 2/2 is complete, 1 chunks" in first.stdout
     assert not (tmp_path / "a" / "sweep.nc").exists()
     second = call(path, "--out", tmp_path / "a", "--shard", "1/2", "--quiet")
     assert (second.exit_code, second.output) == (0, "")

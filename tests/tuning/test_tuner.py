@@ -242,7 +242,7 @@ def test_progress_is_told(outcome, progress):
         "screening 5 points of the box",
         "compiling the gradient",
         "tuning from 2 starts",
-        "judging on held-out noise",
+        "evaluating on held-out noise",
     ]
     assert dict(progress.stages)["tuning from 2 starts"] == 6
     assert len(progress.bests) == len(outcome.result.history)

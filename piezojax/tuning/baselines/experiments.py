@@ -191,7 +191,7 @@ def period_of(wave: Float[np.ndarray, " samples"], dt: float) -> float:
     if rises.size < _FEWEST + 1 or not np.all(np.isfinite(wave)):
         raise ValueError(
             f"no oscillation: {max(rises.size - 1, 0)} periods in {wave.size} samples; "
-            f"it takes {_FEWEST:g}"
+            f"at least {_FEWEST:g} are needed"
         )
     places = rises + wave[rises] / (wave[rises] - wave[rises + 1])
     return float((places[-1] - places[0]) / (rises.size - 1) * dt)

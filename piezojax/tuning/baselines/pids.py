@@ -48,7 +48,7 @@ def rule_pids(objective: Objective, case: Case) -> tuple[list[RulePID], list[str
     A note names an experiment that failed, and the reason.
     """
     if case.study.axes is not None:
-        return [], ["rules for a PID: they are for a stage with one axis"]
+        return [], ["rules for a PID: they need a stage with one axis"]
     experiments = {
         "ultimate gain": (_by_gain, _named("Ziegler-Nichols", ZIEGLER_NICHOLS)),
         "relay": (
