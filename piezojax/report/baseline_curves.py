@@ -25,7 +25,7 @@ def baselines_table(baselines: Baselines) -> Table:
         title=Text(
             f"{baselines.title}\nbaselines on the same objective: "
             "error is the geometric mean on held-out noise\n"
-            "(as good: when piezojax had a loss as low; sooner: how many times)"
+            "(as good: time at which piezojax had a loss as low; sooner: ratio)"
         )
     )
     table.add_column("method")
@@ -60,7 +60,7 @@ def baselines_text(baselines: Baselines) -> str:
         f"as good as {best.method}, the best baseline, after {best.reached_s:.1f} s "
         f"instead of {best.wall_s:.1f} s: {_times(best.ratio)} sooner, {running} "
         f"without compiling, {_times(best.ratio_cpu)} in processor time, {near} "
-        "sooner than it came within 0.001 of its end"
+        "sooner than the baseline came within 0.001 of its final loss"
     )
 
 

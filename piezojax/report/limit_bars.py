@@ -22,10 +22,10 @@ from .figures import (
 LIMIT_FILE, LIMIT_PICTURE = "limit.json", "limit.png"
 
 CAUSES: dict[str | None, str] = {
-    "noise": "lets through more sensor noise than it has to",
-    "unpredicted": "cancels too little of what the reference does not predict",
-    "predicted": "leaves what a linear filter of the reference would cancel",
-    None: "is too far from linear to say why",
+    "noise": "passes more sensor noise than necessary",
+    "unpredicted": "cancels too little of the unpredicted disturbance",
+    "predicted": "leaves an error that a linear filter of the reference would cancel",
+    None: "is too nonlinear to name a cause",
 }
 """Explanations of a large error, by the share that exceeds the limit's most."""
 
@@ -45,12 +45,11 @@ def limit_text(report: LimitReport | str) -> str:
         return f"note: no limit of linear control: {report}"
     count = len(report.references)
     lines = [
-        "limit of linear control with full preview (resolved to "
-        f"{report.resolution:.3g} Hz): tuned is {report.ratio:.2f}x that, "
-        f"{report.near} of {count} references within {NEAR:g}x; it is "
-        f"{report.ratio_to_one_controller:.2f}x "
-        "what one such controller for all of them leaves, "
-        f"{report.near_one_controller} of {count}"
+        "limit of linear control with full preview (resolution "
+        f"{report.resolution:.3g} Hz): the tuned error is {report.ratio:.2f}x the "
+        f"limit, {report.near} of {count} references within {NEAR:g}x; it is "
+        f"{report.ratio_to_one_controller:.2f}x the error of one linear controller for "
+        f"all references, {report.near_one_controller} of {count} within {NEAR:g}x"
     ]
     by_cause: dict[str | None, list[str]] = {}
     below = []
@@ -67,8 +66,8 @@ def limit_text(report: LimitReport | str) -> str:
     ]
     if below:
         lines.append(
-            f"note: {', '.join(below)}: below the limit, as a controller may be that "
-            "is not linear or knows more of the stage"
+            f"note: {', '.join(below)}: below the limit, which a controller that is "
+            "nonlinear or knows more of the stage can reach"
         )
     return "\n".join(lines)
 

@@ -128,7 +128,7 @@ def ranking_table(report: RankingReport) -> Table:
             style="bold" if row.model == report.best else None,
         )
     table.caption = (
-        "BIC above the lowest; * validates worse than the best, beyond chance"
+        "BIC above the lowest; * validates significantly worse than the best"
     )
     return table
 
@@ -147,16 +147,16 @@ def ranking_notes(report: RankingReport) -> list[str]:
         "free run are correlated"
     )
     if report.interrupted:
-        notes.append("interrupted: the best of those that were fitted by then")
+        notes.append("interrupted: the best of the models fitted so far")
     notes.append(f"best: {report.best} ({report.rule})")
     if report.test is None:
         notes.append(
-            "the choice has seen the validation part: its error there is no hold-out "
-            "figure; --test START:STOP keeps samples for one"
+            "the choice used the validation part: its error there is not a held-out "
+            "figure; --test START:STOP holds samples back for one"
         )
     else:
         notes.append(
-            f"its error on the test part, which neither fits nor choice have seen: "
+            f"its error on the test part, which neither fits nor choice used: "
             f"{report.test.rmse:.4g} {report.test.unit}, "
             f"{report.test.rmse_percent_of_span:.2f} % of span"
         )

@@ -19,7 +19,7 @@ from ..tuning.result import Perturbed, Result, Scores
 def models_table() -> Table:
     """Return the table of the models that can be fitted: parts and whole models."""
     table = Table(title="models; parts are joined by '+', as in coleman_hodgdon+lag")
-    for column in ("model", "kind", "what it is, or how it is fitted"):
+    for column in ("model", "kind", "description or method"):
         table.add_column(column, no_wrap=column == "model", overflow="fold")
     for name, kind in parts().items():
         table.add_row(name, f"part: {kind.part.place}", kind.part.summary)

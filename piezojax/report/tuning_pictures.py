@@ -184,7 +184,7 @@ def hysteresis_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
     right.set(
         xlabel=f"reference ({unit})",
         ylabel=f"{_quantity(trace)} less reference ({small})",
-        title=f"{name}: what is left in closed loop\n",
+        title=f"{name}: error in closed loop\n",
     )
     legend_above(right)
     return picture

@@ -32,7 +32,7 @@ def cells(table: str) -> list[Cell]:
     - Stage, noise and errors are those of chapter 7, but without its additional sample
       of delay, with which the driven axes agree less (docs/reproduction.md).
 
-    The order of the controllers agrees; the levels do not, they are too low. Section
+    The order of the controllers agrees; the simulated errors are too low. Section
     8.5.4.2 does not name the axis of its number for the first experiment; it is Ry, the
     axis without a reference.
     """

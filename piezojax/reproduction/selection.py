@@ -115,10 +115,10 @@ def screen(
     """Return the ``FINALISTS`` candidates with the least cost, each with its point.
 
     A grid search comes first, because the best value may be decades from the printed
-    one, where the slope at the printed value is no guide. A few steps of the optimiser
-    follow, together with the quantities that are already ``free``. Both run twice, from
-    ``point`` and from the printed stage, because a stage fitted to compensate a
-    misprint hides the misprint.
+    one, where the slope at the printed value is misleading. A few steps of the
+    optimiser follow, together with the quantities that are already ``free``. Both run
+    twice, from ``point`` and from the printed stage, because a stage fitted to
+    compensate a misprint hides the misprint.
     """
     progress = Silent() if progress is None else progress
     grid = (jnp.arange(GRID) + 0.5) / GRID

@@ -12,8 +12,9 @@ that use it. The candidates are:
 Every array leaf of every controller belongs to a candidate, with three exceptions. Q
 acts only through R/Q, which R covers. The poles of the models are covered by their
 gain. The rest point of the inverse is not printed. The sampling rate, the shapes and
-frequencies of the references, and the equations are not candidates, because they are no
-parameters of these loops. The stage is not a candidate, because it is fitted anyway.
+frequencies of the references, and the equations are not candidates, because they are
+not parameters of these loops. The stage is not a candidate, because it is fitted
+anyway.
 
 A candidate is varied by a factor on its printed value. Its bounds are a factor of 100
 in both directions for tuned numbers (10 for alpha, which ends at 1), and 3 for numbers

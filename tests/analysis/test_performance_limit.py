@@ -307,10 +307,10 @@ def test_the_words_name_what_exceeds():
     assert report.near == 2
     assert report.ratio == pytest.approx((2.0**4 * 1.1 * 0.5) ** (1.0 / 6.0))
     text = limit_text(report)
-    assert "on A 2.00x the loop lets through more sensor noise" in text
+    assert "on A 2.00x the loop passes more sensor noise" in text
     assert "on B 2.00x the loop cancels too little" in text
-    assert "on C 2.00x the loop leaves what a linear filter" in text
-    assert "on F 2.00x the loop is too far from linear" in text
+    assert "on C 2.00x the loop leaves an error that a linear filter" in text
+    assert "on F 2.00x the loop is too nonlinear" in text
     assert "note: E 0.50x: below the limit" in text
     assert "D" not in text.split("\n", 1)[1]
 

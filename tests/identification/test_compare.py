@@ -217,14 +217,14 @@ def test_the_test_part_is_kept_from_fits_and_choice(made):
     off = 0.01 * (NOISE[:, 0] + 1e-4 * np.sin(np.arange(2000)))[1600:]
     assert report.test.rmse == pytest.approx(np.sqrt(np.mean(off**2)))
     notes = " ".join(ranking_notes(report))
-    assert "neither fits nor choice have seen" in notes
-    assert "no hold-out" not in notes
+    assert "neither fits nor choice used" in notes
+    assert "held-out" not in notes
 
 
 def test_without_a_test_part_the_choice_is_said_to_have_seen_it_all(made):
     made()
     notes = " ".join(ranking_notes(identify_all(RICH).report))
-    assert "--test START:STOP keeps samples" in notes
+    assert "--test START:STOP holds samples" in notes
 
 
 @pytest.mark.parametrize(
