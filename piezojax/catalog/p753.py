@@ -233,21 +233,29 @@ ADAPTIVE_INVERSE = {
 changes slower than half a second."""
 
 
-def adaptive_disturbance_observer(table: str = "5-2") -> AdaptiveInverse:
-    """Return ``disturbance_observer`` in an AdaptiveInverse (ours).
+def lags() -> tuple[float, float]:
+    """Return the two time constants of (5.33), s, the slow one first."""
+    poles = np.real(ARMA(**DYNAMICS_BEHIND_HYSTERESIS).poles())
+    slow, fast = sorted(-DT / np.log(poles), reverse=True)
+    return float(slow), float(fast)
 
-    Its share of 0 makes it equal to ``disturbance_observer``. The initial weights
-    follow from the printed gain and poles, those of the stops from a typical
-    hysteresis.
+
+def adaptive_disturbance_observer(table: str = "5-2") -> AdaptiveInverse:
+    """Return ``disturbance_observer`` in an AdaptiveInverse (ours)."""
+    return with_adaptive_inverse(disturbance_observer(table))
+
+
+def with_adaptive_inverse(controller: System) -> AdaptiveInverse:
+    """Return ``controller`` in an AdaptiveInverse (ours), um to V.
+
+    Its share of 0 makes it equal to ``controller``. The initial weights follow from the
+    printed gain and poles, those of the stops from a typical hysteresis.
     """
-    slow, fast = (
-        -DT / float(np.log(pole))
-        for pole in np.real(ARMA(**DYNAMICS_BEHIND_HYSTERESIS).poles())
-    )
+    slow, fast = lags()
     gains = (1.0 / GAIN, (slow + fast) / GAIN, slow * fast / GAIN)
     stops = len(ADAPTIVE_INVERSE["thresholds"])
     return AdaptiveInverse(
-        disturbance_observer(table),
+        controller,
         weights=(*gains, *(0.1 * gains[0],) * stops),
         deviations=(*(0.5 * gain for gain in gains), *(0.3 * gains[0],) * stops),
         **ADAPTIVE_INVERSE,

@@ -6,27 +6,34 @@ surface are the printed ones of ``p753``.
 """
 
 from ..control import (
+    PID,
+    AdaptiveInverse,
     AlphaBeta,
     BoundaryLayer,
     FeedforwardFeedback,
+    FilteredCommand,
     InverseFeedforward,
+    InverseGain,
     LearningLaw,
     RepetitiveControl,
     SlidingMode,
     SuperTwisting,
     SwitchingLaw,
 )
-from ..core.system import Affine
-from ..dynamics import ARMA, FirstOrderLag
+from ..core.system import Affine, System
+from ..dynamics import ARMA, FirstOrderLag, Notch
 from ..hardware import ChargeDrive
 from ..hysteresis import InverseColemanHodgdon
-from . import p753
+from . import p753, p753_stage
 
 BOUNDARY_LAYER = {"gain": 1e4, "width": 4e4}
 """K in V and the layer in um/s. K is large because the inverse passes 1 % of v."""
 
 SUPER_TWISTING = {"root_gain": 10.0, "sign_gain": 1e6, "layer": 1e4}
 """Gains in V/(um/s)^(1/2) and V/s, layer in um/s."""
+
+NOTCH = {"damping": 0.5, "depth": 0.1}
+"""Damping and depth of a notch at the nominal mode of the stage."""
 
 REPETITIVE = {"gain": 0.7, "lead": 40, "advance": 8}
 """Learning gain; lead and advance in samples; Q is a lag of ``advance`` samples."""
@@ -71,6 +78,47 @@ def inverse_feedforward() -> InverseFeedforward:
 def feedforward_pid() -> FeedforwardFeedback:
     """Return the inverse of the printed hysteresis beside ``p753.pid``, um to V."""
     return FeedforwardFeedback(_inverse(), p753.pid())
+
+
+def simc_pi() -> PID:
+    """Return a PI by the SIMC rule of Skogestad (2003) for (5.33), um to V.
+
+    Half of the smaller time constant counts as a delay and half as a lag; the loop and
+    the hold delay by one and a half samples. With a closed-loop time constant equal to
+    the delay, P = lag / (2 gain delay), and the integral time is the lesser of the lag
+    and eight delays.
+    """
+    slow, fast = p753.lags()
+    lag, delay = slow + 0.5 * fast, 0.5 * fast + 1.5 * p753.DT
+    gain = lag / (2.0 * p753.GAIN * delay)
+    time = min(lag, 8.0 * delay)
+    return PID(gain, gain / time, 0.0, p753.DT, 1.0 / time, dt=p753.DT)
+
+
+def notch_pi() -> FilteredCommand:
+    """Return ``simc_pi`` with a notch at the nominal mode of the stage, um to V."""
+    notch = Notch(p753_stage.MODE_FREQUENCY, **NOTCH, dt=p753.DT)
+    return FilteredCommand(simc_pi(), notch)
+
+
+def static_feedforward(feedback: System) -> FeedforwardFeedback:
+    """Return ``feedback`` with the reference divided by K_e fed forward, um to V."""
+    return FeedforwardFeedback(InverseGain(Affine(p753.GAIN)), feedback)
+
+
+def feedforward_simc_pi() -> FeedforwardFeedback:
+    """Return ``simc_pi`` with a static feedforward, um to V."""
+    return static_feedforward(simc_pi())
+
+
+def feedforward_notch_pi() -> FeedforwardFeedback:
+    """Return ``notch_pi`` with a static feedforward, um to V."""
+    return static_feedforward(notch_pi())
+
+
+def adaptive_notch_pi() -> AdaptiveInverse:
+    """Return ``notch_pi`` in an AdaptiveInverse, um to V."""
+    return p753.with_adaptive_inverse(notch_pi())
 
 
 def repetitive(period: int = 2_000) -> RepetitiveControl:

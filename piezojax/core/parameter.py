@@ -30,8 +30,9 @@ class Parameter:
     ``scale``: "log" for positive values that span decades, "logit" for values between 0
     and 1. The ``unit`` of a pure number is "1"; a name in brackets, as in "[u]/um",
     stands for a unit that only an outer System knows (see ``System.part_units``). A
-    frequency with ``below_nyquist`` must be below pi / dt, with the sample time dt of
-    the declaring System. A ``whole`` parameter is an integer, such as a count.
+    frequency with ``below_nyquist`` must be below pi / dt in rad/s or 0.5 / dt in Hz,
+    with the sample time dt of the declaring System. A ``whole`` parameter is an
+    integer, such as a count.
     """
 
     unit: str
@@ -49,7 +50,8 @@ class Parameter:
         """Return the declaration for a System with sample time ``dt`` in s."""
         if not self.below_nyquist:
             return self
-        return dataclasses.replace(self, below=min(self.below, math.pi / dt))
+        nyquist = 0.5 / dt if self.unit == "Hz" else math.pi / dt
+        return dataclasses.replace(self, below=min(self.below, nyquist))
 
     def with_units(self, units: Mapping[str, str]) -> "Parameter":
         """Return the declaration with the names in brackets replaced by ``units``."""

@@ -10,6 +10,10 @@ from .creep import LogarithmicCreep as LogarithmicCreep
 from .creep import SpringDamperCreep as SpringDamperCreep
 from .delay import FractionalDelay as FractionalDelay
 from .drift import ThermalDrift as ThermalDrift
+from .filters import Biquad as Biquad
+from .filters import FirstOrderLowPass as FirstOrderLowPass
+from .filters import Notch as Notch
+from .filters import SecondOrderLowPass as SecondOrderLowPass
 from .lag import FirstOrderLag as FirstOrderLag
 from .lag import SecondOrderLag as SecondOrderLag
 from .linear_map import LinearMap as LinearMap

@@ -182,7 +182,7 @@ def test_what_was_learned_is_forgotten_and_a_certain_weight_is_held():
         ({"weights": (1.0, 2.0)}, "2 weights and 5 deviations; each weight needs one"),
         (
             {"weights": (1.0,) * 6, "deviations": (1.0,) * 6},
-            "6 weights for 2 thresholds; it must be three and one for each",
+            "6 weights for 2 thresholds; there must be three weights and one more for",
         ),
         ({"thresholds": (0.4, 0.0)}, "thresholds in um is 0; it must be finite and ab"),
         ({"deviations": (-1.0,) + (1.0,) * 4}, "deviations .* is -1; .* at least 0"),

@@ -15,13 +15,17 @@ from piezojax.core.system import Affine, Delay
 from piezojax.dynamics import (
     ARMA,
     AmplitudeScheduled,
+    Biquad,
     ExponentialCreep,
     FirstOrderLag,
+    FirstOrderLowPass,
     FractionalDelay,
     LinearMap,
     NeuralStateSpace,
+    Notch,
     Oversampled,
     SecondOrderLag,
+    SecondOrderLowPass,
     SpringDamperCreep,
     StateSpace,
 )
@@ -80,6 +84,12 @@ MODELS |= {
 MODELS |= {
     f"second order, {damping}": partial(SecondOrderLag, 800.0, damping, DT)
     for damping in (0.7, 1.0, 1.5)
+}
+MODELS |= {
+    "first-order low-pass": partial(FirstOrderLowPass, 120.0, DT),
+    "second-order low-pass": partial(SecondOrderLowPass, 120.0, 0.7, DT),
+    "biquad": partial(Biquad, 150.0, 0.05, 90.0, 0.6, DT),
+    "notch": partial(Notch, 150.0, 0.4, 0.1, DT),
 }
 MODELS |= {
     "held": lambda: Oversampled(FirstOrderLag(2 * DT, DT), 4),
