@@ -82,6 +82,24 @@ class Sensor(System):
         return state, displacement + self.noise_rms * draw
 
 
+class SensorResponse(System):
+    """Passes the displacement through ``dynamics``, and the noise draw unchanged.
+
+    Input and output are ``(displacement, draw)``, as those of the Sensor behind it.
+    ``dynamics`` maps um to um: a bandwidth, a delay.
+    """
+
+    dynamics: System
+
+    def init(self, input: Any = (0.0, 0.0)) -> State:
+        return self.dynamics.init(input[0])
+
+    def step(self, state: State, input: Any) -> tuple[State, tuple[Any, Any]]:
+        displacement, draw = input
+        state, displacement = self.dynamics.step(state, displacement)
+        return state, (displacement, draw)
+
+
 class ChargeDriveState(NamedTuple):
     """Last command, load voltage and charge over C_L, all in V; state of the load."""
 

@@ -417,12 +417,13 @@ def test_a_cut_off_just_below_nyquist(study):
             "disturbance, ensemble, constraints, pareto, holdout_draws, sweep; "
             "did you mean 'rate'?",
         ),
-        ("actuator/uper", 1.0, "actuator.uper is unknown; allowed are lower, upper, "),
+        ("actuator/uper", 1.0, "actuator.uper is unknown; allowed are resolution, "),
         (
             "sensor/noise",
             0.1,
-            "sensor.noise is unknown; allowed are noise_rms, resolution; did you mean "
-            "'noise_rms'?",
+            "sensor.noise is unknown; allowed are resolution, bits, range, bandwidth, "
+            "order, delay, noise_rms, anti_aliasing, anti_aliasing_order; "
+            "did you mean 'noise_rms'?",
         ),
         (
             "references/setle",

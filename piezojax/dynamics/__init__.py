@@ -1,5 +1,6 @@
 """Dynamics of a stage: linear and scheduled models, creep, lags, delays and drift."""
 
+from .analog_low_pass import AnalogLowPass as AnalogLowPass
 from .arma import ARMA as ARMA
 from .arma import scaled_to_dc as scaled_to_dc
 from .channels import Channel as Channel

@@ -13,16 +13,15 @@ from ..catalog import CONTROLLERS, PLANTS, at_rate
 from ..control.design import DESIGNS
 from ..core.about import About
 from ..core.arrays import as_array
-from ..core.axes import PerAxis
 from ..core.feedback import Feedback, Observation
 from ..core.paths import declared, static_fields
 from ..core.serial import from_data, read_about
 from ..core.serial import load as load_system
 from ..core.space import Space
-from ..core.system import System, rest_output, series
-from ..hardware import Quantiser, Saturation, Sensor, SlewLimit
+from ..core.system import System, rest_output
 from ..identification import Fit, identify, read_record
 from .ensemble import Ensemble, Stage, ensemble_of
+from .make_hardware import driven, make_actuator, make_amplifier, make_sensor, per_axis
 from .parameters import search_space
 from .schema import Study, load
 from .stage_tables import RecordPlant
@@ -37,6 +36,8 @@ class Case:
     names to the plants of a sweep, which replace the plant of the loop. ``notes`` name
     the starts that differ from the controller of the study. ``plant_about`` is the
     origin of a plant from a record or a file, with the bound on its error.
+    ``amplifier`` maps the voltage of the actuator to that of the piezo, both in V; it
+    is part of the plant, and None if the study has none.
     """
 
     study: Study
@@ -48,6 +49,7 @@ class Case:
     plants: Mapping[str, System] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     plant_about: About = field(default_factory=About)
+    amplifier: System | None = None
 
     def unit(self, path: str) -> str:
         """Return the declared unit of the parameter at ``path`` in the loop.
@@ -72,6 +74,10 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     if seed is not None:
         study = study.model_copy(update={"seed": seed})
     plant, fit, about = _plant(study, path.parent)
+    zero = per_axis(study, lambda axis: as_array(0.0))
+    _check_role(plant, zero, "plant", "a voltage to a displacement")
+    amplifier = make_amplifier(study)
+    plant = driven(amplifier, plant)
     controller = _from_source(
         study.controller,
         "controller",
@@ -80,17 +86,20 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         study.rate,
         design=lambda name: _designed(study, name, plant),
     )
-    zero = _per_axis(study, lambda axis: as_array(0.0))
-    _check_role(plant, zero, "plant", "a voltage to a displacement")
     observation = Observation(zero, zero, zero, zero)
     _check_role(controller, observation, "controller", "an Observation to a command")
-    loop = Feedback(controller, plant, _actuator(study), _sensor(study))
+    loop = Feedback(controller, plant, make_actuator(study), make_sensor(study))
     loop, space, notes = search_space(study, loop)
     _check_rates(study, loop, "the controller or plant")
     stage = Stage(loop.plant, loop.sensor)
-    ensemble = ensemble_of(study, stage, path.parent)
-    plants = _swept_plants(study, zero)
-    return Case(study, path.stem, loop, space, fit, ensemble, plants, notes, about)
+    ensemble = ensemble_of(study, stage, path.parent, amplifier)
+    plants = {
+        name: driven(amplifier, plant)
+        for name, plant in _swept_plants(study, zero).items()
+    }
+    return Case(
+        study, path.stem, loop, space, fit, ensemble, plants, notes, about, amplifier
+    )
 
 
 def read(path: str | Path, seed: int | None = None) -> Case:
@@ -135,13 +144,6 @@ def _swept_plants(study: Study, zero: Any) -> dict[str, System]:
     return plants
 
 
-def _per_axis(study: Study, make: Callable[[int], Any]) -> Any:
-    """Return ``make(0)`` on a stage with one axis, else ``make(axis)`` of each axis."""
-    if study.axes is None:
-        return make(0)
-    return tuple(make(axis) for axis in range(study.axis_count))
-
-
 def _designed(study: Study, name: str, plant: System) -> System:
     design = DESIGNS[one_of(name, DESIGNS)]
     if study.axes is not None:
@@ -153,38 +155,6 @@ def _designed(study: Study, name: str, plant: System) -> System:
         study.by_axis(limit) for limit in (study.actuator.lower, study.actuator.upper)
     )
     return design(plant, study.dt, (lower, upper))
-
-
-def _per_axis_system(study: Study, make: Callable[[int], System]) -> System:
-    parts = _per_axis(study, make)
-    return PerAxis(parts, study.axes.names) if study.axes else parts
-
-
-def _actuator(study: Study) -> System:
-    table = study.actuator
-    lower, upper = study.by_axis(table.lower), study.by_axis(table.upper)
-
-    def axis_actuator(axis: int) -> System:
-        parts: dict[str, System] = {"limits": Saturation(lower[axis], upper[axis])}
-        if table.slew_rate is not None:
-            parts["slew"] = SlewLimit(table.slew_rate, study.dt)
-        if table.resolution is not None:
-            parts["converter"] = Quantiser(table.resolution)
-        return series(**parts)
-
-    return _per_axis_system(study, axis_actuator)
-
-
-def _sensor(study: Study) -> System:
-    noise = study.by_axis(study.sensor.noise_rms)
-
-    def axis_sensor(axis: int) -> System:
-        parts: dict[str, System] = {"noise": Sensor(noise[axis])}
-        if study.sensor.resolution is not None:
-            parts["converter"] = Quantiser(study.sensor.resolution)
-        return series(**parts)
-
-    return _per_axis_system(study, axis_sensor)
 
 
 def _check_role(system: System, example: Any, where: str, role: str) -> None:

@@ -18,6 +18,7 @@ from ..core.feedback import Feedback
 from ..core.files import read_model
 from ..core.paths import get, replace
 from ..core.system import System
+from .make_hardware import driven
 from .schema import Study
 
 Part = Literal["tune", "margins", "holdout"]
@@ -104,18 +105,22 @@ class Ensemble:
         return replace(stage, values)
 
 
-def ensemble_of(study: Study, nominal: Stage, folder: Path) -> Ensemble | None:
+def ensemble_of(
+    study: Study, nominal: Stage, folder: Path, amplifier: System | None = None
+) -> Ensemble | None:
     """Return the ensemble of ``study``, or None if the study has none.
 
-    The files that the study names lie in ``folder``. Raises ValueError for an unknown
-    deviation or path, and for a file without standard errors.
+    Drawn plants have the ``amplifier`` of the nominal one in front. The files that the
+    study names lie in ``folder``. Raises ValueError for an unknown deviation or path,
+    and for a file without standard errors.
     """
     table = study.ensemble
     if table is None:
         return None
     varied = (*table.spread, *table.range)
     paths = tuple(name for name in varied if "." in name)
-    make, arguments = None, ()
+    make: Callable[..., System] | None = None
+    arguments: tuple[str, ...] = ()
     if len(paths) < len(varied):
         name = str(study.plant.get("catalog", ""))
         known = deviations_of(name)
@@ -125,7 +130,7 @@ def ensemble_of(study: Study, nominal: Stage, folder: Path) -> Ensemble | None:
                 "ensemble: plant.catalog must be one whose variations are known: "
                 f"{plants}; for others name paths, as plant.0.a"
             )
-        make = PLANTS[name]
+        make = _behind(amplifier, PLANTS[name])
         for deviation in varied:
             if "." not in deviation and deviation not in known:
                 key = "spread" if deviation in table.spread else "range"
@@ -143,6 +148,17 @@ def ensemble_of(study: Study, nominal: Stage, folder: Path) -> Ensemble | None:
         else {}
     )
     return Ensemble(study, nominal, make, arguments, paths, errors)
+
+
+def _behind(
+    amplifier: System | None, make: Callable[..., System]
+) -> Callable[..., System]:
+    """Return ``make`` of a plant, with the plant behind ``amplifier``."""
+
+    def made(**deviations: Any) -> System:
+        return driven(amplifier, make(**deviations))
+
+    return made
 
 
 def _check_path(stage: Stage, path: str, where: str) -> None:

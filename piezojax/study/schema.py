@@ -272,13 +272,17 @@ class Study(Table):
 
     @model_validator(mode="after")
     def _by_axis(self) -> "Study":
+        tables = {
+            "references": self.references,
+            "actuator": self.actuator,
+            "sensor": self.sensor,
+            "disturbance": self.disturbance,
+        }
         lists = {
-            "references.amplitude": self.references.amplitude,
-            "references.offset": self.references.offset,
-            "actuator.lower": self.actuator.lower,
-            "actuator.upper": self.actuator.upper,
-            "sensor.noise_rms": self.sensor.noise_rms,
-            "disturbance.drift_rms": self.disturbance.drift_rms,
+            f"{name}.{key}": value
+            for name, table in tables.items()
+            for key, value in table
+            if key not in ("tune", "unseen")
         }
         for key, value in lists.items():
             if isinstance(value, tuple) and len(value) != self.axis_count:

@@ -1,12 +1,16 @@
 """Tables of a study that describe the stage: plant, drive, sensor, disturbance."""
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-from pydantic import field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from ..identification import chain
 from .tables import ByAxis, Finite, NotNegative, Positive, Table
+
+Bandwidth = Annotated[float, Field(ge=1e-3, le=1e9, allow_inf_nan=False, strict=True)]
+Order = Annotated[int, Field(strict=True, ge=1, le=4)]
 
 
 class RecordPlant(Table):
@@ -32,16 +36,54 @@ class RecordPlant(Table):
         return name
 
 
-class Actuator(Table):
-    """Drive: its limits ``lower`` and ``upper``, V, and optional properties.
+class ElectronicsTable(Table):
+    """Electronics between the controller and the stage; each entry may be left out.
 
-    ``slew_rate`` is in V/s; ``resolution`` is that of the converter, V.
+    Of the converter, ``resolution`` is one step, or ``bits`` divide its ``range``; both
+    in the unit of the signal. ``bandwidth`` (Hz) and ``order`` (1 to 4) are those of a
+    Butterworth low-pass, ``delay`` is in s.
+    """
+
+    resolution: ByAxis[Positive] | None = None
+    bits: Annotated[int, Field(strict=True, ge=1, le=32)] | None = None
+    range: ByAxis[Positive] | None = None
+    bandwidth: ByAxis[Bandwidth] | None = None
+    order: Order | None = None
+    delay: ByAxis[NotNegative] = 0.0
+
+    @model_validator(mode="after")
+    def _converter(self) -> "ElectronicsTable":
+        if self.resolution is not None and self.bits is not None:
+            raise ValueError("resolution and bits are both given; give one of them")
+        _needs(self, "range", "bits")
+        _needs(self, "order", "bandwidth")
+        return self
+
+
+def _needs(table: Table, key: str, other: str) -> None:
+    """Raise ValueError if ``table`` has ``key`` without ``other``."""
+    if getattr(table, key) is not None and getattr(table, other) is None:
+        raise ValueError(f"{key} is given without {other}; give both or neither")
+
+
+class Actuator(ElectronicsTable):
+    """Drive: its limits ``lower`` and ``upper``, V, and the properties of amplifier.
+
+    ``slew_rate`` is in V/s. ``current_limit`` (A) and ``capacitance`` of the stage (F)
+    limit the slew rate too. ``computation`` is the time from the sample of the sensor
+    to the change of the voltage, in samples. Without ``range`` the bits divide the
+    interval from ``lower`` to ``upper``.
+
+    The controller knows the voltage after the limits, the slew rate and the converter,
+    but not the amplifier's bandwidth and delay behind them.
     """
 
     lower: ByAxis[Finite]
     upper: ByAxis[Finite]
-    slew_rate: Positive | None = None
-    resolution: Positive | None = None
+    slew_rate: ByAxis[Positive] | None = None
+    current_limit: ByAxis[Positive] | None = None
+    capacitance: ByAxis[Positive] | None = None
+    computation: NotNegative = 0.0
 
     @model_validator(mode="after")
     def _ordered(self) -> "Actuator":
@@ -54,14 +96,32 @@ class Actuator(Table):
                     f"lower is {lower:g} V and upper {upper:g} V; "
                     "lower must be below upper"
                 )
+        if self.current_limit is not None and self.capacitance is None:
+            raise ValueError(
+                "current_limit is given without capacitance; "
+                "the slew rate is the current over the capacitance of the stage"
+            )
         return self
 
 
-class SensorTable(Table):
-    """Noise and resolution of the sensor, um."""
+class SensorTable(ElectronicsTable):
+    """Noise of the sensor, um, and the properties of its electronics.
+
+    ``noise_rms`` is white up to half the rate and is added behind the bandwidth and the
+    delay. ``anti_aliasing`` (Hz), of order ``anti_aliasing_order``, filters the
+    displacement and the noise before the converter.
+    """
 
     noise_rms: ByAxis[NotNegative] = 0.0
-    resolution: Positive | None = None
+    anti_aliasing: ByAxis[Bandwidth] | None = None
+    anti_aliasing_order: Order | None = None
+
+    @model_validator(mode="after")
+    def _measured(self) -> "SensorTable":
+        if self.bits is not None and self.range is None:
+            raise ValueError("bits is given without range, the travel that it divides")
+        _needs(self, "anti_aliasing_order", "anti_aliasing")
+        return self
 
 
 class DisturbanceTable(Table):

@@ -15,6 +15,7 @@ from piezojax.core.system import Affine, Delay
 from piezojax.dynamics import (
     ARMA,
     AmplitudeScheduled,
+    AnalogLowPass,
     Biquad,
     ExponentialCreep,
     FirstOrderLag,
@@ -90,6 +91,10 @@ MODELS |= {
     "second-order low-pass": partial(SecondOrderLowPass, 120.0, 0.7, DT),
     "biquad": partial(Biquad, 150.0, 0.05, 90.0, 0.6, DT),
     "notch": partial(Notch, 150.0, 0.4, 0.1, DT),
+}
+MODELS |= {
+    f"analogue low-pass of order {order}": partial(AnalogLowPass, 120.0, DT, order)
+    for order in (1, 4)
 }
 MODELS |= {
     "held": lambda: Oversampled(FirstOrderLag(2 * DT, DT), 4),

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from ...core.feedback import Feedback, LoopSample
@@ -51,8 +52,9 @@ def problem_of(
     ``rest`` [references x draws] are the voltages (V) before the runs; other arguments
     as for ``performance_limit``.
 
-    Raises ValueError for a run that diverges, a sensor without noise, several axes, and
-    a plant that is unstable or does not move as its linear model does.
+    Raises ValueError for a run that diverges, a sensor with dynamics or without noise,
+    several axes, and a plant that is unstable or does not move as its linear model
+    does.
     """
     sensor_noise = runs.measured - runs.displacement
     if not np.all(np.isfinite(runs.displacement)):
@@ -74,6 +76,10 @@ def problem_of(
         return windowed(signals, window, points)
 
     plant = linear_plant(loop, 0.5 * (references.min() + references.max()), dt)
+    if jax.tree.leaves(loop.sensor.init((0.0, 0.0))):
+        raise ValueError(
+            "the limit is known for a sensor without bandwidth, delay and filter"
+        )
     response = plant_response(plant, runs.voltage, rest)
     gain = gain_from_noise(
         lines(predictor.unpredicted(by_draw(response))),
