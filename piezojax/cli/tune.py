@@ -147,7 +147,12 @@ def _compare(
     import tomli_w
 
     from .. import study as studies
-    from ..report.comparison_map import comparison_table, write_comparison
+    from ..report.comparison_map import (
+        comparison_table,
+        perturbed_table,
+        perturbed_text,
+        write_comparison,
+    )
     from ..report.tuning_pictures import write_numbers
     from ..tuning.comparison import compare
 
@@ -174,6 +179,9 @@ def _compare(
     ]
     print_alarms(console, alarms)
     console.print(comparison_table(comparison))
+    if (perturbed := perturbed_table(comparison)) is not None:
+        console.print(perturbed)
+        console.print(perturbed_text(comparison), soft_wrap=True)
     for row in comparison.rows:
         for note in row.notes:
             console.print(f"note: {row.study}: {note}", soft_wrap=True)

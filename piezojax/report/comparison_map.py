@@ -67,6 +67,59 @@ def _tuned(row: TunedStudy) -> str:
     return _nanometres(row.after_um) + ("!" if row.alarms else "")
 
 
+def perturbed_table(comparison: ComparisonResult) -> Table | None:
+    """Return errors on held-out perturbed plants in nm rms; None without any."""
+    rows = [row for row in comparison.rows if row.perturbed is not None]
+    if not rows:
+        return None
+    several = len({row.rate_Hz for row in rows}) > 1
+    table = Table(
+        title=Text(
+            "rms tracking error on held-out perturbed plants, nm: geometric mean over "
+            "the references\n(median and worst plant; bold: lowest; ! with an alarm; "
+            "Ms: largest)"
+        )
+    )
+    table.add_column("controller")
+    for title in ("gains", "before", "tuned", "worst", "unstable", "Ms"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for row in rows:
+        found = row.perturbed
+        assert found is not None
+        peak = found.constraints.get("sensitivity_peak")
+        rate = f"{row.rate_Hz:g}"
+        wins = comparison.best_perturbed.get(rate) == row.controller
+        table.add_row(
+            row.controller + (f", {float(rate) / 1000:g} kHz" if several else ""),
+            str(row.tuned),
+            _finer(found.geomean_before_rms_um),
+            _finer(found.geomean_rms_um) + ("!" if row.alarms else ""),
+            _finer(found.worst_rms_um),
+            f"{found.unstable} of {found.plants}",
+            "-" if peak is None or peak.value is None else f"{peak.value:.2f}",
+            style="bold" if wins else None,
+        )
+    return table
+
+
+def perturbed_text(comparison: ComparisonResult) -> str:
+    """Return a line for each rate: the best on held-out plants, and the next best."""
+    lines = []
+    for rate, best in comparison.best_perturbed.items():
+        errors = {
+            row.controller: row.perturbed_um
+            for row in comparison.rows
+            if f"{row.rate_Hz:g}" == rate and row.perturbed_um is not None
+        }
+        least = errors.pop(best)
+        line = f"lowest on held-out plants at {float(rate) / 1000:g} kHz: {best}"
+        if errors:
+            name, error = min(errors.items(), key=lambda item: item[1])
+            line += f", {error / least:.2f}x below the next, {name}"
+        lines.append(line)
+    return "\n".join(lines)
+
+
 def write_comparison(comparison: ComparisonResult, folder: Path) -> None:
     """Write comparison.json and comparison.png into ``folder``."""
     text = comparison.model_dump_json(indent=2)
@@ -195,6 +248,10 @@ def _rows_of(comparison: ComparisonResult, controller: str) -> list[TunedStudy]:
 
 def _nanometres(value: float | None) -> str:
     return "-" if value is None else f"{1e3 * value:.1f}"
+
+
+def _finer(value: float | None) -> str:
+    return "-" if value is None else f"{1e3 * value:.2f}"
 
 
 def _times(value: float | None) -> str:

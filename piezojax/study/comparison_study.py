@@ -14,8 +14,9 @@ from ..core.paths import get
 from ..core.plain import read_plain
 from ..core.system import Affine
 from .case import Case, build, read
+from .ensemble_table import EnsembleTable
 from .schema import ObjectiveTable, OptimiserTable, References, Study
-from .stage_tables import SensorTable
+from .stage_tables import DisturbanceTable, SensorTable
 from .tables import Positive, RangeTable, Table, one_of, validated
 
 Start = Literal["printed", "scaled", "rule", "own"]
@@ -100,9 +101,11 @@ class ComparisonStudy(Table):
     plant: dict[str, Any]
     actuator: dict[str, Any]
     sensor: SensorTable = SensorTable()
+    disturbance: DisturbanceTable = DisturbanceTable()
     references: References
     objective: ObjectiveTable = ObjectiveTable()
     optimiser: OptimiserTable = OptimiserTable()
+    ensemble: EnsembleTable | None = None
     constraints: dict[str, Any] = Field(default_factory=dict)
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
     bounds: dict[str, RateRange] = Field(default_factory=dict)

@@ -10,7 +10,7 @@ from ..core.progress import Progress, Silent
 from ..study import ComparedCase
 from ..study.comparison_study import Start
 from .outcome import Outcome
-from .result import Result, Status
+from .result import Perturbed, Result, Status
 from .tuner import tune
 
 COMPARISON_FILE = "comparison.json"
@@ -21,8 +21,10 @@ class TunedStudy(BaseModel):
 
     ``before_um`` and ``after_um`` are those on held-out noise, ``unseen_before_um`` and
     ``unseen_um`` those on held-out references with held-out noise; None where a run
-    diverges or rails. ``alarms`` are the reasons not to use the gains. A study that
-    could not be tuned has the status "failed" and the reason in ``alarms``.
+    diverges or rails. ``perturbed`` holds the figures on the held-out plants of an
+    ensemble. ``tuned`` is the number of tuned parameters. ``alarms`` are the reasons
+    not to use the gains. A study that could not be tuned has the status "failed" and
+    the reason in ``alarms``.
     """
 
     study: str
@@ -34,6 +36,8 @@ class TunedStudy(BaseModel):
     after_um: float | None = None
     unseen_before_um: float | None = None
     unseen_um: float | None = None
+    perturbed: Perturbed | None = None
+    tuned: int = 0
     notes: list[str] = []
     alarms: list[str] = []
     wall_s: float = 0.0
@@ -48,6 +52,16 @@ class TunedStudy(BaseModel):
         """Ratio of the errors on held-out references before and after tuning."""
         return _ratio(self.unseen_before_um, self.unseen_um)
 
+    @property
+    def perturbed_um(self) -> float | None:
+        """Error of the tuned gains on the median held-out plant, um.
+
+        None without such plants, or if a run diverges or rails on any of them.
+        """
+        if self.perturbed is None or self.perturbed.unstable:
+            return None
+        return self.perturbed.geomean_rms_um
+
 
 class ComparisonResult(BaseModel):
     """Content of ``comparison.json``: the rows, with summaries by controller and rate.
@@ -55,7 +69,8 @@ class ComparisonResult(BaseModel):
     ``better`` and ``unseen_better`` are the geometric means of ``ratio`` and
     ``unseen_ratio`` over the rows of a controller, None where one of its runs diverges
     or rails or one of its rows failed. ``best`` is the controller with the lowest error
-    after tuning at each rate (Hz).
+    after tuning at each rate (Hz), ``best_perturbed`` that with the lowest error on the
+    median held-out plant.
     """
 
     title: str
@@ -64,6 +79,7 @@ class ComparisonResult(BaseModel):
     better: dict[str, float | None]
     unseen_better: dict[str, float | None]
     best: dict[str, str]
+    best_perturbed: dict[str, str] = {}
     versions: dict[str, str]
     seed: int
     wall_s: float
@@ -106,7 +122,8 @@ def compare(
         rows=rows,
         better=_by_controller(rows, "ratio"),
         unseen_better=_by_controller(rows, "unseen_ratio"),
-        best=_best(rows),
+        best=_best(rows, "after_um"),
+        best_perturbed=_best(rows, "perturbed_um"),
         versions=versions,
         seed=entries[0].case.study.seed,
         wall_s=time.perf_counter() - began,
@@ -135,6 +152,8 @@ def _row_of(entry: ComparedCase, result: Result) -> TunedStudy:
         after_um=geomean(result.holdout),
         unseen_before_um=geomean(result.unseen_before),
         unseen_um=geomean(result.unseen),
+        perturbed=result.perturbed,
+        tuned=len(result.gains),
         notes=result.warnings,
         alarms=result.alarms,
         wall_s=result.wall_s,
@@ -155,11 +174,11 @@ def _by_controller(rows: Sequence[TunedStudy], figure: str) -> dict[str, float |
     return found
 
 
-def _best(rows: Sequence[TunedStudy]) -> dict[str, str]:
-    best: dict[float, TunedStudy] = {}
+def _best(rows: Sequence[TunedStudy], figure: str) -> dict[str, str]:
+    """Return the controller with the lowest ``figure`` by rate."""
+    best: dict[float, tuple[float, str]] = {}
     for row in rows:
-        leader = best.get(row.rate_Hz)
-        error = row.after_um
-        if error is not None and (leader is None or error < (leader.after_um or 0.0)):
-            best[row.rate_Hz] = row
-    return {f"{rate:g}": best[rate].controller for rate in sorted(best)}
+        error, rate = getattr(row, figure), row.rate_Hz
+        if error is not None and (rate not in best or error < best[rate][0]):
+            best[rate] = error, row.controller
+    return {f"{rate:g}": best[rate][1] for rate in sorted(best)}

@@ -121,6 +121,13 @@ class Perturbed(BaseModel):
     constraints: dict[str, ConstraintOutcome] = {}
     values: dict[str, list[float | None]] = {}
 
+    @property
+    def geomean_before_rms_um(self) -> float | None:
+        """Median of ``geomeans_before_um``; None if a loop is unstable."""
+        known = [mean for mean in self.geomeans_before_um if mean is not None]
+        usable = known and not self.unstable_before
+        return float(np.median(known)) if usable else None
+
     @classmethod
     def of(
         cls,

@@ -77,7 +77,7 @@ def test_designs_of_scipy(share):
         (FirstOrderLowPass(frequency, DT), SecondOrderLowPass(frequency, 0.5**0.5, DT))
     ):
         design: Any = scipy.signal.butter(order + 1, share)
-        expected = scipy.signal.lfilter(*design, inputs)
+        expected = scipy.signal.lfilter(design[0], design[1], inputs)
         np.testing.assert_allclose(
             response(system, inputs, 0.0), expected, rtol=0.0, atol=1e-12
         )

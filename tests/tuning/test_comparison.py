@@ -12,7 +12,11 @@ from click.testing import CliRunner
 from piezojax.catalog import p753_chapter4
 from piezojax.cli.tune import main
 from piezojax.core.paths import get
-from piezojax.report.comparison_map import comparison_table
+from piezojax.report.comparison_map import (
+    comparison_table,
+    perturbed_table,
+    perturbed_text,
+)
 from piezojax.study import (
     ComparisonStudy,
     compared_cases,
@@ -33,6 +37,7 @@ FILE = {
     "plant": LAG,
     "actuator": {"lower": -20.0, "upper": 120.0},
     "sensor": {"noise_rms": 0.012},
+    "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
     "references": {
         "tune": ["SIN50"],
         "unseen": ["SW50"],
@@ -57,9 +62,11 @@ FILE = {
         },
     },
 }
+NOISE = "sensor.noise.noise_rms"
+ENSEMBLE = {"tune": 0, "margins": 0, "holdout": 3, "spread": {NOISE: 0.3}}
 KEYS = {
     *("title", "status", "rows", "better", "unseen_better", "best"),
-    *("versions", "seed", "wall_s"),
+    *("best_perturbed", "versions", "seed", "wall_s"),
 }
 
 
@@ -83,7 +90,8 @@ def with_controller(**changes):
 def compared(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compared")
     path = folder / "both.toml"
-    path.write_text(tomli_w.dumps(FILE | {"rates": [5000.0]}), encoding="utf-8")
+    file = FILE | {"rates": [5000.0], "ensemble": ENSEMBLE}
+    path.write_text(tomli_w.dumps(file), encoding="utf-8")
     done = CliRunner().invoke(main, [str(path), "--out", str(folder / "out")])
     assert done.exit_code == 0, done.output
     assert done.stderr == ""
@@ -114,6 +122,10 @@ def test_rows_are_the_studies_results(compared):
         assert row["after_um"] == result.holdout.geomean_rms_um
         assert row["unseen_um"] == result.unseen.geomean_rms_um
         assert row["status"] == result.status
+        assert row["tuned"] == 2
+        assert result.perturbed is not None
+        assert row["perturbed"] == result.perturbed.model_dump()
+        assert row["perturbed"]["plants"] == 3
         assert (out / row["study"] / "gains.toml").exists()
 
 
@@ -157,6 +169,43 @@ def test_a_start_that_diverges_has_no_ratio(compared, monkeypatch):
     assert comparison.best["5000"] == "PID"
 
 
+def perturbed_to(result, error, unstable=0, before=(0.4, None, 0.2)):
+    changes = {
+        "geomean_rms_um": error,
+        "unstable": unstable,
+        "unstable_before": before.count(None),
+        "geomeans_before_um": before,
+    }
+    perturbed = result.perturbed.model_copy(update=changes)
+    return result.model_copy(update={"perturbed": perturbed})
+
+
+def test_the_best_on_held_out_plants_is_stable_on_all_of_them(compared, monkeypatch):
+    _, out, data = compared
+    result = load_result(out / data["rows"][0]["study"])
+    stable = perturbed_to(result, 0.03, before=(0.4, 0.2, 0.3))
+    # PID at 5 and 10 kHz, then the continuous one at 5 kHz.
+    results = iter([perturbed_to(result, 0.01, unstable=1), stable, stable])
+    monkeypatch.setattr(
+        comparing,
+        "tune",
+        lambda case, progress: SimpleNamespace(result=next(results), case=case),
+    )
+    comparison = compare("made up", entries(file_with()))
+    assert comparison.best_perturbed == {"5000": "continuous", "10000": "PID"}
+    before = [row.perturbed.geomean_before_rms_um for row in comparison.rows]
+    assert before == [None, 0.3, 0.3]
+    assert perturbed_text(comparison).splitlines() == [
+        "lowest on held-out plants at 5 kHz: continuous",
+        "lowest on held-out plants at 10 kHz: PID",
+    ]
+    worse = perturbed_to(result, 0.06).perturbed
+    first = comparison.rows[0].model_copy(update={"perturbed": worse})
+    rows = [first, *comparison.rows[1:]]
+    text = perturbed_text(comparison.model_copy(update={"rows": rows}))
+    assert "5 kHz: continuous, 2.00x below the next, PID" in text
+
+
 def test_its_studies_can_be_tuned_alone(compared):
     _, out, data = compared
     study = out / data["rows"][0]["study"] / "study.toml"
@@ -171,6 +220,8 @@ def test_the_command_ends_with_the_table(compared):
     printed, out, _ = compared
     assert "2 of 2: continuous at 5 kHz" in printed
     assert "rms tracking error, nm" in printed
+    assert "held-out perturbed plants" in printed
+    assert "lowest on held-out plants at 5 kHz: " in printed
     assert "geometric mean" in printed
     assert "complete: 2 of 2 studies" in printed
     assert (out / "comparison.png").read_bytes().startswith(b"\x89PNG")
@@ -184,13 +235,13 @@ def test_several_studies_are_compared(compared, tmp_path, monkeypatch):
         paths[-1].write_text((out / row["study"] / "study.toml").read_text())
     monkeypatch.setattr(comparing, "tune", hopeless)
     done = CliRunner().invoke(main, [*map(str, paths), "--out", str(tmp_path / "out")])
-    assert done.exit_code == 0, done.output
+    assert done.exit_code == 3, done.output
     comparison = ComparisonResult.model_validate_json(
         (tmp_path / "out" / "comparison.json").read_text(encoding="utf-8")
     )
     assert [row.study for row in comparison.rows] == ["PID", "continuous"]
     assert [row.start for row in comparison.rows] == ["own", "own"]
-    assert "note: PID: the loop diverges everywhere" in done.stdout
+    assert "ALARM: PID: the loop diverges everywhere" in done.stdout
 
 
 def test_two_studies_of_one_name_are_refused(compared, tmp_path):
@@ -260,10 +311,11 @@ def test_a_study_that_cannot_be_tuned_is_a_row(monkeypatch):
     monkeypatch.setattr(comparing, "tune", hopeless)
     comparison = compare("none", entries(file_with()))
     assert {row.status for row in comparison.rows} == {"failed"}
-    assert comparison.rows[0].notes == ["the loop diverges everywhere"]
+    assert comparison.rows[0].alarms == ["the loop diverges everywhere"]
     assert comparison.better == {"PID": None, "continuous": None}
     assert comparison.best == {}
     assert comparison_table(comparison).row_count > 0
+    assert perturbed_table(comparison) is None
 
 
 def test_the_shipped_comparison_is_valid():
