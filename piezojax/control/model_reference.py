@@ -1,6 +1,5 @@
 """Model-reference sliding mode control (section 4.5.3.3)."""
 
-from collections.abc import Iterable
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -12,7 +11,7 @@ from ..core.parameter import PartUnits, parameter
 from ..core.system import System
 from ..dynamics.arma import ARMA
 from .observer import Observer
-from .output_tracking import check_inversion, inversion_gain
+from .output_tracking import check_has_poles, check_inversion, dot, inversion_gain
 from .switching import SwitchingLaw
 
 
@@ -67,9 +66,8 @@ class ModelReferenceSlidingMode(System):
     inversion: str = eqx.field(static=True, default="tikhonov")
 
     def __check_init__(self):
+        check_has_poles(self.model)
         order = len(self.model.autoregressive)
-        if order < 1:
-            raise ValueError("the model has no a coefficient; it must have at least 1")
         if len(self.surface) != order - 1:
             raise ValueError(
                 f"surface holds {len(self.surface)} weights; it must hold {order - 1} "
@@ -83,15 +81,15 @@ class ModelReferenceSlidingMode(System):
         gain = inversion_gain(
             self.inversion, self.model, self.error_weight, self.control_weight
         )
-        return gain * (wanted - _dot(later, past))
+        return gain * (wanted - dot(later, past))
 
     def _advanced(self, outputs: tuple[Scalar, ...]) -> Scalar:
         """Return the contribution of the past ``outputs`` to the model's next one."""
-        return as_array(_dot(self.model.autoregressive, outputs))
+        return as_array(dot(self.model.autoregressive, outputs))
 
     def _sliding(self, errors: tuple[Scalar, ...]) -> Scalar:
         newest, *older = errors
-        return newest + _dot(reversed(self.surface), older)
+        return newest + dot(reversed(self.surface), older)
 
     def init(self, input: Observation) -> ModelReferenceState:
         reference = as_array(input.reference)
@@ -129,7 +127,7 @@ class ModelReferenceSlidingMode(System):
 
         sliding = self._sliding(errors)
         # S A_e delta: each error one sample older, the newest predicted by the model.
-        shifted = _dot(reversed(self.surface), errors)
+        shifted = dot(reversed(self.surface), errors)
         equivalent = self._inverse(-(self._advanced(errors) + shifted), state.feedback)
         law, switching = self.law.step(state.law, sliding)
         feedback = equivalent + switching
@@ -144,9 +142,3 @@ class ModelReferenceSlidingMode(System):
             law=law,
         )
         return state, forward + feedback
-
-
-def _dot(weights: Iterable[Scalar], values: Iterable[Scalar]) -> Scalar:
-    """Return the sum of products up to the end of the shorter sequence."""
-    pairs = zip(weights, values, strict=False)
-    return sum((weight * value for weight, value in pairs), start=as_array(0.0))

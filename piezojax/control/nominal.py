@@ -10,7 +10,6 @@ from ..core.feedback import Observation
 from ..core.parameter import PartUnits, parameter
 from ..core.system import System
 from ..dynamics.arma import ARMA
-from .output_tracking import check_second_order
 from .switching import SwitchingLaw
 
 READINGS = ("nominal_state", "measured_state")
@@ -70,7 +69,7 @@ class NominalSlidingMode(System):
     reading: str = eqx.field(static=True, default="nominal_state")
 
     def __check_init__(self):
-        check_second_order(self.model)
+        _check_second_order(self.model)
         if self.reading not in READINGS:
             raise ValueError(
                 f"reading {self.reading!r}; it must be one of {list(READINGS)}"
@@ -132,3 +131,13 @@ class NominalSlidingMode(System):
         law, switching = self.law.step(state.law, sliding)
         command = self._inverse() * (v + sum(self.model.moving) * switching)
         return following._replace(law=law), command
+
+
+def _check_second_order(model: ARMA) -> None:
+    """Raise ValueError unless ``model`` has a_1, a_2 and b_0, b_1, b_2."""
+    orders = len(model.autoregressive), len(model.moving)
+    if orders != (2, 3):
+        raise ValueError(
+            f"the model has {orders[0]} a and {orders[1]} b coefficients; "
+            "it must have 2 and 3"
+        )

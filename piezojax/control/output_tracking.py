@@ -1,10 +1,13 @@
-"""Equations of output-tracking sliding mode control (chapters 4 and 5)."""
+"""Equations of output-tracking sliding mode control of any order (chapters 4, 5)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+from math import comb
 
-from ..core.arrays import Scalar, check_not_zero
+from ..core.arrays import Scalar, as_array, check_not_zero
 from ..dynamics.arma import ARMA
-from .observer import Motion
+
+Row = tuple[Scalar, ...]
 
 INVERSIONS: dict[str, Callable[[Scalar, Scalar, Scalar], Scalar]] = {
     "printed": lambda b0, error, control: error / (b0 * (error + control)),
@@ -29,53 +32,89 @@ def inversion_gain(form: str, model: ARMA, error: Scalar, control: Scalar) -> Sc
     return INVERSIONS[form](model.moving[0], error, control)
 
 
-def check_second_order(model: ARMA) -> None:
-    """Raise ValueError unless ``model`` has a_1, a_2 and b_0, b_1, b_2."""
-    orders = len(model.autoregressive), len(model.moving)
-    if orders != (2, 3):
-        raise ValueError(
-            f"the model has {orders[0]} a and {orders[1]} b coefficients; "
-            "it must have 2 and 3"
-        )
+def check_has_poles(model: ARMA) -> None:
+    """Raise ValueError for a model without a_1."""
+    if not model.autoregressive:
+        raise ValueError("the model has no a coefficient; it must have at least 1")
 
 
-def tracking_error(
-    motion: Motion, reference: Scalar, older_reference: Scalar, dt: float
-) -> Motion:
-    """Return e1 = y - r in um and e2 = dy/dt - dr/dt in um/s, dr/dt by difference."""
-    return Motion(
-        motion.position - reference,
-        motion.velocity - (reference - older_reference) / dt,
-    )
+def derivatives(position: Scalar, velocities: Row, dt: float) -> Row:
+    """Return e, de/dt, d2e/dt2, ...: the error state (5.3), (5.5).
+
+    The state holds ``position`` e and backward differences of ``velocities``, those at
+    k, k-1, ...; it has one component more than there are velocities.
+    """
+    found = [position]
+    while velocities:
+        found.append(velocities[0])
+        velocities = tuple((new - old) / dt for new, old in pairwise(velocities))
+    return tuple(found)
+
+
+def sliding(surface: Scalar, state: Row) -> Scalar:
+    """Return s = ``surface``^(2-n) (``surface`` + d/dt)^(n-1) e, um/s (5.15).
+
+    n is the size of the error ``state``. The factor before the bracket gives s the same
+    unit for any n; for n = 2 it is 1.
+    """
+    position, *rates = state
+    found, share = surface * position, as_array(1.0)
+    for i, rate in enumerate(rates, start=1):
+        found = found + comb(len(rates), i) * share * rate
+        share = share / surface
+    return found
 
 
 def feedforward(
-    model: ARMA, next_reference: Scalar, reference: Scalar, older_reference: Scalar
+    model: ARMA, next_reference: Scalar, references: Iterable[Scalar]
 ) -> Scalar:
-    """Return v1 (4.6), which moves the model from one reference state to the next."""
-    a1, a2 = model.autoregressive
-    return (next_reference - a1 * reference - a2 * older_reference) / model.moving[0]
+    """Return v1 (4.6), which moves the model from one reference state to the next.
+
+    ``references`` are r(k), r(k-1), ..., one for each a coefficient.
+    """
+    moved = dot(model.autoregressive, references)
+    return (next_reference - moved) / model.moving[0]
+
+
+def drive(model: ARMA, surface: Scalar, dt: float) -> Scalar:
+    """Return S B_d of (4.12), the change of s by the control v in one sample."""
+    order = len(model.autoregressive)
+    unit = [model.moving[0]]  # the error state moved by v = 1, from rest
+    for _ in range(order - 1):
+        unit.append(unit[-1] / dt)
+    return sliding(surface, tuple(unit))
 
 
 def equivalent_control(
-    model: ARMA, surface: Scalar, error: Motion, dt: float
+    model: ARMA,
+    surface: Scalar,
+    position: Scalar,
+    velocities: Row,
+    dt: float,
 ) -> Scalar:
-    """Return v_eq (4.10), which brings s = ``surface`` e1 + e2 to zero in one sample.
+    """Return v_eq (4.10), which brings s to zero in one sample.
 
-    The model's state is x = [y, (y - y')/T], driven through B = [b0, b0/T].
+    The past errors of the model with the error state of ``derivatives`` are
+    e(k-j) = e - dt (de(k)/dt + ... + de(k-j+1)/dt).
     """
-    e1, e2 = error
-    a1, a2 = model.autoregressive
-    b0 = model.moving[0]
-    next_e1 = (a1 + a2) * e1 - a2 * dt * e2
-    next_e2 = ((a1 + a2 - 1.0) * e1 / dt) - a2 * e2
-    return -(1.0 / (surface * b0 + b0 / dt)) * (surface * next_e1 + next_e2)
+    a = model.autoregressive
+    past = as_array(0.0)
+    rise = (sum(a[1:], a[0]) - 1.0) * position
+    for weight, velocity in zip(a[1:], velocities, strict=True):
+        past = past + dt * velocity
+        rise = rise - weight * past
+    moved = (rise / dt, *velocities)[: len(velocities)]
+    following = derivatives(position + rise, moved, dt)
+    return -sliding(surface, following) / drive(model, surface, dt)
 
 
-def inverted(
-    model: ARMA, gain: Scalar, v: Scalar, outputs: tuple[Scalar, Scalar]
-) -> Scalar:
-    """Return f = gain [b0 v - b1 f' - b2 f''], the inverse of the model's numerator."""
-    b0, b1, b2 = model.moving
-    older, oldest = outputs
-    return gain * (b0 * v - b1 * older - b2 * oldest)
+def inverted(model: ARMA, gain: Scalar, v: Scalar, outputs: Iterable[Scalar]) -> Scalar:
+    """Return f = gain [b_0 v - b_1 f(k-1) - ...], the inverse of the numerator."""
+    b0, *later = model.moving
+    return gain * (b0 * v - dot(later, outputs))
+
+
+def dot(weights: Iterable[Scalar], values: Iterable[Scalar]) -> Scalar:
+    """Return the sum of products up to the end of the shorter sequence."""
+    products = [w * value for w, value in zip(weights, values, strict=False)]
+    return sum(products[1:], products[0]) if products else as_array(0.0)

@@ -3,51 +3,62 @@
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 
-from ..core.arrays import Scalar, State, as_array
+from ..core.arrays import Scalar, State, as_array, check_not_zero
 from ..core.feedback import Observation
 from ..core.parameter import PartUnits, parameter
 from ..core.system import System
 from ..dynamics.arma import ARMA
 from .observer import Observer
 from .output_tracking import (
+    Row,
+    check_has_poles,
     check_inversion,
-    check_second_order,
+    derivatives,
     equivalent_control,
     feedforward,
     inversion_gain,
     inverted,
-    tracking_error,
+    sliding,
 )
 from .switching import SwitchingLaw
 
 
 class SlidingModeState(NamedTuple):
-    """States of filter and law, the last reference, and the last two outputs."""
+    """States of filter and law, and histories, newest first.
+
+    ``references`` r(k-1), r(k-2), ... in um, ``velocities`` de/dt at k-1, k-2, ... in
+    um/s and ``outputs`` f(k-1), f(k-2), ...
+    """
 
     filter: State
     law: State
-    older_reference: Scalar
-    outputs: tuple[Scalar, Scalar]
+    references: Row
+    velocities: Row
+    outputs: Row
 
 
 class SlidingMode(System):
-    """Output-tracking sliding mode control on a second-order model.
+    """Output-tracking sliding mode control on a model of any order n.
 
-    The observer ``filter`` estimates the state x = [y, dy/dt]. The sliding variable is
-    ``s = surface e1 + e2`` in um/s (5.15). The equivalent control and the reference
-    part v1 come from ``model`` (a_1, a_2 | b_0, b_1, b_2, b_0 not zero), the switching
-    part from ``law``: a ``SwitchingPID`` (5.18), ``BangBang``, ``BoundaryLayer`` or
-    ``SuperTwisting``. The zeros of the model, which may lie outside the unit circle,
-    are inverted in the least-squares sense: f = Q/(Q+R) [v - (b1/b0) f' - (b2/b0) f'']
-    (5.23), or in another form ``inversion`` of ``INVERSIONS``. ``correction`` weighs
-    the equivalent control: a smaller one weakens the feedback, not the reference part.
+    The observer ``filter`` estimates y and dy/dt; higher derivatives of the error
+    e = y - r are backward differences of de/dt (5.3)-(5.6). The sliding variable is
+    ``s = surface^(2-n) (surface + d/dt)^(n-1) e`` in um/s (5.15), for n = 2
+    ``surface e + de/dt``. The equivalent control and the reference part v1 come from
+    ``model`` (a_1, ..., a_n | b_0, ..., b_0 not zero), the switching part from ``law``:
+    a ``SwitchingPID`` (5.18), ``BangBang``, ``BoundaryLayer`` or ``SuperTwisting``. The
+    zeros of the model, which may lie outside the unit circle, are inverted in the
+    least-squares sense: f = Q/(Q+R) [v - (b_1/b_0) f(k-1) - ...] (5.23), or in another
+    form ``inversion`` of ``INVERSIONS``. ``correction`` weighs the equivalent control:
+    a smaller one weakens the feedback, not the reference part.
 
     Input an Observation; output f in the unit of the model's input: V if the model was
     identified from voltage, um behind an inverse hysteresis or in a disturbance
     observer with its own gain. The switching part v has that unit.
 
-    Raises ValueError for a model of another order, b_0 = 0 or an unknown inversion.
+    Raises ValueError for a model without a_1, b_0 = 0, a surface of 0 unless n = 2, or
+    an unknown inversion.
     """
 
     part_units: ClassVar[PartUnits] = {"law": {"s": "um/s", "v": "[u]"}}
@@ -70,7 +81,9 @@ class SlidingMode(System):
     )
 
     def __check_init__(self):
-        check_second_order(self.model)
+        check_has_poles(self.model)
+        if len(self.model.autoregressive) != 2:
+            check_not_zero("surface", self.surface)
         check_inversion(self.inversion, self.model)
 
     @property
@@ -85,34 +98,42 @@ class SlidingMode(System):
 
     def init(self, input: Observation) -> SlidingModeState:
         reference, applied = as_array(input.reference), as_array(input.applied)
-        b0, b1, b2 = self.model.moving
+        order, (b0, *later) = len(self.model.autoregressive), self.model.moving
         # At rest s = 0: the law holds the part that the feedforward does not give.
-        needed = applied * (1.0 / self._inversion_gain() + b1 + b2) / b0
-        held = needed - feedforward(self.model, reference, reference, reference)
+        needed = applied * (1.0 / self._inversion_gain() + sum(later)) / b0
+        held = needed - feedforward(self.model, reference, (reference,) * order)
         return SlidingModeState(
             filter=self.filter.init(input),
             law=self.law.start(as_array(0.0), held),
-            older_reference=reference,
-            outputs=(applied, applied),
+            references=(reference,) * max(order - 1, 1),
+            velocities=(jnp.zeros_like(reference),) * max(order - 2, 0),
+            outputs=(applied,) * max(len(later), 1),
         )
 
     def step(
         self, state: SlidingModeState, input: Observation
     ) -> tuple[SlidingModeState, Scalar]:
-        dt = self.dt
+        order, dt = len(self.model.autoregressive), self.dt
         filter_state, motion = self.filter.step(state.filter, input)
-        reference, older = input.reference, state.older_reference
-        error = tracking_error(motion, reference, older, dt)
-        s = self.surface * error.position + error.velocity
+        references = (as_array(input.reference), *state.references)
+        error = motion.position - references[0]
+        slope = motion.velocity - (references[0] - references[1]) / dt
+        velocities = (slope, *state.velocities)[: order - 1]
+        s = sliding(self.surface, derivatives(error, velocities, dt))
         law, switching = self.law.step(state.law, s)
         v = (
-            feedforward(self.model, input.next_reference, reference, older)
-            + self.correction * equivalent_control(self.model, self.surface, error, dt)
+            feedforward(self.model, input.next_reference, references)
+            + self.correction
+            * equivalent_control(self.model, self.surface, error, velocities, dt)
             + switching
         )
         f = inverted(self.model, self._inversion_gain(), v, state.outputs)
         return SlidingModeState(
-            filter_state, law, as_array(reference), (f, state.outputs[0])
+            filter_state,
+            law,
+            references[: len(state.references)],
+            velocities[: len(state.velocities)],
+            (f, *state.outputs[:-1]),
         ), f
 
 
@@ -153,7 +174,7 @@ class ContinuousSlidingMode(System):
     ) -> tuple[ContinuousSlidingModeState, Scalar]:
         filter_state, motion = self.filter.step(state.filter, input)
         reference = as_array(input.reference)
-        error = tracking_error(motion, reference, state.older_reference, self.filter.dt)
-        s = self.surface * error.position + error.velocity
+        moved = (reference - state.older_reference) / self.filter.dt
+        s = self.surface * (motion.position - reference) + motion.velocity - moved
         law, voltage = self.law.step(state.law, s)
         return ContinuousSlidingModeState(filter_state, law, reference), voltage

@@ -317,8 +317,8 @@ def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
             "derivative_weight is nan; it must be finite",
         ),
         (
-            lambda: sliding_mode(model=FIRST_ORDER),
-            "the model has 1 a and 1 b coefficients; it must have 2 and 3",
+            lambda: sliding_mode(model=ARMA((), (0.5,))),
+            "the model has no a coefficient; it must have at least 1",
         ),
         (
             lambda: sliding_mode(error_weight=0.0),
@@ -333,8 +333,16 @@ def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
         (lambda: AlphaBeta(0.1, 2.0, DT), "beta is 2; it must be finite and at least"),
         (lambda: AlphaBeta(0.1, 0.1, -DT), "dt in s is -5e-05"),
         (
-            lambda: observer(FIRST_ORDER),
-            "the model has 1 a and 1 b coefficients; it must have 2 and 3",
+            lambda: sliding_mode(model=FIRST_ORDER, surface=0.0),
+            "surface is 0; it must be another number",
+        ),
+        (
+            lambda: observer(ARMA((), (0.5,))),
+            "the model is a gain; it must have an order of at least 1",
+        ),
+        (
+            lambda: observer(FIRST_ORDER, coefficients="printed"),
+            "the model has the order 1; printed coefficients are for 2",
         ),
         (lambda: observer(gain=0.0), "gain in um/V is 0; it must be finite and"),
         (

@@ -192,8 +192,8 @@ MUTATIONS = (
     Mutation(
         "c_1 with the square",
         "control/disturbance_observer.py",
-        "(0.5 - double) * total",
-        "(0.5 - square) * total",
+        "(0.5 + x) * a + (0.5 - x) * b",
+        "(0.5 + x) * a + (0.5 - 0.5 * x) * b",
         (_LOOPS,),
     ),
     Mutation(
@@ -206,15 +206,15 @@ MUTATIONS = (
     Mutation(
         "start memory swapped",
         "control/disturbance_observer.py",
-        "memory=(next_term + last_term, last_term),",
-        "memory=(last_term, next_term + last_term),",
+        "memory=tuple(terms)[::-1],",
+        "memory=tuple(terms),",
         (_LOOPS, "-k", "away_from_zero"),
     ),
     Mutation(
         "surface reversed",
         "control/model_reference.py",
-        "return newest + _dot(reversed(self.surface), older)",
-        "return newest + _dot(self.surface, older)",
+        "return newest + dot(reversed(self.surface), older)",
+        "return newest + dot(self.surface, older)",
         ("tests/control/test_chapter4.py",),
     ),
     Mutation(
