@@ -18,7 +18,8 @@ from .switching import SwitchingLaw
 class ModelReferenceState(NamedTuple):
     """States of the parts; histories, newest first, of y_d and errors in um.
 
-    ``desired`` starts at y_d(k); ``forward`` and ``feedback`` hold past u1 and u2 in V.
+    ``desired`` starts at y_d(k); ``forward`` and ``feedback`` hold past u1 and u2 in V,
+    the last ones at least.
     """
 
     filter: State
@@ -107,8 +108,8 @@ class ModelReferenceSlidingMode(System):
             reference_model=self.reference_model.init(reference),
             desired=desired,
             errors=errors[1:],
-            forward=(forward,) * lags,
-            feedback=(feedback,) * lags,
+            forward=(forward,) * max(lags, 1),
+            feedback=(feedback,) * max(lags, 1),
             # The rest of the feedback is u_eq.
             law=self.law.start(self._sliding(errors), feedback - slope * feedback),
         )
@@ -129,7 +130,9 @@ class ModelReferenceSlidingMode(System):
         # S A_e delta: each error one sample older, the newest predicted by the model.
         shifted = dot(reversed(self.surface), errors)
         equivalent = self._inverse(-(self._advanced(errors) + shifted), state.feedback)
-        law, switching = self.law.step(state.law, sliding)
+        shortfall = input.applied - (state.forward[0] + state.feedback[0])
+        driven = self.law.driven(state.law, shortfall)
+        law, switching = self.law.step(driven, sliding)
         feedback = equivalent + switching
 
         state = ModelReferenceState(

@@ -29,7 +29,7 @@ from .switching import SwitchingLaw
 class MultiAxisState(NamedTuple):
     """States of the parts and histories, newest first, in the units of the axes.
 
-    ``desired`` holds y_d(k+1), y_d(k), ...; ``forward`` past u1;
+    ``desired`` holds y_d(k+1), y_d(k), ...; ``forward`` past u1, the last at least;
     ``feedback`` the last u2; ``predicted`` the state X2 of (7.27); ``law`` the state of
     the switching law.
     """
@@ -60,7 +60,7 @@ class MultiAxisSlidingMode(Designed):
 
     Input an Observation of q axes, output a tuple of q commands. The thesis filters the
     measurements (see ``Filtered``). No parameter is limited in sign, so a loop may be
-    unstable. There is no anti-windup.
+    unstable.
 
     At rest without disturbance the state is constant. If the DC gain of the model
     differs from that of the stage, a small error remains at s = 0, because the
@@ -220,7 +220,7 @@ class ResolvedMultiAxis(System):
         return MultiAxisState(
             reference_model=self.reference_model.init(desired[0]),
             desired=desired,
-            forward=(forward,) * (p - 1),
+            forward=(forward,) * max(p - 1, 1),
             feedback=feedback,
             predicted=tuple(predicted),
             law=self.law.start(sliding, minus(feedback, equivalent)),
@@ -234,11 +234,13 @@ class ResolvedMultiAxis(System):
             state.reference_model, input.reference
         )
         desired = (following, *state.desired)
-        forward = self._forward(desired, state.forward)
+        forward = self._forward(desired, state.forward[: len(self.surface) - 1])
 
         predicted = self._predicted(error, state.predicted, state.feedback)
         sliding = self._sliding(predicted)
-        law, switching = self.law.step(state.law, sliding)
+        shortfall = minus(input.applied, plus(state.forward[0], state.feedback))
+        driven = self.law.driven(state.law, shortfall)
+        law, switching = self.law.step(driven, sliding)
         feedback = plus(_summed(self.equivalent, predicted), switching)
         state = MultiAxisState(
             reference_model=reference_model,

@@ -16,14 +16,15 @@ READINGS = ("nominal_state", "measured_state")
 
 
 class NominalState(NamedTuple):
-    """States of model and law; the last measurement, reference and disturbance in the
-    unit of the axis."""
+    """States of model and law; the last measurement, reference, disturbance and command
+    in the unit of the axis."""
 
     model: State
     law: State
     measured: Scalar
     reference: Scalar
     disturbance: Scalar
+    command: Scalar
 
 
 class NominalSlidingMode(System):
@@ -118,6 +119,7 @@ class NominalSlidingMode(System):
             measured=as_array(input.measured),
             reference=as_array(input.reference),
             disturbance=input.measured - modelled,
+            command=as_array(input.applied),
         )
         # The law holds the part of the command at rest that v does not give.
         v, sliding, _ = self._advance(state, input)
@@ -128,9 +130,12 @@ class NominalSlidingMode(System):
         self, state: NominalState, input: Observation
     ) -> tuple[NominalState, Scalar]:
         v, sliding, following = self._advance(state, input)
-        law, switching = self.law.step(state.law, sliding)
-        command = self._inverse() * (v + sum(self.model.moving) * switching)
-        return following._replace(law=law), command
+        gain = sum(self.model.moving)
+        shortfall = (input.applied - state.command) / (self._inverse() * gain)
+        driven = self.law.driven(state.law, shortfall)
+        law, switching = self.law.step(driven, sliding)
+        command = self._inverse() * (v + gain * switching)
+        return following._replace(law=law, command=command), command
 
 
 def _check_second_order(model: ARMA) -> None:

@@ -8,6 +8,7 @@ from ..core.arrays import Scalar
 from ..core.feedback import Observation
 from ..core.parameter import parameter, sample_time
 from ..core.system import System
+from .anti_windup import anti_windup
 
 
 class PIDState(NamedTuple):
@@ -54,14 +55,7 @@ class PID(System):
         typical=(1e-6, 1e-1),
         default=0.0,
     )
-    anti_windup: Scalar = parameter(
-        "1/s",
-        "rate of anti-windup; 0 switches it off",
-        least=0.0,
-        scale="log",
-        typical=(1e-1, 1e4),
-        default=0.0,
-    )
+    anti_windup: Scalar = anti_windup()
     proportional_weight: Scalar = parameter(
         "1", "set-point weight b of P", typical=(0.0, 2.0), default=1.0
     )

@@ -114,20 +114,23 @@ class SlidingMode(System):
         self, state: SlidingModeState, input: Observation
     ) -> tuple[SlidingModeState, Scalar]:
         order, dt = len(self.model.autoregressive), self.dt
+        gain = self._inversion_gain()
         filter_state, motion = self.filter.step(state.filter, input)
         references = (as_array(input.reference), *state.references)
         error = motion.position - references[0]
         slope = motion.velocity - (references[0] - references[1]) / dt
         velocities = (slope, *state.velocities)[: order - 1]
         s = sliding(self.surface, derivatives(error, velocities, dt))
-        law, switching = self.law.step(state.law, s)
+        shortfall = (input.applied - state.outputs[0]) / gain
+        driven = self.law.driven(state.law, shortfall / self.model.moving[0])
+        law, switching = self.law.step(driven, s)
         v = (
             feedforward(self.model, input.next_reference, references)
             + self.correction
             * equivalent_control(self.model, self.surface, error, velocities, dt)
             + switching
         )
-        f = inverted(self.model, self._inversion_gain(), v, state.outputs)
+        f = inverted(self.model, gain, v, state.outputs)
         return SlidingModeState(
             filter_state,
             law,
@@ -138,11 +141,12 @@ class SlidingMode(System):
 
 
 class ContinuousSlidingModeState(NamedTuple):
-    """States of filter and law, and the last reference in um."""
+    """States of filter and law, the last reference in um and voltage in V."""
 
     filter: State
     law: State
     older_reference: Scalar
+    voltage: Scalar
 
 
 class ContinuousSlidingMode(System):
@@ -167,6 +171,7 @@ class ContinuousSlidingMode(System):
             filter=self.filter.init(input),
             law=self.law.start(as_array(0.0), as_array(input.applied)),
             older_reference=as_array(input.reference),
+            voltage=as_array(input.applied),
         )
 
     def step(
@@ -176,5 +181,7 @@ class ContinuousSlidingMode(System):
         reference = as_array(input.reference)
         moved = (reference - state.older_reference) / self.filter.dt
         s = self.surface * (motion.position - reference) + motion.velocity - moved
-        law, voltage = self.law.step(state.law, s)
-        return ContinuousSlidingModeState(filter_state, law, reference), voltage
+        driven = self.law.driven(state.law, input.applied - state.voltage)
+        law, voltage = self.law.step(driven, s)
+        state = ContinuousSlidingModeState(filter_state, law, reference, voltage)
+        return state, voltage

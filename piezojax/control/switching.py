@@ -10,6 +10,7 @@ from ..core.arrays import Scalar, ScalarLike, Signal, State, as_array
 from ..core.axes import Rows, as_rows, product
 from ..core.parameter import parameter, sample_time
 from ..core.system import System
+from .anti_windup import anti_windup
 
 Gain: TypeAlias = Scalar | Rows
 """A gain of one axis, or a matrix of gains as rows of scalars."""
@@ -36,6 +37,14 @@ class SwitchingLaw(System):
         start at rest is bumpless.
         """
 
+    @abc.abstractmethod
+    def driven(self, state: State, shortfall: Signal) -> State:
+        """Return ``state`` with its integral driven by ``shortfall``, anti-windup.
+
+        ``shortfall`` in [v] is the output that the actuator applied less the one that
+        the law gave. A law without an integral returns its state.
+        """
+
     def init(self, input: Signal = 0.0) -> State:
         return self.start(input, jax.tree.map(jnp.zeros_like, input))
 
@@ -52,6 +61,8 @@ class SwitchingPID(SwitchingLaw):
 
     The law of (4.43), (5.18), (7.33) and (8.34). With several axes s and v are tuples
     of one scalar per axis, and a gain is a matrix or a scalar for all axes.
+    ``anti_windup`` drives the integral by the difference of the applied and the last
+    commanded v (back-calculation), of each axis by its own; the thesis has none.
     """
 
     proportional: Gain = parameter(
@@ -76,11 +87,18 @@ class SwitchingPID(SwitchingLaw):
         converter=as_gain,
     )
     dt: float = sample_time()
+    anti_windup: Scalar = anti_windup()
 
     def start(self, sliding: Signal, output: Signal) -> SwitchingPIDState:
         sliding = jax.tree.map(as_array, sliding)
         integral = jax.tree.map(jnp.add, output, _times(self.proportional, sliding))
         return SwitchingPIDState(integral, sliding)
+
+    def driven(self, state: SwitchingPIDState, shortfall: Signal) -> SwitchingPIDState:
+        share = self.anti_windup * self.dt
+        return state._replace(
+            integral=jax.tree.map(lambda i, v: i + share * v, state.integral, shortfall)
+        )
 
     def step(
         self, state: SwitchingPIDState, input: Signal
@@ -119,6 +137,9 @@ class BangBang(SwitchingLaw):
     def start(self, sliding: ScalarLike, output: ScalarLike) -> Scalar:
         return as_array(output) + self.gain * jnp.sign(as_array(sliding))
 
+    def driven(self, state: Scalar, shortfall: ScalarLike) -> Scalar:
+        return state
+
     def step(self, state: Scalar, input: ScalarLike) -> tuple[Scalar, Scalar]:
         return state, state - self.gain * jnp.sign(as_array(input))
 
@@ -141,6 +162,9 @@ class BoundaryLayer(SwitchingLaw):
 
     def start(self, sliding: ScalarLike, output: ScalarLike) -> Scalar:
         return as_array(output) - self._switched(sliding)
+
+    def driven(self, state: Scalar, shortfall: ScalarLike) -> Scalar:
+        return state
 
     def _switched(self, sliding: ScalarLike) -> Scalar:
         return -self.gain * jnp.clip(sliding / self.width, -1.0, 1.0)
@@ -171,9 +195,13 @@ class SuperTwisting(SwitchingLaw):
         "[s]", "width of the smooth layer", above=0.0, scale="log", typical=(1.0, 1e5)
     )
     dt: float = sample_time()
+    anti_windup: Scalar = anti_windup()
 
     def start(self, sliding: ScalarLike, output: ScalarLike) -> Scalar:
         return as_array(output) + self._root(as_array(sliding))
+
+    def driven(self, state: Scalar, shortfall: ScalarLike) -> Scalar:
+        return state + self.anti_windup * self.dt * shortfall
 
     def _root(self, sliding: Scalar) -> Scalar:
         return self.root_gain * sliding / jnp.sqrt(self._distance(sliding))

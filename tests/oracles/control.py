@@ -271,6 +271,7 @@ class ModelReference:
         self.feedback = [0.0] * lags
         self.s_sum = 0.0
         self.s_prev = 0.0
+        self.command = self.wound = 0.0
 
     def step(self, z, r_next, r, r_prev):
         """The command u(k), not yet clipped; r(k-1) is not used."""
@@ -308,20 +309,26 @@ class ModelReference:
         for i in range(len(b)):
             pushed += b[i] * self.feedback[i]
         self.s_sum += s
-        u2 = -g * pushed - (
-            gains["P"] * s
-            + gains["I"] * period * self.s_sum
-            + gains["D"] * (s - self.s_prev) / period
+        u2 = (
+            self.wound
+            - g * pushed
+            - (
+                gains["P"] * s
+                + gains["I"] * period * self.s_sum
+                + gains["D"] * (s - self.s_prev) / period
+            )
         )
         self.s_prev = s
         self.e = e
         self.yd = [yd_next, *self.yd[:-1]]
         self.forward = [u1, *self.forward][: len(b)]
         self.feedback = [u2, *self.feedback][: len(b)]
-        return u1 + u2
+        self.command = u1 + u2
+        return self.command
 
     def applied(self, u):
-        """Only the observer depends on the limits."""
+        """The observer and the back-calculation depend on the limits."""
+        self.wound += back_calculated(self, u)
         self.observer.applied(u)
 
 
@@ -334,6 +341,7 @@ class Continuous:
         self.observer = make_observer(gains, self.period)
         self.s_sum = 0.0
         self.s_prev = 0.0
+        self.command = self.wound = 0.0
 
     def step(self, z, r_next, r, r_prev):
         """The command u(k), not yet clipped."""
@@ -343,11 +351,19 @@ class Continuous:
         slope = (s - self.s_prev) / self.period
         self.s_prev = s
         total = self.gains["P"] * s + self.gains["I"] * self.period * self.s_sum
-        return -(total + self.gains["D"] * slope)
+        self.command = self.wound - (total + self.gains["D"] * slope)
+        return self.command
 
     def applied(self, u):
-        """Only the observer depends on the limits."""
+        """The observer and the back-calculation depend on the limits."""
+        self.wound += back_calculated(self, u)
         self.observer.applied(u)
+
+
+def back_calculated(controller, u):
+    """The change of the integral by the shortfall of u; gains: anti_windup, 1/s."""
+    rate = controller.gains.get("anti_windup", 0.0)
+    return controller.period * rate * (u - controller.command)
 
 
 def make_controller(kind, gains, rate):

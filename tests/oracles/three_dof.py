@@ -78,13 +78,17 @@ class Switching:
     def __init__(self, gains):
         self.P, self.I = np.array(gains["P"]), np.array(gains["I"])
         self.D = np.array(gains.get("D", [0.0, 0.0, 0.0]))
-        self.total = self.before = 0.0
+        self.rate = gains.get("anti_windup", 0.0)
+        self.total = self.before = self.wound = 0.0
+
+    def wind(self, shortfall):
+        self.wound = self.wound + T * self.rate * shortfall
 
     def step(self, s):
         self.total = self.total + s
         slope = (s - self.before) / T
         self.before = s
-        return -(self.P * s + self.I * T * self.total + self.D * slope)
+        return self.wound - (self.P * s + self.I * T * self.total + self.D * slope)
 
 
 class PID:
@@ -95,6 +99,9 @@ class PID:
 
     def step(self, z, r_next, r):
         return -self.law.step(r - z), {}
+
+    def applied(self, u):
+        """There is no anti-windup."""
 
 
 def autoregression():
@@ -174,6 +181,10 @@ class PIDSMC:
         self.u2 = [u2, v1]
         return u1 + u2, {"s": s, "yd": yd, "u1": u1, "u2": u2}
 
+    def applied(self, u):
+        """Store u(k) after its limits."""
+        self.law.wind(u - self.u1[0] - self.u2[0])
+
 
 class Observer:
     """Q Pn^-1 y - Q u of (8.14), with the corrected Q filter of (5.31)-(5.32)."""
@@ -246,11 +257,19 @@ class NominalSMC:
         if self.observer is not None:
             w = self.observer.step(y)
             u = un - w
-            self.observer.applied(u)
 
+        self.w = w
         self.y1, self.d1 = y, d
         self.yn, self.un = (yn, self.yn[0]), (un, self.un[0])
         return u, {"s": s, "un": un, "w": w, "yn": yn}
+
+    def applied(self, u):
+        """Store u(k) after its limits: un and the observer depend on it."""
+        un, (wanted, before) = u + self.w, self.un
+        self.law.wind((un - wanted) / (self.inverse * (self.b1 + self.b2)))
+        self.un = (un, before)
+        if self.observer is not None:
+            self.observer.applied(u)
 
 
 def make_controller(name, **options):
@@ -263,10 +282,11 @@ def make_controller(name, **options):
     return NominalSMC(gains, name == "dob_smc", **options)
 
 
-def simulate(name, references, noise=None, plant=None, **options):
+def simulate(name, references, noise=None, plant=None, limits=None, **options):
     """Run a controller on the plant (7.53), `plant` the options of `Plant`.
 
-    references [N+1, ..., 3] for N samples, noise [N, ..., 3] adds to the measurement.
+    references [N+1, ..., 3] for N samples, noise [N, ..., 3] adds to the measurement,
+    limits (lower, upper) of the commands.
     Returns arrays [N, ..., 3]: y (the plant's output), z (measured), u, and what the
     controller logs, the sliding variable s among it.
     """
@@ -279,7 +299,9 @@ def simulate(name, references, noise=None, plant=None, **options):
         y = plant.output()
         z = y if noise is None else y + noise[k]
         u, logged = controller.step(z, references[k + 1], references[k])
-        plant.push(u)
+        push = u if limits is None else np.clip(u, *limits)
+        controller.applied(push)
+        plant.push(push)
         row = {"y": y, "z": z, "u": u, **logged}
         rows.append({key: np.broadcast_to(row[key], y.shape) for key in row})
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}
