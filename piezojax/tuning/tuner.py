@@ -27,6 +27,7 @@ from .make_objective import make_objective
 from .model_alarms import model_alarms
 from .objective import Objective
 from .outcome import Outcome
+from .reach import require_reach
 from .result import (
     ConstraintOutcome,
     FrontPoint,
@@ -50,13 +51,15 @@ def tune(
     a budget as ``baselines``, the baselines are run on the same objective afterwards.
     ``Ctrl-C`` ends the search and keeps the best gains found so far. A start that
     diverges or rails is replaced by the best of the candidates. Raises ValueError if
-    neither the start nor any candidate gives a stable loop.
+    a reference is beyond the stroke of the stage, or if neither the start nor any
+    candidate gives a stable loop.
     """
     progress = progress or Silent()
     clock = Clock()
     case = study if isinstance(study, Case) else read(study or shipped())
     table, space = case.study, case.space
     data = make_data(case)
+    require_reach(case, data)
 
     progress.stage("simulating the start")
     evaluator = Evaluator(clock, case)

@@ -1,0 +1,44 @@
+"""Check of the references of a study against the stroke of its stage."""
+
+import numpy as np
+
+from ..analysis.stroke import stroke_of
+from ..study import Case
+from .data import Data
+
+SLACK = 0.02
+"""Share of the stroke by which a reference may leave it, because the displacement at a
+limit varies a little with noise, drift and history."""
+
+
+def require_reach(case: Case, data: Data) -> None:
+    """Raise ValueError if a reference leaves the stroke of the stage by over ``SLACK``.
+
+    The message names the reference, its range, the stroke and the remedy.
+    """
+    study = case.study
+    table, limits = study.references, study.actuator
+    stage = case.loop.actuator >> case.loop.plant
+    found = stroke_of(stage, study.by_axis(limits.lower), study.by_axis(limits.upper))
+    names = study.axes.names if study.axes else ("",)
+    units = study.axes.units if study.axes else ("um",)
+    references = np.asarray(data.holdout.references)
+    references = references.reshape(*references.shape[:2], -1)  # [runs, samples, axes]
+    amplitudes, offsets = study.by_axis(table.amplitude), study.by_axis(table.offset)
+    for axis, (name, unit) in enumerate(zip(names, units, strict=True)):
+        lowest, highest = found.lowest[axis], found.highest[axis]
+        slack = SLACK * (highest - lowest)
+        bottoms, tops = (f(references[..., axis], axis=1) for f in (np.min, np.max))
+        beyond = np.flatnonzero((bottoms < lowest - slack) | (tops > highest + slack))
+        if not beyond.size:
+            continue
+        run = beyond[0]
+        part = "tune" if run < len(table.tune) else "unseen"
+        where = f"axis {name}" if name else "the stage"
+        raise ValueError(
+            f"references.{part}: {(*table.tune, *table.unseen)[run]} spans "
+            f"{bottoms[run]:.4g} to {tops[run]:.4g} {unit}, beyond the stroke of "
+            f"{where}, {lowest:.4g} to {highest:.4g} {unit} between the limits of the "
+            f"actuator: reduce references.amplitude, now {amplitudes[axis]:g}, or "
+            f"change references.offset, now {offsets[axis]:g}"
+        )
