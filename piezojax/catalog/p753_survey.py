@@ -9,6 +9,7 @@ from ..control import (
     PID,
     AdaptiveInverse,
     AlphaBeta,
+    Anticipation,
     BoundaryLayer,
     FeedforwardFeedback,
     FilteredCommand,
@@ -19,9 +20,10 @@ from ..control import (
     SlidingMode,
     SuperTwisting,
     SwitchingLaw,
+    WeightedMixedSensitivity,
 )
 from ..core.system import Affine, System
-from ..dynamics import ARMA, FirstOrderLag, Notch
+from ..dynamics import ARMA, FirstOrderLag, Notch, scaled_to_dc
 from ..hardware import ChargeDrive
 from ..hysteresis import InverseColemanHodgdon
 from . import p753, p753_stage
@@ -34,6 +36,9 @@ SUPER_TWISTING = {"root_gain": 10.0, "sign_gain": 1e6, "layer": 1e4}
 
 NOTCH = {"damping": 0.5, "depth": 0.1}
 """Damping and depth of a notch at the nominal mode of the stage."""
+
+H_INFINITY_BOUND = 3.0
+"""Bound of the weighted responses: ours."""
 
 REPETITIVE = {"gain": 0.7, "lead": 40, "advance": 8}
 """Learning gain; lead and advance in samples; Q is a lag of ``advance`` samples."""
@@ -114,6 +119,22 @@ def feedforward_simc_pi() -> FeedforwardFeedback:
 def feedforward_notch_pi() -> FeedforwardFeedback:
     """Return ``notch_pi`` with a static feedforward, um to V."""
     return static_feedforward(notch_pi())
+
+
+def feedforward_h_infinity() -> Anticipation:
+    """Return H-infinity control of (5.33) with a static feedforward, um to V; ours.
+
+    The weights are those of ``p753.mixed_sensitivity_inversion``, from V instead of um.
+    The reference can be advanced, because the design has no rate of the reference.
+    """
+    control = WeightedMixedSensitivity(
+        scaled_to_dc(ARMA(**p753.DYNAMICS_BEHIND_HYSTERESIS), p753.GAIN),
+        **p753.SENSITIVITY_WEIGHT,
+        effort_weight=p753.GAIN * p753.EFFORT_WEIGHT,
+        bound=H_INFINITY_BOUND,
+        dt=p753.DT,
+    )
+    return Anticipation(static_feedforward(control), (0.0,))
 
 
 def adaptive_notch_pi() -> AdaptiveInverse:

@@ -39,3 +39,6 @@ from .switching import BoundaryLayer as BoundaryLayer
 from .switching import SuperTwisting as SuperTwisting
 from .switching import SwitchingLaw as SwitchingLaw
 from .switching import SwitchingPID as SwitchingPID
+from .weighted_mixed_sensitivity import (
+    WeightedMixedSensitivity as WeightedMixedSensitivity,
+)

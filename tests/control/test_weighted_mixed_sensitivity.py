@@ -1,0 +1,90 @@
+"""Tunable H-infinity control against the design by SciPy's Riccati solver."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from piezojax.control import (
+    WeightedMixedSensitivity,
+    first_order_weight,
+    mixed_sensitivity,
+)
+from piezojax.core.paths import replace
+from piezojax.dynamics import ARMA
+
+DT = 5e-5
+MODEL = ARMA((1.6035, -0.61995), (0.0050811, -0.0036354, 0.010553))  # (5.33)
+WEIGHT = {"low": 1e3, "crossover": 600.0, "high": 0.5}
+EFFORT = 0.1
+DESIGN = mixed_sensitivity(MODEL, first_order_weight(**WEIGHT, dt=DT), EFFORT, dt=DT)
+FREQUENCY = np.geomspace(0.1, 9.9e3, 50)
+
+
+def controlled(bound):
+    return WeightedMixedSensitivity(
+        MODEL, **WEIGHT, effort_weight=EFFORT, bound=bound, dt=DT
+    )
+
+
+def response(law, frequency):
+    """Return the frequency response of matrices in plain NumPy."""
+    A, B, C, D = (np.asarray(m) for m in (law.A, law.B, law.C, law.D))
+    z = np.exp(2j * np.pi * DT * frequency)
+    return np.array(
+        [(C @ np.linalg.solve(p * np.eye(len(A)) - A, B) + D)[0, 0] for p in z]
+    )
+
+
+@jax.jit
+def law_of(bound):
+    return replace(controlled(2.0), {"bound": bound}).resolved().law
+
+
+def test_at_the_same_bound_it_is_the_design_of_scipy():
+    expected = response(DESIGN.controller.law, FREQUENCY)
+    found = response(law_of(DESIGN.gamma), FREQUENCY)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [1.01, 1.5, 30.0])
+def test_the_weighted_responses_keep_the_bound(factor):
+    bound = factor * DESIGN.gamma
+    law = law_of(bound)
+    angles = np.linspace(1e-4, np.pi, 4000)
+    frequency = angles / (2.0 * np.pi * DT)
+    z = np.exp(1j * angles)
+    a, b = (np.asarray(part) for part in (MODEL.autoregressive, MODEL.moving))
+    # y(k+1) = a y(k) + ... + b u(k) + ...
+    over = b[0] + b[1] / z + b[2] / z**2
+    plant = over / (z - a[0] - a[1] / z)
+    K = response(law, frequency)
+    S = 1.0 / (1.0 + plant * K)
+    assert np.max(np.abs(S)) < 3.0
+    weight = response(first_order_weight(**WEIGHT, dt=DT), frequency)
+    size = np.sqrt(np.abs(weight * S) ** 2 + np.abs(EFFORT * K * S) ** 2)
+    assert np.max(size) < bound
+    if factor == 1.01:
+        assert np.max(size) > 0.9 * bound
+
+
+def test_a_bound_without_a_controller_gives_no_numbers():
+    assert np.all(np.isnan(law_of(0.98 * DESIGN.gamma).C))
+
+
+def test_slopes_are_those_of_differences():
+    control = controlled(1.2 * DESIGN.gamma)
+    names: tuple[str, ...] = ("low", "crossover", "high", "effort_weight", "bound")
+    start = jnp.array([getattr(control, name) for name in names])
+
+    def size(logs):
+        values = dict(zip(names, start * jnp.exp(logs), strict=True))
+        law = replace(control, values).resolved().law
+        return jnp.log(jnp.abs(law.frequency_response(jnp.array([200.0]))[0, 0, 0]))
+
+    step = 1e-5
+    points = jnp.vstack([jnp.zeros(5), step * jnp.eye(5), -step * jnp.eye(5)])
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(size)))(points)
+    expected = (values[1:6] - values[6:]) / (2.0 * step)
+    assert np.max(np.abs(expected)) > 0.1
+    np.testing.assert_allclose(slopes[0], expected, rtol=1e-4, atol=1e-7)
