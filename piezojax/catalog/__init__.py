@@ -39,6 +39,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_traditional": p753_by_rate.traditional,
     "p753_bang_bang": p753_by_rate.bang_bang,
     "p753_continuous": p753_by_rate.continuous,
+    "p753_pole_placement": p753_survey.pole_placement,
     "p753_boundary_layer": p753_survey.boundary_layer,
     "p753_super_twisting": p753_survey.super_twisting,
     "p753_feedforward": p753_survey.inverse_feedforward,

@@ -16,12 +16,15 @@ from ..control import (
     InverseFeedforward,
     InverseGain,
     LearningLaw,
+    PlacedPID,
     RepetitiveControl,
     SlidingMode,
     SuperTwisting,
     SwitchingLaw,
     WeightedMixedSensitivity,
 )
+from ..control.output_tracking import drive
+from ..core.arrays import as_array
 from ..core.system import Affine, System
 from ..dynamics import ARMA, FirstOrderLag, Notch, scaled_to_dc
 from ..hardware import ChargeDrive
@@ -46,6 +49,9 @@ REPETITIVE = {"gain": 0.7, "lead": 40, "advance": 8}
 LEARNING = {"gain": 0.7, "lead": 40, "smoothing": (0.25,)}
 """Learning law of the reference of a loop, lead in samples."""
 
+POLES = (0.9992, 0.0, 0.0)
+"""Poles of the sliding variable: those of the printed I = 60 (Table 5-4), P = D = 0."""
+
 CHARGE_TIME = 1.0
 """R C of amplifier and load in s: the charge is controlled above 0.16 Hz."""
 
@@ -63,6 +69,16 @@ def _switched(law: SwitchingLaw) -> SlidingMode:
 
 def _inverse() -> InverseColemanHodgdon:
     return InverseColemanHodgdon(p753.hysteresis())
+
+
+def pole_placement() -> SlidingMode:
+    """Return sliding mode control with a PID by (4.18), um to V; poles ours."""
+    model = ARMA(**p753.DYNAMICS_FROM_VOLTAGE)
+    b0, *later = model.moving
+    # Q/(Q+R) acts on v, and the later terms of the inversion feed back.
+    share = b0 / (b0 * (1.0 + p753.CONTROL_WEIGHT / p753.ERROR_WEIGHT) + sum(later))
+    moved = share * drive(model, as_array(p753.SURFACE), p753.DT)
+    return _switched(PlacedPID(POLES, moved, p753.DT))
 
 
 def boundary_layer() -> SlidingMode:
