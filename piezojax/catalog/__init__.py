@@ -10,6 +10,7 @@ from . import p558_stage as p558_stage
 from . import p753 as p753
 from . import p753_by_rate as p753_by_rate
 from . import p753_chapter4 as p753_chapter4
+from . import p753_inverses as p753_inverses
 from . import p753_stage as p753_stage
 from . import p753_survey as p753_survey
 
@@ -17,6 +18,7 @@ PLANTS: dict[str, Callable[..., System]] = {
     "p753": p753_by_rate.plant,
     "p753_chapter4": p753_by_rate.chapter4_plant,
     "p753_stage": p753_stage.stage,
+    "p753_preisach": p753_inverses.preisach_plant,
     "p558": p558_stage.plant,
     "mirror": mirror.stage,
 }
@@ -28,6 +30,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_pid": p753.pid,
     "p753_sliding_mode": p753.sliding_mode,
     "p753_inversion": p753_by_rate.inversion,
+    "p753_preisach_inversion": p753_inverses.preisach_inversion,
     "p753_disturbance_observer": p753_by_rate.disturbance_observer,
     "p753_adaptive_disturbance_observer": p753.adaptive_disturbance_observer,
     "p753_anticipating_disturbance_observer": p753.anticipating_disturbance_observer,

@@ -162,6 +162,16 @@ def coleman_hodgdon_inverse(record: Record) -> InverseColemanHodgdon:
     return InverseColemanHodgdon(fitted_coleman_hodgdon(record))
 
 
-def preisach_inversion(record: Record, table: str = "5-2") -> InversionControl:
-    """Return ``p753.inversion`` with a Preisach model fitted to ``record``, um to V."""
-    return InversionControl(p753.inversion(table).feedback, preisach_inverse(record))
+def preisach_inversion(
+    record: Record | None = None, table: str = "5-2"
+) -> InversionControl:
+    """Return ``p753.inversion`` with an inverse Preisach model, um to V.
+
+    The model is fitted to ``record``, or, without one, is that of the stage on the
+    coarser grid of ``CELLS``.
+    """
+    if record is None:
+        inverse = InversePreisach(preisach(CELLS))
+    else:
+        inverse = preisach_inverse(record)
+    return InversionControl(p753.inversion(table).feedback, inverse)

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from piezojax.catalog import p753_chapter4
 from piezojax.cli.tune import main
 from piezojax.core.paths import get
+from piezojax.hysteresis import InverseColemanHodgdon, InversePreisach, Preisach
 from piezojax.report.comparison_map import (
     comparison_table,
     perturbed_table,
@@ -316,6 +317,18 @@ def test_a_study_that_cannot_be_tuned_is_a_row(monkeypatch):
     assert comparison.best == {}
     assert comparison_table(comparison).row_count > 0
     assert perturbed_table(comparison) is None
+
+
+def test_the_inverses_are_compared_on_the_stage_with_preisach_hysteresis():
+    comparison = load_comparison_study(shipped("comparison/p753_inverses"))
+    cases = [e.case for e in compared_cases(comparison, "p753_inverses.toml")]
+    inverses = [getattr(case.loop.controller, "inverse", None) for case in cases]
+    kinds = [InversePreisach, InverseColemanHodgdon, type(None)]
+    assert [type(inverse) for inverse in inverses] == kinds
+    # The inverse has the density of the stage on another grid.
+    stage = cases[0].loop.plant.parts[0]
+    assert (len(inverses[0].model.weights), len(stage.weights)) == (20, 28)
+    assert all(isinstance(case.loop.plant.parts[0], Preisach) for case in cases)
 
 
 def test_the_shipped_comparison_is_valid():
