@@ -81,6 +81,7 @@ def _tune(
         write_baselines,
     )
     from ..report.bode import write_stability
+    from ..report.drive_table import drive_table
     from ..report.fit_pictures import write_fit
     from ..report.limit_bars import limit_text, write_limit
     from ..report.robustness import constraints_table, front_table
@@ -114,6 +115,7 @@ def _tune(
     console.print(tuning_table(result))
     console.print(gains_table(result))
     console.print(stability_table(outcome.stability))
+    console.print(drive_table(outcome.drive, description.rate))
     if result.constraints:
         console.print(constraints_table(result))
     if result.front and case.study.pareto:

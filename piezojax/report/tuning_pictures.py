@@ -68,7 +68,9 @@ def write_results(outcome: Outcome, folder: Path) -> None:
 
 def write_numbers(outcome: Outcome, folder: Path) -> None:
     """Write result.json and gains.toml into ``folder``."""
-    write_text(folder / RESULT_FILE, outcome.result.model_dump_json(indent=2) + "\n")
+    before, after = outcome.drive
+    result = outcome.result.model_copy(update={"drive_before": before, "drive": after})
+    write_text(folder / RESULT_FILE, result.model_dump_json(indent=2) + "\n")
     save(outcome.controller, folder / GAINS_FILE, outcome.about)
 
 

@@ -6,17 +6,20 @@ from functools import cached_property
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..analysis.limit import LimitReport, performance_limit
 from ..analysis.stability import StabilityReports
 from ..core.about import About
+from ..core.axes import axis_of
 from ..core.feedback import Feedback, LoopSample, loop_inputs
 from ..core.rollout import simulate
-from ..core.system import System
+from ..core.system import System, resolve
 from ..study import Case
 from .baselines import Baselines
 from .coupling import Coupling, coupling_matrix
+from .drive import Drive, drive_of
 from .result import Result
 from .runs import Signals
 
@@ -33,8 +36,8 @@ class Outcome:
     ``before`` and ``after`` are the loops with the gains of the study and with the
     tuned gains; ``holdout`` are the held-out signals. ``baselines`` is None unless a
     budget for them was given. ``stability`` is that of both loops at the highest
-    reference. ``limit`` and ``coupling`` are computed when they are first read, so that
-    many studies can be tuned without them.
+    reference. ``limit``, ``coupling`` and ``drive`` are computed when they are first
+    read, so that many studies can be tuned without them.
     """
 
     result: Result
@@ -110,29 +113,72 @@ class Outcome:
 
         return matrix(before), matrix(after)
 
+    @cached_property
+    def drive(self) -> tuple[dict[str, Drive], dict[str, Drive]]:
+        """Figures of the voltage at the piezo by axis, before and after tuning.
+
+        The name of the only axis is "piezo".
+        """
+        before, after = (self._drive(loop) for loop in (self.before, self.after))
+        return before, after
+
+    def _drive(self, loop: Feedback) -> dict[str, Drive]:
+        study, signals = self.case.study, self.holdout
+        count = len(signals.references)
+        logs = [self._log(loop, index) for index in range(count)]
+        level = jnp.broadcast_to(signals.references[0, 0], signals.references[0].shape)
+        still = None if signals.disturbance is None else jnp.zeros_like(level)
+        held = _log(loop, level, signals.noise[0, 0], still)
+        voltages = [
+            _at_piezo(self.case.amplifier, log.voltage) for log in (*logs, held)
+        ]
+        names = study.axes.names if study.axes else ("piezo",)
+        found = {}
+        for axis, name in enumerate(names):
+            every = [axis_of(v, axis) if study.axes else v for v in voltages]
+            *runs, still = (_finite(voltage) for voltage in every)
+            capacitance = study.actuator.capacitance
+            found[name] = drive_of(
+                runs,
+                still,
+                study.dt,
+                round(study.references.settle * study.rate),
+                study.by_axis(capacitance)[axis] if capacitance is not None else None,
+            )
+        return found
+
     def logs(self, runs: Iterable[int]) -> dict[int, Logs]:
         """Return the samples of both loops by the number of the reference in ``runs``.
 
         The noise is the first draw of the hold-out. Samples beyond 1e9 um or V, of a
         run that diverges, are NaN.
         """
-        signals = self.holdout
-
-        @jax.jit
-        def run(loop: Feedback, index: Any) -> LoopSample:
-            reference, noise = signals.references[index], signals.noise[index, 0]
-            moved = signals.disturbance
-            inputs = loop_inputs(
-                reference, noise, None if moved is None else moved[index, 0]
-            )
-            return simulate(loop, inputs, loop.init(reference[0]))[1]
-
         return {
             index: jax.tree.map(
-                _finite, (run(self.before, index), run(self.after, index))
+                _finite, (self._log(self.before, index), self._log(self.after, index))
             )
             for index in sorted(set(runs))
         }
+
+    def _log(self, loop: Feedback, index: int) -> LoopSample:
+        signals = self.holdout
+        moved = None if signals.disturbance is None else signals.disturbance[index, 0]
+        return _log(loop, signals.references[index], signals.noise[index, 0], moved)
+
+
+@jax.jit
+def _log(loop: Feedback, reference: Any, noise: Any, disturbance: Any) -> LoopSample:
+    inputs = loop_inputs(reference, noise, disturbance)
+    return simulate(loop, inputs, loop.init(reference[0]))[1]
+
+
+@jax.jit
+def _at_piezo(amplifier: System | None, voltage: Any) -> Any:
+    """Return the voltage behind ``amplifier``, which rests at the first sample."""
+    if amplifier is None:
+        return voltage
+    first = jax.tree.map(lambda u: u[0], voltage)
+    return simulate(amplifier, voltage, resolve(amplifier).init(first))[1]
 
 
 def tracking_rms(log: LoopSample, start: int) -> float:

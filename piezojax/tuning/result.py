@@ -12,6 +12,7 @@ from ..core.files import read_model
 from ..core.metrics import TrackingFigures
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import Status
+from .drive import Drive
 from .objective import RAILED
 
 RESULT_FILE = "result.json"
@@ -206,6 +207,10 @@ class Result(BaseModel):
     constraints: dict[str, ConstraintOutcome] = {}
     front: list[FrontPoint] | None = None
     perturbed: Perturbed | None = None
+    drive_before: dict[str, Drive] = {}
+    """Figures of the voltage at the piezo before tuning, by axis ("piezo" on one)."""
+    drive: dict[str, Drive] = {}
+    """The same figures of the tuned gains."""
     units: dict[str, str] = {}
     gain_units: dict[str, str] = {}
     """Declared units of ``gains``; "" without a declaration."""
