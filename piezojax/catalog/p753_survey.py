@@ -5,11 +5,12 @@ tuning at 20 kHz, which track SIN10 of 5 um with the printed noise. Models, filt
 surface are the printed ones of ``p753``.
 """
 
+import math
+
 from ..control import (
     PID,
     AdaptiveInverse,
     AlphaBeta,
-    Anticipation,
     BoundaryLayer,
     FeedforwardFeedback,
     FilteredCommand,
@@ -25,8 +26,15 @@ from ..control import (
 )
 from ..control.output_tracking import drive
 from ..core.arrays import as_array
-from ..core.system import Affine, System
-from ..dynamics import ARMA, FirstOrderLag, Notch, scaled_to_dc
+from ..core.system import Affine, System, series
+from ..dynamics import (
+    ARMA,
+    Biquad,
+    FirstOrderLag,
+    Notch,
+    SecondOrderLowPass,
+    scaled_to_dc,
+)
 from ..hardware import ChargeDrive
 from ..hysteresis import InverseColemanHodgdon
 from . import p753, p753_stage
@@ -39,6 +47,9 @@ SUPER_TWISTING = {"root_gain": 10.0, "sign_gain": 1e6, "layer": 1e4}
 
 NOTCH = {"damping": 0.5, "depth": 0.1}
 """Damping and depth of a notch at the nominal mode of the stage."""
+
+LOW_PASS = {"frequency": 3000.0, "damping": 0.7}
+"""Frequency in Hz and damping of a second-order low-pass: ours."""
 
 H_INFINITY_BOUND = 3.0
 """Bound of the weighted responses: ours."""
@@ -137,11 +148,12 @@ def feedforward_notch_pi() -> FeedforwardFeedback:
     return static_feedforward(notch_pi())
 
 
-def feedforward_h_infinity() -> Anticipation:
-    """Return H-infinity control of (5.33) with a static feedforward, um to V; ours.
+def feedforward_h_infinity() -> FeedforwardFeedback:
+    """Return H-infinity control of (5.33) with an inverse feedforward, um to V; ours.
 
     The weights are those of ``p753.mixed_sensitivity_inversion``, from V instead of um.
-    The reference can be advanced, because the design has no rate of the reference.
+    A low-pass filters the command. The feedforward is the inverse of (5.33) without its
+    zeros, behind a low-pass.
     """
     control = WeightedMixedSensitivity(
         scaled_to_dc(ARMA(**p753.DYNAMICS_BEHIND_HYSTERESIS), p753.GAIN),
@@ -150,7 +162,14 @@ def feedforward_h_infinity() -> Anticipation:
         bound=H_INFINITY_BOUND,
         dt=p753.DT,
     )
-    return Anticipation(static_feedforward(control), (0.0,))
+    feedback = FilteredCommand(control, SecondOrderLowPass(**LOW_PASS, dt=p753.DT))
+    slow, fast = p753.lags()
+    mean = math.sqrt(slow * fast)
+    inverse = Biquad(
+        0.5 / (math.pi * mean), 0.5 * (slow + fast) / mean, **LOW_PASS, dt=p753.DT
+    )
+    static = InverseGain(Affine(p753.GAIN))
+    return FeedforwardFeedback(series(dynamics=inverse, gain=static), feedback)
 
 
 def adaptive_notch_pi() -> AdaptiveInverse:

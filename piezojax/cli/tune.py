@@ -88,6 +88,7 @@ def _tune(
     from ..report.summary_tables import (
         gains_table,
         perturbed_text,
+        sliding_text,
         stability_table,
         tuning_table,
     )
@@ -116,6 +117,8 @@ def _tune(
     console.print(gains_table(result))
     console.print(stability_table(outcome.stability))
     console.print(drive_table(outcome.drive, description.rate))
+    if (line := sliding_text(result)) is not None:
+        console.print(line, soft_wrap=True)
     if result.constraints:
         console.print(constraints_table(result))
     if result.front and case.study.pareto:

@@ -106,6 +106,21 @@ def perturbed_text(perturbed: Perturbed) -> str:
     )
 
 
+def sliding_text(result: Result) -> str | None:
+    """Return one line on the error in the sliding variable; None without one."""
+    shares = [
+        "-" if parts is None or parts.share is None else f"{100.0 * parts.share:.1f} %"
+        for parts in (result.sliding_before, result.sliding)
+    ]
+    if result.sliding is None:
+        return None
+    return (
+        f"sliding variable: {shares[1]} of its mean square is tracking error "
+        f"({shares[0]} before); the rest is the lag of the observer behind the "
+        "reference, and noise"
+    )
+
+
 def gains_table(result: Result) -> Table:
     """Return the table of the parameters before and after tuning.
 

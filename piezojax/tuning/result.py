@@ -14,6 +14,7 @@ from ..solve.problem import TOLERANCE
 from ..solve.search_state import Status
 from .drive import Drive
 from .objective import RAILED
+from .sliding import SlidingShare
 
 RESULT_FILE = "result.json"
 GAINS_FILE = "gains.toml"
@@ -183,8 +184,10 @@ class Result(BaseModel):
     ``coupling`` concern the axes that should rest, under all references of the
     hold-out. ``constraints`` holds the outcomes of the study's limits, ``front`` its
     Pareto front, and ``perturbed`` the figures of the gains on the held-out plants of
-    its ensemble. ``history`` holds the lowest loss of each start after each step, and
-    ``times_s`` the time (s) from the start of the search to the end of that step.
+    its ensemble. ``sliding_before`` and ``sliding`` tell how much of the sliding
+    variable is tracking error, None for other controllers. ``history`` holds the lowest
+    loss of each start after each step, and ``times_s`` the time (s) from the start of
+    the search to the end of that step.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -211,6 +214,8 @@ class Result(BaseModel):
     """Figures of the voltage at the piezo before tuning, by axis ("piezo" on one)."""
     drive: dict[str, Drive] = {}
     """The same figures of the tuned gains."""
+    sliding_before: SlidingShare | None = None
+    sliding: SlidingShare | None = None
     units: dict[str, str] = {}
     gain_units: dict[str, str] = {}
     """Declared units of ``gains``; "" without a declaration."""

@@ -37,6 +37,7 @@ from .result import (
     scores,
 )
 from .search import search_box
+from .sliding import sliding_share
 
 
 def tune(
@@ -82,6 +83,9 @@ def tune(
         result = _report(case, data, evaluator, before, after, search, clock, {}, None)
     try:
         stability = _stability(case, after)
+        result.sliding_before, result.sliding = (
+            sliding_share(loop, data, evaluator.start) for loop in (case.loop, after)
+        )
     except KeyboardInterrupt:
         result.status = "interrupted"
         stability = StabilityReports(problems={"after": "they were interrupted"})
