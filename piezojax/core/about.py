@@ -11,8 +11,10 @@ class About(BaseModel):
     """Origin of a saved System, and the reasons not to use it.
 
     ``piezojax`` is the version that wrote the file. ``study`` is the name of the study
-    with its ``seed``, ``rate_Hz`` the sampling rate. ``units`` maps the channels of the
-    System to their units. ``error_bound`` bounds the error of a fitted model, and
+    with its ``seed``, ``record`` the origin of the record of a fit, and ``rate_Hz`` the
+    sampling rate. ``units`` maps the channels of the System to their units, and
+    ``parameter_units`` its parameters, by path; "" is a unit that is not known.
+    ``error_bound`` bounds the error of a fitted model, and
     ``standard_errors`` are those of its parameters, by path. ``unsafe`` lists the
     alarms raised when the System was made; ``load`` refuses a file with any. Keys of
     later versions are ignored.
@@ -21,8 +23,10 @@ class About(BaseModel):
     piezojax: str = Field(default_factory=lambda: version("piezojax"))
     study: str | None = None
     seed: int | None = None
+    record: str | None = None
     rate_Hz: float | None = None  # noqa: N815
     units: dict[str, str] = {}
+    parameter_units: dict[str, str] = {}
     error_bound: ErrorBound | None = None
     standard_errors: dict[str, float] = {}
     unsafe: list[str] = []

@@ -10,6 +10,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from ..core.about import About
+from ..core.conversion import replaced
+from ..core.paths import declared, parameters
 from ..core.progress import Progress, Silent
 from ..core.system import System
 from .chain import DEFAULT, automatic, shown_dynamics, training_record
@@ -125,8 +127,10 @@ class Fit:
         }
         residuals = self.report.residuals
         return About(
+            record=record.source or None,
             rate_Hz=1.0 / record.dt,
             units=units,
+            parameter_units=self._parameter_units(),
             error_bound=None if residuals is None else residuals.error_bound,
             standard_errors={
                 path: found.standard_error
@@ -135,6 +139,23 @@ class Fit:
             },
             unsafe=self.report.alarms,
         )
+
+    def _parameter_units(self) -> dict[str, str]:
+        """Return the units of the parameters of the System, by path.
+
+        Parts declare V and um, which stand for the units of the record. With several
+        channels the parameters may be in any of their units: those are "".
+        """
+        record = self.record
+        sides = {"V": set(record.input_units), "um": set(record.output_units)}
+        known = {name: "".join(each) for name, each in sides.items() if len(each) == 1}
+        found = {}
+        for path in parameters(self.system):
+            declaration = declared(self.system, path)
+            unit = declaration.unit if declaration else ""
+            unclear = any(name in unit and name not in known for name in sides)
+            found[path] = "" if unclear else replaced(unit, known)
+        return found
 
     @property
     def record(self) -> Record:

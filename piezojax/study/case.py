@@ -22,6 +22,7 @@ from ..core.system import System, rest_output
 from ..identification import Fit, identify, read_record
 from .ensemble import Ensemble, Stage, ensemble_of
 from .make_hardware import driven, make_actuator, make_amplifier, make_sensor, per_axis
+from .origin import check_origin, check_rate, in_study_units
 from .parameters import search_space
 from .schema import Study, load
 from .stage_tables import RecordPlant
@@ -86,6 +87,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         study.rate,
         design=lambda name: _designed(study, name, plant),
     )
+    check_origin(_about_file(study.controller, path.parent), study, "controller.file")
     observation = Observation(zero, zero, zero, zero)
     _check_role(controller, observation, "controller", "an Observation to a command")
     loop = Feedback(controller, plant, make_actuator(study), make_sensor(study))
@@ -115,22 +117,30 @@ def _plant(study: Study, folder: Path) -> tuple[System, Fit | None, About]:
     table = study.plant
     if "record" not in table:
         plant = _from_source(table, "plant", folder, PLANTS, study.rate)
-        known = "file" in table
-        about = read_about(folder / str(table["file"])) if known else About()
+        about = _about_file(table, folder)
+        check_origin(about, study, "plant.file")
         return plant, None, about
     if set(table) & {"catalog", "file", "type"}:
         raise _source_error(table, "plant", ("catalog", "file", "type", "record"))
     description = validated(RecordPlant, table, "plant")
-    record = read_record(
-        folder / description.record,
-        time=description.time,
-        input=description.input,
-        output=description.output,
-        rate=description.record_rate,
+    record = in_study_units(
+        read_record(
+            folder / description.record,
+            time=description.time,
+            input=description.input,
+            output=description.output,
+            rate=description.record_rate,
+        )
     )
+    check_rate(1.0 / record.dt, study, "plant.record")
     train = slice(*description.train) if description.train else None
     fit = identify(record, description.model, train=train)
     return fit.system, fit, fit.about
+
+
+def _about_file(table: Mapping[str, Any], folder: Path) -> About:
+    """Return the origin of the file of a table, empty for another source."""
+    return read_about(folder / str(table["file"])) if "file" in table else About()
 
 
 def _swept_plants(study: Study, zero: Any) -> dict[str, System]:

@@ -67,7 +67,7 @@ def _needs(table: Table, key: str, other: str) -> None:
 
 
 class Actuator(ElectronicsTable):
-    """Drive: its limits ``lower`` and ``upper``, V, and the properties of amplifier.
+    """Drive: its limits ``lower`` and ``upper``, V, and the rest of its amplifier.
 
     ``slew_rate`` is in V/s. ``current_limit`` (A) and ``capacitance`` of the stage (F)
     limit the slew rate too. ``computation`` is the time from the sample of the sensor

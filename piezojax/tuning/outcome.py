@@ -14,6 +14,7 @@ from ..analysis.stability import StabilityReports
 from ..core.about import About
 from ..core.axes import axis_of
 from ..core.feedback import Feedback, LoopSample, loop_inputs
+from ..core.paths import parameters
 from ..core.rollout import simulate
 from ..core.system import System, resolve
 from ..study import Case
@@ -65,6 +66,10 @@ class Outcome:
             rate_Hz=study.rate,
             unsafe=self.result.alarms,
             units=dict(channels) or {"measured": "um", "command": "V"},
+            parameter_units={
+                path: self.case.unit(f"controller.{path}")
+                for path in parameters(self.controller)
+            },
         )
 
     @cached_property

@@ -1,0 +1,77 @@
+"""Units and sampling rate of the records and files that a study names."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..core.about import About
+from ..core.conversion import factor
+from ..identification import Record
+from .schema import Study
+
+
+def in_study_units(record: Record) -> Record:
+    """Return ``record`` with its input in V and its output in um.
+
+    Raises ValueError for a unit that cannot be converted.
+    """
+    factors = {}
+    for side, units, wanted in (
+        ("input", record.input_units, "V"),
+        ("output", record.output_units, "um"),
+    ):
+        each = [factor(unit, wanted) for unit in units]
+        if None in each:
+            raise ValueError(
+                f"plant.record: the {side} of {record.source} is in {units[0]}; a "
+                f"study of one axis needs it in {wanted}: scale the column, and name "
+                f"it with its unit, as {side}_{wanted}"
+            )
+        factors[side] = np.array(each)
+    return dataclasses.replace(
+        record,
+        inputs=record.inputs * factors["input"],
+        outputs=record.outputs * factors["output"],
+        input_units="V",
+        output_units="um",
+    )
+
+
+def check_origin(about: About, study: Study, where: str) -> None:
+    """Raise ValueError unless the file at the key ``where`` fits ``study``.
+
+    Units and a sampling rate that ``about`` does not tell are not checked.
+    """
+    for channel, wanted in _channels(study).items():
+        unit = about.units.get(channel, wanted)
+        if unit != wanted:
+            raise ValueError(
+                f"{where}: its {channel} is in {unit}, and the study needs {wanted}: "
+                f"{_REMEDIES[where]}"
+            )
+    if about.rate_Hz is not None:
+        check_rate(about.rate_Hz, study, where)
+
+
+def check_rate(rate: float, study: Study, where: str) -> None:
+    """Raise ValueError unless ``rate`` (Hz) at the key ``where`` is the study's."""
+    if not np.isclose(rate, study.rate, rtol=1e-6, atol=0.0):
+        raise ValueError(
+            f"rate is {study.rate:g} Hz, but {where} was made for {rate:g} Hz"
+        )
+
+
+_REMEDIES = {
+    "plant.file": "name its record in [plant], which is converted, or fit it again in "
+    "V and um",
+    "controller.file": "tune it again in a study with these units",
+}
+
+
+def _channels(study: Study) -> Mapping[str, str]:
+    """Return the units of ``study`` by the names of channels in the files."""
+    if study.axes is None:
+        return {"input": "V", "output": "um", "measured": "um", "command": "V"}
+    outputs = {f"output {i}": unit for i, unit in enumerate(study.axes.units)}
+    return outputs | dict(zip(study.axes.names, study.axes.units, strict=True))
