@@ -21,7 +21,8 @@ from piezojax.hysteresis import (
     RateDependentPreisach,
 )
 from piezojax.identification import METHODS
-from piezojax.identification.chain import DEFAULT, automatic, structure
+from piezojax.identification.automatic import automatic
+from piezojax.identification.chain import DEFAULT, structure
 from piezojax.identification.estimators.neural import neural_start
 from piezojax.study import read
 

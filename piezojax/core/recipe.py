@@ -12,10 +12,14 @@ PLACES = ("hysteresis", "creep", "dynamics", "lag", "delay")
 
 
 class Resonance(NamedTuple):
-    """Natural frequency (Hz) and damping ratio (1) of a resonance."""
+    """Natural frequency (Hz) and damping ratio (1) of a resonance.
+
+    ``share`` is its part of the static gain of all resonances of the stage.
+    """
 
     frequency: float
     damping: float
+    share: float = 1.0
 
 
 class Extent(NamedTuple):

@@ -22,7 +22,7 @@ from .linearise import linearise as linearise
 from .matrix_arma import MatrixARMA as MatrixARMA
 from .matrix_arma import observability_form as observability_form
 from .mode import Mode as Mode
-from .mode import SensedMode as SensedMode
+from .modes import Modes as Modes
 from .neural_state_space import NeuralStateSpace as NeuralStateSpace
 from .oversampled import Oversampled as Oversampled
 from .reduction import Reduction as Reduction

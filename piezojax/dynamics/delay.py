@@ -9,6 +9,9 @@ from ..core.parameter import parameter, sample_time
 from ..core.recipe import Extent, Fittable, Part, Recipe
 from ..core.space import Range
 
+NEAR = 0.25
+"""Largest change by a fit of a delay that the record shows, in samples."""
+
 
 class FractionalDelay(Fittable):
     """``y(t) = x(t - delay)``, interpolated linearly between samples.
@@ -35,9 +38,14 @@ class FractionalDelay(Fittable):
         dt = extent.dt
         found = extent.delay
         starts = [0.5 * dt, 2.5 * dt] if found is None else [min(found, 4.5 * dt)]
+        bounds = Range(0.0, 5.0 * dt)
+        if found is not None and extent.modes:
+            # As for a mode, the errors of a hysteresis would pull the delay away.
+            off = NEAR * dt
+            bounds = Range(max(0.0, starts[0] - off), min(starts[0] + off, 5.0 * dt))
         return Recipe(
             cls(0.5 * dt, dt, 5),
-            {"delay": Range(0.0, 5.0 * dt)},
+            {"delay": bounds},
             [{"delay": delay} for delay in starts],
         )
 

@@ -1,5 +1,6 @@
 """Identification of plant models from measured records."""
 
+from .chain import DEFAULT as DEFAULT
 from .chain import chain as chain
 from .compare import identify_all as identify_all
 from .estimators.estimate import Options as Options

@@ -20,10 +20,7 @@ LINEAR = ("dynamics", "lag", "delay")
 """Places of linear dynamics, whose parameters the record must excite."""
 
 DEFAULT = "auto"
-"""Model that is fitted by default: SLOW and the dynamics that the record shows."""
-
-SLOW = "shaped_coleman_hodgdon+exponential_creep"
-"""Hysteresis and creep of the default model."""
+"""Model that is fitted by default (``automatic``)."""
 
 FRACTION = 0.2
 """Shortest delay, in samples, for which a model with a mode has a delay."""
@@ -85,12 +82,8 @@ def dynamics_parts(record: Record) -> str:
     if not shown.modes:
         return "lag"
     late = shown.delay is not None and shown.delay > FRACTION * record.dt
-    return ("sensed_mode" if shown.lags else "mode") + ("+delay" if late else "")
-
-
-def automatic(record: Record) -> str:
-    """Return the default chain for ``record``: SLOW and the dynamics it shows."""
-    return f"{SLOW}+{dynamics_parts(record)}"
+    alone = len(shown.modes) == 1 and not shown.lags
+    return ("mode" if alone else "modes") + ("+delay" if late else "")
 
 
 def extent_of(record: Record) -> Extent:

@@ -14,7 +14,8 @@ from ..core.conversion import replaced
 from ..core.paths import declared, parameters
 from ..core.progress import Progress, Silent
 from ..core.system import System
-from .chain import DEFAULT, automatic, shown_dynamics, training_record
+from .automatic import automatic
+from .chain import DEFAULT, shown_dynamics, training_record
 from .estimators.estimate import FittedParameter, LinearDetail, Options
 from .estimators.resonances import LinearDynamics
 from .methods import method_for
@@ -186,7 +187,8 @@ def identify(
 
     ``model`` is a chain of parts such as ``"prandtl_ishlinskii+logarithmic_creep+lag"``
     (see ``--model help``) or one of the models of ``identification.METHODS``; the
-    default is a chain with the resonance, lag and delay that the record shows.
+    default is a chain with the resonances, lag and delay that the record shows, and
+    with the hysteresis that describes it best (``automatic``).
     ``method`` is a name in METHODS; left out, it is the first that can fit the model.
     The model is fitted over the samples ``train`` of each record (the first half if
     left out) and validated by its free run on ``validate`` (the rest if left out).
@@ -200,7 +202,7 @@ def identify(
         min(r.samples for r in records), train, validate
     )
     if model == DEFAULT:
-        model = automatic(training_record(records, train))
+        model = automatic(training_record(records, train), progress)
     shown = shown_dynamics(records, train)
     chosen = method_for(model, method)
     estimate = chosen.estimate(

@@ -20,6 +20,7 @@ from .estimators.neural import fit_neural_state_space
 from .estimators.output_error import Optimum, from_rest, output_error
 from .estimators.regression import instrumental_variables, least_squares
 from .estimators.steady_state import fit_structure, steady_response
+from .estimators.structure import Structure
 from .records.record import Record
 from .records.resample import average_periods, resample, whole_periods
 
@@ -62,20 +63,23 @@ def _by_output_error(
         systems[0],
         _free_runs(systems, records),
         named,
-        _optimum_warnings(optimum, options.steps),
+        _optimum_warnings(optimum, shape, options.steps),
         shape.order,
         bool(hystereses(shape.system)),
     )
 
 
-def _optimum_warnings(optimum: Optimum, steps: int) -> list[str]:
+def _optimum_warnings(optimum: Optimum, shape: Structure, steps: int) -> list[str]:
     found = []
+    # Their narrow bounds stand for what the record shows of them.
+    shown = shape.dynamics if shape.whitening else ()
     if not optimum.finished:
         found.append(f"the fit had not converged after its {steps} steps")
     equal = optimum.units[optimum.losses <= optimum.losses[0] * (1.0 + EQUAL_LOSS)]
     spread = np.ptp(equal, axis=0)
     for i, name in enumerate(optimum.names):
-        found += bound_warning(name, optimum.units[0, i])
+        if name not in shown:
+            found += bound_warning(name, optimum.units[0, i])
         if optimum.deviations[i] is None:
             found.append(f"{name} is not determined by this record")
         elif spread[i] > AMBIGUOUS:

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from ..identification import chain
+from ..identification import DEFAULT, chain
 from .tables import ByAxis, Finite, NotNegative, Positive, Table
 
 Bandwidth = Annotated[float, Field(ge=1e-3, le=1e9, allow_inf_nan=False, strict=True)]
@@ -22,7 +22,7 @@ class RecordPlant(Table):
     """
 
     record: Path
-    model: str
+    model: str = DEFAULT
     time: str | int | None = None
     input: str | int = 0
     output: str | int = 1
@@ -32,7 +32,8 @@ class RecordPlant(Table):
     @field_validator("model")
     @classmethod
     def _known(cls, name: str) -> str:
-        chain(name)
+        if name != DEFAULT:
+            chain(name)
         return name
 
 

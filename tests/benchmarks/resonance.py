@@ -25,7 +25,7 @@ from oracles import resonant_records
 from piezojax import Record, identify
 from piezojax.core.recipe import Resonance
 from piezojax.core.system import Series
-from piezojax.dynamics import ARMA, Mode, SensedMode
+from piezojax.dynamics import ARMA, Mode, Modes
 from piezojax.identification import identify_all
 from piezojax.identification.chain import dynamics_of, training_record
 
@@ -37,8 +37,11 @@ def resonances(system):
     """Return the resonances of a fitted model."""
     if isinstance(system, Series):
         return [mode for part in system.parts for mode in resonances(part)]
-    if isinstance(system, Mode | SensedMode):
+    if isinstance(system, Mode):
         return [Resonance(float(system.frequency), float(system.damping))]
+    if isinstance(system, Modes):
+        pairs = zip(system.frequency, system.damping, strict=True)
+        return [Resonance(float(f), float(d)) for f, d in pairs]
     if isinstance(system, ARMA):
         poles = system.poles().astype(complex)
         rates = np.log(poles[(poles.imag > 1e-9)]) / DT

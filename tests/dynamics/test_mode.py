@@ -7,10 +7,10 @@ import pytest
 import scipy.linalg
 
 from piezojax import Record, load, save, simulate
-from piezojax.core.paths import replace
+from piezojax.core.paths import get, replace
 from piezojax.core.recipe import Extent, Resonance
 from piezojax.core.registry import parts
-from piezojax.dynamics import ARMA, Mode, SensedMode
+from piezojax.dynamics import ARMA, Mode, Modes
 from piezojax.identification.chain import structure
 
 DT = 1e-4
@@ -126,35 +126,62 @@ def by_three_states(frequency, damping, time_constant, inputs, rest):
     return np.array(outputs)
 
 
+def modes(frequency, damping, sensor):
+    return Modes([frequency], [damping], DT, time_constant=[sensor])
+
+
 @pytest.mark.parametrize("sensor", [1e-5, 1e-4, 3e-3])
 @pytest.mark.parametrize(("frequency", "damping"), [(300.0, 0.005), (4000.0, 0.1)])
-def test_a_sensed_mode_is_discretised_in_one(frequency, damping, sensor):
+def test_a_mode_and_its_sensor_are_discretised_in_one(frequency, damping, sensor):
     expected = by_three_states(frequency, damping, sensor, INPUT, 2.0)
-    found = response(SensedMode(frequency, damping, sensor, DT), INPUT, 2.0)
+    found = response(modes(frequency, damping, sensor), INPUT, 2.0)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 
 
-def test_the_gradient_of_a_sensed_mode_is_that_of_differences():
-    @jax.jit
-    def last(parameters):
-        return jnp.sum(response(SensedMode(*parameters, DT), INPUT) ** 2)
+def test_modes_are_in_parallel():
+    single = [
+        response(Mode(f, z, DT), INPUT, 2.0) for f, z in ((300.0, 0.01), (900.0, 0.05))
+    ]
+    found = response(Modes([300.0, 900.0], [0.01, 0.05], DT, [-0.1]), INPUT, 2.0)
+    np.testing.assert_allclose(found, 1.1 * single[0] - 0.1 * single[1], atol=1e-9)
 
-    point = np.array([780.0, 0.02, 1e-3])
+
+def test_the_gradient_of_modes_is_that_of_differences():
+    @jax.jit
+    def last(point):
+        stage = Modes(point[:2], point[2:4], DT, point[4:5], point[5:])
+        return jnp.sum(response(stage, INPUT) ** 2)
+
+    point = np.array([780.0, 1500.0, 0.02, 0.05, 0.1, 1e-3])
     steps = np.diag(1e-5 * point)
     differences = [(last(point + h) - last(point - h)) / (2 * h.sum()) for h in steps]
     np.testing.assert_allclose(jax.jit(jax.grad(last))(point), differences, rtol=1e-5)
 
 
-def test_a_bad_sensor_is_refused():
-    with pytest.raises(ValueError, match="time_constant in s is 0; it must be"):
-        SensedMode(780.0, 0.02, 0.0, DT)
+@pytest.mark.parametrize(
+    ("lists", "message"),
+    [
+        (([780.0], [0.02], DT, [], [0.0]), "time_constant in s is 0; it must be"),
+        (
+            ([780.0], [0.02, 0.1], DT),
+            "1 values of frequency, 2 of damping and 0 of",
+        ),
+    ],
+)
+def test_bad_modes_are_refused(lists, message):
+    with pytest.raises(ValueError, match=message):
+        Modes(*lists)
 
 
-def test_a_sensed_mode_starts_from_the_lag_of_the_record():
-    extent = EXTENT._replace(modes=(Resonance(780.0, 0.02),), lags=(1e-3,))
-    found = parts()["sensed_mode"].recipe(extent).system
-    values = (found.frequency, found.damping, found.time_constant)
-    assert tuple(map(float, values)) == (780.0, 0.02, 1e-3)
+def test_modes_start_from_what_the_record_shows():
+    seen = (Resonance(780.0, 0.02, -0.1), Resonance(300.0, 0.05, 1.1))
+    extent = EXTENT._replace(modes=seen, lags=(1e-3,))
+    recipe = parts()["modes"].recipe(extent)
+    paths = ("frequency.0", "damping.0", "frequency.1", "share.0", "time_constant.0")
+    values = [float(get(recipe.system, path)) for path in paths]
+    assert values == [300.0, 0.05, 780.0, -0.1, 1e-3]
+    for path, value in zip(paths, values, strict=True):
+        assert recipe.bounds[path].lower < value < recipe.bounds[path].upper
 
 
 def test_an_arma_starts_as_the_resonance_of_the_record():

@@ -34,6 +34,9 @@ PARALLEL_STARTS = 4
 TRIAL_STEPS = 12
 """Number of steps after which only the best starts continue."""
 
+ROUGH_STEPS = 24
+"""Number of steps of a fit from which another one starts."""
+
 TOLERANCE = 1e-10
 """Relative change of loss and point below which a descent ends."""
 
@@ -198,7 +201,8 @@ def output_error(
     problem, names = problem_of(structure, records, train)
     starts = _starts_for_records(structure, problem)
     progress.stage(f"compiling the fit of {len(names)} parameters")
-    units, losses, finished = _descended(problem, starts, steps, progress)
+    rough = min(steps, ROUGH_STEPS) if structure.whitening else steps
+    units, losses, finished = _descended(problem, starts, rough, progress)
     if structure.whitening:
         # Errors of the hysteresis may have hidden a resonance from the first fit.
         problem = _balanced(problem, as_array(units[0]))

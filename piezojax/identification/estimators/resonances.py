@@ -38,6 +38,10 @@ DROPS = (0.99, 0.95)
 shown. A harmonic of the hysteresis that meets the first resonance looks like another,
 weak one."""
 
+EVIDENCE = 20.0
+"""Least rise of the log likelihood by a mode: in a short record a smaller one is
+chance."""
+
 NEGLIGIBLE = 1e-6
 """White error, as a share of the output, below which no mode is looked for."""
 
@@ -151,17 +155,47 @@ class _Hammerstein(NamedTuple):
 
     def modes(self, dt: float) -> tuple[Resonance, ...]:
         """Return the resonances that the record shows, strongest first."""
-        found = []
-        for pole in self.dynamics.poles():
-            rate = np.log(pole) / dt if pole.imag > 0.0 else 0.0
-            frequency = abs(rate) / (2.0 * np.pi)
-            damping = -np.real(rate) / max(abs(rate), 1e-30)
-            if not (0.0 < frequency * dt < HIGHEST and damping < DAMPED):
+        found, gains = [], self._static_gains()
+        for pole, gain in gains.items():
+            rate = np.log(pole)
+            cycles, damping = abs(rate) / (2.0 * np.pi), -np.real(rate) / abs(rate)
+            if not (0.0 < cycles < HIGHEST and damping < DAMPED):
                 continue
-            if self._explained(frequency * dt) > EXPLAINED:
-                peak = abs(self.dynamics.response(np.array([frequency * dt]))[0])
-                found.append((peak, Resonance(float(frequency), float(damping))))
-        return tuple(resonance for _, resonance in sorted(found, reverse=True))
+            if self._explained(cycles) > EXPLAINED:
+                peak = abs(self.dynamics.response(np.array([cycles]))[0])
+                found.append((peak, cycles / dt, damping, gain))
+        whole = sum(gain for *_, gain in found)
+        return tuple(
+            Resonance(float(frequency), float(damping), float(gain / whole))
+            for _, frequency, damping, gain in sorted(found, reverse=True)
+        )
+
+    def _static_gains(self) -> dict[complex, float]:
+        """Return the static gain of each pair of complex poles, by its upper pole.
+
+        A mode with poles p in the s plane and lags behind it have the residue ``gain
+        w^2 / ((p - conj(p)) p) / prod (1 - p / r)`` at p in their step response, r the
+        poles of the lags; the discrete transfer function over z - 1 has the same one.
+        """
+        poles, slow = self.dynamics.poles(), self._real_rates()
+        upper = poles[np.imag(poles) > 1e-9]
+        found = {}
+        for pole in upper:
+            rate, others = np.log(pole), poles[poles != pole]
+            residue = np.polyval(self.dynamics.numerator[::-1], 1.0 / pole) * pole
+            residue = residue / np.prod(1.0 - others / pole) / (pole - 1.0)
+            own = abs(rate) ** 2 / ((rate - np.conj(rate)) * rate)
+            found[complex(pole)] = residue / own * np.prod(1.0 - rate / slow)
+        if not found:
+            return {}
+        # The strongest mode tells the delay of all; it has the sign of the slope.
+        strongest = max(found, key=lambda pole: abs(found[pole]))
+        sign = np.sign(self.slope()) or 1.0
+        delay = -np.angle(sign * found[strongest]) / np.angle(strongest)
+        return {
+            pole: float(abs(gain) * np.sign(np.real(gain * pole**delay)))
+            for pole, gain in found.items()
+        }
 
     def _explained(self, cycles: float) -> float:
         """Return the explained share of the output in the octave around ``cycles``."""
@@ -181,14 +215,19 @@ class _Hammerstein(NamedTuple):
         A pole with a zero beside it, or below the high-pass filter, is creep or an
         error of the hysteresis.
         """
+        return tuple(float(-dt / rate) for rate in self._real_rates())
+
+    def _real_rates(self) -> np.ndarray:
+        """Return the poles of the lags in the s plane, per sample, slowest first."""
         poles, zeros = self.dynamics.poles(), np.roots(self.dynamics.numerator)
         real = np.real(poles[(np.abs(np.imag(poles)) < 1e-9) & (np.real(poles) > 0.0)])
-        return tuple(
-            float(-dt / np.log(pole))
+        kept = [
+            pole
             for pole in sorted(real, reverse=True)
             if np.all(np.abs(zeros - pole) > DIPOLE * (1.0 - pole))
             and 1.0 - pole > 2.0 * np.pi * SLOWEST
-        )
+        ]
+        return np.log(np.array(kept))
 
     def slope(self) -> float:
         """Return the mean slope over the full range at the slowest frequencies."""
@@ -203,9 +242,12 @@ class _Hammerstein(NamedTuple):
         highest = max([0.2, *(1.2 * mode.frequency * dt for mode in modes)])
         cycles = np.linspace(3.0 * SLOWEST, min(highest, HIGHEST), 400)
         turn = np.exp(-2j * np.pi * cycles)
-        rates = [rate for mode in modes for rate in _rates(mode)]
-        rates += [complex(-1.0 / lag) for lag in lags]
-        rest = self.dynamics.response(cycles) / turn / _held(rates, dt, turn)
+        slow = [complex(-1.0 / lag) for lag in lags]
+        held = sum(
+            (mode.share * _held([*_rates(mode), *slow], dt, turn) for mode in modes),
+            np.zeros(cycles.size) if modes else _held(slow, dt, turn),
+        )
+        rest = self.dynamics.response(cycles) / turn / held
         phase = np.unwrap(np.angle(rest * np.sign(np.real(rest[0]))))
         return float(max(0.0, -(phase @ cycles) / (2.0 * np.pi * cycles @ cycles)) * dt)
 
@@ -270,12 +312,13 @@ def _with_lag(signals: _Signals, modes: int, delay: int = 1) -> _Hammerstein | N
 def _chosen(signals: _Signals) -> _Hammerstein:
     """Return the model with as many modes as lower the error."""
     best = _with_lag(signals, 0)
+    chance = np.exp(-EVIDENCE / signals.output.size)
     for modes, drop in enumerate(DROPS, 1):
         if _cost(best) < NEGLIGIBLE * np.std(signals.output):
             break
         model = _with_lag(signals, modes)
         shown = model is not None and len(model.modes(1.0)) == modes
-        if not shown or _cost(model) > drop * _cost(best):
+        if not shown or _cost(model) > min(drop, chance) * _cost(best):
             break
         best = model
     if best is None:
