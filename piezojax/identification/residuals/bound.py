@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.signal
 
 from ...core.error_bound import UNSEEN, ErrorBound
 from ..estimators.welch import SHORTEST, SpectralResponse, spectral_response
@@ -110,6 +109,8 @@ def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeErro
 
 def _stands_out(found: SpectralResponse, resolution: float) -> np.ndarray:
     """Return whether the input's power in each line exceeds the leakage of others."""
+    import scipy.signal  # takes long to import
+
     places = np.round(found.frequency / resolution).astype(int)
     power = np.zeros(places.max() + 1)
     power[places] = found.power

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.signal
 from pydantic import BaseModel
 
 from ...core.error_bound import ErrorBound
@@ -61,6 +60,8 @@ def coverage_of(records: Sequence[Record], bound: ErrorBound | None) -> Coverage
 
 def unseen_in(input: np.ndarray, dt: float, train: slice, validate: slice) -> Unseen:
     """Return what ``input`` [samples] holds in ``validate`` and not in ``train``."""
+    import scipy.signal  # takes long to import
+
     parts = [input[train], input[validate]]
     size = 2 ** int(np.log2(max(8, min(part.size for part in parts) // 4)))
     frequency = np.fft.rfftfreq(size, dt)
