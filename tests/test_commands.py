@@ -253,7 +253,7 @@ def test_tune_tells_where_it_stands_and_ends_with_a_table(tuned):
     assert lines[0] == "reading small.toml"
     assert "tuning from 2 starts" in lines
     text = printed.stdout
-    for part in ("SIN50", "SW50", "geometric mean", "controller.integral"):
+    for part in ("SIN50", "SW50", "geometric mean", "integral"):
         assert part in text
     assert "results in" in text
     assert "\x1b" not in text  # no colours where there is no terminal
@@ -310,7 +310,8 @@ def assert_interrupted(out):
     result = pj.load_result(out)
     assert result.status == "interrupted"
     assert result.holdout.stable
-    controller = pj.load(out / "gains.toml")
+    # So early the search may not have met the limits; result.alarms would say so.
+    controller = pj.load(out / "gains.toml", accept_unsafe=True)
     assert float(controller.integral) == result.gains["controller.integral"]
     assert_pictures(out, "tracking.png", "hysteresis.png")
     return result
@@ -561,7 +562,7 @@ def test_model_help_lists_the_models(record):
 def test_identify_bad_input(record, tmp_path):
     out = ("--out", tmp_path / "out")
     failed(call("identify", tmp_path / "no.csv", *out), "no.csv: No such file or dir")
-    failed(call("identify", record, *out), "name the time column, or give its rate")
+    failed(call("identify", record, *out), "name the columns of input and output")
     failed(
         call("identify", record, *out, "--rate", -5.0),
         "bench.csv: rate is -5 Hz; it must be above 0",

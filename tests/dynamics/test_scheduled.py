@@ -114,7 +114,7 @@ OTHER = StateSpace(*MATRICES[0], 2.0 * DT)
 @pytest.mark.parametrize(
     ("models", "levels", "time_constant", "message"),
     [
-        ((ONE,), (1.0,), 0.1, "1 models for 1 levels; there must be one a level, and"),
+        ((ONE,), (1.0,), 0.1, "1 models for 1 levels; there must be one model per"),
         ((ONE, ONE), (1.0,), 0.1, "2 models for 1 levels"),
         ((ONE, OTHER), (1.0, 2.0), 0.1, "models differ in .states, outputs"),
         ((ONE, ONE), (2.0, 1.0), 0.1, "a level is 2 and the next is 1"),

@@ -23,6 +23,7 @@ STUDY = {
     "plant": {"catalog": "p558"},
     "actuator": {"lower": [-60.0, -300.0, -300.0], "upper": [60.0, 300.0, 300.0]},
     "sensor": {"noise_rms": [0.0008, 0.013, 0.013]},
+    "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
     "controller": {"catalog": "p558_pid"},
     "references": {
         "tune": ["Z:SIN5", "Z:SIN5 Rx:SIN10"],

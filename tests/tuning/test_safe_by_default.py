@@ -52,7 +52,7 @@ def safe(tmp_path_factory):
 def test_the_defaults_hold_where_the_best_gains_would_break_them(free, safe):
     assert exact(free).sensitivity_peak > 2.1
     assert free.result.constraints == {}
-    assert exact(safe).sensitivity_peak == pytest.approx(2.0, rel=2e-2)
+    assert 1.9 < exact(safe).sensitivity_peak < 2.02
     assert safe.result.constraints["sensitivity_peak"].kept
     assert safe.result.constraints["delay_margin"].limit == 1.0
     assert safe.result.after.worst_rms_um > free.result.after.worst_rms_um

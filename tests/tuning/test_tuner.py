@@ -27,6 +27,7 @@ BASE = {
     "plant": LAG,
     "actuator": {"lower": -20.0, "upper": 120.0},
     "sensor": {"noise_rms": 0.012},
+    "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
     "controller": {"catalog": "p753_pid"},
     "references": {
         "tune": ["SIN50", "SW50"],
