@@ -15,6 +15,7 @@ from .stability.differentiable import (
     disk_margin_of,
     peak_of,
 )
+from .stability.model_error import worst_delay_margin, worst_sensitivity
 
 OFF = "off"
 """Limit in a study that switches a constraint off."""
@@ -24,22 +25,32 @@ CAP = 3.0
 and the size of the violation has no meaning."""
 
 
+class Margins(NamedTuple):
+    """Sensitivity of a loop and the error of its plant, from which margins follow.
+
+    ``sensitivity`` is S [plants, branches, lines, axes, axes] on the plants on which
+    margins are constrained; ``error`` [lines] bounds the relative error of a plant of
+    one axis, None if nothing is known of it.
+    """
+
+    sensitivity: Sensitivity
+    error: Float[Array, " lines"] | None = None
+
+
 class LoopFigures(NamedTuple):
     """Figures of a loop from which constraints are evaluated.
 
-    ``tracking`` and ``extremes`` hold arrays [plants, references, draws];
-    ``sensitivity`` is S [plants, branches, lines, axes, axes] on the plants on which
-    margins are constrained. ``extremes`` and ``sensitivity`` are None unless a limit
-    needs them. ``dt`` in s.
+    ``tracking`` and ``extremes`` hold arrays [plants, references, draws]. ``extremes``
+    and ``margins`` are None unless a limit needs them. ``dt`` in s.
     """
 
     tracking: TrackingFigures
     extremes: ExtremeFigures | None
-    sensitivity: Sensitivity | None
+    margins: Margins | None
     dt: float
 
 
-Source = Literal["tracking", "extremes", "sensitivity"]
+Source = Literal["tracking", "extremes", "margins"]
 """Field of ``LoopFigures`` from which a constraint is evaluated."""
 
 
@@ -82,19 +93,45 @@ def _largest(runs: Array) -> Array:
     return jnp.max(runs, axis=(1, 2))
 
 
-def _margin(figure: Callable[[Array], Array]) -> Callable[[Array, float], Array]:
-    return lambda sensitivity, dt: jax.vmap(jax.vmap(figure))(sensitivity)
+def _margin(figure: Callable[[Array, Any], Array]) -> Callable[[Margins, float], Array]:
+    def values(margins: Margins, dt: float) -> Array:
+        del dt
+        of_each = jax.vmap(jax.vmap(lambda found: figure(found, margins.error)))
+        return of_each(margins.sensitivity)
+
+    return values
+
+
+def _peak(sensitivity: Sensitivity, error: Array | None) -> Array:
+    """Return the largest Ms of a plant within ``error`` of the model."""
+    if error is None:
+        return peak_of(sensitivity)
+    return jnp.max(worst_sensitivity(sensitivity[:, 0, 0], error))
+
+
+def _delay(sensitivity: Sensitivity, error: Array | None) -> Array:
+    """Return the least delay margin of a plant within ``error`` of the model."""
+    nominal = delay_margin_of(sensitivity)
+    if error is None:
+        return nominal
+    angle = jnp.linspace(0.0, jnp.pi, error.size)
+    worst = worst_delay_margin(sensitivity[:, 0, 0], error, angle)
+    return jnp.minimum(nominal, jnp.min(worst))
+
+
+def _disk(sensitivity: Sensitivity, error: Array | None) -> Array:
+    """Return the disk margin of the model: a disk is a bound of its own."""
+    del error
+    return disk_margin_of(sensitivity)
 
 
 CONSTRAINTS: dict[str, Constraint] = {
     "sensitivity_peak": Constraint(
-        "1", "at most", "sensitivity", _margin(peak_of), above=1.0, default=2.0
+        "1", "at most", "margins", _margin(_peak), above=1.0, default=2.0
     ),
-    "disk_margin": Constraint(
-        "1", "at least", "sensitivity", _margin(disk_margin_of), below=2.0
-    ),
+    "disk_margin": Constraint("1", "at least", "margins", _margin(_disk), below=2.0),
     "delay_margin": Constraint(
-        "samples", "at least", "sensitivity", _margin(delay_margin_of), default=1.0
+        "samples", "at least", "margins", _margin(_delay), default=1.0
     ),
     "peak_voltage": Constraint(
         "V", "at most", "tracking", lambda figures, dt: _largest(figures.peak_voltage)
@@ -111,11 +148,12 @@ CONSTRAINTS: dict[str, Constraint] = {
 }
 """Constraints by their name in a study; each holds for every plant and reference of
 the objective. The sensitivity peak, disk margin and delay margin (samples) are those of
-the loop, linearised at the highest reference on both branches of the hysteresis. On
-several axes they are the largest singular value of S, a lower bound of the disk margin
-of all axes at once, and the least delay margin of one axis with the others closed. The
-others are the largest values in the runs; ``overshoot`` is a share of the reference's
-range."""
+the loop, linearised at the highest reference on both branches of the hysteresis; for a
+fitted plant the sensitivity peak and the delay margin are the worst within the error
+bound of its model. On several axes they are the largest singular value of S, a lower
+bound of the disk margin of all axes at once, and the least delay margin of one axis
+with the others closed. The others are the largest values in the runs; ``overshoot`` is
+a share of the range of the reference."""
 
 
 def limits_of(written: Mapping[str, Any]) -> dict[str, float]:

@@ -53,6 +53,21 @@ class ErrorBound(BaseModel):
         relative = np.asarray(self.relative)
         return np.maximum(relative[below], relative[above])
 
+    def over(self, frequency: np.ndarray) -> np.ndarray:
+        """Return the largest bound half way to both neighbours of each ``frequency``.
+
+        ``frequency`` (Hz) is a grid of equal steps.
+        """
+        half = 0.5 * (frequency[1] - frequency[0])
+        lines, relative = np.asarray(self.frequency), np.asarray(self.relative)
+        ends = np.maximum(self.at(frequency - half), self.at(frequency + half))
+        return np.array(
+            [
+                np.max(relative[np.abs(lines - f) <= half], initial=end)
+                for f, end in zip(frequency, ends, strict=True)
+            ]
+        )
+
     def excited_at(self, frequency: Any) -> np.ndarray:
         """Return whether both neighbours of ``frequency`` (Hz) are excited."""
         below, above = self._neighbours(frequency)

@@ -6,9 +6,10 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from ..analysis.constraints import LoopFigures, uses
-from ..analysis.stability.differentiable import Sensitivity, sensitivities
+from ..analysis.constraints import LoopFigures, Margins, uses
+from ..analysis.stability.differentiable import lines, sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
+from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, Extremes, TrackingFigures
 from ..solve.clock import Clock
@@ -19,8 +20,9 @@ from .runs import Signals, evaluate
 class Evaluator:
     """Simulator of loops on signals, compiled once per shape of signals.
 
-    ``start`` is the first sample that counts, ``limits`` are those of the study;
-    ``clock`` measures the compile time.
+    ``start`` is the first sample that counts, ``limits`` are those of the study,
+    ``model_error`` [lines] bounds the relative error of the plant if its record tells
+    one; ``clock`` measures the compile time.
     """
 
     def __init__(self, clock: Clock, case: Case):
@@ -28,6 +30,8 @@ class Evaluator:
         study = case.study
         self.start = round(study.references.settle * study.rate)
         self.limits = study.limits
+        bound = case.plant_about.error_bound
+        self.model_error = bound and as_array(bound.over(lines(study.dt)))
         self._programs: dict[str, Callable] = {}
 
     def _compiled(self, key: str, function: Callable, *arguments: Any) -> Callable:
@@ -52,8 +56,8 @@ class Evaluator:
         means the plant of the loop alone.
         """
         tracking, extremes = self._runs(loop, signals, stages)
-        sensitivity = self._sensitivity(loop, margin_stages)
-        return LoopFigures(tracking, extremes, sensitivity, dt=self._case.study.dt)
+        margins = self._margins(loop, margin_stages)
+        return LoopFigures(tracking, extremes, margins, dt=self._case.study.dt)
 
     def _runs(
         self, loop: Feedback, signals: Signals, stages: Stage | None
@@ -74,10 +78,10 @@ class Evaluator:
         found = self._compiled(key, run, loop, dynamic, signals)(loop, dynamic, signals)
         return found if beside else (found, None)
 
-    def _sensitivity(self, loop: Feedback, stages: Stage | None) -> Sensitivity | None:
-        """Return S on each of ``stages``, or None if no limit needs it."""
+    def _margins(self, loop: Feedback, stages: Stage | None) -> Margins | None:
+        """Return the Margins on each of ``stages``, or None if no limit needs them."""
         study = self._case.study
-        if not uses(self.limits, "sensitivity"):
+        if not uses(self.limits, "margins"):
             return None
         dynamic, static = eqx.partition(stages, eqx.is_array)
         point = OperatingPoint(study.highest, dt=study.dt)
@@ -90,7 +94,8 @@ class Evaluator:
             return jax.vmap(one)(dynamic) if _count(stages) else _stacked(one(None))
 
         key = f"margins of {_count(stages)} stages"
-        return self._compiled(key, margins, loop, dynamic)(loop, dynamic)
+        found = self._compiled(key, margins, loop, dynamic)(loop, dynamic)
+        return Margins(found, self.model_error)
 
 
 def _count(stages: Stage | None) -> int:

@@ -42,6 +42,7 @@ def make_objective(
         resting=tuple(not trace.driven for trace in data.traces[: data.tuned]),
         stages=stages,
         margin_stages=drawn_stages(case, "margins"),
+        model_error=evaluator.model_error,
         over=table.ensemble.aggregate if table.ensemble else "mean",
         tail=table.ensemble.tail if table.ensemble else 1.0,
         highest=as_array(table.highest),

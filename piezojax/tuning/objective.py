@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..analysis.constraints import LoopFigures, uses, violations
+from ..analysis.constraints import LoopFigures, Margins, uses, violations
 from ..analysis.stability.differentiable import sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
 from ..core.arrays import as_array
@@ -70,7 +70,8 @@ class Objective(eqx.Module):
 
     ``limits`` are the limits of constraints by name (``constraints.CONSTRAINTS``). They
     must hold on every stage; limits on margins must hold on every one of
-    ``margin_stages``, at the reference ``highest`` (um). ``loss`` is an augmented
+    ``margin_stages``, at the reference ``highest`` (um), for all plants within the
+    relative error ``model_error`` [lines] of these. ``loss`` is an augmented
     Lagrangian with ``multipliers`` and ``penalty``.
     """
 
@@ -83,6 +84,7 @@ class Objective(eqx.Module):
     weights: Float[Array, " references"] | None = None
     stages: Stage | None = None
     margin_stages: Stage | None = None
+    model_error: Float[Array, " lines"] | None = None
     resting: tuple[bool, ...] = eqx.field(static=True, default=())
     aggregate: Aggregate = eqx.field(static=True, default="geometric_mean")
     over: Over = eqx.field(static=True, default="mean")
@@ -148,10 +150,14 @@ class Objective(eqx.Module):
 
         figures, errors = _on_each(run, self.stages)
         figures, extremes = figures if beside else (figures, None)
-        known = uses(self.limits, "sensitivity")
+        known = uses(self.limits, "margins")
         # Of several axes a whole batch of matrices would not fit into memory.
         size = None if self.highest is None or self.highest.ndim == 0 else 1
-        found = _on_each(margins, self.margin_stages, size) if known else None
+        found = None
+        if known:
+            found = Margins(
+                _on_each(margins, self.margin_stages, size), self.model_error
+            )
         return LoopFigures(figures, extremes, found, dt=self.dt), errors
 
     def _normalised(self, figures: TrackingFigures) -> Array:

@@ -148,7 +148,7 @@ def _search(
         name: study.limits[name] for name in study.constraints if name in study.limits
     }
     every = objective.with_limits(study.limits)
-    if uses(own, "sensitivity") or study.pareto or own == study.limits:
+    if uses(own, "margins") or study.pareto or own == study.limits:
         return every, *search_box(every, case, clock, progress)
     objective = objective.with_limits(own)
     search, strategy = search_box(objective, case, clock, progress)

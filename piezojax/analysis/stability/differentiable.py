@@ -19,6 +19,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from ...core.arrays import Scalar, ScalarLike, State, as_array
@@ -123,6 +124,15 @@ def closed_loop_poles(loop: Feedback, at: Any = 0.0) -> Complex[Array, " order"]
     return jnp.linalg.eigvals(model.A - model.B @ model.C)
 
 
+def lines(dt: float) -> np.ndarray:
+    """Return the frequencies (Hz) of S for the default duration."""
+    return np.fft.rfftfreq(_samples(dt), dt)
+
+
+def _samples(dt: float) -> int:
+    return max(round(DURATION / dt), LEAST)
+
+
 def _responses(
     loop: Feedback,
     point: OperatingPoint,
@@ -130,7 +140,7 @@ def _responses(
     duration: float | None,
 ) -> Sensitivity:
     signal, dt = point.signal, point.sample_time(loop)
-    samples = max(round(DURATION / dt), LEAST) if duration is None else duration / dt
+    samples = _samples(dt) if duration is None else duration / dt
     impulse = _axes_impulse if isinstance(signal, tuple) else _impulse
 
     def one(side: ScalarLike) -> Float[Array, "samples axes axes"]:
