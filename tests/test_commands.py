@@ -564,7 +564,7 @@ def test_identify_bad_input(record, tmp_path):
     failed(call("identify", tmp_path / "no.csv", *out), "no.csv: No such file or dir")
     failed(call("identify", record, *out), "name the columns of input and output")
     failed(
-        call("identify", record, *out, "--rate", -5.0),
+        call("identify", record, *out, *COLUMNS[2:], "--rate", -5.0),
         "bench.csv: rate is -5 Hz; it must be above 0",
     )
     failed(
