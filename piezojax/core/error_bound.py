@@ -12,6 +12,9 @@ A mode of damping zeta that is not in the model changes the response by the fact
 ``1 / (2 zeta)`` at its resonance: 25 for a lightly damped stage of 2 %.
 """
 
+NARROW = 0.1
+"""Excited band, as a share of the Nyquist frequency, below which a record is narrow."""
+
 Share = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
@@ -53,20 +56,34 @@ class ErrorBound(BaseModel):
         relative = np.asarray(self.relative)
         return np.maximum(relative[below], relative[above])
 
-    def over(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the largest bound half way to both neighbours of each ``frequency``.
+    @property
+    def highest(self) -> float:
+        """Highest excited frequency, Hz; 0 if there is none."""
+        pairs = zip(self.frequency, self.excited, strict=True)
+        return max((line for line, excited in pairs if excited), default=0.0)
 
-        ``frequency`` (Hz) is a grid of equal steps.
+    @property
+    def narrow(self) -> bool:
+        """Whether the record excited less than the share ``NARROW`` of the band."""
+        return self.highest < NARROW * self.frequency[-1]
+
+    def supported(self, frequency: np.ndarray) -> np.ndarray:
+        """Return the bound that a search can respect, on a grid of equal steps (Hz).
+
+        It is the largest one half way to both neighbours of each ``frequency``. Above
+        the band of a narrow record it is 0: there the record supports no gains, which
+        calls for another record and not for other gains.
         """
         half = 0.5 * (frequency[1] - frequency[0])
         lines, relative = np.asarray(self.frequency), np.asarray(self.relative)
         ends = np.maximum(self.at(frequency - half), self.at(frequency + half))
-        return np.array(
+        found = np.array(
             [
                 np.max(relative[np.abs(lines - f) <= half], initial=end)
                 for f, end in zip(frequency, ends, strict=True)
             ]
         )
+        return np.where(self.narrow & (frequency + half > self.highest), 0.0, found)
 
     def excited_at(self, frequency: Any) -> np.ndarray:
         """Return whether both neighbours of ``frequency`` (Hz) are excited."""

@@ -31,7 +31,7 @@ class Evaluator:
         self.start = round(study.references.settle * study.rate)
         self.limits = study.limits
         bound = case.plant_about.error_bound
-        self.model_error = bound and as_array(bound.over(lines(study.dt)))
+        self.model_error = bound and as_array(bound.supported(lines(study.dt)))
         self._programs: dict[str, Callable] = {}
 
     def _compiled(self, key: str, function: Callable, *arguments: Any) -> Callable:

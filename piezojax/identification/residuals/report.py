@@ -5,15 +5,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pydantic import BaseModel
 
-from ...core.error_bound import ErrorBound
+from ...core.error_bound import NARROW, ErrorBound
 from ..records.record import Record
 from .bound import RelativeError, error_bound, relative_error
 from .correlation import Correlation, autocorrelation, cross_correlation
 from .coverage import Coverage, Unseen, coverage_of, unseen_in
 from .peaks import LEAST, VISIBLE, Peak, unmodelled_peaks
-
-NARROW = 0.1
-"""Excited band, as a share of the Nyquist frequency, below which to warn."""
 
 OTHER_GAIN = 1.25
 """Least factor between the motions of stage and model that raises a warning."""
