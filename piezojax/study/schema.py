@@ -132,7 +132,7 @@ class OptimiserTable(Table):
     ``steps`` steps.
     """
 
-    method: str = "bfgs"
+    method: str = "gauss_newton"
     starts: Annotated[int, Field(strict=True, ge=1, le=256)] = 8
     candidates: Annotated[int, Field(strict=True, ge=0, le=65536)] = 64
     steps: Annotated[int, Field(strict=True, ge=1, le=10000)] = 60

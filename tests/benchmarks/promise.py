@@ -100,7 +100,12 @@ def setup(stage, design, kind="careful"):
             "duration": 0.3,
             "settle": 0.1,
         },
-        "optimiser": {"method": "bfgs", "starts": 2, "candidates": 32, "steps": 20},
+        "optimiser": {
+            "method": "gauss_newton",
+            "starts": 2,
+            "candidates": 32,
+            "steps": 40,
+        },
     }
     return Setup(stage, columns, study)
 

@@ -40,7 +40,7 @@ ROUGH_STEPS = 24
 TOLERANCE = 1e-10
 """Relative change of loss and point below which a descent ends."""
 
-STALLED = Patience(14, share=1e-6)
+STALLED = Patience(14, share=3e-4)
 """Steps within which the best mean square must fall by this share; otherwise the fit
 ends. A point with a parameter that tends to its bound does not converge by itself."""
 
