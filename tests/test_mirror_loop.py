@@ -11,6 +11,7 @@ import piezojax as pj
 from piezojax.catalog import mirror
 from piezojax.core.axes import packed
 from piezojax.core.feedback import loop_inputs
+from piezojax.core.system import resolve
 
 REST = (0.0, 0.0, 0.0)
 
@@ -64,3 +65,21 @@ def test_it_follows_sines_and_starts_at_rest(loop):
         )
         miss = np.stack(log.displacement, axis=-1) - reference
         assert np.all(np.sqrt(np.mean(miss[1_600:] ** 2, axis=0)) < most)
+
+
+@pytest.mark.parametrize("order", mirror.ORDERS)
+def test_state_tracking_is_stable_on_both_models(order):
+    control = resolve(mirror.state_sliding_mode())
+    F, G, H, K = (
+        np.asarray(x) for x in (control.A, control.B, control.C, control.gain)
+    )
+    E = np.asarray(control.equivalent)
+    model = mirror.model(order).delayed()
+    A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
+    # x+ = A x + B u, u = E v; v+ = (1 - K H) (F v + G u) + K C x+.
+    kept = np.eye(len(F)) - K @ H
+    poles = np.linalg.eigvals(
+        np.block([[A, B @ E], [K @ C @ A, kept @ (F + G @ E) + K @ C @ B @ E]])
+    )
+    expected = {12: 0.9956, 24: 0.9897}[order]
+    assert np.abs(poles).max() == pytest.approx(expected, abs=1e-4)

@@ -21,6 +21,7 @@ PLANTS: dict[str, Callable[..., System]] = {
     "p753_preisach": p753_inverses.preisach_plant,
     "p558": p558_stage.plant,
     "mirror": mirror.stage,
+    "mirror_24_states": mirror.detailed_stage,
 }
 """Plants by the name that a study uses. The positional arguments of a plant are the
 deviations that an ensemble may draw; the docstring of the plant states whether one is
@@ -59,9 +60,14 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p558_anticipating_disturbance_observer": (
         p558_control.anticipating_disturbance_observer
     ),
+    "p558_state_sliding_mode": p558_control.state_sliding_mode,
+    "p558_anticipating_state_sliding_mode": (
+        p558_control.anticipating_state_sliding_mode
+    ),
     "p558_nominal": p558_control.nominal,
     "p558_disturbance_observer": p558_control.disturbance_observer,
     "mirror_multi_axis": mirror.anticipating_multi_axis,
+    "mirror_state_sliding_mode": mirror.anticipating_state_sliding_mode,
 }
 """Controllers by the name that a study uses, with printed gains unless their docstring
 says "ours". Those with an argument ``rate`` (Hz) are made for the rate of the study."""

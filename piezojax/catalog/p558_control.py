@@ -14,6 +14,7 @@ from ..control.filtered import Filtered
 from ..control.multi_axis import MultiAxisSlidingMode
 from ..control.nominal import NominalSlidingMode
 from ..control.pid import PID
+from ..control.state_sliding_mode import StateSlidingMode
 from ..control.switching import SwitchingPID
 from ..core.axes import PerAxis, diagonal
 from ..core.feedback import Feedback
@@ -54,6 +55,9 @@ MULTI_AXIS_GAINS = {
 damping of 0.9: sections 7.5.4.2 and 7.5.4.3."""
 
 DAMPING = 0.9
+
+STATE_WEIGHTS = {"effort_weight": 1.0, "process": 1.0, "drift": 0.1}
+"""Ours, without unit on this stage."""
 
 ARX = (
     ((1.699, -0.7394), (-0.004917, 0.04512)),
@@ -130,6 +134,28 @@ def multi_axis(gains: str = "dynamic", filtered: bool = True) -> System:
         return controller
     parts = tuple(AlphaBeta(**FILTER, dt=DT) for _ in OUTPUTS)
     return Filtered(PerAxis(parts, OUTPUTS), controller)
+
+
+def state_sliding_mode() -> System:
+    """Return state-tracking control on the model (7.53); weights ours.
+
+    Reaching gain and reference model are those of ``multi_axis``.
+    """
+    none = diagonal((0.0, 0.0, 0.0))
+    frequency = MULTI_AXIS_GAINS["dynamic"]["frequency"]
+    lags = tuple(SecondOrderLag(frequency, DAMPING, DT) for _ in OUTPUTS)
+    return StateSlidingMode(
+        SwitchingPID(none, none, none, dt=DT),
+        p558.model("7"),
+        PerAxis(lags, OUTPUTS),
+        reaching=diagonal(REACHING),
+        **STATE_WEIGHTS,
+    )
+
+
+def anticipating_state_sliding_mode() -> System:
+    """Return ``state_sliding_mode`` in an Anticipation of lead 0 (ours)."""
+    return Anticipation(state_sliding_mode(), (0.0, 0.0, 0.0))
 
 
 def anticipating_multi_axis() -> System:

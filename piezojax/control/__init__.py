@@ -34,6 +34,7 @@ from .preview import zero_phase_inverse as zero_phase_inverse
 from .repetitive import RepetitiveControl as RepetitiveControl
 from .sliding_mode import ContinuousSlidingMode as ContinuousSlidingMode
 from .sliding_mode import SlidingMode as SlidingMode
+from .state_sliding_mode import StateSlidingMode as StateSlidingMode
 from .state_space_controller import StateSpaceController as StateSpaceController
 from .switching import BangBang as BangBang
 from .switching import BoundaryLayer as BoundaryLayer

@@ -11,10 +11,8 @@ from ..core.parameter import parameter, sample_time
 from ..core.system import Designed
 from ..dynamics.arma import ARMA
 from ..dynamics.state_space import StateSpace
+from .riccati import riccati
 from .state_space_controller import StateSpaceController
-
-DOUBLINGS = 20
-"""Doublings of the Riccati iteration, which reach 2^20 samples."""
 
 
 class WeightedMixedSensitivity(Designed):
@@ -124,17 +122,6 @@ def _riccati(
 ) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
     """Return the stabilising solution X, and a number near 0 where there is one."""
     A, B, C, D, _ = plant
-    cross, identity = C.T @ D, jnp.eye(len(A))
+    cross = C.T @ D
     part = jnp.linalg.solve(R, cross.T)
-
-    def double(carry, _):
-        A, G, H = carry
-        left = jnp.linalg.solve(identity + G @ H, jnp.hstack([A, G]))
-        size = len(A)
-        moved, gain = left[:, :size], left[:, size:]
-        return (A @ moved, G + A @ gain @ A.T, H + A.T @ H @ moved), None
-
-    start = A - B @ part, B @ jnp.linalg.solve(R, B.T), C.T @ C - cross @ part
-    (rest, _, X), _ = jax.lax.scan(double, start, length=DOUBLINGS)
-    # The matrix that is doubled vanishes only if the closed loop is stable.
-    return 0.5 * (X + X.T), jnp.max(jnp.abs(jax.lax.stop_gradient(rest)))
+    return riccati(A - B @ part, B @ jnp.linalg.solve(R, B.T), C.T @ C - cross @ part)

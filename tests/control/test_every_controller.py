@@ -77,6 +77,9 @@ COSTLY = (
     "p558_multi_axis",
     "p558_anticipating_multi_axis",
     "p558_anticipating_disturbance_observer",
+    "p558_state_sliding_mode",
+    "p558_anticipating_state_sliding_mode",
+    "mirror_state_sliding_mode",
 )
 """Controllers whose program takes a minute to compile; they have tests of their own."""
 

@@ -1,9 +1,12 @@
 """Tunable H-infinity control against the design by SciPy's Riccati solver."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
 from piezojax.control import (
     WeightedMixedSensitivity,
@@ -88,3 +91,23 @@ def test_slopes_are_those_of_differences():
     expected = (values[1:6] - values[6:]) / (2.0 * step)
     assert np.max(np.abs(expected)) > 0.1
     np.testing.assert_allclose(slopes[0], expected, rtol=1e-4, atol=1e-7)
+
+
+def test_without_a_bound_it_is_the_h2_design():
+    a, b = (np.asarray(part) for part in (MODEL.autoregressive, MODEL.moving))
+    weight = first_order_weight(**WEIGHT, dt=DT)
+    Aw, Bw, Cw, Dw = (float(m[0, 0]) for m in (weight.A, weight.B, weight.C, weight.D))
+    y = np.eye(1, 4)
+    A = np.zeros((4, 4))
+    A[:3, :3] = np.eye(3, k=1)
+    A[:2, 0] = a
+    A[3] = [-Bw, 0.0, 0.0, Aw]
+    B1, B2 = Bw * np.eye(4)[:, 3:], np.append(b, 0.0)[:, None]
+    C = np.vstack([Cw * np.eye(4)[3] - Dw * y[0], np.zeros(4)])
+    X = solve_discrete_are(A, B2, C.T @ C, [[EFFORT**2]])
+    S = EFFORT**2 + B2.T @ X @ B2
+    F, f = -(B2.T @ X @ A) / S, -(B2.T @ X @ B1) / S
+    F = F + f * y
+    law = SimpleNamespace(A=A + B1 @ y + B2 @ F, B=B1 + B2 @ f, C=F, D=f)
+    found = response(law_of(1e6), FREQUENCY)
+    np.testing.assert_allclose(found, response(law, FREQUENCY), rtol=1e-6)
