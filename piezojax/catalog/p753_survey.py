@@ -16,6 +16,7 @@ from ..control import (
     FilteredCommand,
     InverseFeedforward,
     InverseGain,
+    LearningControl,
     LearningLaw,
     PlacedPID,
     RepetitiveControl,
@@ -185,6 +186,14 @@ def repetitive(period: int = 2_000) -> RepetitiveControl:
     """
     lag = FirstOrderLag(REPETITIVE["advance"] * p753.DT, p753.DT)
     return RepetitiveControl(p753.pid(), lag, **REPETITIVE, period=period)
+
+
+def learning_control(period: int = 2_000) -> LearningControl:
+    """Return iterative learning around ``p753.pid``, um to V; gains ours.
+
+    ``period`` as for ``repetitive``.
+    """
+    return LearningControl(p753.pid(), period=period, **LEARNING)
 
 
 def learning() -> LearningLaw:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..core.arrays import Scalar, as_array, as_scalars, check
 from ..core.feedback import Feedback, loop_inputs
@@ -70,19 +70,26 @@ class LearningLaw(eqx.Module):
     def __check_init__(self):
         check_declared(self)
 
+    def corrected(
+        self, feedforward: Signal, error: Signal, sample: Int[Array, ""]
+    ) -> Scalar:
+        """Return one ``sample`` of the next feedforward; arguments as in ``next``."""
+
+        def wanted(at: Int[Array, ""]) -> Scalar:
+            ahead = jnp.minimum(at + self.lead, error.shape[0] - 1)
+            return feedforward[at] + self.gain * error[ahead]
+
+        middle = smooth = wanted(sample)
+        for distance, weight in enumerate(self.smoothing, start=1):
+            before = jnp.maximum(sample - distance, 0)
+            after = jnp.minimum(sample + distance, error.shape[0] - 1)
+            smooth = smooth + weight * (wanted(before) + wanted(after) - 2.0 * middle)
+        return smooth
+
     def next(self, feedforward: Signal, error: Signal) -> Signal:
         """Return the next feedforward from that of a trial and its error [samples]."""
-        samples = error.shape[0]
-        ahead = jnp.minimum(jnp.arange(samples) + self.lead, samples - 1)
-        wanted = feedforward + self.gain * error[ahead]
-        taps = len(self.smoothing)
-        padded = jnp.pad(wanted, taps, mode="edge")
-        smooth = wanted
-        for distance, weight in enumerate(self.smoothing, start=1):
-            before = padded[taps - distance : taps - distance + samples]
-            after = padded[taps + distance : taps + distance + samples]
-            smooth = smooth + weight * (before + after - 2.0 * wanted)
-        return smooth
+        samples = jnp.arange(error.shape[0])
+        return jax.vmap(self.corrected, (None, None, 0))(feedforward, error, samples)
 
 
 def learn(
