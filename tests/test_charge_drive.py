@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles.hysteresis import inverse_trapezoid_step
-from oracles.published import HYSTERESIS, KE
+from oracles.published import HYSTERESIS, KE, T2_G, T2_P
+from scipy.signal import lfilter
 
 from piezojax import (
     Feedback,
@@ -148,3 +149,22 @@ def test_bad_parameters_are_refused(arguments, message):
     *values, dt = arguments
     with pytest.raises(ValueError, match=message):
         ChargeDrive(Affine(), *values, dt)
+
+
+def test_the_catalogued_stage_follows_the_charge():
+    # The hysteresis of the stage undoes that of the load: what moves is the charge.
+    stage = p753_survey.charge_driven_stage()
+    time = DT * np.arange(4_000)
+    inputs = 30.0 * (1.0 - np.cos(2.0 * np.pi * 20.0 * time))
+    found = response(stage, jnp.asarray(inputs))
+    charge = v = u = f = 0.0
+    force = []
+    for value in inputs:
+        charge += value - v + DT * (v - u) / p753_survey.CHARGE_TIME
+        u = inverse_trapezoid_step(f, u, KE * charge, *HYSTERESIS)
+        f, v = KE * charge, value
+        force.append(f)
+    (a1, a2), b = T2_P, T2_G
+    expected = lfilter(b, [1.0, -a1, -a2], force)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+    assert np.ptp(expected) > 5.0

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 
 from ..core.system import System
 from . import mirror as mirror
+from . import p558_actuators as p558_actuators
 from . import p558_control as p558_control
 from . import p558_stage as p558_stage
 from . import p753 as p753
@@ -19,7 +20,9 @@ PLANTS: dict[str, Callable[..., System]] = {
     "p753_chapter4": p753_by_rate.chapter4_plant,
     "p753_stage": p753_stage.stage,
     "p753_preisach": p753_inverses.preisach_plant,
+    "p753_charge_driven": p753_survey.charge_driven_stage,
     "p558": p558_stage.plant,
+    "p558_four_actuators": p558_actuators.four_actuators,
     "mirror": mirror.stage,
     "mirror_24_states": mirror.detailed_stage,
 }

@@ -15,13 +15,19 @@ from jaxtyping import Float
 from ..control.allocation import Allocation
 from ..core.axes import Packed, PerAxis
 from ..core.system import Series, System, series
-from ..dynamics import LinearMap, StateSpace
+from ..dynamics import ARMA, LinearMap, StateSpace
+from ..hysteresis import PrandtlIshlinskii
+from .p558_control import ARX
+from .p558_stage import HYSTERESIS, PLAY
 
 POSITIONS = ((50.0, 50.0), (-50.0, 50.0), (-50.0, -50.0), (50.0, -50.0))
 """(x, y) of each actuator in mm, counterclockwise."""
 
 TRAVEL = (0.0, 50.0)
 """Bounds of each actuator's elongation, um."""
+
+GAINS = (1.0, 1.02, 0.98, 1.01)
+"""Gains of the actuators of ``four_actuators``."""
 
 
 def elongations() -> Float[np.ndarray, "4 3"]:
@@ -63,6 +69,28 @@ def stage(actuator: StateSpace, method: str = "bounded") -> Series:
         allocation=allocation(method),
         actuators=StateSpace(A, B, C, D, actuator.dt),
         plate=LinearMap(geometry()),
+    )
+
+
+def four_actuators() -> Series:
+    """Return the stage on four actuators with the play of ``p558_stage`` each.
+
+    Each has the dynamics of (8.40), the model of the Z axis, and differs from the
+    others in gain: ``GAINS``. A command of a pose is allocated to them within their
+    travel.
+    """
+    (a, b), *_ = ARX
+    gain = sum(b) / (1.0 - sum(a))
+    return axes_stage(
+        tuple(
+            series(
+                hysteresis=PrandtlIshlinskii(
+                    (share * (1.0 - HYSTERESIS),), (PLAY,), (share * HYSTERESIS,)
+                ),
+                dynamics=ARMA(a, (b[0] / gain, b[1] / gain, 0.0)),
+            )
+            for share in GAINS
+        )
     )
 
 

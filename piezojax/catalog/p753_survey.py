@@ -27,7 +27,7 @@ from ..control import (
 )
 from ..control.output_tracking import drive
 from ..core.arrays import as_array
-from ..core.system import Affine, System, series
+from ..core.system import Affine, Series, System, series
 from ..dynamics import (
     ARMA,
     Biquad,
@@ -205,3 +205,14 @@ def charge_drive() -> ChargeDrive:
     """Return a charge amplifier on the stage's own hysteresis, V to V; times ours."""
     load = Affine(p753.GAIN) >> _inverse()
     return ChargeDrive(load, 1.0, CHARGE_TIME, CHARGE_TIME, p753.DT)
+
+
+def charge_driven_stage() -> Series:
+    """Return ``p753.plant`` behind ``charge_drive``, from the command in V to um.
+
+    The voltage of the stage may exceed the limits of the command.
+    """
+    stage = p753.plant()
+    return series(
+        drive=charge_drive(), **dict(zip(stage.names, stage.parts, strict=True))
+    )

@@ -105,6 +105,32 @@ def test_a_loop_starts_at_rest_on_its_pose(locked):
     np.testing.assert_allclose(rest_output(plant, command), pose, atol=1e-9)
 
 
+def test_the_catalogued_stage_is_the_geometry_of_its_actuators():
+    time = np.arange(300)[:, None] / 100.0
+    poses = (1.0 - np.cos(np.pi * time)) * [15.0, 40.0, -30.0]
+
+    @jax.jit
+    def moved(stage, poses):
+        return packed(simulate(stage, tuple(poses.T), stage.init(tuple(poses[0])))[1])
+
+    found = moved(p558_actuators.four_actuators(), jnp.asarray(poses))
+    (a, b), *_ = p558_control.ARX
+    scale = (1.0 - sum(a)) / sum(b)
+    play, force, y = np.zeros(4), np.zeros((2, 4)), np.zeros((2, 4))
+    expected = []
+    for pose in poses:
+        q = p558_actuators.elongations() @ pose  # no twist, within the travel
+        assert np.all((q >= 0.0) & (q <= 50.0))
+        play = np.clip(play, q - 4.0, q + 4.0)
+        new = p558_actuators.GAINS * (0.98 * q + 0.02 * play)
+        moved_by = a[0] * y[0] + a[1] * y[1]
+        y = [moved_by + scale * (b[0] * new + b[1] * force[0]), y[0]]
+        force = [new, force[0]]
+        expected.append(p558_actuators.geometry() @ y[0])
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+    assert np.ptp(found, axis=0).min() > 20.0
+
+
 def test_gradient_in_closed_loop_is_finite_differences():
     plant = p558_actuators.axes_stage(EACH_ITS_OWN, allocation(True))
     few = REFERENCE[:60]
