@@ -24,6 +24,7 @@ from ..control import (
     SuperTwisting,
     SwitchingLaw,
     WeightedMixedSensitivity,
+    zero_phase_inverse,
 )
 from ..control.output_tracking import drive
 from ..core.arrays import as_array
@@ -176,6 +177,19 @@ def feedforward_h_infinity() -> FeedforwardFeedback:
 def adaptive_notch_pi() -> AdaptiveInverse:
     """Return ``notch_pi`` in an AdaptiveInverse, um to V."""
     return p753.with_adaptive_inverse(notch_pi())
+
+
+def preview_feedforward_pid() -> FeedforwardFeedback:
+    """Return an inverse of (5.33) and its hysteresis beside ``p753.pid``, um to V.
+
+    Both zeros of (5.33) lie outside the unit circle: the inverse has zero phase and
+    looks two samples further than r(k+1).
+    """
+    model = scaled_to_dc(ARMA(**p753.DYNAMICS_BEHIND_HYSTERESIS), 1.0)
+    inverse = series(
+        dynamics=zero_phase_inverse(model).extrapolated(), hysteresis=_inverse()
+    )
+    return FeedforwardFeedback(inverse, p753.pid())
 
 
 def repetitive(period: int = 2_000) -> RepetitiveControl:

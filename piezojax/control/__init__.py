@@ -28,6 +28,7 @@ from .observer import Motion as Motion
 from .observer import Observer as Observer
 from .pid import PID as PID
 from .pole_placement import PlacedPID as PlacedPID
+from .preview import ExtrapolatedInverse as ExtrapolatedInverse
 from .preview import PreviewInverse as PreviewInverse
 from .preview import direct_inverse as direct_inverse
 from .preview import stable_inverse as stable_inverse

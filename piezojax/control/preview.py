@@ -2,18 +2,22 @@
 
 A zero outside the unit circle makes the exact causal inverse unstable. An inverse that
 uses future values of the reference can be stable. These inverses act on a whole
-reference before the loop runs, as open-loop input or as the reference of a loop.
+reference before the loop runs, as open-loop input or as the reference of a loop, or,
+with the references beyond r(k+1) extrapolated, inside a loop.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core.arrays import as_array, check
+from ..core.arrays import Scalar, ScalarLike, State, as_array, as_scalars, check
+from ..core.parameter import parameter
 from ..core.rollout import simulate
+from ..core.system import System
 from ..dynamics.arma import ARMA
 
 
@@ -36,6 +40,10 @@ class PreviewInverse(eqx.Module):
         """Number of samples after k of which the reference is used."""
         return self.delay + self.weights.size
 
+    def extrapolated(self) -> "ExtrapolatedInverse":
+        """Return the inverse for use inside a loop."""
+        return ExtrapolatedInverse(self.causal, tuple(self.weights), self.delay)
+
     def __call__(self, reference: Float[Array, " samples"]) -> Float[Array, " samples"]:
         """Return u(k) for a ``reference`` r(k) in um."""
         reference = as_array(reference)
@@ -44,6 +52,55 @@ class PreviewInverse(eqx.Module):
         weighted = jnp.convolve(ahead, self.weights[::-1], mode="valid")
         start = self.causal.init(jnp.sum(self.weights) * reference[0])
         return simulate(self.causal, weighted, start)[1]
+
+
+class ExtrapolatedState(NamedTuple):
+    """The last reference in um and the state of the causal part."""
+
+    reference: Scalar
+    causal: State
+
+
+class ExtrapolatedInverse(System):
+    """PreviewInverse inside a loop, which knows the reference up to r(k+1) only.
+
+    The references beyond r(k+1) are those of the line through r(k) and r(k+1), so that
+    the few samples that the inverse looks ahead need not be known. The error of a
+    reference with the acceleration a is about a T^2 j^2 / 2 at j samples. Input r(k+1)
+    in um, output in the unit of the model's input: the ``inverse`` of an
+    ``InverseFeedforward`` or a ``FeedforwardFeedback``, alone or in series with an
+    inverse hysteresis. ``weights``, ``delay`` and ``causal`` as in ``PreviewInverse``.
+    """
+
+    causal: ARMA
+    weights: tuple[Scalar, ...] = parameter(
+        "1", "weights of the references ahead", converter=as_scalars
+    )
+    delay: int = parameter(
+        "samples",
+        "delay of the model",
+        least=0.0,
+        whole=True,
+        static=True,
+        default=0,
+    )
+
+    def init(self, input: ScalarLike = 0.0) -> ExtrapolatedState:
+        reference = as_array(input)
+        weighted = sum(self.weights) * reference
+        return ExtrapolatedState(reference, self.causal.init(weighted))
+
+    def step(
+        self, state: ExtrapolatedState, input: ScalarLike
+    ) -> tuple[ExtrapolatedState, Scalar]:
+        reference = as_array(input)
+        rise = reference - state.reference
+        ahead = [
+            weight * (reference + (self.delay + j) * rise)
+            for j, weight in enumerate(self.weights)
+        ]
+        causal, output = self.causal.step(state.causal, sum(ahead[1:], ahead[0]))
+        return ExtrapolatedState(reference, causal), output
 
 
 def direct_inverse(model: ARMA) -> PreviewInverse:

@@ -4,10 +4,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracles.published import MODEL_533_A, MODEL_533_B
+from oracles import signals
+from oracles.hysteresis import inverse_trapezoid_step
+from oracles.loop import closed_loop
+from oracles.published import HYSTERESIS, MODEL_533_A, MODEL_533_B, plant_t2, unit_dc
 from scipy.signal import lfilter
 
+from piezojax import simulate
+from piezojax.catalog import p753, p753_survey
+from piezojax.control import InverseFeedforward
 from piezojax.control.preview import INVERSES
+from piezojax.core.feedback import LoopInput
 from piezojax.dynamics import (
     ARMA,
 )
@@ -167,3 +174,48 @@ def test_it_batches_and_jit_changes_nothing():
 def test_what_has_no_such_inverse_is_refused(kind, model, options, message):
     with pytest.raises(ValueError, match=message):
         INVERSES[kind](ARMA(*model), **options)
+
+
+class Feedforward:
+    """The zero-phase inverse of (5.33) at unit gain, then the inverse hysteresis."""
+
+    def __init__(self):
+        b = np.array(unit_dc(MODEL_533_A, MODEL_533_B))
+        # Both zeros are outside: all of B(z), forwards in time, over B(1)^2.
+        self.ahead = (b / b.sum() ** 2).tolist()
+        self.w, self.f, self.u = None, 0.0, 0.0
+
+    def step(self, z, r_next, r, r_prev):
+        steps = enumerate(self.ahead)
+        w = sum(x * (r_next + j * (r_next - r)) for j, x in steps)
+        if self.w is None:
+            self.w = [sum(self.ahead) * r] * 2
+        a1, a2 = MODEL_533_A
+        f = w - a1 * self.w[0] - a2 * self.w[1]
+        self.w = [w, self.w[0]]
+        self.u = inverse_trapezoid_step(self.f, self.u, f, *HYSTERESIS)
+        self.f = f
+        return self.u
+
+    def applied(self, u):
+        """There is no feedback."""
+
+
+def test_inside_a_loop_it_extrapolates():
+    reference = signals.sine(50, 5.0, 0.1 + 1.0 / p753.RATE)
+    inverse = p753_survey.preview_feedforward_pid().inverse
+    loop = p753.loop(InverseFeedforward(inverse), 0.0)
+
+    @jax.jit
+    def run(loop, reference):
+        inputs = LoopInput(reference[1:], jnp.zeros(len(reference) - 1))
+        return simulate(loop, inputs, loop.init(0.0))[1]
+
+    found = run(loop, jnp.asarray(reference))
+    expected = closed_loop(Feedforward(), reference, plant_t2("trapezoid"), None)
+    for column in ("displacement", "command"):
+        np.testing.assert_allclose(
+            getattr(found, column), expected[column], rtol=0.0, atol=1e-9
+        )
+    error = expected["displacement"] - reference[:-1]
+    assert np.abs(error[200:]).max() < 0.02  # of 10 um, without feedback
