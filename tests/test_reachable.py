@@ -29,6 +29,7 @@ ONE = {  # controller, tuned parameter, stage
         "controller.feedback.law.integral",
         "p753_preisach",
     ),
+    "phase compensation": ("p753_phase_compensator", "controller.share", "p753"),
     "preview": ("p753_preview_feedforward_pid", PID, "p753"),
     "iterative learning": ("p753_iterative_learning", "controller.gain", "p753"),
     "H-infinity": (

@@ -49,6 +49,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_pole_placement": p753_survey.pole_placement,
     "p753_boundary_layer": p753_survey.boundary_layer,
     "p753_super_twisting": p753_survey.super_twisting,
+    "p753_phase_compensator": p753_survey.phase_compensator,
     "p753_feedforward": p753_survey.inverse_feedforward,
     "p753_feedforward_pid": p753_survey.feedforward_pid,
     "p753_feedforward_simc_pi": p753_survey.feedforward_simc_pi,

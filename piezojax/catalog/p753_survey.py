@@ -18,6 +18,7 @@ from ..control import (
     InverseGain,
     LearningControl,
     LearningLaw,
+    PhaseCompensator,
     PlacedPID,
     RepetitiveControl,
     SlidingMode,
@@ -65,6 +66,9 @@ LEARNING = {"gain": 0.7, "lead": 40, "smoothing": (0.25,)}
 POLES = (0.9992, 0.0, 0.0)
 """Poles of the sliding variable: those of the printed I = 60 (Table 5-4), P = D = 0."""
 
+PHASER = {"share": 0.1, "threshold": 10.0}
+"""Weight of the stop operator, and the V at which it saturates."""
+
 CHARGE_TIME = 1.0
 """R C of amplifier and load in s: the charge is controlled above 0.16 Hz."""
 
@@ -102,6 +106,11 @@ def boundary_layer() -> SlidingMode:
 def super_twisting() -> SlidingMode:
     """Return super-twisting sliding mode control, um to V; gains ours."""
     return _switched(SuperTwisting(**SUPER_TWISTING, dt=p753.DT))
+
+
+def phase_compensator() -> PhaseCompensator:
+    """Return ``p753.pid`` with a phaser behind it, um to V; the phaser is ours."""
+    return PhaseCompensator(p753.pid(), **PHASER)
 
 
 def inverse_feedforward() -> InverseFeedforward:

@@ -26,6 +26,7 @@ from .multi_axis import MultiAxisSlidingMode as MultiAxisSlidingMode
 from .nominal import NominalSlidingMode as NominalSlidingMode
 from .observer import Motion as Motion
 from .observer import Observer as Observer
+from .phase_compensator import PhaseCompensator as PhaseCompensator
 from .pid import PID as PID
 from .pole_placement import PlacedPID as PlacedPID
 from .preview import ExtrapolatedInverse as ExtrapolatedInverse
