@@ -34,7 +34,7 @@ ONE = {  # controller, tuned parameter, stage
     "iterative learning": ("p753_iterative_learning", "controller.gain", "p753"),
     "H-infinity": (
         "p753_feedforward_h_infinity",
-        "controller.feedback.effort_weight",
+        "controller.feedback.controller.effort_weight",
         "p753",
     ),
     "charge drive": ("p753_pid", "controller.integral", "p753_charge_driven"),

@@ -79,7 +79,7 @@ def test_the_catalogued_loop_is_that_of_the_equations():
     ("poles", "message"),
     [
         ((0.5, 0.1), "poles holds 2 numbers; it must hold 3"),
-        ((1.0, 0.1, 0.1), "poles is 1; it must be finite and above -1 and below 1"),
+        ((1.1, 0.1, 0.1), "poles is 1.1; it must be finite and above -1 and at most 1"),
     ],
 )
 def test_other_poles_are_refused(poles, message):
