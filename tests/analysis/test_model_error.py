@@ -103,6 +103,13 @@ def test_loops_of_infinite_gain_and_of_none(sensitivity, bound, expected):
     assert worst_delay_margin(*arguments, jnp.ones(1))[0] == expected
 
 
+@pytest.mark.parametrize("loop", [-0.1, -1e-6, 0.1])
+def test_a_small_loop_gain_of_phase_zero_needs_a_delay(loop):
+    # At the Nyquist frequency L is real: a negative one lies towards -1, but far away.
+    arguments = (jnp.asarray([1.0 / (1.0 + loop) + 0j]), jnp.asarray([5.0]))
+    assert worst_delay_margin(*arguments, jnp.full(1, np.pi))[0] == UNLIMITED_DELAY
+
+
 @pytest.mark.parametrize("figure", ["sensitivity", "delay"])
 def test_slopes_are_those_of_finite_differences(figure):
     def value(scale):
@@ -130,6 +137,22 @@ def test_a_bound_between_two_lines_is_the_larger_one():
     expected = [0.1, 0.1, 0.3, 0.3, 0.3, 0.2, 25.0, 25.0]
     np.testing.assert_array_equal(BOUNDS.at(asked), expected)
     np.testing.assert_array_equal(BOUNDS.excited_at(asked), [True] * 6 + [False, False])
+
+
+def test_a_search_respects_the_largest_bound_of_each_cell():
+    found = BOUNDS.supported(np.array([0.0, 16.0, 32.0]))
+    np.testing.assert_array_equal(found, [0.3, 25.0, 25.0])
+
+
+def test_a_narrow_record_bounds_nothing_above_its_band():
+    narrow = ErrorBound(
+        frequency=(1.0, 2.0, 3.0, 100.0),
+        relative=(0.1, 0.3, 5.0, 25.0),
+        excited=(True, True, False, False),
+    )
+    assert narrow.highest == 2.0
+    found = narrow.supported(np.array([1.0, 2.0, 3.0, 4.0]))
+    np.testing.assert_array_equal(found, [0.3, 0.0, 0.0, 0.0])
 
 
 def test_a_bound_survives_plain_data():

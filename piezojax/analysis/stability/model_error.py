@@ -61,7 +61,9 @@ def worst_delay_margin(
     half = jnp.arccos(jnp.where(inside, cosine, 0.0))
     half = jnp.where(inside, half, jnp.where(cosine < 0.0, jnp.pi, 0.0))
     unstable = jnp.where(
-        known, jnp.abs(start) <= half, bound * jnp.abs(complementary) >= 1.0
+        known,
+        (jnp.abs(start) <= half) & (cosine <= 1.0),
+        bound * jnp.abs(complementary) >= 1.0,
     )
     turn = jnp.mod(-half - start, 2.0 * jnp.pi)
     moving = (angle > 0.0) & known & (cosine < 1.0)
