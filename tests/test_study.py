@@ -231,6 +231,17 @@ def test_a_pattern_starts_what_is_switched_off_at_its_lower_bound(study):
     assert read(study({})).notes == ()
 
 
+def test_a_pattern_takes_a_start_outside_the_declared_range(study):
+    stock = {"type": "PID", "proportional": 1.0, "integral": 9.0, "dt": 5e-5}
+    stock |= {"derivative": 1e-12, "derivative_filter": 1e-4, "anti_windup": 10.0}
+    changes = {"controller": stock, "parameters": GONE, "tune": ["controller.*"]}
+    ranges = read(study(changes)).space.ranges()
+    found = ranges["controller.derivative"]
+    assert found.lower == pytest.approx(1e-13)
+    assert found.upper == declared_range("controller.derivative").upper
+    assert ranges[INTEGRAL] == declared_range(INTEGRAL)
+
+
 def test_a_table_does_not_move_a_start_of_zero(refusal):
     message = refusal({"parameters": {"controller.derivative": {}}})
     assert message.startswith("controller.derivative starts at 0; its bounds")

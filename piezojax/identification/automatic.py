@@ -4,6 +4,7 @@ import numpy as np
 
 from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
+from ..hysteresis.model import hystereses
 from .chain import dynamics_of, dynamics_parts, structure
 from .estimators.output_error import from_rest, output_error
 from .records.record import Record
@@ -76,13 +77,18 @@ def _slowed(record: Record) -> Record:
 
 
 def _error(name: str, record: Record) -> float:
-    """Return the rms error after a short fit, infinite if there is none."""
+    """Return the rms error after a short fit.
+
+    It is infinite if there is no fit, or if the fitted hysteresis has no inverse over
+    the range of the input, which designs of controllers need.
+    """
     shape = structure(f"{name}+{CREEP}+{dynamics_parts(record)}", record)
     every = slice(0, record.samples)
     try:
         optimum = output_error(shape, [record], every, steps=STEPS)
+        system = shape.space.put(shape.system, as_array(optimum.units[0]))
+        hystereses(system)[0].inverse(record.input.min(), record.input.max())
     except ValueError:
         return np.inf
-    system = shape.space.put(shape.system, as_array(optimum.units[0]))
     run = np.asarray(from_rest(system, as_array(record.input)))
     return float(np.std(run - record.output))

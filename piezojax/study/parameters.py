@@ -60,6 +60,8 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
         )
         for path, table in tables.items()
     }
+    for path in tables.keys() - study.parameters.keys():
+        ranges[path] = _reaching(ranges[path], float(get(loop, path)))
     switched_off = [
         path
         for path in tables.keys() - {*study.parameters, *study.tune}
@@ -75,6 +77,21 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
         for path in sorted(switched_off)
     )
     return ranges, notes
+
+
+def _reaching(bounds: Range, start: float) -> Range:
+    """Return ``bounds``, a decade beyond ``start`` if it lies outside on a log scale.
+
+    Declared ranges are those of usual controllers; a design may start elsewhere.
+    """
+    if bounds.scale != "log" or start <= 0.0:
+        return bounds
+    lower, upper = bounds.lower, bounds.upper
+    return dataclasses.replace(
+        bounds,
+        lower=lower if start > lower else start / 10.0,
+        upper=upper if start < upper else start * 10.0,
+    )
 
 
 def check_value(system: System, path: str, value: float, where: str) -> None:

@@ -48,7 +48,7 @@ NEGLIGIBLE = 1e-6
 LAG_DROP = 0.995
 """Factor by which a lag or a sample of delay must lower it."""
 
-DIPOLE = 0.5
+DIPOLE = 1.0
 """Distance of a zero, as a share of a pole's distance from 1, that cancels a lag."""
 
 HIGHEST = 0.45
