@@ -227,6 +227,19 @@ def test_an_ensemble_keeps_the_amplifier():
     assert np.all(delays <= stages.plant.parts[0].parts[0].longest * DT)
 
 
+@pytest.mark.parametrize(
+    ("table", "bound"),
+    [
+        ({"spread": {"plant.amplifier.delay.delay": 1.5}}, "at least 0"),
+        ({"range": {"plant.amplifier.delay.delay": [0.0, 2.5e-4]}}, "at most 0.0002"),
+    ],
+)
+def test_an_ensemble_beyond_what_a_part_allows_is_refused(table, bound):
+    message = rf"ensemble.*amplifier.delay.delay: delay in s is .*{bound}"
+    with pytest.raises(ValueError, match=message):
+        case_of({"actuator": {"delay": 1e-4}}, ensemble=table)
+
+
 AXES = {
     "axes": {"names": ["x", "y"], "units": ["um", "um"]},
     "plant": {

@@ -18,7 +18,9 @@ from ..core.feedback import Feedback
 from ..core.files import read_model
 from ..core.paths import get, replace
 from ..core.system import System
+from .ensemble_table import EnsembleTable
 from .make_hardware import driven
+from .parameters import check_value
 from .schema import Study
 
 Part = Literal["tune", "margins", "holdout"]
@@ -142,6 +144,7 @@ def ensemble_of(
     for path in paths:
         key = "spread" if path in table.spread else "range"
         _check_path(nominal, path, f"ensemble.{key}")
+        _check_ends(nominal, path, table, f"ensemble.{key}.{path}")
     errors = (
         _standard_errors(folder / table.standard_errors, nominal)
         if table.standard_errors
@@ -168,6 +171,16 @@ def _check_path(stage: Stage, path: str, where: str) -> None:
         raise ValueError(f"{where}: {error}") from None
     if jnp.ndim(leaf):
         raise ValueError(f"{where}.{path} has shape {leaf.shape}; it must be a number")
+
+
+def _check_ends(stage: Stage, path: str, table: EnsembleTable, where: str) -> None:
+    """Raise ValueError if a constructor refuses an end of the interval of ``path``."""
+    part, inner = path.split(".", 1)
+    system, value = getattr(stage, part), float(get(stage, path))
+    spread = table.spread.get(path, 0.0)
+    ends = table.range.get(path, (value * (1.0 - spread), value * (1.0 + spread)))
+    for end in ends:
+        check_value(system, inner, end, where)
 
 
 class _Estimate(BaseModel):
