@@ -160,6 +160,17 @@ def test_margins_hold_the_electronics():
     assert bare.sensitivity_peak < 0.9 * report.sensitivity_peak
 
 
+def test_converters_leave_the_margins_as_they_are():
+    """No voltage of the DAC holds the reference exactly: 3.14159 lies between two."""
+    coarse = {"actuator": {"bits": 8}, "sensor": {"resolution": 0.01}}
+    smooth, rounded = (
+        stability_report(case_of(LINEAR, *changes).loop, 3.14159)
+        for changes in ((), (coarse,))
+    )
+    assert rounded.sensitivity_peak == pytest.approx(smooth.sensitivity_peak, rel=1e-9)
+    assert rounded.voltage_V == pytest.approx(3.14159, rel=1e-9)
+
+
 def test_gradients_by_the_hardware_are_those_of_differences():
     loop = case_of(LINEAR).loop
     paths = [

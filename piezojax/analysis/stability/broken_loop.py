@@ -11,7 +11,7 @@ from ...core.feedback import Feedback, LoopState, Observation
 from ...core.system import Affine, System
 from ...dynamics import StateSpace
 from ...dynamics.linearise import linearise
-from ...hardware import Saturation
+from ...hardware import Quantiser, Saturation
 from .operating_point import OperatingPoint
 
 VOLTAGE_PUSH = 2.0**-40
@@ -106,8 +106,9 @@ def broken_loop(loop: Feedback, at: Any = 0.0) -> BrokenLoop:
     branches are the same.
 
     Limits of the voltage (Saturation) are removed from the actuator, because margins
-    hold for small motions. Slew limits and converters have their slope at rest, 1. A
-    switching term (``BangBang``) has no slope and is left out.
+    hold for small motions, and so are the steps of converters (Quantiser), at which no
+    loop rests exactly. Slew limits have their slope at rest, 1. A switching term
+    (``BangBang``) has no slope and is left out.
     """
     point = OperatingPoint.at(at)
     return cut(loop, point.signal, point.side, point.state)
@@ -120,8 +121,9 @@ def cut(
 
     ``side`` is +1 on the ascending branch and -1 on the descending one.
     """
-    start = loop.init(reference) if state is None else state
-    freed = _without_limits(loop)
+    smooth = _without(loop, Quantiser)
+    start = smooth.init(reference) if state is None else state
+    freed = _without(smooth, Saturation)
     # Direct gain from the reference to the command; its sign may be either.
     tried = jax.tree.map(lambda r: VOLTAGE_PUSH**0.5 * (1.0 + jnp.abs(r)), reference)
     moved = BrokenLoop(freed, reference, start, reference_push=tried)
@@ -143,14 +145,19 @@ def cut(
     return BrokenLoop(freed, reference, start, *jax.lax.stop_gradient(pushes))
 
 
-def _without_limits(loop: Feedback) -> Feedback:
-    def freed(part: Any) -> Any:
-        return Affine() if isinstance(part, Saturation) else part
+def _without(loop: Feedback, kind: type[System]) -> Feedback:
+    """Return ``loop`` without the parts of this ``kind`` in actuator and sensor."""
 
-    actuator = jax.tree.map(
-        freed, loop.actuator, is_leaf=lambda part: isinstance(part, Saturation)
+    def freed(system: System) -> Any:
+        return jax.tree.map(
+            lambda part: Affine() if isinstance(part, kind) else part,
+            system,
+            is_leaf=lambda part: isinstance(part, kind),
+        )
+
+    return Feedback(
+        loop.controller, loop.plant, freed(loop.actuator), freed(loop.sensor)
     )
-    return Feedback(loop.controller, loop.plant, actuator, loop.sensor)
 
 
 def open_loop(loop: Feedback, at: Any = 0.0) -> StateSpace:
