@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from piezojax.core.feedback import LoopSample
-from piezojax.core.metrics import (
-    Tracking,
-)
+from piezojax.core.metrics import Extremes, MetricPair, Tracking, root
 
 SAMPLES = 300
 
@@ -17,7 +15,8 @@ def record(seed=10):
     reference, voltage = 5.0 + draw(size=SAMPLES), 20.0 * draw(size=SAMPLES)
     displacement = reference + 0.1 * draw(size=SAMPLES)
     shortfall = np.random.default_rng(seed).choice([0.0, 0.05, 30.0], SAMPLES)
-    columns = reference, displacement, displacement, voltage + shortfall, voltage
+    measured = displacement + 0.01 * draw(size=SAMPLES)
+    columns = reference, displacement, measured, voltage + shortfall, voltage
     return LoopSample(*map(jnp.array, columns))
 
 
@@ -109,3 +108,33 @@ def test_gradient_is_the_closed_form():
 def test_figures_are_float64():
     found = figures(Tracking(), record())
     assert {value.dtype for value in found} == {jnp.dtype("float64")}
+
+
+def test_extremes_are_those_of_the_whole_run():
+    run = record()
+    found = figures(Extremes(), run)
+    swing = np.ptp(run.reference)
+    beyond = np.max(run.displacement) - np.max(run.reference)
+    np.testing.assert_allclose(found.peak_slew, np.abs(np.diff(run.voltage)).max())
+    np.testing.assert_allclose(found.overshoot, beyond / swing, rtol=1e-12)
+    assert beyond > 0.0
+
+
+def test_below_the_reference_and_at_rest_nothing_overshoots():
+    run = record()
+    below = run._replace(displacement=run.reference - 1.0)
+    assert figures(Extremes(), below).overshoot == 0.0
+    still = run._replace(reference=jnp.full(SAMPLES, 1.0))
+    assert figures(Extremes(), still).overshoot == 0.0
+
+
+def test_a_pair_of_metrics_gives_the_figures_of_each():
+    run, first, second = record(), Tracking(100), Extremes()
+    found = figures(MetricPair(first, second), run)
+    assert found == (figures(first, run), figures(second, run))
+
+
+def test_the_root_is_flat_at_zero():
+    assert root(jnp.asarray(9.0)) == 3.0
+    assert root(jnp.asarray(0.0)) == jax.grad(root)(0.0) == 0.0
+    assert np.isnan(root(jnp.asarray(np.nan)))

@@ -1,9 +1,10 @@
-"""The table of mutations stays applicable: run.py tries them, which takes minutes."""
+"""The tables of mutations stay applicable: run.py and sample.py take minutes."""
 
 from pathlib import Path
 
 import pytest
 
+from mutations.modules import MODULES
 from mutations.table import MUTATIONS
 
 ROOT = Path(__file__).parents[2]
@@ -21,3 +22,11 @@ def test_a_mutation_still_has_its_place(mutation):
     files = [part for part in mutation.tests if part.endswith(".py")]
     assert files
     assert all((ROOT / file).is_file() for file in files)
+
+
+@pytest.mark.parametrize("file", MODULES)
+def test_a_sampled_module_and_its_tests_are_there(file):
+    assert (ROOT / "piezojax" / file).is_file()
+    files = [part for part in MODULES[file] if part.endswith(".py")]
+    assert files
+    assert all((ROOT / name).is_file() for name in files)

@@ -137,6 +137,36 @@ def test_exact_margins(stability, message):
     assert bool(unlimited) == ("unstable" in message)
 
 
+def test_a_run_rails_from_a_share_of_its_samples():
+    (alarm,) = alarms(changed(holdout=scores(saturated=90.1)))
+    assert alarm.startswith("the tuned loop rails on hold-out runs of SW30")
+    assert alarms(changed(holdout=scores(saturated=89.9))) == []
+
+
+def test_each_branch_counts():
+    branches = {
+        "ascending": report_of(integrator(2.0)),
+        "descending": report_of(integrator(0.45)),
+    }
+    found = alarms(stability=StabilityReports(reports={"after": branches}))
+    first, second = found[:2]
+    assert "unstable for small motions on the ascending branch" in first
+    assert second.startswith("sensitivity_peak is ")
+    assert "on the nominal plant on the descending branch" in second
+
+
+def test_exact_margins_replace_those_of_the_nominal_plant_alone():
+    def missed(*values):
+        figure = outcome("sensitivity_peak", values, 2.0)
+        return changed(constraints={"sensitivity_peak": figure})
+
+    assert alarms(missed(2.1)) == []
+    (alarm,) = alarms(missed(1.9, 2.1))
+    assert alarm.startswith("sensitivity_peak is 2.1 on 1 of 2 tuned plants, above")
+    unknown = StabilityReports(problems={"after": "it has no derivative"})
+    assert any("2.1 on 1 of 1 tuned" in a for a in alarms(missed(2.1), unknown))
+
+
 def test_a_margin_that_is_not_a_number_is_an_alarm():
     report = replace(report_of(integrator(0.1)), sensitivity_peak=math.nan)
     stability = StabilityReports(reports={"after": {"descending": report}})

@@ -1,0 +1,36 @@
+"""The modules that sampled mutants are drawn from, and the fast tests of each."""
+
+_MARGINS = ("tests/analysis/test_margins.py",)
+_LIMIT = (
+    "tests/analysis/test_performance_limit.py",
+    "tests/analysis/test_wiener.py",
+    "tests/analysis/test_verification.py",
+)
+_RESULTS = ("tests/tuning/test_alarms.py", "tests/tuning/test_tuner.py")
+_STUDY = ("tests/test_study.py",)
+
+MODULES = {
+    "core/metrics.py": ("tests/test_metrics.py",),
+    "tuning/alarms.py": ("tests/tuning/test_alarms.py", "-k", "not command"),
+    "tuning/reach.py": ("tests/tuning/test_reach.py", "-k", "not shipped"),
+    "tuning/objective.py": ("tests/tuning/test_data.py", "tests/tuning/test_robust.py"),
+    "tuning/result.py": _RESULTS,
+    "tuning/tuner.py": _RESULTS[1:],
+    "study/case.py": _STUDY,
+    "study/parameters.py": _STUDY,
+    "study/schema.py": _STUDY,
+    "analysis/stroke.py": ("tests/analysis/test_stroke.py",),
+    "analysis/stability/assess.py": _MARGINS,
+    "analysis/stability/crossings.py": _MARGINS,
+    "analysis/stability/margins.py": _MARGINS,
+    "analysis/stability/differentiable.py": (
+        "tests/analysis/test_differentiable_margins.py",
+    ),
+    "analysis/stability/axes_margins.py": (
+        "tests/analysis/test_multi_axis_margins.py",
+    ),
+    "analysis/limit/performance.py": _LIMIT,
+    "analysis/limit/spectra.py": _LIMIT,
+    "analysis/limit/wiener.py": _LIMIT,
+}
+"""Arguments of pytest by the module's file in the package."""
