@@ -295,6 +295,12 @@ def _warnings(
             "unexplained; this residual is a disturbance of the loop, that of the "
             "training part while tuning, that of the validation part in the hold-out"
         )
+        report = case.fit.report
+        found += [
+            f"fitted plant: {text}"
+            for text in report.warnings
+            if text not in report.alarms
+        ]
     if at_bound:
         found.append(f"at the edge of its bounds: {', '.join(at_bound)}")
     for where, figures in (("tuning", after), ("hold-out", holdout)):

@@ -206,7 +206,7 @@ def line_of(setup):
             return line | {"refused": str(error)}
     result, fit = outcome.result, outcome.case.fit
     line["alarms"] = [str(alarm) for alarm in getattr(result, "alarms", ())]
-    notes = [*(fit.report.warnings if fit else ()), *result.warnings]
+    notes = result.warnings
     kept = [n for n in notes if not any(part in n for part in ROUTINE)]
     line["notes"] = [note for note in kept if note not in line["alarms"]]
     figures = judged(outcome, setup)
