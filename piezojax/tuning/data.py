@@ -86,9 +86,9 @@ def _signals(
     shape = (count, draws, samples, *axes)
     noise = as_array(random.standard_normal(shape))
     disturbance = None
-    unexplained = _unexplained(case, time_s, part)
+    unexplained = _unexplained(case, references, time_s, part)
     if unexplained is not None:
-        disturbance = jnp.broadcast_to(unexplained, shape)
+        disturbance = jnp.broadcast_to(unexplained[:, None], shape)
     drift = np.array(case.study.by_axis(case.study.disturbance.drift_rms))
     if drift.any():
         steps = random.standard_normal(shape) * np.sqrt(case.study.dt)
@@ -119,13 +119,18 @@ def _reference(study: Study, name: str, time_s: jax.Array) -> jax.Array:
 
 
 def _unexplained(
-    case: Case, time_s: jax.Array, part: Literal["train", "validate"]
+    case: Case,
+    references: jax.Array,
+    time_s: jax.Array,
+    part: Literal["train", "validate"],
 ) -> jax.Array | None:
-    """Return the residual [samples] of the fitted plant as a disturbance.
+    """Return the residual of the fitted plant as disturbances [references, samples].
 
     Without it, a controller that contains the fitted model would be tuned and evaluated
-    as if the stage were that model. The residual is played forwards and backwards until
-    the references end. None without a fit.
+    as if the stage were that model. The errors of a hysteresis follow the path of the
+    stage: the residual is played as far as the reference has travelled, or as time has
+    passed, whichever is farther; forwards and backwards until the references end. None
+    without a fit.
     """
     if case.fit is None:
         return None
@@ -133,14 +138,23 @@ def _unexplained(
     where = getattr(fit, part)
     # The first half of the training part holds the initial loading, a single event.
     start = where.start if part == "validate" else (where.start + where.stop) // 2
-    residual = (fit.record.output - fit.simulated)[start : where.stop]
-    replayed = np.concatenate([residual, residual[-2:0:-1]])
-    dt = fit.record.dt
-    return as_array(
-        np.interp(
-            np.asarray(time_s),
-            np.arange(replayed.size) * dt,
-            replayed,
-            period=replayed.size * dt,
+    chosen = slice(start, where.stop)
+    residual = (fit.record.output - fit.simulated)[chosen]
+    moved = np.abs(np.diff(fit.simulated[chosen]))
+    moved = np.maximum(moved, 1e-9 * moved.max())  # where it rests
+    places = np.arange(residual.size)
+    travelled = np.concatenate([[0.0], np.cumsum(moved)])
+    found = []
+    for reference in np.asarray(references):
+        way = np.cumsum(np.abs(np.diff(reference, prepend=reference[0])))
+        rounds, rest = np.divmod(way, travelled[-1])
+        # Odd rounds go backwards.
+        there = np.interp(rest, travelled, places)
+        back = places[-1] - np.interp(travelled[-1] - rest, travelled, places)
+        by_way = rounds * places[-1] + np.where(rounds % 2 == 0, there, back)
+        place = np.maximum(np.asarray(time_s) / fit.record.dt, by_way)
+        phase = np.mod(place, 2.0 * places[-1])
+        found.append(
+            np.interp(np.minimum(phase, 2.0 * places[-1] - phase), places, residual)
         )
-    )
+    return as_array(np.stack(found))
