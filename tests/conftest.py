@@ -16,6 +16,15 @@ settings.load_profile("repeatable")
 jax.config.update("jax_disable_most_optimizations", True)
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 
+
+@pytest.fixture
+def optimised():
+    """Compile the programs of a test well, because they run long."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
+
+
 # Tracing makes many small objects, of which few are garbage.
 gc.set_threshold(100_000, 20, 20)
 

@@ -150,6 +150,7 @@ def test_white_box_on_the_shared_record(benchmark):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_black_box_on_the_shared_record(benchmark):
     mean, fresh = benchmark
     system = fit_neural_state_space(resample(mean), settle=1000)

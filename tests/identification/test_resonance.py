@@ -1,6 +1,5 @@
 """Resonances behind slow sensors are found, and fits of dynamics start there."""
 
-import jax
 import numpy as np
 import pytest
 import scipy.signal
@@ -45,16 +44,9 @@ def test_a_stage_without_a_resonance_shows_none(excitation):
     assert dynamics_of(record(case)).modes == ()
 
 
-@pytest.fixture
-def optimised():
-    """Let programs that run long be compiled well."""
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
-    jax.config.update("jax_disable_most_optimizations", True)
-
-
 @pytest.mark.slow
-def test_the_named_stage_is_fitted_by_default(optimised):
+@pytest.mark.usefixtures("optimised")
+def test_the_named_stage_is_fitted_by_default():
     case = records.NAMED._replace(seconds=1.0)
     fit = identify(record(case))
     assert fit.report.model.endswith("+exponential_creep+modes")
