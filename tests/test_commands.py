@@ -5,6 +5,7 @@ import dataclasses
 import importlib
 import io
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -324,7 +325,8 @@ def test_ctrl_c_in_mid_run(study, tmp_path, monkeypatch):
     monkeypatch.setattr(Bar, "advance", press)
     result = call("tune", study, "--out", tmp_path / "out")
     assert result.exit_code == 130
-    assert "interrupted after 7 evaluations" in " ".join(result.stdout.split())
+    printed = " ".join(result.stdout.split())
+    assert re.search(r"interrupted after \d+ evaluations", printed)
     assert "Traceback" not in result.output
     assert len(assert_interrupted(tmp_path / "out").history) == 1
 
