@@ -38,7 +38,7 @@ BASE = {
         PROPORTIONAL: {"lower": 0.1, "upper": 5.0, "scale": "log"},
         INTEGRAL: {"lower": 100.0, "upper": 2e4, "scale": "log"},
     },
-    "optimiser": {"starts": 2, "candidates": 4, "steps": 6},
+    "optimiser": {"method": "bfgs", "starts": 2, "candidates": 4, "steps": 6},
 }
 RESULT_KEYS = {
     "gain_units",
@@ -433,7 +433,7 @@ def test_the_other_methods_and_objectives(method, aggregate):
 
 
 def test_one_start_no_candidates():
-    changes = {"starts": 1, "candidates": 0, "steps": 3}
+    changes = {"method": "bfgs", "starts": 1, "candidates": 0, "steps": 3}
     result = pj.tune(case_of({"optimiser": changes})).result
     assert result.evaluations == 1 + 3
     assert result.after.geomean_rms_um < result.before.geomean_rms_um
