@@ -42,6 +42,7 @@ STUDY = {
     "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
     "actuator": {"lower": -20.0, "upper": 120.0},
     "sensor": {"noise_rms": 0.012},
+    "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
     "controller": {"catalog": "p753_pid"},
     "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
     "parameters": {
