@@ -9,8 +9,9 @@ from ..core.progress import Progress, Silent
 from .candidates import Candidate, UntriedModel, first_round, later_rounds, parts_at
 from .criteria import Criteria, criteria, effective_samples, first_equivalent, ranking
 from .estimators.estimate import Options
-from .fit import Fit, check_compatible, identify, train_and_validation
+from .fit import Fit, identify
 from .ranking import RULE, ModelRanking, RankedModel, RankingReport, file_name
+from .records.parts import check_compatible, train_and_validation
 from .records.record import Record
 
 CHAINS_KEPT = 2

@@ -21,12 +21,12 @@ from .estimators.resonances import LinearDynamics
 from .methods import method_for
 from .plausibility import plausibility_warnings
 from .records.checks import record_warnings
+from .records.parts import check_compatible, train_and_validation
 from .records.record import Record
 from .residuals.report import ResidualReport, residual_report
 
 POOR = 0.2
 """Validation error, as a share of the output's deviation, above which to warn."""
-
 
 MISSED = 0.1
 """Relative distance of all poles from a resonance from which a model lacks it."""
@@ -269,48 +269,6 @@ def _missed(shown: LinearDynamics, linear: LinearDetail | None) -> list[str]:
         for mode in shown.modes
         if np.all(np.abs(frequencies / mode.frequency - 1.0) > MISSED)
     ]
-
-
-def check_compatible(records: tuple[Record, ...]) -> None:
-    """Raise ValueError unless all records have the same sample time and units."""
-    if not records:
-        raise ValueError("no record to fit a model to")
-    for record in records[1:]:
-        if not np.isclose(record.dt, records[0].dt, rtol=1e-6, atol=0.0):
-            raise ValueError(
-                f"{record.source} has the sample time {record.dt:g} s and "
-                f"{records[0].source} {records[0].dt:g} s; they must be the same"
-            )
-        for side in ("input_units", "output_units"):
-            if getattr(record, side) != getattr(records[0], side):
-                raise ValueError(
-                    f"{record.source} has the {side.replace('_', ' ')} "
-                    f"{getattr(record, side)} and {records[0].source} "
-                    f"{getattr(records[0], side)}; they must be the same"
-                )
-
-
-def train_and_validation(
-    samples: int, train: slice | None, validate: slice | None
-) -> tuple[slice, slice]:
-    """Return the parts to fit and to validate on; left out, they are halves.
-
-    Raises ValueError for a part that is empty or outside of the ``samples``.
-    """
-    train = _closed(train or slice(0, samples // 2), samples)
-    validate = _closed(validate or slice(min(train.stop, samples), samples), samples)
-    for name, part in (("train", train), ("validate", validate)):
-        if not 0 <= part.start < part.stop <= samples:
-            raise ValueError(
-                f"{name} is {part.start}:{part.stop}; "
-                f"it must lie in 0:{samples} and hold a sample"
-            )
-    return train, validate
-
-
-def _closed(part: slice, samples: int) -> slice:
-    stop = samples if part.stop is None else part.stop
-    return slice(part.start or 0, stop)
 
 
 def _errors(
