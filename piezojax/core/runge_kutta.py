@@ -1,10 +1,25 @@
 """Classical Runge-Kutta step for Systems given by a differential equation."""
 
 from collections.abc import Callable
+from typing import Any
 
 from .arrays import Scalar, ScalarLike
+from .parameter import parameter
 
 Point = tuple[Scalar, ...]
+
+
+def parts_of_a_step() -> Any:
+    """Return the field of the number of parts into which a step is divided."""
+    return parameter(
+        "1",
+        "parts of a step",
+        least=1.0,
+        most=1000.0,
+        whole=True,
+        static=True,
+        default=1,
+    )
 
 
 def runge_kutta(

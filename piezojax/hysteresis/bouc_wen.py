@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, as_array
 from ..core.parameter import parameter
-from ..core.runge_kutta import runge_kutta
+from ..core.runge_kutta import parts_of_a_step, runge_kutta
 from .inverse import Inverse, InverseHysteresis
 from .model import Hysteresis, Laws, differential_laws
 
@@ -43,15 +43,7 @@ class BoucWen(Hysteresis):
     beta_gamma: Scalar = parameter("N^(1 - nu)/m", "bend against the velocity's sign")
     beta_delta: Scalar = parameter("N^(1 - nu)/m", "bend with the velocity")
     nu: Scalar = parameter("1", "sharpness of the bend", above=0.0, default=1.0)
-    substeps: int = parameter(
-        "1",
-        "parts of a step",
-        least=1.0,
-        most=1000.0,
-        whole=True,
-        static=True,
-        default=1,
-    )
+    substeps: int = parts_of_a_step()
 
     def rate(self, force: Scalar, velocity: Scalar) -> Scalar:
         """Return z' at force z and velocity y'; along a path, dz from dy."""

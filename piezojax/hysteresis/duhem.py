@@ -18,7 +18,7 @@ from ..core.recipe import (
     rest_starts,
     scaled_range,
 )
-from ..core.runge_kutta import runge_kutta
+from ..core.runge_kutta import parts_of_a_step, runge_kutta
 from ..core.space import Range
 from .inverse import Inverse, InverseHysteresis
 from .loading import load_to
@@ -93,15 +93,7 @@ class Duhem(Hysteresis, Fittable):
     )
     rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
     rest_memory: Scalar = parameter("1", "x in the virgin state", default=0.0)
-    substeps: int = parameter(
-        "1",
-        "parts of a step",
-        least=1.0,
-        most=1000.0,
-        whole=True,
-        static=True,
-        default=1,
-    )
+    substeps: int = parts_of_a_step()
 
     def __check_init__(self):
         if not any(self.output):

@@ -16,6 +16,7 @@ from ..core.recipe import (
     rest_starts,
     scaled_range,
 )
+from ..core.runge_kutta import parts_of_a_step
 from ..core.space import Range
 from .bouc_wen import BoucWen, BoucWenState
 from .inverse import Inverse, InverseHysteresis
@@ -75,15 +76,7 @@ class NormalisedBoucWen(Hysteresis, Fittable):
     n: Scalar = parameter("1", "sharpness of the bend", least=1.0, default=1.0)
     rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
     scheme: str = eqx.field(static=True, default="runge_kutta")
-    substeps: int = parameter(
-        "1",
-        "parts of a step",
-        least=1.0,
-        most=1000.0,
-        whole=True,
-        static=True,
-        default=1,
-    )
+    substeps: int = parts_of_a_step()
 
     def __check_init__(self):
         if self.scheme not in SCHEMES:
