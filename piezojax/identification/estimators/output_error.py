@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from ...core.arrays import ScalarLike, as_array
 from ...core.progress import Progress, Silent
 from ...core.rollout import simulate
-from ...core.space import Space, squash, unsquash
+from ...core.space import INSIDE, Space, squash, unsquash
 from ...core.system import System, rest_output
 from ...hysteresis.model import input_before
 from ...solve.gauss_newton import (
@@ -46,9 +46,6 @@ ends. A point with a parameter that tends to its bound does not converge by itse
 
 FAILED_LOSS = 1e11
 """Least mean square of a simulation that counts as not finite."""
-
-INSIDE = 1e-6
-"""Least distance of a repeated start from the faces of the unit box."""
 
 UNDETERMINED = 1e-12
 """Relative singular value of the Jacobian below which a direction is undetermined."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from pydantic import BaseModel
 
-from ...core.error_bound import NARROW, ErrorBound
+from ...core.error_bound import ErrorBound
 from ..records.record import Record
 from .bound import RelativeError, error_bound, relative_error
 from .correlation import Correlation, autocorrelation, cross_correlation
@@ -69,7 +69,7 @@ def residual_report(
         *_peak_warnings(report),
         *_response_warnings(report, relative),
         *_gain_warnings(records, runs, validate),
-        *_coverage_warnings(report.coverage, records[0].dt),
+        *_coverage_warnings(report, records[0].dt),
         *_unseen_warnings(report),
     ]
 
@@ -142,10 +142,11 @@ def _gain_warnings(
             )
 
 
-def _coverage_warnings(coverage: Coverage, dt: float) -> Iterator[str]:
-    if coverage.band_Hz is not None and coverage.band_Hz[1] < NARROW * 0.5 / dt:
+def _coverage_warnings(report: ResidualReport, dt: float) -> Iterator[str]:
+    bound = report.error_bound
+    if bound is not None and any(bound.excited) and bound.narrow:
         yield (
-            f"the record excites nothing above {coverage.band_Hz[1]:.3g} Hz: a "
+            f"the record excites nothing above {bound.highest:.3g} Hz: a "
             "resonance above it stays unseen, and gains tuned on this model are not "
             f"validated there; record a chirp or noise up to {0.2 / dt:.3g} Hz"
         )
