@@ -15,6 +15,9 @@ settings.load_profile("repeatable")
 # them badly. Commands that tests start inherit this.
 jax.config.update("jax_disable_most_optimizations", True)
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
+# Nor does a test look where in the source an operation of a program stands.
+jax.config.update("jax_traceback_in_locations_limit", 0)
+os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
 
 
 @pytest.fixture
