@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
@@ -170,8 +171,12 @@ def holding_input(plant: System, output: Signal) -> Signal:
     ``output``, because commands have its unit and the pose 0 may be outside, or on the
     edge of, the range of a stage with an allocation.
     """
-    output = jax.tree.map(as_array, output)
+    return _holding_input(plant, jax.tree.map(as_array, output))
 
+
+# Traced once for all plants of a structure, because root finding is long to trace.
+@eqx.filter_jit
+def _holding_input(plant: System, output: Signal) -> Signal:
     def residual(input, _):
         return jax.tree.map(jnp.subtract, rest_output(plant, input), output)
 
