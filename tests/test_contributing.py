@@ -115,6 +115,29 @@ _, found = pj.simulate(inverse, wanted, inverse.init(wanted[0]))
 print(float(np.max(np.abs(found[1:] - voltage[1:]))))
 """
 
+ENDED = "-- ended with status"
+IN_TURN = f"""
+import importlib, json, sys
+main = importlib.import_module("piezojax.cli." + sys.argv[1]).main
+for line in json.loads(sys.argv[2]):
+    try:
+        main(line)
+    except SystemExit as ended:
+        print("{ENDED}", ended.code)
+"""
+
+
+def in_turn(lab, command, *lines, cwd):
+    """Run a command with each of ``lines`` in one process, which imports once.
+
+    Return the process, what each printed up to its end, and the status of each.
+    """
+    done = python(lab, "-c", IN_TURN, command, json.dumps(lines), cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    parts = re.split(rf"^{ENDED} (\d+)\n", done.stdout, flags=re.MULTILINE)
+    assert len(parts) == 2 * len(lines) + 1
+    return done, parts[:-1:2], [int(status) for status in parts[1::2]]
+
 
 def test_the_page_has_every_recipe(page):
     assert set(page[0]) == {"dahl.py", "lead_lag.py", "rms_slew.py", "my_stage.py"}
@@ -125,29 +148,23 @@ def test_a_model_is_saved_inverted_listed_fitted_tried_and_drawn(lab, tmp_path):
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) < 1e-6
 
-    identify = ("-m", "piezojax.identify")
-    listed = python(lab, *identify, "--model", "help", cwd=tmp_path)
-    assert "Dahl: a line less a bounded part" in listed.stdout
-
     columns = ("--time", "time", "--input", "input", "--output", "output")
     record = ("record.npz", *columns, "--train", "0:2000", "--validate", "2000:3000")
-    fit = python(
-        lab, *identify, *record, "--model", "dahl+lag", "--out", "fit", cwd=tmp_path
+    lines = (
+        ("--model", "help"),
+        (*record, "--model", "dahl+lag", "--out", "fit"),
+        (*record, "--model", "all", "--among", "dahl", "--out", "all"),
     )
-    assert fit.returncode == 0, fit.stderr
+    done, (listed, _, tried), statuses = in_turn(lab, "identify", *lines, cwd=tmp_path)
+    assert statuses == [0, 0, 0], done.stderr
+    assert "Dahl: a line less a bounded part" in listed
     report = json.loads((tmp_path / "fit" / "fit.json").read_text())
     assert report["validation"]["rmse"] < 0.006
     for name, true in (("slope", 0.1), ("height", 0.2), ("rate", 0.2)):
         found = report["parameters"][f"hysteresis.{name}"]
         assert abs(found["value"] - true) < 5.0 * found["standard_error"]
     assert (tmp_path / "fit" / "fit.png").stat().st_size > 10_000
-
-    among = ("--among", "dahl")
-    tried = python(
-        lab, *identify, *record, "--model", "all", *among, "--out", "all", cwd=tmp_path
-    )
-    assert tried.returncode == 0, tried.stderr
-    assert "dahl" in tried.stdout
+    assert "dahl" in tried
 
 
 def study(page, limit):
@@ -160,22 +177,19 @@ def study(page, limit):
 
 def test_a_controller_a_constraint_and_a_stage_meet_in_a_study(page, lab, tmp_path):
     (tmp_path / "study.toml").write_text(study(page, 1e6))
-    tune = ("-m", "piezojax.tune", "study.toml", "--out")
-    done = python(lab, *tune, "results", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    result = json.loads((tmp_path / "results" / "result.json").read_text())
+    (tmp_path / "wrong.toml").write_text(study(page, -1.0))
+    lines = [(f"{name}.toml", "--out", name) for name in ("study", "wrong")]
+    done, _, statuses = in_turn(lab, "tune", *lines, cwd=tmp_path)
+    assert statuses == [0, 1], done.stderr
+    assert "rms_slew is -1.0; it must be a number above 0" in done.stderr
+    result = json.loads((tmp_path / "study" / "result.json").read_text())
     assert set(result["gains"]) == {"controller.gain"}
     kept = result["constraints"]["rms_slew"]
     assert kept["unit"] == "V/s"
     assert 0.0 < kept["value"] < kept["limit"]
     assert result["perturbed"]["plants"] == 1
-    gains = tomllib.loads((tmp_path / "results" / "gains.toml").read_text())
+    gains = tomllib.loads((tmp_path / "study" / "gains.toml").read_text())
     assert gains["type"] == "LeadLag"
-
-    (tmp_path / "study.toml").write_text(study(page, -1.0))
-    refused = python(lab, *tune, "refused", cwd=tmp_path)
-    assert refused.returncode == 1
-    assert "rms_slew is -1.0; it must be a number above 0" in refused.stderr
 
 
 def test_the_lead_lag_is_that_of_the_bilinear_transform(page, tmp_path, monkeypatch):
