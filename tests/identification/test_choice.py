@@ -111,6 +111,7 @@ def test_stops_are_chosen_as_the_plays_that_they_are():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_the_micromanipulator():
     # Its sensor's noise is 0.067 um, cycles differ by as much.
     if MICROMANIPULATOR.is_file():

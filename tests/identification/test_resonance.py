@@ -45,9 +45,8 @@ def test_a_stage_without_a_resonance_shows_none(excitation):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("optimised")
 def test_the_named_stage_is_fitted_by_default():
-    case = records.NAMED._replace(seconds=0.6)
+    case = records.NAMED._replace(seconds=0.4)
     fit = identify(record(case))
     assert fit.report.model.endswith("+exponential_creep+modes")
     assert fit.report.found.startswith("a resonance at 7")
