@@ -16,6 +16,9 @@ from ..core.parameter import parameter
 from ..core.rollout import simulate
 from ..core.system import System
 
+CONVERGED = 1e-14
+"""Newton step, as a share of the range of the input, that has converged."""
+
 
 class Inverse(System):
     """System from a wanted output in um to the voltage that reaches it.
@@ -103,8 +106,9 @@ class InverseHysteresis(Inverse):
             rises = slope > 0.0
             newton = voltage - error / jnp.where(rises, slope, 1.0)
             newton = jnp.clip(newton, lower, upper)
-            # A step below rounding has converged.
-            inside = ((newton > low) & (newton < high)) | (newton == voltage)
+            # A step of a few roundings has converged, also where it meets the bracket.
+            converged = jnp.abs(newton - voltage) <= CONVERGED * (upper - lower)
+            inside = ((newton > low) & (newton < high)) | converged
             middle = 0.5 * (jnp.maximum(low, lower) + jnp.minimum(high, upper))
             return low, high, jnp.where(rises & inside, newton, middle)
 

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from oracles.published import HYSTERESIS
 
@@ -71,6 +71,8 @@ def voltages_and_outputs(inverse, wanted):
 
 @settings(max_examples=12)
 @given(st.lists(st.floats(0.5, 8.0), min_size=24, max_size=24))
+# The last Newton step goes back by one rounding, to the end of the bracket.
+@example([1.0] * 22 + [6.0, 0.6254148300550961])
 def test_inverse_then_model_is_the_identity(inverse, wanted):
     voltages, found = voltages_and_outputs(inverse, jnp.array(wanted))
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-9)
