@@ -307,16 +307,6 @@ class Study(Table):
         """Number of axes of the stage."""
         return len(self.axes.names) if self.axes else 1
 
-    @property
-    def highest(self) -> float | tuple[float, ...]:
-        """Highest reference, offset plus amplitude; a tuple on a stage with axes."""
-        table = self.references
-        values = zip(
-            self.by_axis(table.offset), self.by_axis(table.amplitude), strict=True
-        )
-        peaks = tuple(offset + amplitude for offset, amplitude in values)
-        return peaks if self.axes else peaks[0]
-
     def by_axis(self, value: float | tuple[float, ...]) -> tuple[float, ...]:
         """Return the value of each axis; a single value applies to all axes."""
         return value if isinstance(value, tuple) else (value,) * self.axis_count

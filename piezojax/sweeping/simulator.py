@@ -22,6 +22,7 @@ from ..core.rollout import Metric, simulate
 from ..core.system import System
 from ..signals.waveforms import time_grid
 from ..study import Case, Stage
+from ..study.references import highest_reference
 from ..study.sweep_table import SENSITIVITY
 from ..tuning.data import make_data
 from .plan import TRAJECTORIES, Plan, plants_of, references_of, sweep_table
@@ -151,7 +152,9 @@ class Simulator:
 
     def _peaks(self, loop: Feedback) -> tuple[Array, Array]:
         """Return Ms and the state matrix of the closed loop, both for every branch."""
-        point = OperatingPoint(self.case.study.highest, dt=self.case.study.dt)
+        point = OperatingPoint(
+            highest_reference(self.case.study), dt=self.case.study.dt
+        )
         models = [
             open_loop(loop, dataclasses.replace(point, branch=name))
             for name in BRANCHES

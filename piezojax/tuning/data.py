@@ -10,9 +10,9 @@ import numpy as np
 
 from ..core.arrays import as_array, as_signal
 from ..core.feedback import holding_input
-from ..signals import motions
-from ..signals import waveforms as signal_library
-from ..study import Case, Study
+from ..signals import waveforms
+from ..study import Case
+from ..study.references import reference_signals
 from .runs import Signals
 from .traces import Trace, traces_of
 
@@ -39,9 +39,8 @@ def make_data(case: Case) -> Data:
     """
     study = case.study
     table = study.references
-    time_s = signal_library.time_grid(table.duration, study.rate)
-    runs = (*table.tune, *table.unseen)
-    references = jnp.stack([_reference(study, name, time_s) for name in runs])
+    time_s = waveforms.time_grid(table.duration, study.rate)
+    references = reference_signals(study)
     # Two streams of one seed: the hold-out draws are new for every reference.
     streams = np.random.SeedSequence(study.seed).spawn(2)
     counts = study.objective.noise_draws, study.holdout_draws
@@ -108,14 +107,6 @@ def _holding(case: Case, begins: jax.Array) -> jax.Array:
     # Many references begin at the same place: solve once for each place.
     places, which = np.unique(np.asarray(begins), axis=0, return_inverse=True)
     return jax.jit(jax.vmap(one))(as_array(places))[which.ravel()]
-
-
-def _reference(study: Study, name: str, time_s: jax.Array) -> jax.Array:
-    table = study.references
-    amplitudes, offsets = study.by_axis(table.amplitude), study.by_axis(table.offset)
-    if study.axes is None:
-        return signal_library.signal(name, time_s, amplitudes[0], offsets[0])
-    return motions.motion(name, time_s, study.axes.names, amplitudes, offsets)
 
 
 def _unexplained(

@@ -14,6 +14,7 @@ from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, Extremes, TrackingFigures
 from ..solve.clock import Clock
 from ..study import Case, Stage
+from ..study.references import highest_reference
 from .runs import Signals, evaluate
 
 
@@ -84,7 +85,7 @@ class Evaluator:
         if not uses(self.limits, "margins"):
             return None
         dynamic, static = eqx.partition(stages, eqx.is_array)
-        point = OperatingPoint(study.highest, dt=study.dt)
+        point = OperatingPoint(highest_reference(study), dt=study.dt)
 
         def margins(loop, dynamic):
             def one(part):

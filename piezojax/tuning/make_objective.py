@@ -8,6 +8,7 @@ from ..core.arrays import as_array
 from ..core.metrics import TrackingFigures
 from ..study import Case, Stage
 from ..study.ensemble import Part
+from ..study.references import highest_reference
 from .data import Data
 from .evaluator import Evaluator
 from .objective import RAILED, Objective
@@ -45,7 +46,7 @@ def make_objective(
         model_error=evaluator.model_error,
         over=table.ensemble.aggregate if table.ensemble else "mean",
         tail=table.ensemble.tail if table.ensemble else 1.0,
-        highest=as_array(table.highest),
+        highest=as_array(highest_reference(table)),
         dt=table.dt,
     )
 

@@ -18,6 +18,7 @@ from ..solve.clock import Clock
 from ..solve.multi_start import Strategy
 from ..solve.search_state import SearchState
 from ..study import Case, read, shipped
+from ..study.references import highest_reference
 from .alarms import alarms_of
 from .baselines import Budget, compare_baselines
 from .data import Data, make_data
@@ -124,7 +125,7 @@ def _stability(case: Case, after: Feedback) -> StabilityReports:
     study = case.study
     return stability_reports(
         {"before": case.loop, "after": after},
-        study.highest,
+        highest_reference(study),
         study.dt,
         study.axes.names if study.axes else (),
     )
