@@ -16,6 +16,7 @@ from ..core.system import System
 from ..study import Case, Study
 from ..study.parameters import check_value
 from ..study.sweep_table import SweepTable, SweptTable
+from ..tuning.unexplained import STRETCHES
 
 CHUNK_LANE_STEPS = 5e7
 """Simulated samples of a chunk, all plants and references together.
@@ -137,7 +138,8 @@ def plants_of(case: Case) -> dict[str, System]:
 def runs_of_point(study: Study) -> int:
     """Return the number of simulations for each point."""
     plants = len(sweep_table(study).plants) or 1
-    return plants * len(references_of(study)) * study.holdout_draws
+    stretches = STRETCHES if "record" in study.plant else 1
+    return plants * len(references_of(study)) * study.holdout_draws * stretches
 
 
 def samples_of(study: Study) -> int:

@@ -15,6 +15,7 @@ from ..study import Case
 from ..study.references import reference_signals
 from .runs import Signals
 from .traces import Trace, traces_of
+from .unexplained import STRETCHES, residual_disturbances
 
 
 @dataclass
@@ -35,7 +36,8 @@ class Data:
 def make_data(case: Case) -> Data:
     """Return the signals of ``case``, the tuning references before the unseen ones.
 
-    The noise of the hold-out comes from a random stream of its own.
+    The noise of the hold-out comes from a random stream of its own. With a fitted plant
+    there are ``STRETCHES`` times as many draws.
     """
     study = case.study
     table = study.references
@@ -82,12 +84,17 @@ def _signals(
     part: Literal["train", "validate"],
 ) -> Signals:
     count, samples, *axes = references.shape
+    if case.fit is not None:
+        draws *= STRETCHES
     shape = (count, draws, samples, *axes)
     noise = as_array(random.standard_normal(shape))
     disturbance = None
-    unexplained = _unexplained(case, references, time_s, part)
-    if unexplained is not None:
-        disturbance = jnp.broadcast_to(unexplained[:, None], shape)
+    if case.fit is not None:
+        played = [
+            residual_disturbances(case.fit, reference, np.asarray(time_s), part)
+            for reference in np.asarray(references)
+        ]
+        disturbance = as_array(np.repeat(played, draws // STRETCHES, axis=1))
     drift = np.array(case.study.by_axis(case.study.disturbance.drift_rms))
     if drift.any():
         steps = random.standard_normal(shape) * np.sqrt(case.study.dt)
@@ -107,45 +114,3 @@ def _holding(case: Case, begins: jax.Array) -> jax.Array:
     # Many references begin at the same place: solve once for each place.
     places, which = np.unique(np.asarray(begins), axis=0, return_inverse=True)
     return jax.jit(jax.vmap(one))(as_array(places))[which.ravel()]
-
-
-def _unexplained(
-    case: Case,
-    references: jax.Array,
-    time_s: jax.Array,
-    part: Literal["train", "validate"],
-) -> jax.Array | None:
-    """Return the residual of the fitted plant as disturbances [references, samples].
-
-    Without it, a controller that contains the fitted model would be tuned and evaluated
-    as if the stage were that model. The errors of a hysteresis follow the path of the
-    stage: the residual is played as far as the reference has travelled, or as time has
-    passed, whichever is farther; forwards and backwards until the references end. None
-    without a fit.
-    """
-    if case.fit is None:
-        return None
-    fit = case.fit
-    where = getattr(fit, part)
-    # The first half of the training part holds the initial loading, a single event.
-    start = where.start if part == "validate" else (where.start + where.stop) // 2
-    chosen = slice(start, where.stop)
-    residual = (fit.record.output - fit.simulated)[chosen]
-    moved = np.abs(np.diff(fit.simulated[chosen]))
-    moved = np.maximum(moved, 1e-9 * moved.max())  # where it rests
-    places = np.arange(residual.size)
-    travelled = np.concatenate([[0.0], np.cumsum(moved)])
-    found = []
-    for reference in np.asarray(references):
-        way = np.cumsum(np.abs(np.diff(reference, prepend=reference[0])))
-        rounds, rest = np.divmod(way, travelled[-1])
-        # Odd rounds go backwards.
-        there = np.interp(rest, travelled, places)
-        back = places[-1] - np.interp(travelled[-1] - rest, travelled, places)
-        by_way = rounds * places[-1] + np.where(rounds % 2 == 0, there, back)
-        place = np.maximum(np.asarray(time_s) / fit.record.dt, by_way)
-        phase = np.mod(place, 2.0 * places[-1])
-        found.append(
-            np.interp(np.minimum(phase, 2.0 * places[-1] - phase), places, residual)
-        )
-    return as_array(np.stack(found))

@@ -21,7 +21,7 @@ GAINS_FILE = "gains.toml"
 
 
 class Scores(BaseModel):
-    """Tracking errors (um) of one set of gains by reference, over all noise draws.
+    """Tracking errors (um) of one set of gains by reference, of the worst draw.
 
     Errors are None for a run that diverged.
     """
@@ -138,10 +138,13 @@ class Perturbed(BaseModel):
         driven: np.ndarray,
         limits: Mapping[str, float],
     ) -> "Perturbed":
-        """Return the summary of figures [plants, traces, draws] before and after."""
+        """Return the summary of figures [plants, traces, draws] before and after.
+
+        The error of a trace is that of its worst draw.
+        """
         means, lost = [], []
         for figures in (before.tracking, after.tracking):
-            rms = np.sqrt(np.mean(np.asarray(figures.rms_error) ** 2, axis=2))
+            rms = np.max(np.asarray(figures.rms_error), axis=2)
             railed = np.max(np.asarray(figures.saturated), axis=(1, 2)) > RAILED
             lost.append(railed | ~np.all(np.isfinite(rms), axis=1))
             with np.errstate(divide="ignore"):
@@ -240,10 +243,10 @@ class Result(BaseModel):
 
 
 def scores(figures: TrackingFigures, names: tuple[str, ...]) -> Scores:
-    """Return the Scores of figures [references, draws]."""
-    rms = np.sqrt(np.mean(np.asarray(figures.rms_error) ** 2, axis=1))
+    """Return the Scores of figures [references, draws], each of its worst draw."""
+    rms = np.max(np.asarray(figures.rms_error), axis=1)
     peak = np.max(np.asarray(figures.peak_error), axis=1)
-    saturated = 100.0 * np.mean(np.asarray(figures.saturated), axis=1)
+    saturated = 100.0 * np.max(np.asarray(figures.saturated), axis=1)
     finite = bool(np.all(np.isfinite(rms)))
     voltage = float(np.max(np.asarray(figures.peak_voltage)))
     return Scores(

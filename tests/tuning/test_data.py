@@ -10,10 +10,12 @@ from piezojax.identification.fit import Fit, FitError, FitReport
 from piezojax.identification.records.record import Record
 from piezojax.solve.clock import Clock
 from piezojax.study import Study, build
+from piezojax.tuning import unexplained
 from piezojax.tuning.data import make_data
 from piezojax.tuning.evaluator import Evaluator
 from piezojax.tuning.objective import FAILED_LOSS, Objective
 from piezojax.tuning.runs import Signals
+from piezojax.tuning.unexplained import residual_disturbances
 
 STUDY = {
     "title": "a PID on a stage without dynamics",
@@ -102,34 +104,56 @@ def fitted(residual):
 
 def test_each_part_of_the_record_disturbs_its_own_runs():
     # The initial loading, the rest of the training part, the validation part.
-    residual = np.repeat([9.0, 1.0, -2.0], [100, 100, 200])
+    residual = np.repeat([9.0, 1.0, -2.0], [1, 199, 200])
     data = fitted(residual)
-    np.testing.assert_allclose(data.tuning.disturbance, np.full((2, 1, 400), 1.0))
-    np.testing.assert_allclose(data.holdout.disturbance, np.full((3, 1, 400), -2.0))
+    np.testing.assert_allclose(data.tuning.disturbance, np.full((2, 2, 400), 1.0))
+    np.testing.assert_allclose(data.holdout.disturbance, np.full((3, 2, 400), -2.0))
+
+
+REST, SLOW = np.zeros(400), 1e-9 * np.arange(400.0)
+"""A reference that travels nowhere, and a stage that hardly moves."""
+
+
+def played(residual, reference=REST, moved=SLOW, part="validate"):
+    """Return the disturbances of a fit that leaves ``residual`` of its record.
+
+    The first has the largest deviation, the second the largest fast changes.
+    """
+    case = case_of()
+    record = Record(np.arange(400.0), moved + residual, case.study.dt)
+    fit = fit_of(case, record, moved)
+    time_s = case.study.dt * np.arange(float(len(reference)))
+    return residual_disturbances(fit, reference, time_s, part)
 
 
 def test_a_short_residual_runs_forth_and_back():
-    ramp = np.arange(400.0)
-    held = np.asarray(fitted(ramp).holdout.disturbance)[0, 0]
-    np.testing.assert_allclose(held[:200], ramp[200:], atol=1e-3)
-    np.testing.assert_allclose(held[200:398], ramp[398:200:-1], atol=1e-3)
-    np.testing.assert_allclose(held[398:], ramp[200:202])
+    for found in played(np.arange(400.0)) - 200.0:
+        expected = np.mod(found[0] + np.arange(400.0), 398.0)
+        expected = np.minimum(expected, 398.0 - expected)
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(("part", "first"), [("train", 0), ("validate", 200)])
+def test_the_worst_stretches_are_played(part, first, monkeypatch):
+    """A hump in the middle is the largest, and late it swings fast."""
+    monkeypatch.setattr(unexplained, "FAST", 10)
+    time = np.arange(200.0)
+    swing = np.where(time > 150.0, np.sin(2.0 * np.pi * time / 10.0), 0.0)
+    residual = np.zeros(400)
+    residual[first : first + 200] = swing
+    residual[first + 100 : first + 145] += 6.0 * np.sin(np.linspace(0.0, np.pi, 45))
+    slow, fast = played(residual, np.zeros(45), part=part)
+    assert np.ptp(slow) > 5.0
+    assert np.ptp(fast) == pytest.approx(2.0, rel=0.1)
 
 
 def test_a_residual_follows_the_path_of_a_fast_reference():
     # The stage of the record moves 1e-4 um a sample, slower than the reference.
-    case = case_of()
-    output = 1e-4 * np.arange(400.0)
-    residual = np.arange(400.0)
-    record = Record(np.arange(400.0), output + residual, case.study.dt)
-    fit = fit_of(case, record, output)
-    data = make_data(dataclasses.replace(case, fit=fit)).holdout
-    reference = np.asarray(data.references)[0]
-    way = np.cumsum(np.abs(np.diff(reference, prepend=reference[0])))
-    place = np.maximum(np.arange(400.0), way / 1e-4) % 398.0
-    expected = 200.0 + np.minimum(place, 398.0 - place)
-    found = np.asarray(data.disturbance)[0, 0]
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    reference = np.asarray(make_data(case_of()).holdout.references)[0]
+    way = np.cumsum(np.abs(np.diff(reference, prepend=reference[0]))) / 1e-4
+    for found in played(np.arange(400.0), reference, 1e-4 * np.arange(400.0)) - 200.0:
+        place = np.maximum(found[0] + np.arange(400.0), found[0] + way) % 398.0
+        np.testing.assert_allclose(found, np.minimum(place, 398.0 - place), atol=1e-6)
 
 
 # Perturbed plants
