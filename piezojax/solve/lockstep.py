@@ -1,5 +1,6 @@
 """Lockstep descent: an optimiser of ``optimisers.METHODS`` from all starts at once."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,11 +10,10 @@ from jaxtyping import Array
 
 from ..core.arrays import as_array
 from ..core.progress import Progress
-from ..core.rollout import in_blocks
 from .augmented_lagrangian import with_zero_multipliers
 from .clock import Clock
 from .gradient import with_finite_gradient
-from .multi_start import BatchedDescents, Patience
+from .multi_start import BatchedDescents, Patience, in_batches
 from .optimisers import METHODS
 from .problem import Problem, Verdict
 
@@ -49,22 +49,29 @@ class LockstepDescent:
         self._method, self._tolerance = METHODS[method], tolerance
         self._forward = forward
         self._programs: dict[int, tuple[Any, Any, Any]] = {}
+        self._screening: Callable[..., Any] | None = None
+        self._width = 0
 
     @property
     def constraints(self) -> int:
         """Number of constraints, each with a multiplier."""
         return self._problem.multipliers.size
 
-    def screen(self, units: np.ndarray) -> tuple[np.ndarray, Verdict]:
-        """Return loss and verdict of any number of points."""
-        program = self._clock.compiled(
-            lambda problem, units: in_blocks(
-                lambda unit: problem.value_and_verdict(unit), units, size=self._at_once
-            ),
-            self._problem,
-            as_array(units),
-        )
-        return jax.tree.map(np.asarray, program(self._problem, as_array(units)))
+    def screen(self, problem: Problem, units: np.ndarray) -> tuple[np.ndarray, Verdict]:
+        """Return loss, without multipliers, and verdict of any number of points.
+
+        The first call compiles the program, for as many points at once as it has.
+        """
+        if self._screening is None:
+            self._width = min(self._at_once, len(units))
+            self._screening = self._clock.compiled(
+                lambda p, units: jax.vmap(lambda u: p.value_and_verdict(u))(units),
+                self._problem,
+                as_array(units[: self._width]),
+            )
+        program = self._screening
+        problem = problem.with_multipliers(self._problem.multipliers)
+        return in_batches(lambda batch: program(problem, batch), units, self._width)
 
     def wait(self) -> None:
         """Do nothing, because no program compiles in the background."""

@@ -17,7 +17,7 @@ from ..core.arrays import as_array
 from ..core.progress import Progress
 from .augmented_lagrangian import rounds, update_multipliers
 from .optimisers import View
-from .problem import Problem, Verdict
+from .problem import TOLERANCE, Problem, Verdict
 from .search_state import SearchState
 
 Cut = Callable[[int, int], int | None]
@@ -173,8 +173,8 @@ class Strategy(Protocol):
         """Number of constraints, each with a multiplier."""
         ...
 
-    def screen(self, units: np.ndarray) -> tuple[np.ndarray, Verdict]:
-        """Return loss and verdict of any number of points."""
+    def screen(self, problem: Problem, units: np.ndarray) -> tuple[np.ndarray, Verdict]:
+        """Return loss, without multipliers, and verdict of any number of points."""
         ...
 
     def wait(self) -> None:
@@ -210,7 +210,8 @@ def minimise(
     """Improve ``state`` from ``starts`` by up to ``steps`` steps.
 
     With constraints the rounds of the augmented Lagrangian share these steps; each
-    round starts from the end of the previous one.
+    round starts from the end of the previous one, and an end that violates a constraint
+    is pulled back towards the best point.
     """
     strategy.prepare(len(starts), progress)
     progress.stage(f"tuning from {len(starts)} starts", steps)
@@ -229,9 +230,11 @@ def minimise(
         standing, ended = descend(
             descents, share, watch, cut=strategy.cut, patience=strategy.patience
         )
-        if ended and last:
-            state.status = "converged"
-        if not last:
+        if last:
+            state.status = "converged" if ended else state.status
+            for end in standing.units[standing.verdict.violation > TOLERANCE]:
+                _pull_back(strategy, problem, end, state)
+        else:
             best = np.argsort(standing.losses, kind="stable")[: strategy.finalists]
             units, best = standing.units[best], standing.places[best]
             places = places[best]
@@ -240,3 +243,20 @@ def minimise(
                 multipliers[best],
                 as_array(penalty),
             )
+
+
+PULLS, SHARES = 2, np.linspace(0.125, 1.0, 8)
+"""Number of times that a segment is tried, and the places on it."""
+
+
+def _pull_back(
+    strategy: Strategy, problem: Problem, end: np.ndarray, state: SearchState
+) -> None:
+    """Improve ``state`` on the segment to ``end``, which violates a constraint.
+
+    The augmented Lagrangian approaches an active constraint from both sides, and its
+    last points may miss it by more than the tolerance.
+    """
+    for _ in range(PULLS):
+        points = state.unit + SHARES[:, None] * (end - state.unit)
+        state.update_best(points, strategy.screen(problem, points)[1])

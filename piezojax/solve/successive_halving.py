@@ -92,9 +92,10 @@ class SuccessiveHalving:
         """Number of constraints, each with a multiplier."""
         return self._problem.multipliers.size
 
-    def screen(self, units: np.ndarray) -> tuple[np.ndarray, Verdict]:
-        """Return loss and verdict of any number of points."""
-        return self._screened(self._problem, units)
+    def screen(self, problem: Problem, units: np.ndarray) -> tuple[np.ndarray, Verdict]:
+        """Return loss, without multipliers, and verdict of any number of points."""
+        problem = problem.with_multipliers(self._problem.multipliers)
+        return self._screened(problem, units)
 
     def _screened(
         self, problem: Problem, units: np.ndarray

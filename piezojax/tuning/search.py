@@ -66,7 +66,7 @@ def search_box(
         progress.stage(f"screening {len(points)} points of the box")
         strategy = make_strategy(objective, case, inner)
         try:
-            losses, verdict = strategy.screen(points)
+            losses, verdict = strategy.screen(objective, points)
             chosen = _starts(losses, table.starts, search)
             search.update_best(points, verdict)
             search.starts = points[chosen]

@@ -283,7 +283,7 @@ def programs(objective):
 
 def test_screening_any_number_of_points(objective, programs):
     points = np.random.default_rng(0).uniform(0.1, 0.9, (POINTS + 1, 2))
-    found, verdict = programs.screen(points)
+    found, verdict = programs.screen(objective, points)
     np.testing.assert_array_equal(found, verdict.loss)
     expected = jax.jit(jax.vmap(lambda u: objective.loss(u)))(jnp.asarray(points))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
@@ -309,7 +309,7 @@ def test_a_study_is_tuned(outcome):
     assert len(history) < steps <= 3 * len(history)
 
 
-def test_no_point_around_is_better(outcome, programs):
+def test_no_point_around_is_better(outcome, objective, programs):
     """Of grids in the box; their loss is the tuner's, less a constant."""
     case = case_of()
     values = jnp.array([outcome.result.gains[path] for path in case.space.paths])
@@ -319,8 +319,8 @@ def test_no_point_around_is_better(outcome, programs):
     around = np.clip(
         np.concatenate([unit + scale * grid for scale in (1e-3, 0.03, 1.0)]), 0.0, 1.0
     )
-    here = programs.screen(unit[None])[0][0]
-    assert np.all(programs.screen(around)[0] >= here - 1e-5)
+    here = programs.screen(objective, unit[None])[0][0]
+    assert np.all(programs.screen(objective, around)[0] >= here - 1e-5)
 
 
 class Stopping:

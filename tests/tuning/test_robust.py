@@ -55,7 +55,7 @@ STUDY = {
         "peak_slew": 1e6,
         "effort": 50.0,
     },
-    "pareto": {"constraint": "sensitivity_peak", "limits": [1.2, 1.4], "steps": 5},
+    "pareto": {"constraint": "sensitivity_peak", "limits": [1.2, 1.4], "steps": 10},
     "optimiser": {
         "method": "gauss_newton",
         "starts": 2,
@@ -94,7 +94,7 @@ def exact_peak(loop, stage):
     """Return Ms on the worse branch at the top of the references, by poles and QR."""
     other = stage.around(loop)
     reports = [
-        stability_report(other, OperatingPoint(2.0, b))
+        stability_report(other, OperatingPoint(4.0, b))
         for b in ("ascending", "descending")
     ]
     return max(report.sensitivity_peak for report in reports)

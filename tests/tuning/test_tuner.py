@@ -88,7 +88,6 @@ def outcome(progress):
     changes = {
         "plant": {"catalog": "p753"},
         "references/unseen": ["TRI50"],
-        "objective/noise_draws": 2,
         "holdout_draws": 3,
     }
     return pj.tune(case_of(changes), progress=progress)
