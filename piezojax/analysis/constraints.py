@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..core.arrays import largest, smallest
 from ..core.metrics import ExtremeFigures, TrackingFigures
 from .stability.differentiable import (
     Sensitivity,
@@ -90,7 +91,7 @@ class Constraint(NamedTuple):
 
 def _largest(runs: Array) -> Array:
     """Return the largest value [plants] of ``runs`` [plants, references, draws]."""
-    return jnp.max(runs, axis=(1, 2))
+    return largest(runs.reshape(runs.shape[0], -1))
 
 
 def _margin(figure: Callable[[Array, Any], Array]) -> Callable[[Margins, float], Array]:
@@ -106,7 +107,7 @@ def _peak(sensitivity: Sensitivity, error: Array | None) -> Array:
     """Return the largest Ms of a plant within ``error`` of the model."""
     if error is None:
         return peak_of(sensitivity)
-    return jnp.max(worst_sensitivity(sensitivity[:, 0, 0], error))
+    return largest(worst_sensitivity(sensitivity[:, 0, 0], error))
 
 
 def _delay(sensitivity: Sensitivity, error: Array | None) -> Array:
@@ -116,7 +117,7 @@ def _delay(sensitivity: Sensitivity, error: Array | None) -> Array:
         return nominal
     angle = jnp.linspace(0.0, jnp.pi, error.size)
     worst = worst_delay_margin(sensitivity[:, 0, 0], error, angle)
-    return jnp.minimum(nominal, jnp.min(worst))
+    return jnp.minimum(nominal, smallest(worst))
 
 
 def _disk(sensitivity: Sensitivity, error: Array | None) -> Array:

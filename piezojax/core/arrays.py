@@ -53,6 +53,22 @@ def as_signal(value: Any) -> Any:
     return as_array(value)
 
 
+def largest(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """Return the largest of ``values``, with the derivative of that element.
+
+    ``jnp.max`` looks for the elements that equal its result when it is differentiated.
+    If XLA computes them twice and rounds differently, there are none, and the
+    derivative is NaN.
+    """
+    place = jnp.argmax(jax.lax.stop_gradient(values), axis=-1, keepdims=True)
+    return jnp.take_along_axis(values, place, axis=-1)[..., 0]
+
+
+def smallest(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """Return the smallest of ``values``, as ``largest``."""
+    return -largest(-values)
+
+
 def as_matrix(value: Any) -> Array:
     """Return ``value`` as a float64 matrix.
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..analysis.constraints import LoopFigures, Margins, uses, violations
 from ..analysis.stability.differentiable import sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
-from ..core.arrays import as_array
+from ..core.arrays import as_array, largest
 from ..core.feedback import Feedback
 from ..core.metrics import Extremes, TrackingFigures
 from ..core.rollout import in_blocks
@@ -196,7 +196,7 @@ class Objective(eqx.Module):
             each = jnp.broadcast_to(shares * shares.size, logs.shape)
             joined = jax.nn.logsumexp(logs, axis=1, b=each) / _SHARPNESS
         if self.over == "worst":
-            return jnp.max(joined)
+            return largest(joined)
         if self.over == "cvar":
             worst = max(1, math.ceil(self.tail * joined.size))
             return jnp.mean(jnp.sort(joined)[-worst:])

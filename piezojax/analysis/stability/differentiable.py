@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from ...core.arrays import Scalar, ScalarLike, State, as_array
+from ...core.arrays import Scalar, ScalarLike, State, as_array, largest, smallest
 from ...core.feedback import Feedback
 from ...core.rollout import simulate
 from ...core.system import System
@@ -209,7 +209,7 @@ def _largest_singular(matrices: Sensitivity) -> Float[Array, ""]:
     needs no LAPACK, whose calls from XLA may deadlock on a CPU.
     """
     if matrices.shape[-1] == 1:
-        return jnp.max(jnp.abs(matrices))
+        return largest(jnp.abs(matrices).ravel())
     sizes = jnp.exp(_log_norm(jax.lax.stop_gradient(matrices)))
     worst = matrices[jnp.argmax(sizes)]
     return jnp.exp(_log_norm(worst))
@@ -244,7 +244,7 @@ def delay_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
     On several axes it is the smallest margin of one axis, with all others closed.
     """
     axes = jnp.diagonal(sensitivity, axis1=-2, axis2=-1)
-    return jnp.min(jax.vmap(_delay_margin, in_axes=-1)(axes))
+    return smallest(jax.vmap(_delay_margin, in_axes=-1)(axes))
 
 
 def _delay_margin(sensitivity: Complex[Array, " lines"]) -> Float[Array, ""]:
@@ -259,4 +259,4 @@ def _delay_margin(sensitivity: Complex[Array, " lines"]) -> Float[Array, ""]:
     turn = jnp.mod(lag[1:] - lag[:-1] + jnp.pi, 2.0 * jnp.pi) - jnp.pi
     there = jnp.mod(lag[:-1] + share * turn, 2.0 * jnp.pi)
     place = angle[:-1] + share * (angle[1:] - angle[:-1])
-    return jnp.min(jnp.where(crosses, there / place, UNLIMITED_DELAY))
+    return smallest(jnp.where(crosses, there / place, UNLIMITED_DELAY))

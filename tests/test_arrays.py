@@ -1,0 +1,30 @@
+"""Largest and smallest elements, as objectives and constraints need them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from piezojax.core.arrays import largest, smallest
+
+rows = st.lists(
+    st.lists(st.floats(-1e6, 1e6), min_size=4, max_size=4), min_size=1, max_size=3
+)
+
+
+@given(rows)
+def test_they_are_those_of_numpy(values):
+    np.testing.assert_array_equal(largest(jnp.array(values)), np.max(values, axis=1))
+    np.testing.assert_array_equal(smallest(jnp.array(values)), np.min(values, axis=1))
+
+
+def test_the_derivative_is_that_of_one_element_among_equals_too():
+    values = jnp.array([1.0, 3.0, 3.0, -2.0])
+    np.testing.assert_array_equal(jax.grad(largest)(values), [0.0, 1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(jax.grad(smallest)(values), [0.0, 0.0, 0.0, 1.0])
+
+
+def test_an_infinite_element_leaves_the_derivatives_of_others_finite():
+    found = jax.grad(lambda x: smallest(jnp.stack([x, jnp.inf])))(2.0)
+    assert found == 1.0
