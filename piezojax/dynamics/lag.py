@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array
+from ..core.arrays import Scalar, ScalarLike, Scalars, as_array
 from ..core.parameter import parameter, sample_time
 from ..core.recipe import Extent, Fittable, Part, Recipe
 from ..core.space import Range
@@ -37,6 +37,11 @@ class FirstOrderLag(Fittable):
             {"time_constant": bounds},
             [{"time_constant": lag} for lag in starts],
         )
+
+    @property
+    def lags(self) -> Scalars:
+        """Time constant, s."""
+        return (self.time_constant,)
 
     def pole(self) -> Scalar:
         """Return the pole in the z plane."""

@@ -79,6 +79,11 @@ class Modes(Designed, Fittable):
                 "n - 1"
             )
 
+    @property
+    def lags(self) -> Scalars:
+        """Time constants of the lags, s."""
+        return self.time_constant
+
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
         first = mode_starts(extent)[0]

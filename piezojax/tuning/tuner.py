@@ -39,6 +39,7 @@ from .result import (
 )
 from .search import search_box
 from .sliding import sliding_share
+from .tip import tip_note
 
 
 def tune(
@@ -87,6 +88,8 @@ def tune(
         result.sliding_before, result.sliding = (
             sliding_share(loop, data, evaluator.start) for loop in (case.loop, after)
         )
+        note = tip_note(case, after, data, evaluator.start)
+        result.warnings += [note] if note else []
     except KeyboardInterrupt:
         result.status = "interrupted"
         stability = StabilityReports(problems={"after": "they were interrupted"})
