@@ -13,6 +13,10 @@ from .result import ConstraintOutcome, Perturbed, Result, Scores
 EXACT = 1e-2
 """Relative error of the margins of the search, by which exact ones may miss a limit."""
 
+HELD_OUT = 0.05
+"""Relative excess over a limit in the hold-out that does not count, because its noise
+differs from that of tuning."""
+
 _TIGHTEN = "lower the upper bounds of the gains, or raise 'candidates' and 'steps'"
 
 
@@ -38,6 +42,7 @@ def alarms_of(
         *_run_alarms(scores),
         *_stability_alarms(stability, limits),
         *_limit_alarms(others, result.perturbed),
+        *_holdout_alarms(result.holdout_constraints),
         *_plant_alarms(result.perturbed),
         *model,
     ]
@@ -137,6 +142,16 @@ def _limit_alarms(
             if not outcome.kept:
                 plants = f"{outcome.of - outcome.on} of {outcome.of} {where} plants"
                 yield _missed(name, outcome.value, outcome.limit, plants)
+
+
+def _holdout_alarms(limits: Mapping[str, ConstraintOutcome]) -> Iterable[str]:
+    for name, outcome in limits.items():
+        at_most = CONSTRAINTS[name].sense == "at most"
+        room = 1.0 + HELD_OUT if at_most else 1.0 - HELD_OUT
+        value = np.nan if outcome.value is None else outcome.value
+        inside = value <= outcome.limit * room
+        if not (inside if at_most else value >= outcome.limit * room):
+            yield _missed(name, outcome.value, outcome.limit, "the hold-out")
 
 
 def _missed(name: str, value: float | None, limit: float, where: str) -> str:

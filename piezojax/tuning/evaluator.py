@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from ..analysis.constraints import LoopFigures, Margins, uses
+from ..analysis.constraints import CONSTRAINTS, LoopFigures, Margins, uses
 from ..analysis.stability.differentiable import lines, sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
 from ..core.arrays import as_array
@@ -43,6 +43,16 @@ class Evaluator:
     def figures(self, loop: Feedback, signals: Signals) -> TrackingFigures:
         """Return the figures [references, draws] of ``loop``."""
         return jax.tree.map(lambda x: x[0], self._runs(loop, signals, None)[0])
+
+    @property
+    def limits_on_runs(self) -> list[str]:
+        """Names of the limits that are not on margins."""
+        return [n for n in self.limits if CONSTRAINTS[n].source != "margins"]
+
+    def run_figures(self, loop: Feedback, signals: Signals) -> LoopFigures:
+        """Return the figures of ``limits_on_runs`` on the plant of ``loop``."""
+        tracking, extremes = self._runs(loop, signals, None)
+        return LoopFigures(tracking, extremes, None, dt=self._case.study.dt)
 
     def limited(
         self,

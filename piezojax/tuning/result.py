@@ -185,12 +185,13 @@ class Result(BaseModel):
     references with held-out noise. On a stage with several axes all of these concern
     the driven axes, each error in its own unit of ``units``. ``coupling_before`` and
     ``coupling`` concern the axes that should rest, under all references of the
-    hold-out. ``constraints`` holds the outcomes of the study's limits, ``front`` its
-    Pareto front, and ``perturbed`` the figures of the gains on the held-out plants of
-    its ensemble. ``sliding_before`` and ``sliding`` tell how much of the sliding
-    variable is tracking error, None for other controllers. ``history`` holds the lowest
-    loss of each start after each step, and ``times_s`` the time (s) from the start of
-    the search to the end of that step.
+    hold-out. ``constraints`` holds the outcomes of the study's limits, and
+    ``holdout_constraints`` those of the limits on runs under all references of the
+    hold-out; ``front`` is the Pareto front, and ``perturbed`` the figures of the gains
+    on the held-out plants of its ensemble. ``sliding_before`` and ``sliding`` tell how
+    much of the sliding variable is tracking error, None for other controllers.
+    ``history`` holds the lowest loss of each start after each step, and ``times_s`` the
+    time (s) from the start of the search to the end of that step.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -211,6 +212,7 @@ class Result(BaseModel):
     coupling_before: Scores | None = None
     coupling: Scores | None = None
     constraints: dict[str, ConstraintOutcome] = {}
+    holdout_constraints: dict[str, ConstraintOutcome] = {}
     front: list[FrontPoint] | None = None
     perturbed: Perturbed | None = None
     drive_before: dict[str, Drive] = {}

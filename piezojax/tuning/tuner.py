@@ -1,14 +1,14 @@
 """Tuning of a study: search of the box, and evaluation on the hold-out."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from ..analysis.constraints import uses, worst_by_plant
+from ..analysis.constraints import LoopFigures, uses, worst_by_plant
 from ..analysis.stability import StabilityReports, stability_reports
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
@@ -189,13 +189,19 @@ def _constraint_outcomes(
     objective: Objective, evaluator: Evaluator, after: Feedback
 ) -> dict[str, ConstraintOutcome]:
     """Return the outcomes of the limits on the plants that were tuned on."""
-    limits = evaluator.limits
     figures = evaluator.limited(
         after, objective.signals, objective.stages, objective.margin_stages
     )
+    return _outcomes(evaluator.limits, evaluator.limits, figures)
+
+
+def _outcomes(
+    names: Iterable[str], limits: Mapping[str, float], figures: LoopFigures
+) -> dict[str, ConstraintOutcome]:
+    """Return the outcomes of the limits ``names`` from the figures of the plants."""
     return {
         name: ConstraintOutcome.of_values(name, limits[name], np.asarray(values))
-        for name, values in worst_by_plant(limits, figures).items()
+        for name, values in worst_by_plant(names, figures).items()
     }
 
 
@@ -253,6 +259,11 @@ def _report(
         coupling_before=coupling_before,
         coupling=coupling,
         constraints=kept,
+        holdout_constraints=_outcomes(
+            evaluator.limits_on_runs,
+            evaluator.limits,
+            evaluator.run_figures(after, data.holdout),
+        ),
         front=front,
         perturbed=_perturbed(case, data, evaluator, case.loop, after),
         units={trace.name: trace.unit for trace in data.traces},

@@ -73,7 +73,9 @@ def alarms(result=None, stability=None, limits=LIMITS, model=()):
     return alarms_of(result or RESULT, stability or reports(0.1), limits, model)
 
 
-RESULT = result(unseen=None, coupling=None, constraints={}, perturbed=None)
+RESULT = result(
+    unseen=None, coupling=None, constraints={}, holdout_constraints={}, perturbed=None
+)
 
 
 def changed(**changes):
@@ -83,6 +85,9 @@ def changed(**changes):
 def test_safe_gains_raise_no_alarm():
     kept = {"sensitivity_peak": outcome("sensitivity_peak", [1.4, 1.9], 2.0)}
     assert alarms(changed(constraints=kept, perturbed=perturbed(**kept))) == []
+    # The noise of the hold-out is another one.
+    near = {"peak_slew": outcome("peak_slew", [1.04], 1.0)}
+    assert alarms(changed(holdout_constraints=near)) == []
     # The margins of the search differ from the exact ones by less than 1 %.
     exact = report_of(integrator(0.2)).sensitivity_peak
     assert alarms(stability=reports(0.2), limits={"sensitivity_peak": exact}) == []
@@ -95,6 +100,10 @@ def test_safe_gains_raise_no_alarm():
         ({"holdout": scores(saturated=91.0)}, "rails on hold-out runs of SW30: reduce"),
         ({"unseen": scores(rms=None)}, "diverges on unseen runs of SW30"),
         ({"coupling": scores(rms=None)}, "diverges on resting runs of SW30"),
+        (
+            {"holdout_constraints": {"effort": outcome("effort", [53.0], 50.0)}},
+            r"effort is 53 V rms on the hold-out, above its limit 50 V rms",
+        ),
         (
             {"constraints": {"effort": outcome("effort", [99.0], 50.0)}},
             "effort is 99 V rms on 1 of 1 tuned plants, above its limit 50 V rms: low",
