@@ -1,18 +1,13 @@
 """Tuning of a study: search of the box, and evaluation on the hold-out."""
 
 import math
-from collections.abc import Iterable, Mapping
-from importlib.metadata import version
+from collections.abc import Mapping
 from pathlib import Path
 
-import jax
-import numpy as np
-
-from ..analysis.constraints import LoopFigures, uses, worst_by_plant
+from ..analysis.constraints import uses
 from ..analysis.stability import StabilityReports, stability_reports
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
-from ..core.metrics import TrackingFigures
 from ..core.progress import Progress, Silent
 from ..solve.clock import Clock
 from ..solve.multi_start import Strategy
@@ -21,22 +16,15 @@ from ..study import Case, read, shipped
 from ..study.references import highest_reference
 from .alarms import alarms_of
 from .baselines import Budget, compare_baselines
-from .data import Data, make_data
+from .data import make_data
 from .evaluator import Evaluator
 from .front import trace_front
 from .make_objective import make_objective
+from .make_result import constraint_outcomes, make_result
 from .model_alarms import model_alarms
 from .objective import Objective
 from .outcome import Outcome
 from .reach import require_reach
-from .result import (
-    ConstraintOutcome,
-    FrontPoint,
-    Perturbed,
-    Result,
-    Scores,
-    scores,
-)
 from .search import search_box
 from .sliding import sliding_share
 from .tip import tip_note
@@ -72,17 +60,19 @@ def tune(
 
     after = space.put(case.loop, as_array(search.unit))
     try:
-        front, kept = None, _constraint_outcomes(objective, evaluator, after)
+        front, kept = None, constraint_outcomes(objective, evaluator, after)
         if table.pareto is not None and strategy and search.status != "interrupted":
             front = trace_front(objective, case, search, strategy, clock, progress)
         progress.stage("evaluating on held-out noise")
-        result = _report(
+        result = make_result(
             case, data, evaluator, before, after, search, clock, kept, front
         )
     except KeyboardInterrupt:
         # The gains found are kept; only a second interrupt ends the report too.
         search.status = "interrupted"
-        result = _report(case, data, evaluator, before, after, search, clock, {}, None)
+        result = make_result(
+            case, data, evaluator, before, after, search, clock, {}, None
+        )
     try:
         stability = _stability(case, after)
         result.sliding_before, result.sliding = (
@@ -160,7 +150,7 @@ def _search(
         return objective, search, strategy
     try:
         after = case.space.put(case.loop, as_array(search.unit))
-        kept = _constraint_outcomes(every, evaluator, after)
+        kept = constraint_outcomes(every, evaluator, after)
     except KeyboardInterrupt:
         search.status = "interrupted"
         return objective, search, strategy
@@ -169,159 +159,3 @@ def _search(
     again, strategy = search_box(every, case, clock, progress, search.unit[None])
     again.evaluations += search.evaluations
     return every, again, strategy
-
-
-def _perturbed(
-    case: Case, data: Data, evaluator: Evaluator, before: Feedback, after: Feedback
-) -> Perturbed | None:
-    stages = case.ensemble.stages("holdout") if case.ensemble else None
-    if stages is None:
-        return None
-    driven = np.array([trace.driven for trace in data.traces])
-    figures = [
-        evaluator.limited(loop, data.holdout, stages, stages)
-        for loop in (before, after)
-    ]
-    return Perturbed.of(figures[0], figures[1], driven, case.study.limits)
-
-
-def _constraint_outcomes(
-    objective: Objective, evaluator: Evaluator, after: Feedback
-) -> dict[str, ConstraintOutcome]:
-    """Return the outcomes of the limits on the plants that were tuned on."""
-    figures = evaluator.limited(
-        after, objective.signals, objective.stages, objective.margin_stages
-    )
-    return _outcomes(evaluator.limits, evaluator.limits, figures)
-
-
-def _outcomes(
-    names: Iterable[str], limits: Mapping[str, float], figures: LoopFigures
-) -> dict[str, ConstraintOutcome]:
-    """Return the outcomes of the limits ``names`` from the figures of the plants."""
-    return {
-        name: ConstraintOutcome.of_values(name, limits[name], np.asarray(values))
-        for name, values in worst_by_plant(names, figures).items()
-    }
-
-
-def _report(
-    case: Case,
-    data: Data,
-    evaluator: Evaluator,
-    before: TrackingFigures,
-    after: Feedback,
-    search: SearchState,
-    clock: Clock,
-    kept: dict[str, ConstraintOutcome],
-    front: list[FrontPoint] | None,
-) -> Result:
-    driven = np.array([trace.driven for trace in data.traces])
-    tuned_on = np.arange(len(data.traces)) < data.tuned
-
-    def scores_of(figures: TrackingFigures, chosen: np.ndarray) -> Scores | None:
-        return _chosen(figures, data.names, chosen) if chosen.any() else None
-
-    def split(figures: TrackingFigures) -> tuple[Scores, Scores | None, Scores | None]:
-        return (
-            _chosen(figures, data.names, driven & tuned_on),
-            scores_of(figures, driven & ~tuned_on),
-            scores_of(figures, ~driven),
-        )
-
-    on_holdout = [evaluator.figures(loop, data.holdout) for loop in (case.loop, after)]
-    holdout_before, unseen_before, coupling_before = split(on_holdout[0])
-    holdout, unseen_after, coupling = split(on_holdout[1])
-    tuned = driven[: data.tuned]
-    names = data.names[: data.tuned]
-    after_scores = _chosen(evaluator.figures(after, data.tuning), names, tuned)
-    unit = np.asarray(search.unit)
-    values = case.space.from_unit(as_array(unit))
-    at_bound = [
-        path
-        for path, place in zip(case.space.paths, unit, strict=True)
-        if place < 1e-2 or place > 1.0 - 1e-2
-    ]
-    return Result(
-        study=case.name,
-        title=case.study.title,
-        status=search.status,
-        method=case.study.optimiser.method,
-        gains=_named(case, values),
-        start=_named(case, case.space.from_unit(case.space.start(case.loop))),
-        at_bound=at_bound,
-        before=_chosen(before, names, tuned),
-        after=after_scores,
-        holdout_before=holdout_before,
-        holdout=holdout,
-        unseen_before=unseen_before,
-        unseen=unseen_after,
-        coupling_before=coupling_before,
-        coupling=coupling,
-        constraints=kept,
-        holdout_constraints=_outcomes(
-            evaluator.limits_on_runs,
-            evaluator.limits,
-            evaluator.run_figures(after, data.holdout),
-        ),
-        front=front,
-        perturbed=_perturbed(case, data, evaluator, case.loop, after),
-        units={trace.name: trace.unit for trace in data.traces},
-        gain_units={path: case.unit(path) for path in case.space.paths},
-        warnings=[
-            *case.notes,
-            *search.warnings,
-            *_warnings(case, at_bound, after_scores, holdout),
-        ],
-        history=search.losses_by_start,
-        times_s=search.times_s,
-        evaluations=search.evaluations,
-        compile_s=clock.compile_s,
-        wall_s=clock.wall_s(),
-        versions={n: version(n) for n in _VERSIONED},
-        seed=case.study.seed,
-    )
-
-
-_VERSIONED = ("piezojax", "jax", "jaxlib", "optimistix", "jaxopt", "equinox", "numpy")
-
-
-def _chosen(
-    figures: TrackingFigures, names: tuple[str, ...], chosen: np.ndarray
-) -> Scores:
-    """Return the scores of the traces for which ``chosen`` is True."""
-    where = np.flatnonzero(chosen)
-    part = jax.tree.map(lambda x: np.asarray(x)[where], figures)
-    return scores(part, tuple(names[i] for i in where))
-
-
-def _named(case: Case, values: jax.Array) -> dict[str, float]:
-    return dict(zip(case.space.paths, map(float, values), strict=True))
-
-
-def _warnings(
-    case: Case, at_bound: list[str], after: Scores, holdout: Scores
-) -> list[str]:
-    found = []
-    if case.fit is not None:
-        part = case.fit.report.validation
-        found.append(
-            f"the fitted plant leaves {part.rmse:.3g} {part.unit} rms of its record "
-            "unexplained; this residual is a disturbance of the loop, that of the "
-            "training part while tuning, that of the validation part in the hold-out"
-        )
-        report = case.fit.report
-        found += [
-            f"fitted plant: {text}"
-            for text in report.warnings
-            if text not in report.alarms
-        ]
-    if at_bound:
-        found.append(f"at the edge of its bounds: {', '.join(at_bound)}")
-    for where, figures in (("tuning", after), ("hold-out", holdout)):
-        railed = [n for n, share in figures.saturated_percent.items() if share > 0]
-        if railed:
-            found.append(
-                f"the actuator saturates on {where} runs of {', '.join(railed)}"
-            )
-    return found

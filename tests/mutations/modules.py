@@ -15,6 +15,7 @@ MODULES = {
     "tuning/reach.py": ("tests/tuning/test_reach.py", "-k", "not shipped"),
     "tuning/objective.py": ("tests/tuning/test_data.py", "tests/tuning/test_robust.py"),
     "tuning/result.py": _RESULTS,
+    "tuning/make_result.py": _RESULTS,
     "tuning/tuner.py": _RESULTS[1:],
     "study/case.py": _STUDY,
     "study/parameters.py": _STUDY,

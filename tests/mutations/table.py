@@ -32,7 +32,7 @@ MUTATIONS = (
     ),
     Mutation(
         "validation residual from the training part",
-        "tuning/data.py",
+        "tuning/unexplained.py",
         "where = getattr(fit, part)",
         "where = fit.train",
         (_DATA,),
@@ -127,8 +127,8 @@ MUTATIONS = (
     Mutation(
         "delay margin of a response without crossings with phase lead",
         "analysis/stability/differentiable.py",
-        "jnp.min(jnp.where(crosses, there",
-        "jnp.min(jnp.where(crosses & (there < jnp.pi), there",
+        "smallest(jnp.where(crosses, there",
+        "smallest(jnp.where(crosses & (there < jnp.pi), there",
         ("tests/analysis/test_differentiable_margins.py", "-k", "lead"),
     ),
     Mutation(

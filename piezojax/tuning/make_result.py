@@ -1,0 +1,187 @@
+"""Result of a search: scores, limits and warnings, evaluated on the hold-out."""
+
+from collections.abc import Iterable, Mapping
+from importlib.metadata import version
+
+import jax
+import numpy as np
+
+from ..analysis.constraints import LoopFigures, worst_by_plant
+from ..core.arrays import as_array
+from ..core.feedback import Feedback
+from ..core.metrics import TrackingFigures
+from ..solve.clock import Clock
+from ..solve.search_state import SearchState
+from ..study import Case
+from .data import Data
+from .evaluator import Evaluator
+from .objective import Objective
+from .result import (
+    ConstraintOutcome,
+    FrontPoint,
+    Perturbed,
+    Result,
+    Scores,
+    scores,
+)
+
+
+def make_result(
+    case: Case,
+    data: Data,
+    evaluator: Evaluator,
+    before: TrackingFigures,
+    after: Feedback,
+    search: SearchState,
+    clock: Clock,
+    kept: dict[str, ConstraintOutcome],
+    front: list[FrontPoint] | None,
+) -> Result:
+    """Return the Result of ``search``, whose best gains are those of ``after``.
+
+    ``before`` are the tuning figures of the study's own gains, ``kept`` the outcomes of
+    the limits while tuning.
+    """
+    driven = np.array([trace.driven for trace in data.traces])
+    tuned_on = np.arange(len(data.traces)) < data.tuned
+
+    def scores_of(figures: TrackingFigures, chosen: np.ndarray) -> Scores | None:
+        return _chosen(figures, data.names, chosen) if chosen.any() else None
+
+    def split(figures: TrackingFigures) -> tuple[Scores, Scores | None, Scores | None]:
+        return (
+            _chosen(figures, data.names, driven & tuned_on),
+            scores_of(figures, driven & ~tuned_on),
+            scores_of(figures, ~driven),
+        )
+
+    on_holdout = [evaluator.figures(loop, data.holdout) for loop in (case.loop, after)]
+    holdout_before, unseen_before, coupling_before = split(on_holdout[0])
+    holdout, unseen_after, coupling = split(on_holdout[1])
+    tuned = driven[: data.tuned]
+    names = data.names[: data.tuned]
+    after_scores = _chosen(evaluator.figures(after, data.tuning), names, tuned)
+    unit = np.asarray(search.unit)
+    values = case.space.from_unit(as_array(unit))
+    at_bound = [
+        path
+        for path, place in zip(case.space.paths, unit, strict=True)
+        if place < 1e-2 or place > 1.0 - 1e-2
+    ]
+    return Result(
+        study=case.name,
+        title=case.study.title,
+        status=search.status,
+        method=case.study.optimiser.method,
+        gains=_named(case, values),
+        start=_named(case, case.space.from_unit(case.space.start(case.loop))),
+        at_bound=at_bound,
+        before=_chosen(before, names, tuned),
+        after=after_scores,
+        holdout_before=holdout_before,
+        holdout=holdout,
+        unseen_before=unseen_before,
+        unseen=unseen_after,
+        coupling_before=coupling_before,
+        coupling=coupling,
+        constraints=kept,
+        holdout_constraints=_outcomes(
+            evaluator.limits_on_runs,
+            evaluator.limits,
+            evaluator.run_figures(after, data.holdout),
+        ),
+        front=front,
+        perturbed=_perturbed(case, data, evaluator, case.loop, after),
+        units={trace.name: trace.unit for trace in data.traces},
+        gain_units={path: case.unit(path) for path in case.space.paths},
+        warnings=[
+            *case.notes,
+            *search.warnings,
+            *_warnings(case, at_bound, after_scores, holdout),
+        ],
+        history=search.losses_by_start,
+        times_s=search.times_s,
+        evaluations=search.evaluations,
+        compile_s=clock.compile_s,
+        wall_s=clock.wall_s(),
+        versions={n: version(n) for n in _VERSIONED},
+        seed=case.study.seed,
+    )
+
+
+_VERSIONED = ("piezojax", "jax", "jaxlib", "optimistix", "jaxopt", "equinox", "numpy")
+
+
+def _perturbed(
+    case: Case, data: Data, evaluator: Evaluator, before: Feedback, after: Feedback
+) -> Perturbed | None:
+    stages = case.ensemble.stages("holdout") if case.ensemble else None
+    if stages is None:
+        return None
+    driven = np.array([trace.driven for trace in data.traces])
+    figures = [
+        evaluator.limited(loop, data.holdout, stages, stages)
+        for loop in (before, after)
+    ]
+    return Perturbed.of(figures[0], figures[1], driven, case.study.limits)
+
+
+def constraint_outcomes(
+    objective: Objective, evaluator: Evaluator, after: Feedback
+) -> dict[str, ConstraintOutcome]:
+    """Return the outcomes of the limits on the plants that were tuned on."""
+    figures = evaluator.limited(
+        after, objective.signals, objective.stages, objective.margin_stages
+    )
+    return _outcomes(evaluator.limits, evaluator.limits, figures)
+
+
+def _outcomes(
+    names: Iterable[str], limits: Mapping[str, float], figures: LoopFigures
+) -> dict[str, ConstraintOutcome]:
+    """Return the outcomes of the limits ``names`` from the figures of the plants."""
+    return {
+        name: ConstraintOutcome.of_values(name, limits[name], np.asarray(values))
+        for name, values in worst_by_plant(names, figures).items()
+    }
+
+
+def _chosen(
+    figures: TrackingFigures, names: tuple[str, ...], chosen: np.ndarray
+) -> Scores:
+    """Return the scores of the traces for which ``chosen`` is True."""
+    where = np.flatnonzero(chosen)
+    part = jax.tree.map(lambda x: np.asarray(x)[where], figures)
+    return scores(part, tuple(names[i] for i in where))
+
+
+def _named(case: Case, values: jax.Array) -> dict[str, float]:
+    return dict(zip(case.space.paths, map(float, values), strict=True))
+
+
+def _warnings(
+    case: Case, at_bound: list[str], after: Scores, holdout: Scores
+) -> list[str]:
+    found = []
+    if case.fit is not None:
+        part = case.fit.report.validation
+        found.append(
+            f"the fitted plant leaves {part.rmse:.3g} {part.unit} rms of its record "
+            "unexplained; this residual is a disturbance of the loop, that of the "
+            "training part while tuning, that of the validation part in the hold-out"
+        )
+        report = case.fit.report
+        found += [
+            f"fitted plant: {text}"
+            for text in report.warnings
+            if text not in report.alarms
+        ]
+    if at_bound:
+        found.append(f"at the edge of its bounds: {', '.join(at_bound)}")
+    for where, figures in (("tuning", after), ("hold-out", holdout)):
+        railed = [n for n, share in figures.saturated_percent.items() if share > 0]
+        if railed:
+            found.append(
+                f"the actuator saturates on {where} runs of {', '.join(railed)}"
+            )
+    return found
