@@ -39,14 +39,23 @@ def model_alarms(
         yield from _error_alarm(bound, limit, stability)
 
 
-def _error_alarm(
-    bound: ErrorBound, limit: float, stability: StabilityReports
-) -> Iterator[str]:
-    """Yield an alarm if the model's error can make Ms exceed ``limit``.
+def worst_peak(
+    bound: ErrorBound | None, stability: StabilityReports
+) -> tuple[float, float]:
+    """Return the largest exact Ms of the tuned loop, and its frequency (Hz).
 
-    The worst |S| under a relative error l of the plant is |S| / (1 - l |T|).
+    It is that of all plants within ``bound``, infinite if one of them is unstable. The
+    worst |S| under a relative error l of the plant is |S| / (1 - l |T|). ``stability``
+    holds the loop "after".
     """
+    axes = [stability.axes["after"].report] if "after" in stability.axes else []
     worst, at = 0.0, 0.0
+    for report in [*stability.reports.get("after", {}).values(), *axes]:
+        peak = report.sensitivity_peak if report.stable else np.inf
+        if peak is not None and peak > worst:
+            worst, at = float(peak), report.sensitivity_peak_Hz or 0.0
+    if bound is None or "after" not in stability.loops:
+        return worst, at
     for curves in stability.curves("after", DECADES).values():
         share = bound.at(curves.frequency) * np.abs(curves.T)
         peak = int(np.argmax(share))
@@ -57,6 +66,14 @@ def _error_alarm(
             reached = float(size[peak])
         if reached > worst:
             worst, at = reached, float(curves.frequency[peak])
+    return worst, at
+
+
+def _error_alarm(
+    bound: ErrorBound, limit: float, stability: StabilityReports
+) -> Iterator[str]:
+    """Yield an alarm if the model's error can make Ms exceed ``limit``."""
+    worst, at = worst_peak(bound, stability)
     if np.isfinite(worst) and worst <= limit * (1.0 + SLACK):
         return
     here = np.array([at])

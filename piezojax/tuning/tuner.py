@@ -4,28 +4,22 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from ..analysis.constraints import uses
-from ..analysis.stability import StabilityReports, stability_reports
+from ..analysis.stability import StabilityReports
 from ..core.arrays import as_array
-from ..core.feedback import Feedback
 from ..core.progress import Progress, Silent
 from ..solve.clock import Clock
-from ..solve.multi_start import Strategy
-from ..solve.search_state import SearchState
 from ..study import Case, read, shipped
-from ..study.references import highest_reference
 from .alarms import alarms_of
 from .baselines import Budget, compare_baselines
 from .data import make_data
 from .evaluator import Evaluator
 from .front import trace_front
+from .limited_search import search_within_limits
 from .make_objective import make_objective
 from .make_result import constraint_outcomes, make_result
 from .model_alarms import model_alarms
-from .objective import Objective
 from .outcome import Outcome
 from .reach import require_reach
-from .search import search_box
 from .sliding import sliding_share
 from .tip import tip_note
 
@@ -56,7 +50,9 @@ def tune(
     evaluator = Evaluator(clock, case)
     before = evaluator.figures(case.loop, data.tuning)
     objective = make_objective(case, data, evaluator, before)
-    objective, search, strategy = _search(objective, case, evaluator, clock, progress)
+    objective, search, strategy, stability = search_within_limits(
+        objective, case, evaluator, clock, progress
+    )
 
     after = space.put(case.loop, as_array(search.unit))
     try:
@@ -74,7 +70,6 @@ def tune(
             case, data, evaluator, before, after, search, clock, {}, None
         )
     try:
-        stability = _stability(case, after)
         result.sliding_before, result.sliding = (
             sliding_share(loop, data, evaluator.start) for loop in (case.loop, after)
         )
@@ -82,7 +77,6 @@ def tune(
         result.warnings += [note] if note else []
     except KeyboardInterrupt:
         result.status = "interrupted"
-        stability = StabilityReports(problems={"after": "they were interrupted"})
     limits = table.limits
     doubts = _model_alarms(case, limits, stability)
     result.alarms = alarms_of(result, stability, limits, doubts)
@@ -107,55 +101,3 @@ def _model_alarms(
             stability,
         )
     )
-
-
-def _stability(case: Case, after: Feedback) -> StabilityReports:
-    """Return the exact stability of the loops "before" and "after".
-
-    The operating point is the highest reference, where the branches of a hysteresis
-    differ most.
-    """
-    study = case.study
-    return stability_reports(
-        {"before": case.loop, "after": after},
-        highest_reference(study),
-        study.dt,
-        study.axes.names if study.axes else (),
-    )
-
-
-def _search(
-    objective: Objective,
-    case: Case,
-    evaluator: Evaluator,
-    clock: Clock,
-    progress: Progress,
-) -> tuple[Objective, SearchState, Strategy | None]:
-    """Return the objective with its limits, the search, and its strategy.
-
-    The defaults among the limits are rarely active, and margins in every loss cost time
-    to compile. Unless the study limits a margin itself, the box is searched without
-    them first, and again with them if the result violates any.
-    """
-    study = case.study
-    own = {
-        name: study.limits[name] for name in study.constraints if name in study.limits
-    }
-    every = objective.with_limits(study.limits)
-    if uses(own, "margins") or study.pareto or own == study.limits:
-        return every, *search_box(every, case, clock, progress)
-    objective = objective.with_limits(own)
-    search, strategy = search_box(objective, case, clock, progress)
-    if search.status == "interrupted":
-        return objective, search, strategy
-    try:
-        after = case.space.put(case.loop, as_array(search.unit))
-        kept = constraint_outcomes(every, evaluator, after)
-    except KeyboardInterrupt:
-        search.status = "interrupted"
-        return objective, search, strategy
-    if all(outcome.kept for outcome in kept.values()):
-        return objective, search, strategy
-    again, strategy = search_box(every, case, clock, progress, search.unit[None])
-    again.evaluations += search.evaluations
-    return every, again, strategy

@@ -1,0 +1,131 @@
+"""Search of a study within its limits, judged by the exact margins."""
+
+from ..analysis.constraints import uses
+from ..analysis.stability import StabilityReports, stability_reports
+from ..core.arrays import as_array
+from ..core.progress import Progress
+from ..solve.clock import Clock
+from ..solve.multi_start import Strategy, minimise
+from ..solve.search_state import SearchState
+from ..study import Case
+from ..study.references import highest_reference
+from .alarms import EXACT
+from .evaluator import Evaluator
+from .make_result import constraint_outcomes
+from .model_alarms import SLACK, worst_peak
+from .objective import Objective
+from .search import search_box
+
+PEAK = "sensitivity_peak"
+
+REPEATS, LEAST_SHARE = 3, 0.3
+"""Most searches with a tighter limit on Ms, and the least share of the room above 1
+that one of them leaves of the limit before."""
+
+Found = tuple[Objective, SearchState, Strategy | None, StabilityReports]
+
+
+def search_within_limits(
+    objective: Objective,
+    case: Case,
+    evaluator: Evaluator,
+    clock: Clock,
+    progress: Progress,
+) -> Found:
+    """Return the objective with its limits, the search, its strategy and the stability.
+
+    The defaults among the limits are rarely active, and margins in every loss cost time
+    to compile. Unless the study limits a margin itself, the box is searched without
+    them first, and again with them if the result violates any.
+    """
+    study = case.study
+    own = {
+        name: study.limits[name] for name in study.constraints if name in study.limits
+    }
+    every = objective.with_limits(study.limits)
+    if uses(own, "margins") or study.pareto or own == study.limits:
+        search, strategy = search_box(every, case, clock, progress)
+        return every, *_tightened(every, case, search, strategy, progress)
+    objective = objective.with_limits(own)
+    search, strategy = search_box(objective, case, clock, progress)
+    try:
+        stability = exact_stability(case, search)
+        after = case.space.put(case.loop, as_array(search.unit))
+        kept = constraint_outcomes(every, evaluator, after)
+        fine = all(outcome.kept for outcome in kept.values())
+        if search.status == "interrupted" or (fine and not _missed(case, stability)):
+            return objective, search, strategy, stability
+    except KeyboardInterrupt:
+        search.status = "interrupted"
+        return objective, search, strategy, INTERRUPTED
+    again, strategy = search_box(every, case, clock, progress, search.unit[None])
+    again.evaluations += search.evaluations
+    return every, *_tightened(every, case, again, strategy, progress)
+
+
+INTERRUPTED = StabilityReports(problems={"after": "they were interrupted"})
+
+
+def exact_stability(case: Case, search: SearchState) -> StabilityReports:
+    """Return the exact stability of the loops "before" and "after".
+
+    The operating point is the highest reference, where the branches of a hysteresis
+    differ most.
+    """
+    study = case.study
+    after = case.space.put(case.loop, as_array(search.unit))
+    return stability_reports(
+        {"before": case.loop, "after": after},
+        highest_reference(study),
+        study.dt,
+        study.axes.names if study.axes else (),
+    )
+
+
+def _missed(case: Case, stability: StabilityReports) -> float:
+    """Return the exact Ms if it raises an alarm, else 0."""
+    limit = case.study.limits.get(PEAK)
+    if limit is None or "after" in stability.problems:
+        return 0.0
+    nominal, _ = worst_peak(None, stability)
+    worst, _ = worst_peak(case.plant_about.error_bound, stability)
+    alarming = nominal > limit * (1.0 + EXACT) or worst > limit * (1.0 + SLACK)
+    return worst if alarming else 0.0
+
+
+def _tightened(
+    objective: Objective,
+    case: Case,
+    search: SearchState,
+    strategy: Strategy | None,
+    progress: Progress,
+) -> tuple[SearchState, Strategy | None, StabilityReports]:
+    """Search again below the limit of Ms while the exact one is above it.
+
+    The search sees Ms on lines of an impulse response, between which a light mode of
+    the closed loop hides.
+    """
+    limits = case.study.limits
+    try:
+        stability, aim = exact_stability(case, search), limits.get(PEAK, 0.0)
+        for _ in range(REPEATS):
+            peak = _missed(case, stability)
+            if not peak or strategy is None or search.status == "interrupted":
+                break
+            share = (limits[PEAK] - 1.0) / (peak - 1.0)
+            aim = 1.0 + (aim - 1.0) * max(share, LEAST_SHARE)
+            progress.stage(f"Ms is {peak:.3g}: searching below {aim:.3g}")
+            again = SearchState(search.unit, starts=search.unit[None])
+            minimise(
+                strategy,
+                objective.with_limits(limits | {PEAK: aim}),
+                again.starts,
+                again,
+                case.study.optimiser.steps,
+                progress,
+            )
+            again.evaluations += search.evaluations
+            search, stability = again, exact_stability(case, again)
+    except KeyboardInterrupt:
+        search.status, stability = "interrupted", INTERRUPTED
+    return search, strategy, stability
