@@ -68,11 +68,11 @@ def test_figures_are_those_of_the_exact_report(name, branch):
 
 
 def test_a_light_mode_is_seen_between_the_lines():
-    """Its peak is 3.5 Hz wide, in the middle of two lines of the impulse response."""
+    """Its peak is 7 Hz wide, in the middle of two lines of the impulse response."""
     dt = 1e-4
     loop = pj.Feedback(
-        pj.control.PID(0.0, 10.0, dt=dt),
-        pj.dynamics.Mode(347.5, 0.005, dt),
+        pj.control.PID(0.0, 20.0, dt=dt),
+        pj.dynamics.Mode(347.5, 0.01, dt),
         pj.hardware.Saturation(-50.0, 50.0),
         pj.hardware.Sensor(0.0),
     )

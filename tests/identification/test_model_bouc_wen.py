@@ -153,5 +153,5 @@ def test_white_box_on_the_shared_record(benchmark):
 @pytest.mark.usefixtures("optimised")
 def test_black_box_on_the_shared_record(benchmark):
     mean, fresh = benchmark
-    system = fit_neural_state_space(resample(mean), settle=1000)
+    system = fit_neural_state_space(resample(mean), settle=1000, steps=120)
     assert rms(predicted(system, fresh, 1) - fresh.output) < 1.2e-5  # m; bar 2e-5

@@ -57,7 +57,7 @@ def test_a_known_stage_is_found_from_its_own_cells(problem):
     before = geomean(made.log_ratios(made.start))
     assert before > 1.05
     free = range(made.stage)
-    point, least = fit(made, free, starts(made), steps=20)
+    point, least = fit(made, free, starts(made), steps=12)
     found = made.space.named(point)
     assert geomean(made.log_ratios(point)) < 1.005
     assert least == pytest.approx(float(jnp.sum(made.residuals(point) ** 2)))
