@@ -75,7 +75,7 @@ def _stability_alarms(
             f"the margins of the tuned loop are unknown, because {why}: test the gains "
             "with little amplitude first, or switch the limits off in [constraints]"
         )
-    for where, figures in _exact_figures(stability).items():
+    for where, figures in exact_figures(stability).items():
         if figures is None:
             yield f"the tuned loop is unstable for small motions{where}: {_TIGHTEN}"
             continue
@@ -87,10 +87,13 @@ def _stability_alarms(
 _EXACT_FIGURES = ("sensitivity_peak", "delay_margin", "disk_margin")
 
 
-def _exact_figures(
+def exact_figures(
     stability: StabilityReports,
 ) -> dict[str, dict[str, float | None] | None]:
-    """Return the exact figures by branch, None where the loop is unstable."""
+    """Return the exact figures of the tuned loop, None where it is unstable.
+
+    The keys tell the branch on one axis, and are "" on several.
+    """
     found: dict[str, dict[str, float | None] | None] = {}
     for branch, report in stability.reports.get("after", {}).items():
         found[f" on the {branch} branch"] = _figures(report, [report])

@@ -1,5 +1,7 @@
 """Search of a study within its limits, judged by the exact margins."""
 
+import numpy as np
+
 from ..analysis.constraints import uses
 from ..analysis.stability import StabilityReports, stability_reports
 from ..core.arrays import as_array
@@ -9,7 +11,7 @@ from ..solve.multi_start import Strategy, minimise
 from ..solve.search_state import SearchState
 from ..study import Case
 from ..study.references import highest_reference
-from .alarms import EXACT
+from .alarms import EXACT, exact_figures
 from .evaluator import Evaluator
 from .make_result import constraint_outcomes
 from .model_alarms import SLACK, worst_peak
@@ -83,14 +85,21 @@ def exact_stability(case: Case, search: SearchState) -> StabilityReports:
 
 
 def _missed(case: Case, stability: StabilityReports) -> float:
-    """Return the exact Ms if it raises an alarm, else 0."""
-    limit = case.study.limits.get(PEAK)
+    """Return the exact Ms, or that within the error bound, if it raises an alarm.
+
+    Otherwise return 0. Ms of an unstable loop is infinite.
+    """
+    limit, bound = case.study.limits.get(PEAK), case.plant_about.error_bound
     if limit is None or "after" in stability.problems:
         return 0.0
-    nominal, _ = worst_peak(None, stability)
-    worst, _ = worst_peak(case.plant_about.error_bound, stability)
+    figures = exact_figures(stability).values()
+    peaks = [found[PEAK] if found else None for found in figures]
+    nominal = max(np.inf if peak is None else peak for peak in peaks)
+    worst = 0.0
+    if bound is not None and "after" in stability.loops:
+        worst, _ = worst_peak(bound, stability)
     alarming = nominal > limit * (1.0 + EXACT) or worst > limit * (1.0 + SLACK)
-    return worst if alarming else 0.0
+    return max(nominal, worst) if alarming else 0.0
 
 
 def _tightened(

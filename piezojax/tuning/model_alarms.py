@@ -39,23 +39,14 @@ def model_alarms(
         yield from _error_alarm(bound, limit, stability)
 
 
-def worst_peak(
-    bound: ErrorBound | None, stability: StabilityReports
-) -> tuple[float, float]:
-    """Return the largest exact Ms of the tuned loop, and its frequency (Hz).
+def worst_peak(bound: ErrorBound, stability: StabilityReports) -> tuple[float, float]:
+    """Return the largest Ms of the tuned loop within ``bound``, and its frequency (Hz).
 
-    It is that of all plants within ``bound``, infinite if one of them is unstable. The
-    worst |S| under a relative error l of the plant is |S| / (1 - l |T|). ``stability``
-    holds the loop "after".
+    Ms is infinite if a plant within the bound makes the loop unstable. The worst |S|
+    under a relative error l of the plant is |S| / (1 - l |T|). ``stability`` holds the
+    linear loops "after".
     """
-    axes = [stability.axes["after"].report] if "after" in stability.axes else []
     worst, at = 0.0, 0.0
-    for report in [*stability.reports.get("after", {}).values(), *axes]:
-        peak = report.sensitivity_peak if report.stable else np.inf
-        if peak is not None and peak > worst:
-            worst, at = float(peak), report.sensitivity_peak_Hz or 0.0
-    if bound is None or "after" not in stability.loops:
-        return worst, at
     for curves in stability.curves("after", DECADES).values():
         share = bound.at(curves.frequency) * np.abs(curves.T)
         peak = int(np.argmax(share))

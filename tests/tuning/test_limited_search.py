@@ -6,9 +6,30 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from piezojax import Feedback
+from piezojax.analysis.stability import (
+    OperatingPoint,
+    stability_report,
+    stability_reports,
+)
+from piezojax.control import PID
+from piezojax.core.error_bound import ErrorBound
 from piezojax.core.progress import Silent
+from piezojax.dynamics import FirstOrderLag
+from piezojax.hardware import Saturation, Sensor
 from piezojax.solve.search_state import SearchState
 from piezojax.tuning import limited_search
+
+DT = 1e-4
+
+
+def integral_loop(integral):
+    return Feedback(
+        PID(0.0, integral, dt=DT),
+        FirstOrderLag(2e-4, DT),
+        Saturation(-10.0, 10.0),
+        Sensor(0.0),
+    )
 
 
 class Limited:
@@ -62,3 +83,30 @@ def test_it_ends_after_three_searches_that_each_leave_some_room(monkeypatch):
 def test_it_does_nothing_where_nothing_is_missed_or_can_be_done(monkeypatch, changes):
     aims, _ = repeated(monkeypatch, **({"peaks": [3.0]} | changes))
     assert aims == []
+
+
+def missed(loop, bound=None, **limits):
+    """Return the Ms that misses the limit of a study with one ``loop``."""
+    case = SimpleNamespace(
+        study=SimpleNamespace(limits=limits),
+        plant_about=SimpleNamespace(error_bound=bound),
+    )
+    stability = stability_reports({"after": loop}, 1.0, DT)
+    return inspect.unwrap(limited_search._missed)(case, stability)
+
+
+def test_the_exact_peak_is_missed_where_it_raises_an_alarm():
+    loop = integral_loop(4000.0)
+    exact = stability_report(loop, OperatingPoint(1.0, dt=DT)).sensitivity_peak
+    assert missed(loop, sensitivity_peak=0.98 * exact) == pytest.approx(exact)
+    assert missed(loop, sensitivity_peak=exact) == 0.0
+    assert missed(loop) == 0.0
+    assert missed(integral_loop(1e5), sensitivity_peak=2.0) == np.inf
+
+
+def test_the_error_bound_of_the_plant_counts():
+    loop = integral_loop(4000.0)
+    exact = stability_report(loop, OperatingPoint(1.0, dt=DT)).sensitivity_peak
+    bound = ErrorBound(frequency=(1.0, 5e3), relative=(0.3, 0.3), excited=(True, True))
+    found = missed(loop, bound, sensitivity_peak=1.01 * exact)
+    assert found > 1.1 * exact
