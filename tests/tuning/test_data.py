@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stand_ins import fit_of
 
-from piezojax.identification.fit import Fit, FitError, FitReport
 from piezojax.identification.records.record import Record
 from piezojax.solve.clock import Clock
 from piezojax.study import Study, build
@@ -78,27 +78,12 @@ def test_noise_is_of_unit_variance():
 # What a fitted plant leaves unexplained
 
 
-def fit_of(case, record, run):
-    """Return a fit of the first half of ``record`` by a model that gives ``run``."""
-    error = FitError(rmse=1.0, rmse_percent_of_span=1.0, unit="um")
-    report = FitReport(
-        model="none",
-        parameters={},
-        train=error,
-        validation=error,
-        warnings=[],
-        wall_s=0.0,
-    )
-    runs = (run[:, None],)
-    return Fit(case.loop.plant, report, (record,), runs, slice(0, 200), slice(200, 400))
-
-
 def fitted(residual):
     """Return the data of a case fitted to a record of 0, 1, 0, 1, ... um."""
     case = case_of()
     output = np.arange(400.0) % 2.0
     record = Record(output, output, case.study.dt)
-    fit = fit_of(case, record, output - residual)
+    fit = fit_of(case.loop.plant, record, output - residual)
     return make_data(dataclasses.replace(case, fit=fit))
 
 
@@ -121,7 +106,7 @@ def played(residual, reference=REST, moved=SLOW, part="validate"):
     """
     case = case_of()
     record = Record(np.arange(400.0), moved + residual, case.study.dt)
-    fit = fit_of(case, record, moved)
+    fit = fit_of(case.loop.plant, record, moved)
     time_s = case.study.dt * np.arange(float(len(reference)))
     return residual_disturbances(fit, reference, time_s, part)
 

@@ -5,13 +5,13 @@ import re
 
 import numpy as np
 import pytest
+from stand_ins import fit_of
 
 from piezojax import simulate
 from piezojax.core.feedback import loop_inputs
 from piezojax.dynamics import FirstOrderLag, Modes
 from piezojax.dynamics.lags import before_lag, lags_of
 from piezojax.hysteresis import ColemanHodgdon
-from piezojax.identification.fit import Fit, FitError, FitReport
 from piezojax.identification.records.record import Record
 from piezojax.study import Study, build
 from piezojax.tuning.data import make_data
@@ -38,22 +38,9 @@ def case():
 
 def fitted(case, residual):
     """Return ``case`` as if its plant were fitted and left ``residual`` (um)."""
-    error = FitError(rmse=1.0, rmse_percent_of_span=1.0, unit="um")
-    report = FitReport(
-        model="none",
-        parameters={},
-        train=error,
-        validation=error,
-        warnings=[],
-        wall_s=0.0,
-    )
     moved = 10.0 * np.sin(np.arange(800.0) / 20.0)
     record = Record(moved, moved + residual, DT)
-    runs = (moved[:, None],)
-    halves = slice(0, 400), slice(400, 800)
-    return dataclasses.replace(
-        case, fit=Fit(case.loop.plant, report, (record,), runs, *halves)
-    )
+    return dataclasses.replace(case, fit=fit_of(case.loop.plant, record, moved))
 
 
 def test_what_a_lag_turned_into_its_output_is_found_again():
