@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tomli_w
+from stand_ins import fit_of
 
 from piezojax import About, save
 from piezojax.catalog import CONTROLLERS, p753
@@ -17,9 +18,8 @@ from piezojax.control import PID, DisturbanceObserverControl
 from piezojax.core.parameter import declarations
 from piezojax.core.paths import get, parameters
 from piezojax.core.space import Range
-from piezojax.dynamics import (
-    FirstOrderLag,
-)
+from piezojax.dynamics import FirstOrderLag
+from piezojax.hysteresis import ShapedColemanHodgdon
 from piezojax.study import (
     DEFAULT,
     build,
@@ -862,6 +862,52 @@ def test_a_design_that_does_not_fit_the_plant(refusal):
         "controller.design: the plant has a pole of modulus 1; a design needs a plant "
         "that comes to rest, with all poles below 1"
     )
+
+
+@pytest.fixture
+def study_of_a_bent_plant(study, monkeypatch):
+    """Return a study of a plant whose output rises up to 110 V only."""
+    bent = ShapedColemanHodgdon((0.0, 0.0077, -4e-5), (0.3,), -0.0487)
+
+    def written(highest):
+        path = study(
+            {
+                "plant": {"record": "r.csv", "time": "t", "input": "u", "output": "y"},
+                "controller": {"design": "inversion_pid"},
+                "parameters": GONE,
+                "tune": ["controller.feedback.*"],
+            }
+        )
+        rows = [f"{i / 20_000},{i * highest / 99},{i}" for i in range(100)]
+        (path.parent / "r.csv").write_text("\n".join(["t,u,y", *rows]))
+        return path
+
+    monkeypatch.setattr(
+        "piezojax.study.case.identify",
+        lambda record, *_, **__: fit_of(bent, record, record.output),
+    )
+    return written
+
+
+def test_a_design_keeps_to_the_record_where_the_model_falls_beyond(
+    study_of_a_bent_plant,
+):
+    case = read(study_of_a_bent_plant(80.0))
+    inverse = case.loop.controller.inverse
+    assert (float(inverse.lower), float(inverse.upper)) == (0.0, 80.0)
+    assert re.fullmatch(
+        r"controller\.design: no inverse of the hysteresis from -20 to 120 V: .* over "
+        "its record, 0 to 80 V: the voltage stays between these",
+        case.notes[0],
+    )
+
+
+def test_a_design_is_refused_where_the_model_falls_within_the_record(
+    study_of_a_bent_plant,
+):
+    message = r"controller\.design: no inverse of the hysteresis from -20 to 120 V"
+    with pytest.raises(ValueError, match=message):
+        read(study_of_a_bent_plant(120.0))
 
 
 @pytest.mark.parametrize(

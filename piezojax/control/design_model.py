@@ -29,6 +29,10 @@ SMALLEST_PACE = 1e-4
 """Smallest pace that ``DesignModel.fastest_stable`` tries."""
 
 
+class NoInverseError(ValueError):
+    """The hysteresis of a plant has no inverse between the limits of the actuator."""
+
+
 class DesignModel(NamedTuple):
     """A plant as a static part, from V to um, and linear dynamics, from um to um.
 
@@ -51,7 +55,7 @@ class DesignModel(NamedTuple):
     def inverse(self) -> Inverse:
         """Return the inverse of the hysteresis between the limits, or of the gain.
 
-        Raises ValueError with the reason where the hysteresis has none.
+        Raises NoInverseError with the reason where the hysteresis has none.
         """
         if self.hysteresis is None:
             assert isinstance(self.static, Affine)
@@ -60,7 +64,7 @@ class DesignModel(NamedTuple):
             return self.hysteresis.inverse(*self.limits)
         except ValueError as error:
             lower, upper = self.limits
-            raise ValueError(
+            raise NoInverseError(
                 f"no inverse of the hysteresis from {lower:g} to {upper:g} V: {error}"
             ) from None
 

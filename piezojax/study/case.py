@@ -11,6 +11,7 @@ import numpy as np
 
 from ..catalog import CONTROLLERS, PLANTS, at_rate
 from ..control.design import DESIGNS
+from ..control.design_model import NoInverseError
 from ..core.about import About
 from ..core.arrays import as_array
 from ..core.feedback import Feedback, Observation
@@ -35,10 +36,11 @@ class Case:
 
     ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
     names to the plants of a sweep, which replace the plant of the loop. ``notes`` name
-    the starts that differ from the controller of the study. ``plant_about`` is the
-    origin of a plant from a record or a file, with the bound on its error.
-    ``amplifier`` maps the voltage of the actuator to that of the piezo, both in V; it
-    is part of the plant, and None if the study has none.
+    the starts that differ from the controller of the study, and a design that keeps to
+    the voltages of the record. ``plant_about`` is the origin of a plant from a record
+    or a file, with the bound on its error. ``amplifier`` maps the voltage of the
+    actuator to that of the piezo, both in V; it is part of the plant, and None if the
+    study has none.
     """
 
     study: Study
@@ -79,13 +81,14 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     _check_role(plant, zero, "plant", "a voltage to a displacement")
     amplifier = make_amplifier(study)
     plant = driven(amplifier, plant)
+    design_notes: list[str] = []
     controller = _from_source(
         study.controller,
         "controller",
         path.parent,
         CONTROLLERS,
         study.rate,
-        design=lambda name: _designed(study, name, plant),
+        design=lambda name: _designed(study, name, plant, fit, design_notes.append),
     )
     check_origin(_about_file(study.controller, path.parent), study, "controller.file")
     observation = Observation(zero, zero, zero, zero)
@@ -100,7 +103,16 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         for name, plant in _swept_plants(study, zero).items()
     }
     return Case(
-        study, path.stem, loop, space, fit, ensemble, plants, notes, about, amplifier
+        study,
+        path.stem,
+        loop,
+        space,
+        fit,
+        ensemble,
+        plants,
+        (*design_notes, *notes),
+        about,
+        amplifier,
     )
 
 
@@ -154,7 +166,19 @@ def _swept_plants(study: Study, zero: Any) -> dict[str, System]:
     return plants
 
 
-def _designed(study: Study, name: str, plant: System) -> System:
+def _designed(
+    study: Study,
+    name: str,
+    plant: System,
+    fit: Fit | None,
+    note: Callable[[str], None],
+) -> System:
+    """Return the controller of a design.
+
+    A fitted hysteresis that has no inverse between the limits of the actuator may have
+    one over its record, beyond which it extrapolates: then the voltage stays within the
+    record, and ``note`` takes a sentence that says so.
+    """
     design = DESIGNS[one_of(name, DESIGNS)]
     if study.axes is not None:
         raise ValueError(
@@ -164,7 +188,22 @@ def _designed(study: Study, name: str, plant: System) -> System:
     (lower,), (upper,) = (
         study.by_axis(limit) for limit in (study.actuator.lower, study.actuator.upper)
     )
-    return design(plant, study.dt, (lower, upper))
+    try:
+        return design(plant, study.dt, (lower, upper))
+    except NoInverseError as error:
+        if fit is None:
+            raise
+        recorded = fit.record.input
+        inner = max(lower, float(recorded.min())), min(upper, float(recorded.max()))
+        try:
+            controller = design(plant, study.dt, inner)
+        except ValueError:
+            raise error from None
+        note(
+            f"controller.design: {error}. The model has an inverse over its record, "
+            f"{inner[0]:.4g} to {inner[1]:.4g} V: the voltage stays between these"
+        )
+        return controller
 
 
 def _check_role(system: System, example: Any, where: str, role: str) -> None:
