@@ -1,10 +1,11 @@
 import gc
 import os
-import tempfile
+from pathlib import Path
 
 import jax
 import pytest
 from hypothesis import settings
+from jaxtyping import install_import_hook
 
 # The same examples in every run: a red run can be repeated, a green one is no luck.
 settings.register_profile("repeatable", derandomize=True, deadline=None)
@@ -32,22 +33,26 @@ def optimised():
 gc.set_threshold(100_000, 20, 20)
 
 
+# There is a worker for each core: a compiler of several threads gains nothing.
 ONE_THREAD = "--xla_cpu_parallel_codegen_split_count=1"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD}".strip()
 
 
-def pytest_configure(config):
-    """Let all workers and commands of a run share what they compile, each on a core.
+def modules_with_arrays():
+    """Return the modules that import types of arrays, but for conversions to them.
 
-    Most of the time goes into compiling, and many files compile the same loops.
+    Those are called so often that to check them takes a tenth of all time.
     """
-    if hasattr(config, "workerinput") or "PIEZOJAX_COMPILATION_CACHE" in os.environ:
-        return
-    folder = tempfile.TemporaryDirectory(prefix="piezojax-programs-")
-    os.environ["PIEZOJAX_COMPILATION_CACHE"] = folder.name
-    config.add_cleanup(folder.cleanup)
-    # There is a worker for each core: a compiler of several threads gains nothing.
-    flags = [os.environ.get("XLA_FLAGS", ""), ONE_THREAD]
-    os.environ["XLA_FLAGS"] = " ".join(flags).strip()
+    package = Path(__file__).parents[1] / "piezojax"
+    for path in package.rglob("*.py"):
+        name = ".".join(path.relative_to(package.parent).with_suffix("").parts)
+        imports = "from jaxtyping import" in path.read_text(encoding="utf-8")
+        if imports and name != "piezojax.core.arrays":
+            yield name
+
+
+# Shapes and types of their annotated functions are checked while the tests run.
+install_import_hook([*modules_with_arrays()], "beartype.beartype")
 
 
 def pytest_collection_modifyitems(items):
@@ -64,12 +69,5 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_sessionfinish():
-    """Look for leaks once: pytest would five times, in gigabytes of traced programs."""
-    gc.collect()
+    """Keep pytest from its last search for garbage in gigabytes of traced programs."""
     gc.freeze()
-
-
-@pytest.fixture(scope="session", autouse=True)
-def kept_programs():
-    """Small compiled programs are shared too: a loop made again costs its tracing."""
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -344,6 +344,8 @@ def main():
                 console.print(f"    {key[:-1]}: {text}", soft_wrap=True)
         if chosen.json:
             chosen.json.write_text(json.dumps(lines, indent=1), encoding="utf-8")
+        # The programs of twenty stages are more than a process may map into memory.
+        jax.clear_caches()
     console.print(table_of(lines))
     for sentence in (poor_summary if chosen.poor else summary)(lines):
         console.print(sentence, soft_wrap=True)

@@ -40,7 +40,7 @@ def tree(folder: Path) -> Path:
     return copy
 
 
-def outcome(copy: Path, mutation: Mutation, cache: str) -> tuple[str, float]:
+def outcome(copy: Path, mutation: Mutation) -> tuple[str, float]:
     """Return "caught", "survived" or why it was not tried, and the seconds it took."""
     place = copy / "piezojax" / mutation.file
     if not place.is_file():
@@ -57,11 +57,7 @@ def outcome(copy: Path, mutation: Mutation, cache: str) -> tuple[str, float]:
                 *("-p", "no:cacheprovider", *mutation.tests),
             ],
             cwd=copy,
-            env={
-                **os.environ,
-                "PYTHONPATH": str(copy),
-                "PIEZOJAX_COMPILATION_CACHE": cache,
-            },
+            env=os.environ | {"PYTHONPATH": str(copy)},
             capture_output=True,
             text=True,
             check=False,
@@ -93,9 +89,8 @@ def main() -> int:
     rows = []
     with tempfile.TemporaryDirectory(prefix="piezojax-mutations-") as folder:
         copy = tree(Path(folder))
-        cache = os.environ.get("PIEZOJAX_COMPILATION_CACHE", f"{folder}/programs")
         for mutation in chosen:
-            found, seconds = outcome(copy, mutation, cache)
+            found, seconds = outcome(copy, mutation)
             print(f"{found:9s} {seconds:6.1f} s  {mutation.file}: {mutation.name}")
             sys.stdout.flush()
             rows.append(

@@ -25,6 +25,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+import jaxtyping
 import pytest
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
@@ -99,13 +100,14 @@ def drawn(source: str, count: int, seed: int) -> list[Mutant]:
     return sorted((chance.choice(found[p]) for p in places), key=lambda m: m.line)
 
 
-def tested(copy: Path, tests: tuple[str, ...], cache: str, caught) -> None:
+def tested(copy: Path, tests: tuple[str, ...], caught) -> None:
     """Run the tests of a copy of the tree; set ``caught`` to pytest's exit status."""
     os.chdir(copy)
     sys.path[:0] = [str(copy), str(copy / "tests")]
-    os.environ |= {"PIEZOJAX_COMPILATION_CACHE": cache, "PYTHONPATH": str(copy)}
+    os.environ["PYTHONPATH"] = str(copy)
     sys.dont_write_bytecode = True
-    # Without the checks of annotations, which would catch mutants for the tests.
+    # Checks of annotations would catch mutants for the tests.
+    jaxtyping.config.update("jaxtyping_disable", True)
     options = ["-q", "-x", "-o", "addopts=", "-p", "no:cacheprovider"]
     # Plugins are among the modules that were imported before.
     options += ["-W", "ignore:Module already imported:pytest.PytestWarning"]
@@ -113,10 +115,10 @@ def tested(copy: Path, tests: tuple[str, ...], cache: str, caught) -> None:
         caught.value = int(pytest.main([*options, *tests]))
 
 
-def outcome(context, copy, tests, cache, limit) -> tuple[str, float]:
+def outcome(context, copy, tests, limit) -> tuple[str, float]:
     """Return "caught", "survived" or "late", and the seconds it took."""
     status, begun = context.Value("i", -1), time.perf_counter()
-    process = context.Process(target=tested, args=(copy, tests, cache, status))
+    process = context.Process(target=tested, args=(copy, tests, status))
     process.start()
     process.join(limit)
     late = process.is_alive()
@@ -137,11 +139,11 @@ def difference(source: str, mutated: str) -> str:
     return "\n".join(f"    {line}" for line in list(lines)[2:])
 
 
-def tried(context, copy, file, chosen, cache) -> dict:
+def tried(context, copy, file, chosen) -> dict:
     """Try the mutants ``chosen`` of a module; print and return what became of them."""
     place, tests = copy / "piezojax" / file, MODULES[file]
     source, rows = place.read_text(encoding="utf-8"), []
-    found, seconds = outcome(context, copy, tests, cache, None)
+    found, seconds = outcome(context, copy, tests, None)
     if found != "survived":
         raise SystemExit(f"{file}: its tests fail without a mutation")
     limit = 30.0 + PATIENCE * seconds
@@ -150,7 +152,7 @@ def tried(context, copy, file, chosen, cache) -> dict:
         mutated = mutate_code(source, operator, mutant.occurrence)
         place.write_text(mutated, encoding="utf-8")
         try:
-            found, seconds = outcome(context, copy, tests, cache, limit)
+            found, seconds = outcome(context, copy, tests, limit)
         finally:
             place.write_text(source, encoding="utf-8")
         change = difference(source, mutated)
@@ -179,11 +181,10 @@ def main() -> int:
     parts = []
     with tempfile.TemporaryDirectory(prefix="piezojax-mutants-") as folder:
         copy = tree(Path(folder))
-        cache = os.environ.get("PIEZOJAX_COMPILATION_CACHE", f"{folder}/programs")
         for file in options.modules:
             source = (ROOT / "piezojax" / file).read_text(encoding="utf-8")
             chosen = drawn(source, options.count, options.seed)
-            parts.append(tried(context, copy, file, chosen, cache))
+            parts.append(tried(context, copy, file, chosen))
             if options.json:
                 options.json.write_text(json.dumps(parts, indent=1) + "\n")
     caught, of = (sum(part[key] for part in parts) for key in ("caught", "of"))

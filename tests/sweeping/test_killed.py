@@ -22,10 +22,9 @@ def bits(dataset):
     return {name: dataset[name].values.tobytes() for name in ("rms_error", "saturated")}
 
 
-def start(path, out, tmp_path):
+def start(path, out):
     return subprocess.Popen(
-        [sys.executable, "-m", "piezojax.sweep", path, "--out", out, "--quiet"],
-        env=os.environ | {"PIEZOJAX_COMPILATION_CACHE": str(tmp_path / "programs")},
+        [sys.executable, "-m", "piezojax.sweep", path, "--out", out, "--quiet"]
     )
 
 
@@ -40,7 +39,7 @@ def test_a_sweep_killed_again_and_again_loses_nothing(write, tmp_path):
     assert whole is not None
     draw, before = random.Random(1), 0
     for _ in range(2):
-        process = start(path, out, tmp_path)
+        process = start(path, out)
         # Killed while it simulates and writes, after a few new chunks.
         wanted = before + draw.randint(1, 12)
         while chunks(out) < wanted and process.poll() is None:
@@ -51,18 +50,14 @@ def test_a_sweep_killed_again_and_again_loses_nothing(write, tmp_path):
         before = chunks(out)
         assert wanted <= before < 63
         assert not (out / "sweep.nc").exists()
-    assert start(path, out, tmp_path).wait() == 0
+    assert start(path, out).wait() == 0
     with xr.open_dataset(out / "sweep.nc", engine="h5netcdf") as found:
         assert found.identical(whole)
         assert bits(found) == bits(whole)
 
 
 @pytest.mark.slow
-def test_workers_of_a_cluster_give_the_same_and_may_be_killed(
-    write, tmp_path, monkeypatch
-):
-    # Each worker compiles for itself; the one that replaces the killed one, too.
-    monkeypatch.setenv("PIEZOJAX_COMPILATION_CACHE", str(tmp_path / "programs"))
+def test_workers_of_a_cluster_give_the_same_and_may_be_killed(write, tmp_path):
     path = write(MANY | {"samples": 700})
     whole = pj.sweep(path)
     assert whole is not None
