@@ -14,9 +14,9 @@ HYSTERESES = (
     "asymmetric_prandtl_ishlinskii",
     "normalised_bouc_wen",
 )
-"""Hysteresis models to choose from, that with the fewest parameters first. They stand
-for the classes of loops: of an anhysteretic curve, of a memory that wipes out, and of a
-memory that decays along the input."""
+"""Hysteresis models to choose from, that with the fewest parameters first. They
+represent three classes of loops: around an anhysteretic curve, with a memory that is
+wiped out, and with a memory that decays along the input."""
 
 CREEP = "exponential_creep"
 """Creep of the default model."""

@@ -171,9 +171,9 @@ def first_round(
 def later_rounds(
     records: Sequence[Record], train: slice
 ) -> list[Callable[[Sequence[str]], list[Candidate]]]:
-    """Return functions from the best chains so far to the candidates of a next round.
+    """Return a function for each later round, from the best chains to its candidates.
 
-    The first round replaces the creep, the second takes simpler dynamics.
+    The first of these rounds replaces the creep, the second takes simpler dynamics.
     """
     if _not_single_channel(records):
         return []

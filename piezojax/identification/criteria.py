@@ -1,11 +1,11 @@
 """Model selection: AIC and BIC, equivalent models, and the ranking of fits.
 
-The errors of a free run are strongly autocorrelated: n samples are fewer than n
-independent observations. With n samples counted, any parameter that lowers the error a
-little would lower the criteria. The criteria therefore count an effective number of
-samples, as AIC does with a variance inflation factor (Lebreton et al. 1992, Ecol.
-Monogr. 62(1); Burnham and Anderson 2002, Model Selection, 2.5). All models share the
-number of the best fit.
+The errors of a free run are strongly autocorrelated: n samples hold less
+information than n independent observations. If the criteria counted all n, any
+parameter that lowers the error a little would lower them. They therefore count an
+effective number of samples, as AIC does with a variance inflation factor (Lebreton et
+al. 1992, Ecol. Monogr. 62(1); Burnham and Anderson 2002, Model Selection, 2.5). The
+effective number of the best fit applies to all models.
 """
 
 from collections.abc import Sequence

@@ -71,7 +71,7 @@ def _by_output_error(
 
 def _optimum_warnings(optimum: Optimum, shape: Structure, steps: int) -> list[str]:
     found = []
-    # Their narrow bounds stand for what the record shows of them.
+    # Their narrow bounds come from the record: a value at a bound needs no warning.
     shown = shape.dynamics if shape.whitening else ()
     if not optimum.finished:
         found.append(f"the fit had not converged after its {steps} steps")

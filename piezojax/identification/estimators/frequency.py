@@ -16,7 +16,8 @@ EXCITED = 1e-4
 """Least input power of an excited line, as a share of the strongest line."""
 
 INDEPENDENT = 1e-6
-"""Least eigenvalue ratio of the input power matrix of a line that can be solved."""
+"""Least ratio of the smallest to the largest eigenvalue of the input power matrix of a
+line, below which the inputs count as dependent."""
 
 
 CONFIDENCE = 1.96
@@ -78,7 +79,8 @@ def empirical_response(
     _check_independent(power, frequency)
     inverse = np.linalg.inv(power)
     response = np.sum(weight * _outer(outputs, inputs), axis=0) @ inverse
-    # Row i of the response has the covariance inverse (sum w^2 s_i^2 U U^H) inverse.
+    # Row i of the response has the covariance P^-1 (sum w^2 s_i^2 U U^H) P^-1, with
+    # P the power.
     spread = np.einsum("rli,rlab->liab", noise, weight**2 * _outer(inputs, inputs))
     covariance = inverse[:, None] @ spread @ inverse[:, None]
     variance = np.real(np.diagonal(covariance, axis1=2, axis2=3))

@@ -121,7 +121,7 @@ def by_frequency_response(
 def _without_feedthrough(
     model: StateSpace, measured: EmpiricalResponse, left: float
 ) -> StateSpace:
-    """Set D to zero unless it adds more than the mean square ``left`` by the fit.
+    """Set D to zero unless its mean-square output exceeds ``left``, the fit's error.
 
     A loop needs a held input to reach the sampled output one sample later.
     """

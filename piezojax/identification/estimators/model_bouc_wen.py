@@ -23,9 +23,9 @@ def bouc_wen(record: Record) -> Structure:
     """Return a mass on a spring, a damper and a Bouc-Wen element, driven by a force.
 
     The starts divide the stiffness of the best linear oscillator between the spring and
-    the element. The element's loop bends over the displacements in the record in one of
-    two shapes. Raises ValueError if the best linear oscillator does not have a positive
-    mass and stiffness.
+    the element. The element's loop bends within the displacements of the record, in one
+    of two shapes. Raises ValueError if the best linear oscillator does not have a
+    positive mass and stiffness.
     """
     mass, damping, stiffness = linear_oscillator(record)
     # The bend makes the loop turn over at the typical force and displacement.

@@ -144,10 +144,10 @@ def preisach_with_lag(record: Record, train: slice, model: str) -> PreisachFit:
     seen = record.until(train.stop)
     problem = _Problem(seen, _delayed_input(seen), train, cells)
     unknowns = _unknowns(problem.shifted, model)
-    ends = {start: problem.end(unknowns, start) for start in STARTS}
-    start = min(STARTS, key=lambda start: ends[start].cost)
-    logs, warnings = ends[start].x, _at_edges(unknowns, ends[start].x)
-    if not ends[start].status:
+    optima = {start: problem.optimum(unknowns, start) for start in STARTS}
+    start = min(STARTS, key=lambda start: optima[start].cost)
+    logs, warnings = optima[start].x, _at_edges(unknowns, optima[start].x)
+    if not optima[start].status:
         warnings.append(f"lag and rate had not converged after {STEPS} steps")
     chain = problem.fitted(logs, start)
     searched = {u.name: float(v) for u, v in zip(unknowns, np.exp(logs), strict=True)}
@@ -198,8 +198,8 @@ class _Problem(NamedTuple):
         moved = [self.reduced(logs + s, start) for s in STEP * np.eye(logs.size)]
         return (np.column_stack(moved) - here[:, None]) / STEP
 
-    def end(self, unknowns: list[SearchParameter], start: str) -> OptimizeResult:
-        """Return the result of the search with one of the histories."""
+    def optimum(self, unknowns: list[SearchParameter], start: str) -> OptimizeResult:
+        """Return the optimum of the search with the history ``start``."""
 
         def loss(logs: np.ndarray) -> float:
             return float(np.sum(self.reduced(logs, start) ** 2))

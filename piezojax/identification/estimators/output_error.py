@@ -250,7 +250,7 @@ def _balanced(problem: Problem, unknown: Array) -> Problem:
 
 
 def _starts_for_records(structure: Structure, problem: Problem) -> np.ndarray:
-    """Return the starts, with the own parameters repeated for every record."""
+    """Return the starts, with the parameters in ``own`` repeated for every record."""
     unknowns = int(np.max(problem.which)) + 1
     starts = np.empty((len(structure.starts), unknowns))
     for row in np.asarray(problem.which):
@@ -268,7 +268,7 @@ def _normal_equations(
 
 @eqx.filter_jit
 def _sensitivity(problem: Problem, unit: Array) -> tuple[Array, Array, Array]:
-    """Return the unknowns' values, their slopes, the residuals' weighted Jacobian."""
+    """Return the unknowns' values and slopes, and the residuals' weighted Jacobian."""
     jacobian = jax.jacfwd(lambda unknown: problem.residuals(unknown))(unit)
     slopes = jax.jacfwd(lambda u: _values(problem, u))(unit).diagonal()
     return _values(problem, unit), slopes, jacobian

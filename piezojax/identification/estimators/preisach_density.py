@@ -18,7 +18,7 @@ from ...hysteresis.rate_dependent_preisach import fast_share
 from ..records.record import Record
 
 LEAST_SLOPE = 0.01
-"""Least slope after a turn over the mean slope of the record: see fit_preisach."""
+"""Least slope after a turn, as a share of the record's mean slope: see fit_preisach."""
 
 
 def fit_preisach(
@@ -160,7 +160,7 @@ def line_by_line(cells: int) -> list[tuple[int, int]]:
 
 
 class _Memory(System):
-    """The levels of a Preisach model as its output."""
+    """Memory of a Preisach model; its output is the levels."""
 
     lines: PlayLines
 
@@ -186,7 +186,8 @@ def responses(
 ) -> np.ndarray:
     """Return the output over ``part`` of 1 um in each cell, one column per cell.
 
-    Cells ``line_by_line``, first those of the slow density, then of a fast one.
+    The cells are ordered as in ``line_by_line``; those of a fast density follow those
+    of the slow one.
     """
     slow = _slow(shape)
     levels = np.asarray(_levels(slow, jnp.asarray(input)))

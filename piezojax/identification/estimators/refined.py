@@ -18,14 +18,14 @@ NOISE_ORDER = 20
 """Number of coefficients of the autoregressive model of the errors."""
 
 SETTLE = 50
-"""Number of samples that are left out at the begin, where filters settle."""
+"""Number of samples that are left out at the beginning, where filters settle."""
 
 INSIDE = 0.9999
 """Largest modulus of a pole; others are reflected into the unit circle."""
 
 
 class TransferFunction(NamedTuple):
-    """``A(q) y(k) = B(q) x(k - delay)`` with errors that ``noise`` turns into white.
+    """``A(q) y(k) = B(q) x(k - delay)`` with errors that the filter ``noise`` whitens.
 
     ``numerator`` B and ``denominator`` A (its first coefficient is 1) hold the
     coefficients of q^0, q^-1, ...; ``delay`` in samples; ``noise`` is the
@@ -43,7 +43,7 @@ class TransferFunction(NamedTuple):
         return _filtered(self.delayed_numerator(), self.denominator, signal)
 
     def whitened(self, signal: np.ndarray) -> np.ndarray:
-        """Return ``signal`` behind the filter of the errors, without its begin."""
+        """Return ``signal`` behind the filter of the errors, without its beginning."""
         return _filtered(self.noise, [1.0], signal)[SETTLE:]
 
     def delayed_numerator(self) -> np.ndarray:
@@ -73,10 +73,10 @@ def refined_instrumental_variables(
     """Fit a transfer function from ``x`` to ``y`` [samples], both of zero mean.
 
     All signals are filtered by the inverse of the denominator and by the noise model of
-    the last fit, and the instruments are its outputs. At convergence the estimate is
-    that of least variance under the errors' own spectrum, and sensor noise leaves it
-    unbiased. It starts from least squares, or from ``start`` of the same order. The
-    best of all iterations is returned.
+    the last fit. The instruments are the outputs of that fit. At convergence the
+    estimate is that of least variance under the errors' own spectrum, and sensor noise
+    leaves it unbiased. It starts from least squares, or from ``start`` of the same
+    order. The best of all iterations is returned.
 
     Raises ValueError if the signals do not determine the coefficients.
     """

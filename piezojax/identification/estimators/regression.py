@@ -166,7 +166,10 @@ class _Problem:
         )
 
     def equation_errors(self, c: float, theta: np.ndarray) -> HystereticARMA:
-        """Return errors by s^2 (W'W)^-1 at fixed c, to first order for the offset."""
+        """Return standard errors from s^2 (W'W)^-1 at fixed c.
+
+        That of the offset holds to first order.
+        """
         matrix = rows(self.record, c, self.structure, self.record.output)[self.part]
         error = matrix @ theta - self.record.output[self.part]
         covariance = _covariance(matrix, error)
@@ -177,7 +180,7 @@ class _Problem:
         return _refilled(model(theta), [np.nan, *deviations[1:]])
 
     def output_errors(self, c: float, theta: np.ndarray) -> HystereticARMA:
-        """Return errors from s^2 (J'J)^-1 with the Jacobian J of the free run."""
+        """Return standard errors from s^2 (J'J)^-1, J the Jacobian of the free run."""
         model = self.structure.model(c, theta)
         jacobian = np.asarray(_slopes(model, self.input))
         covariance = _covariance(jacobian[self.part], self.error(c, theta))
@@ -222,7 +225,7 @@ def _solve(
 ) -> np.ndarray:
     """Return theta with ``instruments' (matrix theta - target) = 0``.
 
-    An orthonormal base of the instruments and scaled columns keep the condition number
+    An orthonormal basis of the instruments and scaled columns keep the condition number
     at that of the rows, not its square.
     """
     scale = np.linalg.norm(matrix, axis=0)

@@ -46,7 +46,7 @@ NEGLIGIBLE = 1e-6
 """White error, as a share of the output, below which no mode is looked for."""
 
 LAG_DROP = 0.995
-"""Factor by which a lag or a sample of delay must lower it."""
+"""Factor by which a lag or a sample of delay must lower the white error."""
 
 DIPOLE = 1.0
 """Distance of a zero, as a share of a pole's distance from 1, that cancels a lag."""
@@ -173,9 +173,9 @@ class _Hammerstein(NamedTuple):
     def _static_gains(self) -> dict[complex, float]:
         """Return the static gain of each pair of complex poles, by its upper pole.
 
-        A mode with poles p in the s plane and lags behind it have the residue ``gain
-        w^2 / ((p - conj(p)) p) / prod (1 - p / r)`` at p in their step response, r the
-        poles of the lags; the discrete transfer function over z - 1 has the same one.
+        The step response of a mode (poles p and conj(p) in the s plane) in series with
+        lags (poles r) has at p the residue ``gain w^2 / ((p - conj(p)) p)`` divided by
+        ``prod (1 - p / r)``. So has the discrete transfer function over z - 1.
         """
         poles, slow = self.dynamics.poles(), self._real_rates()
         upper = poles[np.imag(poles) > 1e-9]
@@ -188,7 +188,7 @@ class _Hammerstein(NamedTuple):
             found[complex(pole)] = residue / own * np.prod(1.0 - rate / slow)
         if not found:
             return {}
-        # The strongest mode tells the delay of all; it has the sign of the slope.
+        # All modes share the delay of the strongest, whose gain has the slope's sign.
         strongest = max(found, key=lambda pole: abs(found[pole]))
         sign = np.sign(self.slope()) or 1.0
         delay = -np.angle(sign * found[strongest]) / np.angle(strongest)
@@ -238,7 +238,10 @@ class _Hammerstein(NamedTuple):
     def extra_delay(
         self, modes: tuple[Resonance, ...], lags: tuple[float, ...], dt: float
     ) -> float:
-        """Return the delay (s) that modes and lags, each held, leave in the phase."""
+        """Return the delay (s) that explains the phase beyond that of modes and lags.
+
+        The response of modes and lags is that to a held input.
+        """
         highest = max([0.2, *(1.2 * mode.frequency * dt for mode in modes)])
         cycles = np.linspace(3.0 * SLOWEST, min(highest, HIGHEST), 400)
         turn = np.exp(-2j * np.pi * cycles)

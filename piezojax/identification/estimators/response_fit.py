@@ -81,9 +81,14 @@ def refined(
 
 
 class _Data(NamedTuple):
+    """Measured response, weighted by ``root``, the Cholesky factor of twice the power.
+
+    The squares of ``target``, response @ root, sum to the outputs' mean square.
+    """
+
     z: Complex[Array, " lines"]
-    root: Complex[Array, "lines m m"]  # of twice the power
-    target: Complex[Array, "lines p m"]  # response @ root: squares sum to outputs'
+    root: Complex[Array, "lines m m"]
+    target: Complex[Array, "lines p m"]
 
 
 def _data(measured: EmpiricalResponse) -> _Data:
@@ -183,7 +188,7 @@ def _single(parts: Array, sign: Array, outputs: int) -> tuple[Array, Array, Arra
 
 
 def _weighted(pole: Array, left: Array, right: Array, data: _Data) -> Array:
-    """Return the contribution of one pole to the response, times root."""
+    """Return the contribution of one pole to the response, times ``root``."""
     right = right @ data.root
     return left[:, None] * (right / (data.z - pole)[:, None])[:, None, :]
 

@@ -119,7 +119,7 @@ def _tdms(file: BinaryIO) -> Columns:
     from nptdms import TdmsFile
     from nptdms.log import log_manager
 
-    # It logs what it makes of a broken file, pages of bytes included.
+    # The library logs the content of a broken file, pages of bytes included.
     log_manager.set_level(logging.CRITICAL)
     content = TdmsFile.read(file)
     if content.file_status.incomplete_final_segment:

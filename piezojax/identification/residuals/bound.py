@@ -38,7 +38,8 @@ AVERAGES = 8
 
 
 ABSORBED = 0.05
-"""Smooth error that the fitted parameters of a model may hide in a band."""
+"""Least error at an excited line that limits a missing mode: the fitted parameters may
+absorb as much of its smooth error."""
 
 WIDTH = 0.01
 """Relative width of the bands of a bound: half the width of a peak of 1 % damping."""
@@ -65,7 +66,7 @@ class RelativeError(NamedTuple):
 
     @property
     def sure(self) -> np.ndarray:
-        """Whether an error is there [lines], with a certainty for all lines at once."""
+        """Whether the error [lines] is above 0, with certainty at all lines at once."""
         return self.error > 2.0 * self.margin
 
     @property
@@ -146,10 +147,10 @@ def error_bound(
 def _completed(found: RelativeError, record: Record) -> ErrorBound:
     """Return the bound on all lines up to the Nyquist frequency.
 
-    A mode that the model lacks, of frequency f and of the share k of the static gain,
-    has the relative error ``k / (1 - (f_i / f)^2) - k`` at an excited line f_i off its
-    resonance. The bounds at all excited lines limit k, which is 1 at most. At
-    its resonance a lightly damped mode has the error ``UNSEEN k``. No mode is assumed
+    A mode that the model lacks, of frequency f and with the share k of the static gain,
+    causes the relative error ``k / (1 - (f_i / f)^2) - k`` at an excited line f_i off
+    its resonance. The bounds at all excited lines limit k, which is 1 at most. At its
+    resonance a lightly damped mode causes the error ``UNSEEN k``. No mode is assumed
     below the lowest excited line. A weakly excited line limits the bound too.
     """
     kept = (found.margin < CERTAIN) | found.sure

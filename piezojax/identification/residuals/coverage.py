@@ -34,10 +34,10 @@ class Coverage(BaseModel):
 
 
 class Unseen(BaseModel):
-    """Frequencies (Hz) and inputs that validation holds and training does not.
+    """Frequencies (Hz) and inputs of the validation part that training does not cover.
 
-    ``band_Hz`` goes from the lowest to the highest new line. Both are None if there are
-    none.
+    ``band_Hz`` goes from the lowest to the highest new line, ``input_range`` is that of
+    the validation part. Each is None if training covers it.
     """
 
     band_Hz: tuple[float, float] | None  # noqa: N815
@@ -59,7 +59,7 @@ def coverage_of(records: Sequence[Record], bound: ErrorBound | None) -> Coverage
 
 
 def unseen_in(input: np.ndarray, dt: float, train: slice, validate: slice) -> Unseen:
-    """Return what ``input`` [samples] holds in ``validate`` and not in ``train``."""
+    """Return the frequencies and inputs in ``validate`` that ``train`` lacks."""
     import scipy.signal  # takes long to import
 
     parts = [input[train], input[validate]]

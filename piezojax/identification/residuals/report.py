@@ -26,9 +26,10 @@ class ResidualReport(BaseModel):
     ``whiteness`` holds the autocorrelation of each output's residual,
     ``input_correlation`` its correlation with each input (outputs vary slowest).
     ``peaks`` are resonances that the model lacks. ``coverage`` is the band and range of
-    the whole records, ``unseen`` what the training part lacks of them. ``error_bound``
-    bounds the relative error of the model over frequency; it is None, and ``peaks`` is
-    empty, for records of several inputs or outputs, and for records that are too short.
+    the whole records, ``unseen`` the part of validation that training does not cover.
+    ``error_bound`` bounds the relative error of the model over frequency; it is None,
+    and ``peaks`` is empty, for records of several inputs or outputs, and for records
+    that are too short.
     """
 
     whiteness: list[Correlation]
