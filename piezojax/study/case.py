@@ -35,12 +35,12 @@ class Case:
     """A study with its loop and its search space.
 
     ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
-    names to the plants of a sweep, which replace the plant of the loop. ``notes`` name
-    the starts that differ from the controller of the study, and a design that keeps to
-    the voltages of the record. ``plant_about`` is the origin of a plant from a record
-    or a file, with the bound on its error. ``amplifier`` maps the voltage of the
-    actuator to that of the piezo, both in V; it is part of the plant, and None if the
-    study has none.
+    names to the plants of a sweep, which replace the plant of the loop. ``notes`` are
+    sentences: on starts that differ from the controller of the study, and on a design
+    whose voltage stays within the record. ``plant_about`` is the origin of a plant from
+    a record or a file, with the bound on its error. ``amplifier`` maps the voltage of
+    the actuator to that of the piezo, both in V; it is part of the plant, and None if
+    the study has none.
     """
 
     study: Study

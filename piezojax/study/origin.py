@@ -41,7 +41,7 @@ def in_study_units(record: Record) -> Record:
 def check_origin(about: About, study: Study, where: str) -> None:
     """Raise ValueError unless the file at the key ``where`` fits ``study``.
 
-    Units and a sampling rate that ``about`` does not tell are not checked.
+    Units and a sampling rate that ``about`` does not state are not checked.
     """
     for channel, wanted in _channels(study).items():
         unit = about.units.get(channel, wanted)

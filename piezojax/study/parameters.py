@@ -80,9 +80,10 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
 
 
 def _reaching(bounds: Range, start: float) -> Range:
-    """Return ``bounds``, a decade beyond ``start`` if it lies outside on a log scale.
+    """Return ``bounds``, extended to a decade beyond a ``start`` outside them.
 
-    Declared ranges are those of usual controllers; a design may start elsewhere.
+    Only bounds on a logarithmic scale are extended. Declared ranges are
+    those of usual controllers; a design may start elsewhere.
     """
     if bounds.scale != "log" or start <= 0.0:
         return bounds

@@ -33,7 +33,7 @@ def highest_reference(study: Study) -> float | tuple[float, ...]:
 
     It is the operating point of the margins of a study.
     """
-    # A caller may be traced; the references are known all the same.
+    # JAX may be tracing the caller; the references are constants all the same.
     with jax.ensure_compile_time_eval():
         peaks = np.max(np.asarray(reference_signals(study)), axis=(0, 1))
     return tuple(peaks.tolist()) if study.axes else float(peaks)
