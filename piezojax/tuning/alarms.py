@@ -11,7 +11,8 @@ from .objective import RAILED
 from .result import ConstraintOutcome, Perturbed, Result, Scores
 
 EXACT = 1e-2
-"""Relative error of the margins of the search, by which exact ones may miss a limit."""
+"""Relative error of the margins in the search; exact margins may miss a limit by as
+much."""
 
 HELD_OUT = 0.05
 """Relative excess over a limit in the hold-out that does not count, because its noise
@@ -92,7 +93,7 @@ def exact_figures(
 ) -> dict[str, dict[str, float | None] | None]:
     """Return the exact figures of the tuned loop, None where it is unstable.
 
-    The keys tell the branch on one axis, and are "" on several.
+    On one axis the keys name the branch; on several the only key is "".
     """
     found: dict[str, dict[str, float | None] | None] = {}
     for branch, report in stability.reports.get("after", {}).items():

@@ -22,8 +22,8 @@ class Evaluator:
     """Simulator of loops on signals, compiled once per shape of signals.
 
     ``start`` is the first sample that counts, ``limits`` are those of the study,
-    ``model_error`` [lines] bounds the relative error of the plant if its record tells
-    one; ``clock`` measures the compile time.
+    ``model_error`` [lines] bounds the relative error of the plant if its record gives
+    a bound; ``clock`` measures the compile time.
     """
 
     def __init__(self, clock: Clock, case: Case):

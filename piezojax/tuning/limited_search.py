@@ -21,8 +21,8 @@ from .search import search_box
 PEAK = "sensitivity_peak"
 
 REPEATS, LEAST_SHARE = 3, 0.3
-"""Most searches with a tighter limit on Ms, and the least share of the room above 1
-that one of them leaves of the limit before."""
+"""Largest number of searches with a tighter limit on Ms, and the least factor by which
+one of them shrinks the distance of the limit from 1."""
 
 Found = tuple[Objective, SearchState, Strategy | None, StabilityReports]
 
@@ -109,10 +109,10 @@ def _tightened(
     strategy: Strategy | None,
     progress: Progress,
 ) -> tuple[SearchState, Strategy | None, StabilityReports]:
-    """Search again below the limit of Ms while the exact one is above it.
+    """Search again with a tighter limit on Ms while the exact Ms exceeds the limit.
 
-    The search sees Ms on lines of an impulse response, between which a light mode of
-    the closed loop hides.
+    The search computes S on the lines of an impulse response. Between two lines it
+    may miss the peak of a lightly damped mode of the closed loop.
     """
     limits = case.study.limits
     try:

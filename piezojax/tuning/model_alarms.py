@@ -1,4 +1,4 @@
-"""Alarms of the model of a plant: what its record does not support."""
+"""Alarms of the model of a plant, from its fit and from the bound on its error."""
 
 from collections.abc import Iterator
 
@@ -12,8 +12,8 @@ DECADES = 5.0
 """Decades below the Nyquist frequency in which the model error is compared."""
 
 SLACK = 0.05
-"""Relative excess over the limit of Ms that does not count: the search sees a light
-mode at lines of its own distance, this check at more."""
+"""Relative excess over the limit of Ms that does not count: this check samples a
+lightly damped mode at more lines than the search does."""
 
 
 def model_alarms(

@@ -179,7 +179,7 @@ def _log(loop: Feedback, reference: Any, noise: Any, disturbance: Any) -> LoopSa
 
 @jax.jit
 def _at_piezo(amplifier: System | None, voltage: Any) -> Any:
-    """Return the voltage behind ``amplifier``, which rests at the first sample."""
+    """Return the voltage behind ``amplifier``, which starts at rest."""
     if amplifier is None:
         return voltage
     first = jax.tree.map(lambda u: u[0], voltage)

@@ -237,7 +237,7 @@ class Result(BaseModel):
 
     @property
     def heading(self) -> str:
-        """Title of tables and pictures, which tells of any alarm."""
+        """Title of tables and pictures, which mentions any alarm."""
         if not self.alarms:
             return self.title
         count = "an alarm" if len(self.alarms) == 1 else f"{len(self.alarms)} alarms"

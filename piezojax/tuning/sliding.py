@@ -17,10 +17,11 @@ from .runs import Signals
 class SlidingShare(BaseModel):
     """Parts of the sliding variable of a loop, means over the tuning references.
 
-    ``share`` is the share of the error terms m e + de/dt in the mean square of error
-    and rest, from 0 to 1. The RMS values of s, of the error terms and of the rest are
-    in um/s. The rest is the lag of the observer behind the reference, and noise. The
-    values are those of held-out noise, None for a loop that diverges.
+    ``share``, from 0 to 1, is the mean square of the error terms m e + de/dt over the
+    sum of the mean squares of error terms and rest. The RMS values of s, of the error
+    terms and of the rest are in um/s. The rest is the lag of the observer behind the
+    reference, and noise. All values are those under held-out noise, None for a loop
+    that diverges.
     """
 
     share: float | None

@@ -13,15 +13,15 @@ from .data import Data
 from .runs import Signals
 
 CERTAIN = 1.2
-"""Ratio of both errors below which the tip is as good as its reading."""
+"""Ratio of the error of the tip to that of the reading up to which no note is given."""
 
 
 def tip_note(case: Case, loop: Feedback, data: Data, start: int) -> str | None:
     """Return a note on the error of the tip in the hold-out, or None if it needs none.
 
-    A record does not tell whether a lag of its fitted plant is that of the stage or
-    that of its sensor. If it is that of the sensor, the loop controls its reading, and
-    the tip is ahead of it. Samples before ``start`` do not count.
+    A record does not tell whether a lag of its fitted plant belongs to the stage or to
+    its sensor. If it belongs to the sensor, the loop controls the reading of the
+    sensor, and the tip is ahead of that. Samples before ``start`` do not count.
     """
     dt = case.study.dt
     lags = [lag for lag in lags_of(case.loop.plant) if lag > dt]

@@ -92,7 +92,7 @@ def tune(
 def _model_alarms(
     case: Case, limits: Mapping[str, float], stability: StabilityReports
 ) -> list[str]:
-    """Return the alarms of the plant's model: what its record does not support."""
+    """Return the ``model_alarms`` of the plant of ``case``."""
     return list(
         model_alarms(
             case.fit.report if case.fit else None,

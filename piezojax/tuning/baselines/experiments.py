@@ -33,9 +33,9 @@ RELAY = 0.1
 SIGMAS = 3.0
 """Hysteresis of the relay, in standard deviations of the sensor's noise."""
 
-_DECADES = (-6.0, 1.0)  # of the gains, around the voltage span over the step
-_WILD = 10.0  # steps: a larger displacement has left the linear range
-_CALM = 0.05  # steps: a smaller oscillation has settled
+_DECADES = (-6.0, 1.0)  # powers of ten of the gains over (voltage span / step)
+_WILD = 10.0  # times the step: a larger displacement has left the linear range
+_CALM = 0.05  # times the step: a smaller oscillation has settled
 _FEWEST = 3.0  # periods of an oscillation
 
 
@@ -95,7 +95,7 @@ def ultimate_by_gain(
 
     def swings(loop, gains):
         runs = jax.vmap(lambda gain: displacement(loop, gain))(gains)
-        return jax.vmap(lambda run: _swing(run, step))(runs)
+        return jax.vmap(lambda run: _oscillates(run, step))(runs)
 
     low, high = (10.0**decade * span / step for decade in _DECADES)
     gains = np.geomspace(low, high, GAINS)
@@ -116,7 +116,7 @@ def ultimate_by_gain(
     return Ultimate(float(high), period_of(np.diff(last), dt))
 
 
-def _swing(run: Float[jax.Array, " samples"], step: float) -> jax.Array:
+def _oscillates(run: Float[jax.Array, " samples"], step: float) -> jax.Array:
     """Return whether the oscillation of a step response does not decay."""
     quarter = run.shape[0] // 4
     early = jnp.std(run[quarter : 2 * quarter])
