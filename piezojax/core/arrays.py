@@ -56,9 +56,8 @@ def as_signal(value: Any) -> Any:
 def largest(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     """Return the largest of ``values``, with the derivative of that element.
 
-    ``jnp.max`` looks for the elements that equal its result when it is differentiated.
-    If XLA computes them twice and rounds differently, there are none, and the
-    derivative is NaN.
+    The derivative of ``jnp.max`` looks for the elements that equal the result. If XLA
+    computes them a second time and rounds differently, it finds none and returns NaN.
     """
     place = jnp.argmax(jax.lax.stop_gradient(values), axis=-1, keepdims=True)
     return jnp.take_along_axis(values, place, axis=-1)[..., 0]

@@ -191,7 +191,7 @@ class PerAxisMetric(Metric):
 
 
 def packed(signals: Any) -> Any:
-    """Return ``signals``, such as a log, with arrays [..., axes] for tuples."""
+    """Return ``signals``, such as a log, with an array [..., axes] for each tuple."""
     return jax.tree.map(
         lambda node: jnp.stack(node, axis=-1) if _is_axes(node) else node,
         signals,

@@ -15,7 +15,7 @@ A mode of damping zeta that is not in the model changes the response by the fact
 NARROW = 0.1
 """Excited band, as a share of the Nyquist frequency, below which a record is narrow."""
 
-Share = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+_NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 class ErrorBound(BaseModel):
@@ -30,8 +30,8 @@ class ErrorBound(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    frequency: tuple[Share, ...] = Field(min_length=1)
-    relative: tuple[Share, ...]
+    frequency: tuple[_NonNegative, ...] = Field(min_length=1)
+    relative: tuple[_NonNegative, ...]
     excited: tuple[bool, ...]
 
     @model_validator(mode="after")
@@ -50,7 +50,8 @@ class ErrorBound(BaseModel):
     def at(self, frequency: Any) -> np.ndarray:
         """Return the bound at ``frequency`` (Hz): the larger of both neighbours.
 
-        Below the first and above the last line it is that of the line.
+        Below the first line it is the bound of the first, above the last that of the
+        last.
         """
         below, above = self._neighbours(frequency)
         relative = np.asarray(self.relative)
@@ -70,9 +71,9 @@ class ErrorBound(BaseModel):
     def supported(self, frequency: np.ndarray) -> np.ndarray:
         """Return the bound that a search can respect, on a grid of equal steps (Hz).
 
-        It is the largest one half way to both neighbours of each ``frequency``. Above
-        the band of a narrow record it is 0: there the record supports no gains, which
-        calls for another record and not for other gains.
+        It is the largest bound within half a step of each ``frequency``. Above the band
+        of a narrow record it is 0: there the record supports no gains, and the remedy
+        is another record, not other gains.
         """
         half = 0.5 * (frequency[1] - frequency[0])
         lines, relative = np.asarray(self.frequency), np.asarray(self.relative)

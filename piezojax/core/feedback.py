@@ -68,7 +68,8 @@ class Feedback(System):
 
     At sample k the sensor measures y(k), the controller receives r(k), r(k+1) and the
     measurement, the actuator turns the command into u(k), and u(k) moves the plant to
-    y(k+1). The measured output lags the input by one sample, so no loop is algebraic.
+    y(k+1). The measured output lags the input by one sample, so that there is no
+    algebraic loop.
 
     With several axes every signal is a tuple with one scalar per axis, in the unit of
     the axis.
@@ -85,8 +86,8 @@ class Feedback(System):
         """Return the state at rest at the reference ``input`` (um): a bumpless start.
 
         With several axes ``input`` is a vector or a tuple. ``holding`` is the result of
-        ``holding_input`` for it. Pass it if it is known: the solver takes longer to
-        compile than the rest.
+        ``holding_input`` for this reference. Pass it if it is known: its solver takes
+        longer to compile than the rest.
         """
         reference = as_signal(input)
         if holding is None:
@@ -141,9 +142,9 @@ def loop_inputs(
     """Return the inputs of a loop that follows ``reference`` (um).
 
     ``noise`` holds unit-variance draws, zero if left out; ``disturbance`` (um) is added
-    to the output of the plant. The last reference is repeated as its own successor,
-    which acts only after the end of the record. Several axes are columns, each in the
-    unit of its axis.
+    to the output of the plant. The last reference is also the next reference of the
+    last sample, where it acts only after the end of the record. Several axes are
+    columns, each in the unit of its axis.
     """
     reference = as_array(reference)
     following = jnp.concatenate([reference[1:], reference[-1:]])

@@ -127,8 +127,7 @@ def fresh_folder(path: Path) -> Path:
 
 
 def numbered_folder(stem: Path) -> Path:
-    """Return the first empty or missing folder of ``stem``, ``stem-2``, ``stem-3``,
-    ...
+    """Return the first empty or missing folder of ``stem``, ``stem-2`` and so on.
 
     Temporary files of killed runs in these folders are deleted.
     """

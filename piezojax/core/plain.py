@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 DEEPEST = 64
-"""Largest number of tables and lists inside each other in a file."""
+"""Largest depth to which tables and lists in a file may be nested."""
 
 SHOWN = 80
 """Largest number of characters of a value in a message."""
@@ -16,9 +16,9 @@ def read_plain(path: Path, kind: Literal["toml", "json"], name: str) -> Any:
     """Return the content of the TOML or JSON file ``path``.
 
     ``name`` is the name of the file in errors. Raises ValueError, one line, for a file
-    that cannot be read or has other content, for more than DEEPEST tables inside each
-    other, for an integer beyond the range of a float, and for a key with control
-    characters, such as a line end.
+    that cannot be read or has other content, for tables nested more than DEEPEST deep,
+    for an integer beyond the range of a float, and for a key with control characters,
+    such as a line end.
     """
     try:
         text = path.read_text(encoding="utf-8")

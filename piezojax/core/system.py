@@ -23,7 +23,7 @@ class System(eqx.Module):
     """
 
     part_units: ClassVar[PartUnits] = {}
-    """Units inside each part, for the names in brackets in the units it declares.
+    """Units that replace the names in brackets in the units that each part declares.
 
     ``{"law": {"s": "um/s", "v": "[u]"}}`` for a field ``law`` with a gain in "[v]/[s]".
     They hold at all depths unless an inner System replaces them.

@@ -82,8 +82,8 @@ def _age(path: Path) -> float:
 def _is_running(process: int) -> bool:
     """Return whether another ``process`` of this machine is running.
 
-    The numbers of processes start anew in a container: a file with the number of this
-    process that is not its own belongs to an earlier one.
+    Process numbers start anew in a container: a file that bears the number of this
+    process, but is not its own, belongs to an earlier process.
     """
     if process == os.getpid():
         return False
