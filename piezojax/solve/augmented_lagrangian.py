@@ -28,7 +28,8 @@ def penalty_terms(
 ) -> Float[Array, " constraints"]:
     """Return the terms of the augmented Lagrangian, each as a number to be squared.
 
-    The squares sum to ``penalty``/2 max(0, g + multiplier/penalty)^2 over all g.
+    The square of a term is ``penalty``/2 max(0, g + multiplier/penalty)^2, with the
+    violation g.
     """
     shifted = violation + multipliers / penalty
     return jnp.sqrt(0.5 * penalty) * jnp.maximum(shifted, 0.0)

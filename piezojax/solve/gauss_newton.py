@@ -1,14 +1,14 @@
 """Damped Gauss-Newton: descents from several starts that advance side by side.
 
 The loss of a control loop has long, narrow, curved valleys, in which gradient methods
-zigzag. It is a sum of squared errors, so that their derivatives also give its
-curvature. A step along a curved valley leaves its floor; the errors at its end and the
-same derivatives correct it (simplified Newton method: Deuflhard, Newton Methods for
-Nonlinear Problems, 2004).
+zigzag. It is a sum of squared errors, so that the derivatives of the errors also give
+its curvature. A step along a curved valley leaves the floor of the valley; the errors
+at the end of the step, with the derivatives at its start, correct it (simplified Newton
+method: Deuflhard, Newton Methods for Nonlinear Problems, 2004).
 
-One driver serves tuning and every fit. A search differs in its ``Damping``, in its box
-(a problem searched through a sigmoid has none) and in the functions that return trials
-and models.
+One driver serves tuning and every fit. Searches differ in their ``Damping``, in their
+box (a problem searched through a sigmoid has none) and in the functions that return
+trials and models.
 """
 
 from collections.abc import Callable, Generator, Sequence
@@ -59,8 +59,8 @@ which the curvature of a control loop is 1 to 1e6."""
 SEQUENTIAL = Damping(
     first=1e-3, shrink=0.1, least=1e-9, grow=10.0, attempts=15, last=3e5
 )
-"""Rule for losses much cheaper than their derivatives, and a metric of unit
-diagonal."""
+"""Rule for losses much cheaper than their derivatives, and a metric that scales the
+curvature to unit diagonal."""
 
 TRUST_REGION = Damping(enough=0.01, good=0.99, shrink=1.0 / 3.5)
 """Rule for losses that are computed together with their derivatives. The constants are
@@ -68,10 +68,11 @@ those of optimistix (Gould et al. 2005, 4OR 3)."""
 
 
 class Trials(NamedTuple):
-    """Losses [points] of points that a descent tries at once, and what comes with them.
+    """Losses [points] of the points that a descent tries at once.
 
-    These are Verdicts, ``residuals`` [points, residuals] for corrections, and
-    ``models`` of the points if the derivatives are computed together with the losses.
+    The other fields are optional: Verdicts, ``residuals`` [points, residuals] for
+    corrections, and ``models`` of the points if the derivatives are computed together
+    with the losses.
     """
 
     losses: np.ndarray
@@ -106,7 +107,7 @@ class Descent:
     def step(self) -> Generator[np.ndarray, Trials, None]:
         """Yield points [points, n] to try, receive their Trials, move to the best.
 
-        Without a model the present point is the only one.
+        Without a model only the present point is tried.
         """
         if self.model is None:
             self._move(self.point, (yield self.point[None]), 0)

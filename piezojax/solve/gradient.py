@@ -27,8 +27,8 @@ def with_finite_gradient(loss, *, forward: bool):
     """Return ``loss`` of a vector, its gradient finite and computed with the value.
 
     The derivative of a diverged run is NaN and would spoil the memory of the optimiser;
-    it becomes zero. ``forward`` selects forward mode, faster for few parameters and few
-    lanes, else reverse mode.
+    it is replaced by zero. ``forward`` selects forward mode, faster for few parameters
+    and few lanes, else reverse mode.
     """
 
     def guarded(unit):

@@ -81,9 +81,10 @@ def descend(
 ) -> tuple[DescentStatus, bool]:
     """Advance ``descents`` by at least one and at most ``steps`` steps.
 
-    The loop ends when all are done or ``patience`` with the best is exhausted, which
-    restarts after each cut. ``watch`` receives the DescentStatus of every step. Returns
-    the last DescentStatus, and whether the descents ended before the step limit.
+    The loop ends when all descents are done, or when ``patience`` with the best loss is
+    exhausted; patience starts anew after each cut. ``watch`` receives the DescentStatus
+    of every step. Returns the last DescentStatus, and whether the descents ended before
+    the step limit.
     """
     step, bests = 0, []
     while True:
@@ -102,9 +103,10 @@ def descend(
 
 
 def in_batches(program: Callable[[Array], Any], points: np.ndarray, width: int) -> Any:
-    """Return what ``program`` returns at ``width`` points, for any number of points.
+    """Call ``program``, which takes ``width`` points, on any number of points.
 
-    Leaves have a leading axis for the points. The last point fills up the last batch.
+    Leaves of the result have a leading axis for the points. Copies of the last point
+    fill the last batch.
     """
     filler = np.repeat(points[-1:], -len(points) % width, axis=0)
     batches = np.concatenate([points, filler]).reshape(-1, width, *points.shape[1:])
@@ -115,8 +117,8 @@ def in_batches(program: Callable[[Array], Any], points: np.ndarray, width: int) 
 class BatchedDescents:
     """Descents of an Optimiser that advance in one compiled program.
 
-    ``advance(carry)`` returns the next carry, Views and Verdicts of all descents, of
-    which ``carry`` is the first.
+    ``advance(carry)`` returns the next carry, Views and Verdicts of all descents;
+    ``carry`` is the carry before the first step.
     """
 
     def __init__(

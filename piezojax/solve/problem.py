@@ -27,9 +27,10 @@ class Errors(NamedTuple):
     """Least-squares form of a problem at a point.
 
     ``loss`` is minimised; ``errors`` are a sample of the errors of each run, ``added``
-    the terms of the augmented Lagrangian. A weight is the slope of the loss over half
-    the mean square of the errors of a run. With these weights, and 2 for the added
-    terms, the squares have the gradient of the loss as far as it depends on them.
+    the terms of the augmented Lagrangian. A weight is the derivative of the loss with
+    respect to half the mean square of the errors of a run. With these weights, and 2
+    for the added terms, the squares have the gradient of the loss as far as it depends
+    on them.
     """
 
     loss: Float[Array, ""]
@@ -82,7 +83,7 @@ class Problem(Protocol):
         ...
 
     def errors(self, unit: Unit, every: int) -> Errors:
-        """Return the least-squares form at ``unit``, with one of ``every`` errors."""
+        """Return the least-squares form at ``unit``, with every ``every``-th error."""
         ...
 
     def residuals(self, unit: Unit) -> Float[Array, " residuals"]:

@@ -53,9 +53,9 @@ def in_threads(function: Callable[[np.ndarray], R]) -> Callable[[np.ndarray], li
 class SuccessiveHalving:
     """Gauss-Newton descents on ``problem``; every few steps the worse half is dropped.
 
-    The curvature is computed from one of ``every`` errors. A descent ends when it gains
-    less than ``tolerance`` in PATIENCE steps. ``size`` is the number of unknowns. After
-    the first round of an augmented Lagrangian only the best descent continues.
+    The curvature is computed from every ``every``-th error. A descent ends when it
+    gains less than ``tolerance`` in PATIENCE steps. ``size`` is the number of unknowns.
+    After the first round of an augmented Lagrangian only the best descent continues.
     """
 
     cut = staticmethod(better_half)
