@@ -18,9 +18,9 @@ class AnalogLowPass(Designed):
     Its gain is -3 dB at ``bandwidth``, which may lie above the Nyquist frequency. Input
     and output have the same unit. The step is exact for an input that is linear between
     samples, as a displacement nearly is. For an input held between samples, as that of
-    an amplifier, the output is the mean over the sample that begins, so a plant that
-    holds it moves as it should on average. Raises ValueError for parameters outside
-    their limits.
+    an amplifier, the output is the mean of the true output over the sample that begins.
+    A plant that holds this mean moves correctly on average. Raises ValueError for
+    parameters outside their limits.
     """
 
     bandwidth: Scalar = parameter(

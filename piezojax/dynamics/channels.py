@@ -79,8 +79,8 @@ class Channels(System):
 def channels_of(models: Sequence[StateSpace]) -> Channels:
     """Return the plant of a loop from ``models`` with one input each.
 
-    Raises ValueError for a model with more inputs, or with D other than zero, where an
-    input acts on the output of its own sample.
+    Raises ValueError for a model with more inputs, or with D other than zero, because
+    the output must not depend on the input of the same sample.
     """
     for model in models:
         if model.B.shape[1] != 1:

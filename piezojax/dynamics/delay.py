@@ -10,7 +10,7 @@ from ..core.recipe import Extent, Fittable, Part, Recipe
 from ..core.space import Range
 
 NEAR = 0.25
-"""Largest change by a fit of a delay that the record shows, in samples."""
+"""Largest change, in samples, that a fit makes to a delay estimated from the record."""
 
 
 class FractionalDelay(Fittable):

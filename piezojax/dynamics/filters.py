@@ -4,7 +4,7 @@ Each is the bilinear transform of a continuous filter, prewarped so that its fre
 are exact. The sections are integrators by the trapezoidal rule: unlike the coefficients
 of a difference equation they keep the DC gain exactly at frequencies far below the
 rate. They use sine and cosine in place of the tangent of the prewarped frequency, so
-that numbers and derivatives stay finite up to Nyquist's.
+that numbers and derivatives stay finite up to the Nyquist frequency.
 """
 
 import math
@@ -41,7 +41,7 @@ class FirstOrderLowPass(Designed):
     """``1 / (1 + s / w)`` with w = 2 pi frequency: the gain is -3 dB at ``frequency``.
 
     Input and output have the same unit. Raises ValueError for a frequency that is not
-    between 0 and Nyquist's.
+    between 0 and the Nyquist frequency.
     """
 
     frequency: Scalar = _frequency("cut-off frequency")
@@ -56,8 +56,9 @@ class FirstOrderLowPass(Designed):
 class SecondOrderLowPass(Designed):
     """``w^2 / (s^2 + 2 damping w s + w^2)`` with w = 2 pi frequency.
 
-    With a damping of 0.707 it is Butterworth's, with -3 dB at ``frequency``. Input and
-    output have the same unit. Raises ValueError for parameters outside their limits.
+    With a damping of 0.707 it is a Butterworth filter, with -3 dB at ``frequency``.
+    Input and output have the same unit. Raises ValueError for parameters outside their
+    limits.
     """
 
     frequency: Scalar = _frequency("undamped natural frequency")
@@ -72,9 +73,9 @@ class SecondOrderLowPass(Designed):
 class Biquad(Designed):
     """``(s^2/v^2 + 2 zero_damping s/v + 1) / (s^2/w^2 + 2 damping s/w + 1)``.
 
-    v = 2 pi zero_frequency, w = 2 pi frequency. With the zeros on a resonance of the
-    stage it replaces its poles by others. Input and output have the same unit. Raises
-    ValueError for parameters outside their limits.
+    v = 2 pi zero_frequency, w = 2 pi frequency. With its zeros on a resonance of the
+    stage, the filter replaces the poles of that resonance by its own. Input and output
+    have the same unit. Raises ValueError for parameters outside their limits.
     """
 
     zero_frequency: Scalar = _frequency("frequency of the zeros")

@@ -30,9 +30,9 @@ def lags_of(system: Any) -> list[float]:
 def before_lag(
     output: Float[np.ndarray, "*batch samples"], time_constant: float, dt: float
 ) -> Float[np.ndarray, "*batch samples-1"]:
-    """Return what a first-order lag turned into ``output``, but the last sample.
+    """Return the input of a first-order lag with this ``output``, less its last sample.
 
-    It inverts ``FirstOrderLag``, whose input is held between samples of ``dt`` s.
+    This inverts ``FirstOrderLag``, whose input is held between samples of ``dt`` s.
     """
     pole = np.exp(-dt / time_constant)
     return (output[..., 1:] - pole * output[..., :-1]) / (1.0 - pole)

@@ -11,7 +11,8 @@ class LinearMap(System):
     """``output = matrix @ input``: a geometry, a decoupling matrix.
 
     ``matrix`` [outputs, inputs], in the units of its neighbours in the chain; input and
-    output are vectors. Raises ValueError for numbers that are not finite or no matrix.
+    output are vectors. Raises ValueError unless ``matrix`` is a matrix of finite
+    numbers.
     """
 
     matrix: Matrix = parameter(

@@ -105,7 +105,7 @@ def observability_form(model: StateSpace, lags: int | None = None) -> MatrixARMA
     the Markov parameters h (7.5). For n = p q the A are those of the thesis, the last
     rows of F A F^-1. Otherwise F has more rows than columns, and the A are the solution
     of least norm. The result is still exact: it has p q - n additional modes that no
-    input excites. More lags than needed improve the condition of F.
+    input excites. More lags than needed improve the conditioning of F.
 
     Raises ValueError for a model that is not square, has D other than zero or is not
     observable in p samples, and for a stable model whose additional modes would lie on

@@ -15,8 +15,9 @@ GUESSES = (Resonance(0.05, 0.1), Resonance(0.2, 0.1))
 per sample."""
 
 NEAR, NEAR_DAMPED, FADED = 0.002, 0.05, 0.1
-"""Largest relative change by a fit of a frequency that the record shows, the same as a
-multiple of its damping, and that of the damping."""
+"""Largest relative changes that a fit makes to a resonance estimated from the record:
+of the frequency, NEAR or NEAR_DAMPED times the damping ratio if that is larger; of the
+damping ratio, FADED."""
 
 
 class Mode(Designed, Fittable):
@@ -67,8 +68,8 @@ def mode_starts(extent: Extent) -> list[Resonance]:
 def mode_bounds(extent: Extent, mode: Resonance) -> dict[str, Range]:
     """Return the bounds of frequency and damping, near ``mode`` if the record shows it.
 
-    Its values come from the errors at all frequencies. In a fit of a free run the
-    errors of the hysteresis, which are much larger, would pull it away.
+    Its values were estimated from the errors at all frequencies. A fit of a free run
+    would change them, because the errors of the hysteresis are much larger there.
     """
     if mode in extent.modes:
         off = max(NEAR, NEAR_DAMPED * mode.damping)

@@ -1,4 +1,4 @@
-"""Resonances of a stage in parallel, behind the lags of its sensor."""
+"""Resonances of a stage in parallel, followed by the lags of its sensor."""
 
 import math
 from typing import ClassVar
@@ -15,10 +15,10 @@ from ..core.system import Designed, System
 from .mode import mode_bounds, mode_starts
 
 LAG_SHARES = (0.9, 1.1)
-"""Bounds of a time constant, as shares of the lag in the record."""
+"""Bounds of a time constant, as multiples of the one estimated from the record."""
 
 SHARE_OFF = 0.05
-"""Largest change by a fit of the share of a mode that the record shows."""
+"""Largest change that a fit makes to the share of a mode estimated from the record."""
 
 
 class Modes(Designed, Fittable):
@@ -26,11 +26,11 @@ class Modes(Designed, Fittable):
 
     Each mode is that of ``Mode``. ``share`` holds the shares of the static gain of all
     modes but the first, which has the rest: the static gain is 1, and the output has
-    the unit of x. ``time_constant`` are those of lags in series behind the modes, none
-    if empty. All are discretised together, exactly for an input x held between samples;
-    a Mode followed by a FirstOrderLag holds its output between samples too, and is half
-    a sample early. Raises ValueError for parameters outside their limits, and for
-    lists of different length.
+    the unit of x. ``time_constant`` holds the time constants of lags in series behind
+    the modes, if any. All are discretised together, exactly for an input x held between
+    samples; a Mode followed by a FirstOrderLag holds its output between samples too,
+    and is half a sample early. Raises ValueError for parameters outside their limits,
+    and for lists of different length.
     """
 
     part: ClassVar[Part] = Part(

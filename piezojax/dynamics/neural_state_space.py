@@ -22,7 +22,7 @@ class NeuralStateSpace(System):
     output; the states have none. Source: Suykens et al., Nonlinear system
     identification using neural state space models, 1995.
 
-    Raises ValueError for shapes that do not belong together or non-finite numbers.
+    Raises ValueError for shapes that do not match or non-finite numbers.
     """
 
     state_matrix: Float[Array, "n n"] = parameter("1", "A")

@@ -118,11 +118,11 @@ def _balance(model: StateSpace) -> _Balance:
             f"the model has a pole at radius {radius:.6g}; only a stable one, below 1, "
             "can be balanced"
         )
-    reached = _root(linalg.solve_discrete_lyapunov(A, B @ B.T))
-    shown = _root(linalg.solve_discrete_lyapunov(A.T, C.T @ C))
-    left, hankel, right = np.linalg.svd(shown.T @ reached)
+    controllable = _root(linalg.solve_discrete_lyapunov(A, B @ B.T))
+    observable = _root(linalg.solve_discrete_lyapunov(A.T, C.T @ C))
+    left, hankel, right = np.linalg.svd(observable.T @ controllable)
     connected = int(np.sum(hankel > len(A) * np.finfo(float).eps * hankel[0]))
-    return _Balance(hankel, shown @ left, reached @ right.T, connected)
+    return _Balance(hankel, observable @ left, controllable @ right.T, connected)
 
 
 def _root(gramian: np.ndarray) -> np.ndarray:
