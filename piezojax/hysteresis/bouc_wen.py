@@ -32,7 +32,8 @@ class BoucWen(Hysteresis):
     wiping-out and no congruency, and the force drifts under repeated partial unloading.
     Its loops run clockwise, as for a dissipating force over a displacement; those of
     the displacement of a piezo over its voltage run counter-clockwise. The inverse is
-    InverseHysteresis, below the force where z' = 0, which no displacement exceeds.
+    InverseHysteresis, for forces below that at which z' = 0; no displacement produces a
+    larger one.
 
     Raises ValueError for parameters outside their limits.
     """

@@ -36,8 +36,7 @@ class ColemanHodgdon(Hysteresis, Fittable):
     """Rate-independent hysteresis ``y' = |x'| (a x + c y) + b x'``.
 
     Input x in V, output y in um; c is negative for a loop that closes. The material
-    starts on its virgin loading curve from
-    ``rest_input`` (V) and ``rest_output`` (um).
+    starts on its virgin loading curve from ``rest_input`` (V) and ``rest_output`` (um).
 
     ``scheme`` is one of
 

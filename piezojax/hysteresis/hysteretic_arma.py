@@ -16,7 +16,7 @@ from .model import Hysteresis
 
 
 class HystereticARMA(Hysteresis):
-    """Two Coleman-Hodgdon operators behind one autoregressive denominator, (3.32).
+    """Two Coleman-Hodgdon operators with a common autoregressive denominator, (3.32).
 
     ``z(k) = sum_i autoregressive[i] z(k-1-i) + sum_i moving_1[i] y_1(k-i) + sum_i
     moving_2[i] y_2(k-i)``, and ``offset`` (um) added to z. y_1 (V^2) and y_2 (V) are

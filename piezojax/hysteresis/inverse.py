@@ -17,7 +17,7 @@ from ..core.rollout import simulate
 from ..core.system import System
 
 CONVERGED = 1e-14
-"""Newton step, as a share of the range of the input, that has converged."""
+"""Largest Newton step that counts as converged, as a share of the input range."""
 
 
 class Inverse(System):

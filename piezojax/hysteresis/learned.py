@@ -91,9 +91,9 @@ class LearnedOperator(Hysteresis, Fittable):
                     f"{name} has {size} weights; with {len(self.thresholds)} plays "
                     f"and {neurons} neurons it must have {needed}"
                 )
-        check("sum of the autoregressive part", self._held(), below=1.0)
+        check("sum of the autoregressive part", self._autoregressive_sum(), below=1.0)
 
-    def _held(self) -> Scalar:
+    def _autoregressive_sum(self) -> Scalar:
         return sum(self.autoregressive, as_array(0.0))
 
     def _scaled(self, input: Scalar) -> Scalar:
@@ -111,7 +111,9 @@ class LearnedOperator(Hysteresis, Fittable):
         input = as_array(input)
         virgin = (self._scaled(self.rest_input),) * len(self.thresholds)
         plays = advance_plays(self._scaled(input), virgin, self.thresholds)
-        rest = self._driven(input, plays, jnp.zeros_like(input)) / (1.0 - self._held())
+        rest = self._driven(input, plays, jnp.zeros_like(input)) / (
+            1.0 - self._autoregressive_sum()
+        )
         return LearnedState(input, plays, (rest,) * len(self.autoregressive))
 
     def step(

@@ -14,7 +14,7 @@ from ..core.space import Range
 Memory = tuple[Scalar, ...]
 
 ITERATIONS = 20
-"""Newton steps for a polynomial P; a step that leaves the bracket halves it instead."""
+"""Newton steps for a polynomial P; bisection replaces one that leaves the bracket."""
 
 PLAYS = 10
 """Operators of a fitted Prandtl-Ishlinskii model."""

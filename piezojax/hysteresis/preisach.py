@@ -226,7 +226,8 @@ class PlayLines(System):
         constant until the input reaches its level, then it grows linearly, and narrow
         lines are reached first. The sum is therefore convex, the maximum of n linear
         functions, and the least of their n solutions is the solution. For a falling
-        input everything is reflected: the rest of a line is counted from the top.
+        input everything is reflected: cells are counted from the top, and outputs
+        change their sign.
         """
         (held,) = outputs(state, self.rows)
         rise = as_array(wanted) - self.lowest - jnp.sum(held)
