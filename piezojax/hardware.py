@@ -67,9 +67,9 @@ class Quantiser(System):
 class Sensor(System):
     """Adds noise to the displacement.
 
-    The input is ``(displacement, draw)`` in um and of unit variance; the output is the
-    measurement ``displacement + noise_rms * draw`` in um. A Quantiser after it models
-    the converter.
+    The input is ``(displacement, draw)``, in um and a random draw of unit variance. The
+    output is the measurement ``displacement + noise_rms * draw`` in um. A Quantiser
+    after it models the converter.
     """
 
     noise_rms: Scalar = parameter("um", "rms noise of the sensor", least=0.0)
@@ -85,7 +85,7 @@ class Sensor(System):
 class SensorResponse(System):
     """Passes the displacement through ``dynamics``, and the noise draw unchanged.
 
-    Input and output are ``(displacement, draw)``, as those of the Sensor behind it.
+    Input and output are ``(displacement, draw)``, the input of the Sensor behind it.
     ``dynamics`` maps um to um: a bandwidth, a delay.
     """
 
