@@ -88,22 +88,26 @@ def _less(a: _Point, b: _Point) -> _Point:
     return a[0] - b[0], a[1] - b[1]
 
 
-def _square_distance(error: _Point, there: _Point, on: _Point) -> Scalar:
-    """Return the square distance of ``error`` from the circle through -there, 0, on."""
-    squares = [a * a + b * b for a, b in (there, on)]
+def _square_distance(error: _Point, arriving: _Point, leaving: _Point) -> Scalar:
+    """Return the square distance of ``error`` from a circle.
+
+    The circle passes through the three points -``arriving``, 0 and ``leaving``.
+    """
+    squares = [a * a + b * b for a, b in (arriving, leaving)]
     # Inversion turns the circle into a line: its tangent at 0.
     tangent = [
         a / _positive(squares[0]) + b / _positive(squares[1])
-        for a, b in zip(there, on, strict=True)
+        for a, b in zip(arriving, leaving, strict=True)
     ]
     steepness = tangent[0] ** 2 + tangent[1] ** 2
     # A path at rest, or one that reverses, has no tangent: it is a point.
     smooth = (squares[0] > 0.0) & (squares[1] > 0.0) & (steepness > 0.0)
     length = jnp.sqrt(jnp.where(smooth, steepness, 1.0))
     across = (tangent[0] * error[1] - tangent[1] * error[0]) / length
-    chord = (there[0] + on[0]) ** 2 + (there[1] + on[1]) ** 2
+    chord = (arriving[0] + leaving[0]) ** 2 + (arriving[1] + leaving[1]) ** 2
     sides = _positive(squares[0]) * _positive(squares[1]) * _positive(chord)
-    curvature = 2.0 * (there[0] * on[1] - there[1] * on[0]) / jnp.sqrt(sides)
+    turn = arriving[0] * leaving[1] - arriving[1] * leaving[0]
+    curvature = 2.0 * turn / jnp.sqrt(sides)
     whole = error[0] ** 2 + error[1] ** 2
     # |error - centre| - radius, written so that a line is a circle of curvature 0.
     bend = curvature**2 * whole - 2.0 * curvature * across

@@ -2,8 +2,8 @@
 
 A named contour stands for two signals of ``piezojax.signals``: ``Rx+Ry:CIRCLE5`` is a
 shorthand for ``Rx:SIN5 Ry:COS5``. Every contour starts on its path, so that a loop at
-rest on its first point meets only a jump in speed (none with SIN, SCAN and the stairs).
-With ``rise`` the functions below have no such jump.
+rest on its first point meets only a jump in speed (none on an axis that follows SIN,
+SCAN or the steps of a raster). With ``rise`` the functions below have no such jump.
 """
 
 import math

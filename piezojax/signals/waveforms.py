@@ -138,7 +138,7 @@ def superposed_sine(
     amplitude: ScalarLike = 5.0,
     offset: ScalarLike = 0.0,
 ) -> Time:
-    """SW, (4.48): four sines with ``frequency`` the highest; A = 5 um as printed.
+    """SW, (4.48): four sines up to ``frequency``; A = 5 um as printed.
 
     Swings from -2.3 to 12.9 um at A = 5 um. (Chapter 7 prints the same signal.)
     """
