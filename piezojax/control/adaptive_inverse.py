@@ -15,7 +15,7 @@ Row = tuple[Scalar, ...]
 
 
 class TermsState(NamedTuple):
-    """The last two positions (um) and the stop operators (um)."""
+    """The last two positions (um) and the outputs of the stop operators (um)."""
 
     positions: tuple[Scalar, Scalar]
     stops: Row
@@ -74,10 +74,10 @@ class AdaptiveInverse(System):
     """``u = share * (learned inverse of the reference) + controller(residual)``.
 
     The voltage of a stage is modelled as a weighted sum of its MotionTerms: position,
-    velocity, acceleration and stop operators. They are the inverse of a gain, two poles
-    and a hysteresis. RecursiveWeights learns the weights from the applied voltage and
-    the measured displacement, both filtered by the same double lag at ``cutoff``. The
-    weighted sum of the reference's terms is fed forward. Gain, poles and hysteresis
+    velocity, acceleration and stop operators. Such a sum is the inverse of a gain, two
+    poles and a hysteresis. RecursiveWeights learns the weights from the applied voltage
+    and the measured displacement, both filtered by the same double lag at ``cutoff``.
+    The weighted sum of the reference's terms is fed forward. Gain, poles and hysteresis
     need not be known, and the feedback corrects the remaining error. Sources: adaptive
     inverse control, Widrow and Walach 1996; stop operators for the inverse of a
     hysteresis, Kuhnen and Krejci 2007.

@@ -66,7 +66,7 @@ def disturbance_observer_sliding_mode(
 
 
 def inversion_pid(plant: System, dt: float, limits: Limits) -> InversionControl:
-    """Return an integral-dominated PID behind the inverse of the plant's hysteresis.
+    """Return an integral-dominated PID ahead of the inverse of the plant's hysteresis.
 
     Raises ValueError where there is no inverse between ``limits`` (V), and as
     ``design_model``; ``dt`` in s.

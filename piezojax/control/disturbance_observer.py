@@ -110,11 +110,11 @@ class DisturbanceObserverControl(System):
     def init(self, input: Observation) -> DisturbanceObserverState:
         # At rest Q = 1: w = z / (gain G(1)) - u.
         w = input.measured / (self.gain * self.model.dc_gain()) - input.applied
-        force = self.gain * (input.applied + w)
-        # At rest each place holds the terms of all samples that it still awaits.
+        applied_f = self.gain * (input.applied + w)
+        # At rest each element of the memory is the sum of its own and all later terms.
         terms = itertools.accumulate(reversed(self._past(input, w)))
         return DisturbanceObserverState(
-            feedback=self.feedback.init(input._replace(applied=force)),
+            feedback=self.feedback.init(input._replace(applied=applied_f)),
             disturbance=w,
             memory=tuple(terms)[::-1],
         )
@@ -142,8 +142,9 @@ class DisturbanceObserverControl(System):
         *terms, last = self._past(input, w)
         later = zip(terms, state.memory[1:], strict=True)
         memory = (*(new + old for new, old in later), last)
-        force = self.gain * (u + state.disturbance)
-        feedback, f = self.feedback.step(state.feedback, input._replace(applied=force))
+        applied_f = self.gain * (u + state.disturbance)
+        observation = input._replace(applied=applied_f)
+        feedback, f = self.feedback.step(state.feedback, observation)
         state = DisturbanceObserverState(feedback, w, memory)
         return state, f / self.gain - w
 

@@ -20,7 +20,7 @@ class InverseFeedforward(System):
     ``inverse`` maps the wanted displacement in um to a voltage in V: an
     ``InverseColemanHodgdon``, or inverse dynamics in series with one. u(k) moves the
     stage to y(k+1), hence the next reference. The measurement is not used, so errors of
-    the inverse remain. If the inverse of the start differs from the applied voltage,
+    the inverse remain. If the inverse at the start differs from the applied voltage,
     the difference is kept as a constant bias.
     """
 
@@ -54,10 +54,10 @@ class FeedforwardFeedback(System):
     """``u(k) = inverse(r(k+1)) + feedback``, Figure 2.9.
 
     ``inverse`` as in ``InverseFeedforward``; ``feedback`` is any controller from an
-    Observation to V. Its applied voltage is the applied one less the feedforward, so
-    its start and its anti-windup stay correct. The inverse depends on the reference
-    alone. Unlike in ``InversionControl`` the feedback does not act on it, so the gain
-    of the stage's hysteresis stays in the feedback loop.
+    Observation to V. It sees the applied voltage less the feedforward, so its start and
+    its anti-windup stay correct. The inverse depends on the reference alone. Unlike in
+    ``InversionControl`` the feedback does not act on it, so the gain of the stage's
+    hysteresis stays in the feedback loop.
     """
 
     inverse: System

@@ -32,15 +32,15 @@ class InversionControl(System):
 
     def init(self, input: Observation) -> InversionState:
         hysteresis = self.inverse.model.init(input.applied)
-        force = rest_output(self.inverse.model, input.applied)
-        observation = input._replace(applied=force)
+        applied_f = rest_output(self.inverse.model, input.applied)
+        observation = input._replace(applied=applied_f)
         return InversionState(self.feedback.init(observation), hysteresis)
 
     def step(
         self, state: InversionState, input: Observation
     ) -> tuple[InversionState, Scalar]:
-        hysteresis, force = self.inverse.model.step(state.hysteresis, input.applied)
-        observation = input._replace(applied=force)
+        hysteresis, applied_f = self.inverse.model.step(state.hysteresis, input.applied)
+        observation = input._replace(applied=applied_f)
         feedback, wanted = self.feedback.step(state.feedback, observation)
         voltage = self.inverse.solve(hysteresis, wanted)
         return InversionState(feedback, hysteresis), voltage

@@ -34,7 +34,7 @@ class KalmanFilter(Observer):
     ``y(k+1) = a_1 y(k) + a_2 y(k-1) + ... + b_0 u(k) + b_1 u(k-1) + ... + d(k)``, where
     u is the applied input and the drift d in um represents unmodelled effects:
     hysteresis, creep, an error of the DC gain. ``gain`` corrects y(k), y(k-1), ..., one
-    for each a coefficient and two at least, and then d. The velocity of the Motion is
+    for each a_i and two at least, and then d. The velocity of the Motion is
     (y(k) - y(k-1)) / dt of the estimates, the state of chapter 4's second-order models.
     With a gain of zero the model runs in open loop.
 
@@ -98,7 +98,7 @@ class KalmanFilter(Observer):
 
 
 def position_count(model: ARMA) -> int:
-    """Return the number of estimated positions: that of a coefficients, at least 2."""
+    """Return the number of estimated positions: one for each a_i, at least 2."""
     return max(len(model.autoregressive), 2)
 
 

@@ -13,7 +13,7 @@ from .iterative_learning import LearningLaw
 
 
 class LearningState(NamedTuple):
-    """State of the feedback, corrections and errors of two trials, and the place.
+    """State of the feedback, corrections and errors of two trials, and two indices.
 
     ``corrections`` and ``errors`` [2, period] in um; ``trial`` is the row of the trial
     under way, ``index`` the sample in it.
@@ -32,9 +32,10 @@ class LearningControl(System):
     A trial is a ``period`` of the reference. ``feedback``, any controller, sees r + u
     in place of r. At its start a trial takes the corrections u that the ``LearningLaw``
     with ``gain``, ``smoothing`` and ``lead`` gives for the last one; in the first u is
-    0. The law looks ahead in the trial, and its Q-filter has no phase; a
-    ``RepetitiveControl`` has one trial without end. There is no rest between trials,
-    so the errors decay as long as their transients are shorter than a period.
+    0. The law looks ahead in the trial, and its Q-filter has no phase;
+    ``RepetitiveControl`` learns without pause, in one endless trial. There is no rest
+    between trials, so the errors decay as long as their transients are shorter than a
+    period.
 
     Input an Observation, output that of ``feedback``. At rest without error u is zero.
     Raises ValueError unless ``lead`` and ``smoothing`` are shorter than the period.

@@ -41,11 +41,12 @@ def mixed_sensitivity(
 ) -> Design:
     """Return the controller that minimises the weighted responses to r.
 
-    ``model`` G maps u(k) to y(k+1) in um. At all frequencies up to Nyquist's,
-    |W1 S|^2 + |W2 K S|^2 + |W3 T|^2 < gamma^2, with S = 1/(1 + G K) and T = 1 - S, W1 =
-    ``error_weight``, W2 = ``effort_weight``, a number above 0 in um per unit of the
-    input, and W3 = ``output_weight``, none if left out. Bisection brings gamma within
-    0.1 % of its infimum. The controller has the states of the model and of the weights.
+    ``model`` G maps u(k) to y(k+1) in um. At all frequencies up to the Nyquist
+    frequency, |W1 S|^2 + |W2 K S|^2 + |W3 T|^2 < gamma^2, with S = 1/(1 + G K) and
+    T = 1 - S, W1 = ``error_weight``, W2 = ``effort_weight``, a number above 0 in um per
+    unit of the input, and W3 = ``output_weight``, none if left out. Bisection brings
+    gamma within 0.1 % of its infimum. The controller has the states of the model and of
+    the weights.
 
     The reference r enters the error without a filter, so the error determines r. Of the
     two Riccati equations (Glover and Doyle, 1988; in discrete time Green and Limebeer,

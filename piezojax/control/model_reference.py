@@ -19,7 +19,7 @@ class ModelReferenceState(NamedTuple):
     """States of the parts; histories, newest first, of y_d and errors in um.
 
     ``desired`` starts at y_d(k); ``forward`` and ``feedback`` hold past u1 and u2 in V,
-    the last ones at least.
+    at least the last ones.
     """
 
     filter: State
@@ -110,7 +110,7 @@ class ModelReferenceSlidingMode(System):
             errors=errors[1:],
             forward=(forward,) * max(lags, 1),
             feedback=(feedback,) * max(lags, 1),
-            # The rest of the feedback is u_eq.
+            # The remainder of the feedback is u_eq.
             law=self.law.start(self._sliding(errors), feedback - slope * feedback),
         )
 

@@ -70,7 +70,7 @@ def feedforward(
 ) -> Scalar:
     """Return v1 (4.6), which moves the model from one reference state to the next.
 
-    ``references`` are r(k), r(k-1), ..., one for each a coefficient.
+    ``references`` are r(k), r(k-1), ..., one for each a_i.
     """
     moved = dot(model.autoregressive, references)
     return (next_reference - moved) / model.moving[0]
@@ -94,7 +94,7 @@ def equivalent_control(
 ) -> Scalar:
     """Return v_eq (4.10), which brings s to zero in one sample.
 
-    The past errors of the model with the error state of ``derivatives`` are
+    The error state of ``derivatives`` gives the past errors of the model:
     e(k-j) = e - dt (de(k)/dt + ... + de(k-j+1)/dt).
     """
     a = model.autoregressive

@@ -29,8 +29,8 @@ class PhaseCompensator(System):
     The gain lies between 1 and 1 + ``share``. Sums of stops are the inverse of a
     Prandtl-Ishlinskii model (``PrandtlIshlinskii.inverse``).
 
-    ``controller`` sees the v of the applied voltage, so its limits and anti-windup stay
-    correct. At rest at the start the stop is 0. Input an Observation, output in V.
+    ``controller`` sees the v that gives the applied voltage, so its limits and
+    anti-windup stay correct. The stop starts at 0. Input an Observation, output in V.
     """
 
     part_units: ClassVar[PartUnits] = {"controller": {"u": "V"}}

@@ -24,7 +24,7 @@ class PIDState(NamedTuple):
 class PID(System):
     """``u = P (b r - z) + I int (r - z) dt + D d(c r - z)/dt`` for reference r.
 
-    The command u is a voltage (V), or a displacement (um) behind an inverse of the
+    The command u is a voltage (V), or a displacement (um) ahead of an inverse of the
     plant. The derivative acts through a first-order filter. ``anti_windup`` drives the
     integral by the difference of the applied and the last commanded u. The integral is
     rectangular and has the unit of u, so a change of I causes no jump.
@@ -32,8 +32,8 @@ class PID(System):
     ``proportional_weight`` b and ``derivative_weight`` c are the set-point weights of
     Astrom and Hagglund (Advanced PID Control, 2006). With 1 the PID acts on the error
     alone. Below 1 a jump of r is softened; above 1, P (b - 1) r and D (c - 1) dr/dt
-    feed the reference and its rate forward. Feedback, noise and stability do not
-    depend on them. The rate ends at r(k); r(k+1) is not used.
+    feed the reference and its rate forward. Feedback, noise and stability do not depend
+    on them. The reference is used up to r(k), without r(k+1).
 
     Raises ValueError for a parameter outside its limits.
     """

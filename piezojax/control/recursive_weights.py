@@ -16,7 +16,7 @@ class RecursiveWeightsState(Learned):
     """Weights and their covariance.
 
     The covariance is the only matrix in a loop: as scalars it takes four times as long
-    to compile, because every element needs every other, and runs no faster.
+    to compile, because every element depends on every other, and runs no faster.
     """
 
     weights: Row
@@ -64,7 +64,7 @@ class RecursiveWeights(System):
             )
 
     def init(self, input: Any = None) -> RecursiveWeightsState:
-        """Return the start of weights and covariance; ``input`` is not used."""
+        """Return the initial weights and covariance; ``input`` is not used."""
         return RecursiveWeightsState(self.weights, self._prior())
 
     def _prior(self) -> Matrix:

@@ -11,9 +11,9 @@ DOUBLINGS = 20
 def riccati(
     A: Float[Array, "n n"], G: Float[Array, "n n"], H: Float[Array, "n n"]
 ) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
-    """Return the stabilising X = H + A' X (1 + G X)^-1 A, and how far it is from one.
+    """Return the stabilising solution of X = H + A' X (1 + G X)^-1 A, and a residue.
 
-    ``G`` = B R^-1 B' and ``H`` are symmetric. The second number is 0 where the doubling
+    ``G`` = B R^-1 B' and ``H`` are symmetric. The residue is 0 where the doubling
     algorithm (Chu, Fan and Lin, 2005) has converged; it is not small if there is no
     stabilising solution.
     """

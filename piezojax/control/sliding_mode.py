@@ -54,7 +54,7 @@ class SlidingMode(System):
     a smaller one weakens the feedback, not the reference part.
 
     Input an Observation; output f in the unit of the model's input: V if the model was
-    identified from voltage, um behind an inverse hysteresis or in a disturbance
+    identified from voltage, um ahead of an inverse hysteresis or in a disturbance
     observer with its own gain. The switching part v has that unit.
 
     Raises ValueError for a model without a_1, b_0 = 0, a surface of 0 unless n = 2, or

@@ -27,7 +27,7 @@ Vector = Float[Array, " n"]
 
 
 class StateSlidingModeState(NamedTuple):
-    """States of the reference model and the law, and what the next sample needs.
+    """States of the reference model and the law, the estimate, and the last signals.
 
     ``estimate`` holds x(k|k) of the model and the input disturbance d, ``desired``
     y_d(k), ``command`` the last command.
@@ -43,9 +43,9 @@ class StateSlidingModeState(NamedTuple):
 class StateSlidingMode(Designed):
     """Sliding mode control of q axes on the estimated state of ``model``.
 
-    The first approach of the thesis' third future work: state tracking with state
-    estimation, where ``MultiAxisSlidingMode`` tracks outputs. ``model`` has q inputs, q
-    outputs and any number of states; u(k) moves it to y(k+1) = C x(k+1). A
+    The first approach to the third item of future work in the thesis: state tracking
+    with state estimation, where ``MultiAxisSlidingMode`` tracks outputs. ``model`` has
+    q inputs, q outputs and any number of states; u(k) moves it to y(k+1) = C x(k+1). A
     steady-state Kalman filter estimates x and a disturbance d of the inputs,
 
     ``x(k+1) = A x(k) + B (u(k) + d(k) + w)``, ``d(k+1) = d(k) + n``, ``z = C x + v``,
@@ -54,9 +54,9 @@ class StateSlidingMode(Designed):
     axes. The sliding variable s = B' P (x - N y_d) is zero in the state in which the
     model rests at y_d, the output of ``reference_model`` from r(k) to y_d(k+1). P
     solves the Riccati equation with the weights C' C and ``effort_weight``^2, and the
-    motion on s = 0 is stable for every weight. With the equivalent control s(k+1) =
-    ``reaching`` s(k) + S B law(s). The estimate of d removes offsets, so the law may
-    be zero.
+    motion on s = 0 is stable for every weight. With the equivalent control, s(k+1) =
+    ``reaching`` s(k) + S B law(s). The estimate of d removes offsets, so the law may be
+    zero.
 
     Input an Observation of q axes, output a tuple of q commands. Raises ValueError for
     a model with a direct transmission or with another number of inputs than outputs,
@@ -172,7 +172,7 @@ class ResolvedStateSlidingMode(System):
         applied = tuple(as_array(u) for u in input.applied)
         measured = tuple(as_array(z) for z in input.measured)
         state = self.rest @ jnp.stack(measured)
-        # The disturbance is what the model needs to rest here, less what is applied.
+        # The disturbance is the input that holds the model here, less the applied one.
         calm = jnp.concatenate([state, jnp.zeros(len(measured))])
         _, needed = self._advance(calm, measured, measured)
         held = jnp.stack(minus(needed, applied))

@@ -22,10 +22,10 @@ class StateSpaceController(System):
     """``u = bias + law(r - z)`` with any linear ``law`` of one input and one output.
 
     The law acts on the error in um. Its state starts at zero, and ``bias`` is the
-    applied command at the start less the direct part of the law, so the start does not
-    jump, even with an integrator in the law. There is no anti-windup. Input an
-    Observation, output in the unit of the law's output. Raises ValueError for a law of
-    several inputs or outputs.
+    applied command at the start less the direct part of the law, so the command does
+    not jump at the start, even with an integrator in the law. There is no anti-windup.
+    Input an Observation, output in the unit of the law's output. Raises ValueError for
+    a law of several inputs or outputs.
     """
 
     law: StateSpace
