@@ -10,7 +10,7 @@ from ..study.sweep_table import METRICS
 if TYPE_CHECKING:
     from xarray import Dataset
 
-_BEYOND = 1e3  # times the median: the loop is lost
+_BEYOND = 1e3  # times the median: larger values are those of lost points
 
 
 class MetricMap(NamedTuple):
@@ -25,7 +25,7 @@ class MetricMap(NamedTuple):
     unit: str
 
     def finite(self) -> np.ndarray:
-        """Return the values with NaN for lost points: not finite, or far beyond."""
+        """Return the values, NaN if lost: not finite, or far above the median."""
         finite = np.where(np.isfinite(self.values), self.values, np.nan)
         if not np.isfinite(finite).any():
             return finite
