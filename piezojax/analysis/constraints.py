@@ -121,7 +121,7 @@ def _delay(sensitivity: Sensitivity, error: Array | None) -> Array:
 
 
 def _disk(sensitivity: Sensitivity, error: Array | None) -> Array:
-    """Return the disk margin of the model: a disk is a bound of its own."""
+    """Return the disk margin of the model, which is itself a margin for its error."""
     del error
     return disk_margin_of(sensitivity)
 

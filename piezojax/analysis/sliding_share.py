@@ -27,7 +27,7 @@ class SlidingParts(NamedTuple):
 
     @property
     def share(self) -> Scalar:
-        """Share of the error in the mean square of error and rest, from 0 to 1."""
+        """Mean square of the error over the sum of those of error and rest, 0 to 1."""
         return self.error**2 / (self.error**2 + self.rest**2)
 
 

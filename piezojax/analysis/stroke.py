@@ -30,14 +30,16 @@ def stroke_of(
 ) -> Stroke:
     """Return the stroke of ``stage`` between commands ``lower`` and ``upper`` [axes].
 
-    ``stage`` is a plant behind its actuator. It begins at rest at one end, is driven to
-    the other end in ``SAMPLES`` samples and back. On one axis the ends are the limits,
-    each of them in turn the first. On several axes they are the opposite corners of the
-    box of the limits, and the limits of each axis with the others in the middle.
+    ``stage`` is a plant behind its actuator. Each drive begins at rest at one end, goes
+    to the other end in ``SAMPLES`` samples, and returns. On one axis the ends are the
+    limits, in both orders. On several axes there is a drive from each corner of the box
+    of the limits to the opposite one, and from each limit of an axis to the other, with
+    the other axes in the middle.
 
-    The displacements at rest hold the whole creep and the static gain, however slow the
-    stage; those of the drive hold both branches of the hysteresis. Noise or drift only
-    widen the stroke. An axis with a displacement that is not finite has no bounds.
+    The displacements at rest include the whole creep and the static gain, however slow
+    the stage; those of the drive include both branches of the hysteresis. Noise or
+    drift only widen the stroke. An axis with a displacement that is not finite has no
+    bounds.
     """
     ends = _ends(np.array(lower), np.array(upper))
     alone = ends.shape[2] == 1
@@ -52,8 +54,8 @@ def _ends(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     middle, half = 0.5 * lower + 0.5 * upper, 0.5 * upper - 0.5 * lower
     axes = len(lower)
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=axes)))
-    ways = np.unique(np.vstack([corners, np.eye(axes), -np.eye(axes)]), axis=0)
-    return np.stack([middle - ways * half, middle + ways * half], axis=1)
+    directions = np.unique(np.vstack([corners, np.eye(axes), -np.eye(axes)]), axis=0)
+    return np.stack([middle - directions * half, middle + directions * half], axis=1)
 
 
 @eqx.filter_jit

@@ -2,11 +2,11 @@
 
 The plant P is the linearised stage (``linear_plant``). Its gain is that of the stage
 for voltage caused by sensor noise in the loop's own runs (``gain_from_noise``). The
-disturbance is the residual of the plant in those runs, d = y
-- P u: the effect of hysteresis, creep, drift and the study's own disturbance. It is
-taken from the assessed runs with their noise, because noise that reaches the voltage
-changes the state of a hysteresis: a run without noise has another disturbance. So does
-another controller; ``verify_limit`` measures how much that matters.
+disturbance is the residual of the plant in those runs, d = y - P u: the effect of
+hysteresis, creep, drift and the study's own disturbance. It is taken from the assessed
+runs with their noise, because noise that reaches the voltage changes the state of a
+hysteresis: a run without noise has another disturbance. The disturbance depends on the
+controller too; ``verify_limit`` measures how much that matters.
 
 One linear filter of the reference predicts part of the disturbance on all references.
 With full preview that part costs nothing. Feedback acts on the rest, known by its

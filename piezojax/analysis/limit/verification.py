@@ -68,7 +68,7 @@ class LinearLimit(System):
         at, model, states, innovations = state
         loop = self.loop
         sensor, measured = loop.sensor.step(at.sensor, (at.displacement, input.noise))
-        # at.reference holds the displacement of the model, one sample after its input.
+        # at.reference is reused for the model's displacement, a sample after its input.
         innovation = measured - at.reference - input.prediction
         innovations = jnp.concatenate([innovation[None], innovations[:-1]])
         command = input.voltage - self.taps @ innovations

@@ -32,12 +32,12 @@ from .broken_loop import BrokenLoop, cut, open_loop
 from .operating_point import BRANCHES, OperatingPoint
 
 DURATION = 0.2
-"""Length of the impulse response, s, if that is ``LEAST`` samples. Slower modes are
-truncated."""
+"""Length of the impulse response, s, if that is at least ``LEAST`` samples. Slower
+modes are truncated."""
 
 PADDING = 4
-"""Lines of one axis in 1 / duration; several axes have one, because each line is a
-matrix."""
+"""Number of lines per 1 / duration on one axis; on several axes it is 1, because each
+line is a matrix."""
 
 UNLIMITED_DELAY = 1e6
 """Delay margin (samples) of a loop that no delay makes unstable: large, but finite so
@@ -49,8 +49,8 @@ LEAST = 512
 Sensitivity = Complex[Array, "*batch lines axes axes"]
 
 _SQUARINGS = 24
-"""Squarings of a Gram matrix on the way to its largest eigenvalue, whose relative error
-is then at most ln(axes) / 2^24."""
+"""Number of squarings of a Gram matrix that give its largest eigenvalue, with a
+relative error of at most ln(axes) / 2^24."""
 
 
 class SmallMotion(System):
