@@ -53,7 +53,7 @@ def write_ranking(ranking: ModelRanking, folder: Path) -> None:
     _write_table(ranking, ranking.report, folder)
     with plot_style():
         write(ranking_figure(ranking), folder / RANKING_PICTURE)
-    # The ranking so far held the best model with the others.
+    # write_ranking_so_far put the best model among the others.
     shutil.rmtree(folder / _place(ranking.report.best), ignore_errors=True)
     with suppress(OSError):  # the folder holds other models, or is missing
         (folder / _MODELS).rmdir()
