@@ -55,7 +55,7 @@ def remember(number: int) -> None:
     """Remember ``number``, the signal that interrupts the command."""
     _first.append(number)
     if number == signal.SIGTERM:
-        # Python's handlers wait for XLA's compiler to return; the system's does not.
+        # A Python handler waits for XLA's compiler to return; the default does not.
         signal.signal(number, signal.SIG_DFL)
 
 
