@@ -12,7 +12,7 @@ SHORTEST = 1.0
 """Shortest length of the window in which errors count, s."""
 
 PERIODS = {"SIN": 1.0, "PWSW": 4.0, "SW": 20.0}
-"""Periods of the frequency in the name after which a signal repeats."""
+"""Number of periods, at the frequency in its name, after which a signal repeats."""
 
 
 @dataclass(frozen=True)

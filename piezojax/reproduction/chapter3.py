@@ -18,7 +18,7 @@ TABLES = {"3-6": ("voros", "trapezoid"), "3-7": ("trapezoid", "quadratic")}
 """Discretisation schemes of each table, which are its columns."""
 
 AMPLITUDE = 35.0
-"""V: the inputs of the thesis swing by 70 V."""
+"""Amplitude of the inputs, V; those of the thesis swing by 70 V."""
 
 C_BOUNDS = (-0.1, -0.01)
 """Bounds of c, 1/V, around its first fit in the thesis, -0.0378."""
@@ -68,13 +68,13 @@ def _model(scheme: str) -> System:
 def cells(table: str) -> list[Cell]:
     """Return the 22 cells of ``table`` ("3-6" or "3-7"), simulated.
 
-    One reading applies to all cells; nothing is tuned. ``simulated_stage`` with the
-    white noise of the sensor, ``p753.NOISE_RMS``, replaces the hardware. Every scheme
-    is identified from one record of 70 V sines up to 200 Hz. The thesis does not define
-    its online estimation. The poles it gives (Tables 3-2, 3-4) are free of the bias of
-    least squares, so refined instrumental variables replace it. The error is the RMS of
-    the free run minus the measured displacement, from rest, over the second of two
-    windows.
+    One reading of the thesis applies to all cells; nothing is tuned.
+    ``simulated_stage`` with the white noise of the sensor, ``p753.NOISE_RMS``, replaces
+    the hardware. Every scheme is identified from one record of 70 V sines up to 200 Hz.
+    The thesis does not define its online estimation. The poles it gives (Tables 3-2,
+    3-4) are free of the bias of least squares, so refined instrumental variables
+    replace it. The error is the RMS of the free run minus the measured displacement,
+    from rest, over the second of two windows.
 
     The simulated errors contain the errors of the discretisation and the noise. They do
     not contain the effects that only the hardware has, which cause most of the printed

@@ -179,7 +179,7 @@ TABLES = (*RATES, *FIGURES)
 def cells(table: str) -> list[Cell]:
     """Return the cells of ``table`` ("4-5", "4-6" or a figure's numbers), simulated.
 
-    One reading applies to all cells of both tables; nothing is tuned:
+    One reading of the thesis applies to all cells of both tables; nothing is tuned:
 
     - The gains and the rows of Table 4-1 are used as printed. The alpha-beta filter of
       20 kHz is also used at 5 kHz, where none is printed.
@@ -191,8 +191,7 @@ def cells(table: str) -> list[Cell]:
     The traditional column cannot agree: the only printed gains, Table 4-2, have a
     control weight that makes it too slow for all of its cells. The continuous column at
     5 kHz disagrees too: its printed integral gain looks ten times too small. For the
-    reading of the figures see ``step_responses``; the steps at 1 kHz are not
-    reproduced.
+    figures, see ``step_responses``; the steps at 1 kHz are not reproduced.
     """
     return _figure(table) if table in FIGURES else _table(table)
 

@@ -33,10 +33,10 @@ def _rms_error(controller: System, reference: jax.Array) -> jax.Array:
 def cells(table: str) -> list[Cell]:
     """Return the 30 cells of ``table`` ("5-3" or "5-5"), simulated.
 
-    One reading applies to all cells; nothing is tuned. The gains are those printed. The
-    stage has unit DC gain behind its hysteresis and no sensor noise, and starts from
-    rest at zero. A cell is the RMS error of the true displacement over the second of
-    two windows (see ``window``).
+    One reading of the thesis applies to all cells; nothing is tuned. The gains are
+    those printed. The stage has unit DC gain behind its hysteresis and no sensor noise,
+    and starts from rest at zero. A cell is the RMS error of the true displacement over
+    the second of two windows (see ``window``).
     """
     paper = printed("ch5", table)
     simulated = []

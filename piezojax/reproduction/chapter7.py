@@ -25,7 +25,7 @@ TABLES = ("7-4", FIGURE)
 def cells(table: str) -> list[Cell]:
     """Return the 54 cells of Table 7-4 or the 6 of Figure 7.4, simulated.
 
-    One reading applies to all cells; nothing is tuned for single cells:
+    One reading of the thesis applies to all cells; nothing is tuned for single cells:
 
     - The gains are those printed for dynamic tracking.
     - The stage is (7.53) behind a hysteresis of about 1 %, with one additional sample

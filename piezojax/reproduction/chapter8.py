@@ -23,7 +23,7 @@ TABLES = ("8-2", "8-3", *FIGURES)
 def cells(table: str) -> list[Cell]:
     """Return the cells of a table or figure, simulated.
 
-    One reading applies to all cells; nothing is tuned for single cells:
+    One reading of the thesis applies to all cells; nothing is tuned for single cells:
 
     - The gains are those of Table 8-1, the alpha-beta filter is as printed.
     - The equivalent control uses the state of the nominal model, because it is unstable

@@ -30,7 +30,7 @@ class RateError(NamedTuple):
 def errors_by_rate(signals: tuple[str, ...] = SIGNALS) -> list[RateError]:
     """Return the errors of both columns at each rate with printed gains.
 
-    The reading is that of Tables 4-5 and 4-6. The numbers of the figure are not
+    The thesis is read as for Tables 4-5 and 4-6. The numbers of the figure are not
     printed. According to the text, the model-reference controller is better, and its
     advantage grows towards low rates.
     """

@@ -98,7 +98,7 @@ class Problem(eqx.Module):
 def _normal_equations(
     problem: Problem, base: Point, free: Free, points: Float[Array, "points free"]
 ) -> tuple[Array, Array, Array]:
-    """Return those of the quantities ``free``, the others as in ``base``."""
+    """Return the normal equations of ``free`` quantities, the others as in ``base``."""
 
     def linearise(point):
         part = squash(point)
