@@ -85,7 +85,7 @@ def model(order: int = 12) -> StateSpace:
 
 
 def stage(*, order: int = 12) -> MatrixARMA:
-    """Return the mirror as plant of a loop, with one sample of delay to compute."""
+    """Return the mirror as plant of a loop, with a sample of delay for computation."""
     return observability_form(model(order).delayed())
 
 

@@ -229,7 +229,7 @@ ADAPTIVE_INVERSE = {
     "equation_error": 3.0,
     "memory": 0.5,
 }
-"""Ours: um, rad/s, V, s. The stops suit motions of some um; the feedback corrects
+"""Ours: um, rad/s, V, s. The stops suit motions of a few um; the feedback corrects
 changes slower than half a second."""
 
 

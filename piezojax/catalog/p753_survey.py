@@ -67,7 +67,7 @@ POLES = (0.9992, 0.0, 0.0)
 """Poles of the sliding variable: those of the printed I = 60 (Table 5-4), P = D = 0."""
 
 PHASER = {"share": 0.1, "threshold": 10.0}
-"""Weight of the stop operator, and the V at which it saturates."""
+"""Weight of the stop operator, and the voltage (V) at which it saturates."""
 
 CHARGE_TIME = 1.0
 """R C of amplifier and load in s: the charge is controlled above 0.16 Hz."""
