@@ -216,9 +216,9 @@ class _Search:
         if not self.fits:
             return {}
         models = self._listed()
-        worth = self.criteria()
+        scores = self.criteria()
         alike = first_equivalent(
-            [worth[model].bic for model in models],
+            [scores[model].bic for model in models],
             [self.fits[model].count for model in models],
             [self.fits[model].errors(slice(None)) for model in models],
         )
@@ -230,11 +230,11 @@ class _Search:
         """Return whether each model validates as well as the best, best model first."""
         if not self.fits:
             return {}
-        models, worth, duplicates = self._listed(), self.criteria(), self.duplicates()
+        models, scores, duplicates = self._listed(), self.criteria(), self.duplicates()
         # Equivalent models share their lowest BIC: the first listed ranks first.
         bics = [
             min(
-                worth[m].bic
+                scores[m].bic
                 for m in models
                 if duplicates.get(m, m) == duplicates.get(own, own)
             )
@@ -259,7 +259,7 @@ def _ranking_of(
     interrupted: bool,
     wall_s: float,
 ) -> ModelRanking:
-    ranked, worth = search.ranked(), search.criteria()
+    ranked, scores = search.ranked(), search.criteria()
     fits = {model: search.fits[model] for model in ranked}
     best, duplicates = next(iter(ranked)), search.duplicates()
     rows = [
@@ -273,8 +273,8 @@ def _ranking_of(
             train_rmse=fit.report.train.rmse,
             validation_rmse=fit.report.validation.rmse,
             validation_rmse_percent_of_span=fit.report.validation.rmse_percent_of_span,
-            aic=worth[model].aic,
-            bic=worth[model].bic,
+            aic=scores[model].aic,
+            bic=scores[model].bic,
             validates_as_well=ranked[model],
             wall_s=fit.report.wall_s,
             warnings=fit.report.warnings,

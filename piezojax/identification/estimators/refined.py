@@ -91,12 +91,12 @@ def refined_instrumental_variables(
         model = _with_noise(x, y, a, b, delay)
         found.append(model)
         prefilter = (model.noise, a)
-        seen, clean, driven = (
+        measured, modelled, driven = (
             _filtered(*prefilter, signal) for signal in (y, model.applied(x), x)
         )
-        rows = _rows(driven, seen, poles, zeros, delay)
-        instruments = _rows(driven, clean, poles, zeros, delay)
-        solution = _solved(instruments.T @ rows, instruments.T @ seen[SETTLE:])
+        rows = _rows(driven, measured, poles, zeros, delay)
+        instruments = _rows(driven, modelled, poles, zeros, delay)
+        solution = _solved(instruments.T @ rows, instruments.T @ measured[SETTLE:])
         last, (a, b) = a, _split(solution, poles)
         if np.max(np.abs(a - last)) < CONVERGED:
             break

@@ -317,7 +317,7 @@ def _time_step(time: np.ndarray, even: bool) -> float:
 
 def _common_step(steps: dict[str, float | None]) -> float:
     """Return the sample time in s; check that all known values agree."""
-    known = [(who, step) for who, step in steps.items() if step is not None]
+    known = [(source, step) for source, step in steps.items() if step is not None]
     if not known:
         raise ContentError("name the time column, or give its rate in Hz")
     first, dt = known[0]

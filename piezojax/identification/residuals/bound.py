@@ -176,8 +176,8 @@ def _share(frequency: float, known: np.ndarray, upper: np.ndarray) -> float:
     """Return the largest share of a mode at ``frequency`` that no line contradicts."""
     if frequency < known[0]:
         return 0.0
-    seen = np.abs((frequency / known) ** 2 - 1.0)
-    return float(min(1.0, np.min(np.maximum(upper, ABSORBED) * seen)))
+    share_per_error = np.abs((frequency / known) ** 2 - 1.0)
+    return float(min(1.0, np.min(np.maximum(upper, ABSORBED) * share_per_error)))
 
 
 def _bound(

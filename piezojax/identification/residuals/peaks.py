@@ -28,12 +28,12 @@ class Peak(BaseModel):
 def unmodelled_peaks(found: RelativeError) -> list[Peak]:
     """Return the resonances that the model lacks, the highest first.
 
-    The lower end of its interval is above ``LEAST``, a line of its flanks is sure (at
-    the top leakage widens the interval), and it exceeds the median within an octave by
-    the factor ``SHARP``.
+    A peak counts if the lower end of its interval is above ``LEAST``, a line on its
+    flanks is sure (at the top leakage widens the interval), and it exceeds the median
+    within an octave by the factor ``SHARP``.
     """
     frequency, error = found.frequency, found.error
-    seen = found.lower * found.gain / max(found.gain[0], np.finfo(float).tiny)
+    amplitude = found.lower * found.gain / max(found.gain[0], np.finfo(float).tiny)
     sure = found.sure & (found.lower > LEAST)
     kept: list[int] = []
     for i in np.argsort(error)[::-1]:
@@ -41,7 +41,7 @@ def unmodelled_peaks(found: RelativeError) -> list[Peak]:
         around = (ratio > 0.5) & (ratio < 2.0)
         near = (ratio > 0.8) & (ratio < 1.25)
         outside = error[around & ~near]
-        large = found.lower[i] > LEAST and seen[i] > VISIBLE
+        large = found.lower[i] > LEAST and amplitude[i] > VISIBLE
         if not large or not sure[near].any() or outside.size < 4:
             continue
         taken = any(0.8 < frequency[i] / frequency[j] < 1.25 for j in kept)
