@@ -151,10 +151,10 @@ def _limit_alarms(
 def _holdout_alarms(limits: Mapping[str, ConstraintOutcome]) -> Iterable[str]:
     for name, outcome in limits.items():
         at_most = CONSTRAINTS[name].sense == "at most"
-        room = 1.0 + HELD_OUT if at_most else 1.0 - HELD_OUT
+        allowance = 1.0 + HELD_OUT if at_most else 1.0 - HELD_OUT
         value = np.nan if outcome.value is None else outcome.value
-        inside = value <= outcome.limit * room
-        if not (inside if at_most else value >= outcome.limit * room):
+        inside = value <= outcome.limit * allowance
+        if not (inside if at_most else value >= outcome.limit * allowance):
             yield _missed(name, outcome.value, outcome.limit, "the hold-out")
 
 

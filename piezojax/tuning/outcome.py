@@ -132,8 +132,8 @@ class Outcome:
         count = len(signals.references)
         logs = [self._log(loop, index) for index in range(count)]
         level = jnp.broadcast_to(signals.references[0, 0], signals.references[0].shape)
-        still = None if signals.disturbance is None else jnp.zeros_like(level)
-        held = _log(loop, level, signals.noise[0, 0], still)
+        undisturbed = None if signals.disturbance is None else jnp.zeros_like(level)
+        held = _log(loop, level, signals.noise[0, 0], undisturbed)
         voltages = [
             _at_piezo(self.case.amplifier, log.voltage) for log in (*logs, held)
         ]
@@ -141,11 +141,11 @@ class Outcome:
         found = {}
         for axis, name in enumerate(names):
             every = [axis_of(v, axis) if study.axes else v for v in voltages]
-            *runs, still = (_finite(voltage) for voltage in every)
+            *runs, constant = (_finite(voltage) for voltage in every)
             capacitance = study.actuator.capacitance
             found[name] = drive_of(
                 runs,
-                still,
+                constant,
                 study.dt,
                 round(study.references.settle * study.rate),
                 study.by_axis(capacitance)[axis] if capacitance is not None else None,

@@ -78,8 +78,8 @@ def tune(
     except KeyboardInterrupt:
         result.status = "interrupted"
     limits = table.limits
-    doubts = _model_alarms(case, limits, stability)
-    result.alarms = alarms_of(result, stability, limits, doubts)
+    of_model = _model_alarms(case, limits, stability)
+    result.alarms = alarms_of(result, stability, limits, of_model)
     result.wall_s = clock.wall_s()
     comparison = (
         compare_baselines(objective, case, data, search, baselines, progress)
