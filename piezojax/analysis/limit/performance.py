@@ -80,10 +80,10 @@ def performance_limit(
     best = [best_response(spectrum, variance, inner) for spectrum in problem.spectra]
 
     error = (runs.displacement - runs.reference).reshape(noise.shape)
-    quiet = noise_free_error(loop, problem.plant, references, problem.residual)
+    noise_free = noise_free_error(loop, problem.plant, references, problem.residual)
     tuned = _mean_square(error[..., start:])
-    noisy = _mean_square((error - quiet)[..., start:])
-    kept = _mean_square(predictor.unpredicted(quiet))
+    by_noise = _mean_square((error - noise_free)[..., start:])
+    unpredicted = _mean_square(predictor.unpredicted(noise_free))
     whole = _mean_square(predictor.centred(problem.residual))
     line = 1.0 / (points * dt)
     rows = {}
@@ -97,7 +97,7 @@ def performance_limit(
             disturbance=_root(whole[i]),
             unpredicted=_root(np.mean(spectrum)),
             bandwidth=_last_above(spectrum, variance) * line,
-            tuned_shares=_shares(tuned[i], noisy[i], kept[i]),
+            tuned_shares=_shares(tuned[i], by_noise[i], unpredicted[i]),
             limit_shares=Shares(noise=_root(least[1]), unpredicted=_root(least[0])),
         )
     T, half = np.array(best), slice(1, points // 2)

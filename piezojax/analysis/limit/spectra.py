@@ -37,9 +37,9 @@ class ReferencePredictor:
         self._start, self.count = start, self._counted.shape[1]
         steps = self._steps()
         power, directions = np.linalg.eigh(sum(step.T @ step for step in steps))
-        telling = power > LEAST_SHARE * max(power[-1], np.finfo(float).tiny)
-        self._directions = directions[:, telling]
-        self._power = power[telling]
+        strong = power > LEAST_SHARE * max(power[-1], np.finfo(float).tiny)
+        self._directions = directions[:, strong]
+        self._power = power[strong]
 
     def _steps(self) -> list[np.ndarray]:
         return [np.diff(rows, axis=0) for rows in self._counted]

@@ -140,8 +140,8 @@ def verify_limit(
             + rest.reshape(noise.shape[:2])[:, :1]
         )
         moved = 0.0 if disturbance is None else disturbance
-        still = jnp.broadcast_to(moved, noise.shape)
-        logs = _logs(control, voltage, prediction, references, noise, still)
+        disturbances = jnp.broadcast_to(moved, noise.shape)
+        logs = _logs(control, voltage, prediction, references, noise, disturbances)
         runs = jax.tree.map(lambda x: np.asarray(x).reshape(-1, x.shape[-1]), logs)
         error = problem.predictor.centred(
             np.asarray(logs.displacement - logs.reference)

@@ -75,11 +75,13 @@ class BrokenLoop(System):
 
     def step(self, state: BrokenState, input: Signal) -> tuple[BrokenState, Signal]:
         loop, reference = self.loop, _pushed(self.reference, self.reference_push)
-        quiet = jax.tree.map(jnp.zeros_like, state.displacement)
-        sensor, measured = loop.sensor.step(state.sensor, (state.displacement, quiet))
+        no_noise = jax.tree.map(jnp.zeros_like, state.displacement)
+        sensor, measured = loop.sensor.step(
+            state.sensor, (state.displacement, no_noise)
+        )
         known = _pushed(state.applied, self.voltage_push)
-        seen = Observation(reference, reference, measured, known)
-        controller, command = loop.controller.step(state.controller, seen)
+        observed = Observation(reference, reference, measured, known)
+        controller, command = loop.controller.step(state.controller, observed)
         actuator, applied = loop.actuator.step(state.actuator, command)
         plant, displacement = loop.plant.step(
             state.plant, _pushed(input, self.voltage_push)

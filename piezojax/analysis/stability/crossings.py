@@ -30,8 +30,8 @@ def angle_grid(loop: LinearLoop | LinearAxes) -> np.ndarray:
     )
     poles = poles[np.abs(poles) > 1e-6]
     logs = np.log(poles.astype(complex))
-    speeds = np.abs(logs)[np.abs(logs) > 1e-9]
-    slowest = min(1e-2, speeds.min(initial=1.0)) * 1e-3
+    rates = np.abs(logs)[np.abs(logs) > 1e-9]
+    slowest = min(1e-2, rates.min(initial=1.0)) * 1e-3
     count = int(PER_DECADE * np.log10(np.pi / slowest))
     around = np.abs(np.imag(logs))[:, None] + np.abs(np.real(logs))[:, None] * _AROUND
     near = np.unique(around[(around > slowest) & (around < np.pi)])
