@@ -71,13 +71,13 @@ def outputs_figure(fit: Fit) -> Figure:
     shown = slice(max(part.start, part.stop - SHOWN), part.stop)
     picture = figure(9.0, 2.4 * run.shape[1] + 0.8)
     panels = picture.subplots(run.shape[1], 2, squeeze=False)
-    for i, (course, spectrum) in enumerate(panels):
+    for i, (over_time, spectrum) in enumerate(panels):
         unit = display_unit(record.output_units[i])
         time = record.time[shown]
-        course.plot(time, record.outputs[shown, i], color=MEASURED, label="measured")
-        course.plot(time, run[shown, i], color=AFTER, lw=0.9, label="simulated")
-        course.set(ylabel=f"output {i} ({unit})")
-        course.locator_params(axis="x", nbins=5)
+        over_time.plot(time, record.outputs[shown, i], color=MEASURED, label="measured")
+        over_time.plot(time, run[shown, i], color=AFTER, lw=0.9, label="simulated")
+        over_time.set(ylabel=f"output {i} ({unit})")
+        over_time.locator_params(axis="x", nbins=5)
         sizes = fit.spectra(part, i)
         for size, colour, label in (
             (sizes.measured, MEASURED, "measured"),
@@ -90,7 +90,7 @@ def outputs_figure(fit: Fit) -> Figure:
             title=f"validation residual {rmse:.3g} {unit} rms",
         )
         if i == 0:
-            course.legend()
+            over_time.legend()
             spectrum.legend()
     panels[-1, 0].set(xlabel="time (s)")
     panels[-1, 1].set(xlabel="frequency (Hz)")
@@ -124,13 +124,15 @@ def fit_figure(fit: Fit) -> Figure:
     time, error = record.time, fit.simulated - record.output
     unit = display_unit(record.output_unit)
     picture = figure(9.0, 5.6)
-    (loop, course), (residual, spectrum) = picture.subplots(2, 2)
+    (loop, over_time), (residual, spectrum) = picture.subplots(2, 2)
     part = fit.validate
     loop_panel(loop, fit, "simulated")
-    course.plot(time, record.output, color=MEASURED, label="measured")
-    course.plot(time, fit.simulated, color=AFTER, lw=0.9, label="free-run simulation")
-    course.set(xlabel="time (s)", ylabel=f"output ({unit})", title="Whole record\n")
-    legend_above(course)
+    over_time.plot(time, record.output, color=MEASURED, label="measured")
+    over_time.plot(
+        time, fit.simulated, color=AFTER, lw=0.9, label="free-run simulation"
+    )
+    over_time.set(xlabel="time (s)", ylabel=f"output ({unit})", title="Whole record\n")
+    legend_above(over_time)
     residual.plot(time, error, color=BEFORE, lw=0.7)
     residual.axvspan(time[part.start], time[part.stop - 1], color="#eef4f6", zorder=0)
     residual.set(
