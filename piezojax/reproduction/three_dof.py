@@ -51,14 +51,14 @@ def references() -> dict[str, np.ndarray]:
     distance from its mean is 50 urad.
     """
     time = signals.time_grid(LENGTH_S, 1.0 / p558.DT)
-    still = np.zeros((time.size, 3))
+    at_rest = np.zeros((time.size, 3))
     runs: dict[str, np.ndarray] = {}
     for axis, name in enumerate(AXES):
         for hertz in FREQUENCIES:
-            wave = still.copy()
+            wave = at_rest.copy()
             wave[:, axis] = 10.0 * _sine(time, float(hertz))
             runs[f"drive_{name}_{hertz}Hz"] = wave
-    first, second = still.copy(), still.copy()
+    first, second = at_rest.copy(), at_rest.copy()
     first[:, 0], first[:, 1] = 10.0 * _sine(time, 2.0), 50.0 * _sine(time, 5.0)
     second[:, 0] = signals.piecewise_sine(time, 2.0, 10.0)
     wave = np.asarray(signals.superposed_sine(time, 10.0, 5.0)) - 5.0
