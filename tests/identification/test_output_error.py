@@ -1,25 +1,17 @@
-"""Free-run fits against known truth and the measured micromanipulator."""
-
-from pathlib import Path
+"""Free-run fits against known truth."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from piezojax import (
-    Record,
-    identify,
-)
+from piezojax import Record, identify
 from piezojax.catalog import p753
 from piezojax.core.paths import replace
 from piezojax.identification import free_run
 from piezojax.identification.chain import structure
 from piezojax.identification.estimators.output_error import problem_of
 
-MICROMANIPULATOR = (
-    Path(__file__).parents[2].parent / "shared/data/micromanipulator/Model_Vi_Do.dat"
-)
 MODEL = "coleman_hodgdon+arma"
 
 
@@ -48,18 +40,6 @@ def test_noise_does_not_bias_the_p753():
     assert found.value == pytest.approx(float(truth.parts[0].c), rel=0.02)
     assert abs(found.value - float(truth.parts[0].c)) < 4.0 * found.standard_error
     assert fit.report.validation.rmse == pytest.approx(p753.NOISE_RMS, rel=0.03)
-
-
-@pytest.mark.slow
-def test_the_measured_micromanipulator():
-    if not MICROMANIPULATOR.is_file():
-        pytest.skip(f"{MICROMANIPULATOR} is not here; its excerpt is tested elsewhere")
-    columns = np.loadtxt(MICROMANIPULATOR)
-    record = Record(columns[:, 0], columns[:, 4], 1.0 / 200.0, source="Model_Vi_Do.dat")
-    fit = identify(record)
-    assert (fit.train.start, fit.validate.stop) == (0, record.samples)
-    # Its sensor's noise is 0.067 um, cycles differ by as much.
-    assert fit.report.validation.rmse < 0.15
 
 
 def test_residuals_of_records_of_different_length_leave_the_padding_out():
