@@ -1,4 +1,4 @@
-"""Rooms of the package: imports go down only, and a module's name has one place."""
+"""Subpackages: imports go down only, and a module's name has one place."""
 
 import ast
 from collections import defaultdict
@@ -8,16 +8,16 @@ import pytest
 
 import piezojax
 
-ROOMS = (
+SUBPACKAGES = (
     *("core", "signals", "dynamics", "hysteresis", "hardware", "control", "analysis"),
     *("solve", "identification", "catalog", "study", "tuning", "sweeping"),
     *("reproduction", "report", "cli"),
 )
-"""Rooms from the ground up: each may import those before it, so that ``cli`` alone
-imports ``report``."""
+"""Subpackages from the ground up: each may import those before it, so that ``cli``
+alone imports ``report``."""
 
 ENTRIES = ("__init__", "tune", "identify", "sweep", "reproduce")
-"""Modules at the top, which may import any room and no room may import."""
+"""Modules at the top, which may import any subpackage and no subpackage may import."""
 
 
 def modules(package):
@@ -56,45 +56,45 @@ def imported(package, parts, path, is_package):
 
 
 def violations(package):
-    """Return what breaks the order of rooms in the package, a line each."""
+    """Return what breaks the order of subpackages in the package, a line each."""
     found, arrows, places = [], defaultdict(set), defaultdict(set)
     for parts, (path, is_package) in modules(package).items():
-        room, where = parts[0], ".".join(parts)
-        if room not in (*ROOMS, *ENTRIES):
-            found.append(f"{where}: {room} is not a room")
+        subpackage, where = parts[0], ".".join(parts)
+        if subpackage not in (*SUBPACKAGES, *ENTRIES):
+            found.append(f"{where}: {subpackage} is not a subpackage")
             continue
         if not is_package and parts[-1] != "__init__" and len(parts) > 1:
-            places[parts[-1]].add(room)
-        if room in ENTRIES:
+            places[parts[-1]].add(subpackage)
+        if subpackage in ENTRIES:
             continue
         for line, target in imported(package, parts, path, is_package):
             other = target[0] if target else "__init__"
-            if other == room:
+            if other == subpackage:
                 continue
-            arrows[room].add(other)
-            if other not in ROOMS:
+            arrows[subpackage].add(other)
+            if other not in SUBPACKAGES:
                 found.append(f"{where}:{line} imports {other} from the top")
-            elif ROOMS.index(other) > ROOMS.index(room):
-                found.append(f"{where}:{line} imports {other}, a room above")
+            elif SUBPACKAGES.index(other) > SUBPACKAGES.index(subpackage):
+                found.append(f"{where}:{line} imports {other}, a subpackage above")
     mutual = ((a, b) for a in arrows for b in arrows[a] if a in arrows.get(b, ()))
     pairs = {tuple(sorted(pair)) for pair in mutual}
     found += [f"{one} and {other} import each other" for one, other in sorted(pairs)]
     found += [
-        f"{name} is a module of {' and '.join(sorted(rooms))}"
-        for name, rooms in sorted(places.items())
-        if len(rooms) > 1
+        f"{name} is a module of {' and '.join(sorted(subpackages))}"
+        for name, subpackages in sorted(places.items())
+        if len(subpackages) > 1
     ]
     return found
 
 
-def test_rooms_import_downwards_and_share_no_names():
+def test_subpackages_import_downwards_and_share_no_names():
     assert violations(Path(piezojax.__file__).parent) == []
 
 
-def test_every_room_is_there():
+def test_every_subpackage_is_there():
     package = Path(piezojax.__file__).parent
-    rooms = {parts[0] for parts in modules(package)}
-    assert rooms == {*ROOMS, *ENTRIES}
+    subpackages = {parts[0] for parts in modules(package)}
+    assert subpackages == {*SUBPACKAGES, *ENTRIES}
 
 
 def test_pictures_are_drawn_without_computing():
@@ -141,14 +141,14 @@ LEGAL = {
         (
             {"core/system.py": "from ..control.pid import PID"},
             [
-                "core.system:1 imports control, a room above",
+                "core.system:1 imports control, a subpackage above",
                 "control and core import each other",
             ],
         ),
         (
             {"core/paths.py": "def late():\n    import small.report.bode"},
             [
-                "core.paths:2 imports report, a room above",
+                "core.paths:2 imports report, a subpackage above",
             ],
         ),
         (
@@ -156,18 +156,18 @@ LEGAL = {
                 "core/paths.py": "from typing import TYPE_CHECKING\n"
                 "if TYPE_CHECKING:\n    from ..analysis import margins"
             },
-            ["core.paths:3 imports analysis, a room above"],
+            ["core.paths:3 imports analysis, a subpackage above"],
         ),
         (
             {"core/paths.py": "from .. import solve"},
-            ["core.paths:1 imports solve, a room above"],
+            ["core.paths:1 imports solve, a subpackage above"],
         ),
         (
             {"core/paths.py": "from .. import simulate"},
             ["core.paths:1 imports simulate from the top"],
         ),
         ({"core/pid.py": ""}, ["pid is a module of control and core"]),
-        ({"utils/pid.py": ""}, ["utils.pid: utils is not a room"]),
+        ({"utils/pid.py": ""}, ["utils.pid: utils is not a subpackage"]),
     ],
 )
 def test_a_planted_violation_is_found(tmp_path, planted, expected):
