@@ -72,7 +72,7 @@ def test_a_registered_class_is_saved_and_loaded(fresh, tmp_path):
 
 
 def test_a_class_that_is_not_registered_is_not_saved(tmp_path):
-    message = "Straight is not known to files; register its class with piezojax.regis"
+    message = "Straight cannot be saved; register its class with piezojax.regis"
     with pytest.raises(ValueError, match=message):
         pj.save(line()(2.0), tmp_path / "a.json")
     with pytest.raises(ValueError, match=message):

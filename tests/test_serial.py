@@ -285,7 +285,7 @@ def test_type_must_be_a_name(kind):
 def test_no_type():
     message = message_for({"gain": 2.0})
     assert message.startswith(
-        "system needs a key 'type'; one of ARMA, AdaptiveInverse, Affine, "
+        "system needs a key 'type' with one of ARMA, AdaptiveInverse, Affine, "
     )
 
 
@@ -360,7 +360,7 @@ def test_bad_values(data, message):
         ({"type": "Delay", "samples": -1}, "system.parts.1: samples is -1"),
         ({"type": "Dealy", "samples": 1}, "system.parts.1.type is 'Dealy'; it must"),
         ({"type": "Delay", "smaples": 1}, "system.parts.1.smaples is unknown; Delay"),
-        ({"samples": 1}, "system.parts.1 needs a key 'type'; one of ARMA"),
+        ({"samples": 1}, "system.parts.1 needs a key 'type' with one of ARMA"),
     ],
 )
 def test_messages_lead_to_the_nested_table(part, message):
@@ -550,7 +550,7 @@ NESTED = {
 @pytest.mark.parametrize("name", NESTED)
 def test_a_file_nested_too_deep(tmp_path, name):
     (tmp_path / name).write_text(NESTED[name], encoding="utf-8")
-    message = rf"{name} holds more than 64 tables or lists inside each other$"
+    message = rf"{name} nests tables or lists more than 64 deep$"
     with pytest.raises(ValueError, match=message):
         load(tmp_path / name)
 

@@ -40,7 +40,9 @@ class _SampleRange(click.ParamType):
 @click.option("--rate", type=float, help="Sampling rate, Hz, without a time column.")
 @click.option("--period", type=int, help="Samples per period of a periodic input.")
 @click.option("--resample", type=float, help="Resample the record to this rate, Hz.")
-@click.option("--method", help="Method of the fit (default: the first to apply).")
+@click.option(
+    "--method", help="Method of the fit (default: the first that can fit the model)."
+)
 @click.option(
     "--order",
     type=click.IntRange(min=1),

@@ -52,7 +52,7 @@ class KalmanFilter(Observer):
 
     def __check_init__(self):
         if not self.model.autoregressive:
-            raise ValueError("the model has no a coefficient; it must have at least 1")
+            raise ValueError("the model has no coefficient a_1; it must have one")
         needed = position_count(self.model) + 1
         if len(self.gain) != needed:
             raise ValueError(

@@ -73,7 +73,7 @@ def mixed_sensitivity(
     while (best := _controller(plant, upper, dt)) is None:
         upper *= 2.0
         if upper > 1e12:
-            raise ValueError("no gamma up to 1e12 has a controller")
+            raise ValueError("no controller exists for any gamma up to 1e12")
     lower = 0.0
     while upper - lower > GAMMA_TOLERANCE * upper:
         middle = 0.5 * (lower + upper)

@@ -35,7 +35,7 @@ def inversion_gain(form: str, model: ARMA, error: Scalar, control: Scalar) -> Sc
 def check_has_poles(model: ARMA) -> None:
     """Raise ValueError for a model without a_1."""
     if not model.autoregressive:
-        raise ValueError("the model has no a coefficient; it must have at least 1")
+        raise ValueError("the model has no coefficient a_1; it must have one")
 
 
 def derivatives(position: Scalar, velocities: Row, dt: float) -> Row:

@@ -124,7 +124,9 @@ def zero_phase_inverse(model: ARMA, margin: float = 1.0) -> PreviewInverse:
     scale, stable, unstable, delay = _split(model, margin)
     at_rest = unstable.sum()
     if abs(at_rest) < 1e-9 * np.abs(unstable).sum():
-        raise ValueError("the model has a zero at z = 1; it must pass a reference")
+        raise ValueError(
+            "the model has a zero at z = 1; its gain at rest must not be 0"
+        )
     return _inverse(model, scale, stable, unstable / at_rest**2, delay)
 
 

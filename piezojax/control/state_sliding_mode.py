@@ -97,7 +97,7 @@ class StateSlidingMode(Designed):
                 "must be equal"
             )
         if np.any(np.asarray(self.model.D)):
-            raise ValueError("D of the model is not zero; u(k) must move y(k+1)")
+            raise ValueError("D of the model is not zero; y(k) must not depend on u(k)")
         check_square("reaching", self.reaching, outputs)
 
     @property

@@ -40,7 +40,7 @@ def shown(value: Any) -> str:
 
 
 def _too_deep(name: str) -> str:
-    return f"{name} holds more than {DEEPEST} tables or lists inside each other"
+    return f"{name} nests tables or lists more than {DEEPEST} deep"
 
 
 def _check(data: Any, name: str) -> None:

@@ -30,7 +30,7 @@ def to_data(system: System) -> dict[str, Any]:
     name = type(system).__name__
     if kinds().get(name) is not type(system):
         raise ValueError(
-            f"{name} is not known to files; register its class with piezojax.register"
+            f"{name} cannot be saved; register its class with piezojax.register"
         )
     data: dict[str, Any] = {"type": name}
     for field in dataclasses.fields(system):
@@ -57,7 +57,7 @@ def from_data(data: Any, where: str = "system") -> System:
     known = kinds()
     allowed = ", ".join(known)
     if not isinstance(data, Mapping) or "type" not in data:
-        raise ValueError(f"{where} needs a key 'type'; one of {allowed}")
+        raise ValueError(f"{where} needs a key 'type' with one of {allowed}")
     kind = known.get(data["type"]) if isinstance(data["type"], str) else None
     if kind is None:
         raise ValueError(

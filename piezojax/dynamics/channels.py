@@ -86,5 +86,5 @@ def channels_of(models: Sequence[StateSpace]) -> Channels:
         if model.B.shape[1] != 1:
             raise ValueError(f"a channel has {model.B.shape[1]} inputs; it must have 1")
         if np.any(np.asarray(model.D)):
-            raise ValueError("D is not zero; an input must not reach its own sample")
+            raise ValueError("D is not zero; y(k) must not depend on u(k)")
     return Channels(tuple(Channel(m.A, m.B[:, 0], m.C, m.dt) for m in models))

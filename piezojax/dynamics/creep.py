@@ -102,13 +102,13 @@ class LogarithmicCreep(Fittable):
     """
 
     part: ClassVar[Part] = Part(
-        "logarithmic_creep", "creep", "Creep with the logarithm of time"
+        "logarithmic_creep", "creep", "Creep that grows with the logarithm of time"
     )
 
     gain_per_decade: Scalar = parameter(
         "1", "creep in each decade of time", typical=(0.0, 0.1)
     )
-    shortest: float = parameter("s", "begin of the creep", above=0.0, static=True)
+    shortest: float = parameter("s", "start of the creep", above=0.0, static=True)
     longest: float = parameter("s", "end of the creep", above=0.0, static=True)
     dt: float = sample_time()
     direct: float = parameter(

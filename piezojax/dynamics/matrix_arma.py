@@ -117,7 +117,7 @@ def observability_form(model: StateSpace, lags: int | None = None) -> MatrixARMA
             f"the model has {inputs} inputs and {q} outputs; the numbers must be equal"
         )
     if np.any(np.asarray(model.D)):
-        raise ValueError("D is not zero; an input must not reach its own sample")
+        raise ValueError("D is not zero; y(k) must not depend on u(k)")
     p = -(-n // q) if lags is None else lags
     if p * q < n:
         raise ValueError(f"lags is {p}; {n} states and {q} outputs need {-(-n // q)}")

@@ -34,7 +34,7 @@ class Modes(Designed, Fittable):
     """
 
     part: ClassVar[Part] = Part(
-        "modes", "dynamics", "Resonances in parallel, behind the lag of a sensor"
+        "modes", "dynamics", "Resonances in parallel, followed by the lag of a sensor"
     )
 
     frequency: Scalars = parameter(

@@ -79,7 +79,7 @@ class StateSpace(System):
         Raises ValueError if D is not zero, because the loop would be algebraic.
         """
         if np.any(np.asarray(self.D)):
-            raise ValueError("D is not zero; an input must not reach its own sample")
+            raise ValueError("D is not zero; y(k) must not depend on u(k)")
         return StateSpace(self.A, self.B, self.C @ self.A, self.C @ self.B, self.dt)
 
     def as_arma(self) -> ARMA:

@@ -65,7 +65,7 @@ class ColemanHodgdon(Hysteresis, Fittable):
 
     a: Scalar = parameter("um/V^2", "pull by the input")
     b: Scalar = parameter("um/V", "slope just after a turn at the origin")
-    c: Scalar = parameter("1/V", "decay with the input's path", below=0.0)
+    c: Scalar = parameter("1/V", "decay along the path of the input", below=0.0)
     rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
     rest_output: Scalar = parameter("um", "output of the virgin state", default=0.0)
     scheme: str = eqx.field(static=True, default="trapezoid")

@@ -70,7 +70,7 @@ class Duhem(Hysteresis, Fittable):
     part: ClassVar[Part] = Part(
         "duhem",
         "hysteresis",
-        "Semilinear Duhem: each branch its own linear law, y' = (F + G sign x') x'",
+        "Semilinear Duhem: a linear law for each branch, y' = (F + G sign x') x'",
     )
 
     reversible: Surface = parameter(

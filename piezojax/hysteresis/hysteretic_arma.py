@@ -32,7 +32,7 @@ class HystereticARMA(Hysteresis):
 
     dynamic: ClassVar[bool] = True
 
-    c: Scalar = parameter("1/V", "decay with the input's path", below=0.0)
+    c: Scalar = parameter("1/V", "decay along the path of the input", below=0.0)
     autoregressive: Scalars = parameter(
         "1", "coefficients of past outputs", converter=as_scalars
     )

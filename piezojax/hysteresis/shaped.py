@@ -50,7 +50,7 @@ class ShapedColemanHodgdon(Hysteresis, Fittable):
     slope: Scalars = parameter(
         "um/V^(i+1)", "coefficient i of the polynomial g", converter=as_scalars
     )
-    c: Scalar = parameter("1/V", "decay with the input's path", below=0.0)
+    c: Scalar = parameter("1/V", "decay along the path of the input", below=0.0)
     rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
     rest_output: Scalar = parameter("um", "output of the virgin state", default=0.0)
 

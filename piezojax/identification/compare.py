@@ -266,9 +266,7 @@ def _ranking_of(
         RankedModel(
             model=model,
             status="fitted",
-            note=f"another way to write {duplicates[model]}"
-            if model in duplicates
-            else "",
+            note=f"equivalent to {duplicates[model]}" if model in duplicates else "",
             parameters=fit.count,
             train_rmse=fit.report.train.rmse,
             validation_rmse=fit.report.validation.rmse,

@@ -85,7 +85,7 @@ def _relation(record: Record) -> Iterator[str]:
     if lead > AHEAD:
         yield (
             f"the output runs ahead of the input by {np.degrees(np.arcsin(lead)):.1f} "
-            "degrees, and a stage can only follow: are the columns swapped? Name them "
+            "degrees, but a stage can only lag: are the columns swapped? Name them "
             "with --input and --output"
         )
 

@@ -54,7 +54,7 @@ def baselines_text(baselines: Baselines) -> str:
         return "no baseline has a stable loop"
     best, ours = baselines.entry(baselines.best), baselines.ours
     if best.ratio is None or best.reached_s is None:
-        return f"{ours.method} never was as good as {best.method}, the best baseline"
+        return f"{ours.method} was never as good as {best.method}, the best baseline"
     running, near = _times(best.ratio_running), _times(best.ratio_best)
     return (
         f"as good as {best.method}, the best baseline, after {best.reached_s:.1f} s "

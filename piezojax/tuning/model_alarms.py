@@ -32,8 +32,8 @@ def model_alarms(
         yield from report.alarms
         if bound is None:
             yield (
-                "the record does not tell how wrong the fitted plant is: use a longer "
-                "record with one input and one output"
+                "the record gives no bound on the error of the fitted plant: use a "
+                "longer record with one input and one output"
             )
     if bound is not None and "after" in stability.loops:
         yield from _error_alarm(bound, limit, stability)

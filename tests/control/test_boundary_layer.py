@@ -89,7 +89,7 @@ def changed(**values):
         (lambda: changed(inversion="none"), "inversion 'none'; it must be one of"),
         (
             lambda: changed(model=ARMA((), (0.5,))),
-            "the model has no a coefficient; it must have at least 1",
+            "the model has no coefficient a_1; it must have one",
         ),
     ],
 )

@@ -340,7 +340,7 @@ def changed(controller, **values):
         ),
         (
             lambda: changed(PRINTED, model=ARMA((), (1.0,)), surface=()),
-            "the model has no a coefficient; it must have at least 1",
+            "the model has no coefficient a_1; it must have one",
         ),
         (
             lambda: changed(PRINTED, inversion="exact"),
@@ -360,7 +360,7 @@ def changed(controller, **values):
         (lambda: changed(SWITCHED.law, gain=-1.0), "gain .* is -1; .* at least 0"),
         (
             lambda: changed(SWITCHED, model=ARMA((), (0.1,))),
-            "the model has no a coefficient; it must have at least 1",
+            "the model has no coefficient a_1; it must have one",
         ),
         (
             lambda: changed(SWITCHED, control_weight=-1.0),

@@ -256,7 +256,7 @@ def test_the_studies_differ_in_the_observer_only(name):
         ),
         (
             lambda: KalmanFilter(ARMA((), (1.0,)), (0.1, 0.1, 0.1), DT),
-            "the model has no a coefficient; it must have at least 1",
+            "the model has no coefficient a_1; it must have one",
         ),
         (lambda: KalmanFilter(STAGE, (np.nan, 0.1, 0.1), DT), "gain is nan"),
         (lambda: KalmanFilter(STAGE, GAIN, 0.0), "dt in s is 0; .* above 0"),

@@ -318,7 +318,7 @@ def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
         ),
         (
             lambda: sliding_mode(model=ARMA((), (0.5,))),
-            "the model has no a coefficient; it must have at least 1",
+            "the model has no coefficient a_1; it must have one",
         ),
         (
             lambda: sliding_mode(error_weight=0.0),

@@ -104,7 +104,7 @@ def test_stops_are_chosen_as_the_plays_that_they_are():
     assert found.report.best == "prandtl_ishlinskii+lag"
     rows = {row.model: row for row in found.report.rows}
     note = rows["stop_prandtl_ishlinskii+lag"].note
-    assert note == "another way to write prandtl_ishlinskii+lag"
+    assert note == "equivalent to prandtl_ishlinskii+lag"
     stops, *others = plant.parts
     same = Series((stops.as_plays(), *others), plant.names)
     check_recovered(found.best, same, clean)

@@ -88,7 +88,7 @@ def test_of_two_ways_to_write_one_model_the_first_is_chosen(made, monkeypatch):
     plays = "prandtl_ishlinskii+exponential_creep+arma"
     assert stop.bic < rows[plays].bic
     assert found.report.best.split("+")[0] == "prandtl_ishlinskii"
-    assert stop.note == f"another way to write {plays}"
+    assert stop.note == f"equivalent to {plays}"
     assert f"{stop.model} is {stop.note}" in ranking_notes(found.report)
     # Another model has its place in the further rounds.
     assert not any(

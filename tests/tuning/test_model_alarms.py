@@ -73,4 +73,4 @@ def test_alarms_of_the_fit_and_a_missing_bound_are_alarms(stability):
     report = FitReport.model_construct(alarms=["wrong column"])
     first, second = model_alarms(report, None, 2.0, stability)
     assert first == "wrong column"
-    assert "does not tell how wrong" in second
+    assert "gives no bound on the error" in second

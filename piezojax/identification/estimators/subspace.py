@@ -207,7 +207,7 @@ def identify_channel(
     if excited < 2 * p:
         notes.append(
             f"the input excites {excited} of the {2 * p} directions of {2 * p} "
-            "samples: the response in the others is up to noise and prior"
+            "samples: in the others noise and prior alone determine the response"
         )
     return ChannelFit(model, markov, hankel_singular_values(markov), tuple(notes))
 

@@ -210,7 +210,8 @@ def _unknown_start(record: Record, hysteresis: bool) -> Iterator[str]:
                 away = 100.0 * abs(output_start - end)
                 yield (
                     f"{name} starts {away:.0f} % of its range away "
-                    f"from the end where input starts: its initial loading is unknown"
+                    "from the end of its range that matches the start of the "
+                    "input: its initial loading is unknown"
                 )
 
 

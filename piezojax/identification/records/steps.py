@@ -31,7 +31,9 @@ def stated_step(scalars: Mapping[str, Any]) -> float | None:
     steps = list(known.values())
     if steps and max(steps) - min(steps) > AGREE * max(steps):
         listed = ", ".join(f"{name} ({step:g} s)" for name, step in known.items())
-        raise ContentError(f"the sample times in the file contradict: {listed}")
+        raise ContentError(
+            f"the sample times in the file contradict each other: {listed}"
+        )
     return steps[0] if steps else None
 
 
