@@ -281,8 +281,12 @@ def summary(lines):
     far = [line["name"] for line in silent if line["ratio"] > FAR]
     false = [line["name"] for line in lines if warned(line) and healthy(line)]
     refused = [line["name"] for line in lines if line["refused"]]
+    ratios = [line["ratio"] for line in silent] or [np.nan]
+    worst = max((line["worst"] for line in silent), default=np.nan)
     return [
         f"{len(lines)} stages, {len(lines) - len(silent)} with an alarm",
+        f"without an alarm: ratio {np.median(ratios):.2f} in the median, "
+        f"{max(ratios):.2f} at most, {worst:.2f} for one reference",
         f"lost or railing without an alarm: {len(lost)} (bar 0) {lost}",
         f"without an alarm within {CLOSE}: {len(kept)} (bar {KEPT} of 40)",
         f"without an alarm above {FAR:g}: {len(far)} (bar 0) {far}",
