@@ -721,8 +721,8 @@ def test_what_must_not_be_missing(refusal, place):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a = " + "[" * 5000 + "]" * 5000, "holds more than 64 tables or lists insi"),
-        (f"[{'.'.join(['a'] * 2000)}]", "holds more than 64 tables or lists inside"),
+        ("a = " + "[" * 5000 + "]" * 5000, "nests tables or lists more than 64 deep"),
+        (f"[{'.'.join(['a'] * 2000)}]", "nests tables or lists more than 64 deep"),
         ("rate = 1" + "0" * 400, "rate is 1000000"),
         ("rate = 1" + "0" * 9000, "Exceeds the limit"),
     ],

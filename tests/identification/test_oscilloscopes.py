@@ -251,7 +251,7 @@ def test_a_rate_beside_the_arrays(tmp_path, suffix, name, value):
         ({"fs": 0.0}, "fs is 0.0; it must be a number above 0"),
         ({"dt": np.nan}, "dt is nan; it must be"),
         ({"dt": "fast"}, "dt is 'fast'; it must be"),
-        ({"dt": 1e-3, "fs": 5e4}, "contradict: dt (0.001 s), fs (2e-05 s)"),
+        ({"dt": 1e-3, "fs": 5e4}, "contradict each other: dt (0.001 s), fs (2e-05 s)"),
     ],
 )
 def test_a_rate_that_is_none(tmp_path, scalars, message):
