@@ -1,6 +1,5 @@
 import gc
 import os
-import tempfile
 from pathlib import Path
 
 import jax
@@ -56,18 +55,6 @@ def modules_with_arrays():
 install_import_hook([*modules_with_arrays()], "beartype.beartype")
 
 
-def pytest_configure(config):
-    """Let all workers and commands of a run share what they compile.
-
-    Many files compile the same loops.
-    """
-    if hasattr(config, "workerinput") or "PIEZOJAX_COMPILATION_CACHE" in os.environ:
-        return
-    folder = tempfile.TemporaryDirectory(prefix="piezojax-programs-")
-    os.environ["PIEZOJAX_COMPILATION_CACHE"] = folder.name
-    config.add_cleanup(folder.cleanup)
-
-
 def pytest_collection_modifyitems(items):
     """Begin with the files that take long: the workers then end at the same time.
 
@@ -84,9 +71,3 @@ def pytest_collection_modifyitems(items):
 def pytest_sessionfinish():
     """Keep pytest from its last search for garbage in gigabytes of traced programs."""
     gc.freeze()
-
-
-@pytest.fixture(scope="session", autouse=True)
-def kept_programs():
-    """Small compiled programs are shared too: a loop made again costs its tracing."""
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
