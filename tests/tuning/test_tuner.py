@@ -312,8 +312,7 @@ def test_a_box_in_which_everything_diverges():
         f"parameters/{INTEGRAL}": {"lower": 3e6, "upper": 1e7, "start": 5e6},
     }
     with pytest.raises(
-        ValueError,
-        match="the loop diverges or rails at the start and",
+        ValueError, match="the loop diverges or rails at the start and"
     ) as got:
         pj.tune(case_of(changes))
     assert str(got.value) == (
