@@ -2,6 +2,10 @@ import gc
 import os
 from pathlib import Path
 
+# There is a worker for each core: further threads of linear algebra would wait for
+# each other in a busy loop. Read when NumPy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 import pytest
 from hypothesis import settings
