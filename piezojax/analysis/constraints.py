@@ -17,6 +17,7 @@ from .stability.differentiable import (
     peak_of,
 )
 from .stability.model_error import worst_delay_margin, worst_sensitivity
+from .stability.operating_point import BRANCHES
 
 OFF = "off"
 """Limit in a study that switches a constraint off."""
@@ -95,12 +96,13 @@ def _largest(runs: Array) -> Array:
 
 
 def _margin(figure: Callable[[Array, Any], Array]) -> Callable[[Margins, float], Array]:
-    def values(margins: Margins, dt: float) -> Array:
-        del dt
-        of_each = jax.vmap(jax.vmap(lambda found: figure(found, margins.error)))
-        return of_each(margins.sensitivity)
+    # Outside a program its dozens of operations would be compiled one by one.
+    @jax.jit
+    def of_each(margins: Margins) -> Array:
+        one = lambda found: figure(found, margins.error)  # noqa: E731
+        return jax.vmap(jax.vmap(one))(margins.sensitivity)
 
-    return values
+    return lambda margins, dt: of_each(margins)
 
 
 def _peak(sensitivity: Sensitivity, error: Array | None) -> Array:
@@ -175,6 +177,17 @@ def limits_of(written: Mapping[str, Any]) -> dict[str, float]:
 def uses(names: Iterable[str], source: Source) -> bool:
     """Return whether any of the constraints ``names`` is evaluated from ``source``."""
     return any(CONSTRAINTS[name].source == source for name in names)
+
+
+def constraint_count(names: Iterable[str], plants: int, margin_plants: int) -> int:
+    """Return the number of ``violations`` of the limits ``names``.
+
+    Runs are limited on ``plants``, margins on each branch of ``margin_plants``.
+    """
+    margins = margin_plants * len(BRANCHES)
+    return sum(
+        margins if CONSTRAINTS[name].source == "margins" else plants for name in names
+    )
 
 
 def violations(

@@ -5,7 +5,6 @@ Source: Nocedal and Wright, Numerical Optimization, 2006, section 17.4.
 
 from collections.abc import Iterator
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -44,13 +43,9 @@ def update_multipliers(
     return jnp.maximum(multipliers + penalty * violation, 0.0)
 
 
-def with_zero_multipliers(problem: Problem, size: int) -> Problem:
-    """Return ``problem`` with ``size`` unknowns and all multipliers 0."""
-    if not problem.limits:
-        return problem
-    middle = jnp.full(size, 0.5)
-    count = jax.eval_shape(lambda p: p.violations(middle), problem).shape[0]
-    return problem.with_multipliers(jnp.zeros(count))
+def with_zero_multipliers(problem: Problem) -> Problem:
+    """Return ``problem`` with all multipliers 0."""
+    return problem.with_multipliers(jnp.zeros(problem.constraints))
 
 
 def rounds(problem: Problem, steps: int) -> Iterator[tuple[float, int, bool]]:

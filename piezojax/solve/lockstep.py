@@ -44,11 +44,11 @@ class LockstepDescent:
         forward: bool,
         at_once: int,
     ):
-        self._problem = with_zero_multipliers(problem, size)
+        self._problem = with_zero_multipliers(problem)
         self._size, self._clock, self._at_once = size, clock, at_once
         self._method, self._tolerance = METHODS[method], tolerance
         self._forward = forward
-        self._programs: dict[int, tuple[Any, Any, Any]] = {}
+        self._programs: dict[int, tuple[Any, Any]] = {}
         self._screening: Callable[..., Any] | None = None
         self._width = 0
 
@@ -77,7 +77,7 @@ class LockstepDescent:
         """Do nothing, because no program compiles in the background."""
 
     def prepare(self, starts: int, progress: Progress) -> None:
-        """Compile the programs that begin, advance and return violations."""
+        """Compile the programs that begin and advance."""
         progress.stage("compiling the gradient")
         if starts in self._programs:
             return
@@ -104,12 +104,9 @@ class LockstepDescent:
                 view = solver.view(carry)
                 if problem.limits:
                     return carry, view, problem.verdict(view.unit)
-                return carry, view, Verdict(view.loss, jnp.zeros(()))
+                return carry, view, Verdict(view.loss, jnp.zeros(0))
 
             return jax.vmap(advance_one)(carry, multipliers)
-
-        def violated(problem, units):
-            return jax.vmap(lambda unit: problem.violations(unit))(units)
 
         problem = self._problem
         units = jnp.full((starts, self._size), 0.5)
@@ -119,14 +116,13 @@ class LockstepDescent:
         self._programs[starts] = (
             compiled(begin, problem, units, multipliers),
             compiled(advance, problem, carry, multipliers),
-            compiled(violated, problem, units) if problem.limits else None,
         )
 
     def begin(
         self, problem: Problem, units: np.ndarray, multipliers: Array
     ) -> tuple[BatchedDescents, int]:
         """Return descents from ``units``, and the number of evaluations used."""
-        begin, advance, _ = self._programs[len(units)]
+        begin, advance = self._programs[len(units)]
         problem = problem.with_multipliers(self._problem.multipliers)
         descents = BatchedDescents(
             lambda carry: advance(problem, carry, multipliers),
@@ -134,9 +130,3 @@ class LockstepDescent:
             len(units),
         )
         return descents, 0
-
-    def violations(self, problem: Problem, units: np.ndarray) -> Array:
-        """Return the violations [starts, constraints] at ``units``."""
-        violated = self._programs[len(units)][2]
-        problem = problem.with_multipliers(self._problem.multipliers)
-        return violated(problem, as_array(units))

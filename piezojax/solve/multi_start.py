@@ -196,10 +196,6 @@ class Strategy(Protocol):
         """
         ...
 
-    def violations(self, problem: Problem, units: np.ndarray) -> Array:
-        """Return the violations [starts, constraints] at ``units``."""
-        ...
-
 
 def minimise(
     strategy: Strategy,
@@ -238,13 +234,12 @@ def minimise(
                 _pull_back(strategy, problem, end, state)
         else:
             best = np.argsort(standing.losses, kind="stable")[: strategy.finalists]
-            units, best = standing.units[best], standing.places[best]
-            places = places[best]
             multipliers = update_multipliers(
-                strategy.violations(problem, units),
-                multipliers[best],
+                as_array(standing.verdict.violations[best]),
+                multipliers[standing.places[best]],
                 as_array(penalty),
             )
+            units, places = standing.units[best], places[standing.places[best]]
 
 
 PULLS, SHARES = 2, np.linspace(0.125, 1.0, 8)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 Unit = Float[Array, " n"]
@@ -17,10 +18,18 @@ TOLERANCE = 1e-3
 
 
 class Verdict(NamedTuple):
-    """Objective and largest constraint violation at a point."""
+    """Objective without constraints, and the violation of each, at a point.
+
+    A violation is positive where the constraint is violated; they are on the last axis.
+    """
 
     loss: Any
-    violation: Any
+    violations: Any
+
+    @property
+    def violation(self) -> np.ndarray:
+        """Largest violation, 0 if there is none."""
+        return np.max(np.asarray(self.violations), axis=-1, initial=0.0)
 
 
 class Errors(NamedTuple):
@@ -54,6 +63,11 @@ class Problem(Protocol):
         ...
 
     @property
+    def constraints(self) -> int:
+        """Number of constraints."""
+        ...
+
+    @property
     def multipliers(self) -> Array:
         """Multipliers of the augmented Lagrangian, one per constraint."""
         ...
@@ -75,11 +89,7 @@ class Problem(Protocol):
         ...
 
     def verdict(self, unit: Unit) -> Verdict:
-        """Return the objective without constraints, and the largest violation."""
-        ...
-
-    def violations(self, unit: Unit) -> Float[Array, " constraints"]:
-        """Return the violation of every constraint, positive where it is violated."""
+        """Return the objective without constraints, and their violations."""
         ...
 
     def errors(self, unit: Unit, every: int) -> Errors:

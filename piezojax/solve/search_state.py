@@ -55,7 +55,7 @@ class SearchState:
         self.evaluations += taken
         best = float(ranks[leader])
         self.history.add(taken, best if best < VIOLATED else np.inf)
-        if best < rank(Verdict(self.loss, self.violation)):
+        if best < _rank(self.loss, self.violation):
             self.loss = float(verdict.loss[leader])
             self.violation = float(verdict.violation[leader])
             self.unit = units[leader]
@@ -73,7 +73,10 @@ class SearchState:
 
 def rank(verdict: Verdict) -> np.ndarray:
     """Return the loss, or a larger number if a constraint is violated."""
-    loss, violation = np.asarray(verdict.loss), np.asarray(verdict.violation)
+    return _rank(np.asarray(verdict.loss), verdict.violation)
+
+
+def _rank(loss: np.ndarray | float, violation: np.ndarray | float) -> np.ndarray:
     loss = np.where(np.isfinite(loss), loss, np.inf)
     violated = VIOLATED + np.minimum(violation, VIOLATED - 1.0)
     return np.where((violation <= TOLERANCE) | (loss >= FAILED_LOSS), loss, violated)

@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -65,7 +64,7 @@ class SuccessiveHalving:
     def __init__(
         self, problem: Problem, size: int, clock: Clock, *, tolerance: float, every: int
     ):
-        self._problem = problem = with_zero_multipliers(problem, size)
+        self._problem = problem = with_zero_multipliers(problem)
         self._clock, self._patience = clock, Patience(PATIENCE, gain=tolerance)
         units = as_array(np.zeros((POINTS, size)))
         # The derivatives compile in the background, while the box is screened.
@@ -79,12 +78,6 @@ class SuccessiveHalving:
         )
         self._errors = clock.compiled(
             lambda p, units: errors_at(p, units, every), problem, units
-        )
-        # A problem without limits has one round, which needs no violations.
-        self._violated: Callable = (
-            clock.compiled(lambda p, unit: p.violations(unit), problem, units[0])
-            if problem.limits
-            else problem.violations
         )
 
     @property
@@ -140,8 +133,3 @@ class SuccessiveHalving:
         ]
         group = GaussNewton(descents, in_threads(evaluate), in_threads(linearise))
         return group, len(descents)
-
-    def violations(self, problem: Problem, units: np.ndarray) -> Array:
-        """Return the violations [starts, constraints] at ``units``."""
-        problem = problem.with_multipliers(self._problem.multipliers)
-        return jnp.stack([self._violated(problem, as_array(unit)) for unit in units])

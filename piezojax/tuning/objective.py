@@ -10,7 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..analysis.constraints import LoopFigures, Margins, uses, violations
+from ..analysis.constraints import (
+    LoopFigures,
+    Margins,
+    constraint_count,
+    uses,
+    violations,
+)
 from ..analysis.stability.differentiable import sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
 from ..core.arrays import as_array, largest
@@ -33,6 +39,11 @@ RAILED = 0.9
 
 _SHARPNESS = 20.0  # of the smooth maximum in "worst"
 _FLOOR = 1e-9  # um: errors below a femtometre count as equal
+
+
+def _count(stages: Stage | None) -> int:
+    """Return the number of stacked ``stages``, 1 for None."""
+    return 1 if stages is None else jax.tree.leaves(stages)[0].shape[0]
 
 
 def _on_each(
@@ -104,6 +115,13 @@ class Objective(eqx.Module):
         """Number of runs in one evaluation."""
         runs = self.signals.noise.shape[0] * self.signals.noise.shape[1]
         return runs * self.scale.shape[0]
+
+    @property
+    def constraints(self) -> int:
+        """Number of constraints, those of every limit, plant and branch."""
+        return constraint_count(
+            self.limits, self.scale.shape[0], _count(self.margin_stages)
+        )
 
     def with_multipliers(self, multipliers: Array) -> "Objective":
         """Return the objective with these multipliers of its limits."""
@@ -230,7 +248,7 @@ class Objective(eqx.Module):
             jnp.where(jnp.isfinite(x), x, FAILED_LOSS)
             for x in (total + jnp.sum(added**2), total)
         )
-        return loss, Verdict(alone, jnp.max(violation, initial=0.0)), added
+        return loss, Verdict(alone, violation), added
 
     def errors(self, unit: Float[Array, " n"], every: int) -> Errors:
         """Return the objective and each ``every``-th error of a run."""
@@ -246,12 +264,8 @@ class Objective(eqx.Module):
         return Errors(loss, verdict, flat, added, weights.ravel())
 
     def verdict(self, unit: Float[Array, " n"]) -> Verdict:
-        """Return the objective without constraints, and the largest violation."""
+        """Return the objective without constraints, and their violations."""
         return self.value_and_verdict(unit)[1]
-
-    def violations(self, unit: Float[Array, " n"]) -> Float[Array, " constraints"]:
-        """Return all violations, as ``constraints.violations`` does."""
-        return self._error_and_violations(self.figures(unit))[1]
 
     def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " residuals"]:
         """Return residuals whose squares sum to the loss.

@@ -52,7 +52,7 @@ class Problem(eqx.Module):
     def errors(self, unit, every):
         errors = self.residuals(unit)[None]
         loss = 0.5 * jnp.mean(errors**2)
-        verdict = Verdict(loss, jnp.zeros(()))
+        verdict = Verdict(loss, jnp.zeros(0))
         return Errors(loss, verdict, errors, jnp.zeros(0), jnp.ones(1))
 
     def loss(self, unit):
