@@ -42,7 +42,13 @@ class Evaluator:
 
     def figures(self, loop: Feedback, signals: Signals) -> TrackingFigures:
         """Return the figures [references, draws] of ``loop``."""
-        return jax.tree.map(lambda x: x[0], self._runs(loop, signals, None)[0])
+        return jax.tree.map(lambda x: x[0], self.figures_on(None, loop, signals))
+
+    def figures_on(
+        self, stages: Stage | None, loop: Feedback, signals: Signals
+    ) -> TrackingFigures:
+        """Return the figures [stages, references, draws] of ``loop`` on ``stages``."""
+        return self._runs(loop, signals, stages)[0]
 
     @property
     def limits_on_runs(self) -> list[str]:

@@ -2,18 +2,16 @@
 
 from collections.abc import Callable, Sequence
 
-import jax
 import numpy as np
-from jax import Array
 
 from ..analysis.constraints import CONSTRAINTS, worst_by_plant
 from ..core.arrays import as_array
 from ..core.progress import Progress
-from ..solve.clock import Clock
 from ..solve.multi_start import Strategy, minimise
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import SearchState
 from ..study import Case
+from .evaluator import Evaluator
 from .objective import Objective
 from .result import ConstraintOutcome, FrontPoint
 
@@ -26,7 +24,7 @@ def trace_front(
     case: Case,
     search: SearchState,
     strategy: Strategy,
-    clock: Clock,
+    evaluator: Evaluator,
     progress: Progress,
 ) -> list[FrontPoint]:
     """Return the best gains found for each limit of the study's front.
@@ -40,13 +38,6 @@ def trace_front(
     assert table is not None
     limits = case.study.limits
 
-    def worst_and_errors(
-        objective: Objective, unit: Array
-    ) -> tuple[dict[str, Array], Array]:
-        loop = objective.figures(unit)
-        return worst_by_plant(objective.limits, loop), loop.tracking.rms_error[0]
-
-    program = clock.compiled(worst_and_errors, objective, as_array(search.unit))
     loosest_first = sorted(
         table.limits, reverse=CONSTRAINTS[table.constraint].sense == "at most"
     )
@@ -56,10 +47,14 @@ def trace_front(
         state = SearchState(unit, starts=unit[None])
         minimise(strategy, limited, unit[None], state, table.steps, progress)
         unit = state.unit
-        values, rms = jax.tree.map(np.asarray, program(limited, as_array(unit)))
-        rms = np.sqrt(np.mean(rms**2, axis=1))
+        loop = case.space.put(case.loop, as_array(unit))
+        figures = evaluator.limited(
+            loop, objective.signals, objective.stages, objective.margin_stages
+        )
+        rms = np.sqrt(np.mean(figures.tracking.rms_error[0] ** 2, axis=1))
+        values = worst_by_plant([table.constraint], figures)[table.constraint]
         reached = ConstraintOutcome.of_values(
-            table.constraint, limit, values[table.constraint]
+            table.constraint, limit, np.asarray(values)
         )
         return unit, FrontPoint(
             limit=limit,

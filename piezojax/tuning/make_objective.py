@@ -25,7 +25,7 @@ def make_objective(
     stages = drawn_stages(case, "tune")
     scale = _scale(before, data)[None]
     if stages is not None:
-        found = evaluator.limited(case.loop, data.tuning, stages).tracking
+        found = evaluator.figures_on(stages, case.loop, data.tuning)
         scale = jax.vmap(lambda one: _scale(one, data, scale[0]))(found)
     return Objective(
         loop=case.loop,

@@ -58,7 +58,7 @@ def tune(
     try:
         front, kept = None, constraint_outcomes(objective, evaluator, after)
         if table.pareto is not None and strategy and search.status != "interrupted":
-            front = trace_front(objective, case, search, strategy, clock, progress)
+            front = trace_front(objective, case, search, strategy, evaluator, progress)
         progress.stage("evaluating on held-out noise")
         result = make_result(
             case, data, evaluator, before, after, search, clock, kept, front
