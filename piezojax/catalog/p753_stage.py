@@ -5,8 +5,10 @@ and its flexure has a mode: at 5.6 kHz +- 20 % unloaded according to its manufac
 and lower with a load. Creep and mode are assumptions of ours, not printed.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Complex
 
 from ..core.arrays import Scalar, ScalarLike, as_array
 from ..core.system import Affine, Series, series
@@ -63,14 +65,26 @@ def stage(
 def _dynamics(poles: Scalar, zeros: Scalar) -> ARMA:
     """Return (5.33) with unit DC gain, its roots raised to 1 + their deviation."""
     printed = ARMA(**p753.DYNAMICS_BEHIND_HYSTERESIS)
-    _, *denominator = _moved(printed.poles(), poles)
-    numerator = _moved(printed.zeros(), zeros)
+    roots = np.array([printed.poles(), printed.zeros()])
+    return ARMA(*_coefficients(np.log(roots + 0j), poles, zeros))
+
+
+# One program instead of one for each operation.
+@jax.jit
+def _coefficients(
+    logarithms: Complex[Array, "2 2"], poles: Scalar, zeros: Scalar
+) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
+    """Return the coefficients of ``ARMA`` from the logarithms of poles and zeros."""
+    _, *denominator = _moved(logarithms[0], poles)
+    numerator = _moved(logarithms[1], zeros)
     scale = (1.0 + sum(denominator)) / sum(numerator)
-    return ARMA(tuple(-a for a in denominator), tuple(b * scale for b in numerator))
+    return tuple(-a for a in denominator), tuple(b * scale for b in numerator)
 
 
-def _moved(roots: np.ndarray, faster: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Return 1, c_1, c_2 of the polynomial with ``roots`` raised to 1 + ``faster``."""
-    first, second = (jnp.exp((1.0 + faster) * np.log(root + 0j)) for root in roots)
+def _moved(
+    logarithms: Complex[Array, "2"], faster: Scalar
+) -> tuple[Scalar, Scalar, Scalar]:
+    """Return 1, c_1, c_2 of the polynomial with its roots raised to 1 + ``faster``."""
+    first, second = jnp.exp((1.0 + faster) * logarithms)
     one = jnp.ones_like(faster)
     return one, -jnp.real(first + second), jnp.real(first * second)
