@@ -147,13 +147,18 @@ def loop_inputs(
     columns, each in the unit of its axis.
     """
     reference = as_array(reference)
-    following = jnp.concatenate([reference[1:], reference[-1:]])
+    following = _following(reference)
     noise = jnp.zeros_like(reference) if noise is None else noise
     return LoopInput(
         _columns(following),
         _columns(noise),
         None if disturbance is None else _columns(disturbance),
     )
+
+
+@jax.jit
+def _following(reference: Array) -> Array:
+    return jnp.concatenate([reference[1:], reference[-1:]])
 
 
 def _columns(signal: Array) -> Any:

@@ -117,11 +117,13 @@ class Space(eqx.Module):
         ]
         return jnp.stack(mapped)
 
+    @jax.jit
     def to_unit(self, values: Float[Array, " n"]) -> Float[Array, " n"]:
         """Map parameter values into [0, 1]^n."""
         low, high = self._map(self.lower, 0), self._map(self.upper, 0)
         return (self._map(values, 0) - low) / (high - low)
 
+    @jax.jit
     def from_unit(self, unit: Float[Array, " n"]) -> Float[Array, " n"]:
         """Map [0, 1]^n to parameter values, never outside the bounds."""
         low, high = self._map(self.lower, 0), self._map(self.upper, 0)

@@ -65,6 +65,7 @@ class StateSpace(System):
         )
         return powers
 
+    @jax.jit
     def frequency_response(
         self, frequency: Float[ArrayLike, " lines"]
     ) -> Complex[Array, "lines p m"]:
@@ -125,6 +126,7 @@ class StateSpace(System):
         return self.A @ state + self.B @ input, self.C @ state + self.D @ input
 
 
+@jax.jit
 def _at_rest(A: Array, forcing: Array) -> Array:
     return jnp.linalg.solve(jnp.eye(len(A)) - A, forcing)
 

@@ -110,6 +110,7 @@ def check_weights(name: str, weights: Matrix) -> None:
     check(f"{name} where beta is above alpha", above, least=0.0, most=0.0)
 
 
+@jax.jit
 def rows_of(weights: Matrix) -> Rows:
     """Return the weights of all lines in each cell of beta.
 
@@ -134,6 +135,7 @@ class Traverse(NamedTuple):
     slopes: Matrix
 
 
+@jax.jit
 def _upwards(rows: Rows) -> Traverse:
     """Return the lines for a rising input, which passes their alphas."""
     alpha, line = np.arange(len(rows))[:, None], np.arange(len(rows))
@@ -141,6 +143,7 @@ def _upwards(rows: Rows) -> Traverse:
     return Traverse(jnp.cumsum(slopes, axis=0) - slopes, slopes)
 
 
+@jax.jit
 def _downwards(rows: Rows) -> Traverse:
     """Return the lines for a falling input, from the top and with reversed sign."""
     slopes = jnp.stack(rows)[::-1]

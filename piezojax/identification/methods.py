@@ -1,6 +1,6 @@
 """Methods of identification by name, with a common signature."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from .estimators.linear import by_frequency_response, by_subspace
 from .estimators.model_bouc_wen import bouc_wen
 from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
 from .estimators.neural import fit_neural_state_space
-from .estimators.output_error import Optimum, from_rest, output_error
+from .estimators.output_error import Optimum, from_rest, output_error, values_and_errors
 from .estimators.regression import instrumental_variables, least_squares
 from .estimators.steady_state import fit_structure, steady_response
 from .estimators.structure import Structure
@@ -54,22 +54,27 @@ def _by_output_error(
         for row in np.asarray(optimum.problem.which)
     ]
     named = {
-        name: FittedParameter(value=float(value), standard_error=deviation)
-        for name, value, deviation in zip(
-            optimum.names, optimum.values, optimum.deviations, strict=True
+        name: FittedParameter(value=float(value), standard_error=error)
+        for name, value, error in zip(
+            optimum.names, *values_and_errors(optimum), strict=True
         )
     }
     return Estimate(
         systems[0],
         _free_runs(systems, records),
         named,
-        _optimum_warnings(optimum, shape, options.steps),
+        _optimum_warnings(optimum, named, shape, options.steps),
         shape.order,
         bool(hystereses(shape.system)),
     )
 
 
-def _optimum_warnings(optimum: Optimum, shape: Structure, steps: int) -> list[str]:
+def _optimum_warnings(
+    optimum: Optimum,
+    fitted: Mapping[str, FittedParameter],
+    shape: Structure,
+    steps: int,
+) -> list[str]:
     found = []
     # Their narrow bounds come from the record: a value at a bound needs no warning.
     shown = shape.dynamics if shape.whitening else ()
@@ -80,7 +85,7 @@ def _optimum_warnings(optimum: Optimum, shape: Structure, steps: int) -> list[st
     for i, name in enumerate(optimum.names):
         if name not in shown:
             found += bound_warning(name, optimum.units[0, i])
-        if optimum.deviations[i] is None:
+        if fitted[name].standard_error is None:
             found.append(f"{name} is not determined by this record")
         elif spread[i] > AMBIGUOUS:
             found.append(

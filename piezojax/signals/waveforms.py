@@ -5,12 +5,14 @@ Each takes ``time`` in s and parameters that may be arrays: ``frequency`` in Hz,
 """
 
 from collections.abc import Callable
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core.arrays import ScalarLike, check
+from ..core.arrays import ScalarLike, as_array, check
 from ..core.plain import shown
 
 Time = Float[Array, " samples"]
@@ -29,9 +31,10 @@ def time_grid(duration: float, rate: float) -> Time:
             f"{duration:g} s at {rate:g} Hz hold {samples} samples; "
             "at least 2 are needed"
         )
-    return jnp.arange(samples, dtype=jnp.float64) / rate
+    return as_array(np.arange(samples) / rate)
 
 
+@jax.jit
 def constant(
     time: Time,
     frequency: ScalarLike = 0.0,
@@ -42,6 +45,7 @@ def constant(
     return jnp.full_like(time, 1.0) * (offset + amplitude)
 
 
+@jax.jit
 def step(
     time: Time,
     frequency: ScalarLike = 10.0,
@@ -52,6 +56,7 @@ def step(
     return offset + amplitude * (time * frequency >= 0.1).astype(time.dtype)
 
 
+@jax.jit
 def square(
     time: Time,
     frequency: ScalarLike = 10.0,
@@ -63,6 +68,7 @@ def square(
     return offset + 2.0 * amplitude * high.astype(time.dtype)
 
 
+@jax.jit
 def triangle(
     time: Time,
     frequency: ScalarLike = 10.0,
@@ -74,6 +80,7 @@ def triangle(
     return offset + 2.0 * amplitude * (1.0 - jnp.abs(2.0 * phase - 1.0))
 
 
+@jax.jit
 def sine(
     time: Time,
     frequency: ScalarLike = 10.0,
@@ -84,6 +91,7 @@ def sine(
     return offset + amplitude * (1.0 - jnp.cos(2.0 * jnp.pi * frequency * time))
 
 
+@jax.jit
 def cosine(
     time: Time,
     frequency: ScalarLike = 10.0,
@@ -97,6 +105,7 @@ def cosine(
     return offset + amplitude * (1.0 + jnp.sin(2.0 * jnp.pi * frequency * time))
 
 
+@partial(jax.jit, static_argnames="turnaround")
 def scan(
     time: Time,
     frequency: ScalarLike = 10.0,
@@ -120,6 +129,7 @@ def scan(
     return offset + jnp.where(below <= 0.25, gone, 2.0 * amplitude - gone)
 
 
+@jax.jit
 def piecewise_sine(
     time: Time,
     frequency: ScalarLike = 10.0,
@@ -132,6 +142,7 @@ def piecewise_sine(
     return offset + share * (sine(time, frequency, amplitude))
 
 
+@jax.jit
 def superposed_sine(
     time: Time,
     frequency: ScalarLike = 10.0,
@@ -157,6 +168,7 @@ def superposed_sine(
     return offset + amplitude / 5.0 * total
 
 
+@jax.jit
 def chirp(
     time: Time,
     frequency: ScalarLike = 100.0,
@@ -168,6 +180,7 @@ def chirp(
     return offset + amplitude * (1.0 - jnp.cos(2.0 * jnp.pi * phase))
 
 
+@partial(jax.jit, static_argnames="tones")
 def multisine(
     time: Time,
     frequency: ScalarLike = 100.0,
@@ -182,6 +195,7 @@ def multisine(
     return offset + amplitude * jnp.cos(angle).sum(axis=1) / (1.7 * np.sqrt(tones / 2))
 
 
+@partial(jax.jit, static_argnames="seed")
 def prbs(
     time: Time,
     frequency: ScalarLike = 100.0,

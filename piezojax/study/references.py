@@ -1,10 +1,10 @@
 """References of a study as signals."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..core.arrays import as_array
 from ..signals import motions, waveforms
 from .schema import Study
 
@@ -17,7 +17,7 @@ def reference_signals(study: Study) -> Float[Array, "references samples *axes"]:
     table = study.references
     time_s = waveforms.time_grid(table.duration, study.rate)
     names = (*table.tune, *table.unseen)
-    return jnp.stack([_signal(study, name, time_s) for name in names])
+    return as_array(np.stack([_signal(study, name, time_s) for name in names]))
 
 
 def _signal(study: Study, name: str, time_s: Array) -> Array:

@@ -42,7 +42,7 @@ def make_data(case: Case) -> Data:
     study = case.study
     table = study.references
     time_s = waveforms.time_grid(table.duration, study.rate)
-    references = reference_signals(study)
+    references = np.asarray(reference_signals(study))
     # Two streams of one seed: the hold-out draws are new for every reference.
     streams = np.random.SeedSequence(study.seed).spawn(2)
     counts = study.objective.noise_draws, study.holdout_draws
@@ -76,7 +76,7 @@ def make_data(case: Case) -> Data:
 
 def _signals(
     case: Case,
-    references: jax.Array,
+    references: np.ndarray,
     holding: jax.Array,
     time_s: jax.Array,
     random: np.random.Generator,
@@ -92,7 +92,7 @@ def _signals(
     if case.fit is not None:
         played = [
             residual_disturbances(case.fit, reference, np.asarray(time_s), part)
-            for reference in np.asarray(references)
+            for reference in references
         ]
         disturbance = as_array(np.repeat(played, draws // STRETCHES, axis=1))
     drift = np.array(case.study.by_axis(case.study.disturbance.drift_rms))
@@ -101,10 +101,10 @@ def _signals(
         # One axis has no dimension for axes.
         walk = as_array(np.cumsum(steps, axis=2) * (drift if axes else drift[0]))
         disturbance = walk if disturbance is None else disturbance + walk
-    return Signals(references, noise, disturbance, (), holding)
+    return Signals(as_array(references), noise, disturbance, (), holding)
 
 
-def _holding(case: Case, begins: jax.Array) -> jax.Array:
+def _holding(case: Case, begins: np.ndarray) -> jax.Array:
     """Return the inputs under which the stage rests at ``begins`` of the references."""
 
     def one(begin):
@@ -112,5 +112,6 @@ def _holding(case: Case, begins: jax.Array) -> jax.Array:
         return jnp.stack(held) if isinstance(held, tuple) else held
 
     # Many references begin at the same place: solve once for each place.
-    places, which = np.unique(np.asarray(begins), axis=0, return_inverse=True)
-    return jax.jit(jax.vmap(one))(as_array(places))[which.ravel()]
+    places, which = np.unique(begins, axis=0, return_inverse=True)
+    held = np.asarray(jax.jit(jax.vmap(one))(as_array(places)))
+    return as_array(held[which.ravel()])

@@ -23,15 +23,19 @@ def make_objective(
     """
     table = case.study
     stages = drawn_stages(case, "tune")
+    before = jax.tree.map(np.asarray, before)
     scale = _scale(before, data)[None]
     if stages is not None:
-        found = evaluator.figures_on(stages, case.loop, data.tuning)
-        scale = jax.vmap(lambda one: _scale(one, data, scale[0]))(found)
+        found = jax.tree.map(
+            np.asarray, evaluator.figures_on(stages, case.loop, data.tuning)
+        )
+        parts = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(len(found[0])))
+        scale = np.stack([_scale(one, data, scale[0]) for one in parts])
     return Objective(
         loop=case.loop,
         space=case.space,
         signals=data.tuning,
-        scale=scale,
+        scale=as_array(scale),
         voltage_span=as_array(
             np.mean(np.subtract(table.actuator.upper, table.actuator.lower))
         ),
@@ -52,25 +56,25 @@ def make_objective(
 
 
 def _scale(
-    before: TrackingFigures, data: Data, otherwise: jax.Array | None = None
-) -> jax.Array:
+    before: TrackingFigures, data: Data, otherwise: np.ndarray | None = None
+) -> np.ndarray:
     """Return the scale (um) of the error of each trace: its RMS error before tuning.
 
     If the start diverges or rails, the scale is ``otherwise``, or, without it, the
     standard deviation of the reference.
     """
-    rms = jnp.sqrt(jnp.mean(jnp.asarray(before.rms_error) ** 2, axis=1))
-    usable = jnp.all(jnp.isfinite(rms)) & (jnp.max(before.saturated) <= RAILED)
-    own = jnp.where(rms > 0.0, rms, 1e-9)
-    return jnp.where(usable, own, _swing(data) if otherwise is None else otherwise)
+    rms = np.sqrt(np.mean(before.rms_error**2, axis=1))
+    if np.all(np.isfinite(rms)) and np.max(before.saturated) <= RAILED:
+        return np.where(rms > 0.0, rms, 1e-9)
+    return _swing(data) if otherwise is None else otherwise
 
 
-def _swing(data: Data) -> jax.Array:
-    swing = jnp.maximum(jnp.std(data.tuning.references, axis=1), 1e-3)
+def _swing(data: Data) -> np.ndarray:
+    swing = np.maximum(np.std(data.tuning.references, axis=1), 1e-3)
     if swing.ndim == 1:
         return swing
-    largest = jnp.max(swing, axis=1)
-    return jnp.stack(
+    largest = np.max(swing, axis=1)
+    return np.stack(
         [
             swing[trace.run, trace.axis] if trace.driven else largest[trace.run]
             for trace in data.traces[: data.tuned]

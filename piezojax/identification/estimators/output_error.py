@@ -55,17 +55,13 @@ class Optimum(NamedTuple):
     """Results of all starts, best first.
 
     ``units`` [starts, n] are points in the unit box, ``losses`` their mean squares.
-    ``values`` and ``deviations`` are the parameters and standard errors of the best
-    point; an undetermined parameter has the deviation None. ``finished`` tells whether
-    the best descent ended by itself.
+    ``finished`` tells whether the best descent ended by itself.
     """
 
     problem: "Problem"
     names: tuple[str, ...]
     units: np.ndarray
     losses: np.ndarray
-    values: np.ndarray
-    deviations: list[float | None]
     finished: bool
 
 
@@ -209,8 +205,7 @@ def output_error(
         starts = np.concatenate([again, units])[: len(units) + 1]
         starts = np.clip(starts, INSIDE, 1.0 - INSIDE)
         units, losses, finished = _descended(problem, starts, steps, progress)
-    values, deviations = _with_errors(problem, as_array(units[0]), losses[0])
-    return Optimum(problem, names, units, losses, values, deviations, finished)
+    return Optimum(problem, names, units, losses, finished)
 
 
 def _descended(
@@ -282,19 +277,20 @@ def _values(problem: Problem, unit: Array) -> Array:
     return values
 
 
-def _with_errors(
-    problem: Problem, unit: Array, loss: float
-) -> tuple[np.ndarray, list[float | None]]:
-    """Return values and Gauss-Newton standard errors, white residuals assumed.
+def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]:
+    """Return the parameters of the best point and their standard errors.
 
-    The covariance is s^2 (J'J)^-1; a parameter in a direction that the record does not
-    determine has no standard error.
+    The errors are those of Gauss-Newton: the covariance is s^2 (J'J)^-1, for white
+    residuals. A parameter in a direction that the record does not determine has the
+    error None.
     """
+    problem, unit = optimum.problem, as_array(optimum.units[0])
     values, slopes, jacobian = map(np.asarray, _sensitivity(problem, unit))
     jacobian = jacobian / np.where(slopes == 0.0, 1.0, slopes)
     kinds = 2 if problem.whitening.size else 1
     counted = kinds * int(np.sum(np.asarray(problem.weights) > 0))
-    return values, standard_errors(jacobian, loss / max(counted - unit.size, 1))
+    variance = optimum.losses[0] / max(counted - unit.size, 1)
+    return values, standard_errors(jacobian, variance)
 
 
 def standard_errors(jacobian: np.ndarray, variance: float) -> list[float | None]:
