@@ -474,8 +474,8 @@ def test_a_real_ctrl_c(tmp_path):
         tmp_path,
         references={
             "tune": ["SIN50", "SW50", "PWSW50", "SIN10"],
-            "duration": 0.5,
-            "settle": 0.1,
+            "duration": 0.1,
+            "settle": 0.05,
         },
         optimiser={"starts": 16, "candidates": 16, "steps": 10_000},
     )

@@ -94,6 +94,6 @@ def test_one_linear_model_is_as_good_as_the_published_one(linear, mirror):
 
 @pytest.mark.usefixtures("optimised")
 def test_dynamics_that_follow_the_level_beat_every_linear_model(linear, known, mirror):
-    model = fit_scheduled(list(known.values()), linear.model, steps=4)
+    model = fit_scheduled(list(known.values()), linear.model, steps=2)
     for level, error in errors(model, mirror).items():
         assert error < 0.7 * LINEAR[level], level
