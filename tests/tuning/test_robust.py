@@ -11,10 +11,16 @@ import pytest
 import tomli_w
 
 import piezojax as pj
-from piezojax.analysis.constraints import CONSTRAINTS
+from piezojax.analysis.constraints import (
+    CONSTRAINTS,
+    LoopFigures,
+    Margins,
+    constraint_count,
+    violations,
+)
 from piezojax.analysis.stability import OperatingPoint, stability_report
 from piezojax.catalog import p753, p753_stage
-from piezojax.core.metrics import TrackingFigures
+from piezojax.core.metrics import ExtremeFigures, TrackingFigures
 from piezojax.core.paths import replace
 from piezojax.core.system import rest_output
 from piezojax.solve.augmented_lagrangian import penalty_terms, update_multipliers
@@ -135,6 +141,21 @@ def test_what_is_kept_costs_nothing():
 
 
 # Limits
+
+
+@pytest.mark.parametrize(
+    "names", [CONSTRAINTS, ["effort"], ["delay_margin", "peak_slew"], []]
+)
+def test_constraints_are_counted_as_they_are_evaluated(names):
+    runs = jnp.ones((3, 2, 1))
+    figures = LoopFigures(
+        TrackingFigures(*[runs] * len(TrackingFigures._fields)),
+        ExtremeFigures(*[runs] * len(ExtremeFigures._fields)),
+        Margins(jnp.full((5, 2, 64, 1, 1), 1.1 + 0j)),
+        dt=5e-5,
+    )
+    limits = dict.fromkeys(names, 1.5)
+    assert constraint_count(limits, 3, 5) == violations(limits, figures).size
 
 
 def test_the_limit_is_kept_active_and_where_the_margin_says(outcome):
