@@ -68,12 +68,20 @@ class ErrorBound(BaseModel):
         """Whether the record excited less than the share ``NARROW`` of the band."""
         return self.highest < NARROW * self.frequency[-1]
 
-    def supported(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the bound that a search can respect, on a grid of equal steps (Hz).
+    def respected(self, frequency: np.ndarray) -> np.ndarray:
+        """Return the bound ``at`` each ``frequency`` (Hz) that gains can respect.
 
-        It is the largest bound within half a step of each ``frequency``. Above the band
-        of a narrow record it is 0: there the record supports no gains, and the remedy
-        is another record, not other gains.
+        Above the band of a narrow record it is 0: there the record supports no gains,
+        and the remedy is another record, not other gains.
+        """
+        beyond = self.narrow & (frequency > self.highest)
+        return np.where(beyond, 0.0, self.at(frequency))
+
+    def supported(self, frequency: np.ndarray) -> np.ndarray:
+        """Return the bound that a search respects, on a grid of equal steps (Hz).
+
+        It is the largest bound within half a step of each ``frequency``, with the
+        exception of ``respected``.
         """
         half = 0.5 * (frequency[1] - frequency[0])
         lines, relative = np.asarray(self.frequency), np.asarray(self.relative)

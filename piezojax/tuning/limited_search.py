@@ -55,7 +55,9 @@ def search_within_limits(
         after = case.space.put(case.loop, as_array(search.unit))
         kept = constraint_outcomes(every, evaluator, after)
         fine = all(outcome.kept for outcome in kept.values())
-        if search.status == "interrupted" or (fine and not _missed(case, stability)):
+        if search.status == "interrupted" or (
+            fine and not _alarming_peak(case, stability)
+        ):
             return objective, search, strategy, stability
     except KeyboardInterrupt:
         search.status = "interrupted"
@@ -84,8 +86,8 @@ def exact_stability(case: Case, search: SearchState) -> StabilityReports:
     )
 
 
-def _missed(case: Case, stability: StabilityReports) -> float:
-    """Return the exact Ms, or that within the error bound, if it raises an alarm.
+def _alarming_peak(case: Case, stability: StabilityReports) -> float:
+    """Return the exact Ms, or that within the error bound, if other gains are needed.
 
     Otherwise return 0. Ms of an unstable loop is infinite.
     """
@@ -97,7 +99,7 @@ def _missed(case: Case, stability: StabilityReports) -> float:
     nominal = max(np.inf if peak is None else peak for peak in peaks)
     worst = 0.0
     if bound is not None and "after" in stability.loops:
-        worst, _ = worst_peak(bound, stability)
+        worst, _ = worst_peak(bound.respected, stability)
     alarming = nominal > limit * (1.0 + EXACT) or worst > limit * (1.0 + SLACK)
     return max(nominal, worst) if alarming else 0.0
 
@@ -118,7 +120,7 @@ def _tightened(
     try:
         stability, aim = exact_stability(case, search), limits.get(PEAK, 0.0)
         for _ in range(REPEATS):
-            peak = _missed(case, stability)
+            peak = _alarming_peak(case, stability)
             if not peak or strategy is None or search.status == "interrupted":
                 break
             share = (limits[PEAK] - 1.0) / (peak - 1.0)

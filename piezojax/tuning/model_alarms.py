@@ -1,6 +1,6 @@
 """Alarms of the model of a plant, from its fit and from the bound on its error."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -39,16 +39,18 @@ def model_alarms(
         yield from _error_alarm(bound, limit, stability)
 
 
-def worst_peak(bound: ErrorBound, stability: StabilityReports) -> tuple[float, float]:
+def worst_peak(
+    bound: Callable[[np.ndarray], np.ndarray], stability: StabilityReports
+) -> tuple[float, float]:
     """Return the largest Ms of the tuned loop within ``bound``, and its frequency (Hz).
 
-    Ms is infinite if a plant within the bound makes the loop unstable. The worst |S|
-    under a relative error l of the plant is |S| / (1 - l |T|). ``stability`` holds the
-    linear loops "after".
+    ``bound`` returns the relative error l of the plant at frequencies in Hz. The worst
+    |S| under it is |S| / (1 - l |T|); Ms is infinite if a plant within the bound makes
+    the loop unstable. ``stability`` holds the linear loops "after".
     """
     worst, at = 0.0, 0.0
     for curves in stability.curves("after", DECADES).values():
-        share = bound.at(curves.frequency) * np.abs(curves.T)
+        share = bound(curves.frequency) * np.abs(curves.T)
         peak = int(np.argmax(share))
         reached = np.inf
         if share[peak] < 1.0:
@@ -64,7 +66,7 @@ def _error_alarm(
     bound: ErrorBound, limit: float, stability: StabilityReports
 ) -> Iterator[str]:
     """Yield an alarm if the model's error can make Ms exceed ``limit``."""
-    worst, at = worst_peak(bound, stability)
+    worst, at = worst_peak(bound.at, stability)
     if np.isfinite(worst) and worst <= limit * (1.0 + SLACK):
         return
     here = np.array([at])

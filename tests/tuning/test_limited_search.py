@@ -19,6 +19,7 @@ from piezojax.dynamics import FirstOrderLag
 from piezojax.hardware import Saturation, Sensor
 from piezojax.solve.search_state import SearchState
 from piezojax.tuning import limited_search
+from piezojax.tuning.model_alarms import model_alarms
 
 DT = 1e-4
 
@@ -52,7 +53,7 @@ def repeated(monkeypatch, peaks, status="converged", strategy="a strategy"):
 
     monkeypatch.setattr(limited_search, "minimise", minimise)
     monkeypatch.setattr(limited_search, "exact_stability", lambda *_: next(values))
-    monkeypatch.setattr(limited_search, "_missed", lambda _, peak: peak)
+    monkeypatch.setattr(limited_search, "_alarming_peak", lambda _, peak: peak)
     case = SimpleNamespace(
         study=SimpleNamespace(
             limits={"sensitivity_peak": 2.0, "effort": 1.0},
@@ -85,28 +86,46 @@ def test_it_does_nothing_where_nothing_is_missed_or_can_be_done(monkeypatch, cha
     assert aims == []
 
 
-def missed(loop, bound=None, **limits):
-    """Return the Ms that misses the limit of a study with one ``loop``."""
+def alarming_peak(loop, bound=None, **limits):
+    """Return the Ms that asks for other gains in a study with one ``loop``."""
     case = SimpleNamespace(
         study=SimpleNamespace(limits=limits),
         plant_about=SimpleNamespace(error_bound=bound),
     )
     stability = stability_reports({"after": loop}, 1.0, DT)
-    return inspect.unwrap(limited_search._missed)(case, stability)
+    return inspect.unwrap(limited_search._alarming_peak)(case, stability)
 
 
-def test_the_exact_peak_is_missed_where_it_raises_an_alarm():
+def test_the_exact_peak_counts_where_it_raises_an_alarm():
     loop = integral_loop(4000.0)
     exact = stability_report(loop, OperatingPoint(1.0, dt=DT)).sensitivity_peak
-    assert missed(loop, sensitivity_peak=0.98 * exact) == pytest.approx(exact)
-    assert missed(loop, sensitivity_peak=exact) == 0.0
-    assert missed(loop) == 0.0
-    assert missed(integral_loop(1e5), sensitivity_peak=2.0) == np.inf
+    assert alarming_peak(loop, sensitivity_peak=0.98 * exact) == pytest.approx(exact)
+    assert alarming_peak(loop, sensitivity_peak=exact) == 0.0
+    assert alarming_peak(loop) == 0.0
+    assert alarming_peak(integral_loop(1e5), sensitivity_peak=2.0) == np.inf
 
 
 def test_the_error_bound_of_the_plant_counts():
     loop = integral_loop(4000.0)
     exact = stability_report(loop, OperatingPoint(1.0, dt=DT)).sensitivity_peak
     bound = ErrorBound(frequency=(1.0, 5e3), relative=(0.3, 0.3), excited=(True, True))
-    found = missed(loop, bound, sensitivity_peak=1.01 * exact)
+    found = alarming_peak(loop, bound, sensitivity_peak=1.01 * exact)
     assert found > 1.1 * exact
+
+
+def test_beyond_the_band_of_a_narrow_record_no_gains_are_searched():
+    """They cannot help there; the alarm remains."""
+    loop = integral_loop(4000.0)
+    exact = stability_report(loop, OperatingPoint(1.0, dt=DT)).sensitivity_peak
+    narrow = ErrorBound(
+        frequency=(1.0, 20.0, 25.0, 5e3),
+        relative=(0.01, 0.01, 50.0, 50.0),
+        excited=(True, True, False, False),
+    )
+    limit = 1.05 * exact
+    assert alarming_peak(loop, narrow, sensitivity_peak=limit) == 0.0
+    stability = stability_reports({"after": loop}, 1.0, DT)
+    (alarm,) = model_alarms(None, narrow, limit, stability)
+    assert "the record excites nothing" in alarm
+    wide = narrow.model_copy(update={"excited": (True,) * 4})
+    assert alarming_peak(loop, wide, sensitivity_peak=limit) == np.inf
