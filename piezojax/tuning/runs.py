@@ -13,6 +13,7 @@ from ..core.axes import PerAxisMetric
 from ..core.feedback import Feedback, loop_inputs
 from ..core.metrics import MetricPair, Tracking
 from ..core.rollout import Metric, simulate
+from ..core.system import resolve
 
 
 class Signals(eqx.Module):
@@ -71,7 +72,7 @@ def sampled(
         metric = PerAxisMetric(metric, signals.references.shape[2])
 
     def one(parameters, reference, noise, disturbance, holding):
-        loop = loop_of(parameters)
+        loop = resolve(loop_of(parameters))  # once for the start and the run
         inputs = loop_inputs(reference, noise, disturbance)
         state = loop.init(reference[0], holding)
         found = simulate(loop, inputs, state, metric=metric, every=every)[1]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from ...core.arrays import ScalarLike, Signal, State, as_signal
 from ...core.feedback import Feedback, LoopState, Observation
-from ...core.system import Affine, System
+from ...core.system import Affine, System, resolve
 from ...dynamics import StateSpace
 from ...dynamics.linearise import linearise
 from ...hardware import Quantiser, Saturation
@@ -123,7 +123,7 @@ def cut(
 
     ``side`` is +1 on the ascending branch and -1 on the descending one.
     """
-    smooth = _without(loop, Quantiser)
+    smooth = _without(resolve(loop), Quantiser)
     start = smooth.init(reference) if state is None else state
     freed = _without(smooth, Saturation)
     # Direct gain from the reference to the command; its sign may be either.

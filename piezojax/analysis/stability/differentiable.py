@@ -192,6 +192,7 @@ def _axes_impulse(
     return jnp.concatenate([jnp.eye(axes)[None], response])
 
 
+@jax.jit
 def peak_of(sensitivity: Sensitivity) -> Float[Array, ""]:
     """Return Ms, the largest singular value of S over frequency; |S| on one axis.
 
@@ -200,6 +201,7 @@ def peak_of(sensitivity: Sensitivity) -> Float[Array, ""]:
     return _largest_singular(sensitivity)
 
 
+@jax.jit
 def disk_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
     """Return alpha = 1 / (largest singular value of (S - T)/2 over frequency).
 
@@ -246,6 +248,7 @@ def _product(left: Array, right: Array) -> Array:
     return jnp.sum(left[..., :, :, None] * right[..., None, :, :], axis=-2)
 
 
+@jax.jit
 def delay_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
     """Return the delay margin in samples, ``UNLIMITED_DELAY`` if |L| never crosses 1.
 
