@@ -18,9 +18,9 @@ TOLERANCE = 1e-3
 
 
 class Verdict(NamedTuple):
-    """Objective without constraints, and the violation of each, at a point.
+    """Objective without constraints at a point, and the violation of each constraint.
 
-    A violation is positive where the constraint is violated; they are on the last axis.
+    Violations are on the last axis, positive where a constraint is violated.
     """
 
     loss: Any
@@ -89,7 +89,7 @@ class Problem(Protocol):
         ...
 
     def verdict(self, unit: Unit) -> Verdict:
-        """Return the objective without constraints, and their violations."""
+        """Return the objective without constraints, and all violations."""
         ...
 
     def errors(self, unit: Unit, every: int) -> Errors:

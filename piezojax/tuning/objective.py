@@ -264,7 +264,7 @@ class Objective(eqx.Module):
         return Errors(loss, verdict, flat, added, weights.ravel())
 
     def verdict(self, unit: Float[Array, " n"]) -> Verdict:
-        """Return the objective without constraints, and their violations."""
+        """Return the objective without constraints, and all violations."""
         return self.value_and_verdict(unit)[1]
 
     def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " residuals"]:
