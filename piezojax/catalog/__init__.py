@@ -55,7 +55,7 @@ CONTROLLERS: dict[str, Callable[..., System]] = {
     "p753_feedforward_simc_pi": p753_survey.feedforward_simc_pi,
     "p753_feedforward_notch_pi": p753_survey.feedforward_notch_pi,
     "p753_feedforward_h_infinity": p753_survey.feedforward_h_infinity,
-    "p753_adaptive_notch_pi": p753_survey.adaptive_notch_pi,
+    "p753_adaptive_pi": p753_survey.adaptive_pi,
     "p753_preview_feedforward_pid": p753_survey.preview_feedforward_pid,
     "p753_repetitive": p753_survey.repetitive,
     "p753_iterative_learning": p753_survey.learning_control,

@@ -224,13 +224,12 @@ def anticipating_disturbance_observer(table: str = "5-2") -> Anticipation:
 
 
 ADAPTIVE_INVERSE = {
-    "thresholds": (0.3, 1.0, 2.5),
-    "cutoff": 2000.0,
+    "thresholds": (0.2, 0.5, 1.0, 2.0, 4.0),
+    "cutoff": 3000.0,
     "equation_error": 3.0,
-    "memory": 0.5,
+    "memory": 1.0,
 }
-"""Ours: um, rad/s, V, s. The stops suit motions of a few um; the feedback corrects
-changes slower than half a second."""
+"""Ours: um, rad/s, V, s. The stops suit motions of a few um."""
 
 
 def lags() -> tuple[float, float]:
@@ -248,8 +247,9 @@ def adaptive_disturbance_observer(table: str = "5-2") -> AdaptiveInverse:
 def with_adaptive_inverse(controller: System) -> AdaptiveInverse:
     """Return ``controller`` in an AdaptiveInverse (ours), um to V.
 
-    Its share of 0 makes it equal to ``controller``. The initial weights follow from the
-    printed gain and poles, those of the stops from a typical hysteresis.
+    Its share of 0 makes it equal to ``controller``. The initial weights and the lead
+    follow from the printed gain and poles, the weights of the stops from a typical
+    hysteresis.
     """
     slow, fast = lags()
     gains = (1.0 / GAIN, (slow + fast) / GAIN, slow * fast / GAIN)
@@ -260,6 +260,7 @@ def with_adaptive_inverse(controller: System) -> AdaptiveInverse:
         deviations=(*(0.5 * gain for gain in gains), *(0.3 * gains[0],) * stops),
         **ADAPTIVE_INVERSE,
         dt=DT,
+        lead=slow + fast,
         share=0.0,
     )
 

@@ -11,6 +11,7 @@ from ..control import (
     PID,
     AdaptiveInverse,
     AlphaBeta,
+    Anticipation,
     BoundaryLayer,
     FeedforwardFeedback,
     FilteredCommand,
@@ -183,9 +184,14 @@ def feedforward_h_infinity() -> FeedforwardFeedback:
     return FeedforwardFeedback(series(dynamics=inverse, gain=static), feedback)
 
 
-def adaptive_notch_pi() -> AdaptiveInverse:
-    """Return ``notch_pi`` in an AdaptiveInverse, um to V."""
-    return p753.with_adaptive_inverse(notch_pi())
+def adaptive_pi() -> Anticipation:
+    """Return ``simc_pi`` behind a low-pass in an AdaptiveInverse, um to V.
+
+    The inverse leads the stage by the lag of the sensor; a negative lead of the
+    reference takes that back.
+    """
+    feedback = FilteredCommand(simc_pi(), SecondOrderLowPass(**LOW_PASS, dt=p753.DT))
+    return Anticipation(p753.with_adaptive_inverse(feedback), (0.0,))
 
 
 def preview_feedforward_pid() -> FeedforwardFeedback:

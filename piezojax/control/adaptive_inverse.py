@@ -15,47 +15,51 @@ Row = tuple[Scalar, ...]
 
 
 class TermsState(NamedTuple):
-    """The last two positions (um) and the outputs of the stop operators (um)."""
+    """Last positions and last position with its lead, and the stops, all um."""
 
     positions: tuple[Scalar, Scalar]
+    leading: Scalar
     stops: Row
 
 
 class MotionTerms(System):
-    """Regressors of the voltage for a motion y: y, dy/dt, d2y/dt2 and stops of y.
+    """Regressors of the voltage for a motion y: y, dy/dt, d2y/dt2 and stops.
 
     Input um; output um, um/s, um/s^2, and um for each of ``thresholds`` (um). A stop
-    operator follows the position and saturates at its threshold. It is the dual of the
-    play operator: the inverse of a Prandtl-Ishlinskii model is a weighted sum of the
-    position and its stops.
+    operator follows its input and saturates at its threshold. It is the dual of the
+    play operator: the inverse of a Prandtl-Ishlinskii model is a weighted sum of its
+    output and the stops of that. The output of a hysteresis which moves the stage
+    through slow dynamics is ahead of y: the stops follow ``y + lead dy/dt``.
     """
 
     thresholds: Row = parameter(
         "um", "thresholds of the stop operators", above=0.0, converter=as_scalars
     )
+    lead: Scalar = parameter("s", "lead of what the stop operators follow", least=0.0)
     dt: float = sample_time()
 
     def init(self, input: ScalarLike = 0.0) -> TermsState:
         position = as_array(input)
         at_rest = (jnp.zeros_like(position),) * len(self.thresholds)
-        return TermsState((position, position), at_rest)
+        return TermsState((position, position), position, at_rest)
 
     def step(self, state: TermsState, input: ScalarLike) -> tuple[TermsState, Row]:
         position = as_array(input)
         last, older = state.positions
-        moved = position - last
+        velocity = (position - last) / self.dt
+        acceleration = (position - 2.0 * last + older) / self.dt**2
+        leading = position + self.lead * velocity
+        moved = leading - state.leading
         stops = tuple(
             jnp.clip(stop + moved, -threshold, threshold)
             for stop, threshold in zip(state.stops, self.thresholds, strict=True)
         )
-        velocity = moved / self.dt
-        acceleration = (moved - (last - older)) / self.dt**2
-        state = TermsState((position, last), stops)
+        state = TermsState((position, last), leading, stops)
         return state, (position, velocity, acceleration, *stops)
 
 
 class AdaptiveInverseState(NamedTuple):
-    """States of the controller, the weights, the motion terms and their filters.
+    """States of the controller, the weights, the filters and the motion terms.
 
     ``feedforward`` is the last feedforward voltage in V, ``motion`` the terms of the
     reference from which it was computed.
@@ -63,8 +67,8 @@ class AdaptiveInverseState(NamedTuple):
 
     controller: State
     weights: State
+    filters: tuple[State, State]
     measured: TermsState
-    filtered: tuple[State, ...]
     reference: TermsState
     motion: Row
     feedforward: Scalar
@@ -75,8 +79,9 @@ class AdaptiveInverse(System):
 
     The voltage of a stage is modelled as a weighted sum of its MotionTerms: position,
     velocity, acceleration and stop operators. Such a sum is the inverse of a gain, two
-    poles and a hysteresis. RecursiveWeights learns the weights from the applied voltage
-    and the measured displacement, both filtered by the same double lag at ``cutoff``.
+    poles and a hysteresis ahead of them, if ``lead`` is about the sum of their time
+    constants. RecursiveWeights learns the weights from the applied voltage and the
+    terms of the measured displacement, both behind the same double lag at ``cutoff``.
     The weighted sum of the reference's terms is fed forward. Gain, poles and hysteresis
     need not be known, and the feedback corrects the remaining error. Sources: adaptive
     inverse control, Widrow and Walach 1996; stop operators for the inverse of a
@@ -128,6 +133,13 @@ class AdaptiveInverse(System):
         typical=(1e-2, 1e2),
     )
     dt: float = sample_time()
+    lead: Scalar = parameter(
+        "s",
+        "lead of what the stop operators follow",
+        least=0.0,
+        typical=(0.0, 5e-3),
+        default=0.0,
+    )
     share: Scalar = parameter(
         "1",
         "share of the reference that is fed forward",
@@ -164,7 +176,7 @@ class AdaptiveInverse(System):
         )
 
     def _motion(self) -> MotionTerms:
-        return MotionTerms(self.thresholds, self.dt)
+        return MotionTerms(self.thresholds, self.lead, self.dt)
 
     def _filter(self) -> Series:
         lag = FirstOrderLag(1.0 / self.cutoff, self.dt)
@@ -184,16 +196,13 @@ class AdaptiveInverse(System):
         voltage = as_array(input.applied)
         motion, low_pass = self._motion(), self._filter()
         measured, reference = motion.init(input.measured), motion.init(input.reference)
-        _, measured_terms = motion.step(measured, input.measured)
         _, reference_terms = motion.step(reference, input.reference)
         offset = voltage - self.weights[0] * input.measured
         return AdaptiveInverseState(
             controller=self.controller.init(self._residual(input, voltage)),
             weights=self._learning(offset).init(),
+            filters=(low_pass.init(voltage), low_pass.init(as_array(input.measured))),
             measured=measured,
-            filtered=tuple(
-                low_pass.init(signal) for signal in (voltage, *measured_terms)
-            ),
             reference=reference,
             motion=reference_terms,
             feedforward=voltage,
@@ -204,14 +213,9 @@ class AdaptiveInverse(System):
     ) -> tuple[AdaptiveInverseState, Scalar]:
         motion, low_pass = self._motion(), self._filter()
         # u(k-1) moved the stage to z(k), as u(k) moves it to r(k+1) below.
-        measured, measured_terms = motion.step(state.measured, input.measured)
-        filtered = [
-            low_pass.step(memory, signal)
-            for memory, signal in zip(
-                state.filtered, (input.applied, *measured_terms), strict=True
-            )
-        ]
-        voltage, *row = (signal for _, signal in filtered)
+        of_voltage, voltage = low_pass.step(state.filters[0], input.applied)
+        of_position, position = low_pass.step(state.filters[1], input.measured)
+        measured, row = motion.step(state.measured, position)
         learned, (_, *weights) = self._learning(as_array(0.0)).step(
             state.weights, ((jnp.ones(()), *row), voltage)
         )
@@ -228,8 +232,8 @@ class AdaptiveInverse(System):
         state = AdaptiveInverseState(
             controller,
             learned,
+            (of_voltage, of_position),
             measured,
-            tuple(memory for memory, _ in filtered),
             reference,
             reference_terms,
             feedforward,

@@ -26,6 +26,7 @@ NUMBERS = {
     "cutoff": 1500.0,
     "equation_error": 5.0,
     "share": 0.8,
+    "lead": 1.1e-3,
     "offset_deviation": 4.0,
     "dt": p753.DT,
 }
@@ -110,6 +111,22 @@ def test_gain_poles_and_hysteresis_that_are_off_are_learned():
     assert errors[1] < errors[0] / 4.0
 
 
+def test_stops_follow_what_moves_the_stage():
+    """Behind its slow pole the stage lags the hysteresis by a twentieth of a cycle."""
+    stage = p753_stage.stage(poles=-0.2, hysteresis=0.2)
+    wanted = 5.0 - 2.5 * np.cos(2.0 * np.pi * 50.0 * np.arange(SAMPLES + 1) * p753.DT)
+    controller = p753.with_adaptive_inverse(p753.pid())
+    errors = []
+    for lead in (0.0, controller.lead):
+        one = eqx.tree_at(
+            lambda c: (c.share, c.lead), controller, (jnp.asarray(1.0), lead)
+        )
+        _, found = run(around(one, stage), wanted, 0.0 * DRAWS)
+        error = (found.displacement - found.reference)[2000:6000]
+        errors.append(float(jnp.sqrt(jnp.mean(error**2))))
+    assert errors[1] < errors[0] / 2.0, errors
+
+
 def test_at_rest_nothing_moves_and_margins_are_those_of_the_controller():
     inner = CONTROLLERS["pid"][0]
     whole = adaptive(inner, memory=0.1, share=1.0)
@@ -129,20 +146,20 @@ def test_slopes_are_those_of_differences_and_jit_is_eager():
     wanted, draws = reference(801), DRAWS[:800]
 
     def error(scale):
-        values = jnp.asarray([0.8, 1500.0, 5.0, 0.02]) * scale
+        values = jnp.asarray([0.8, 1500.0, 5.0, 0.02, 1.1e-3]) * scale
         whole = eqx.tree_at(
-            lambda c: (c.share, c.cutoff, c.equation_error, c.memory),
+            lambda c: (c.share, c.cutoff, c.equation_error, c.memory, c.lead),
             adaptive(CONTROLLERS["pid"][0]),
             tuple(values),
         )
         _, found = run(around(whole), wanted, draws)
         return jnp.mean((found.displacement - found.reference) ** 2)
 
-    slope = jax.jit(jax.jacfwd(error))(jnp.ones(4))
+    slope = jax.jit(jax.jacfwd(error))(jnp.ones(5))
     once = jax.jit(error)
     step = 1e-5
-    for i, along in enumerate(np.eye(4)):
-        ends = [float(once(jnp.ones(4) + s * step * along)) for s in (1.0, -1.0)]
+    for i, along in enumerate(np.eye(5)):
+        ends = [float(once(jnp.ones(5) + s * step * along)) for s in (1.0, -1.0)]
         assert slope[i] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-4)
     whole = adaptive(CONTROLLERS["pid"][0])
     zero, seen = jnp.zeros(()), Observation(*jnp.asarray([1.0, 1.1, 0.9, 8.0]))
@@ -193,6 +210,7 @@ def test_what_was_learned_is_forgotten_and_a_certain_weight_is_held():
         ),
         ({"memory": -1.0}, "memory in s is -1; it must be finite and above 0"),
         ({"offset_deviation": 0.0}, "offset_deviation in V is 0"),
+        ({"lead": -1e-3}, "lead in s is -0.001; it must be .* at least 0"),
         ({"share": np.nan}, "share is nan; it must be finite"),
         ({"dt": 0.0}, "dt in s is 0"),
     ],

@@ -14,34 +14,35 @@ class AdaptiveInverse:
         self.feedback = feedback
         self.thresholds = thresholds
         self.share, self.dt = numbers["share"], numbers["dt"]
+        self.lead = numbers["lead"]
         self.pole = np.exp(-numbers["cutoff"] * self.dt)
         self.equation_error = numbers["equation_error"]
         self.start = np.array([0.0, *weights])
         prior = np.array([numbers["offset_deviation"], *deviations])
         self.normal = np.diag(self.equation_error**2 / prior**2)
         self.right = self.normal @ self.start
-        count = 3 + len(thresholds)
-        self.lags = np.zeros((2, 1 + count))
-        self.seen = [0.0, 0.0], np.zeros(len(thresholds))
-        self.wanted = [0.0, 0.0], np.zeros(len(thresholds))
-        self.terms = np.zeros(count)
+        self.lags = np.zeros((2, 2))
+        self.seen = [0.0, 0.0, 0.0], np.zeros(len(thresholds))
+        self.wanted = [0.0, 0.0, 0.0], np.zeros(len(thresholds))
+        self.terms = np.zeros(3 + len(thresholds))
         self.fed = self.voltage = 0.0
 
     def _terms(self, memory, y):
         past, stops = memory
-        for i, r in enumerate(self.thresholds):
-            stops[i] = min(max(stops[i] + y - past[0], -r), r)
         velocity = (y - past[0]) / self.dt
         acceleration = (y - 2.0 * past[0] + past[1]) / self.dt**2
-        past[:] = y, past[0]
+        ahead = y + self.lead * velocity
+        for i, r in enumerate(self.thresholds):
+            stops[i] = min(max(stops[i] + ahead - past[2], -r), r)
+        past[:] = y, past[0], ahead
         return np.array([y, velocity, acceleration, *stops])
 
     def step(self, z, r_next, r, r_prev):
-        signals = np.array([self.voltage, *self._terms(self.seen, z)])
+        signals = np.array([self.voltage, z])
         for lag in self.lags:
             lag += (1.0 - self.pole) * (signals - lag)
             signals = lag.copy()
-        row = np.array([1.0, *signals[1:]])
+        row = np.array([1.0, *self._terms(self.seen, signals[1])])
         self.normal += np.outer(row, row)
         self.right += row * signals[0]
         weights = np.linalg.solve(self.normal, self.right)[1:]
