@@ -74,6 +74,31 @@ class BrokenLoop(System):
         )
 
     def step(self, state: BrokenState, input: Signal) -> tuple[BrokenState, Signal]:
+        controller, actuator, sensor, applied = self._answer(state)
+        plant, displacement = self._move(state, input)
+        state = BrokenState(controller, actuator, plant, sensor, displacement, applied)
+        return state, jax.tree.map(jnp.negative, applied)
+
+    def closed(self, state: BrokenState, added: Signal) -> tuple[BrokenState, Signal]:
+        """Step with the loop closed for small motions, with ``added`` (V) at the plant.
+
+        Return the voltage that acts there. It differs from that of the operating point
+        by ``added``, exactly; its derivative with respect to the state is that of the
+        actuator's voltage.
+        """
+        controller, actuator, sensor, applied = self._answer(state)
+        acting = jax.tree.map(
+            lambda held, new, more: held + (new - jax.lax.stop_gradient(new)) + more,
+            self.start.voltage,
+            applied,
+            added,
+        )
+        plant, displacement = self._move(state, acting)
+        state = BrokenState(controller, actuator, plant, sensor, displacement, applied)
+        return state, acting
+
+    def _answer(self, state: BrokenState) -> tuple[State, State, State, Signal]:
+        """Return the states of controller, actuator and sensor, and the voltage."""
         loop, reference = self.loop, _pushed(self.reference, self.reference_push)
         no_noise = jax.tree.map(jnp.zeros_like, state.displacement)
         sensor, measured = loop.sensor.step(
@@ -83,11 +108,10 @@ class BrokenLoop(System):
         observed = Observation(reference, reference, measured, known)
         controller, command = loop.controller.step(state.controller, observed)
         actuator, applied = loop.actuator.step(state.actuator, command)
-        plant, displacement = loop.plant.step(
-            state.plant, _pushed(input, self.voltage_push)
-        )
-        state = BrokenState(controller, actuator, plant, sensor, displacement, applied)
-        return state, jax.tree.map(jnp.negative, applied)
+        return controller, actuator, sensor, applied
+
+    def _move(self, state: BrokenState, input: Signal) -> tuple[State, Signal]:
+        return self.loop.plant.step(state.plant, _pushed(input, self.voltage_push))
 
 
 def _pushed(signal: Signal, push: Signal | None) -> Signal:

@@ -58,31 +58,24 @@ class SmallMotion(System):
 
     S = 1/(1+L). Input: the voltage added at the plant's input, V. Output: the voltage
     that then acts there, V. States are those of ``broken`` as deviations from its
-    operating point; ``push`` is their change in one sample for 1 V at the plant.
+    operating point.
     """
 
     broken: BrokenLoop
-    push: State
 
     def init(self, input: Any = 0.0) -> State:
         """Return the operating point: zero deviations."""
-        return jax.tree.map(jnp.zeros_like, self.push)
+        return jax.tree.map(jnp.zeros_like, split_static(self.broken.init())[0])
 
     def step(self, state: State, input: ScalarLike) -> tuple[State, Scalar]:
-        # L answers one sample later: its output is known before its input.
-        moved, returned = _tangent(self.broken, state, jnp.zeros(()))
-        voltage = as_array(input) - returned
-        return jax.tree.map(lambda x, b: x + b * voltage, moved, self.push), voltage
+        moving, held = split_static(self.broken.init())
 
+        def step(moving: State, added: Scalar) -> tuple[State, Scalar]:
+            state, voltage = self.broken.closed(eqx.combine(moving, held), added)
+            return split_static(state)[0], voltage
 
-def _tangent(broken: BrokenLoop, state: State, input: Scalar) -> tuple[State, Scalar]:
-    moving, held = split_static(broken.init())
-
-    def step(moving: State, voltage: Scalar) -> tuple[State, Scalar]:
-        state, output = broken.step(eqx.combine(moving, held), voltage)
-        return split_static(state)[0], output
-
-    return jax.jvp(step, (moving, broken.start.voltage), (state, input))[1]
+        tangents = state, as_array(input)
+        return jax.jvp(step, (moving, jnp.zeros(())), tangents)[1]
 
 
 def sensitivity(
@@ -162,10 +155,8 @@ def _impulse(
     broken: BrokenLoop, samples: int, dt: float
 ) -> Float[Array, "samples 1 1"]:
     """Return the impulse response of S, from a run of ``SmallMotion``."""
-    rest = jax.tree.map(jnp.zeros_like, split_static(broken.init())[0])
-    push, _ = _tangent(broken, rest, jnp.ones(()))
     impulse = jnp.zeros(samples).at[0].set(1.0)
-    return simulate(SmallMotion(broken, push), impulse)[1][:, None, None]
+    return simulate(SmallMotion(broken), impulse)[1][:, None, None]
 
 
 def _axes_impulse(
