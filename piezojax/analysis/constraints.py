@@ -27,28 +27,21 @@ CAP = 3.0
 and the size of the violation has no meaning."""
 
 
-class Margins(NamedTuple):
-    """Sensitivity of a loop and the error of its plant, from which margins follow.
-
-    ``sensitivity`` is S [plants, branches, lines, axes, axes] on the plants on which
-    margins are constrained; ``error`` [lines] bounds the relative error of a plant of
-    one axis, None if nothing is known of it.
-    """
-
-    sensitivity: Sensitivity
-    error: Float[Array, " lines"] | None = None
+MarginFigures = dict[str, Float[Array, "*plants branches"]]
+"""Limited margins of a loop on each plant and branch, by constraint."""
 
 
 class LoopFigures(NamedTuple):
     """Figures of a loop from which constraints are evaluated.
 
     ``tracking`` and ``extremes`` hold arrays [plants, references, draws]. ``extremes``
-    and ``margins`` are None unless a limit needs them. ``dt`` in s.
+    and ``margins``, those of ``margin_figures``, are None unless a limit needs them.
+    ``dt`` in s.
     """
 
     tracking: TrackingFigures
     extremes: ExtremeFigures | None
-    margins: Margins | None
+    margins: MarginFigures | None
     dt: float
 
 
@@ -95,16 +88,6 @@ def _largest(runs: Array) -> Array:
     return largest(runs.reshape(runs.shape[0], -1))
 
 
-def _margin(figure: Callable[[Array, Any], Array]) -> Callable[[Margins, float], Array]:
-    # Outside a program its dozens of operations would be compiled one by one.
-    @jax.jit
-    def of_each(margins: Margins) -> Array:
-        one = lambda found: figure(found, margins.error)  # noqa: E731
-        return jax.vmap(jax.vmap(one))(margins.sensitivity)
-
-    return lambda margins, dt: of_each(margins)
-
-
 def _peak(sensitivity: Sensitivity, error: Array | None) -> Array:
     """Return the largest Ms of a plant within ``error`` of the model."""
     if error is None:
@@ -128,13 +111,48 @@ def _disk(sensitivity: Sensitivity, error: Array | None) -> Array:
     return disk_margin_of(sensitivity)
 
 
+_MARGINS: dict[str, Callable[[Sensitivity, Array | None], Array]] = {
+    "sensitivity_peak": _peak,
+    "disk_margin": _disk,
+    "delay_margin": _delay,
+}
+
+
+def margin_figures(
+    names: Iterable[str],
+    sensitivity: Sensitivity,
+    error: Float[Array, " lines"] | None,
+) -> MarginFigures:
+    """Return the margins [branches] among the constraints ``names``.
+
+    ``sensitivity`` is S [branches, lines, axes, axes] of one plant; ``error`` bounds
+    the relative error of a plant of one axis, None if nothing is known of it.
+    """
+    return {
+        name: jax.vmap(lambda found, of=_MARGINS[name]: of(found, error))(sensitivity)
+        for name in names
+        if name in _MARGINS
+    }
+
+
 CONSTRAINTS: dict[str, Constraint] = {
     "sensitivity_peak": Constraint(
-        "1", "at most", "margins", _margin(_peak), above=1.0, default=2.0
+        "1",
+        "at most",
+        "margins",
+        lambda found, dt: found["sensitivity_peak"],
+        above=1.0,
+        default=2.0,
     ),
-    "disk_margin": Constraint("1", "at least", "margins", _margin(_disk), below=2.0),
+    "disk_margin": Constraint(
+        "1", "at least", "margins", lambda found, dt: found["disk_margin"], below=2.0
+    ),
     "delay_margin": Constraint(
-        "samples", "at least", "margins", _margin(_delay), default=1.0
+        "samples",
+        "at least",
+        "margins",
+        lambda found, dt: found["delay_margin"],
+        default=1.0,
     ),
     "peak_voltage": Constraint(
         "V", "at most", "tracking", lambda figures, dt: _largest(figures.peak_voltage)
@@ -193,23 +211,36 @@ def constraint_count(names: Iterable[str], plants: int, margin_plants: int) -> i
 def violations(
     limits: Mapping[str, Array | float], loop: LoopFigures
 ) -> Float[Array, " constraints"]:
-    """Return ln(value/limit) of all ``limits``, with the opposite sign for lower ones.
-
-    A number above 0 is a violation. There is one number for each plant and branch, in
-    the order of ``limits``. An infinite or undefined value counts as a large violation,
-    and above ``CAP`` a number is compressed to CAP (1 + ln(number/CAP)).
-    """
-    found = []
-    for name, limit in limits.items():
-        kind = CONSTRAINTS[name]
-        sign = 1.0 if kind.sense == "at most" else -1.0
-        value = jnp.maximum(kind.read(loop).ravel(), 1e-12)
-        by = sign * (jnp.log(value) - jnp.log(limit))
-        by = jnp.where(jnp.isfinite(by), by, 100.0 * CAP)
-        far = by > CAP
-        slow = CAP * (1.0 + jnp.log(jnp.where(far, by, CAP) / CAP))
-        found.append(jnp.where(far, slow, by))
+    """Return the ``excess`` over all ``limits``, of each plant and branch, in order."""
+    found = [
+        excess(name, limit, CONSTRAINTS[name].read(loop)).ravel()
+        for name, limit in limits.items()
+    ]
     return jnp.concatenate(found) if found else jnp.zeros(0)
+
+
+def excess(
+    name: str, limit: Array | float, values: Float[Array, "*batch"]
+) -> Float[Array, "*batch"]:
+    """Return ln(value/limit), with the opposite sign for a lower limit.
+
+    A number above 0 is a violation. An infinite or undefined value counts as a large
+    violation, and above ``CAP`` a number is compressed to CAP (1 + ln(number/CAP)).
+    """
+    sign = 1.0 if CONSTRAINTS[name].sense == "at most" else -1.0
+    by = sign * (jnp.log(jnp.maximum(values, 1e-12)) - jnp.log(limit))
+    by = jnp.where(jnp.isfinite(by), by, 100.0 * CAP)
+    far = by > CAP
+    slow = CAP * (1.0 + jnp.log(jnp.where(far, by, CAP) / CAP))
+    return jnp.where(far, slow, by)
+
+
+def worst_excess(
+    limits: Mapping[str, float], margins: MarginFigures
+) -> Float[Array, " plants"]:
+    """Return the largest ``excess`` of the ``margins`` on each plant."""
+    found = [excess(name, limits[name], values) for name, values in margins.items()]
+    return jnp.max(jnp.stack(found), axis=(0, 2))
 
 
 def worst_by_plant(limits: Iterable[str], loop: LoopFigures) -> dict[str, Array]:

@@ -5,17 +5,30 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 
-from ..analysis.constraints import CONSTRAINTS, LoopFigures, Margins, uses
-from ..analysis.stability.differentiable import lines, sensitivities
+from ..analysis.constraints import (
+    CONSTRAINTS,
+    LoopFigures,
+    MarginFigures,
+    uses,
+    worst_excess,
+)
+from ..analysis.stability.differentiable import lines
 from ..analysis.stability.operating_point import OperatingPoint
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, Extremes, TrackingFigures
 from ..solve.clock import Clock
 from ..study import Case, Stage
+from ..study.ensemble import Part
 from ..study.references import highest_reference
+from .objective import margins_on
 from .runs import Signals, evaluate
+
+CARRIED = 32
+"""Largest number of plants whose margins a search of one axis computes at a point."""
 
 
 class Evaluator:
@@ -23,7 +36,8 @@ class Evaluator:
 
     ``start`` is the first sample that counts, ``limits`` are those of the study,
     ``model_error`` [lines] bounds the relative error of the plant if its record gives
-    a bound; ``clock`` measures the compile time.
+    a bound; ``margin_stages`` are those on which margins are limited, None for the
+    loop's own alone. ``clock`` measures the compile time.
     """
 
     def __init__(self, clock: Clock, case: Case):
@@ -33,6 +47,7 @@ class Evaluator:
         self.limits = study.limits
         bound = case.plant_about.error_bound
         self.model_error = bound and as_array(bound.supported(lines(study.dt)))
+        self.margin_stages = drawn_stages(case, "margins")
         self._programs: dict[str, Callable] = {}
 
     def _compiled(self, key: str, function: Callable, *arguments: Any) -> Callable:
@@ -95,8 +110,23 @@ class Evaluator:
         found = self._compiled(key, run, loop, dynamic, signals)(loop, dynamic, signals)
         return found if beside else (found, None)
 
-    def _margins(self, loop: Feedback, stages: Stage | None) -> Margins | None:
-        """Return the Margins on each of ``stages``, or None if no limit needs them."""
+    def worst_plants(self, loop: Feedback) -> tuple[float, Stage | None]:
+        """Return the largest excess of ``loop`` over its limits on margins, and where.
+
+        The stages are the ``CARRIED`` worst of ``margin_stages``, in which a search may
+        carry them; None if it carries them all.
+        """
+        stages = self.margin_stages
+        if _count(stages) <= CARRIED or not uses(self.limits, "margins"):
+            return 0.0, None
+        margins = self._margins(loop, stages)
+        assert margins is not None
+        by = np.asarray(worst_excess(self.limits, margins))
+        worst = np.argsort(-by, kind="stable")[:CARRIED]
+        return float(by[worst[0]]), jax.tree.map(lambda x: x[worst], stages)
+
+    def _margins(self, loop: Feedback, stages: Stage | None) -> MarginFigures | None:
+        """Return the margins on each of ``stages``, or None if no limit needs them."""
         study = self._case.study
         if not uses(self.limits, "margins"):
             return None
@@ -104,15 +134,16 @@ class Evaluator:
         point = OperatingPoint(highest_reference(study), dt=study.dt)
 
         def margins(loop, dynamic):
-            def one(part):
-                around = _around(loop, eqx.combine(part, static))
-                return sensitivities(around, point)
-
-            return jax.vmap(one)(dynamic) if _count(stages) else _stacked(one(None))
+            return margins_on(
+                self.limits,
+                lambda stage: _around(loop, stage),
+                eqx.combine(dynamic, static),
+                point,
+                self.model_error,
+            )
 
         key = f"margins of {_count(stages)} stages"
-        found = self._compiled(key, margins, loop, dynamic)(loop, dynamic)
-        return Margins(found, self.model_error)
+        return self._compiled(key, margins, loop, dynamic)(loop, dynamic)
 
 
 def _count(stages: Stage | None) -> int:
@@ -127,3 +158,17 @@ def _around(loop: Feedback, stage: Stage | None) -> Feedback:
 def _stacked(figures: Any) -> Any:
     """Return the figures of one plant with a leading axis."""
     return jax.tree.map(lambda x: x[None], figures)
+
+
+def drawn_stages(case: Case, part: Part) -> Stage | None:
+    """Return the nominal stage and the drawn stages of ``part``, stacked.
+
+    None if no stages are drawn.
+    """
+    others = case.ensemble.stages(part) if case.ensemble else None
+    if others is None:
+        return None
+    own = Stage(case.loop.plant, case.loop.sensor)
+    return jax.tree.map(
+        lambda own, drawn: jnp.concatenate([own[None], drawn]), own, others
+    )

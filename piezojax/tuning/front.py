@@ -49,7 +49,7 @@ def trace_front(
         unit = state.unit
         loop = case.space.put(case.loop, as_array(unit))
         figures = evaluator.limited(
-            loop, objective.signals, objective.stages, objective.margin_stages
+            loop, objective.signals, objective.stages, evaluator.margin_stages
         )
         rms = np.sqrt(np.mean(figures.tracking.rms_error[0] ** 2, axis=1))
         values = worst_by_plant([table.constraint], figures)[table.constraint]

@@ -5,9 +5,11 @@ import numpy as np
 from ..analysis.constraints import uses
 from ..analysis.stability import StabilityReports, stability_reports
 from ..core.arrays import as_array
+from ..core.feedback import Feedback
 from ..core.progress import Progress
 from ..solve.clock import Clock
 from ..solve.multi_start import Strategy, minimise
+from ..solve.problem import TOLERANCE
 from ..solve.search_state import SearchState
 from ..study import Case
 from ..study.references import highest_reference
@@ -21,8 +23,8 @@ from .search import search_box
 PEAK = "sensitivity_peak"
 
 REPEATS, LEAST_SHARE = 3, 0.3
-"""Largest number of searches with a tighter limit on Ms, and the least factor by which
-one of them shrinks the distance of the limit from 1."""
+"""Largest number of repeated searches, and the least factor by which one of them
+shrinks the distance of the limit on Ms from 1."""
 
 Found = tuple[Objective, SearchState, Strategy | None, StabilityReports]
 
@@ -38,7 +40,8 @@ def search_within_limits(
 
     The defaults among the limits are rarely active, and margins in every loss cost time
     to compile. Unless the study limits a margin itself, the box is searched without
-    them first, and again with them if the result violates any.
+    them first, and again with them if the result violates any. Of many plants on which
+    margins are limited a search carries the worst.
     """
     study = case.study
     own = {
@@ -46,8 +49,9 @@ def search_within_limits(
     }
     every = objective.with_limits(study.limits)
     if uses(own, "margins") or study.pareto or own == study.limits:
+        every = _on_worst_plants(every, evaluator, case.loop)
         search, strategy = search_box(every, case, clock, progress)
-        return every, *_tightened(every, case, search, strategy, progress)
+        return _repeated(every, case, evaluator, search, strategy, progress)
     objective = objective.with_limits(own)
     search, strategy = search_box(objective, case, clock, progress)
     try:
@@ -62,9 +66,18 @@ def search_within_limits(
     except KeyboardInterrupt:
         search.status = "interrupted"
         return objective, search, strategy, INTERRUPTED
+    every = _on_worst_plants(every, evaluator, after)
     again, strategy = search_box(every, case, clock, progress, search.unit[None])
     again.evaluations += search.evaluations
-    return every, *_tightened(every, case, again, strategy, progress)
+    return _repeated(every, case, evaluator, again, strategy, progress)
+
+
+def _on_worst_plants(
+    objective: Objective, evaluator: Evaluator, loop: Feedback
+) -> Objective:
+    """Return the objective with the plants on which ``loop`` has the worst margins."""
+    _, worst = evaluator.worst_plants(loop)
+    return objective if worst is None else objective.on_margin_stages(worst)
 
 
 INTERRUPTED = StabilityReports(problems={"after": "they were interrupted"})
@@ -104,39 +117,45 @@ def _alarming_peak(case: Case, stability: StabilityReports) -> float:
     return max(nominal, worst) if alarming else 0.0
 
 
-def _tightened(
+def _repeated(
     objective: Objective,
     case: Case,
+    evaluator: Evaluator,
     search: SearchState,
     strategy: Strategy | None,
     progress: Progress,
-) -> tuple[SearchState, Strategy | None, StabilityReports]:
-    """Search again with a tighter limit on Ms while the exact Ms exceeds the limit.
+) -> Found:
+    """Search again while the result violates a limit that the search did not see.
 
-    The search computes S on the lines of an impulse response. Between two lines it
-    may miss the peak of a lightly damped mode of the closed loop.
+    The search computes S on the lines of an impulse response. Between two lines it may
+    miss the peak of a lightly damped mode of the closed loop: if the exact Ms exceeds
+    its limit, a tighter limit is searched. If another drawn plant than those that the
+    search carried violates a limit, the plants that are worst there are searched.
     """
-    limits = case.study.limits
+    limits = dict(case.study.limits)
     try:
-        stability, aim = exact_stability(case, search), limits.get(PEAK, 0.0)
+        stability = exact_stability(case, search)
         for _ in range(REPEATS):
-            peak = _alarming_peak(case, stability)
-            if not peak or strategy is None or search.status == "interrupted":
+            if strategy is None or search.status == "interrupted":
                 break
-            share = (limits[PEAK] - 1.0) / (peak - 1.0)
-            aim = 1.0 + (aim - 1.0) * max(share, LEAST_SHARE)
-            progress.stage(f"Ms is {peak:.3g}: searching below {aim:.3g}")
+            loop = case.space.put(case.loop, as_array(search.unit))
+            beyond, worst = evaluator.worst_plants(loop)
+            peak = _alarming_peak(case, stability)
+            if peak:
+                share = (case.study.limits[PEAK] - 1.0) / (peak - 1.0)
+                limits[PEAK] = 1.0 + (limits[PEAK] - 1.0) * max(share, LEAST_SHARE)
+                progress.stage(f"Ms is {peak:.3g}: searching below {limits[PEAK]:.3g}")
+                objective = objective.with_limits(limits)
+            if worst is not None and beyond > TOLERANCE:
+                progress.stage("searching with the plants whose margins are worst")
+                objective = objective.on_margin_stages(worst)
+            elif not peak:
+                break
             again = SearchState(search.unit, starts=search.unit[None])
-            minimise(
-                strategy,
-                objective.with_limits(limits | {PEAK: aim}),
-                again.starts,
-                again,
-                case.study.optimiser.steps,
-                progress,
-            )
+            steps = case.study.optimiser.steps
+            minimise(strategy, objective, again.starts, again, steps, progress)
             again.evaluations += search.evaluations
             search, stability = again, exact_stability(case, again)
     except KeyboardInterrupt:
         search.status, stability = "interrupted", INTERRUPTED
-    return search, strategy, stability
+    return objective, search, strategy, stability

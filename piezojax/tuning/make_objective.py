@@ -1,16 +1,14 @@
 """Objective of a case: signals, scales of the errors, and the stages drawn."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..core.arrays import as_array
 from ..core.metrics import TrackingFigures
-from ..study import Case, Stage
-from ..study.ensemble import Part
+from ..study import Case
 from ..study.references import highest_reference
 from .data import Data
-from .evaluator import Evaluator
+from .evaluator import Evaluator, drawn_stages
 from .objective import RAILED, Objective
 
 
@@ -46,7 +44,7 @@ def make_objective(
         weights=_weights(case, data),
         resting=tuple(not trace.driven for trace in data.traces[: data.tuned]),
         stages=stages,
-        margin_stages=drawn_stages(case, "margins"),
+        margin_stages=evaluator.margin_stages,
         model_error=evaluator.model_error,
         over=table.ensemble.aggregate if table.ensemble else "mean",
         tail=table.ensemble.tail if table.ensemble else 1.0,
@@ -92,17 +90,3 @@ def _weights(case: Case, data: Data) -> jax.Array | None:
     coupling = case.study.objective.coupling_weight
     tuned = data.traces[: data.tuned]
     return as_array([1.0 if trace.driven else coupling for trace in tuned])
-
-
-def drawn_stages(case: Case, part: Part) -> Stage | None:
-    """Return the nominal stage and the drawn stages of ``part``, stacked.
-
-    None if no stages are drawn.
-    """
-    others = case.ensemble.stages(part) if case.ensemble else None
-    if others is None:
-        return None
-    own = Stage(case.loop.plant, case.loop.sensor)
-    return jax.tree.map(
-        lambda own, drawn: jnp.concatenate([own[None], drawn]), own, others
-    )

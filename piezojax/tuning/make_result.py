@@ -131,7 +131,7 @@ def constraint_outcomes(
 ) -> dict[str, ConstraintOutcome]:
     """Return the outcomes of the limits on the plants that were tuned on."""
     figures = evaluator.limited(
-        after, objective.signals, objective.stages, objective.margin_stages
+        after, objective.signals, objective.stages, evaluator.margin_stages
     )
     return _outcomes(evaluator.limits, evaluator.limits, figures)
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Literal, TypeVar
 
 import equinox as eqx
@@ -12,8 +12,9 @@ from jaxtyping import Array, Float
 
 from ..analysis.constraints import (
     LoopFigures,
-    Margins,
+    MarginFigures,
     constraint_count,
+    margin_figures,
     uses,
     violations,
 )
@@ -22,7 +23,7 @@ from ..analysis.stability.operating_point import OperatingPoint
 from ..core.arrays import as_array, largest
 from ..core.feedback import Feedback
 from ..core.metrics import Extremes, TrackingFigures
-from ..core.rollout import in_blocks
+from ..core.rollout import BLOCK, in_blocks
 from ..core.space import Space
 from ..solve.augmented_lagrangian import PENALTY, penalty_terms
 from ..solve.problem import FAILED_LOSS, Errors, Verdict
@@ -36,6 +37,9 @@ Over = Literal["mean", "worst", "cvar"]
 
 RAILED = 0.9
 """Share of saturated samples above which a run counts as railed."""
+
+MARGIN_BLOCK = BLOCK // 2
+"""Plants whose margins are computed at once; each has two branches."""
 
 _SHARPNESS = 20.0  # of the smooth maximum in "worst"
 _FLOOR = 1e-9  # um: errors below a femtometre count as equal
@@ -61,6 +65,28 @@ def _on_each(
         dynamic,
         size=size or len(jax.tree.leaves(dynamic)[0]),
     )
+
+
+def margins_on(
+    limits: Iterable[str],
+    loop_of: Callable[[Stage | None], Feedback],
+    stages: Stage | None,
+    point: OperatingPoint,
+    model_error: Float[Array, " lines"] | None,
+) -> MarginFigures:
+    """Return the margins [plants, branches] among ``limits`` on each of ``stages``.
+
+    ``loop_of(stage)`` is the loop on a stage, ``model_error`` bounds the relative error
+    of its plant.
+    """
+
+    def one(stage: Stage | None) -> MarginFigures:
+        found = sensitivities(loop_of(stage), point)
+        return margin_figures(limits, found, model_error)
+
+    # Of several axes a whole batch of matrices would not fit into memory.
+    one_axis = jnp.ndim(point.reference) == 0
+    return _on_each(one, stages, MARGIN_BLOCK if one_axis else 1)
 
 
 class Objective(eqx.Module):
@@ -131,6 +157,10 @@ class Objective(eqx.Module):
         """Return the objective with this penalty on violated limits."""
         return dataclasses.replace(self, penalty=penalty)
 
+    def on_margin_stages(self, stages: Stage) -> "Objective":
+        """Return the objective with other stages on which margins are limited."""
+        return dataclasses.replace(self, margin_stages=stages)
+
     def with_limits(self, limits: Mapping[str, float]) -> "Objective":
         """Return the objective with other limits of the same constraints."""
         arrays = {name: as_array(limit) for name, limit in limits.items()}
@@ -162,21 +192,18 @@ class Objective(eqx.Module):
                 every,
             )
 
-        def margins(stage):
-            point = OperatingPoint(self.highest, dt=self.dt)
-            return sensitivities(loop_of(unit, stage), point)
-
         figures, errors = _on_each(run, self.stages)
         figures, extremes = figures if beside else (figures, None)
-        known = uses(self.limits, "margins")
-        # Of several axes a whole batch of matrices would not fit into memory.
-        size = None if self.highest is None or self.highest.ndim == 0 else 1
-        found = None
-        if known:
-            found = Margins(
-                _on_each(margins, self.margin_stages, size), self.model_error
+        margins = None
+        if uses(self.limits, "margins"):
+            margins = margins_on(
+                self.limits,
+                lambda stage: loop_of(unit, stage),
+                self.margin_stages,
+                OperatingPoint(self.highest, dt=self.dt),
+                self.model_error,
             )
-        return LoopFigures(figures, extremes, found, dt=self.dt), errors
+        return LoopFigures(figures, extremes, margins, dt=self.dt), errors
 
     def _normalised(self, figures: TrackingFigures) -> Array:
         square = jnp.mean(figures.rms_error**2, axis=2)

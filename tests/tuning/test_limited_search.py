@@ -34,21 +34,27 @@ def integral_loop(integral):
 
 
 class Limited:
-    """Objective that remembers its limits."""
+    """Objective that remembers its limits and the plants of its margins."""
 
-    def __init__(self, limits):
-        self.limits = limits
+    def __init__(self, limits, stages="first"):
+        self.limits, self.stages = limits, stages
 
     def with_limits(self, limits):
-        return Limited(limits)
+        return Limited(dict(limits), self.stages)
+
+    def on_margin_stages(self, stages):
+        return Limited(self.limits, stages)
 
 
-def repeated(monkeypatch, peaks, status="converged", strategy="a strategy"):
-    """Return the limits that are searched, and the search, for exact Ms ``peaks``."""
-    values, aims = iter(peaks), []
+def repeated(monkeypatch, peaks, plants=(), status="converged", strategy="a strategy"):
+    """Return the limits and plants that are searched, and what is returned.
+
+    ``peaks`` are the exact Ms, ``plants`` the excess on the worst plants and these.
+    """
+    values, found, searched = iter(peaks), iter(plants), []
 
     def minimise(strategy, problem, starts, state, steps, progress):
-        aims.append(problem.limits["sensitivity_peak"])
+        searched.append((problem.limits.get("sensitivity_peak"), problem.stages))
         state.status, state.evaluations = "converged", 10
 
     monkeypatch.setattr(limited_search, "minimise", minimise)
@@ -58,32 +64,53 @@ def repeated(monkeypatch, peaks, status="converged", strategy="a strategy"):
         study=SimpleNamespace(
             limits={"sensitivity_peak": 2.0, "effort": 1.0},
             optimiser=SimpleNamespace(steps=7),
-        )
+        ),
+        space=SimpleNamespace(put=lambda loop, unit: loop),
+        loop=None,
     )
+    evaluator = SimpleNamespace(worst_plants=lambda loop: next(found, (0.0, None)))
     search = SearchState(np.array([0.5]), status=status, evaluations=5)
-    tighten = inspect.unwrap(limited_search._tightened)  # its arguments are stand-ins
-    return aims, tighten(Limited({}), case, search, strategy, Silent())
+    repeat = inspect.unwrap(limited_search._repeated)  # its arguments are stand-ins
+    return searched, repeat(Limited({}), case, evaluator, search, strategy, Silent())
 
 
 def test_the_limit_is_tightened_until_the_exact_one_is_kept(monkeypatch):
-    aims, (search, _, stability) = repeated(monkeypatch, [3.0, 2.2, 0.0])
+    searched, found = repeated(monkeypatch, [3.0, 2.2, 0.0])
     # Half of the room above 1, and five sixths of that.
-    assert aims == pytest.approx([1.5, 1.0 + 0.5 / 1.2])
+    assert [aim for aim, _ in searched] == pytest.approx([1.5, 1.0 + 0.5 / 1.2])
+    _, search, _, stability = found
     assert search.evaluations == 25
     assert stability == 0.0
 
 
 def test_it_ends_after_three_searches_that_each_leave_some_room(monkeypatch):
-    aims, _ = repeated(monkeypatch, [np.inf] * 4)
-    assert aims == pytest.approx([1.3, 1.09, 1.027])
+    searched, _ = repeated(monkeypatch, [np.inf] * 4)
+    assert [aim for aim, _ in searched] == pytest.approx([1.3, 1.09, 1.027])
+
+
+def test_plants_that_violate_a_limit_are_searched_until_none_does(monkeypatch):
+    plants = [(0.2, "second"), (1.1e-3, "third"), (9e-4, "fourth")]
+    searched, (objective, *_) = repeated(monkeypatch, [0.0] * 4, plants)
+    assert searched == [(None, "second"), (None, "third")]
+    assert objective.stages == "third"
+
+
+def test_other_plants_and_a_tighter_limit_are_searched_together(monkeypatch):
+    searched, _ = repeated(monkeypatch, [3.0, 0.0], [(0.2, "second"), (0.0, None)])
+    assert searched == [(1.5, "second")]
 
 
 @pytest.mark.parametrize(
-    "changes", [{"peaks": [0.0]}, {"status": "interrupted"}, {"strategy": None}]
+    "changes",
+    [
+        {"peaks": [0.0], "plants": [(1e-4, "second")]},
+        {"status": "interrupted"},
+        {"strategy": None},
+    ],
 )
 def test_it_does_nothing_where_nothing_is_missed_or_can_be_done(monkeypatch, changes):
-    aims, _ = repeated(monkeypatch, **({"peaks": [3.0]} | changes))
-    assert aims == []
+    searched, _ = repeated(monkeypatch, **({"peaks": [3.0]} | changes))
+    assert searched == []
 
 
 def alarming_peak(loop, bound=None, **limits):

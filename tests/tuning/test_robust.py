@@ -14,8 +14,8 @@ import piezojax as pj
 from piezojax.analysis.constraints import (
     CONSTRAINTS,
     LoopFigures,
-    Margins,
     constraint_count,
+    margin_figures,
     violations,
 )
 from piezojax.analysis.stability import OperatingPoint, stability_report
@@ -24,7 +24,9 @@ from piezojax.core.metrics import ExtremeFigures, TrackingFigures
 from piezojax.core.paths import replace
 from piezojax.core.system import rest_output
 from piezojax.solve.augmented_lagrangian import penalty_terms, update_multipliers
+from piezojax.solve.clock import Clock
 from piezojax.study import Stage, load, read
+from piezojax.tuning import evaluator
 from piezojax.tuning.data import make_data
 from piezojax.tuning.objective import Objective
 
@@ -151,7 +153,9 @@ def test_constraints_are_counted_as_they_are_evaluated(names):
     figures = LoopFigures(
         TrackingFigures(*[runs] * len(TrackingFigures._fields)),
         ExtremeFigures(*[runs] * len(ExtremeFigures._fields)),
-        Margins(jnp.full((5, 2, 64, 1, 1), 1.1 + 0j)),
+        jax.vmap(lambda found: margin_figures(names, found, None))(
+            jnp.full((5, 2, 64, 1, 1), 1.1 + 0j)
+        ),
         dt=5e-5,
     )
     limits = dict.fromkeys(names, 1.5)
@@ -168,6 +172,33 @@ def test_the_limit_is_kept_active_and_where_the_margin_says(outcome):
     worst = max(own, *(exact_peak(outcome.after, stage) for stage in stages))
     assert kept.value == pytest.approx(worst, rel=2e-3)
     assert worst == pytest.approx(1.3, rel=5e-3)
+
+
+def test_a_search_that_carries_the_worst_plants_keeps_the_limit_on_all(
+    outcome, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(evaluator, "CARRIED", 2)
+    found = pj.tune(written(tmp_path, changed(pareto=None))).result
+    kept = found.constraints["sensitivity_peak"]
+    assert (kept.kept, kept.active, kept.of) == (True, True, 5)
+    assert found.gains == pytest.approx(outcome.result.gains, rel=2e-3)
+
+
+def test_the_worst_plants_are_those_with_the_largest_exact_peak(outcome, monkeypatch):
+    monkeypatch.setattr(evaluator, "CARRIED", 2)
+    case = dataclasses.replace(
+        outcome.case,
+        study=outcome.case.study.model_copy(
+            update={"constraints": {"sensitivity_peak": 1.3, "delay_margin": "off"}}
+        ),
+    )
+    beyond, worst = evaluator.Evaluator(Clock(), case).worst_plants(outcome.after)
+    own = Stage(case.loop.plant, case.loop.sensor)
+    stages = [own, *each(case.ensemble.stages("margins"))]
+    peaks = sorted((exact_peak(outcome.after, stage) for stage in stages), reverse=True)
+    found = [exact_peak(outcome.after, stage) for stage in each(worst)]
+    assert found == pytest.approx(peaks[:2], rel=1e-9)
+    assert beyond == pytest.approx(np.log(peaks[0] / 1.3), abs=2e-3)
 
 
 def test_no_larger_gain_keeps_the_limit(outcome):
