@@ -9,7 +9,6 @@ import math
 
 from ..control import (
     PID,
-    AdaptiveInverse,
     AlphaBeta,
     Anticipation,
     BoundaryLayer,
@@ -54,6 +53,9 @@ NOTCH = {"damping": 0.5, "depth": 0.1}
 
 LOW_PASS = {"frequency": 3000.0, "damping": 0.7}
 """Frequency in Hz and damping of a second-order low-pass: ours."""
+
+ELECTRONICS_DELAY = 1.2e-4
+"""Delay in s of amplifier, sensor and filters of tuning/p753_electronics.toml."""
 
 H_INFINITY_BOUND = 3.0
 """Bound of the weighted responses: ours."""
@@ -128,12 +130,13 @@ def simc_pi() -> PID:
     """Return a PI by the SIMC rule of Skogestad (2003) for (5.33), um to V.
 
     Half of the smaller time constant counts as a delay and half as a lag; the loop and
-    the hold delay by one and a half samples. With a closed-loop time constant equal to
-    the delay, P = lag / (2 gain delay), and the integral time is the lesser of the lag
-    and eight delays.
+    the hold delay by one and a half samples, electronics by ELECTRONICS_DELAY. With a
+    closed-loop time constant equal to the delay, P = lag / (2 gain delay), and the
+    integral time is the lesser of the lag and eight delays.
     """
     slow, fast = p753.lags()
-    lag, delay = slow + 0.5 * fast, 0.5 * fast + 1.5 * p753.DT
+    lag = slow + 0.5 * fast
+    delay = 0.5 * fast + 1.5 * p753.DT + ELECTRONICS_DELAY
     gain = lag / (2.0 * p753.GAIN * delay)
     time = min(lag, 8.0 * delay)
     return PID(gain, gain / time, 0.0, p753.DT, 1.0 / time, dt=p753.DT)
