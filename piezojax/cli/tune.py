@@ -86,6 +86,7 @@ def _tune(
     from ..report.limit_bars import limit_text, write_limit
     from ..report.robustness import constraints_table, front_table
     from ..report.summary_tables import (
+        beside_table,
         gains_table,
         perturbed_text,
         sliding_text,
@@ -114,6 +115,8 @@ def _tune(
     result = outcome.result
     print_alarms(console, result.alarms)
     console.print(tuning_table(result))
+    if result.beside:
+        console.print(beside_table(result))
     console.print(gains_table(result))
     console.print(stability_table(outcome.stability))
     console.print(drive_table(outcome.drive, description.rate))

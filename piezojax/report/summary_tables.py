@@ -86,6 +86,38 @@ _SMALL = {"um": "nm", "urad": "nrad"}
 _MOST_ROWS = 12  # above it, axes at rest have only their geometric mean
 
 
+def beside_table(result: Result) -> Table:
+    """Return the hold-out's errors of the controllers beside and the tuned one, nm."""
+    plants = result.beside["tuned"].plants
+    title = "rms tracking error on the hold-out, nm: geometric mean over all references"
+    if plants:
+        title += f"\n(median and worst of {plants} held-out perturbed plants)"
+    table = Table(title=Text(title))
+    table.add_column("controller")
+    columns = ("median", "worst", "unstable") if plants else ()
+    for name in ("nominal", *columns, "largest Ms"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, found in result.beside.items():
+        of_plants = (
+            _nanometres(found.geomean_rms_um),
+            _nanometres(found.worst_rms_um),
+            str(found.unstable),
+        )
+        peak = found.sensitivity_peak
+        table.add_row(
+            name,
+            _nanometres(found.nominal_rms_um),
+            *(of_plants if plants else ()),
+            "-" if peak is None else f"{peak:.2f}" if peak < _ANY_PEAK else "unstable",
+            style="bold" if name == "tuned" else None,
+        )
+    return table
+
+
+_ANY_PEAK = 100.0
+"""Ms above which the impulse response of S is that of an unstable loop."""
+
+
 def perturbed_text(perturbed: Perturbed) -> str:
     """Return one line on the plants of the ensemble."""
     if perturbed.unstable or perturbed.median_better is None:

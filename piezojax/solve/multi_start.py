@@ -102,16 +102,19 @@ def descend(
             bests = []
 
 
-def in_batches(program: Callable[[Array], Any], points: np.ndarray, width: int) -> Any:
+def in_batches(program: Callable[[Any], Any], points: Any, width: int) -> Any:
     """Call ``program``, which takes ``width`` points, on any number of points.
 
-    Leaves of the result have a leading axis for the points. Copies of the last point
-    fill the last batch.
+    Leaves of the points and of the result have a leading axis for the points. Copies of
+    the last point fill the last batch.
     """
-    filler = np.repeat(points[-1:], -len(points) % width, axis=0)
-    batches = np.concatenate([points, filler]).reshape(-1, width, *points.shape[1:])
-    results = [program(as_array(batch)) for batch in batches]
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(points)], *results)
+    count = len(jax.tree.leaves(points)[0])
+    rows = np.minimum(np.arange(-(-count // width) * width), count - 1)
+    results = [
+        program(jax.tree.map(lambda x, rows=batch: as_array(x[rows]), points))
+        for batch in rows.reshape(-1, width)
+    ]
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *results)
 
 
 class BatchedDescents:

@@ -15,7 +15,7 @@ from ..control.design_model import NoInverseError
 from ..core.about import About
 from ..core.arrays import as_array
 from ..core.feedback import Feedback, Observation
-from ..core.paths import declared, static_fields
+from ..core.paths import declared, get, replace, static_fields
 from ..core.serial import from_data, read_about
 from ..core.serial import load as load_system
 from ..core.space import Space
@@ -24,7 +24,7 @@ from ..identification import Fit, identify, read_record
 from .ensemble import Ensemble, Stage, ensemble_of
 from .make_hardware import driven, make_actuator, make_amplifier, make_sensor, per_axis
 from .origin import check_origin, check_rate, in_study_units
-from .parameters import search_space
+from .parameters import check_value, search_space
 from .schema import Study, load
 from .stage_tables import RecordPlant
 from .tables import one_of, validated
@@ -40,7 +40,8 @@ class Case:
     whose voltage stays within the record. ``plant_about`` is the origin of a plant from
     a record or a file, with the bound on its error. ``amplifier`` maps the voltage of
     the actuator to that of the piezo, both in V; it is part of the plant, and None if
-    the study has none.
+    the study has none. ``beside`` maps names to the controllers that the tuned one is
+    compared with.
     """
 
     study: Study
@@ -53,6 +54,7 @@ class Case:
     notes: tuple[str, ...] = ()
     plant_about: About = field(default_factory=About)
     amplifier: System | None = None
+    beside: Mapping[str, System] = field(default_factory=dict)
 
     def unit(self, path: str) -> str:
         """Return the declared unit of the parameter at ``path`` in the loop.
@@ -113,6 +115,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         (*design_notes, *notes),
         about,
         amplifier,
+        _beside(study, observation),
     )
 
 
@@ -164,6 +167,25 @@ def _swept_plants(study: Study, zero: Any) -> dict[str, System]:
         _check_rates(study, plant, where)
         plants[name] = plant
     return plants
+
+
+def _beside(study: Study, observation: Observation) -> dict[str, System]:
+    """Return the controllers that the tuned one is compared with, by name."""
+    controllers = {}
+    for name, table in study.beside.items():
+        where = f"beside.{name}"
+        source = {"catalog": table.catalog}
+        controller = _from_source(source, where, Path(), CONTROLLERS, study.rate)
+        _check_role(controller, observation, where, "an Observation to a command")
+        _check_rates(study, controller, where)
+        for path, value in table.gains.items():
+            try:
+                get(controller, path)
+            except ValueError as error:
+                raise ValueError(f"{where}.gains: {error}") from None
+            check_value(controller, path, value, f"{where}.gains.{path}")
+        controllers[name] = replace(controller, table.gains)
+    return controllers
 
 
 def _designed(

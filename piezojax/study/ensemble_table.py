@@ -20,9 +20,9 @@ class EnsembleTable(Table):
 
     The objective includes the nominal stage and ``tune`` drawn stages. Margins are
     constrained on these and on further stages, ``margins`` in all: a search carries the
-    worst of them and looks at all of them at its end. The tuned gains are evaluated on ``holdout`` other stages. ``aggregate``
-    combines the objectives of the stages: their mean, the worst, or the mean of the
-    worst share ``tail`` (CVaR).
+    worst of them and looks at all of them at its end. The tuned gains are evaluated on
+    ``holdout`` other stages. ``aggregate`` combines the objectives of the stages: their
+    mean, the worst, or the mean of the worst share ``tail`` (CVaR).
     """
 
     spread: dict[str, Positive] = Field(default_factory=dict)

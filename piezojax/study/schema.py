@@ -98,6 +98,21 @@ class TunedTable(RangeTable):
     start: Finite | None = None
 
 
+class BesideTable(Table):
+    """Controller that is not tuned, with figures beside those of the tuned one.
+
+    ``gains`` are values by path in the controller of the ``catalog``.
+    """
+
+    catalog: str
+    gains: dict[str, Finite] = Field(default_factory=dict)
+
+    @field_validator("gains", mode="before")
+    @classmethod
+    def _quoted(cls, values: Any) -> Any:
+        return require_quoted_paths(values)
+
+
 class ParetoTable(Table):
     """Pareto front: the study is solved for each of ``limits`` of one constraint.
 
@@ -149,7 +164,8 @@ class Study(Table):
 
     ``rate`` is the sampling rate, Hz. ``tune`` names parameters to tune: paths in the
     loop, or patterns such as ``controller.feedback.*``. ``parameters`` names further
-    ones. It also overrides the declared bounds, scales and starts.
+    ones. It also overrides the declared bounds, scales and starts. ``beside`` names
+    controllers that the tuned one is compared with.
     """
 
     title: str
@@ -170,6 +186,7 @@ class Study(Table):
     constraints: dict[str, Any] = Field(default_factory=dict)
     pareto: ParetoTable | None = None
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
+    beside: dict[str, BesideTable] = Field(default_factory=dict)
     sweep: SweepTable | None = None
 
     @field_validator("parameters", mode="before")

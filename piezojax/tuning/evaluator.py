@@ -1,6 +1,6 @@
-"""Evaluation of loops on signals and stages, compiled once per shape of signals."""
+"""Evaluation of loops on signals and stages, compiled once per shape and structure."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import equinox as eqx
@@ -21,10 +21,11 @@ from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, Extremes, TrackingFigures
 from ..solve.clock import Clock
+from ..solve.multi_start import in_batches
 from ..study import Case, Stage
 from ..study.ensemble import Part
 from ..study.references import highest_reference
-from .objective import margins_on
+from .objective import MARGIN_BLOCK, margins_on
 from .runs import Signals, evaluate
 
 CARRIED = 32
@@ -32,7 +33,7 @@ CARRIED = 32
 
 
 class Evaluator:
-    """Simulator of loops on signals, compiled once per shape of signals.
+    """Simulator of loops on signals, compiled once per shape and structure of loops.
 
     ``start`` is the first sample that counts, ``limits`` are those of the study,
     ``model_error`` [lines] bounds the relative error of the plant if its record gives
@@ -48,9 +49,9 @@ class Evaluator:
         bound = case.plant_about.error_bound
         self.model_error = bound and as_array(bound.supported(lines(study.dt)))
         self.margin_stages = drawn_stages(case, "margins")
-        self._programs: dict[str, Callable] = {}
+        self._programs: dict[Hashable, Callable] = {}
 
-    def _compiled(self, key: str, function: Callable, *arguments: Any) -> Callable:
+    def _compiled(self, key: Hashable, function: Callable, *arguments: Any) -> Callable:
         if key not in self._programs:
             self._programs[key] = self._clock.compiled(function, *arguments)
         return self._programs[key]
@@ -106,7 +107,7 @@ class Evaluator:
 
             return jax.lax.map(one, dynamic) if _count(stages) else _stacked(one(None))
 
-        key = f"{_count(stages)} stages {signals.noise.shape}"
+        key = "runs", _count(stages), signals.noise.shape, jax.tree.structure(loop)
         found = self._compiled(key, run, loop, dynamic, signals)(loop, dynamic, signals)
         return found if beside else (found, None)
 
@@ -142,8 +143,15 @@ class Evaluator:
                 self.model_error,
             )
 
-        key = f"margins of {_count(stages)} stages"
-        return self._compiled(key, margins, loop, dynamic)(loop, dynamic)
+        if stages is None:
+            key = "margins", 0, jax.tree.structure(loop)
+            return self._compiled(key, margins, loop, None)(loop, None)
+        width = min(_count(stages), MARGIN_BLOCK)
+        first = jax.tree.map(lambda x: x[:width], dynamic)
+        key = "margins", width, jax.tree.structure(loop)
+        program = self._compiled(key, margins, loop, first)
+        found = in_batches(lambda batch: program(loop, batch), dynamic, width)
+        return jax.tree.map(jnp.asarray, found)
 
 
 def _count(stages: Stage | None) -> int:

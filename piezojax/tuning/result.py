@@ -176,6 +176,25 @@ class Perturbed(BaseModel):
         )
 
 
+class Beside(BaseModel):
+    """Figures of a controller on the hold-out, to compare controllers by.
+
+    ``nominal_rms_um`` is the geometric mean of the errors of the driven axes over all
+    references of the hold-out, on the nominal plant; ``geomean_rms_um`` and
+    ``worst_rms_um`` are its median and its largest value over ``plants`` held-out
+    plants. They are None if a run diverges or rails, on ``unstable`` of the plants.
+    ``sensitivity_peak`` is the largest on these plants, on the nominal one without
+    them; None if it is not limited.
+    """
+
+    nominal_rms_um: float | None
+    geomean_rms_um: float | None = None
+    worst_rms_um: float | None = None
+    plants: int = 0
+    unstable: int = 0
+    sensitivity_peak: float | None = None
+
+
 class Result(BaseModel):
     """Result of a tuning run: the content of ``result.json``.
 
@@ -188,10 +207,12 @@ class Result(BaseModel):
     hold-out. ``constraints`` holds the outcomes of the study's limits, and
     ``holdout_constraints`` those of the limits on runs under all references of the
     hold-out; ``front`` is the Pareto front, and ``perturbed`` the figures of the gains
-    on the held-out plants of its ensemble. ``sliding_before`` and ``sliding`` tell how
-    much of the sliding variable is tracking error, None for other controllers.
-    ``history`` holds the lowest loss of each start after each step, and ``times_s`` the
-    time (s) from the start of the search to the end of that step.
+    on the held-out plants of its ensemble. ``beside`` holds the figures of the
+    controllers that the study names, then those "before" and "tuned".
+    ``sliding_before`` and ``sliding`` tell how much of the sliding variable is tracking
+    error, None for other controllers. ``history`` holds the lowest loss of each start
+    after each step, and ``times_s`` the time (s) from the start of the search to the
+    end of that step.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -215,6 +236,7 @@ class Result(BaseModel):
     holdout_constraints: dict[str, ConstraintOutcome] = {}
     front: list[FrontPoint] | None = None
     perturbed: Perturbed | None = None
+    beside: dict[str, Beside] = {}
     drive_before: dict[str, Drive] = {}
     """Figures of the voltage at the piezo before tuning, by axis ("piezo" on one)."""
     drive: dict[str, Drive] = {}

@@ -11,6 +11,7 @@ from ..solve.clock import Clock
 from ..study import Case, read, shipped
 from .alarms import alarms_of
 from .baselines import Budget, compare_baselines
+from .beside import figures_beside
 from .data import make_data
 from .evaluator import Evaluator
 from .front import trace_front
@@ -73,6 +74,7 @@ def tune(
         result.sliding_before, result.sliding = (
             sliding_share(loop, data, evaluator.start) for loop in (case.loop, after)
         )
+        result.beside = figures_beside(case, data, evaluator, after, progress)
         note = tip_note(case, after, data, evaluator.start)
         result.warnings += [note] if note else []
     except KeyboardInterrupt:
