@@ -188,13 +188,12 @@ def feedforward_h_infinity() -> FeedforwardFeedback:
 
 
 def adaptive_pi() -> Anticipation:
-    """Return ``simc_pi`` behind a low-pass in an AdaptiveInverse, um to V.
+    """Return ``simc_pi`` in an AdaptiveInverse, um to V.
 
     The inverse leads the stage by the lag of the sensor; a negative lead of the
     reference takes that back.
     """
-    feedback = FilteredCommand(simc_pi(), SecondOrderLowPass(**LOW_PASS, dt=p753.DT))
-    return Anticipation(p753.with_adaptive_inverse(feedback), (0.0,))
+    return Anticipation(p753.with_adaptive_inverse(simc_pi()), (0.0,))
 
 
 def preview_feedforward_pid() -> FeedforwardFeedback:

@@ -1,7 +1,7 @@
 """Evaluation of loops on signals and stages, compiled once per shape and structure."""
 
 from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,8 +28,20 @@ from ..study.references import highest_reference
 from .objective import MARGIN_BLOCK, margins_on
 from .runs import Signals, evaluate
 
-CARRIED = 32
-"""Largest number of plants whose margins a search of one axis computes at a point."""
+CARRIED = 64
+"""Largest number of plants whose margins a search computes at a point."""
+
+
+class Carried(NamedTuple):
+    """Plants that a search carries, of those on which margins are limited.
+
+    ``excess`` is the largest over a limit on any plant. ``stages`` are the carried
+    ones, at ``places`` among all; None if all are carried.
+    """
+
+    excess: float
+    stages: Stage | None
+    places: np.ndarray
 
 
 class Evaluator:
@@ -111,20 +123,25 @@ class Evaluator:
         found = self._compiled(key, run, loop, dynamic, signals)(loop, dynamic, signals)
         return found if beside else (found, None)
 
-    def worst_plants(self, loop: Feedback) -> tuple[float, Stage | None]:
-        """Return the largest excess of ``loop`` over its limits on margins, and where.
+    def worst_plants(self, loop: Feedback, before: Carried | None = None) -> Carried:
+        """Return the plants that a search from ``loop`` carries: ``CARRIED`` at most.
 
-        The stages are the ``CARRIED`` worst of ``margin_stages``, in which a search may
-        carry them; None if it carries them all.
+        They are the worst by the excess over the limits on margins. Half of them are
+        worst among those carried ``before``, so that a search does not forget plants
+        whose limit was active.
         """
         stages = self.margin_stages
         if _count(stages) <= CARRIED or not uses(self.limits, "margins"):
-            return 0.0, None
+            return Carried(0.0, None, np.empty(0, int))
         margins = self._margins(loop, stages)
         assert margins is not None
         by = np.asarray(worst_excess(self.limits, margins))
-        worst = np.argsort(-by, kind="stable")[:CARRIED]
-        return float(by[worst[0]]), jax.tree.map(lambda x: x[worst], stages)
+        worst = np.argsort(-by, kind="stable")
+        kept = worst[:0] if before is None else worst[np.isin(worst, before.places)]
+        first = np.concatenate([worst[: CARRIED // 2], kept[: CARRIED // 2], worst])
+        places = first[np.sort(np.unique(first, return_index=True)[1])][:CARRIED]
+        carried = jax.tree.map(lambda x: x[places], stages)
+        return Carried(float(by[worst[0]]), carried, places)
 
     def _margins(self, loop: Feedback, stages: Stage | None) -> MarginFigures | None:
         """Return the margins on each of ``stages``, or None if no limit needs them."""

@@ -5,7 +5,6 @@ import numpy as np
 from ..analysis.constraints import uses
 from ..analysis.stability import StabilityReports, stability_reports
 from ..core.arrays import as_array
-from ..core.feedback import Feedback
 from ..core.progress import Progress
 from ..solve.clock import Clock
 from ..solve.multi_start import Strategy, minimise
@@ -14,7 +13,7 @@ from ..solve.search_state import SearchState
 from ..study import Case
 from ..study.references import highest_reference
 from .alarms import EXACT, exact_figures
-from .evaluator import Evaluator
+from .evaluator import Carried, Evaluator
 from .make_result import constraint_outcomes
 from .model_alarms import SLACK, worst_peak
 from .objective import Objective
@@ -22,7 +21,7 @@ from .search import search_box
 
 PEAK = "sensitivity_peak"
 
-REPEATS, LEAST_SHARE = 3, 0.3
+REPEATS, LEAST_SHARE = 5, 0.3
 """Largest number of repeated searches, and the least factor by which one of them
 shrinks the distance of the limit on Ms from 1."""
 
@@ -49,9 +48,10 @@ def search_within_limits(
     }
     every = objective.with_limits(study.limits)
     if uses(own, "margins") or study.pareto or own == study.limits:
-        every = _on_worst_plants(every, evaluator, case.loop)
+        carried = evaluator.worst_plants(case.loop)
+        every = every.on_margin_stages(carried.stages)
         search, strategy = search_box(every, case, clock, progress)
-        return _repeated(every, case, evaluator, search, strategy, progress)
+        return _repeated(every, case, evaluator, carried, search, strategy, progress)
     objective = objective.with_limits(own)
     search, strategy = search_box(objective, case, clock, progress)
     try:
@@ -66,18 +66,11 @@ def search_within_limits(
     except KeyboardInterrupt:
         search.status = "interrupted"
         return objective, search, strategy, INTERRUPTED
-    every = _on_worst_plants(every, evaluator, after)
+    carried = evaluator.worst_plants(after)
+    every = every.on_margin_stages(carried.stages)
     again, strategy = search_box(every, case, clock, progress, search.unit[None])
     again.evaluations += search.evaluations
-    return _repeated(every, case, evaluator, again, strategy, progress)
-
-
-def _on_worst_plants(
-    objective: Objective, evaluator: Evaluator, loop: Feedback
-) -> Objective:
-    """Return the objective with the plants on which ``loop`` has the worst margins."""
-    _, worst = evaluator.worst_plants(loop)
-    return objective if worst is None else objective.on_margin_stages(worst)
+    return _repeated(every, case, evaluator, carried, again, strategy, progress)
 
 
 INTERRUPTED = StabilityReports(problems={"after": "they were interrupted"})
@@ -121,6 +114,7 @@ def _repeated(
     objective: Objective,
     case: Case,
     evaluator: Evaluator,
+    carried: Carried,
     search: SearchState,
     strategy: Strategy | None,
     progress: Progress,
@@ -139,16 +133,16 @@ def _repeated(
             if strategy is None or search.status == "interrupted":
                 break
             loop = case.space.put(case.loop, as_array(search.unit))
-            beyond, worst = evaluator.worst_plants(loop)
+            carried = evaluator.worst_plants(loop, carried)
             peak = _alarming_peak(case, stability)
             if peak:
                 share = (case.study.limits[PEAK] - 1.0) / (peak - 1.0)
                 limits[PEAK] = 1.0 + (limits[PEAK] - 1.0) * max(share, LEAST_SHARE)
                 progress.stage(f"Ms is {peak:.3g}: searching below {limits[PEAK]:.3g}")
                 objective = objective.with_limits(limits)
-            if worst is not None and beyond > TOLERANCE:
+            if carried.stages is not None and carried.excess > TOLERANCE:
                 progress.stage("searching with the plants whose margins are worst")
-                objective = objective.on_margin_stages(worst)
+                objective = objective.on_margin_stages(carried.stages)
             elif not peak:
                 break
             again = SearchState(search.unit, starts=search.unit[None])

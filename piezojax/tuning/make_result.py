@@ -98,6 +98,7 @@ def make_result(
             *case.notes,
             *search.warnings,
             *_warnings(case, at_bound, after_scores, holdout),
+            *worse_than_the_start(_chosen(before, names, tuned), after_scores),
         ],
         history=search.losses_by_start,
         times_s=search.times_s,
@@ -185,3 +186,17 @@ def _warnings(
                 f"the actuator saturates on {where} runs of {', '.join(railed)}"
             )
     return found
+
+
+def worse_than_the_start(before: Scores, after: Scores) -> list[str]:
+    """Return a note if gains within the limits track worse than those of the start."""
+    if not (before.stable and after.stable):
+        return []
+    was, found = before.geomean_rms_um, after.geomean_rms_um
+    if was is None or found is None or found <= was:
+        return []
+    return [
+        f"the tuned gains track worse than the start, {1e3 * found:.4g} nm against "
+        f"{1e3 * was:.4g} nm: the start does not keep the limits, or fails on a drawn "
+        "plant; if the limits allow more, raise 'candidates', 'starts' and 'steps'"
+    ]

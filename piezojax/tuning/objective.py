@@ -157,9 +157,11 @@ class Objective(eqx.Module):
         """Return the objective with this penalty on violated limits."""
         return dataclasses.replace(self, penalty=penalty)
 
-    def on_margin_stages(self, stages: Stage) -> "Objective":
-        """Return the objective with other stages on which margins are limited."""
-        return dataclasses.replace(self, margin_stages=stages)
+    def on_margin_stages(self, stages: Stage | None) -> "Objective":
+        """Return the objective with margins limited on ``stages``, if these are any."""
+        return (
+            self if stages is None else dataclasses.replace(self, margin_stages=stages)
+        )
 
     def with_limits(self, limits: Mapping[str, float]) -> "Objective":
         """Return the objective with other limits of the same constraints."""

@@ -19,6 +19,7 @@ from piezojax.dynamics import FirstOrderLag
 from piezojax.hardware import Saturation, Sensor
 from piezojax.solve.search_state import SearchState
 from piezojax.tuning import limited_search
+from piezojax.tuning.evaluator import Carried
 from piezojax.tuning.model_alarms import model_alarms
 
 DT = 1e-4
@@ -68,10 +69,14 @@ def repeated(monkeypatch, peaks, plants=(), status="converged", strategy="a stra
         space=SimpleNamespace(put=lambda loop, unit: loop),
         loop=None,
     )
-    evaluator = SimpleNamespace(worst_plants=lambda loop: next(found, (0.0, None)))
+    evaluator = SimpleNamespace(
+        worst_plants=lambda loop, before: Carried(*next(found, (0.0, None)), before)
+    )
     search = SearchState(np.array([0.5]), status=status, evaluations=5)
     repeat = inspect.unwrap(limited_search._repeated)  # its arguments are stand-ins
-    return searched, repeat(Limited({}), case, evaluator, search, strategy, Silent())
+    return searched, repeat(
+        Limited({}), case, evaluator, None, search, strategy, Silent()
+    )
 
 
 def test_the_limit_is_tightened_until_the_exact_one_is_kept(monkeypatch):
@@ -83,9 +88,10 @@ def test_the_limit_is_tightened_until_the_exact_one_is_kept(monkeypatch):
     assert stability == 0.0
 
 
-def test_it_ends_after_three_searches_that_each_leave_some_room(monkeypatch):
-    searched, _ = repeated(monkeypatch, [np.inf] * 4)
-    assert [aim for aim, _ in searched] == pytest.approx([1.3, 1.09, 1.027])
+def test_it_ends_after_five_searches_that_each_leave_some_room(monkeypatch):
+    searched, _ = repeated(monkeypatch, [np.inf] * 6)
+    aims = 1.0 + 0.3 ** np.arange(1, 6)
+    assert [aim for aim, _ in searched] == pytest.approx(aims)
 
 
 def test_plants_that_violate_a_limit_are_searched_until_none_does(monkeypatch):

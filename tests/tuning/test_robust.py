@@ -28,6 +28,7 @@ from piezojax.solve.clock import Clock
 from piezojax.study import Stage, load, read
 from piezojax.tuning import evaluator
 from piezojax.tuning.data import make_data
+from piezojax.tuning.evaluator import Carried
 from piezojax.tuning.objective import Objective
 
 STUDY = {
@@ -192,12 +193,17 @@ def test_the_worst_plants_are_those_with_the_largest_exact_peak(outcome, monkeyp
             update={"constraints": {"sensitivity_peak": 1.3, "delay_margin": "off"}}
         ),
     )
-    beyond, worst = evaluator.Evaluator(Clock(), case).worst_plants(outcome.after)
+    found = evaluator.Evaluator(Clock(), case)
+    beyond, worst, places = found.worst_plants(outcome.after)
     own = Stage(case.loop.plant, case.loop.sensor)
     stages = [own, *each(case.ensemble.stages("margins"))]
     peaks = sorted((exact_peak(outcome.after, stage) for stage in stages), reverse=True)
-    found = [exact_peak(outcome.after, stage) for stage in each(worst)]
-    assert found == pytest.approx(peaks[:2], rel=1e-9)
+    carried = [exact_peak(outcome.after, stage) for stage in each(worst)]
+    assert carried == pytest.approx(peaks[:2], rel=1e-9)
+    # Half of them were carried before.
+    for old in set(range(5)) - set(places.tolist()):
+        again = found.worst_plants(outcome.after, Carried(0.0, None, np.array([old])))
+        assert again.places.tolist() == [places[0], old]
     assert beyond == pytest.approx(np.log(peaks[0] / 1.3), abs=2e-3)
 
 

@@ -14,6 +14,7 @@ from piezojax.core.paths import get, parameters
 from piezojax.signals import waveforms as signals
 from piezojax.solve.optimisers import METHODS
 from piezojax.study import Study, build
+from piezojax.tuning.make_result import worse_than_the_start
 from piezojax.tuning.result import Result, load_result
 
 # A PID on a lag is compiled in a few seconds; what is tested is the same for any loop.
@@ -105,6 +106,17 @@ def run(loop, name="SIN50", seed=9):
     reference = signals.signal(name, time)
     state = loop.init(reference[0])
     return pj.simulate(loop, pj.loop_inputs(reference, noise), state)[1]
+
+
+def test_gains_that_track_worse_than_the_start_say_so(plain):
+    before, after = plain.result.before, plain.result.after
+    assert not any("than the start" in note for note in plain.result.warnings)
+    assert worse_than_the_start(before, after) == []
+    (note,) = worse_than_the_start(after, before)
+    was, found = 1e3 * after.geomean_rms_um, 1e3 * before.geomean_rms_um
+    assert f"{found:.4g} nm against {was:.4g} nm" in note
+    lost = before.model_copy(update={"geomean_rms_um": None})
+    assert worse_than_the_start(after, lost) == []  # an alarm says more
 
 
 # A run that goes well
