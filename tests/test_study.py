@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -110,9 +111,24 @@ def test_shipped_studies_are_valid(name):
     assert study.references.unseen
 
 
-def test_the_default_study():
+def test_the_default_study_has_a_realistic_stage_and_rivals():
     case = read(shipped())
     assert case.name == DEFAULT
+    assert case.study.ensemble.holdout == 200
+    assert {"2-DOF PID", "2-DOF PID with notch", "H-infinity"} < set(case.beside)
+    # The stage, its electronics, its deviations and the references are those of the
+    # comparison that tuned the others.
+    own, fair = (
+        tomllib.loads(shipped(name).read_text(encoding="utf-8"))
+        for name in (DEFAULT, "comparison/p753_fair")
+    )
+    shared = set(own) & set(fair) - {"title", "optimiser"}
+    assert len(shared) == 8
+    assert {name: own[name] for name in shared} == {name: fair[name] for name in shared}
+
+
+def test_the_study_of_the_thesis():
+    case = read(shipped("p753_dob"))
     assert case.fit is None
     assert case.study.rate == p753.RATE
     assert case.study.references.tune == (
@@ -425,8 +441,8 @@ def test_a_cut_off_just_below_nyquist(study):
             1.0,
             "rat is unknown; allowed are title, rate, seed, axes, plant, actuator, "
             "sensor, controller, references, tune, parameters, objective, optimiser, "
-            "disturbance, ensemble, constraints, pareto, holdout_draws, sweep; "
-            "did you mean 'rate'?",
+            "disturbance, ensemble, constraints, pareto, holdout_draws, beside, "
+            "sweep; did you mean 'rate'?",
         ),
         ("actuator/uper", 1.0, "actuator.uper is unknown; allowed are resolution, "),
         (

@@ -42,10 +42,10 @@ def main(
 ) -> None:
     """Tune the controller that STUDY describes, by gradients through the simulation.
 
-    STUDY is a TOML file or the name of a study that comes with piezojax; without it,
-    the DOB-based PID-SMC of the P-753 stage is tuned. Several studies, or a comparison
-    (controllers and rates in one file, as comparison/p753), are tuned one after
-    another, each into its own folder, and end in one table and picture.
+    STUDY is a TOML file or the name of a study that comes with piezojax; without it, a
+    PI with a learned inverse is tuned on the P-753 stage. Several studies, or a
+    comparison (controllers and rates in one file, as comparison/p753), are tuned one
+    after another, each into its own folder, and end in one table and picture.
 
     Exit status 3 means that the run finished with an alarm: the gains violate a limit,
     rail, diverge or rest on a model that is not validated. The alarms are printed

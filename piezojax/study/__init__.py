@@ -16,7 +16,7 @@ from .ensemble import Stage as Stage
 from .schema import Study as Study
 from .schema import load as load
 
-DEFAULT = "p753_dob"
+DEFAULT = "p753_learned_inverse"
 """Name of the default study."""
 
 

@@ -210,7 +210,7 @@ def test_a_bad_study_is_refused(tables, message, tmp_path):
 
 
 def test_an_ensemble_needs_a_plant_whose_variations_are_known(tmp_path):
-    text = shipped().read_text(encoding="utf-8")
+    text = shipped("p753_dob").read_text(encoding="utf-8")
     text = text.replace('"p753_stage"', '"p753"')
     path = tmp_path / "study.toml"
     path.write_text(text + "\n[ensemble]\nspread = { gain = 0.1 }\n", encoding="utf-8")

@@ -67,9 +67,9 @@ def test_the_line_says_both_shares():
     assert line_of(None, None) is None
 
 
-def test_the_bounded_study_differs_from_the_default_in_its_bounds_alone():
-    bounded, default = load(shipped("p753_sliding_mode")), load(shipped())
-    same = set(type(default).model_fields) - {"title", "parameters"}
+def test_the_bounded_study_differs_from_that_of_the_thesis_in_its_bounds_alone():
+    bounded, free = load(shipped("p753_sliding_mode")), load(shipped("p753_dob"))
+    same = set(type(free).model_fields) - {"title", "parameters"}
     for name in same:
-        assert getattr(bounded, name) == getattr(default, name)
-    assert set(bounded.parameters) == set(default.parameters)
+        assert getattr(bounded, name) == getattr(free, name)
+    assert set(bounded.parameters) == set(free.parameters)
