@@ -191,7 +191,7 @@ def stability_table(stability: StabilityReports) -> Table:
         if axes.report.disk_margin is not None:
             table.add_row(
                 f"{shown}, all axes at once",
-                f"{axes.report.sensitivity_peak:.2f}",
+                f"{axes.report.largest_sensitivity_peak:.2f}",
                 f"{20.0 * math.log10(axes.report.disk_gain_margin or 1.0):.1f} dB",
                 f"{axes.report.disk_phase_margin_deg:.1f}°",
                 "-",

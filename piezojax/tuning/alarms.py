@@ -101,6 +101,8 @@ def exact_figures(
     if "after" in stability.axes:
         report = stability.axes["after"].report
         found[""] = _figures(report, report.axes)
+        if found[""] is not None:
+            found[""]["sensitivity_peak"] = report.largest_sensitivity_peak
     return found
 
 

@@ -20,12 +20,19 @@ from scipy.linalg import block_diag
 from scipy.optimize import linear_sum_assignment, minimize
 
 import piezojax as pj
-from piezojax.analysis.stability import axes_report_of, broken_loop, report_of
+from piezojax import Feedback, Saturation, Sensor
+from piezojax.analysis.stability import (
+    BrokenLoop,
+    axes_report_of,
+    broken_loop,
+    report_of,
+)
 from piezojax.analysis.stability.axes_margins import structured_bound
+from piezojax.analysis.stability.broken_loop import OutputCut
 from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
 from piezojax.analysis.stability.margins import _model, linear_axes
 from piezojax.analysis.stability.operating_point import OperatingPoint
-from piezojax.catalog import p558_control
+from piezojax.catalog import p558_control, p753
 from piezojax.core.feedback import LoopInput
 
 REST = (0.0, 0.0, 0.0)
@@ -127,6 +134,32 @@ def test_peaks_of_the_largest_singular_value(pair):
         values = largest(S if name == "sensitivity_peak" else np.eye(3) - S)
         assert values[everywhere == at] == pytest.approx(expected, rel=1e-6)
         assert values.max() == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_the_peak_of_the_loop_cut_at_its_displacements(name):
+    ours, theirs = LOOPS[name]
+    report = pj.stability_report(p558_control.loop(ours()), REST)
+    stage = control.ss(*three_dof.stacked(), np.zeros((3, 3)), T)
+    L = -(stage * control.ss(*controller_matrices(theirs), T))
+    at, expected = report.output_sensitivity_peak_Hz, report.output_sensitivity_peak
+    everywhere = np.unique([*np.geomspace(1e-3, 0.5 / T, 6_000), at])
+    values = largest(np.linalg.inv(np.eye(3) + response(L, everywhere)))
+    assert values[everywhere == at] == pytest.approx(expected, rel=1e-6)
+    assert values.max() == pytest.approx(expected, rel=1e-6)
+    both = report.sensitivity_peak, expected
+    assert report.largest_sensitivity_peak == max(both)
+    assert both[0] != pytest.approx(both[1], rel=1e-4)
+
+
+def test_one_axis_has_the_same_sensitivity_at_both_cuts():
+    loop = Feedback(p753.pid(), p753.plant(), Saturation(-20.0, 120.0), Sensor(0.0))
+    angle = np.geomspace(1e-4, np.pi, 50)
+    before, behind = (
+        linear_axes(loop, OperatingPoint(2.0), kind)[0].sensitivity(angle)
+        for kind in (BrokenLoop, OutputCut)
+    )
+    np.testing.assert_allclose(behind, before, rtol=1e-8)
 
 
 def one_axis(matrices, axis):

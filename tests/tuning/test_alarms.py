@@ -10,8 +10,9 @@ import tomli_w
 from click.testing import CliRunner
 
 import piezojax as pj
-from piezojax.analysis.stability import StabilityReports, report_of
-from piezojax.analysis.stability.conserved import LinearLoop
+from piezojax.analysis.stability import StabilityReports, axes_report_of, report_of
+from piezojax.analysis.stability.assess import AxesStability
+from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
 from piezojax.cli.tune import main
 from piezojax.core.files import write_json
 from piezojax.tuning.alarms import alarms_of
@@ -174,6 +175,19 @@ def test_exact_margins_replace_those_of_the_nominal_plant_alone():
     assert alarm.startswith("sensitivity_peak is 2.1 on 1 of 2 tuned plants, above")
     unknown = StabilityReports(problems={"after": "it has no derivative"})
     assert any("2.1 on 1 of 1 tuned" in a for a in alarms(missed(2.1), unknown))
+
+
+def test_the_cut_at_the_displacements_counts_on_several_axes():
+    """Two linear loops stand for the cuts: only the one behind exceeds the limit."""
+    A, B, C = np.zeros((1, 1)), np.array([[1.0, 0.0]]), np.array([[0.1], [0.9]])
+    before = LinearAxes(A, B, C, 1e-4)
+    behind = LinearAxes(A, B, 3.0 * C, 1e-4)
+    report = axes_report_of(before, behind)
+    peaks = report.sensitivity_peak, report.output_sensitivity_peak
+    assert peaks[0] < 2.0 < peaks[1]
+    axes = AxesStability(report, before)
+    (alarm,) = alarms(stability=StabilityReports(axes={"after": axes}))
+    assert alarm.startswith(f"sensitivity_peak is {peaks[1]:.3g} on the nominal plant,")
 
 
 def test_a_margin_that_is_not_a_number_is_an_alarm():

@@ -9,8 +9,9 @@ import jax
 import numpy as np
 
 from ...core.arrays import ScalarLike
-from ...core.feedback import Feedback, LoopState
+from ...core.feedback import Feedback
 from .axes_margins import MultiAxisReport, axes_report_of
+from .broken_loop import OutputCut
 from .conserved import LinearAxes, LinearLoop
 from .crossings import angle_grid
 from .margins import (
@@ -56,18 +57,7 @@ def stability_report(
     point = OperatingPoint.at(at)
     if not isinstance(point.signal, tuple):
         return located_report(*linear_loop(loop, point), point)
-    return _located_axes_report(*linear_axes(loop, point), point)
-
-
-def _located_axes_report(
-    model: LinearAxes, start: LoopState, point: OperatingPoint
-) -> MultiAxisReport:
-    return dataclasses.replace(
-        axes_report_of(model),
-        reference=tuple(float(r) for r in jax.tree.leaves(point.signal)),
-        command=tuple(float(u) for u in jax.tree.leaves(start.voltage)),
-        branch=point.branch,
-    )
+    return _axes_stability(loop, point).report
 
 
 class LoopCurves(NamedTuple):
@@ -224,8 +214,17 @@ def stability_reports(
 
 
 def _worse_branch(loop: Feedback, points: Sequence[OperatingPoint]) -> AxesStability:
-    found = []
-    for point in points:
-        model, start = linear_axes(loop, point)
-        found.append(AxesStability(_located_axes_report(model, start, point), model))
+    found = [_axes_stability(loop, point) for point in points]
     return min(found, key=lambda one: one.report.disk_margin or 0.0)
+
+
+def _axes_stability(loop: Feedback, point: OperatingPoint) -> AxesStability:
+    model, start = linear_axes(loop, point)
+    behind, _ = linear_axes(loop, point, OutputCut)
+    report = dataclasses.replace(
+        axes_report_of(model, behind),
+        reference=tuple(float(r) for r in jax.tree.leaves(point.signal)),
+        command=tuple(float(u) for u in jax.tree.leaves(start.voltage)),
+        branch=point.branch,
+    )
+    return AxesStability(report, model)

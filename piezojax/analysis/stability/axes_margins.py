@@ -47,7 +47,10 @@ class MultiAxisReport:
       perturbations it is exact. ``disk_margin_Hz`` is the frequency of the maximum.
       Source: Seiler, Packard and Gahinet, An introduction to disk margins, 2020;
     - ``sensitivity_peak``, ``complementary_peak``: the largest singular values of S and
-      T over frequency. They depend on the units of the commands.
+      T over frequency. They depend on the units of the commands;
+    - ``output_sensitivity_peak``: that of S cut at the displacements instead, in the
+      units of the axes. A disturbance of the displacement is amplified by this much at
+      most.
 
     ``reference``, ``command`` and ``branch`` are the operating point, in the units of
     the axes. Frequencies in Hz, angles in degrees.
@@ -67,22 +70,40 @@ class MultiAxisReport:
     sensitivity_peak_Hz: float | None = None  # noqa: N815
     complementary_peak: float | None = None
     complementary_peak_Hz: float | None = None  # noqa: N815
+    output_sensitivity_peak: float | None = None
+    output_sensitivity_peak_Hz: float | None = None  # noqa: N815
     reference: tuple[float, ...] | None = None
     command: tuple[float, ...] | None = None
     branch: str | None = None
+
+    @property
+    def largest_sensitivity_peak(self) -> float | None:
+        """Larger of the sensitivity peaks of both cuts; None for an unstable loop."""
+        peaks = self.sensitivity_peak, self.output_sensitivity_peak
+        return max((peak for peak in peaks if peak is not None), default=None)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON: poles as [real, imaginary], infinity None."""
         return plain(dataclasses.asdict(self))
 
 
-def axes_report_of(loop: LinearAxes) -> MultiAxisReport:
-    """Return the report on a linear loop of several axes."""
+def axes_report_of(
+    loop: LinearAxes, behind: LinearAxes | None = None
+) -> MultiAxisReport:
+    """Return the report on a linear loop of several axes.
+
+    ``behind`` is the same loop, cut at its displacements instead.
+    """
     found = poles_of(loop)
     if not found["stable"]:
         return MultiAxisReport(**found)
     axes = tuple(report_of(loop.one_cut(axis)) for axis in range(len(loop.C)))
-    return MultiAxisReport(**found, axes=axes, **_figures(loop))
+    figures = _figures(loop)
+    if behind is not None:
+        peaks = sensitivity_figures(behind, angle_grid(behind))
+        for name in ("sensitivity_peak", "sensitivity_peak_Hz"):
+            figures[f"output_{name}"] = peaks[name]
+    return MultiAxisReport(**found, axes=axes, **figures)
 
 
 def _figures(loop: LinearAxes) -> dict[str, Any]:

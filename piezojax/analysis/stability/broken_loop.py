@@ -61,6 +61,11 @@ class BrokenLoop(System):
     voltage_push: Signal | None = None
     reference_push: Signal | None = None
 
+    @property
+    def rest(self) -> Signal:
+        """Input at the operating point."""
+        return self.start.voltage
+
     def init(self, input: Any = None) -> BrokenState:
         """Return the state of the operating point; the input is ignored."""
         start = self.start
@@ -114,6 +119,26 @@ class BrokenLoop(System):
         return self.loop.plant.step(state.plant, _pushed(input, self.voltage_push))
 
 
+class OutputCut(BrokenLoop):
+    """A BrokenLoop cut behind its plant instead, where the sensor reads.
+
+    Input: the displacement that the sensor reads, um. Output: minus that of the plant,
+    um. Feeding back minus the output closes the loop. Its S maps a disturbance of the
+    displacement to the displacement; on several axes it differs from that of the cut
+    before the plant.
+    """
+
+    @property
+    def rest(self) -> Signal:
+        """Input at the operating point."""
+        return self.start.displacement
+
+    def step(self, state: BrokenState, input: Signal) -> tuple[BrokenState, Signal]:
+        unmoved = jax.tree.map(jnp.zeros_like, self.start.voltage)
+        after, _ = self.closed(state._replace(displacement=input), unmoved)
+        return after, jax.tree.map(jnp.negative, state.displacement)
+
+
 def _pushed(signal: Signal, push: Signal | None) -> Signal:
     return signal if push is None else jax.tree.map(jnp.add, signal, push)
 
@@ -141,9 +166,13 @@ def broken_loop(loop: Feedback, at: Any = 0.0) -> BrokenLoop:
 
 
 def cut(
-    loop: Feedback, reference: Signal, side: ScalarLike, state: LoopState | None
+    loop: Feedback,
+    reference: Signal,
+    side: ScalarLike,
+    state: LoopState | None,
+    kind: type[BrokenLoop] = BrokenLoop,
 ) -> BrokenLoop:
-    """Return ``loop`` cut at the plant's input, as ``broken_loop`` does.
+    """Return ``loop`` cut at the place that ``kind`` selects, as ``broken_loop`` does.
 
     ``side`` is +1 on the ascending branch and -1 on the descending one.
     """
@@ -168,7 +197,7 @@ def cut(
         jax.tree.map(voltage_push, start.voltage),
         jax.tree.map(reference_push, output, start.voltage, tried),
     )
-    return BrokenLoop(freed, reference, start, *jax.lax.stop_gradient(pushes))
+    return kind(freed, reference, start, *jax.lax.stop_gradient(pushes))
 
 
 def _without(loop: Feedback, kind: type[System]) -> Feedback:

@@ -13,7 +13,7 @@ from ...core.arrays import Scalar, Signal, as_array
 from ...core.feedback import Feedback, LoopState
 from ...dynamics import StateSpace
 from ...dynamics.linearise import linearise
-from .broken_loop import cut
+from .broken_loop import BrokenLoop, cut
 from .conserved import LinearAxes, LinearLoop, balanced, without_conserved
 from .crossings import angle_grid, peak, roots
 from .operating_point import OperatingPoint
@@ -101,10 +101,10 @@ def _linearised(
     side: Scalar,
     state: LoopState | None,
     dt: float,
+    kind: type[BrokenLoop],
 ) -> tuple[StateSpace, LoopState]:
-    broken = cut(loop, reference, side, state)
-    model = linearise(broken, broken.start.voltage, broken.init(), dt)
-    return model, broken.start
+    broken = cut(loop, reference, side, state, kind)
+    return linearise(broken, broken.rest, broken.init(), dt), broken.start
 
 
 def located_report(
@@ -131,18 +131,24 @@ def linear_loop(loop: Feedback, at: Any = 0.0) -> tuple[LinearLoop, LoopState]:
     ), start
 
 
-def linear_axes(loop: Feedback, at: Any) -> tuple[LinearAxes, LoopState]:
+def linear_axes(
+    loop: Feedback, at: Any, kind: type[BrokenLoop] = BrokenLoop
+) -> tuple[LinearAxes, LoopState]:
     """Return L of a loop cut in all its axes as matrices, and the operating state.
 
-    Arguments and errors are those of ``stability_report``.
+    ``kind`` says where it is cut. Arguments and errors are those of
+    ``stability_report``.
     """
-    model, start = _model(loop, OperatingPoint.at(at))
+    model, start = _model(loop, OperatingPoint.at(at), kind)
     return without_conserved(balanced(model)), start
 
 
-def _model(loop: Feedback, point: OperatingPoint) -> tuple[LinearAxes, LoopState]:
+def _model(
+    loop: Feedback, point: OperatingPoint, kind: type[BrokenLoop] = BrokenLoop
+) -> tuple[LinearAxes, LoopState]:
     reference, dt = point.signal, point.sample_time(loop)
-    model, start = _linearised(loop, reference, as_array(point.side), point.state, dt)
+    side = as_array(point.side)
+    model, start = _linearised(loop, reference, side, point.state, dt, kind)
     point.check(start)
     A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
     if not all(np.isfinite(m).all() for m in (A, B, C)):
