@@ -19,8 +19,9 @@ class EnsembleTable(Table):
     values.
 
     The objective includes the nominal stage and ``tune`` drawn stages. Margins are
-    constrained on these and on further stages, ``margins`` in all: a search carries the
-    worst of them and looks at all of them at its end. The tuned gains are evaluated on
+    limited on the nominal stage and on ``margins`` drawn ones, the first of which are
+    those of ``tune``: a search uses the worst, and all are checked at its end. The
+    tuned gains are evaluated on
     ``holdout`` other stages. ``aggregate`` combines the objectives of the stages: their
     mean, the worst, or the mean of the worst share ``tail`` (CVaR).
     """

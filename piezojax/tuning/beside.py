@@ -22,7 +22,8 @@ def figures_beside(
 ) -> dict[str, Beside]:
     """Return the figures of the controllers that the study names beside its own.
 
-    With any, those of its own gains and of ``after`` follow as "before" and "tuned".
+    If it names any, those of its own gains and of ``after`` follow as "before" and
+    "tuned".
     """
     if not case.beside:
         return {}
@@ -64,9 +65,10 @@ def _of_plants(errors: np.ndarray) -> dict[str, Any]:
 
 
 def _errors(figures: LoopFigures, driven: np.ndarray) -> np.ndarray:
-    """Return the geometric mean (um) of the errors on each plant, of the worst draw.
+    """Return, by plant, the geometric mean over references of the RMS error, um.
 
-    It is infinite where a run diverges or rails.
+    Of several noise draws the worst counts. The mean is infinite where a run diverges,
+    or saturates in more than the share ``RAILED`` of its samples.
     """
     tracking = jax.tree.map(np.asarray, figures.tracking)
     rms = np.max(tracking.rms_error, axis=2)[:, driven]

@@ -33,10 +33,11 @@ CARRIED = 64
 
 
 class Carried(NamedTuple):
-    """Plants that a search carries, of those on which margins are limited.
+    """Plants whose margins a search computes, of those on which they are limited.
 
-    ``excess`` is the largest over a limit on any plant. ``stages`` are the carried
-    ones, at ``places`` among all; None if all are carried.
+    ``excess`` is the largest ln(value/limit) over all plants and limits. ``stages`` are
+    the carried ones, at ``places`` among all. If all are carried, ``stages`` is None
+    and ``excess`` 0.
     """
 
     excess: float
@@ -126,9 +127,9 @@ class Evaluator:
     def worst_plants(self, loop: Feedback, before: Carried | None = None) -> Carried:
         """Return the plants that a search from ``loop`` carries: ``CARRIED`` at most.
 
-        They are the worst by the excess over the limits on margins. Half of them are
-        worst among those carried ``before``, so that a search does not forget plants
-        whose limit was active.
+        They are the worst by the excess over the limits on margins. Up to half of them
+        are the worst of those carried ``before``, so that a search does not forget
+        plants whose limit was active.
         """
         stages = self.margin_stages
         if _count(stages) <= CARRIED or not uses(self.limits, "margins"):

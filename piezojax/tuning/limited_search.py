@@ -22,8 +22,8 @@ from .search import search_box
 PEAK = "sensitivity_peak"
 
 REPEATS, LEAST_SHARE = 5, 0.3
-"""Largest number of repeated searches, and the least factor by which one of them
-shrinks the distance of the limit on Ms from 1."""
+"""Largest number of repeated searches, and the smallest factor on (limit - 1) of Ms in
+one of them."""
 
 Found = tuple[Objective, SearchState, Strategy | None, StabilityReports]
 
@@ -40,7 +40,7 @@ def search_within_limits(
     The defaults among the limits are rarely active, and margins in every loss cost time
     to compile. Unless the study limits a margin itself, the box is searched without
     them first, and again with them if the result violates any. Of many plants on which
-    margins are limited a search carries the worst.
+    margins are limited a search uses only the worst.
     """
     study = case.study
     own = {
@@ -63,10 +63,10 @@ def search_within_limits(
             fine and not _alarming_peak(case, stability)
         ):
             return objective, search, strategy, stability
+        carried = evaluator.worst_plants(after)
     except KeyboardInterrupt:
         search.status = "interrupted"
         return objective, search, strategy, INTERRUPTED
-    carried = evaluator.worst_plants(after)
     every = every.on_margin_stages(carried.stages)
     again, strategy = search_box(every, case, clock, progress, search.unit[None])
     again.evaluations += search.evaluations
@@ -119,12 +119,12 @@ def _repeated(
     strategy: Strategy | None,
     progress: Progress,
 ) -> Found:
-    """Search again while the result violates a limit that the search did not see.
+    """Repeat the search, up to REPEATS times, while its result misses a limit.
 
     The search computes S on the lines of an impulse response. Between two lines it may
     miss the peak of a lightly damped mode of the closed loop: if the exact Ms exceeds
-    its limit, a tighter limit is searched. If another drawn plant than those that the
-    search carried violates a limit, the plants that are worst there are searched.
+    its limit, the limit is tightened. If a drawn plant violates a limit, the plants
+    that are worst now replace part of those that the search carries.
     """
     limits = dict(case.study.limits)
     try:
