@@ -84,17 +84,19 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     amplifier = make_amplifier(study)
     plant = driven(amplifier, plant)
     design_notes: list[str] = []
-    controller = _from_source(
-        study.controller,
-        "controller",
-        path.parent,
-        CONTROLLERS,
-        study.rate,
-        design=lambda name: _designed(study, name, plant, fit, design_notes.append),
-    )
-    check_origin(_about_file(study.controller, path.parent), study, "controller.file")
-    observation = Observation(zero, zero, zero, zero)
-    _check_role(controller, observation, "controller", "an Observation to a command")
+
+    def controller_of(table: dict[str, Any], where: str) -> System:
+        def design(name: str) -> System:
+            return _designed(study, name, plant, fit, design_notes.append)
+
+        folder, rate = path.parent, study.rate
+        found = _from_source(table, where, folder, CONTROLLERS, rate, design)
+        check_origin(_about_file(table, folder), study, f"{where}.file")
+        observation = Observation(zero, zero, zero, zero)
+        _check_role(found, observation, where, "an Observation to a command")
+        return found
+
+    controller = controller_of(study.controller, "controller")
     loop = Feedback(controller, plant, make_actuator(study), make_sensor(study))
     loop, space, notes = search_space(study, loop)
     _check_rates(study, loop, "the controller or plant")
@@ -115,7 +117,15 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         (*design_notes, *notes),
         about,
         amplifier,
-        _beside(study, observation),
+        {
+            name: _with_gains(
+                controller_of(table.controller, f"beside.{name}.controller"),
+                table.gains,
+                study,
+                f"beside.{name}",
+            )
+            for name, table in study.beside.items()
+        },
     )
 
 
@@ -169,23 +179,21 @@ def _swept_plants(study: Study, zero: Any) -> dict[str, System]:
     return plants
 
 
-def _beside(study: Study, observation: Observation) -> dict[str, System]:
-    """Return the controllers that the tuned one is compared with, by name."""
-    controllers = {}
-    for name, table in study.beside.items():
-        where = f"beside.{name}"
-        source = {"catalog": table.catalog}
-        controller = _from_source(source, where, Path(), CONTROLLERS, study.rate)
-        _check_role(controller, observation, where, "an Observation to a command")
-        _check_rates(study, controller, where)
-        for path, value in table.gains.items():
-            try:
-                get(controller, path)
-            except ValueError as error:
-                raise ValueError(f"{where}.gains: {error}") from None
-            check_value(controller, path, value, f"{where}.gains.{path}")
-        controllers[name] = replace(controller, table.gains)
-    return controllers
+def _with_gains(
+    controller: System, gains: Mapping[str, float], study: Study, where: str
+) -> System:
+    """Return a ``controller`` of the rate of ``study`` with other ``gains``, by path.
+
+    Raises ValueError, starting with ``where``, for a wrong rate, path or value.
+    """
+    _check_rates(study, controller, where)
+    for path, value in gains.items():
+        try:
+            get(controller, path)
+        except ValueError as error:
+            raise ValueError(f"{where}.gains: {error}") from None
+        check_value(controller, path, value, f"{where}.gains.{path}")
+    return replace(controller, gains)
 
 
 def _designed(

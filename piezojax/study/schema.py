@@ -101,10 +101,10 @@ class TunedTable(RangeTable):
 class BesideTable(Table):
     """Controller that is not tuned, with figures beside those of the tuned one.
 
-    ``gains`` are values by path in the controller of the ``catalog``.
+    ``controller`` is a table as that of the study. ``gains`` are values by path in it.
     """
 
-    catalog: str
+    controller: dict[str, Any]
     gains: dict[str, Finite] = Field(default_factory=dict)
 
     @field_validator("gains", mode="before")

@@ -20,14 +20,15 @@ from piezojax.tuning.beside import figures_beside
 from piezojax.tuning.data import make_data
 from piezojax.tuning.evaluator import Evaluator
 
+RULE = {"catalog": "p753_feedforward_simc_pi"}
 BESIDE = {
-    "PI by rule": {"catalog": "p753_feedforward_simc_pi"},
+    "PI by rule": {"controller": RULE},
     "slower PI": {
-        "catalog": "p753_feedforward_simc_pi",
+        "controller": RULE,
         "gains": {"feedback.proportional": 1.0, "feedback.integral": 800.0},
     },
     "PI of the wrong sign": {
-        "catalog": "p753_feedforward_simc_pi",
+        "controller": RULE,
         "gains": {"feedback.proportional": -100.0, "feedback.integral": -1e5},
     },
 }
@@ -154,26 +155,41 @@ def test_a_tuned_study_holds_and_prints_them(tmp_path):
     assert names == list(result.beside)
 
 
+def test_gains_of_an_earlier_run_come_from_their_file(tmp_path):
+    pj.save(p753_survey.feedforward_simc_pi(), tmp_path / "gains.toml")
+    beside = {
+        "now": {"controller": {"file": "gains.toml"}},
+        "rule": BESIDE["slower PI"],
+    }
+    beside["now"]["gains"] = beside["rule"]["gains"]
+    case = read(written(tmp_path, beside=beside))
+    assert eqx.tree_equal(case.beside["now"], case.beside["rule"])
+
+
+PID_OF_CATALOG = {"controller": {"catalog": "p753_pid"}}
+
+
 @pytest.mark.parametrize(
     ("beside", "message"),
     [
-        ({"x": {"catalog": "p753_nothing"}}, r"beside.x.catalog: .*p753_nothing"),
-        ({"x": {"catalog": "three_dof_pid"}}, "beside.x"),
-        ({"x": {"gains": {}}}, "beside.x.catalog"),
+        ({"controller": {"catalog": "p753_no"}}, r"beside.x.controller.*p753_no"),
+        ({"controller": {"catalog": "p558_pid"}}, "beside.x"),
+        ({"controller": {"file": "none.toml"}}, "beside.x.controller.file: .*none"),
+        ({"gains": {}}, "beside.x.controller"),
         (
-            {"x": {"catalog": "p753_pid", "gains": {"proportionl": 1.0}}},
+            PID_OF_CATALOG | {"gains": {"proportionl": 1.0}},
             "beside.x.gains: .*proportionl",
         ),
         (
-            {"x": {"catalog": "p753_pid", "gains": {"derivative_filter": -1.0}}},
+            PID_OF_CATALOG | {"gains": {"derivative_filter": -1.0}},
             "beside.x.gains.derivative_filter",
         ),
         (
-            {"x": {"catalog": "p753_pid", "gains": {"proportional": "fast"}}},
+            PID_OF_CATALOG | {"gains": {"proportional": "fast"}},
             "beside.x.gains.proportional",
         ),
     ],
 )
 def test_bad_controllers_beside_are_refused(tmp_path, beside, message):
     with pytest.raises(ValueError, match=message):
-        read(written(tmp_path, beside=beside))
+        read(written(tmp_path, beside={"x": beside}))
