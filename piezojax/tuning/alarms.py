@@ -10,6 +10,8 @@ from ..analysis.stability import StabilityReport, StabilityReports
 from .objective import RAILED
 from .result import ConstraintOutcome, Perturbed, Result, Scores
 
+PEAK = "sensitivity_peak"
+
 EXACT = 1e-2
 """Relative error of the margins in the search; exact margins may miss a limit by as
 much."""
@@ -102,7 +104,7 @@ def exact_figures(
         report = stability.axes["after"].report
         found[""] = _figures(report, report.axes)
         if found[""] is not None:
-            found[""]["sensitivity_peak"] = report.largest_sensitivity_peak
+            found[""][PEAK] = report.largest_sensitivity_peak
     return found
 
 

@@ -2,19 +2,16 @@
 
 from typing import Any
 
-import jax
 import numpy as np
 
 from ..analysis.constraints import LoopFigures, worst_by_plant
 from ..core.feedback import Feedback
 from ..core.progress import Progress
 from ..study import Case
+from .alarms import PEAK
 from .data import Data
 from .evaluator import Evaluator
-from .objective import RAILED
-from .result import Beside
-
-PEAK = "sensitivity_peak"
+from .result import Beside, log_errors, number
 
 
 def figures_beside(
@@ -48,17 +45,17 @@ def figures_beside(
         if PEAK in case.study.limits:
             peak = float(np.max(worst_by_plant([PEAK], plants)[PEAK]))
         found[name] = Beside(
-            nominal_rms_um=_number(error),
+            nominal_rms_um=number(error),
             **({} if stages is None else _of_plants(errors)),
-            sensitivity_peak=_number(peak),
+            sensitivity_peak=number(peak),
         )
     return found
 
 
 def _of_plants(errors: np.ndarray) -> dict[str, Any]:
     return {
-        "geomean_rms_um": _number(np.median(errors)),
-        "worst_rms_um": _number(np.max(errors)),
+        "geomean_rms_um": number(np.median(errors)),
+        "worst_rms_um": number(np.max(errors)),
         "plants": len(errors),
         "unstable": int(np.sum(~np.isfinite(errors))),
     }
@@ -67,16 +64,8 @@ def _of_plants(errors: np.ndarray) -> dict[str, Any]:
 def _errors(figures: LoopFigures, driven: np.ndarray) -> np.ndarray:
     """Return, by plant, the geometric mean over references of the RMS error, um.
 
-    Of several noise draws the worst counts. The mean is infinite where a run diverges,
-    or saturates in more than the share ``RAILED`` of its samples.
+    It is infinite where a run diverges or rails.
     """
-    tracking = jax.tree.map(np.asarray, figures.tracking)
-    rms = np.max(tracking.rms_error, axis=2)[:, driven]
-    lost = np.any(tracking.saturated > RAILED, axis=(1, 2)) | ~np.isfinite(rms).all(1)
-    with np.errstate(divide="ignore"):
-        means = np.exp(np.mean(np.log(np.where(lost[:, None], np.inf, rms)), axis=1))
-    return means
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    logarithms, lost = log_errors(figures.tracking)
+    means = np.exp(np.mean(logarithms[:, driven], axis=1))
+    return np.where(lost, np.inf, means)

@@ -12,14 +12,12 @@ from ..solve.problem import TOLERANCE
 from ..solve.search_state import SearchState
 from ..study import Case
 from ..study.references import highest_reference
-from .alarms import EXACT, exact_figures
+from .alarms import EXACT, PEAK, exact_figures
 from .evaluator import Carried, Evaluator
 from .make_result import constraint_outcomes
 from .model_alarms import SLACK, worst_peak
 from .objective import Objective
 from .search import search_box
-
-PEAK = "sensitivity_peak"
 
 REPEATS, LEAST_SHARE = 5, 0.3
 """Largest number of repeated searches, and the smallest factor on (limit - 1) of Ms in

@@ -71,7 +71,7 @@ class ConstraintOutcome(BaseModel):
         near = sign * worst >= sign * limit * (1.0 - sign * 0.02)
         return cls(
             limit=limit,
-            value=_number(worst),
+            value=number(worst),
             unit=kind.unit,
             sense=kind.sense,
             kept=kept,
@@ -144,11 +144,9 @@ class Perturbed(BaseModel):
         """
         means, lost = [], []
         for figures in (before.tracking, after.tracking):
-            rms = np.max(np.asarray(figures.rms_error), axis=2)
-            railed = np.max(np.asarray(figures.saturated), axis=(1, 2)) > RAILED
-            lost.append(railed | ~np.all(np.isfinite(rms), axis=1))
-            with np.errstate(divide="ignore"):
-                means.append(np.log(rms))
+            logarithms, unstable = log_errors(figures)
+            means.append(logarithms)
+            lost.append(unstable)
         usable = ~lost[0] & ~lost[1]
         better = np.exp(np.mean((means[0] - means[1])[usable][:, driven], axis=1))
         rest = (means[0] - means[1])[usable][:, ~driven]
@@ -159,12 +157,12 @@ class Perturbed(BaseModel):
             plants=len(usable),
             unstable_before=int(lost[0].sum()),
             unstable=int(lost[1].sum()),
-            geomean_rms_um=_number(np.median(errors)) if errors.size else None,
-            worst_rms_um=_number(errors.max()) if errors.size else None,
-            median_better=_number(np.median(better)) if better.size else None,
-            worst_better=_number(better.min()) if better.size else None,
+            geomean_rms_um=number(np.median(errors)) if errors.size else None,
+            worst_rms_um=number(errors.max()) if errors.size else None,
+            median_better=number(np.median(better)) if better.size else None,
+            worst_better=number(better.min()) if better.size else None,
             coupling_better=(
-                _number(np.median(np.exp(np.mean(rest, axis=1)))) if rest.size else None
+                number(np.median(np.exp(np.mean(rest, axis=1)))) if rest.size else None
             ),
             geomeans_before_um=_numbers(np.where(lost[0], np.nan, every[0])),
             geomeans_um=_numbers(np.where(lost[1], np.nan, every[1])),
@@ -274,24 +272,36 @@ def scores(figures: TrackingFigures, names: tuple[str, ...]) -> Scores:
     finite = bool(np.all(np.isfinite(rms)))
     voltage = float(np.max(np.asarray(figures.peak_voltage)))
     return Scores(
-        per_reference_rms_um=dict(zip(names, map(_number, rms), strict=True)),
-        geomean_rms_um=_number(np.exp(np.mean(np.log(rms)))) if finite else None,
-        worst_rms_um=_number(np.max(rms)) if finite else None,
-        peak_error_um=dict(zip(names, map(_number, peak), strict=True)),
+        per_reference_rms_um=dict(zip(names, map(number, rms), strict=True)),
+        geomean_rms_um=number(np.exp(np.mean(np.log(rms)))) if finite else None,
+        worst_rms_um=number(np.max(rms)) if finite else None,
+        peak_error_um=dict(zip(names, map(number, peak), strict=True)),
         saturated_percent={
             name: float(share) for name, share in zip(names, saturated, strict=True)
         },
-        peak_voltage_V=_number(voltage),
+        peak_voltage_V=number(voltage),
     )
 
 
-def _number(value: float) -> float | None:
-    # JSON has no infinity: the figure of a diverged run is None.
+def log_errors(figures: TrackingFigures) -> tuple[np.ndarray, np.ndarray]:
+    """Return ln of the RMS errors (um) [plants, traces], and the lost plants.
+
+    The error of a trace is that of its worst draw. A plant is lost if a run on it
+    diverges or rails.
+    """
+    rms = np.max(np.asarray(figures.rms_error), axis=2)
+    railed = np.max(np.asarray(figures.saturated), axis=(1, 2)) > RAILED
+    with np.errstate(divide="ignore"):
+        return np.log(rms), railed | ~np.all(np.isfinite(rms), axis=1)
+
+
+def number(value: float) -> float | None:
+    """Return ``value``, None if it is not finite: JSON has no infinity."""
     return float(value) if np.isfinite(value) else None
 
 
 def _numbers(values: Any) -> list[float | None]:
-    return [_number(value) for value in np.asarray(values)]
+    return [number(value) for value in np.asarray(values)]
 
 
 def load_result(path: str | Path) -> Result:
