@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from pydantic import BaseModel
 
 from ..catalog import PLANTS, deviations_of
@@ -27,10 +27,15 @@ Part = Literal["tune", "margins", "holdout"]
 
 
 class Stage(eqx.Module):
-    """Plant and sensor of a loop; an ensemble varies both."""
+    """Plant and sensor of a loop; an ensemble varies both.
+
+    ``holding`` are the inputs under which the plant rests at the beginning of each
+    reference, if these are known.
+    """
 
     plant: System
     sensor: System
+    holding: Float[Array, "*begins"] | None = None
 
     def around(self, loop: Feedback) -> Feedback:
         """Return ``loop`` with its plant and sensor replaced by those of this stage."""

@@ -2,16 +2,18 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..core.arrays import as_array, as_signal
-from ..core.feedback import holding_input
+from ..core.feedback import Feedback, holding_input
+from ..core.system import System
 from ..signals import waveforms
-from ..study import Case
+from ..study import Case, Stage
 from ..study.references import reference_signals
 from .runs import Signals
 from .traces import Trace, traces_of
@@ -46,7 +48,7 @@ def make_data(case: Case) -> Data:
     # Two streams of one seed: the hold-out draws are new for every reference.
     streams = np.random.SeedSequence(study.seed).spawn(2)
     counts = study.objective.noise_draws, study.holdout_draws
-    holding = _holding(case, references[:, 0])
+    (holding,) = holding_inputs(own_stage(case.loop), references[:, 0])
     tuning, holdout = (
         _signals(
             case,
@@ -104,14 +106,31 @@ def _signals(
     return Signals(as_array(references), noise, disturbance, (), holding)
 
 
-def _holding(case: Case, begins: np.ndarray) -> jax.Array:
-    """Return the inputs under which the stage rests at ``begins`` of the references."""
+def own_stage(loop: Feedback) -> Stage:
+    """Return the stage of ``loop`` as a stack of one."""
+    return jax.tree.map(lambda x: x[None], Stage(loop.plant, loop.sensor))
 
-    def one(begin):
-        held = holding_input(case.loop.plant, as_signal(begin))
-        return jnp.stack(held) if isinstance(held, tuple) else held
 
+def held(stages: Stage, begins: Any) -> Stage:
+    """Return the stacked ``stages`` with their holding inputs at ``begins``."""
+    return dataclasses.replace(stages, holding=holding_inputs(stages, begins))
+
+
+def holding_inputs(stages: Stage, begins: Any) -> jax.Array:
+    """Return the inputs [stages, begins, *axes] under which each stage rests."""
     # Many references begin at the same place: solve once for each place.
-    places, which = np.unique(begins, axis=0, return_inverse=True)
-    held = np.asarray(jax.jit(jax.vmap(one))(as_array(places)))
-    return as_array(held[which.ravel()])
+    places, which = np.unique(np.asarray(begins), axis=0, return_inverse=True)
+    found = np.asarray(_holding(stages.plant, as_array(places)))
+    return as_array(found[:, which.ravel()])
+
+
+# Compiled once for all plants of a structure.
+@eqx.filter_jit
+def _holding(plants: System, places: jax.Array) -> jax.Array:
+    dynamic, static = eqx.partition(plants, eqx.is_array)
+
+    def one(part, begin):
+        found = holding_input(eqx.combine(part, static), as_signal(begin))
+        return jnp.stack(found) if isinstance(found, tuple) else found
+
+    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(dynamic, places)

@@ -25,6 +25,7 @@ from ..solve.multi_start import in_batches
 from ..study import Case, Stage
 from ..study.ensemble import Part
 from ..study.references import highest_reference
+from .data import held, own_stage
 from .objective import MARGIN_BLOCK, margins_on
 from .runs import Signals, evaluate
 
@@ -109,20 +110,42 @@ class Evaluator:
         self, loop: Feedback, signals: Signals, stages: Stage | None
     ) -> tuple[TrackingFigures, ExtremeFigures | None]:
         beside = Extremes() if uses(self.limits, "extremes") else None
-        dynamic, static = eqx.partition(stages, eqx.is_array)
-        if stages is not None:
-            signals = signals.for_another_plant()
 
-        def run(loop, dynamic, signals):
-            def one(part):
-                around = _around(loop, eqx.combine(part, static))
-                return evaluate(lambda x: x, around, signals, self.start, beside)
+        def runs(loop, stages, signals):
+            stage = jax.tree.map(lambda x: x[0], stages)
+            around, own = stage.around(loop), signals.on(stage)
+            found = evaluate(lambda x: x, around, own, self.start, beside)
+            return jax.tree.map(lambda x: x[None], found)
 
-            return jax.lax.map(one, dynamic) if _count(stages) else _stacked(one(None))
-
-        key = "runs", _count(stages), signals.noise.shape, jax.tree.structure(loop)
-        found = self._compiled(key, run, loop, dynamic, signals)(loop, dynamic, signals)
+        stages = held(own_stage(loop) if stages is None else stages, signals.begins)
+        found = self._on_each("runs", runs, 1, loop, stages, signals)
         return found if beside else (found, None)
+
+    def _on_each(
+        self,
+        name: str,
+        function: Callable,
+        width: int,
+        loop: Feedback,
+        stages: Stage,
+        signals: Signals | None = None,
+    ) -> Any:
+        """Return ``function(loop, stages, signals)`` of any number of stacked stages.
+
+        Its program takes ``width`` of them.
+        """
+        dynamic, static = eqx.partition(stages, eqx.is_array)
+        shapes = None if signals is None else signals.noise.shape
+        key = name, shapes, jax.tree.structure((loop, stages))
+
+        def block(loop, dynamic, signals):
+            return function(loop, eqx.combine(dynamic, static), signals)
+
+        def found(batch):
+            program = self._compiled(key, block, loop, batch, signals)
+            return program(loop, batch, signals)
+
+        return jax.tree.map(jnp.asarray, in_batches(found, dynamic, width))
 
     def worst_plants(self, loop: Feedback, before: Carried | None = None) -> Carried:
         """Return the plants that a search from ``loop`` carries: ``CARRIED`` at most.
@@ -146,44 +169,28 @@ class Evaluator:
 
     def _margins(self, loop: Feedback, stages: Stage | None) -> MarginFigures | None:
         """Return the margins on each of ``stages``, or None if no limit needs them."""
-        study = self._case.study
         if not uses(self.limits, "margins"):
             return None
-        dynamic, static = eqx.partition(stages, eqx.is_array)
+        study = self._case.study
         point = OperatingPoint(highest_reference(study), dt=study.dt)
 
-        def margins(loop, dynamic):
+        def margins(loop, stages, _):
             return margins_on(
                 self.limits,
-                lambda stage: _around(loop, stage),
-                eqx.combine(dynamic, static),
+                lambda stage: stage.around(loop) if stage else loop,
+                stages,
                 point,
                 self.model_error,
             )
 
-        if stages is None:
-            key = "margins", 0, jax.tree.structure(loop)
-            return self._compiled(key, margins, loop, None)(loop, None)
-        width = min(_count(stages), MARGIN_BLOCK)
-        first = jax.tree.map(lambda x: x[:width], dynamic)
-        key = "margins", width, jax.tree.structure(loop)
-        program = self._compiled(key, margins, loop, first)
-        found = in_batches(lambda batch: program(loop, batch), dynamic, width)
-        return jax.tree.map(jnp.asarray, found)
+        stages = own_stage(loop) if stages is None else stages
+        width = MARGIN_BLOCK if self._case.ensemble and not study.axes else 1
+        return self._on_each("margins", margins, width, loop, stages)
 
 
 def _count(stages: Stage | None) -> int:
     """Return the number of stacked ``stages``, 0 for None."""
     return 0 if stages is None else jax.tree.leaves(stages)[0].shape[0]
-
-
-def _around(loop: Feedback, stage: Stage | None) -> Feedback:
-    return loop if stage is None else stage.around(loop)
-
-
-def _stacked(figures: Any) -> Any:
-    """Return the figures of one plant with a leading axis."""
-    return jax.tree.map(lambda x: x[None], figures)
 
 
 def drawn_stages(case: Case, part: Part) -> Stage | None:
@@ -194,7 +201,6 @@ def drawn_stages(case: Case, part: Part) -> Stage | None:
     others = case.ensemble.stages(part) if case.ensemble else None
     if others is None:
         return None
-    own = Stage(case.loop.plant, case.loop.sensor)
     return jax.tree.map(
-        lambda own, drawn: jnp.concatenate([own[None], drawn]), own, others
+        lambda *parts: jnp.concatenate(parts), own_stage(case.loop), others
     )

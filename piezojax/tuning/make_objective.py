@@ -7,7 +7,7 @@ from ..core.arrays import as_array
 from ..core.metrics import TrackingFigures
 from ..study import Case
 from ..study.references import highest_reference
-from .data import Data
+from .data import Data, held
 from .evaluator import Evaluator, drawn_stages
 from .objective import RAILED, Objective
 
@@ -21,6 +21,8 @@ def make_objective(
     """
     table = case.study
     stages = drawn_stages(case, "tune")
+    if stages is not None:
+        stages = held(stages, data.tuning.begins)
     before = jax.tree.map(np.asarray, before)
     scale = _scale(before, data)[None]
     if stages is not None:

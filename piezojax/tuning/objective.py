@@ -176,9 +176,6 @@ class Objective(eqx.Module):
         self, unit: Float[Array, " n"], every: int = 1
     ) -> tuple[LoopFigures, Array | None]:
         beside = Extremes() if uses(self.limits, "extremes") else None
-        signals = self.signals
-        if self.stages is not None:
-            signals = signals.for_another_plant()
 
         def loop_of(unit, stage):
             loop = self.space.put(self.loop, unit)
@@ -188,7 +185,7 @@ class Objective(eqx.Module):
             return sampled(
                 lambda unit: loop_of(unit, stage),
                 unit,
-                signals,
+                self.signals.on(stage),
                 self.start,
                 beside,
                 every,

@@ -14,6 +14,7 @@ from ..core.feedback import Feedback, loop_inputs
 from ..core.metrics import MetricPair, Tracking
 from ..core.rollout import Metric, simulate
 from ..core.system import resolve
+from ..study import Stage
 
 
 class Signals(eqx.Module):
@@ -31,9 +32,16 @@ class Signals(eqx.Module):
     traces: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
     holding: Float[Array, "*begins"] | None = None
 
-    def for_another_plant(self) -> "Signals":
-        """Return the signals without ``holding``, which depends on the plant."""
-        return dataclasses.replace(self, holding=None)
+    @property
+    def begins(self) -> Array:
+        """First samples [references, *axes], at which every run starts at rest."""
+        return self.references[:, 0]
+
+    def on(self, stage: Stage | None) -> "Signals":
+        """Return the signals with the holding inputs of ``stage``, if it is another."""
+        if stage is None:
+            return self
+        return dataclasses.replace(self, holding=stage.holding)
 
 
 def evaluate(

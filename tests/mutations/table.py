@@ -84,15 +84,15 @@ MUTATIONS = (
     Mutation(
         "perturbed plants start with the nominal holding voltage",
         "tuning/evaluator.py",
-        "signals = signals.for_another_plant()",
-        "signals = signals",
+        "around, own = stage.around(loop), signals.on(stage)",
+        "around, own = stage.around(loop), signals",
         (_DATA,),
     ),
     Mutation(
         "perturbed plants are tuned from the nominal holding voltage",
         "tuning/objective.py",
-        "signals = signals.for_another_plant()",
-        "signals = signals",
+        "self.signals.on(stage),",
+        "self.signals,",
         (_DATA,),
     ),
     Mutation(

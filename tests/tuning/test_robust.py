@@ -247,7 +247,7 @@ def test_the_result_loads_back(outcome, tmp_path):
 def test_figures_of_runs_are_those_of_their_logs(outcome):
     """Voltage, slew, effort and overshoot against NumPy on whole logs."""
     found, case = outcome.result.constraints, outcome.case
-    signals = make_data(case).tuning.for_another_plant()
+    signals = make_data(case).tuning
     own = Stage(case.loop.plant, case.loop.sensor)
 
     @eqx.filter_jit
