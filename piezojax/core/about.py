@@ -14,6 +14,7 @@ class About(BaseModel):
     with its ``seed``, ``record`` the origin of the record of a fit, and ``rate_Hz`` the
     sampling rate. ``units`` maps the channels of the System to their units, and
     ``parameter_units`` its parameters, by path; "" is a unit that is not known.
+    ``input_ranges`` are the least and greatest value of each input in the record.
     ``error_bound`` bounds the error of a fitted model, and
     ``standard_errors`` are those of its parameters, by path. ``unsafe`` lists the
     alarms raised when the System was made; ``load`` refuses a file with any. Keys of
@@ -27,6 +28,7 @@ class About(BaseModel):
     rate_Hz: float | None = None  # noqa: N815
     units: dict[str, str] = {}
     parameter_units: dict[str, str] = {}
+    input_ranges: list[tuple[float, float]] = []
     error_bound: ErrorBound | None = None
     standard_errors: dict[str, float] = {}
     unsafe: list[str] = []

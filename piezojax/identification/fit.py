@@ -132,6 +132,10 @@ class Fit:
             rate_Hz=1.0 / record.dt,
             units=units,
             parameter_units=self._parameter_units(),
+            input_ranges=[
+                (float(column.min()), float(column.max()))
+                for column in np.concatenate([one.inputs for one in self.records]).T
+            ],
             error_bound=None if residuals is None else residuals.error_bound,
             standard_errors={
                 path: found.standard_error

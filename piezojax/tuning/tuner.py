@@ -21,6 +21,7 @@ from .make_result import constraint_outcomes, make_result
 from .model_alarms import model_alarms
 from .outcome import Outcome
 from .reach import require_reach
+from .recorded_range import recorded_range_alarms
 from .sliding import sliding_share
 from .tip import tip_note
 
@@ -80,7 +81,10 @@ def tune(
     except KeyboardInterrupt:
         result.status = "interrupted"
     limits = table.limits
-    of_model = _model_alarms(case, limits, stability)
+    of_model = [
+        *_model_alarms(case, limits, stability),
+        *recorded_range_alarms(case, data),
+    ]
     result.alarms = alarms_of(result, stability, limits, of_model)
     result.wall_s = clock.wall_s()
     comparison = (

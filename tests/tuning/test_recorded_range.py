@@ -1,0 +1,107 @@
+"""A model used far outside of the record it was fitted to raises an alarm."""
+
+import copy
+import dataclasses
+
+import pytest
+
+import piezojax as pj
+from piezojax.core.about import About
+from piezojax.study import Study, build
+from piezojax.tuning.data import make_data
+from piezojax.tuning.recorded_range import COVERED, SLACK, recorded_range_alarms
+
+# 2 um/V: references from -40 to 60 um need -20 to 30 V.
+PLANT = {"type": "Affine", "gain": 2.0, "offset": 0.0}
+PID = {"type": "PID", "proportional": 0.0, "integral": 10.0, "dt": 1e-3}
+STUDY = {
+    "title": "2 um/V",
+    "rate": 1000.0,
+    "plant": PLANT,
+    "actuator": {"lower": -20.0, "upper": 120.0},
+    "controller": PID,
+    "references": {
+        "tune": ["SIN10"],
+        "unseen": ["TRI10"],
+        "amplitude": 50.0,
+        "offset": -40.0,
+        "duration": 0.2,
+        "settle": 0.1,
+    },
+    "tune": ["controller.integral"],
+}
+AXES = {
+    "axes": {"names": ["Z", "Rx"], "units": ["um", "urad"]},
+    "plant": {"type": "PerAxis", "parts": [PLANT] * 2},
+    "controller": {"type": "PerAxis", "parts": [PID] * 2},
+    "references": STUDY["references"] | {"tune": ["Z:SIN10", "Rx:SIN10"], "unseen": []},
+    "tune": ["controller.0.integral"],
+}
+
+
+def case_of(*ranges, **tables):
+    study = copy.deepcopy(STUDY) | tables
+    case = build(Study.model_validate(study), "study.toml")
+    return dataclasses.replace(case, plant_about=About(input_ranges=list(ranges)))
+
+
+def alarms(*ranges, **tables):
+    case = case_of(*ranges, **tables)
+    return list(recorded_range_alarms(case, make_data(case)))
+
+
+def test_a_record_of_the_whole_range_raises_none():
+    assert alarms((-20.0, 120.0)) == []
+    assert alarms((-20.0, 30.0)) == []
+
+
+def test_a_plant_that_was_not_fitted_has_none():
+    assert alarms() == []
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "raised"),
+    [
+        (-20.0, 30.0 / (1.0 + 0.9 * SLACK), False),
+        (-20.0, 22.0, True),
+        (-11.0, 80.0, False),
+        (-9.0, 80.0, True),
+    ],
+)
+def test_references_beyond_the_record_raise_one(low, high, raised):
+    found = alarms((low, high))
+    assert len(found) == raised
+    for alarm in found:
+        assert alarm == (
+            f"the references need -20 to 30 V, but the record of the plant ends at "
+            f"{low:.4g} and {high:.4g} V: beyond it the model is a guess; record the "
+            "whole range, or reduce references.amplitude"
+        )
+
+
+def test_a_record_of_a_small_part_of_the_range_raises_one():
+    """As one does whose input was recorded before an amplifier of ten."""
+    small = {"references": STUDY["references"] | {"amplitude": 5.0, "offset": 0.0}}
+    width = COVERED * 140.0
+    assert alarms((0.0, 1.01 * width), **small) == []
+    assert alarms((0.0, 0.99 * width), **small) == [
+        "the record of the plant goes from 0 to 34.65 V only, the actuator from -20 to "
+        "120 V: if the record has the voltage before an amplifier, multiply it by "
+        "the gain; if not, record a larger range, or set actuator.lower and "
+        "actuator.upper to what was recorded"
+    ]
+    limits = {"actuator": {"lower": 0.0, "upper": 0.99 * width}}
+    assert alarms((0.0, 0.99 * width), **small, **limits) == []
+
+
+def test_each_axis_has_its_own():
+    wide = (-20.0, 120.0)
+    assert alarms(wide, wide, **AXES) == []
+    (alarm,) = alarms(wide, (-20.0, 20.0), **AXES)
+    assert alarm.startswith("the references of axis Rx need -20 to 30 V")
+    # Which input belongs to which axis is not known.
+    assert alarms((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), **AXES) == []
+
+
+def test_tuning_ends_with_the_alarm():
+    assert pj.tune(case_of((-20.0, 20.0))).result.alarms[0].startswith("the references")
