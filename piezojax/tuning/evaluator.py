@@ -33,6 +33,10 @@ CARRIED = 64
 """Largest number of plants whose margins a search computes at a point."""
 
 
+RUN_BLOCK = 8
+"""Plants on which runs are simulated in one call of a program."""
+
+
 class Carried(NamedTuple):
     """Plants whose margins a search computes, of those on which they are limited.
 
@@ -112,13 +116,18 @@ class Evaluator:
         beside = Extremes() if uses(self.limits, "extremes") else None
 
         def runs(loop, stages, signals):
-            stage = jax.tree.map(lambda x: x[0], stages)
-            around, own = stage.around(loop), signals.on(stage)
-            found = evaluate(lambda x: x, around, own, self.start, beside)
-            return jax.tree.map(lambda x: x[None], found)
+            dynamic, static = eqx.partition(stages, eqx.is_array)
+
+            def one(part):
+                stage = eqx.combine(part, static)
+                around, own = stage.around(loop), signals.on(stage)
+                return evaluate(lambda x: x, around, own, self.start, beside)
+
+            return jax.lax.map(one, dynamic)
 
         stages = held(own_stage(loop) if stages is None else stages, signals.begins)
-        found = self._on_each("runs", runs, 1, loop, stages, signals)
+        width = RUN_BLOCK if self._case.ensemble else 1
+        found = self._on_each("runs", runs, width, loop, stages, signals)
         return found if beside else (found, None)
 
     def _on_each(
