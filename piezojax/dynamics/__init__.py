@@ -12,7 +12,9 @@ from .creep import SpringDamperCreep as SpringDamperCreep
 from .delay import FractionalDelay as FractionalDelay
 from .drift import ThermalDrift as ThermalDrift
 from .filters import Biquad as Biquad
-from .filters import FirstOrderLowPass as FirstOrderLowPass
+from .filters import HighPass as HighPass
+from .filters import LeadLag as LeadLag
+from .filters import LowPass as LowPass
 from .filters import Notch as Notch
 from .filters import SecondOrderLowPass as SecondOrderLowPass
 from .lag import FirstOrderLag as FirstOrderLag

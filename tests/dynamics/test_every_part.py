@@ -19,9 +19,11 @@ from piezojax.dynamics import (
     Biquad,
     ExponentialCreep,
     FirstOrderLag,
-    FirstOrderLowPass,
     FractionalDelay,
+    HighPass,
+    LeadLag,
     LinearMap,
+    LowPass,
     NeuralStateSpace,
     Notch,
     Oversampled,
@@ -87,7 +89,10 @@ MODELS |= {
     for damping in (0.7, 1.0, 1.5)
 }
 MODELS |= {
-    "first-order low-pass": partial(FirstOrderLowPass, 120.0, DT),
+    "low-pass": partial(LowPass, 120.0, DT),
+    "low-pass of equal poles": partial(LowPass, 120.0, DT, 4, "equal poles", "hold"),
+    "high-pass": partial(HighPass, 120.0, DT, 3),
+    "lead-lag": partial(LeadLag, 60.0, 150.0, DT, "matched"),
     "second-order low-pass": partial(SecondOrderLowPass, 120.0, 0.7, DT),
     "biquad": partial(Biquad, 150.0, 0.05, 90.0, 0.6, DT),
     "notch": partial(Notch, 150.0, 0.4, 0.1, DT),

@@ -1,5 +1,6 @@
-"""Filters against SciPy's bilinear transform, with slopes up to Nyquist's frequency."""
+"""Filters against SciPy's discretisations, with slopes up to Nyquist's frequency."""
 
+import itertools
 from typing import Any
 
 import jax
@@ -9,13 +10,15 @@ import pytest
 import scipy.signal
 
 from piezojax import simulate
-from piezojax.core.paths import replace
 from piezojax.dynamics import (
     Biquad,
-    FirstOrderLowPass,
+    HighPass,
+    LeadLag,
+    LowPass,
     Notch,
     SecondOrderLowPass,
 )
+from piezojax.dynamics.filters import KINDS, METHODS
 
 DT = 5e-5
 NYQUIST = 0.5 / DT
@@ -23,31 +26,91 @@ SHARES = (1e-6, 1e-3, 0.2, 0.5, 0.9, 0.999)
 """Frequencies as shares of Nyquist's."""
 
 
-def filters(frequency):
-    return {
-        "first order": FirstOrderLowPass(frequency, DT),
-        "second order": SecondOrderLowPass(frequency, 0.4, DT),
-        "biquad": Biquad(0.7 * frequency, 0.02, frequency, 0.6, DT),
-        "notch": Notch(frequency, 0.3, 0.05, DT),
+def filters(frequency, method="bilinear"):
+    named = {"discretisation": method}
+    found: dict[str, Any] = {
+        "second order": SecondOrderLowPass(frequency, 0.4, DT, **named),
+        "overdamped": SecondOrderLowPass(frequency, 1.7, DT, **named),
+        "critical": SecondOrderLowPass(frequency, 1.0, DT, **named),
+        "lead": LeadLag(0.4 * frequency, frequency, DT, **named),
+        "lag": LeadLag(frequency, 0.6 * frequency, DT, **named),
+        "biquad": Biquad(0.7 * frequency, 0.02, frequency, 0.6, DT, **named),
+        "real zeros": Biquad(0.7 * frequency, 1.4, frequency, 0.6, DT, **named),
+        "notch": Notch(frequency, 0.3, 0.05, DT, **named),
+        "full notch": Notch(frequency, 0.3, 0.0, DT, **named),
     }
+    for kind, order in itertools.product(KINDS, (1, 2, 3, 4)):
+        found[f"low-pass, {kind}, {order}"] = LowPass(
+            frequency, DT, order, kind, **named
+        )
+        found[f"high-pass, {kind}, {order}"] = HighPass(
+            frequency, DT, order, kind, **named
+        )
+    return found
+
+
+NAMES = tuple(filters(1.0))
 
 
 def warped(frequency):
     return 2.0 / DT * np.tan(np.pi * frequency * DT)
 
 
-def continuous(name, frequency):
-    """Return the coefficients of s of the prewarped continuous filters."""
-    w, v = warped(frequency), warped(0.7 * frequency)
-    return {
-        "first order": ([1.0], [1.0 / w, 1.0]),
-        "second order": ([1.0], [1.0 / w**2, 0.8 / w, 1.0]),
-        "biquad": ([1.0 / v**2, 0.04 / v, 1.0], [1.0 / w**2, 1.2 / w, 1.0]),
-        "notch": ([1.0 / w**2, 0.03 / w, 1.0], [1.0 / w**2, 0.6 / w, 1.0]),
-    }[name]
+def sections(name, frequency, place):
+    """Return coefficients of s of each continuous section; ``place`` gives rad/s."""
+    w, v, u = place(frequency), place(0.7 * frequency), place(0.6 * frequency)
+    if "pass" not in name:
+        over, under = {
+            "second order": ([1.0], [1.0 / w**2, 0.8 / w, 1.0]),
+            "overdamped": ([1.0], [1.0 / w**2, 3.4 / w, 1.0]),
+            "critical": ([1.0], [1.0 / w**2, 2.0 / w, 1.0]),
+            "lead": ([1.0 / place(0.4 * frequency), 1.0], [1.0 / w, 1.0]),
+            "lag": ([1.0 / w, 1.0], [1.0 / u, 1.0]),
+            "biquad": ([1.0 / v**2, 0.04 / v, 1.0], [1.0 / w**2, 1.2 / w, 1.0]),
+            "real zeros": ([1.0 / v**2, 2.8 / v, 1.0], [1.0 / w**2, 1.2 / w, 1.0]),
+            "notch": ([1.0 / w**2, 0.03 / w, 1.0], [1.0 / w**2, 0.6 / w, 1.0]),
+            "full notch": ([1.0 / w**2, 0.0, 1.0], [1.0 / w**2, 0.6 / w, 1.0]),
+        }[name]
+        return [(over, under)]
+    passed, kind, order = name.split(", ")
+    order = int(order)
+    spread = np.sqrt(2.0 ** (1.0 / order) - 1.0)
+    if kind == "butterworth":
+        poles = w * scipy.signal.buttap(order)[1]
+    else:
+        poles = np.full(order, -w / spread if passed == "low-pass" else -w * spread)
+    pairs = poles[poles.imag > 1e-9 * w] if kind == "butterworth" else poles[::2]
+    pairs = pairs[: order // 2]
+    found = [
+        ([1.0], [1.0 / abs(p) ** 2, -2.0 * p.real / abs(p) ** 2, 1.0]) for p in pairs
+    ]
+    if order % 2:
+        (single,) = (p.real for p in poles[np.abs(poles.imag) < 1e-9 * w][:1])
+        found.append(([1.0], [-1.0 / single, 1.0]))
+    if passed == "high-pass":
+        found = [([a[0], *[0.0] * (len(a) - 1)], a) for _, a in found]
+    return found
 
 
-NAMES = tuple(filters(1.0))
+def bilinear(over, under):
+    return scipy.signal.bilinear(over, under, 1.0 / DT)
+
+
+def hold(over, under):
+    b, a, _ = scipy.signal.cont2discrete((over, under), DT, "zoh")
+    return b[0], a
+
+
+def matched(over, under):
+    zeros, poles = (np.exp(np.roots(c) * DT) for c in (over, under))
+    zeros = np.r_[zeros, np.full(len(poles) - len(zeros), -1.0)]
+    b, a = np.real(np.poly(zeros)), np.real(np.poly(poles))
+    at = -1.0 if over[-1] == 0.0 else 1.0
+    wanted = over[0] / under[0] if over[-1] == 0.0 else 1.0
+    return b * wanted * np.polyval(a, at) / np.polyval(b, at), a
+
+
+ORACLES = {"bilinear": bilinear, "hold": hold, "matched": matched}
 
 
 @jax.jit
@@ -55,76 +118,131 @@ def response(system, inputs, start):
     return simulate(system, inputs, system.init(start))[1]
 
 
-@pytest.mark.parametrize("share", SHARES[1:])
-@pytest.mark.parametrize("name", NAMES)
-def test_a_filter_is_the_bilinear_transform_of_its_equation(name, share):
-    frequency = share * NYQUIST
-    over, under = continuous(name, frequency)
-    b, a = scipy.signal.bilinear(over, under, 1.0 / DT)
+def responses(shares, inputs, start, method):
+    """Return the outputs [shares, samples] by name; one program for all filters."""
+
+    @jax.jit
+    @jax.vmap
+    def every(share):
+        systems = filters(share * NYQUIST, method)
+        return {name: response(one, inputs, start) for name, one in systems.items()}
+
+    return every(np.asarray(shares))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_filter_is_the_discretisation_of_its_equation(method):
     inputs = 2.0 + np.random.default_rng(3).normal(size=400)
-    expected = scipy.signal.lfilter(
-        b, a, inputs, zi=2.0 * scipy.signal.lfilter_zi(b, a)
-    )
-    found = response(filters(frequency)[name], inputs, 2.0)
-    np.testing.assert_allclose(found, expected[0], rtol=0.0, atol=1e-8)
+    place = warped if method == "bilinear" else lambda f: 2.0 * np.pi * f
+    shares = (0.01, 0.2, 0.5, 0.9, 0.999)
+    found = responses(shares, inputs, 2.0, method)
+    for name, (number, share) in itertools.product(NAMES, enumerate(shares)):
+        expected, rest = inputs, 2.0
+        for over, under in sections(name, share * NYQUIST, place):
+            b, a = ORACLES[method](over, under)
+            zi = rest * scipy.signal.lfilter_zi(b, a)
+            expected = scipy.signal.lfilter(b, a, expected, zi=zi)[0]
+            rest = rest * np.sum(b) / np.sum(a)
+        scale = np.max(np.abs(expected))
+        np.testing.assert_allclose(
+            found[name][number] / scale, expected / scale, rtol=0.0, atol=1e-10
+        )
 
 
 @pytest.mark.parametrize("share", [0.05, 0.8])
 def test_designs_of_scipy(share):
     frequency = share * NYQUIST
     inputs = np.random.default_rng(4).normal(size=300)
-    for order, system in enumerate(
-        (FirstOrderLowPass(frequency, DT), SecondOrderLowPass(frequency, 0.5**0.5, DT))
+    for (make, btype), order in itertools.product(
+        ((LowPass, "low"), (HighPass, "high")), (1, 2, 4, 5, 8)
     ):
-        design: Any = scipy.signal.butter(order + 1, share)
-        expected = scipy.signal.lfilter(design[0], design[1], inputs)
-        np.testing.assert_allclose(
-            response(system, inputs, 0.0), expected, rtol=0.0, atol=1e-12
-        )
+        design: Any = scipy.signal.butter(order, share, btype, output="sos")
+        expected = scipy.signal.sosfilt(design, inputs)
+        found = response(make(frequency, DT, order), inputs, 0.0)
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-10)
+
+
+def gain(system, frequency, samples=20_000):
+    impulse = np.zeros(samples)
+    impulse[0] = 1.0
+    output = np.asarray(response(system, impulse, 0.0))
+    turns = np.exp(-2j * np.pi * frequency * DT * np.arange(samples))
+    return np.sum(output * turns), output
 
 
 @pytest.mark.parametrize("depth", [0.0, 0.3, 1.0])
 def test_a_notch_has_its_depth_at_its_frequency(depth):
-    frequency, samples = 3000.0, 4000
-    impulse = np.zeros(samples)
-    impulse[0] = 1.0
-    output = np.asarray(response(Notch(frequency, 0.1, depth, DT), impulse, 0.0))
-    turns = np.exp(-2j * np.pi * frequency * DT * np.arange(samples))
-    np.testing.assert_allclose(np.sum(output * turns), depth, rtol=0.0, atol=1e-12)
-    if depth == 1.0:
-        np.testing.assert_allclose(output, impulse, rtol=0.0, atol=1e-15)
+    for method in ("bilinear", "matched"):
+        notch = Notch(3000.0, 0.1, depth, DT, method)
+        found, output = gain(notch, 3000.0)
+        if method == "bilinear":
+            np.testing.assert_allclose(found, depth, rtol=0.0, atol=1e-12)
+        elif depth == 0.0:
+            assert abs(found) < 1e-12
+        if depth == 1.0:
+            impulse = np.eye(1, output.size)[0]
+            np.testing.assert_allclose(output, impulse, rtol=0.0, atol=1e-13)
 
 
-@pytest.mark.parametrize("share", SHARES)
-@pytest.mark.parametrize("name", NAMES)
-def test_rest_stays_exactly_at_rest(name, share):
-    system = filters(share * NYQUIST)[name]
-    state, output = system.step(system.init(37.1), 37.1)
-    assert float(output) == 37.1
-    for left, right in zip(
-        jax.tree.leaves(state), jax.tree.leaves(system.init(37.1)), strict=True
-    ):
-        assert float(left) == float(right)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("make", [LowPass, HighPass])
+def test_the_gain_is_3_db_at_the_cut_off(make, kind):
+    for order in (1, 2, 4, 7):
+        found, _ = gain(make(400.0, DT, order, kind), 400.0)
+        np.testing.assert_allclose(abs(found), np.sqrt(0.5), rtol=1e-9)
 
 
-def test_slopes_are_those_of_differences_and_finite_up_to_nyquist():
+@pytest.mark.parametrize("method", METHODS)
+def test_rest_stays_exactly_at_rest(method):
+    @jax.jit
+    def stepped(frequency):
+        systems = filters(frequency, method)
+        begun = {name: one.init(37.1) for name, one in systems.items()}
+        return begun, {n: one.step(begun[n], 37.1) for n, one in systems.items()}
+
+    for share in SHARES:
+        begun, ended = stepped(share * NYQUIST)
+        for name in NAMES:
+            state, output = ended[name]
+            assert float(output) == (0.0 if name.startswith("high") else 37.1)
+            assert jax.tree.all(jax.tree.map(lambda a, b: a == b, state, begun[name]))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_slopes_are_those_of_differences_and_finite_up_to_nyquist(method):
     shares = np.array([*SHARES, 1.0 - 1e-6, 1.0 - 1e-9])
     inputs = jnp.asarray(np.random.default_rng(5).normal(size=60))
-    for name, system in filters(1000.0).items():
 
-        def last(share, system=system):
-            frequency = {"frequency": share * NYQUIST}
-            outputs = simulate(replace(system, frequency), inputs, system.init(0.0))[1]
-            return outputs[-1]
+    def last(share):
+        systems = filters(share * NYQUIST, method)
+        return {n: response(one, inputs, 0.0)[-1] for n, one in systems.items()}
 
-        values, slopes = jax.vmap(jax.value_and_grad(last))(shares)
-        assert np.all(np.isfinite(values)), name
-        assert np.all(np.isfinite(slopes)), name
-        step = 1e-6 * shares[1:6]
-        upper, lower = (jax.vmap(last)(shares[1:6] + s * step) for s in (1.0, -1.0))
+    values = jax.jit(jax.vmap(last))
+    slopes = jax.jit(jax.vmap(jax.jacfwd(last)))(shares)
+    step = 1e-6 * shares[1:6]
+    upper, lower = (values(shares[1:6] + s * step) for s in (1.0, -1.0))
+    for name, value in values(shares).items():
+        assert np.all(np.isfinite(value)), name
+        assert np.all(np.isfinite(slopes[name])), name
         np.testing.assert_allclose(
-            slopes[1:6], (upper - lower) / (2.0 * step), rtol=1e-5, atol=1e-6
+            slopes[name][1:6],
+            (upper[name] - lower[name]) / (2.0 * step),
+            rtol=1e-5,
+            atol=1e-6,
         )
+
+
+def test_the_damping_has_a_slope_through_critical_damping():
+    inputs = jnp.asarray(np.random.default_rng(6).normal(size=30))
+
+    def last(damping):
+        system = SecondOrderLowPass(2000.0, damping, DT, "hold")
+        return simulate(system, inputs, system.init(0.0))[1][-1]
+
+    dampings = np.array([0.99, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 1.01, 3.0, 30.0])
+    slopes = jax.vmap(jax.grad(last))(dampings)
+    upper, lower = (jax.vmap(last)(dampings + s * 1e-6) for s in (1.0, -1.0))
+    np.testing.assert_allclose(slopes, (upper - lower) / 2e-6, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +252,17 @@ def test_slopes_are_those_of_differences_and_finite_up_to_nyquist():
         (lambda: Notch(1e4, 0.1, 0.1, DT), "frequency in Hz is 10000; .* below 10000"),
         (lambda: Notch(1e3, 0.1, -0.1, DT), "depth is -0.1; .* at least 0"),
         (lambda: Notch(1e3, 0.0, 0.1, DT), "damping is 0; it must be finite and abo"),
-        (lambda: FirstOrderLowPass(1e4, DT), "frequency in Hz is 10000"),
+        (lambda: LowPass(1e4, DT), "frequency in Hz is 10000"),
+        (lambda: LowPass(1e3, DT, 9), "order is 9; .* at most 8"),
+        (
+            lambda: LowPass(1e3, DT, 2, "bessel"),
+            "kind is 'bessel'; it must be one of b",
+        ),
+        (
+            lambda: LeadLag(1e3, 2e3, DT, "tustin"),
+            "discretisation is 'tustin'; it must be one of bilinear, hold, matched",
+        ),
+        (lambda: LeadLag(1e4, 2e3, DT), "zero_frequency in Hz is 10000"),
         (lambda: SecondOrderLowPass(1e3, 0.0, DT), "damping is 0"),
         (lambda: Biquad(2e4, 0.1, 1e3, 0.1, DT), "zero_frequency in Hz is 20000"),
         (lambda: Biquad(1e3, -0.1, 1e3, 0.1, DT), "zero_damping is -0.1"),
