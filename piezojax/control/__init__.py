@@ -1,5 +1,6 @@
 """Controllers: each a System from an Observation to a command."""
 
+from .active_damping import ActiveDamping as ActiveDamping
 from .adaptive_inverse import AdaptiveInverse as AdaptiveInverse
 from .allocation import Allocated as Allocated
 from .allocation import Allocation as Allocation

@@ -29,7 +29,7 @@ from piezojax.core import registry
 from piezojax.core.parameter import declarations, parameter
 from piezojax.core.serial import from_data, to_data
 from piezojax.core.system import Affine, System, resolve
-from piezojax.dynamics import FirstOrderLag, observability_form
+from piezojax.dynamics import FirstOrderLag, SecondOrderLowPass, observability_form
 
 SAMPLES = 8
 STEP = 1e-6
@@ -63,6 +63,9 @@ EXTRA = {
     "from outside": lambda: Leaking(0.3, 0.9),
     "weighted pid": lambda: control.PID(
         0.5, 3000.0, 1e-5, 1e-4, 100.0, 3.0, -2.5, dt=DT
+    ),
+    "active damping": lambda: control.ActiveDamping(
+        p753.pid(), SecondOrderLowPass(2000.0, 0.3, DT), 0.4
     ),
     "repetitive, short": lambda: control.RepetitiveControl(
         p753.sliding_mode(), FirstOrderLag(4 * DT, DT), 0.2, 3

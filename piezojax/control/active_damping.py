@@ -1,0 +1,56 @@
+"""Active damping: the filtered measurement, added to the command of a controller."""
+
+from typing import NamedTuple
+
+from ..core.arrays import Scalar, State, as_array
+from ..core.feedback import Observation
+from ..core.parameter import parameter
+from ..core.system import System
+
+
+class ActiveDampingState(NamedTuple):
+    """States of the controller and the filter, and the last part for damping."""
+
+    controller: State
+    filter: State
+    damping: Scalar
+
+
+class ActiveDamping(System):
+    """``u = controller + gain filter(z)``: an inner loop that damps a resonance.
+
+    The filter and the sign of the gain make the scheme:
+
+    - positive position feedback: ``SecondOrderLowPass`` near the resonance and a gain
+      above 0 (Fanson and Caughey, AIAA J. 28, 1990);
+    - integral resonant control: ``LowPass`` of order 1 and a gain above 0, its form
+      without the feedthrough (Fleming, Aphale and Moheimani, IEEE Trans. Control Syst.
+      Technol. 18, 2010);
+    - resonant shift: ``Affine`` 1 and a gain below 0, which stiffens the stage.
+
+    With a gain above 0, gain times static gain of the stage must be below 1. The
+    controller sees as applied its own part of the voltage, so that its anti-windup
+    responds to the limits. Input an Observation, output in the unit of the controller's
+    command.
+    """
+
+    controller: System
+    filter: System
+    gain: Scalar = parameter("[u]/um", "gain of the damping", typical=(-10.0, 10.0))
+
+    def init(self, input: Observation) -> ActiveDampingState:
+        filter_state = self.filter.init(input.measured)
+        damping = self.gain * self.filter.step(filter_state, input.measured)[1]
+        own = input._replace(applied=input.applied - damping)
+        return ActiveDampingState(
+            self.controller.init(own), filter_state, as_array(damping)
+        )
+
+    def step(
+        self, state: ActiveDampingState, input: Observation
+    ) -> tuple[ActiveDampingState, Scalar]:
+        own = input._replace(applied=input.applied - state.damping)
+        controller, command = self.controller.step(state.controller, own)
+        filter_state, filtered = self.filter.step(state.filter, input.measured)
+        damping = self.gain * filtered
+        return ActiveDampingState(controller, filter_state, damping), command + damping
