@@ -273,13 +273,13 @@ EXECUTABLE = [
 @pytest.mark.parametrize("kind", EXECUTABLE)
 def test_only_systems_are_built(kind):
     message = message_for({"type": kind})
-    assert message.startswith(f"system.type is {kind!r}; it must be one of ARMA, Ada")
+    assert message.startswith(f"system.type is {kind!r}; it must be one of ARMA, Act")
 
 
 @pytest.mark.parametrize("kind", [3, None, True])
 def test_type_must_be_a_name(kind):
     message = message_for({"type": kind})
-    assert message.startswith(f"system.type is {kind!r}; it must be one of ARMA, Ada")
+    assert message.startswith(f"system.type is {kind!r}; it must be one of ARMA, Act")
 
 
 def test_no_type():

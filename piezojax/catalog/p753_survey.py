@@ -48,10 +48,10 @@ BOUNDARY_LAYER = {"gain": 1e4, "width": 4e4}
 SUPER_TWISTING = {"root_gain": 10.0, "sign_gain": 1e6, "layer": 1e4}
 """Gains in V/(um/s)^(1/2) and V/s, layer in um/s."""
 
-NOTCH = {"damping": 0.5, "depth": 0.1}
+NOTCH = 0.5, 0.1
 """Damping and depth of a notch at the nominal mode of the stage."""
 
-LOW_PASS = {"frequency": 3000.0, "damping": 0.7}
+LOW_PASS = 3000.0, 0.7
 """Frequency in Hz and damping of a second-order low-pass: ours."""
 
 ELECTRONICS_DELAY = 1.2e-4
@@ -144,7 +144,7 @@ def simc_pi() -> PID:
 
 def notch_pi() -> FilteredCommand:
     """Return ``simc_pi`` with a notch at the nominal mode of the stage, um to V."""
-    notch = Notch(p753_stage.MODE_FREQUENCY, **NOTCH, dt=p753.DT)
+    notch = Notch(p753_stage.MODE_FREQUENCY, *NOTCH, p753.DT)
     return FilteredCommand(simc_pi(), notch)
 
 
@@ -177,11 +177,11 @@ def feedforward_h_infinity() -> FeedforwardFeedback:
         bound=H_INFINITY_BOUND,
         dt=p753.DT,
     )
-    feedback = FilteredCommand(control, SecondOrderLowPass(**LOW_PASS, dt=p753.DT))
+    feedback = FilteredCommand(control, SecondOrderLowPass(*LOW_PASS, p753.DT))
     slow, fast = p753.lags()
     mean = math.sqrt(slow * fast)
     inverse = Biquad(
-        0.5 / (math.pi * mean), 0.5 * (slow + fast) / mean, **LOW_PASS, dt=p753.DT
+        0.5 / (math.pi * mean), 0.5 * (slow + fast) / mean, *LOW_PASS, p753.DT
     )
     static = InverseGain(Affine(p753.GAIN))
     return FeedforwardFeedback(series(dynamics=inverse, gain=static), feedback)

@@ -6,6 +6,10 @@ from .allocation import Allocated as Allocated
 from .allocation import Allocation as Allocation
 from .alpha_beta import AlphaBeta as AlphaBeta
 from .anticipation import Anticipation as Anticipation
+from .devices import E727 as E727
+from .devices import NV200 as NV200
+from .devices import Device as Device
+from .devices import Servo as Servo
 from .disturbance_observer import (
     DisturbanceObserverControl as DisturbanceObserverControl,
 )

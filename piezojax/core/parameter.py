@@ -8,6 +8,8 @@ from fractions import Fraction
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .arrays import as_array, check
@@ -32,7 +34,8 @@ class Parameter:
     stands for a unit that only an outer System knows (see ``System.part_units``). A
     frequency with ``below_nyquist`` must be below pi / dt in rad/s or 0.5 / dt in Hz,
     with the sample time dt of the declaring System. A ``whole`` parameter is an
-    integer, such as a count.
+    integer, such as a count. ``step`` is the difference of two values that can be typed
+    into a device.
     """
 
     unit: str
@@ -45,6 +48,7 @@ class Parameter:
     typical: tuple[float, float] | None = None
     below_nyquist: bool = False
     whole: bool = False
+    step: float | None = None
 
     def at(self, dt: float) -> "Parameter":
         """Return the declaration for a System with sample time ``dt`` in s."""
@@ -85,6 +89,7 @@ def parameter(
     typical: tuple[float, float] | None = None,
     below_nyquist: bool = False,
     whole: bool = False,
+    step: float | None = None,
     converter: Callable[[Any], Any] = as_array,
     static: bool = False,
     **options: Any,
@@ -100,7 +105,17 @@ def parameter(
     bounds and the API page read unit, meaning and range from the declaration.
     """
     declared = Parameter(
-        unit, meaning, above, least, most, below, scale, typical, below_nyquist, whole
+        unit,
+        meaning,
+        above,
+        least,
+        most,
+        below,
+        scale,
+        typical,
+        below_nyquist,
+        whole,
+        step,
     )
     if static:
         return eqx.field(static=True, metadata={_KEY: declared}, **options)
@@ -156,6 +171,29 @@ def declarations(kind: Any) -> Iterator[tuple[str, Parameter]]:
     for field in dataclasses.fields(kind):
         if _KEY in field.metadata:
             yield field.name, field.metadata[_KEY]
+
+
+def rounded(value: Any, step: float | None) -> Any:
+    """Return ``value`` rounded to a multiple of ``step``; its gradient is kept.
+
+    Nothing is rounded without a step.
+    """
+    if step is None:
+        return value
+    # A step below 1 is the inverse of a whole number, which has no rounding error.
+    nearest = jnp.round(value / step)
+    nearest = nearest / round(1.0 / step) if step < 1.0 else nearest * step
+    return value + jax.lax.stop_gradient(nearest - value)
+
+
+def rounded_fields(system: Any) -> Any:
+    """Return ``system`` with each declared field rounded to its step."""
+    changed = {
+        name: rounded(getattr(system, name), declared.step)
+        for name, declared in declarations(system)
+        if declared.step is not None
+    }
+    return dataclasses.replace(system, **changed)
 
 
 def check_declared(system: Any) -> None:

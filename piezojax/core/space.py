@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .arrays import as_array
-from .parameter import Parameter, Scale
+from .parameter import Parameter, Scale, rounded
 from .paths import get, replace
 from .system import System
 
@@ -35,6 +35,7 @@ class Range:
     """Bounds of a parameter in its ``unit``, and the scale on which it is searched.
 
     ``start`` is the starting value of a search; None keeps the value in the System.
+    Values are rounded to multiples of ``step``, which a device allows.
     """
 
     lower: float
@@ -42,6 +43,7 @@ class Range:
     scale: Scale = "linear"
     start: float | None = None
     unit: str = ""
+    step: float | None = None
 
     @classmethod
     def of(cls, declared: Parameter) -> "Range | None":
@@ -53,7 +55,7 @@ class Range:
             return None
         lower, upper = declared.typical
         upper = min(upper, 0.99 * declared.below)
-        return cls(lower, upper, declared.scale, unit=declared.unit)
+        return cls(lower, upper, declared.scale, unit=declared.unit, step=declared.step)
 
     def check(self, name: str) -> None:
         """Raise ValueError unless the bounds are in order and suit the scale."""
@@ -86,11 +88,15 @@ class Space(eqx.Module):
     scales: tuple[Scale, ...] = eqx.field(static=True)
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
+    steps: tuple[float | None, ...] = eqx.field(static=True)
 
     def ranges(self) -> dict[str, Range]:
         """Return the Range of each parameter by path."""
-        rows = zip(self.lower, self.upper, self.scales, strict=True)
-        ranges = [Range(float(low), float(high), scale) for low, high, scale in rows]
+        rows = zip(self.lower, self.upper, self.scales, self.steps, strict=True)
+        ranges = [
+            Range(float(low), float(high), scale, step=step)
+            for low, high, scale, step in rows
+        ]
         return dict(zip(self.paths, ranges, strict=True))
 
     def start(self, system: System) -> Float[Array, " n"]:
@@ -125,9 +131,15 @@ class Space(eqx.Module):
 
     @jax.jit
     def from_unit(self, unit: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Map [0, 1]^n to parameter values, never outside the bounds."""
+        """Map [0, 1]^n to parameter values, never outside the bounds.
+
+        Values with a step are rounded to it; the derivatives ignore that.
+        """
         low, high = self._map(self.lower, 0), self._map(self.upper, 0)
         values = self._map(low + unit * (high - low), 1)
+        if any(self.steps):
+            pairs = zip(values, self.steps, strict=True)
+            values = jnp.stack([rounded(value, step) for value, step in pairs])
         # exp(log(x)) may differ from x by a rounding error.
         return jnp.clip(values, self.lower, self.upper)
 
@@ -153,6 +165,7 @@ def space_of(ranges: Mapping[str, Range]) -> Space:
         scales=tuple(bounds.scale for bounds in ranges.values()),
         lower=as_array([bounds.lower for bounds in ranges.values()]),
         upper=as_array([bounds.upper for bounds in ranges.values()]),
+        steps=tuple(bounds.step for bounds in ranges.values()),
     )
 
 

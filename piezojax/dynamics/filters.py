@@ -57,8 +57,6 @@ def _order():
 class _Filter(Designed):
     """Filter whose sections are discretised by one method."""
 
-    discretisation: eqx.AbstractVar[str]
-
     def __check_init__(self):
         for field, allowed in (("discretisation", METHODS), ("kind", KINDS)):
             name = getattr(self, field, allowed[0])

@@ -53,6 +53,7 @@ class RangeTable(Table):
             base.upper if self.upper is None else self.upper,
             self.scale or base.scale,
             unit=declared.unit if declared else "",
+            step=declared.step if declared else None,
         )
 
 

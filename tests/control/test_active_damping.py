@@ -109,5 +109,7 @@ def test_negative_feedback_shifts_the_mode_upwards():
 def test_it_starts_at_rest():
     tested = loop("positive position feedback")
     reference = np.full(50, 1.0)
-    _, log = pj.simulate(tested, pj.loop_inputs(jnp.asarray(reference)), tested.init(1.0))
+    _, log = pj.simulate(
+        tested, pj.loop_inputs(jnp.asarray(reference)), tested.init(1.0)
+    )
     np.testing.assert_allclose(log.displacement, 1.0, rtol=0.0, atol=1e-9)

@@ -1,0 +1,6 @@
+"""Controllers of vendors, with the parameters that are typed into them."""
+
+from .e727 import E727 as E727
+from .nv200 import NV200 as NV200
+from .servo import Servo as Servo
+from .servo_loop import Device as Device

@@ -1,0 +1,137 @@
+"""Closed loop of the PI E-727."""
+
+import equinox as eqx
+
+from ...core.arrays import Scalar, check_order
+from ...core.parameter import parameter, sample_time
+from ...dynamics.filters import LowPass, Notch
+from .servo_loop import (
+    FIXED_DT,
+    Device,
+    ServoLoop,
+    SlewedSetpoint,
+    in_series,
+    inverse_or_off,
+    require_option,
+    require_rate,
+)
+
+STRUCTURES = ("series", "parallel")
+NOTCH_METHODS = {0: "bilinear", 1: "hold"}
+"""Discretisation of a notch by the value of parameter 0x08000600."""
+
+
+def _frequency(meaning: str):
+    return parameter(
+        "Hz",
+        meaning,
+        above=0.0,
+        most=9e3,
+        scale="log",
+        typical=(10.0, 9e3),
+        default=1e3,
+    )
+
+
+def _rejection(number: int):
+    return parameter(
+        "1",
+        f"rejection of notch {number}; 1 is off",
+        least=0.0,
+        most=1.0,
+        typical=(0.0, 1.0),
+        default=1.0,
+    )
+
+
+def _bandwidth(number: int):
+    return parameter(
+        "1",
+        f"bandwidth of notch {number}",
+        least=0.1,
+        scale="log",
+        typical=(0.1, 10.0),
+        default=1.0,
+    )
+
+
+class E727(Device):
+    """PID and two notches of the E-727 at 20 kHz, with the meaning of its parameters.
+
+    ``proportional`` (0x07000300) is dimensionless, ``integral_time`` (0x07000301) and
+    ``derivative_time`` (0x07000302) are in s; an integral time of 0 switches the
+    integral off. ``scale`` is V per um of error for P = 1, which has to be measured.
+    The notches (0x08000100 to 0x08000301) follow the PID; the filter of the measurement
+    (0x05000000) is a Butterworth low-pass of order 2 if ``filter_type`` is 1. The slew
+    rate (0x07000200) limits the setpoint.
+
+    Options for what the manual leaves open: ``structure`` "series", in which P
+    multiplies all terms, or "parallel"; ``anti_windup`` "none" or "hold". A notch is
+    ``(s^2 + 2 r k w s + w^2) / (s^2 + 2 k w s + w^2)`` with rejection r and bandwidth
+    k; with k = 1 the two laws that the manual allows agree. ``notch_method``
+    (0x08000600) is 0, bilinear, or 1, zero-order hold.
+
+    Input an Observation, output in V. Raises ValueError for a value out of range.
+    """
+
+    proportional: Scalar = parameter(
+        "1", "P", above=0.0, scale="log", typical=(1e-4, 10.0)
+    )
+    integral_time: Scalar = parameter(
+        "s", "I", least=0.0, scale="log", typical=(1e-5, 1.0)
+    )
+    derivative_time: Scalar = parameter(
+        "s", "D", least=0.0, scale="log", typical=(1e-7, 1e-2), default=0.0
+    )
+    scale: Scalar = parameter("V/um", "command for P = 1 and 1 um", kw_only=True)
+    lower: Scalar = parameter("V", "least voltage", kw_only=True)
+    upper: Scalar = parameter("V", "greatest voltage", kw_only=True)
+    notch_frequency_1: Scalar = _frequency("frequency of notch 1")
+    notch_rejection_1: Scalar = _rejection(1)
+    notch_bandwidth_1: Scalar = _bandwidth(1)
+    notch_frequency_2: Scalar = _frequency("frequency of notch 2")
+    notch_rejection_2: Scalar = _rejection(2)
+    notch_bandwidth_2: Scalar = _bandwidth(2)
+    filter_frequency: Scalar = _frequency("cut-off of the measurement's filter")
+    slew_rate: Scalar = parameter(
+        "um/s", "slew rate of the setpoint", above=0.0, scale="log", default=1e9
+    )
+    dt: float = sample_time(default=FIXED_DT)
+    notch_method: int = parameter(
+        "1", "discretisation of the notches", whole=True, static=True, default=0
+    )
+    filter_type: int = parameter(
+        "1", "filter of the measurement", whole=True, static=True, default=0
+    )
+    structure: str = eqx.field(static=True, default="series")
+    anti_windup: str = eqx.field(static=True, default="none")
+
+    def __check_init__(self):
+        require_rate(self)
+        check_order("lower", self.lower, "upper", self.upper)
+        require_option("structure", self.structure, STRUCTURES)
+        require_option("notch_method", self.notch_method, tuple(NOTCH_METHODS))
+        require_option("filter_type", self.filter_type, (0, 1))
+
+    def loop(self) -> ServoLoop:
+        """Return the loop of the parameters as they are."""
+        gain = self.scale * self.proportional
+        outer = gain if self.structure == "series" else self.scale
+        notches = (
+            (self.notch_frequency_1, self.notch_bandwidth_1, self.notch_rejection_1),
+            (self.notch_frequency_2, self.notch_bandwidth_2, self.notch_rejection_2),
+        )
+        method = NOTCH_METHODS[self.notch_method]
+        low_pass = LowPass(self.filter_frequency, self.dt, 2)
+        return ServoLoop(
+            SlewedSetpoint(self.slew_rate * self.dt),
+            low_pass if self.filter_type else in_series(),
+            in_series(*(Notch(*notch, self.dt, method) for notch in notches)),
+            gain,
+            outer * inverse_or_off(self.integral_time),
+            outer * self.derivative_time,
+            self.lower,
+            self.upper,
+            self.dt,
+            anti_windup=self.anti_windup,
+        )

@@ -1,0 +1,254 @@
+"""Loops of vendors against loops of NumPy, and the rounding of their parameters."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import vendor_loops
+
+import piezojax as pj
+from piezojax.control import E727, NV200, Servo
+from piezojax.core.serial import from_data, to_data
+from piezojax.study import Study, build
+
+DT, SAMPLES, SPAN = 5e-5, 500, (-20.0, 130.0)
+RANGE = {"avmin": -20.0, "avmax": 130.0, "posmin": 0.0, "posmax": 80.0}
+SCALE = 150.0 / 80.0
+REST = 12.0
+
+NV200S = {
+    "integral": {"ki": 70.0},
+    "trapezoidal": {"ki": 70.0, "integration": "trapezoidal"},
+    "half": {"ki": 70.0, "kp": 0.02, "integration": "half"},
+    "pid": {"kp": 0.021, "ki": 40.0, "kd": 3e-3, "scale": 0.9},
+    "filters": {
+        **{"kp": 0.02, "ki": 60.0, "setlpon": 1, "setlpf": 700.0},
+        **{"poslpon": 1, "poslpf": 1234.5, "notchon": 1, "notchf": 811.0},
+        **{"notchb": 400.0, "notch_depth": 0.1},
+    },
+    "equal poles": {"ki": 50.0, "setlpon": 1, "setpoint_filter": "equal poles"},
+    "slew": {"ki": 100.0, "sr": 0.9, "setlpon": 1},
+    "feedforward": {"ki": 30.0, "pcf_x": 0.5, "pcf_v": 1e-3, "pcf_a": 0.2},
+    "windup": {"ki": 900.0, "kp": 0.5, "anti_windup": "hold"},
+}
+E727S = {
+    "integral": {"proportional": 0.02, "integral_time": 2e-4},
+    "off": {"proportional": 0.3, "integral_time": 0.0},
+    "parallel": {
+        **{"proportional": 0.1, "integral_time": 8e-3, "derivative_time": 1e-5},
+        "structure": "parallel",
+    },
+    "notches": {
+        **{"proportional": 0.05, "integral_time": 5e-4, "derivative_time": 2e-5},
+        **{"notch_frequency_1": 800.0, "notch_rejection_1": 0.05},
+        **{"notch_frequency_2": 2100.0, "notch_rejection_2": 0.2},
+        "notch_bandwidth_2": 0.4,
+    },
+    "held notch": {
+        **{"proportional": 0.05, "integral_time": 5e-4, "notch_method": 1},
+        **{"notch_frequency_1": 800.0, "notch_rejection_1": 0.05},
+        "notch_bandwidth_1": 0.7,
+    },
+    "windup": {
+        **{"proportional": 3.0, "integral_time": 2e-3, "anti_windup": "hold"},
+    },
+    "filter and slew": {
+        **{"proportional": 0.05, "integral_time": 5e-4, "filter_type": 1},
+        **{"filter_frequency": 900.0, "slew_rate": 2000.0},
+    },
+}
+SERVOS = {
+    "parallel": {"proportional": 0.3, "integral": 500.0, "derivative": 1e-5},
+    "standard": {
+        **{"proportional": 0.3, "integral": 2e-3, "derivative": 1e-4},
+        "form": "standard",
+    },
+    "everything": {
+        **{"proportional": 0.2, "integral": 300.0, "feedforward": 1.1},
+        **{"notch_frequency_1": 780.0, "notch_width_1": 300.0, "notch_depth_1": 0.05},
+        **{"notch_frequency_2": 2500.0, "notch_width_2": 900.0, "notch_depth_2": 0.3},
+        **{"low_pass": 4000.0, "low_pass_order": 2, "slew_rate": 3000.0},
+    },
+    "windup": {
+        **{"proportional": 1.0, "integral": 6000.0, "feedforward": 0.5},
+        **{"notch_frequency_1": 780.0, "notch_width_1": 300.0, "notch_depth_1": 0.2},
+        "anti_windup": "hold",
+    },
+    "first order": {
+        **{"proportional": 0.2, "integral": 300.0, "low_pass": 3000.0},
+        "low_pass_order": 1,
+    },
+}
+
+
+def nv200(**options):
+    return NV200(**RANGE, **options)
+
+
+def e727(**options):
+    return E727(**options, scale=2.5, lower=SPAN[0], upper=SPAN[1])
+
+
+def servo(**options):
+    return Servo(**options, lower=SPAN[0], upper=SPAN[1], dt=DT)
+
+
+def expected_nv200(**options):
+    limits = {"lower": SPAN[0], "upper": SPAN[1], "stroke": 80.0}
+    named = {"setpoint_filter": "low_pass", "notch_depth": "depth"}
+    given = {"setlpf": 200.0, "scale": SCALE} | options
+    given = {named.get(name, name): value for name, value in given.items()}
+    return vendor_loops.NV200(REST, REST, 30.0, **limits, **given)
+
+
+def expected_e727(**options):
+    names = {"proportional": "P", "integral_time": "I", "derivative_time": "D"}
+    names |= {"notch_method": "method", "slew_rate": "slew"}
+    given = {names.get(name, name): value for name, value in options.items()}
+    return vendor_loops.E727(
+        *(REST, REST, 30.0), scale=2.5, lower=SPAN[0], upper=SPAN[1], **given
+    )
+
+
+def expected_servo(**options):
+    standard = options.get("form") == "standard"
+    names = {"proportional": "gain", "integral": "ti", "derivative": "td"}
+    if not standard:
+        names = {"proportional": "kp", "integral": "ki", "derivative": "kd"}
+    names |= {"low_pass": "low_pass_frequency", "slew_rate": "slew"}
+    given = {names.get(name, name): value for name, value in options.items()}
+    return vendor_loops.GenericServo(
+        *(REST, REST, 30.0), dt=DT, lower=SPAN[0], upper=SPAN[1], **given
+    )
+
+
+CASES = {
+    f"{make.__name__} {name}": (make, oracle, options)
+    for make, oracle, table in (
+        (nv200, expected_nv200, NV200S),
+        (e727, expected_e727, E727S),
+        (servo, expected_servo, SERVOS),
+    )
+    for name, options in table.items()
+}
+
+
+@jax.jit
+def commands(controller, references, measurements):
+    """Return the commands of a controller that begins at rest."""
+
+    def step(state, now):
+        seen = pj.Observation(now[0], now[0], now[1], 30.0)
+        return controller.step(state, seen)
+
+    rest = pj.Observation(REST, REST, REST, 30.0)
+    return jax.lax.scan(step, controller.init(rest), (references, measurements))[1]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_device_is_the_loop_of_its_equations(case):
+    make, oracle, options = CASES[case]
+    random = np.random.default_rng(7)
+    references = REST + 25.0 * (np.arange(SAMPLES) > 20) * (np.arange(SAMPLES) < 260)
+    # What a slow stage would measure, and noise.
+    slow = np.convolve(references, np.exp(-np.arange(SAMPLES) / 60.0) / 60.5)[:SAMPLES]
+    measurements = slow + REST * np.exp(-np.arange(SAMPLES) / 60.0)
+    measurements = measurements + 0.05 * random.normal(size=SAMPLES)
+    signals = jnp.asarray(references), jnp.asarray(measurements)
+    found = commands(make(**options), *signals)
+    independent = oracle(**options)
+    expected = [
+        independent.step(*now) for now in zip(references, measurements, strict=True)
+    ]
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+    if "hold" in options.values():
+        assert 10 < np.sum(np.isin(expected, SPAN)) < SAMPLES - 50
+
+
+def test_an_nv200_computes_with_three_decimals_and_whole_frequencies():
+    typed = nv200(kp=0.0204, ki=70.0004, notchf=811.4, notchb=399.6, notchon=1)
+    exact = nv200(kp=0.02, ki=70.0, notchf=811.0, notchb=400.0, notchon=1)
+    signals = REST + np.arange(50.0), np.full(50, REST)
+    np.testing.assert_array_equal(commands(typed, *signals), commands(exact, *signals))
+    assert float(typed.typed().kp) == 0.02
+    assert float(typed.kp) == 0.0204
+
+
+def test_the_gradient_ignores_the_rounding():
+    signals = REST + np.arange(50.0), np.full(50, REST)
+
+    def last(ki):
+        return commands(nv200(ki=ki), *signals)[-1]
+
+    slope = jax.grad(last)(70.0004)
+    quotient = (last(71.0) - last(69.0)) / 2.0
+    assert float(slope) == pytest.approx(float(quotient), rel=1e-9)
+
+
+def test_a_device_is_saved_and_loaded():
+    for make, _, options in CASES.values():
+        device = make(**options)
+        data = json.loads(json.dumps(to_data(device)))
+        assert to_data(from_data(data)) == data
+
+
+STUDY = {
+    "title": "an NV200 on a lag",
+    "rate": 20_000.0,
+    "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": DT},
+    "actuator": {"lower": -20.0, "upper": 130.0},
+    "controller": {"type": "NV200", "kp": 0.01, "ki": 20.0, **RANGE},
+    "references": {
+        **{"tune": ["SW50"], "amplitude": 20.0, "offset": 20.0},
+        **{"duration": 0.05, "settle": 0.01},
+    },
+    "tune": ["controller.kp", "controller.ki"],
+    "optimiser": {"method": "gauss_newton", "starts": 1, "candidates": 4, "steps": 3},
+}
+
+
+def test_a_study_tunes_what_can_be_typed_in():
+    outcome = pj.tune(build(Study.model_validate(STUDY), "study.toml"))
+    gains = outcome.result.gains
+    for value in gains.values():
+        assert value == round(value, 3)
+    before, after = outcome.result.holdout_before, outcome.result.holdout
+    assert after.geomean_rms_um < 0.5 * before.geomean_rms_um
+    assert float(outcome.controller.ki) == gains["controller.ki"]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: nv200(kp=2e4), "kp is 20000; it must be finite and .* at most 10000"),
+        (
+            lambda: nv200(notchf=100.0, notchb=300.0),
+            "notchb is 300 and 2 notchf is 200",
+        ),
+        (lambda: nv200(integration="tustin"), "integration is 'tustin'; .* half"),
+        (lambda: nv200(anti_windup="clamp"), "anti_windup is 'clamp'; .* none, hold"),
+        (lambda: nv200(setpoint_filter="bessel"), "setpoint_filter is 'bessel'"),
+        (lambda: nv200(dt=1e-4), "dt is 0.0001 s; NV200 runs at 20 kHz"),
+        (lambda: e727(proportional=0.0, integral_time=1.0), "proportional is 0"),
+        (lambda: e727(proportional=1.0, integral_time=1.0, notch_method=2), "0, 1"),
+        (lambda: e727(proportional=1.0, integral_time=1.0, filter_type=99), "0, 1"),
+        (lambda: e727(proportional=1.0, integral_time=1.0, structure="x"), "structure"),
+        (
+            lambda: servo(proportional=1.0, integral=1.0, form="ideal"),
+            "form is 'ideal'",
+        ),
+        (lambda: servo(proportional=1.0, integral=1.0, low_pass_order=3), "0, 1, 2"),
+    ],
+)
+def test_values_that_are_not_allowed_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        commands(make(), REST + np.arange(3.0), np.full(3, REST))
+
+
+def test_a_study_of_another_rate_is_refused():
+    plant = STUDY["plant"] | {"dt": 1e-4}
+    study = Study.model_validate(STUDY | {"rate": 10_000.0, "plant": plant})
+    with pytest.raises(ValueError, match="rate is 10000 Hz, but the controller"):
+        build(study, "study.toml")
