@@ -285,7 +285,7 @@ def test_type_must_be_a_name(kind):
 def test_no_type():
     message = message_for({"gain": 2.0})
     assert message.startswith(
-        "system needs a key 'type' with one of ARMA, AdaptiveInverse, Affine, "
+        "system needs a key 'type' with one of ARMA, ActiveDamping, AdaptiveI"
     )
 
 

@@ -546,12 +546,12 @@ def test_unknown_keys(refusal, place, value, message):
         (
             "plant",
             {"type": "Lag", "time_constant": 1e-3},
-            "plant.type is 'Lag'; it must be one of ARMA, AdaptiveInverse, Affi",
+            "plant.type is 'Lag'; it must be one of ARMA, ActiveDamping, A",
         ),
         (
             "plant",
             {"type": "os.system"},
-            "plant.type is 'os.system'; it must be one of ARMA, AdaptiveInverse, Affi",
+            "plant.type is 'os.system'; it must be one of ARMA, ActiveDamping, A",
         ),
         (
             "parameters/controller.integral/scale",

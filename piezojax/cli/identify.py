@@ -23,6 +23,17 @@ class _SampleRange(click.ParamType):
         return slice(start, stop)
 
 
+class _Gain(click.ParamType):
+    name = "NAME=VALUE"
+
+    def convert(self, value, param, ctx):
+        name, _, number = value.partition("=")
+        try:
+            return name.strip(), float(number)
+        except ValueError:
+            self.fail(f"{value!r} must be a name and a number, as in ki=70", param, ctx)
+
+
 @click.command(cls=Command)
 @click.argument(
     "records", nargs=-1, type=click.Path(path_type=Path), metavar="RECORD..."
@@ -32,6 +43,18 @@ class _SampleRange(click.ParamType):
     default="auto",
     show_default=True,
     help="Model to fit, parts joined by '+'; 'help' lists all, 'all' compares all.",
+)
+@click.option(
+    "--controller",
+    metavar="DEVICE",
+    help="Measure the scale of the gains of nv200 or e727, from its error and voltage.",
+)
+@click.option(
+    "--gain",
+    "gains",
+    multiple=True,
+    type=_Gain(),
+    help="With --controller: a gain typed in when it recorded; give each.",
 )
 @click.option("--among", help="With 'all': compare only these and linear models.")
 @click.option("--time", help="Time column, by name or number from zero.")
@@ -84,6 +107,8 @@ class _SampleRange(click.ParamType):
 def main(
     records,
     model,
+    controller,
+    gains,
     among,
     method,
     order,
@@ -99,6 +124,9 @@ def main(
     **columns,
 ):
     """Fit a plant model to measured RECORDs of one stage.
+
+    With --controller, measure how a device scales its gains: the input is its error,
+    the output its voltage.
 
     Text (.csv, .txt, .dat), .npz, .mat and .h5 files; .tdms, .lvm and .xlsx with
     piezojax[lab].
@@ -124,6 +152,9 @@ def main(
             raise ValueError("--among and --test need --model all")
         loaded = [read_record(record, **columns) for record in records]
         options = Options(order, window, oversample, steps)
+        if controller is not None:
+            measure(console, loaded)
+            return
         if model == ALL:
             compare(console, loaded, options)
             return
@@ -145,6 +176,21 @@ def main(
         for warning in fit.report.warnings:
             console.print(f"note: {warning}", soft_wrap=True)
         console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
+
+    def measure(console, loaded):
+        from ..core.files import write_json
+        from ..identification.device_scale import device_scale
+        from ..report.summary_tables import scale_table
+
+        if len(loaded) > 1:
+            raise ValueError("--controller takes one RECORD")
+        found = device_scale(controller, loaded[0], dict(gains))
+        with results_folder(out, records[0].stem) as folder:
+            write_json(folder / "scale.json", found.model_dump())
+        console.print(scale_table(found))
+        for note in found.notes:
+            console.print(f"note: {note}", soft_wrap=True)
+        console.print(f"results in {folder}", soft_wrap=True)
 
     def compare(console, loaded, options):
         from ..identification.compare import identify_all

@@ -183,7 +183,7 @@ def rounded(value: Any, step: float | None) -> Any:
     # A step below 1 is the inverse of a whole number, which has no rounding error.
     nearest = jnp.round(value / step)
     nearest = nearest / round(1.0 / step) if step < 1.0 else nearest * step
-    return value + jax.lax.stop_gradient(nearest - value)
+    return jax.lax.stop_gradient(nearest) + (value - jax.lax.stop_gradient(value))
 
 
 def rounded_fields(system: Any) -> Any:

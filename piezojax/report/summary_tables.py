@@ -9,6 +9,7 @@ from rich.text import Text
 
 from ..analysis.stability import StabilityReport, StabilityReports, worst_margins
 from ..core.registry import parts
+from ..identification.device_scale import DeviceScale
 from ..identification.fit import FitReport
 from ..identification.methods import METHODS
 from ..reproduction.cell import Cell, title_of
@@ -156,7 +157,8 @@ def sliding_text(result: Result) -> str | None:
 def gains_table(result: Result) -> Table:
     """Return the table of the parameters before and after tuning.
 
-    The unit of a pure number is 1; a dash stands for a unit that is not declared.
+    The unit of a pure number is 1; a dash stands for a unit that is not declared. Gains
+    of a device have all digits that are typed in.
     """
     # The common start of the paths is in the title: long paths would crowd the numbers.
     parents = zip(*(path.split(".")[:-1] for path in result.gains), strict=False)
@@ -169,8 +171,17 @@ def gains_table(result: Result) -> Table:
     table.add_column("unit", no_wrap=True)
     for path, value in result.gains.items():
         name, unit = path.removeprefix(f"{shared}."), result.gain_units.get(path)
-        table.add_row(name, f"{result.start[path]:.4g}", f"{value:.4g}", unit or "-")
+        step = result.gain_steps.get(path)
+        before, after = (_typed(x, step) for x in (result.start[path], value))
+        table.add_row(name, before, after, unit or "-")
     return table
+
+
+def _typed(value: float, step: float | None) -> str:
+    """Return a gain in four digits, or in all digits that are typed into a device."""
+    if step is None:
+        return f"{value:.4g}"
+    return f"{value:.{max(0, -math.floor(math.log10(step)))}f}"
 
 
 def stability_table(stability: StabilityReports) -> Table:
@@ -237,6 +248,24 @@ def fit_table(report: FitReport) -> Table:
         deviation = parameter.standard_error
         shown = "-" if deviation is None else f"{deviation:.2g}"
         table.add_row(path, f"{parameter.value:.5g}", shown)
+    return table
+
+
+def scale_table(found: DeviceScale) -> Table:
+    """Return the measured scale and gains of a device."""
+    ((option, value),) = found.option.items()
+    table = Table(
+        title=f"{found.device}, {option} {value}: residual {found.residual_V:.2g} V",
+        caption=f"the voltage lags the error by {found.lag} samples in the record",
+        caption_justify="left",
+    )
+    table.add_column("", no_wrap=True)
+    table.add_column("value", justify="right")
+    table.add_column("standard error", justify="right")
+    table.add_column("unit")
+    for name in ("scale", "proportional", "integral", "derivative"):
+        one = getattr(found, name)
+        table.add_row(name, f"{one.value:.6g}", f"{one.standard_error:.2g}", one.unit)
     return table
 
 

@@ -94,6 +94,11 @@ def make_result(
         perturbed=_perturbed(case, data, evaluator, case.loop, after),
         units={trace.name: trace.unit for trace in data.traces},
         gain_units={path: case.unit(path) for path in case.space.paths},
+        gain_steps={
+            path: bounds.step
+            for path, bounds in case.space.ranges().items()
+            if bounds.step is not None
+        },
         warnings=[
             *case.notes,
             *search.warnings,

@@ -243,6 +243,7 @@ class Result(BaseModel):
     sliding: SlidingShare | None = None
     units: dict[str, str] = {}
     gain_units: dict[str, str] = {}
+    gain_steps: dict[str, float] = {}
     """Declared units of ``gains``; "" without a declaration."""
     warnings: list[str]
     alarms: list[str] = []

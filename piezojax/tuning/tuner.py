@@ -13,6 +13,7 @@ from .alarms import alarms_of
 from .baselines import Budget, compare_baselines
 from .beside import figures_beside
 from .data import make_data
+from .device_alarms import device_alarms
 from .evaluator import Evaluator
 from .front import trace_front
 from .limited_search import search_within_limits
@@ -84,6 +85,7 @@ def tune(
     of_model = [
         *_model_alarms(case, limits, stability),
         *recorded_range_alarms(case, data),
+        *device_alarms(after.controller),
     ]
     result.alarms = alarms_of(result, stability, limits, of_model)
     result.wall_s = clock.wall_s()

@@ -11,7 +11,10 @@ from oracles import vendor_loops
 import piezojax as pj
 from piezojax.control import E727, NV200, Servo
 from piezojax.core.serial import from_data, to_data
+from piezojax.core.system import Affine
+from piezojax.report.summary_tables import gains_table
 from piezojax.study import Study, build
+from piezojax.tuning.device_alarms import device_alarms
 
 DT, SAMPLES, SPAN = 5e-5, 500, (-20.0, 130.0)
 RANGE = {"avmin": -20.0, "avmax": 130.0, "posmin": 0.0, "posmax": 80.0}
@@ -217,6 +220,17 @@ def test_a_study_tunes_what_can_be_typed_in():
     before, after = outcome.result.holdout_before, outcome.result.holdout
     assert after.geomean_rms_um < 0.5 * before.geomean_rms_um
     assert float(outcome.controller.ki) == gains["controller.ki"]
+    (alarm,) = outcome.result.alarms
+    assert alarm.startswith("the scale of the gains of the NV200 is assumed, 1.875 V")
+    rows = [*gains_table(outcome.result).columns[2].cells]
+    assert rows == [f"{value:.3f}" for value in gains.values()]
+
+
+def test_a_measured_scale_raises_no_alarm():
+    assert list(device_alarms(nv200(scale=2.0))) == []
+    inner = pj.control.FilteredCommand(nv200(), Affine())
+    assert len(list(device_alarms(inner))) == 1
+    assert list(device_alarms(e727(proportional=1.0, integral_time=1.0))) == []
 
 
 @pytest.mark.parametrize(

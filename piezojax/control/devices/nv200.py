@@ -124,11 +124,26 @@ class NV200(Device):
         require_option("integration", self.integration, (*INTEGRATIONS, "half"))
         require_option("setpoint_filter", self.setpoint_filter, KINDS)
 
+    @property
+    def _assumed_scale(self) -> Scalar:
+        return (self.avmax - self.avmin) / (self.posmax - self.posmin)
+
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """A caution if the scale is assumed."""
+        if self.scale > 0.0:
+            return ()
+        return (
+            f"the scale of the gains of the NV200 is assumed, "
+            f"{float(self._assumed_scale):.4g} V/um: the gains may act several times "
+            "as strongly; measure it (python -m piezojax.identify RECORD --controller "
+            "nv200) and set controller.scale",
+        )
+
     def loop(self) -> ServoLoop:
         """Return the loop of the parameters as they are."""
+        scale = jnp.where(self.scale > 0.0, self.scale, self._assumed_scale)
         range = self.posmax - self.posmin
-        assumed = (self.avmax - self.avmin) / range
-        scale = jnp.where(self.scale > 0.0, self.scale, assumed)
         half = self.integration == "half"
         most = jnp.where(self.sr < SLEW_OFF, 10.0 * self.sr * range * self.dt, 1e9)
         low_pass: System | None = None

@@ -30,6 +30,11 @@ class Device(Designed):
         """Return the device with its parameters rounded to what can be typed in."""
         return rounded_fields(self)
 
+    @property
+    def cautions(self) -> tuple[str, ...]:
+        """Reasons not to type the gains in yet, each with a next step."""
+        return ()
+
     def resolved(self) -> "ServoLoop":
         """Return the loop of the rounded parameters."""
         return self.typed().loop()
