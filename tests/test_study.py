@@ -764,6 +764,29 @@ def test_more_samples_than_the_memory_holds(refusal, study):
     assert load(study({"references/duration": 6e3})).references.duration == 6e3
 
 
+def test_as_many_samples_as_the_memory_holds(study, monkeypatch):
+    # 2000 samples of 15 signals of 8 bytes, in GB.
+    monkeypatch.setattr("piezojax.study.schema.MEMORY_GB", 0.1 * 20_000 * 15 * 8e-9)
+    assert load(study({"references/duration": 0.1})).references.duration == 0.1
+
+
+def test_references_last_a_second_by_default(study):
+    table = load(study({"references/duration": GONE})).references
+    assert table.duration == 1.0
+
+
+def test_a_reference_at_half_the_rate(refusal):
+    message = refusal({"references/unseen": ["SIN10000"]})
+    assert message == "references: SIN10000 is not below half the rate, 10000 Hz"
+
+
+def test_a_front_has_two_limits_at_least(study, refusal):
+    front = {"constraint": "effort", "limits": [20.0, 30.0]}
+    limit = {"constraints": {"effort": 30.0}}
+    assert load(study(limit | {"pareto": front})).pareto.limits == (20.0, 30.0)
+    assert "pareto.limits" in refusal(limit | {"pareto": front | {"limits": [20.0]}})
+
+
 @pytest.mark.parametrize("settle", [0.05, 0.06])
 def test_settling_for_the_whole_run(refusal, settle):
     message = f"settle is {settle:g} s; it must be below the duration, 0.05 s"

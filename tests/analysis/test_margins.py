@@ -10,6 +10,7 @@ import pytest
 from oracles import published, transfer
 
 import piezojax as pj
+from piezojax.analysis.stability import stability_reports
 from piezojax.analysis.stability.conserved import LinearLoop
 from piezojax.analysis.stability.margins import linear_loop, report_of
 from piezojax.catalog import p753
@@ -243,3 +244,58 @@ def test_a_conditionally_stable_loop_can_lose_too_much_gain():
     assert report.stable
     assert report.gain_reduction_margin == pytest.approx(0.4)
     assert report.gain_margin == pytest.approx(4.4)
+
+
+def test_curves_are_the_responses_of_the_equations():
+    loop, oracle = loop_of("pid, all"), written("pid, all")
+    reports = stability_reports({"after": loop}, 3.0)
+    (curves,) = reports.curves("after", 2.5).values()
+    frequency = curves.frequency
+    assert frequency[-1] == pytest.approx(0.5 / DT, rel=1e-12)
+    lowest = 0.5 / DT * 10.0**-2.5
+    assert lowest < frequency[0] < 1.05 * lowest
+    L = oracle(np.exp(2j * np.pi * frequency * DT))
+    np.testing.assert_allclose(curves.L, L, rtol=1e-6)
+    np.testing.assert_allclose(curves.S, 1.0 / (1.0 + L), rtol=1e-6)
+    np.testing.assert_allclose(curves.T, L / (1.0 + L), rtol=1e-6)
+
+
+def test_branches_that_differ_have_their_own_curves():
+    loop = pj.Feedback(
+        p753.pid(), p753.plant(), p753.actuator(), pj.hardware.Sensor(0.0)
+    )
+    reports = stability_reports({"after": loop}, 8.0)
+    assert list(reports.curves("after", 3.0)) == ["ascending", "descending"]
+    up, down = reports.curves("after", 3.0).values()
+    slopes = [np.abs(branch.L[len(branch.L) // 2]) for branch in (up, down)]
+    assert abs(slopes[0] / slopes[1] - 1.0) > 1e-3
+
+
+def test_the_default_reference_is_the_middle():
+    loop = pj.Feedback(
+        p753.pid(), p753.plant(), p753.actuator(), pj.hardware.Sensor(0.0)
+    )
+    default, middle, other = (
+        stability_reports({"after": loop}, *at).as_dict() for at in ((), (0.0,), (1.0,))
+    )
+    assert default == middle
+    assert default != other
+
+
+def test_curves_of_several_axes_are_those_of_each():
+    both = {
+        name: pj.Feedback(
+            pj.PerAxis(tuple(pid(n) for n in names)),
+            pj.PerAxis(tuple(around(pid("all")).plant for _ in names)),
+            pj.PerAxis(tuple(around(pid("all")).actuator for _ in names)),
+            pj.PerAxis(tuple(pj.hardware.Sensor(0.0) for _ in names)),
+        )
+        for name, names in {"after": ("integral", "all")}.items()
+    }
+    reports = stability_reports(both, (3.0, 3.0), DT, ("X", "Y"))
+    curves = reports.axes["after"].curves()
+    assert curves.frequency[-1] == pytest.approx(0.5 / DT, rel=1e-12)
+    z = np.exp(2j * np.pi * curves.frequency * DT)
+    each = [np.abs(1.0 / (1.0 + written(f"pid, {n}")(z))) for n in ("integral", "all")]
+    np.testing.assert_allclose(curves.each, each, rtol=1e-5)
+    np.testing.assert_allclose(curves.largest, np.max(each, axis=0), rtol=1e-5)

@@ -90,6 +90,20 @@ def test_the_limit_is_that_of_the_scalar_riccati_equation(linear):
         assert found.limit <= found.one_controller <= 1.03 * known
 
 
+def test_curves_and_bandwidth_are_those_of_the_spectra(linear):
+    """The disturbance has DRIVEN^2 / |1 - MEMORY z^-1|^2, the noise is white."""
+    line = np.arccos((1.0 + MEMORY**2 - (DRIVEN / NOISE) ** 2) / (2.0 * MEMORY)) / (
+        2.0 * np.pi * DT
+    )
+    curves = linear.curves
+    for i, found in enumerate(linear.references.values()):
+        assert found.bandwidth == pytest.approx(line, rel=0.15)
+        # Lines of both signs make the variance.
+        assert np.sqrt(np.mean(curves.limit[i])) == pytest.approx(found.limit, rel=0.02)
+        above = curves.unpredicted[i] > curves.noise
+        assert curves.frequency[np.flatnonzero(above)[-1]] == found.bandwidth
+
+
 def test_errors_and_their_shares_are_those_of_the_loop(linear, disturbance):
     references, noise = driving()
     # The error of y(k + 1) = SLOPE u(k) + d(k), u an integral of r - z.

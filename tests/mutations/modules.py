@@ -8,16 +8,20 @@ _LIMIT = (
 )
 _RESULTS = ("tests/tuning/test_alarms.py", "tests/tuning/test_tuner.py")
 _STUDY = ("tests/test_study.py",)
+_SUMMARIES = ("tests/tuning/test_result.py",)
 
 MODULES = {
     "core/metrics.py": ("tests/test_metrics.py",),
     "tuning/alarms.py": ("tests/tuning/test_alarms.py", "-k", "not command"),
     "tuning/reach.py": ("tests/tuning/test_reach.py", "-k", "not shipped"),
-    "tuning/objective.py": ("tests/tuning/test_data.py", "tests/tuning/test_robust.py"),
-    "tuning/result.py": _RESULTS,
+    "tuning/objective.py": (
+        *("tests/tuning/test_data.py", "tests/tuning/test_robust.py"),
+        "tests/tuning/test_axes.py",
+    ),
+    "tuning/result.py": (*_SUMMARIES, *_RESULTS),
     "tuning/make_result.py": _RESULTS,
     "tuning/tuner.py": _RESULTS[1:],
-    "study/case.py": _STUDY,
+    "study/case.py": (*_STUDY, "tests/tuning/test_beside.py"),
     "study/parameters.py": _STUDY,
     "study/schema.py": _STUDY,
     "analysis/stroke.py": ("tests/analysis/test_stroke.py",),

@@ -147,6 +147,19 @@ def test_exact_margins(stability, message):
     assert bool(unlimited) == ("unstable" in message)
 
 
+def test_limits_at_least_have_their_own_side():
+    exact = report_of(integrator(0.2)).delay_margin_samples
+    for factor, expected in ((0.995, 0), (1.005, 0), (1.03, 1)):
+        limits = {"delay_margin": factor * exact}
+        found = alarms(stability=reports(0.2), limits=limits)
+        assert len(found) == expected
+    near = {"disk_margin": outcome("disk_margin", [0.96], 1.0)}
+    assert alarms(changed(holdout_constraints=near)) == []
+    low = {"disk_margin": outcome("disk_margin", [0.85], 1.0)}
+    (alarm,) = alarms(changed(holdout_constraints=low))
+    assert "disk_margin is 0.85 on the hold-out, below its limit 1" in alarm
+
+
 def test_a_run_rails_from_a_share_of_its_samples():
     (alarm,) = alarms(changed(holdout=scores(saturated=90.1)))
     assert alarm.startswith("the tuned loop rails on hold-out runs of SW30")

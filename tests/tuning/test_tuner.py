@@ -131,6 +131,16 @@ def test_the_loop_becomes_better_on_noise_it_was_not_tuned_on(outcome):
         assert error < result.holdout_before.per_reference_rms_um[name]
 
 
+def test_only_gains_at_an_edge_are_said_to_be_there(outcome):
+    space, gains = outcome.case.space, outcome.result.gains
+    places = np.asarray(space.to_unit(jnp.asarray([*gains.values()])))
+    expected = [
+        path for path, x in zip(gains, places, strict=True) if not 0.01 < x < 0.99
+    ]
+    assert outcome.result.at_bound == expected
+    assert len(expected) < len(gains)
+
+
 def test_the_result_has_the_agreed_keys(outcome):
     result = json.loads(outcome.result.model_dump_json())
     assert set(result) >= RESULT_KEYS
