@@ -56,6 +56,22 @@ class _Gain(click.ParamType):
     type=_Gain(),
     help="With --controller: a gain typed in when it recorded; give each.",
 )
+@click.option(
+    "--response",
+    is_flag=True,
+    help="RECORD is a frequency response: fit modes, lag and delay; needs --rate.",
+)
+@click.option(
+    "--held",
+    is_flag=True,
+    help="With --response: measured through converters that run at --rate.",
+)
+@click.option(
+    "--unit",
+    default="um/V",
+    show_default=True,
+    help="With --response: unit of the response.",
+)
 @click.option("--among", help="With 'all': compare only these and linear models.")
 @click.option("--time", help="Time column, by name or number from zero.")
 @click.option("--input", default="0", show_default=True, help="Input column.")
@@ -109,6 +125,9 @@ def main(
     model,
     controller,
     gains,
+    response,
+    held,
+    unit,
     among,
     method,
     order,
@@ -146,6 +165,9 @@ def main(
             return
         if not records:
             raise ValueError("give a RECORD to fit a model to")
+        if response:
+            fit_response(console)
+            return
         if model == ALL and method is not None:
             raise ValueError("--method needs one model; 'all' uses the default of each")
         if model != ALL and (among is not None or test):
@@ -176,6 +198,28 @@ def main(
         for warning in fit.report.warnings:
             console.print(f"note: {warning}", soft_wrap=True)
         console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
+
+    def fit_response(console):
+        from ..identification.records.response_file import read_response
+        from ..identification.response_model import identify_response
+        from ..report.response_pictures import write_response
+        from ..report.summary_tables import parameter_table
+
+        if len(records) > 1 or columns["rate"] is None:
+            raise ValueError("--response takes one RECORD, and a --rate")
+        with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
+            bar.stage("fitting modes")
+            measured = read_response(records[0], unit=unit)
+            found = identify_response(measured, columns["rate"], held=held)
+            bar.stage("drawing")
+            write_response(found, folder)
+        report = found.report
+        title = f"{report.lines} lines: median error {100.0 * report.error:.2g} %"
+        console.print(parameter_table(report.parameters, title))
+        console.print(f"found: {report.found}", soft_wrap=True)
+        for note in report.notes:
+            console.print(f"note: {note}", soft_wrap=True)
+        console.print(f"results in {folder}", soft_wrap=True)
 
     def measure(console, loaded):
         from ..core.files import write_json

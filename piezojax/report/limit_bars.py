@@ -39,10 +39,19 @@ def write_limit(report: LimitReport | str, folder: Path, title: str = "") -> Non
             write(limit_figure(report, title), folder / LIMIT_PICTURE)
 
 
+NO_LIMIT = 1e4
+"""Ratio of the tuned error to the limit above which the limit is that of rounding."""
+
+
 def limit_text(report: LimitReport | str) -> str:
     """Return lines on the distance from the limit, with the causes of a large one."""
     if isinstance(report, str):
         return f"note: no limit of linear control: {report}"
+    if report.ratio > NO_LIMIT:
+        return (
+            "limit of linear control: none to speak of, because the study disturbs the "
+            "stage by nothing that a controller with preview would not cancel"
+        )
     count = len(report.references)
     lines = [
         "limit of linear control with full preview (resolution "

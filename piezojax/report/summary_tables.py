@@ -1,7 +1,7 @@
 """Tables that the commands print."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import takewhile
 
 from rich.table import Table
@@ -10,6 +10,7 @@ from rich.text import Text
 from ..analysis.stability import StabilityReport, StabilityReports, worst_margins
 from ..core.registry import parts
 from ..identification.device_scale import DeviceScale
+from ..identification.estimators.estimate import FittedParameter
 from ..identification.fit import FitReport
 from ..identification.methods import METHODS
 from ..reproduction.cell import Cell, title_of
@@ -241,10 +242,18 @@ def fit_table(report: FitReport) -> Table:
         caption="\n".join([*_scope(report), *_place_of_the_lag(report)]) or None,
         caption_justify="left",
     )
+    return parameter_table(report.parameters, table)
+
+
+def parameter_table(
+    parameters: Mapping[str, FittedParameter], table: Table | str
+) -> Table:
+    """Return ``table``, or a new one of this title, with a row for each parameter."""
+    table = Table(title=table) if isinstance(table, str) else table
     table.add_column("parameter", no_wrap=True)
     table.add_column("value", justify="right")
     table.add_column("standard error", justify="right")
-    for path, parameter in report.parameters.items():
+    for path, parameter in parameters.items():
         deviation = parameter.standard_error
         shown = "-" if deviation is None else f"{deviation:.2g}"
         table.add_row(path, f"{parameter.value:.5g}", shown)

@@ -329,6 +329,13 @@ def test_the_words_name_what_exceeds():
     assert "D" not in text.split("\n", 1)[1]
 
 
+def test_a_limit_of_rounding_is_no_limit():
+    rows = {"A": comparison(4.0, 1e-12, Shares(3.9, 0.5, 0.7))}
+    nothing = Curves(np.zeros(0), np.zeros((1, 0)), 1.0, *np.zeros((2, 1, 0)))
+    report = LimitReport(rows, DT, NOISE, 10.0, SLOPE, 1.0, 1.1, nothing)
+    assert limit_text(report).startswith("limit of linear control: none to speak of")
+
+
 def test_what_went_wrong_is_said(tmp_path):
     write_limit("the stage sleeps", tmp_path)
     data = json.loads((tmp_path / "limit.json").read_text(encoding="utf-8"))

@@ -37,6 +37,7 @@ def test_a_limit_at_most(values, limit, kept, active, on, worst):
         ([9.0, 2.2], True, False, 2, 2.2),
         ([9.0, 2.03], True, True, 2, 2.03),
         ([9.0, 1.999], True, True, 2, 1.999),
+        ([9.0, 1.997], False, False, 1, 1.997),
         ([9.0, 1.99], False, False, 1, 1.99),
         ([-math.inf, 9.0], False, False, 1, None),
     ],

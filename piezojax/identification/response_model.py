@@ -1,0 +1,165 @@
+"""Model of a stage from its measured frequency response."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from pydantic import BaseModel
+
+from ..core.about import About
+from ..core.paths import declared
+from ..core.system import Affine, System, series
+from ..dynamics import FractionalDelay, Modes
+from .estimators.estimate import FittedParameter
+from .estimators.modal_fit import MOST_MODES, ModalFit, error_bound, modal_fit
+from .records.response_file import FrequencyResponse
+
+SMALL_MOTIONS = (
+    "a frequency response shows small motions: hysteresis and creep are not in the "
+    "model; identify them from a slow record of the whole range"
+)
+FOLDED = 0.9
+"""Share of half the rate above which a measured mode cannot be simulated."""
+
+
+class ResponseReport(BaseModel):
+    """Report of a model from a frequency response, the content of ``response.json``.
+
+    ``error`` is the median of the relative error of the model at the measured lines,
+    ``noise`` that of the standard deviation of the noise.
+    """
+
+    source: str
+    unit: str
+    lines: int
+    found: str
+    parameters: dict[str, FittedParameter]
+    error: float
+    noise: float
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class ResponseModel:
+    """A System fitted to a frequency response, its report and the details of the fit.
+
+    ``system`` is a gain, ``Modes`` and a delay in series.
+    """
+
+    system: System
+    report: ResponseReport
+    response: FrequencyResponse
+    fit: ModalFit
+    about: About
+
+
+def identify_response(
+    response: FrequencyResponse,
+    rate: float,
+    *,
+    held: bool = False,
+    most: int = MOST_MODES,
+) -> ResponseModel:
+    """Return the modes, lag and delay of ``response`` as a System of ``rate`` in Hz.
+
+    With ``held`` the response was measured at this rate through converters that hold
+    the input; otherwise by an analogue analyser. At most ``most`` modes are fitted. The
+    saved model carries a bound on its error, so that a study limits the margins for
+    what the response does not show. Raises ValueError for a rate that is not above 0, a
+    mode too near half the rate, and a response that no mode explains.
+    """
+    if not (math.isfinite(rate) and rate > 0.0):
+        raise ValueError(f"rate is {rate:g} Hz; it must be above 0")
+    dt = 1.0 / rate
+    fit = modal_fit(response, held=dt if held else None, most=most)
+    highest = max(mode.value for mode in fit.frequency)
+    if highest > FOLDED * 0.5 * rate:
+        raise ValueError(
+            f"a mode at {highest:.4g} Hz cannot be simulated at {rate:g} Hz: choose a "
+            "higher rate, or leave out the lines above it"
+        )
+    system = _system_of(fit, dt)
+    output, _, input = response.unit.partition("/")
+    relative = abs(response.values / fit.fitted - 1.0)
+    noise = fit.deviation / abs(fit.fitted)
+    parameters = _parameters(fit)
+    report = ResponseReport(
+        source=response.source,
+        unit=response.unit,
+        lines=response.frequency.size,
+        found=_words(fit),
+        parameters=parameters,
+        error=float(sorted(relative)[relative.size // 2]),
+        noise=float(sorted(noise)[noise.size // 2]),
+        notes=[SMALL_MOTIONS],
+    )
+    about = About(
+        record=response.source or None,
+        rate_Hz=rate,
+        units={"input": input, "output": output},
+        parameter_units=_units(system, parameters, response.unit),
+        error_bound=error_bound(fit, response, dt),
+        standard_errors={
+            path: one.standard_error
+            for path, one in parameters.items()
+            if one.standard_error is not None and path != "gain.gain"
+        },
+    )
+    return ResponseModel(system, report, response, fit, about)
+
+
+def _system_of(fit: ModalFit, dt: float) -> System:
+    gain, delay = fit.static_gain, fit.delay.value
+    modes = Modes(
+        [one.value for one in fit.frequency],
+        [one.value for one in fit.damping],
+        dt,
+        [one.value / gain for one in fit.gain[1:]],
+        [] if fit.lag is None else [fit.lag.value],
+    )
+    parts: dict[str, System] = {"gain": Affine(gain), "dynamics": modes}
+    if delay > 0.0:
+        longest = max(1, math.ceil(delay / dt))
+        parts["delay"] = FractionalDelay(delay, dt, longest)
+    return series(**parts)
+
+
+def _parameters(fit: ModalFit) -> dict[str, FittedParameter]:
+    """Return the parameters of the System, by path, with their standard errors."""
+    gain = fit.static_gain
+    spread = math.sqrt(sum(one.error**2 for one in fit.gain))
+    found = {"gain.gain": (gain, spread)}
+    for i, (frequency, damping) in enumerate(
+        zip(fit.frequency, fit.damping, strict=True)
+    ):
+        found[f"dynamics.frequency.{i}"] = frequency
+        found[f"dynamics.damping.{i}"] = damping
+    for i, one in enumerate(fit.gain[1:]):
+        found[f"dynamics.share.{i}"] = one.value / gain, one.error / abs(gain)
+    if fit.lag is not None:
+        found["dynamics.time_constant.0"] = fit.lag
+    if fit.delay.value > 0.0:
+        found["delay.delay"] = fit.delay
+    return {
+        path: FittedParameter(value=value, standard_error=error)
+        for path, (value, error) in found.items()
+    }
+
+
+def _units(system: System, paths: Iterable[str], unit: str) -> dict[str, str]:
+    known = {path: declared(system, path) for path in paths}
+    units = {path: one.unit if one else "" for path, one in known.items()}
+    return units | {"gain.gain": unit}
+
+
+def _words(fit: ModalFit) -> str:
+    modes = [
+        f"{frequency.value:.5g} Hz with {100.0 * damping.value:.3g} % damping"
+        for frequency, damping in zip(fit.frequency, fit.damping, strict=True)
+    ]
+    several = "a resonance" if len(modes) == 1 else "resonances"
+    lag = "" if fit.lag is None else f", a lag of {1e3 * fit.lag.value:.3g} ms"
+    return (
+        f"{several} at {' and '.join(modes)}{lag}, a delay of "
+        f"{1e6 * fit.delay.value:.3g} us"
+    )

@@ -1,0 +1,191 @@
+"""Modes, lag and delay from noisy frequency responses of stages made in NumPy."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from oracles import modal_responses
+
+import piezojax as pj
+from piezojax.cli.identify import main
+from piezojax.core.serial import read_about
+from piezojax.dynamics import linearise
+from piezojax.identification.estimators.modal_fit import modal_fit, noise_deviation
+from piezojax.identification.records.response_file import (
+    FrequencyResponse,
+    read_response,
+)
+from piezojax.identification.response_model import identify_response
+
+LINES = np.linspace(10.0, 5000.0, 400)
+RATE = 20_000.0
+
+
+def measured(seed):
+    stage = modal_responses.stage(seed)
+    return stage, modal_responses.measured(stage, LINES, seed)
+
+
+@pytest.mark.parametrize("seed", [1000, 1001, 1002])
+def test_the_modes_of_a_stage_are_found(seed):
+    stage, values = measured(seed)
+    fit = modal_fit(FrequencyResponse(LINES, values), most=4)
+    assert len(fit.frequency) == len(stage.frequency)
+    for true, damping, gain in zip(
+        stage.frequency, stage.damping, stage.gain, strict=True
+    ):
+        i = int(np.argmin([abs(one.value - true) for one in fit.frequency]))
+        assert fit.frequency[i].value == pytest.approx(true, rel=2e-3)
+        assert fit.damping[i].value == pytest.approx(damping, rel=0.1)
+        assert fit.gain[i].value == pytest.approx(gain, rel=0.1)
+        assert abs(fit.frequency[i].value - true) < 4.0 * fit.frequency[i].error
+        assert abs(fit.damping[i].value - damping) < 4.0 * fit.damping[i].error
+    assert fit.delay.value == pytest.approx(stage.delay, abs=4.0 * fit.delay.error)
+    exact = modal_responses.response(stage, LINES)
+    assert np.median(np.abs(fit.fitted / exact - 1.0)) < 0.01
+
+
+def test_the_noise_is_seen_without_a_model():
+    stage, values = measured(1001)
+    exact = np.abs(modal_responses.response(stage, LINES))
+    expected = np.hypot(stage.noise[0] * exact, stage.noise[1])
+    ratio = noise_deviation(LINES, values) / expected
+    assert 0.8 < np.median(ratio) < 1.25
+
+
+def test_a_lag_is_told_from_a_mode():
+    stage = modal_responses.stage(1000)
+    s = 2j * np.pi * LINES
+    values = modal_responses.measured(stage, LINES, 3) / (1.0 + 2e-4 * s)
+    fit = modal_fit(FrequencyResponse(LINES, values), most=3)
+    assert fit.lag is not None
+    assert fit.lag.value == pytest.approx(2e-4, rel=0.02)
+    assert len(fit.frequency) == len(stage.frequency)
+
+
+def test_the_system_has_the_response_of_the_stage():
+    """Measured by an analyser; the loop holds its input for a sample."""
+    stage, values = measured(1001)
+    found = identify_response(FrequencyResponse(LINES, values), RATE, most=4)
+    assert isinstance(found.system.parts[1], pj.dynamics.Modes)
+    low = LINES[LINES < 1500.0]
+    model = linearise(found.system, 0.0, found.system.init(0.0), 1.0 / RATE)
+    z = np.exp(2j * np.pi * low / RATE)
+    A, B, C, D = (np.asarray(part) for part in (model.A, model.B, model.C, model.D))
+    ours = np.array(
+        [(C @ np.linalg.solve(x * np.eye(len(A)) - A, B) + D)[0, 0] for x in z]
+    )
+    # The output of a step is that at its end: one sample earlier than a measurement.
+    turn = np.pi * low / RATE
+    hold = np.sinc(turn / np.pi) * np.exp(-1j * turn)
+    exact = modal_responses.response(stage, low) * hold * z
+    np.testing.assert_allclose(ours, exact, rtol=0.05, atol=2e-3 * abs(exact[0]))
+
+
+def test_held_responses_lose_the_hold_and_not_their_delay():
+    stage, values = measured(1000)
+    turn = np.pi * LINES / RATE
+    hold = np.sinc(turn / np.pi) * np.exp(-1j * turn)
+    found = identify_response(
+        FrequencyResponse(LINES, values * hold), RATE, held=True, most=3
+    )
+    delay = found.report.parameters["delay.delay"]
+    assert delay.value == pytest.approx(stage.delay, abs=4.0 * delay.standard_error)
+
+
+def test_the_bound_holds_the_truth():
+    stage, values = measured(1002)
+    found = identify_response(FrequencyResponse(LINES, values), RATE, most=4)
+    exact = modal_responses.response(stage, LINES)
+    error = np.abs(exact / found.fit.fitted - 1.0)
+    bound = found.about.error_bound.at(LINES)
+    assert np.mean(error <= bound) > 0.97
+    assert found.about.error_bound.at(9000.0) == 25.0
+    assert not found.about.error_bound.excited_at(9000.0)
+
+
+HEADS = {
+    "frequency_Hz,magnitude_dB,phase_deg": lambda f, g: (
+        *(f, 20.0 * np.log10(np.abs(g))),
+        np.degrees(np.angle(g)),
+    ),
+    "freq (kHz),gain,phase (rad)": lambda f, g: (f / 1e3, np.abs(g), np.angle(g)),
+    "omega [rad/s],real,imag": lambda f, g: (2.0 * np.pi * f, g.real, g.imag),
+}
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_files_of_analysers(tmp_path, head):
+    _, values = measured(1000)
+    table = np.column_stack(HEADS[head](LINES, values))[::-1]
+    np.savetxt(tmp_path / "r.csv", table, "%.12g", ",", header=head, comments="")
+    found = read_response(tmp_path / "r.csv", unit="nm/V")
+    np.testing.assert_allclose(found.frequency, LINES, rtol=1e-9)
+    np.testing.assert_allclose(found.values, values, rtol=1e-9)
+    assert found.unit == "nm/V"
+
+
+@pytest.mark.parametrize(
+    ("head", "rows", "message"),
+    [
+        ("x,magnitude_dB,phase_deg", 20, "no column is a frequency; name one freq"),
+        ("frequency_Hz,a,b", 20, "name the columns of the response magnitude_dB or"),
+        ("frequency_Hz,gain,phase", 20, "unit of column 'phase' is not known; name it"),
+        ("frequency_Hz,gain,phase_deg", 5, "the response has 5 lines; at least 8"),
+    ],
+)
+def test_files_that_are_refused(tmp_path, head, rows, message):
+    table = np.column_stack([1.0 + np.arange(rows), np.ones(rows), np.zeros(rows)])
+    np.savetxt(tmp_path / "r.csv", table, "%g", ",", header=head, comments="")
+    with pytest.raises(ValueError, match=message):
+        read_response(tmp_path / "r.csv")
+
+
+@pytest.mark.parametrize(
+    ("frequency", "values", "message"),
+    [
+        (np.arange(9.0), np.ones(9), "must be above 0 and increase from line to line"),
+        (np.ones(9), np.ones(9), "must be above 0 and increase"),
+        (1.0 + np.arange(9), np.ones(8), r"shape \(9,\), the response \(8,\)"),
+        (1.0 + np.arange(9), np.full(9, np.nan), "line 0 is not a finite number"),
+    ],
+)
+def test_responses_that_are_refused(frequency, values, message):
+    with pytest.raises(ValueError, match=message):
+        FrequencyResponse(frequency, values)
+
+
+def test_a_rate_too_low_for_a_mode_is_refused():
+    _, values = measured(1000)
+    response = FrequencyResponse(LINES, values)
+    highest = max(modal_responses.stage(1000).frequency)
+    with pytest.raises(ValueError, match=r"cannot be simulated at .* higher rate"):
+        identify_response(response, 2.1 * highest, most=3)
+    with pytest.raises(ValueError, match="rate is 0 Hz; it must be above 0"):
+        identify_response(response, 0.0)
+
+
+def test_the_command_writes_a_model_that_a_study_reads(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    stage, values = measured(1000)
+    table = np.column_stack([LINES, np.abs(values), np.degrees(np.angle(values))])
+    head = "frequency_Hz,magnitude,phase_deg"
+    np.savetxt("bench.csv", table, "%.9g", ",", header=head, comments="")
+    line = "bench.csv --response --rate 20000 --out found"
+    done = CliRunner().invoke(main, line.split())
+    assert done.exit_code == 0, done.output
+    assert "note: a frequency response shows small motions" in done.output
+    report = json.loads((tmp_path / "found" / "response.json").read_text())
+    first = report["parameters"]["dynamics.frequency.0"]
+    assert min(abs(stage.frequency / first["value"] - 1.0)) < 2e-3
+    assert (tmp_path / "found" / "response.png").stat().st_size > 10_000
+    about = read_about(tmp_path / "found" / "model.json")
+    assert about.units == {"input": "V", "output": "um"}
+    plant = pj.load(tmp_path / "found" / "model.json")
+    _, output = pj.simulate(plant, jnp.ones(20_000), plant.init(0.0))
+    assert float(output[-1]) == pytest.approx(sum(stage.gain), rel=0.02)
+    refused = CliRunner().invoke(main, ["bench.csv", "--response"])
+    assert refused.exit_code == 1
+    assert "--response takes one RECORD, and a --rate" in refused.output
