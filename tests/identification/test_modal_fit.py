@@ -19,7 +19,7 @@ from piezojax.identification.records.response_file import (
 )
 from piezojax.identification.response_model import identify_response
 
-LINES = np.linspace(10.0, 5000.0, 400)
+LINES = np.linspace(20.0, 5000.0, 250)
 RATE = 20_000.0
 
 

@@ -140,7 +140,8 @@ def modal_fit(
     best = _Found(_Shape(0, False, True), np.zeros(1), np.inf)
     for _ in range(most):
         best = _with_another_mode(best, data)
-        tried = [best] if best.shape.lag else [best, _with_lag(best, data)]
+        change = _without_lag if best.shape.lag else _with_lag
+        tried = [best, change(best, data)]
         found += tried
         best = min(tried, key=lambda one: _criterion(one, found, data))
         chosen = min(found, key=lambda one: _criterion(one, found, data))
@@ -352,7 +353,7 @@ def _rational(shape: _Shape, data: _Data) -> list[tuple[float, np.ndarray]]:
     x = 1j * data.omega / middle
     order = 2 * shape.modes
     powers = x[:, None] ** np.arange(order + 1)
-    found = []
+    found, solution = [], np.zeros(2 * order - 1)
     for late in np.arange(0.0, DELAYS, 0.5):
         turn = np.exp(1j * data.omega * late / data.omega[-1])
         values = data.values / data.hold * turn
@@ -367,7 +368,8 @@ def _rational(shape: _Shape, data: _Data) -> list[tuple[float, np.ndarray]]:
             rows, right = (np.r_[part.real, part.imag] for part in (rows / size, right))
             solution = np.linalg.lstsq(rows, right, rcond=None)[0] / size
             below = 1.0 + powers[:, 1:] @ solution[order - 1 :]
-        poles = np.roots(np.r_[solution[: order - 2 : -1], 1.0]) * middle
+        coefficients = np.r_[solution[: order - 2 : -1], 1.0]
+        poles = np.asarray(np.roots(coefficients), complex) * middle
         point = _point_of(poles, late, shape, data)
         if point is not None:
             gains, cost = _gains(point, shape, data)
@@ -380,11 +382,11 @@ def _point_of(
     poles: np.ndarray, late: float, shape: _Shape, data: _Data
 ) -> np.ndarray | None:
     """Return the point of the modes with these poles (rad/s), None if it has fewer."""
-    pairs = poles[poles.imag > 0.0]
-    real = np.sort(np.abs(poles[poles.imag == 0.0].real))
+    pairs = poles[np.imag(poles) > 0.0]
+    real = np.sort(np.abs(np.real(poles[np.imag(poles) == 0.0])))
     w = np.r_[np.abs(pairs), np.sqrt(real[0::2][: real.size // 2] * real[1::2])]
     zeta = np.r_[
-        np.abs(pairs.real) / np.abs(pairs), np.full(real.size // 2, MOST_DAMPING)
+        np.abs(np.real(pairs)) / np.abs(pairs), np.full(real.size // 2, MOST_DAMPING)
     ]
     if w.size != shape.modes or not np.all(np.isfinite(w)) or np.any(w <= 0.0):
         return None
@@ -442,6 +444,14 @@ def _with_lag(found: _Found, data: _Data) -> _Found:
         for corner in np.geomspace(data.omega[0] * 3.0, data.omega[-1], 3)
     ]
     return min(tried, key=_cost)
+
+
+def _without_lag(found: _Found, data: _Data) -> _Found:
+    """Return the fit with a longer delay in place of the lag."""
+    n = 3 * found.shape.modes
+    point = np.delete(found.point, n)
+    point[n:] += math.exp(found.point[n]) * data.omega[-1]
+    return _refined(point, found.shape._replace(lag=False), data)
 
 
 def _without_delay(found: _Found, data: _Data) -> _Found:
