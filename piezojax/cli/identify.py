@@ -165,6 +165,16 @@ def main(
             return
         if not records:
             raise ValueError("give a RECORD to fit a model to")
+        for given, needed in (
+            (gains, controller),
+            (held or unit != "um/V", response),
+            (response and controller, None),
+        ):
+            if given and not needed:
+                raise ValueError(
+                    "--gain needs --controller, --held and --unit need --response, and "
+                    "--response and --controller exclude each other"
+                )
         if response:
             fit_response(console)
             return

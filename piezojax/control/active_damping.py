@@ -9,7 +9,7 @@ from ..core.system import System
 
 
 class ActiveDampingState(NamedTuple):
-    """States of the controller and the filter, and the last part for damping."""
+    """States of the controller and the filter, and the last part for damping, [u]."""
 
     controller: State
     filter: State
@@ -24,14 +24,14 @@ class ActiveDamping(System):
     - positive position feedback: ``SecondOrderLowPass`` near the resonance and a gain
       above 0 (Fanson and Caughey, AIAA J. 28, 1990);
     - integral resonant control: ``LowPass`` of order 1 and a gain above 0, its form
-      without the feedthrough (Fleming, Aphale and Moheimani, IEEE Trans. Control Syst.
-      Technol. 18, 2010);
+      without the feedthrough (Fleming, Aphale and Moheimani, IEEE Trans. Nanotechnol.
+      9, 2010);
     - resonant shift: ``Affine`` 1 and a gain below 0, which stiffens the stage.
 
-    With a gain above 0, gain times static gain of the stage must be below 1. The
-    controller sees as applied its own part of the voltage, so that its anti-windup
-    responds to the limits. Input an Observation, output in the unit of the controller's
-    command.
+    With a gain above 0, the product of gain and static gain of the stage must be below
+    1 for stability. The controller receives the applied voltage less the part for
+    damping, so that its anti-windup responds to the limits. Input an Observation,
+    output in the unit of the controller's command.
     """
 
     controller: System

@@ -1,5 +1,7 @@
 """Search box of tuning and identification: paths, bounds and scales of parameters."""
 
+import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
@@ -56,6 +58,15 @@ class Range:
         lower, upper = declared.typical
         upper = min(upper, 0.99 * declared.below)
         return cls(lower, upper, declared.scale, unit=declared.unit, step=declared.step)
+
+    def inside(self) -> "Range":
+        """Return the Range with its bounds moved inside, to multiples of the step."""
+        if self.step is None:
+            return self
+        slack = 1e-9  # a bound on the grid stays, whatever its rounding error
+        lower = self.step * math.ceil(self.lower / self.step - slack)
+        upper = self.step * math.floor(self.upper / self.step + slack)
+        return dataclasses.replace(self, lower=lower, upper=upper)
 
     def check(self, name: str) -> None:
         """Raise ValueError unless the bounds are in order and suit the scale."""
@@ -137,11 +148,12 @@ class Space(eqx.Module):
         """
         low, high = self._map(self.lower, 0), self._map(self.upper, 0)
         values = self._map(low + unit * (high - low), 1)
-        if any(self.steps):
-            pairs = zip(values, self.steps, strict=True)
-            values = jnp.stack([rounded(value, step) for value, step in pairs])
         # exp(log(x)) may differ from x by a rounding error.
-        return jnp.clip(values, self.lower, self.upper)
+        values = jnp.clip(values, self.lower, self.upper)
+        if not any(self.steps):
+            return values
+        pairs = zip(values, self.steps, strict=True)
+        return jnp.stack([rounded(value, step) for value, step in pairs])
 
     def put(self, system: S, unit: Float[Array, " n"]) -> S:
         """Return ``system`` with its tuned parameters at ``unit``."""
@@ -155,9 +167,11 @@ class Space(eqx.Module):
 def space_of(ranges: Mapping[str, Range]) -> Space:
     """Return the Space with the given Ranges by path.
 
-    Raises ValueError, naming the path, for bounds that are not in order or do not suit
-    their scale.
+    Bounds of a parameter with a step are moved inside, to multiples of it. Raises
+    ValueError, naming the path, for bounds that are not in order or do not suit their
+    scale.
     """
+    ranges = {path: bounds.inside() for path, bounds in ranges.items()}
     for path, bounds in ranges.items():
         bounds.check(path)
     return Space(

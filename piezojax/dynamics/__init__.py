@@ -12,8 +12,8 @@ from .creep import SpringDamperCreep as SpringDamperCreep
 from .delay import FractionalDelay as FractionalDelay
 from .drift import ThermalDrift as ThermalDrift
 from .filters import Biquad as Biquad
+from .filters import FirstOrderLeadLag as FirstOrderLeadLag
 from .filters import HighPass as HighPass
-from .filters import LeadLag as LeadLag
 from .filters import LowPass as LowPass
 from .filters import Notch as Notch
 from .filters import SecondOrderLowPass as SecondOrderLowPass

@@ -4,7 +4,7 @@ Each is a section of first or second order, or a chain of them. A section is a
 continuous filter, discretised by the method of its name:
 
 - ``bilinear``: the bilinear transform, prewarped so that its frequencies are exact;
-- ``hold``: exact for an input that is held between samples (zero-order hold);
+- ``hold``: zero-order hold, exact for a section whose input is held between samples;
 - ``matched``: poles and zeros are those of the continuous section, z = exp(s dt); zeros
   at infinity go to z = -1, and the gain is right at 0 Hz, or at the Nyquist frequency
   for a high-pass (Franklin, Powell and Workman, Digital Control of Dynamic Systems,
@@ -69,9 +69,9 @@ class _Filter(Designed):
 class LowPass(_Filter):
     """Low-pass of order 1 to 8 with unit DC gain and -3 dB at ``frequency``.
 
-    Its ``kind`` is "butterworth" or "equal poles", which are all real. Input and output
-    have the same unit. Raises ValueError for parameters outside their limits and for an
-    unknown name.
+    The latter is exact for the bilinear transform. Its ``kind`` is "butterworth" or
+    "equal poles", which are all real. Input and output have the same unit. Raises
+    ValueError for parameters outside their limits and for an unknown name.
     """
 
     frequency: Scalar = _frequency("cut-off frequency")
@@ -89,7 +89,7 @@ class LowPass(_Filter):
 class HighPass(_Filter):
     """High-pass of order 1 to 8 with -3 dB at ``frequency`` and a gain of 0 at 0 Hz.
 
-    The gain is 1 far above ``frequency``. The rest is that of LowPass.
+    The gain is 1 far above ``frequency``. Kinds, units and errors are those of LowPass.
     """
 
     frequency: Scalar = _frequency("cut-off frequency")
@@ -124,7 +124,7 @@ class SecondOrderLowPass(_Filter):
         return _second_order(self.discretisation, place, self.damping, (1.0, 0.0, 0.0))
 
 
-class LeadLag(_Filter):
+class FirstOrderLeadLag(_Filter):
     """``(s/v + 1) / (s/w + 1)`` with v = 2 pi zero_frequency, w = 2 pi frequency.
 
     A lead if the zero lies below the pole; the gain far above both is w/v, at 0 Hz 1.

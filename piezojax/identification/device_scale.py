@@ -11,10 +11,13 @@ from ..core.conversion import factor
 from .records.record import Record
 
 LAGS = 6
-"""Numbers of samples tried by which the voltage may lag the error in the record."""
+"""Number of delays tried, from 0 samples on, of the voltage against the error."""
 
 CLEAR = 9.0
-"""Least difference of chi^2 at which an option is told from another."""
+"""Least difference of chi^2 that tells one value of an option from another."""
+
+UNEXPLAINED = 0.05
+"""Largest share of the voltage that the gains may leave unexplained."""
 
 LIMITS: dict[str, Any] = {"avmin": -1e6, "avmax": 1e6, "posmin": 0.0, "posmax": 1.0}
 
@@ -24,6 +27,8 @@ def _nv200(option: str, **typed: Any) -> Device:
 
 
 def _e727(option: str, **typed: Any) -> Device:
+    if "proportional" not in typed:
+        raise ValueError("give proportional: every gain of the e727 depends on it")
     given: dict[str, Any] = {"integral_time": 0.0} | typed
     return E727(**given, structure=option, scale=1.0, lower=-1e6, upper=1e6)
 
@@ -68,10 +73,10 @@ class Measured(BaseModel):
 class DeviceScale(BaseModel):
     """Gains of a device as they act, and the scale of the numbers typed in.
 
-    ``proportional``, ``integral`` and ``derivative`` are the gains of the PID, with
-    the integral that the device's ``option`` computes. ``scale`` is V per um for a
-    gain of 1. ``lag`` is the number of samples by which the voltage lags the error,
-    ``residual_V`` the rms of the voltage that the gains leave.
+    ``proportional``, ``integral`` and ``derivative`` are the effective gains of a PID
+    that integrates as the ``option`` says. ``scale`` is V per um for a gain of 1.
+    ``lag`` is the number of samples by which the voltage lags the error, ``residual_V``
+    the rms voltage that the effective gains leave unexplained.
     """
 
     device: str
@@ -103,10 +108,11 @@ def device_scale(
     limits. ``typed`` are the gains at the time, by their names. The voltage is
     P e + I sum + D (e - e1)/dt plus a constant: no model of the stage is needed.
 
-    Where several values of the device's option explain the record, the first is taken
-    and a note says what to record. Raises ValueError for an unknown device or gain, a
-    wrong unit or rate, more than one channel, gains that are all 0, a record that does
-    not determine them, or one that they do not explain.
+    The value of the device's option that fits best is returned; a note names others
+    that fit as well, and what to record. Raises ValueError for an unknown or missing
+    gain, an unknown device, a wrong unit or rate, more than one channel, gains that are
+    all 0, a record that does not determine them or has the wrong sign, and for a record
+    that the typed gains do not explain.
     """
     if device not in DEVICES:
         raise ValueError(
@@ -133,22 +139,36 @@ def device_scale(
     lag = int(np.argmin([fit.residual for fit in fits]))
     fit = fits[lag]
     swing = float(np.std(voltage))
-    if fit.residual > 0.05 * swing:
+    if fit.residual > UNEXPLAINED * swing:
         raise ValueError(
             f"a PID of the error leaves {fit.residual:.3g} V of {swing:.3g} V rms: "
             "switch notch, low-passes and feedforward off, stay within the limits, and "
             "record error and voltage in one run"
         )
-    weight = np.linalg.pinv(fit.covariance)
+    size = np.sqrt(np.diag(fit.covariance))
+    weight = np.linalg.inv(fit.covariance / np.outer(size, size)) / np.outer(size, size)
     found = {o: _scaled(fit.gains, weight, v) for o, v in expected.items()}
     best = min(found, key=lambda option: found[option][2])
     scale, deviation, least = found[best]
+    if scale <= 0.0:
+        raise ValueError(
+            "the voltage falls where the error rises: the error must be the setpoint "
+            "less the position"
+        )
+    left = _columns(error, dt, lag)[:, :3] @ (scale * expected[best])
+    unexplained = float(np.std(voltage[1 + lag :] - left))
+    if unexplained > UNEXPLAINED * swing:
+        raise ValueError(
+            f"the gains {', '.join(f'{n} {v:g}' for n, v in typed.items())} leave "
+            f"{unexplained:.3g} V of {swing:.3g} V rms: give every gain as it was when "
+            "the record was made"
+        )
     alike = [o for o in known.values if o != best and found[o][2] - least < CLEAR]
     notes = []
     if alike:
         notes.append(
             f"{known.option} may as well be {' or '.join(alike)}: to tell, record with "
-            "gains P, I and D above 0 together"
+            "gains P, I and D above 0 together, P other than 1"
         )
     trapezoid = best == "trapezoidal"
     shift = np.array([[1.0, 0.5 * dt * trapezoid, 0.0], [0, 1, 0], [0, 0, 1]])
@@ -201,11 +221,7 @@ def _expected(device: Any) -> np.ndarray:
 
 def _fit(error: np.ndarray, voltage: np.ndarray, dt: float, lag: int) -> _Fit:
     """Fit the gains of a rectangular PID to a voltage that lags by ``lag``."""
-    now, before = error[1 : error.size - lag], error[: error.size - lag - 1]
-    wanted = voltage[1 + lag :]
-    columns = np.column_stack(
-        [now, dt * np.cumsum(now), (now - before) / dt, np.ones_like(now)]
-    )
+    columns, wanted = _columns(error, dt, lag), voltage[1 + lag :]
     size = np.linalg.norm(columns, axis=0)
     if not np.all(size > 0.0) or np.linalg.cond(columns / size) > 1e9:
         raise ValueError(
@@ -221,6 +237,14 @@ def _fit(error: np.ndarray, voltage: np.ndarray, dt: float, lag: int) -> _Fit:
     variance = max(variance, (1e-9 * float(np.std(wanted))) ** 2)
     covariance = variance * scatter / np.outer(size, size)
     return _Fit((solution / size)[:3], covariance[:3, :3], float(np.sqrt(variance)))
+
+
+def _columns(error: np.ndarray, dt: float, lag: int) -> np.ndarray:
+    """Return error, its integral and its derivative, and 1 [samples, 4]."""
+    now, before = error[1 : error.size - lag], error[: error.size - lag - 1]
+    return np.column_stack(
+        [now, dt * np.cumsum(now), (now - before) / dt, np.ones_like(now)]
+    )
 
 
 def _scaled(

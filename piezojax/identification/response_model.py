@@ -8,7 +8,7 @@ from pydantic import BaseModel
 
 from ..core.about import About
 from ..core.paths import declared
-from ..core.system import Affine, System, series
+from ..core.system import Affine, Delay, System, series
 from ..dynamics import FractionalDelay, Modes
 from .estimators.estimate import FittedParameter
 from .estimators.modal_fit import MOST_MODES, ModalFit, error_bound, modal_fit
@@ -18,6 +18,9 @@ SMALL_MOTIONS = (
     "a frequency response shows small motions: hysteresis and creep are not in the "
     "model; identify them from a slow record of the whole range"
 )
+LONGEST = 32
+"""Longest delay, in samples, that is interpolated; the rest of a delay is whole."""
+
 FOLDED = 0.9
 """Share of half the rate above which a measured mode cannot be simulated."""
 
@@ -26,7 +29,8 @@ class ResponseReport(BaseModel):
     """Report of a model from a frequency response, the content of ``response.json``.
 
     ``error`` is the median of the relative error of the model at the measured lines,
-    ``noise`` that of the standard deviation of the noise.
+    ``noise`` that of the noise, as a standard deviation. The standard errors of the
+    gain and of the shares neglect the correlation of the gains of the modes.
     """
 
     source: str
@@ -79,9 +83,9 @@ def identify_response(
             "higher rate, or leave out the lines above it"
         )
     system = _system_of(fit, dt)
-    output, _, input = response.unit.partition("/")
+    output, _, input = (part.strip() for part in response.unit.partition("/"))
     relative = abs(response.values / fit.fitted - 1.0)
-    noise = fit.deviation / abs(fit.fitted)
+    noise = math.sqrt(2.0) * fit.deviation / abs(fit.fitted)
     parameters = _parameters(fit)
     report = ResponseReport(
         source=response.source,
@@ -119,8 +123,11 @@ def _system_of(fit: ModalFit, dt: float) -> System:
     )
     parts: dict[str, System] = {"gain": Affine(gain), "dynamics": modes}
     if delay > 0.0:
-        longest = max(1, math.ceil(delay / dt))
-        parts["delay"] = FractionalDelay(delay, dt, longest)
+        whole = max(0, math.floor(delay / dt) - LONGEST)
+        if whole:
+            parts["whole_delay"] = Delay(whole)
+        rest = delay - whole * dt
+        parts["delay"] = FractionalDelay(rest, dt, max(1, math.ceil(rest / dt)))
     return series(**parts)
 
 

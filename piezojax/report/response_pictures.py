@@ -43,7 +43,7 @@ def modal_figure(found: ResponseModel) -> Figure:
         phase.semilogx(hertz, np.degrees(np.unwrap(np.angle(values))), **style)
     phase.set(ylabel="phase (°)")
     error = np.abs(response.values - fit.fitted)
-    left.loglog(hertz, error, label="measured less model", **dots)
+    left.loglog(hertz, error, label="|measured - model|", **dots)
     left.loglog(
         hertz,
         CONFIDENCE * fit.deviation,

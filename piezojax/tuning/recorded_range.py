@@ -1,4 +1,4 @@
-"""Alarms of a study that leaves the inputs of the record its plant was fitted to."""
+"""Alarms of a study whose voltages are not those of the record of its plant."""
 
 from collections.abc import Iterator
 
@@ -8,17 +8,18 @@ from ..study import Case
 from .data import Data, holding_inputs, own_stage
 
 COVERED = 0.25
-"""Least share of the range of the actuator that a record should cover."""
+"""Least ratio of the ranges of record and actuator, in either sense."""
 
 SLACK = 0.1
-"""Share of the recorded range by which the references may leave it: the input that
-holds a displacement depends on the history of the stage by this order."""
+"""Share of the recorded range by which the references may leave it: hysteresis changes
+the input that holds a displacement by as much."""
 
 
 def recorded_range_alarms(case: Case, data: Data) -> Iterator[str]:
-    """Yield an alarm for each axis whose model is used far outside of its record.
+    """Yield alarms for references outside the record, and for ranges far apart.
 
-    Each names the ranges and the next step. Only a fitted plant has a recorded range.
+    The range of the record and that of the actuator are far apart if their ratio is
+    beyond COVERED. Only a fitted plant has a recorded range.
     """
     study, ranges = case.study, case.plant_about.input_ranges
     if len(ranges) != study.axis_count:
@@ -35,15 +36,16 @@ def recorded_range_alarms(case: Case, data: Data) -> Iterator[str]:
         if least < low - slack or most > high + slack:
             yield (
                 f"the references{of_axis} need {least:.4g} to {most:.4g} V, but the "
-                f"record of the plant ends at {low:.4g} and {high:.4g} V: beyond it "
-                "the model is a guess; record the whole range, or reduce "
+                f"record of the plant covers {low:.4g} to {high:.4g} V: outside it "
+                "the model extrapolates; record the whole range, or reduce "
                 "references.amplitude"
             )
-        if high - low < COVERED * (upper - lower):
+        ratio = (high - low) / (upper - lower)
+        if not COVERED < ratio < 1.0 / COVERED:
             yield (
-                f"the record of the plant{of_axis} goes from {low:.4g} to {high:.4g} V "
-                f"only, the actuator from {lower:g} to {upper:g} V: if the record has "
-                "the voltage before an amplifier, multiply it by the gain; if not, "
-                "record a larger range, or set actuator.lower and actuator.upper to "
-                "what was recorded"
+                f"the record of the plant{of_axis} covers {low:.4g} to {high:.4g} V, "
+                f"the actuator {lower:g} to {upper:g} V: if one of them is the voltage "
+                "before an amplifier, multiply it by the gain; if not, record the "
+                "range that is used, or set actuator.lower and actuator.upper to what "
+                "was recorded"
             )

@@ -243,8 +243,9 @@ class Result(BaseModel):
     sliding: SlidingShare | None = None
     units: dict[str, str] = {}
     gain_units: dict[str, str] = {}
-    gain_steps: dict[str, float] = {}
     """Declared units of ``gains``; "" without a declaration."""
+    gain_steps: dict[str, float] = {}
+    """Steps of the gains that are typed into a device."""
     warnings: list[str]
     alarms: list[str] = []
     """Reasons not to use the gains; with any, ``load`` refuses their file."""

@@ -179,6 +179,18 @@ def test_an_nv200_computes_with_three_decimals_and_whole_frequencies():
     assert float(typed.kp) == 0.0204
 
 
+def test_rounding_keeps_the_notch_within_its_limit():
+    notch = nv200(notchf=100.4, notchb=200.8, notchon=1).typed()
+    assert (float(notch.notchf), float(notch.notchb)) == (100.0, 200.0)
+
+
+def test_a_servo_at_a_low_rate_checks_what_is_on():
+    limits = {"lower": 0.0, "upper": 100.0, "dt": 1e-3}
+    assert float(Servo(1.0, 100.0, **limits).notch_frequency_1) == 1000.0
+    with pytest.raises(ValueError, match=r"notch_frequency_1 is 1000; .* below 500"):
+        Servo(1.0, 100.0, notch_depth_1=0.5, **limits)
+
+
 def test_the_gradient_ignores_the_rounding():
     signals = REST + np.arange(50.0), np.full(50, REST)
 

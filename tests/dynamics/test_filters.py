@@ -12,8 +12,8 @@ import scipy.signal
 from piezojax import simulate
 from piezojax.dynamics import (
     Biquad,
+    FirstOrderLeadLag,
     HighPass,
-    LeadLag,
     LowPass,
     Notch,
     SecondOrderLowPass,
@@ -26,20 +26,20 @@ SHARES = (1e-6, 1e-3, 0.2, 0.5, 0.9, 0.999)
 """Frequencies as shares of Nyquist's."""
 
 
-def filters(frequency, method="bilinear"):
+def filters(frequency, method="bilinear", orders=(1, 2, 3, 4)):
     named = {"discretisation": method}
     found: dict[str, Any] = {
         "second order": SecondOrderLowPass(frequency, 0.4, DT, **named),
         "overdamped": SecondOrderLowPass(frequency, 1.7, DT, **named),
         "critical": SecondOrderLowPass(frequency, 1.0, DT, **named),
-        "lead": LeadLag(0.4 * frequency, frequency, DT, **named),
-        "lag": LeadLag(frequency, 0.6 * frequency, DT, **named),
+        "lead": FirstOrderLeadLag(0.4 * frequency, frequency, DT, **named),
+        "lag": FirstOrderLeadLag(frequency, 0.6 * frequency, DT, **named),
         "biquad": Biquad(0.7 * frequency, 0.02, frequency, 0.6, DT, **named),
         "real zeros": Biquad(0.7 * frequency, 1.4, frequency, 0.6, DT, **named),
         "notch": Notch(frequency, 0.3, 0.05, DT, **named),
         "full notch": Notch(frequency, 0.3, 0.0, DT, **named),
     }
-    for kind, order in itertools.product(KINDS, (1, 2, 3, 4)):
+    for kind, order in itertools.product(KINDS, orders):
         found[f"low-pass, {kind}, {order}"] = LowPass(
             frequency, DT, order, kind, **named
         )
@@ -211,10 +211,10 @@ def test_rest_stays_exactly_at_rest(method):
 @pytest.mark.parametrize("method", METHODS)
 def test_slopes_are_those_of_differences_and_finite_up_to_nyquist(method):
     shares = np.array([*SHARES, 1.0 - 1e-6, 1.0 - 1e-9])
-    inputs = jnp.asarray(np.random.default_rng(5).normal(size=60))
+    inputs = jnp.asarray(np.random.default_rng(5).normal(size=40))
 
     def last(share):
-        systems = filters(share * NYQUIST, method)
+        systems = filters(share * NYQUIST, method, orders=(3,))
         return {n: response(one, inputs, 0.0)[-1] for n, one in systems.items()}
 
     values = jax.jit(jax.vmap(last))
@@ -259,10 +259,10 @@ def test_the_damping_has_a_slope_through_critical_damping():
             "kind is 'bessel'; it must be one of b",
         ),
         (
-            lambda: LeadLag(1e3, 2e3, DT, "tustin"),
+            lambda: FirstOrderLeadLag(1e3, 2e3, DT, "tustin"),
             "discretisation is 'tustin'; it must be one of bilinear, hold, matched",
         ),
-        (lambda: LeadLag(1e4, 2e3, DT), "zero_frequency in Hz is 10000"),
+        (lambda: FirstOrderLeadLag(1e4, 2e3, DT), "zero_frequency in Hz is 10000"),
         (lambda: SecondOrderLowPass(1e3, 0.0, DT), "damping is 0"),
         (lambda: Biquad(2e4, 0.1, 1e3, 0.1, DT), "zero_frequency in Hz is 20000"),
         (lambda: Biquad(1e3, -0.1, 1e3, 0.1, DT), "zero_damping is -0.1"),

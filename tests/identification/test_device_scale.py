@@ -124,6 +124,14 @@ RECORD = recorded(nv200(), 3)
         ("nv400", RECORD, NV, "device is 'nv400'; it must be one of nv200, e727"),
         ("nv200", RECORD, {"P": 1.0}, "gains P: nv200 has the gains kp, ki, kd"),
         ("nv200", RECORD, {"kp": 0.0}, "all gains are 0: record with at least one"),
+        ("nv200", RECORD, {"ki": 300.0, "kp": 0.06}, "the gains ki 300, kp 0.06 leave"),
+        ("e727", RECORD, {"integral_time": 0.01}, "give proportional: every gain of"),
+        (
+            "nv200",
+            Record(-RECORD.inputs, RECORD.outputs, DT, "um", "V"),
+            NV,
+            "the error must be the setpoint less the position",
+        ),
         (
             "nv200",
             Record(RECORD.inputs, RECORD.outputs, 1e-4, "um", "V"),

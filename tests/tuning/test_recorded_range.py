@@ -73,8 +73,8 @@ def test_references_beyond_the_record_raise_one(low, high, raised):
     assert len(found) == raised
     for alarm in found:
         assert alarm == (
-            f"the references need -20 to 30 V, but the record of the plant ends at "
-            f"{low:.4g} and {high:.4g} V: beyond it the model is a guess; record the "
+            f"the references need -20 to 30 V, but the record of the plant covers "
+            f"{low:.4g} to {high:.4g} V: outside it the model extrapolates; record the "
             "whole range, or reduce references.amplitude"
         )
 
@@ -85,13 +85,20 @@ def test_a_record_of_a_small_part_of_the_range_raises_one():
     width = COVERED * 140.0
     assert alarms((0.0, 1.01 * width), **small) == []
     assert alarms((0.0, 0.99 * width), **small) == [
-        "the record of the plant goes from 0 to 34.65 V only, the actuator from -20 to "
-        "120 V: if the record has the voltage before an amplifier, multiply it by "
-        "the gain; if not, record a larger range, or set actuator.lower and "
-        "actuator.upper to what was recorded"
+        "the record of the plant covers 0 to 34.65 V, the actuator -20 to 120 V: if "
+        "one of them is the voltage before an amplifier, multiply it by the gain; if "
+        "not, record the range that is used, or set actuator.lower and actuator.upper "
+        "to what was recorded"
     ]
     limits = {"actuator": {"lower": 0.0, "upper": 0.99 * width}}
     assert alarms((0.0, 0.99 * width), **small, **limits) == []
+
+
+def test_a_record_far_beyond_the_actuator_raises_one():
+    """As one does whose input was recorded behind the amplifier."""
+    (alarm,) = alarms((-200.0, 1201.0))
+    assert alarm.startswith("the record of the plant covers -200 to 1201 V, the actuat")
+    assert alarms((-20.0, 500.0)) == []
 
 
 def test_each_axis_has_its_own():

@@ -69,7 +69,8 @@ class E727(Device):
     multiplies all terms, or "parallel"; ``anti_windup`` "none" or "hold". A notch is
     ``(s^2 + 2 r k w s + w^2) / (s^2 + 2 k w s + w^2)`` with rejection r and bandwidth
     k; with k = 1 the two laws that the manual allows agree. ``notch_method``
-    (0x08000600) is 0, bilinear, or 1, zero-order hold.
+    (0x08000600) is 0, bilinear, or 1, zero-order hold; method 2 of the device is not
+    modelled.
 
     Input an Observation, output in V. Raises ValueError for a value out of range.
     """
@@ -84,8 +85,8 @@ class E727(Device):
         "s", "D", least=0.0, scale="log", typical=(1e-7, 1e-2), default=0.0
     )
     scale: Scalar = parameter("V/um", "command for P = 1 and 1 um", kw_only=True)
-    lower: Scalar = parameter("V", "least voltage", kw_only=True)
-    upper: Scalar = parameter("V", "greatest voltage", kw_only=True)
+    lower: Scalar = parameter("V", "minimum voltage", kw_only=True)
+    upper: Scalar = parameter("V", "maximum voltage", kw_only=True)
     notch_frequency_1: Scalar = _frequency("frequency of notch 1")
     notch_rejection_1: Scalar = _rejection(1)
     notch_bandwidth_1: Scalar = _bandwidth(1)

@@ -1,8 +1,9 @@
-"""Servo of a digital controller without a name: PID, notches, low-pass, slew limit."""
+"""Generic digital servo: PID, notches, low-pass, slew-rate limit and saturation."""
 
 import equinox as eqx
+import jax.numpy as jnp
 
-from ...core.arrays import Scalar, check_order
+from ...core.arrays import Scalar, check, check_order
 from ...core.parameter import parameter, sample_time
 from ...dynamics.filters import LowPass, Notch
 from .servo_loop import (
@@ -22,7 +23,6 @@ def _frequency(meaning: str):
         "Hz",
         meaning,
         above=0.0,
-        below_nyquist=True,
         scale="log",
         typical=(10.0, 1e5),
         default=1e3,
@@ -52,26 +52,30 @@ def _depth(number: int):
 
 
 class Servo(Device):
-    """Feedforward, PID, two notches, a low-pass, a slew limit and limits.
+    """Feedforward, PID, two notches, a low-pass, slew-rate limit and saturation.
 
     With the ``form`` "parallel" the PID is P e + I int e dt + D de/dt, with
     ``integral`` in V/(um s) and ``derivative`` in V s/um. With "standard" it is
-    P (e + int e dt / Ti + Td de/dt), with the times Ti and Td, in s, in their places;
-    an integral of 0 is off in both. ``feedforward`` multiplies the setpoint behind its
-    slew limit. ``low_pass_order`` is 0 for no low-pass, 1 or 2. ``anti_windup`` is
-    "none" or "hold". Input an Observation, output in V. Raises ValueError for a value
-    out of range.
+    P (e + int e dt / Ti + Td de/dt), with the times Ti and Td, in s, in their places:
+    give a study the bounds of ``integral`` then. An integral of 0 is off in both.
+    ``feedforward`` multiplies the setpoint behind its slew limit. ``low_pass_order`` is
+    0 for no low-pass, 1 or 2. ``anti_windup`` is "none" or "hold". Input an
+    Observation, output in V. Raises ValueError for a value out of range.
     """
 
     proportional: Scalar = parameter(
         "V/um", "proportional gain P", scale="log", typical=(1e-3, 1e2)
     )
     integral: Scalar = parameter(
-        "V/(um s)", "integral gain I, or Ti in s", scale="log", typical=(1e-1, 1e5)
+        "V/(um s)",
+        "integral gain I; in the form standard the time Ti, in s",
+        least=0.0,
+        scale="log",
+        typical=(1e-1, 1e5),
     )
     derivative: Scalar = parameter(
         "V s/um",
-        "derivative gain D, or Td in s",
+        "derivative gain D; in the form standard the time Td, in s",
         scale="log",
         typical=(1e-8, 1e-1),
         default=0.0,
@@ -87,8 +91,8 @@ class Servo(Device):
     slew_rate: Scalar = parameter(
         "um/s", "slew rate of the setpoint", above=0.0, scale="log", default=1e9
     )
-    lower: Scalar = parameter("V", "least voltage", kw_only=True)
-    upper: Scalar = parameter("V", "greatest voltage", kw_only=True)
+    lower: Scalar = parameter("V", "minimum voltage", kw_only=True)
+    upper: Scalar = parameter("V", "maximum voltage", kw_only=True)
     dt: float = sample_time(kw_only=True)
     low_pass_order: int = parameter(
         "1", "order of the low-pass", whole=True, static=True, default=0
@@ -100,6 +104,13 @@ class Servo(Device):
         check_order("lower", self.lower, "upper", self.upper)
         require_option("form", self.form, FORMS)
         require_option("low_pass_order", self.low_pass_order, (0, 1, 2))
+        for name, used in (
+            ("notch_frequency_1", self.notch_depth_1),
+            ("notch_frequency_2", self.notch_depth_2),
+            ("low_pass", 0.0 if self.low_pass_order else 1.0),
+        ):
+            below = jnp.where(used < 1.0, getattr(self, name), 0.0)
+            check(name, below, below=0.5 / self.dt)
 
     def loop(self) -> ServoLoop:
         """Return the loop of the parameters as they are."""

@@ -20,8 +20,8 @@ ANTI_WINDUPS = ("none", "hold")
 class Device(Designed):
     """Digital controller of a vendor, with the parameters that are typed in.
 
-    It computes with the values as the device rounds them. Gradients ignore the
-    rounding, so that a device can be tuned.
+    Simulation uses the values as the device rounds them; gradients ignore the rounding,
+    so that a device can be tuned.
     """
 
     dt: eqx.AbstractVar[float]
@@ -32,7 +32,7 @@ class Device(Designed):
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """Reasons not to type the gains in yet, each with a next step."""
+        """What to resolve before the gains are typed in, each with a next step."""
         return ()
 
     def resolved(self) -> "ServoLoop":
@@ -58,18 +58,18 @@ class ServoLoopState(NamedTuple):
 
 
 class ServoLoop(System):
-    """PID of a filtered error, with feedforward, filters behind it, and limits.
+    """PID with filters of setpoint, measurement and output, feedforward, saturation.
 
     In a sample, with reference r and measurement z::
 
         s = setpoint(r);  e = s - position(z)
-        u = output(P e + I sum + D (e - e1)/dt + Fx s + Fv dr/dt + Fa d2r/dt2)
+        u = output(P e + I sum(e) dt + D (e - e1)/dt + Fx s + Fv dr/dt + Fa d2r/dt2)
 
-    clipped to ``lower`` and ``upper``. ``integration`` is "rectangular", with the
-    present error, or "trapezoidal". With the ``anti_windup`` "hold" the integral stands
-    still in samples whose output is beyond a limit if it would lead further; with
-    "none" it runs on. Filters have unit DC gain, those in series are one filter. Input
-    an Observation, output in V.
+    with the previous error e1, clipped to ``lower`` and ``upper``. ``integration`` is
+    "rectangular" (backward) or "trapezoidal". The ``anti_windup`` "hold" is conditional
+    integration: no step drives a saturated output further; with "none" the integral
+    runs on. Each filter has unit DC gain. Input an Observation, output in V. Raises
+    ValueError for an unknown option.
     """
 
     setpoint: System
@@ -147,7 +147,7 @@ class ServoLoop(System):
 
 
 def in_series(*filters: System | None) -> System:
-    """Return the filters that are not None in series; nothing filters if all are."""
+    """Return the filters that are not None in series, the identity if all are None."""
     parts = tuple(filter for filter in filters if filter is not None)
     return parts[0] if len(parts) == 1 else Series(parts) if parts else Affine()
 

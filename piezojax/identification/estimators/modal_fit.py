@@ -32,9 +32,15 @@ DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.5)
 PLACES = 100
 """Frequencies at which a new mode is tried."""
 
+LEAST_VARIANCE = 1e-6
+"""Least variance of weighted residuals that counts: below it is rounding."""
+
+SCANNED = 1000
+"""Lines used to search for the start of a mode; all are used to refine it."""
+
 PENALTY = 2.0
-"""Multiple of the penalty of the Bayesian information criterion: of the many places at
-which a mode is tried, one fits the noise best."""
+"""Factor on the penalty of the Bayesian information criterion, because a mode is the
+best of many trial frequencies."""
 
 LEAST_DAMPING, MOST_DAMPING = 1e-4, 0.7
 """Bounds of the damping ratio of a mode."""
@@ -43,22 +49,22 @@ EDGE = 1e-3
 """Distance from a bound, as a share of the range, that counts as on it."""
 
 BEYOND = 1.2
-"""Factor by which the frequency of a mode may lie outside of the measured band."""
+"""Factor by which the frequency of a mode may lie outside the measured band."""
 
 DELAYS = 16
 """Delays tried with the first mode, in units of 1 / the highest angular frequency."""
 
 STARTS = 2
-"""Starts of the descents with another mode, from places and from rational functions."""
+"""Descents for each added mode, from the grid search and from rational functions."""
 
 ITERATIONS = 6
-"""Linear least squares of a rational function."""
+"""Sanathanan-Koerner iterations of a rational function."""
 
 WINDOW = 7
 """Lines of the local parabola whose residual is the noise."""
 
-CONFIDENCE = 2.3
-"""Half-width of a 99 % interval of a complex number's modulus, in deviations."""
+CONFIDENCE = 3.03
+"""Radius of the 99 % disc of complex noise, in standard deviations of one part."""
 
 
 class ModalValue(NamedTuple):
@@ -75,7 +81,7 @@ class ModalFit:
     ``frequency`` (Hz), ``damping`` (1) and ``gain`` (unit of the response, at rest) of
     each mode; ``lag`` is the time constant (s), None if the response shows none, and
     ``delay`` in s. ``fitted`` [lines] is the response of the model, ``deviation``
-    [lines] the standard deviation of a measured value, by the noise alone.
+    [lines] the standard deviation of the noise of the real and of the imaginary part.
     """
 
     frequency: tuple[ModalValue, ...]
@@ -134,6 +140,10 @@ def modal_fit(
     if held is not None:
         turn = 0.5 * omega * held
         hold = np.sinc(turn / np.pi) * np.exp(-1j * turn)
+    if not np.any(response.values):
+        raise ValueError(f"{response.source}: the response is 0 at every line")
+    # Half of the numbers at least are left to tell noise from modes.
+    most = min(most, max(1, (omega.size - 2) // 3))
     deviation = noise_deviation(response.frequency, response.values)
     data = _Data(omega, response.values, deviation, hold)
     found: list[_Found] = []
@@ -162,17 +172,22 @@ def modal_fit(
 def error_bound(fit: ModalFit, response: FrequencyResponse, dt: float) -> ErrorBound:
     """Return the bound of the relative error of ``fit`` up to half the rate.
 
-    At a measured line it is the residual plus its 99 % interval, relative to the model;
-    below the first line that of the first. Above the last nothing was excited.
+    At a measured line it is the residual plus the 99 % radius of the noise, relative to
+    the model; below the first line it is that of the first. Above the last line nothing
+    was excited. Raises ValueError if no line lies below half the rate.
     """
     size = np.abs(fit.fitted)
     relative = (
         np.abs(response.values - fit.fitted) + CONFIDENCE * fit.deviation
     ) / size
     nyquist = 0.5 / dt
-    inside = response.frequency < nyquist
+    inside = response.frequency < nyquist * (1.0 - 1e-5)
+    if not inside.any():
+        raise ValueError(
+            f"no line lies below half the rate, {nyquist:g} Hz: choose a higher rate"
+        )
     lines, bound = response.frequency[inside], relative[inside]
-    beyond = [f for f in (lines[-1] * (1.0 + 1e-6), nyquist) if f > lines[-1]]
+    beyond = [lines[-1] * (1.0 + 1e-6), nyquist]
     return ErrorBound(
         frequency=(*map(float, lines), *beyond),
         relative=(*map(float, bound), *(UNSEEN for _ in beyond)),
@@ -183,11 +198,12 @@ def error_bound(fit: ModalFit, response: FrequencyResponse, dt: float) -> ErrorB
 def noise_deviation(frequency: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the standard deviation [lines] of the noise of complex ``values``.
 
-    It is what parabolas over WINDOW neighbours leave, as the root of a constant part
-    and one in proportion to the power of the response; sharp resonances, which no
-    parabola follows, are left out.
+    It is estimated from the residuals of parabolas over WINDOW lines. The variance is
+    a + b |values|^2 with a, b >= 0; lines at sharp resonances, which no parabola
+    follows, are excluded. Real and imaginary part together have this deviation.
     """
     half, lines = WINDOW // 2, np.arange(WINDOW, frequency.size + 1)
+    lines = lines[:: max(1, lines.size // SCANNED)]
     power = np.empty(lines.size)
     for i, end in enumerate(lines):
         part = slice(end - WINDOW, end)
@@ -196,7 +212,7 @@ def noise_deviation(frequency: np.ndarray, values: np.ndarray) -> np.ndarray:
         rows /= np.linalg.norm(rows, axis=0)
         left = values[part] - rows @ np.linalg.lstsq(rows, values[part], rcond=None)[0]
         power[i] = np.sum(np.abs(left) ** 2) / (WINDOW - 3)
-    gain = np.abs(values[half : half + lines.size]) ** 2
+    gain = np.abs(values[lines - 1 - half]) ** 2
     columns = np.stack([np.ones(gain.size), gain], axis=1)
     parts = np.array([0.0, float(np.median(power / gain))])
     for _ in range(10):
@@ -309,6 +325,7 @@ def _with_another_mode(found: _Found, data: _Data) -> _Found:
     """
     shape = found.shape._replace(modes=found.shape.modes + 1)
     w, zeta, _, lag, delay = _parts(found.point, found.shape)
+    whole, data = data, _thinned(data)
     ends = data.omega[0], data.omega[-1]
     places = np.unique(
         np.r_[np.geomspace(*ends, PLACES // 2), np.linspace(*ends, PLACES // 2)]
@@ -329,7 +346,16 @@ def _with_another_mode(found: _Found, data: _Data) -> _Found:
         point[2 * shape.modes : 3 * shape.modes] = gains
         tried.append((cost, point))
     starts = [*_best(tried, shape), *_best(_rational(shape, data), shape)]
-    return min((_refined(start, shape, data) for start in starts), key=_cost)
+    return min((_refined(start, shape, whole) for start in starts), key=_cost)
+
+
+def _thinned(data: _Data) -> _Data:
+    """Return SCANNED lines at most, the first and the last included."""
+    count = data.omega.size
+    chosen = np.unique(
+        np.linspace(0, count - 1, min(count, SCANNED)).round().astype(int)
+    )
+    return _Data(*(part[chosen] for part in data))
 
 
 def _best(tried: list[tuple[float, np.ndarray]], shape: _Shape) -> list[np.ndarray]:
@@ -469,16 +495,17 @@ def _freedom(found: _Found, data: _Data) -> int:
 def _criterion(one: _Found, found: list[_Found], data: _Data) -> float:
     """Return the information criterion; the best fit of all gives the noise.
 
-    It is infinite for a mode at a bound, beyond the measured band or without a peak:
-    such modes imitate a lag or the noise.
+    It is infinite if a frequency or damping lies at a bound, far outside the measured
+    band or without a peak: such modes imitate a lag or the noise.
     """
     lower, upper = _bounds(one.shape, data)
     place = ((one.point - lower) / (upper - lower))[: 2 * one.shape.modes]
     if np.any((place < EDGE) | (place > 1.0 - EDGE)):
         return math.inf
     variance = min(2.0 * other.cost / _freedom(other, data) for other in found)
+    variance = max(variance, LEAST_VARIANCE)
     penalty = PENALTY * one.shape.size * math.log(2 * data.omega.size)
-    return 2.0 * one.cost / max(variance, 1e-300) + penalty
+    return 2.0 * one.cost / variance + penalty
 
 
 def _fit_of(found: _Found, data: _Data, scale: float) -> ModalFit:

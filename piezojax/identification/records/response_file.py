@@ -11,14 +11,14 @@ from .formats import read_columns
 
 LEAST_LINES = 8
 
-_HERTZ = {"khz": 1e3, "mhz": 1e6, "hz": 1.0, "rad/s": 0.5 / np.pi}
+_HERTZ = {"khz": 1e3, "hz": 1.0, "rad/s": 0.5 / np.pi}
 _ROLES = {
-    "frequency": r"freq|omega|^f$|\bhz\b|khz|rad/s",
+    "coherence": r"coh",
     "real": r"\bre(al)?\b",
     "imaginary": r"\bim(ag|aginary)?\b",
-    "phase": r"phase|\barg\b|angle|deg|°",
-    "magnitude": r"mag|gain|ampl|\bdb\b|abs|ratio",
-    "coherence": r"coh",
+    "phase": r"phase|\barg\b|angle",
+    "magnitude": r"mag|gain|ampl|db|\babs\b|ratio",
+    "frequency": r"freq|omega|^f\b|\bk?hz\b|rad/s",
 }
 """Text in the name or unit of a column that gives its role, the first that matches."""
 
@@ -68,15 +68,20 @@ def read_response(path: str | Path, *, unit: str = "um/V") -> FrequencyResponse:
 
     The names and units of the columns give their roles: a frequency (Hz, kHz or rad/s),
     and magnitude (a ratio, or dB re 1 ``unit``) with phase (degrees or radians), or
-    real and imaginary part. Other columns are ignored. Lines in falling order are
-    turned round; a line at 0 Hz is left out.
+    real and imaginary part. A frequency without a unit is in Hz, an omega in rad/s.
+    Other columns are ignored. The lines are sorted; one at 0 Hz is left out.
 
-    Raises ValueError, listing the columns, for a file without these columns, a phase
-    whose unit is not in its name, and as FrequencyResponse.
+    Raises ValueError, listing the columns, for a file without these columns or with two
+    of one role, for a phase whose unit is not in its name, columns of different length,
+    a magnitude below 0, and as FrequencyResponse.
     """
     path = Path(path)
     columns = read_columns(path)
-    roles = _roles(columns)
+    roles = _roles(columns, path)
+    sizes = {name: columns[name].values.size for name in roles.values()}
+    if len(set(sizes.values())) > 1:
+        shown = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        raise ValueError(f"{path}: the columns differ in length: {shown}")
     listed = ", ".join(columns)
     if "frequency" not in roles:
         raise ValueError(
@@ -107,17 +112,22 @@ def read_response(path: str | Path, *, unit: str = "um/V") -> FrequencyResponse:
 
 
 def _label(name: str, column: Column) -> str:
-    return f"{name} {column.unit or ''}".lower().replace("_", " ")
+    return f"{name} {column.unit or ''}".lower().replace("_", " ").strip()
 
 
-def _roles(columns: Columns) -> dict[str, str]:
-    """Return the first column of each role."""
+def _roles(columns: Columns, path: Path) -> dict[str, str]:
+    """Return the column of each role."""
     found: dict[str, str] = {}
     for name, column in columns.items():
         label = _label(name, column)
         role = next((r for r, text in _ROLES.items() if re.search(text, label)), None)
-        if role is not None:
-            found.setdefault(role, name)
+        if role is None or role == "coherence":
+            continue
+        if role in found:
+            raise ValueError(
+                f"{path}: {found[role]!r} and {name!r} are both a {role}; keep one"
+            )
+        found[role] = name
     return found
 
 
@@ -130,15 +140,19 @@ def _numbers(columns: Columns, name: str, path: Path) -> np.ndarray:
 
 def _magnitude(columns: Columns, name: str, path: Path) -> np.ndarray:
     values = _numbers(columns, name, path)
-    if re.search(r"\bdb\b", _label(name, columns[name])):
+    if "db" in _label(name, columns[name]):
         return 10.0 ** (values / 20.0)
+    if np.any(values < 0.0):
+        raise ValueError(
+            f"{path}: column {name!r} is below 0; name it {name}_dB if it is in dB"
+        )
     return values
 
 
 def _phase(columns: Columns, name: str, path: Path) -> np.ndarray:
     """Return the phase in radians."""
     values, label = _numbers(columns, name, path), _label(name, columns[name])
-    if "deg" in label or "°" in label:
+    if re.search(r"\bdeg(rees?)?\b|°", label):
         return np.deg2rad(values)
     if re.search(r"\brad\b", label):
         return values
