@@ -67,6 +67,9 @@ class Evaluator:
         bound = case.plant_about.error_bound
         self.model_error = bound and as_array(bound.supported(lines(study.dt)))
         self.margin_stages = drawn_stages(case, "margins")
+        # A program takes no more plants than the study draws.
+        drawn = study.ensemble.holdout if study.ensemble else 1
+        self._most = max(1, drawn, _count(self.margin_stages))
         self._programs: dict[Hashable, Callable] = {}
 
     def _compiled(self, key: Hashable, function: Callable, *arguments: Any) -> Callable:
@@ -126,7 +129,7 @@ class Evaluator:
             return jax.lax.map(one, dynamic)
 
         stages = held(own_stage(loop) if stages is None else stages, signals.begins)
-        width = RUN_BLOCK if self._case.ensemble else 1
+        width = min(RUN_BLOCK, self._most)
         found = self._on_each("runs", runs, width, loop, stages, signals)
         return found if beside else (found, None)
 
@@ -193,7 +196,7 @@ class Evaluator:
             )
 
         stages = own_stage(loop) if stages is None else stages
-        width = MARGIN_BLOCK if self._case.ensemble and not study.axes else 1
+        width = 1 if study.axes else min(MARGIN_BLOCK, self._most)
         return self._on_each("margins", margins, width, loop, stages)
 
 
