@@ -9,6 +9,7 @@ would fit noise (Bayesian information criterion).
 
 import itertools
 import math
+import operator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -125,6 +126,9 @@ class _Found(NamedTuple):
     cost: float
 
 
+_COST = operator.attrgetter("cost")
+
+
 def modal_fit(
     response: FrequencyResponse, *, held: float | None = None, most: int = MOST_MODES
 ) -> ModalFit:
@@ -147,7 +151,7 @@ def modal_fit(
     deviation = noise_deviation(response.frequency, response.values)
     data = _Data(omega, response.values, deviation, hold)
     found: list[_Found] = []
-    best = _Found(_Shape(0, False, True), np.zeros(1), np.inf)
+    chosen = best = _Found(_Shape(0, False, True), np.zeros(1), np.inf)
     for _ in range(most):
         best = _with_another_mode(best, data)
         change = _without_lag if best.shape.lag else _with_lag
@@ -157,8 +161,7 @@ def modal_fit(
         chosen = min(found, key=lambda one: _criterion(one, found, data))
         if best.shape.modes > chosen.shape.modes + 1:
             break
-    chosen = min(found, key=lambda one: _criterion(one, found, data))
-    if chosen.shape.delay and _delay(chosen, data) < 0.0:
+    if chosen.point[-1] < 0.0:  # the delay
         chosen = _without_delay(chosen, data)
     scale = math.sqrt(max(2.0 * chosen.cost / _freedom(chosen, data), 1e-12))
     if not np.isfinite(_criterion(chosen, found, data)):
@@ -237,34 +240,40 @@ def _parts(point: np.ndarray, shape: _Shape) -> tuple[np.ndarray, ...]:
     return np.exp(frequency), np.exp(damping), gain, np.exp(lag), rest[len(lag) :]
 
 
+def _common(point: np.ndarray, shape: _Shape, data: _Data) -> np.ndarray:
+    """Return the response [lines] of hold, lag and delay."""
+    *_, lag, delay = _parts(point, shape)
+    common = data.hold
+    if shape.lag:
+        common = common / (1.0 + 1j * data.omega * lag[0])
+    if shape.delay:
+        common = common * np.exp(-1j * data.omega * delay[0] / data.omega[-1])
+    return common
+
+
 def _response(
     point: np.ndarray, shape: _Shape, data: _Data
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the response [lines] and its derivatives [lines, unknowns]."""
-    w, zeta, gain, lag, delay = _parts(point, shape)
+    w, zeta, gain, lag, _ = _parts(point, shape)
     omega = data.omega[:, None]
     below = w**2 - omega**2 + 2j * zeta * w * omega
     mode = w**2 / below
     by_frequency = mode * (2.0 - (2.0 * w**2 + 2j * zeta * w * omega) / below)
     by_damping = -mode * (2j * zeta * w * omega) / below
-    common = data.hold.copy()
-    if shape.lag:
-        common = common / (1.0 + 1j * data.omega * lag[0])
-    unit = 1.0 / data.omega[-1]
-    if shape.delay:
-        common = common * np.exp(-1j * data.omega * delay[0] * unit)
-    modes = common[:, None] * mode
+    common = _common(point, shape, data)[:, None]
+    modes = common * mode
     value = modes @ gain
     slopes = [
-        common[:, None] * by_frequency * gain,
-        common[:, None] * by_damping * gain,
+        common * by_frequency * gain,
+        common * by_damping * gain,
         modes,
     ]
     if shape.lag:
         turn = 1j * data.omega * lag[0]
         slopes.append((-turn / (1.0 + turn) * value)[:, None])
     if shape.delay:
-        slopes.append((-1j * data.omega * unit * value)[:, None])
+        slopes.append((-1j * data.omega / data.omega[-1] * value)[:, None])
     return value, np.concatenate(slopes, axis=1)
 
 
@@ -331,22 +340,14 @@ def _with_another_mode(found: _Found, data: _Data) -> _Found:
         np.r_[np.geomspace(*ends, PLACES // 2), np.linspace(*ends, PLACES // 2)]
     )
     delays = np.arange(DELAYS) if shape.modes == 1 else delay
-    tried = []
-    for late, damping, place in itertools.product(delays, DAMPINGS, places):
-        point = np.concatenate(
-            [
-                np.log([*w, place]),
-                np.log([*zeta, damping]),
-                np.ones(shape.modes),
-                np.log(lag),
-                [late] if shape.delay else [],
-            ]
+    tried = [
+        _with_gains(
+            np.r_[w, place], np.r_[zeta, damping], np.r_[np.log(lag), late], shape, data
         )
-        gains, cost = _gains(point, shape, data)
-        point[2 * shape.modes : 3 * shape.modes] = gains
-        tried.append((cost, point))
-    starts = [*_best(tried, shape), *_best(_rational(shape, data), shape)]
-    return min((_refined(start, shape, whole) for start in starts), key=_cost)
+        for late, damping, place in itertools.product(delays, DAMPINGS, places)
+    ]
+    starts = [*_best(tried), *_best(_rational(shape, data))]
+    return min((_refined(start.point, shape, whole) for start in starts), key=_COST)
 
 
 def _thinned(data: _Data) -> _Data:
@@ -358,18 +359,18 @@ def _thinned(data: _Data) -> _Data:
     return _Data(*(part[chosen] for part in data))
 
 
-def _best(tried: list[tuple[float, np.ndarray]], shape: _Shape) -> list[np.ndarray]:
-    """Return the best of the points that were ``tried``, each apart from the others."""
-    starts: list[np.ndarray] = []
-    for _, point in sorted(tried, key=lambda one: one[0]):
-        if all(_apart(point, other, shape) for other in starts):
-            starts.append(point)
+def _best(tried: list[_Found]) -> list[_Found]:
+    """Return the best of what was ``tried``, each apart from the others."""
+    starts: list[_Found] = []
+    for one in sorted(tried, key=_COST):
+        if all(_apart(one, other) for other in starts):
+            starts.append(one)
         if len(starts) == STARTS:
             break
     return starts
 
 
-def _rational(shape: _Shape, data: _Data) -> list[tuple[float, np.ndarray]]:
+def _rational(shape: _Shape, data: _Data) -> list[_Found]:
     """Return points with the poles of rational functions, and their costs.
 
     For each of several delays the rational function is fitted by iterated linear least
@@ -396,18 +397,16 @@ def _rational(shape: _Shape, data: _Data) -> list[tuple[float, np.ndarray]]:
             below = 1.0 + powers[:, 1:] @ solution[order - 1 :]
         coefficients = np.r_[solution[: order - 2 : -1], 1.0]
         poles = np.asarray(np.roots(coefficients), complex) * middle
-        point = _point_of(poles, late, shape, data)
-        if point is not None:
-            gains, cost = _gains(point, shape, data)
-            point[2 * shape.modes : 3 * shape.modes] = gains
-            found.append((cost, point))
+        one = _from_poles(poles, late, shape, data)
+        if one is not None:
+            found.append(one)
     return found
 
 
-def _point_of(
+def _from_poles(
     poles: np.ndarray, late: float, shape: _Shape, data: _Data
-) -> np.ndarray | None:
-    """Return the point of the modes with these poles (rad/s), None if it has fewer."""
+) -> _Found | None:
+    """Return the fit by the modes of these poles (rad/s), None if there are fewer."""
     pairs = poles[np.imag(poles) > 0.0]
     real = np.sort(np.abs(np.real(poles[np.imag(poles) == 0.0])))
     w = np.r_[np.abs(pairs), np.sqrt(real[0::2][: real.size // 2] * real[1::2])]
@@ -416,49 +415,41 @@ def _point_of(
     ]
     if w.size != shape.modes or not np.all(np.isfinite(w)) or np.any(w <= 0.0):
         return None
-    low, high = data.omega[0] / BEYOND, data.omega[-1] * BEYOND
+    w = np.clip(w, data.omega[0] / BEYOND, data.omega[-1] * BEYOND)
+    zeta = np.clip(zeta, 2.0 * LEAST_DAMPING, MOST_DAMPING)
     lag = [-math.log(10.0 * data.omega[-1])] if shape.lag else []
-    return np.concatenate(
-        [
-            np.log(np.clip(w, low, high)),
-            np.log(np.clip(zeta, 2.0 * LEAST_DAMPING, MOST_DAMPING)),
-            np.ones(shape.modes),
-            lag,
-            [late] if shape.delay else [],
-        ]
-    )
+    return _with_gains(w, zeta, np.r_[lag, late], shape, data)
 
 
-def _gains(point: np.ndarray, shape: _Shape, data: _Data) -> tuple[np.ndarray, float]:
-    """Return the best gains for the other unknowns of ``point``, and the cost."""
-    w, zeta, _, lag, delay = _parts(point, shape)
+def _with_gains(
+    w: np.ndarray,
+    zeta: np.ndarray,
+    rest: np.ndarray,
+    shape: _Shape,
+    data: _Data,
+) -> _Found:
+    """Return the point of these modes with the best gains, and its cost.
+
+    ``rest`` are the other unknowns of a point.
+    """
+    n = shape.modes
+    point = np.concatenate([np.log(w), np.log(zeta), np.zeros(n), rest])
     omega = data.omega[:, None]
-    common = data.hold / data.deviation
-    if shape.lag:
-        common = common / (1.0 + 1j * data.omega * lag[0])
-    if shape.delay:
-        common = common * np.exp(-1j * data.omega * delay[0] / data.omega[-1])
+    common = _common(point, shape, data) / data.deviation
     modes = common[:, None] * (w**2 / (w**2 - omega**2 + 2j * zeta * w * omega))
-    rows = np.r_[modes.real, modes.imag]
     wanted = data.values / data.deviation
-    wanted = np.r_[wanted.real, wanted.imag]
+    rows, wanted = (np.r_[part.real, part.imag] for part in (modes, wanted))
     square, right = rows.T @ rows, rows.T @ wanted
     gains = np.linalg.lstsq(square, right, rcond=None)[0]
-    return gains, 0.5 * float(wanted @ wanted - right @ gains)
+    point[2 * n : 3 * n] = gains
+    return _Found(shape, point, 0.5 * float(wanted @ wanted - right @ gains))
 
 
-def _apart(one: np.ndarray, other: np.ndarray, shape: _Shape) -> bool:
+def _apart(one: _Found, other: _Found) -> bool:
     """Return whether the last modes or the delays of two starts differ."""
-    last = shape.modes - 1
-    places = abs(one[last] - other[last]) > 0.1
-    return bool(
-        places
-        or np.any(np.abs(one[3 * shape.modes :] - other[3 * shape.modes :]) > 0.5)
-    )
-
-
-def _cost(found: _Found) -> float:
-    return found.cost
+    n = one.shape.modes
+    distance = np.abs(one.point - other.point)
+    return bool(distance[n - 1] > 0.1 or np.any(distance[3 * n :] > 0.5))
 
 
 def _with_lag(found: _Found, data: _Data) -> _Found:
@@ -469,7 +460,7 @@ def _with_lag(found: _Found, data: _Data) -> _Found:
         _refined(np.insert(found.point, n, -math.log(corner)), shape, data)
         for corner in np.geomspace(data.omega[0] * 3.0, data.omega[-1], 3)
     ]
-    return min(tried, key=_cost)
+    return min(tried, key=_COST)
 
 
 def _without_lag(found: _Found, data: _Data) -> _Found:
@@ -482,10 +473,6 @@ def _without_lag(found: _Found, data: _Data) -> _Found:
 
 def _without_delay(found: _Found, data: _Data) -> _Found:
     return _refined(found.point[:-1], found.shape._replace(delay=False), data)
-
-
-def _delay(found: _Found, data: _Data) -> float:
-    return float(found.point[-1]) / data.omega[-1]
 
 
 def _freedom(found: _Found, data: _Data) -> int:

@@ -11,7 +11,9 @@ from .formats import read_columns
 
 LEAST_LINES = 8
 
-_HERTZ = {"khz": 1e3, "hz": 1.0, "rad/s": 0.5 / np.pi}
+_HERTZ = {"khz": 1e3, "hz": 1.0, "rad/s": 0.5 / np.pi, "omega": 0.5 / np.pi}
+"""Factors to Hz by text in the name or unit; the first that matches, else 1."""
+
 _ROLES = {
     "coherence": r"coh",
     "real": r"\bre(al)?\b",
@@ -90,10 +92,7 @@ def read_response(path: str | Path, *, unit: str = "um/V") -> FrequencyResponse:
         )
     frequency = _numbers(columns, roles["frequency"], path)
     text = _label(roles["frequency"], columns[roles["frequency"]])
-    scale = next((s for name, s in _HERTZ.items() if name in text), None)
-    if scale is None and "omega" in text:
-        scale = _HERTZ["rad/s"]
-    frequency = frequency * (1.0 if scale is None else scale)
+    frequency = frequency * next((s for n, s in _HERTZ.items() if n in text), 1.0)
     if {"real", "imaginary"} <= roles.keys():
         parts = (_numbers(columns, roles[role], path) for role in ("real", "imaginary"))
         values = np.array([1.0, 1j]) @ np.array([*parts])
