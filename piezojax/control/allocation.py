@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.arrays import ScalarLike, State, as_array, check, check_order
+from ..core.arrays import (
+    ScalarLike,
+    State,
+    as_array,
+    check,
+    check_option,
+    check_order,
+)
 from ..core.parameter import parameter
 from ..core.system import System
 from .box import (
@@ -127,10 +134,7 @@ class Allocation(System):
                 f"geometry has rank {rank}; it must have {min(axes, actuators)}, "
                 "so that every axis can move alone"
             )
-        if self.method not in METHODS:
-            raise ValueError(
-                f"method is {self.method!r}; it must be one of {', '.join(METHODS)}"
-            )
+        check_option("method", self.method, METHODS)
         if self.method == "minimum_norm" and len(set(self.weights)) > 1:
             raise ValueError(
                 f"weights are {self.weights}; with minimum_norm they must be equal"

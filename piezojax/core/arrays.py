@@ -139,6 +139,14 @@ def check_not_zero(name: str, value: Any) -> None:
         raise ValueError(f"{name} is 0; it must be another number")
 
 
+def check_option(name: str, value: Any, allowed: Iterable[Any]) -> None:
+    """Raise ValueError unless ``value`` of the option ``name`` is among ``allowed``."""
+    known = tuple(allowed)
+    if value not in known:
+        shown = ", ".join(map(str, known))
+        raise ValueError(f"{name} is {value!r}; it must be one of {shown}")
+
+
 def check_order(
     low_name: str, low: Any, high_name: str, high: Any, *, equal: bool = False
 ) -> None:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..core.arrays import Scalar, ScalarLike, as_array
+from ..core.arrays import Scalar, ScalarLike, as_array, check_option
 from ..core.parameter import parameter, sample_time
 from ..core.system import Designed, Series, System
 
@@ -59,14 +59,20 @@ class _Filter(Designed):
 
     def __check_init__(self):
         for field, allowed in (("discretisation", METHODS), ("kind", KINDS)):
-            name = getattr(self, field, allowed[0])
-            if name not in allowed:
-                raise ValueError(
-                    f"{field} is {name!r}; it must be one of {', '.join(allowed)}"
-                )
+            check_option(field, getattr(self, field, allowed[0]), allowed)
 
 
-class LowPass(_Filter):
+class _Pass(_Filter):
+    """Low-pass or high-pass of any order."""
+
+    frequency: Scalar = _frequency("cut-off frequency")
+    dt: float = sample_time()
+    order: int = _order()
+    kind: str = eqx.field(static=True, default="butterworth")
+    discretisation: str = eqx.field(static=True, default="bilinear")
+
+
+class LowPass(_Pass):
     """Low-pass of order 1 to 8 with unit DC gain and -3 dB at ``frequency``.
 
     The latter is exact for the bilinear transform. Its ``kind`` is "butterworth" or
@@ -74,29 +80,17 @@ class LowPass(_Filter):
     ValueError for parameters outside their limits and for an unknown name.
     """
 
-    frequency: Scalar = _frequency("cut-off frequency")
-    dt: float = sample_time()
-    order: int = _order()
-    kind: str = eqx.field(static=True, default="butterworth")
-    discretisation: str = eqx.field(static=True, default="bilinear")
-
     def resolved(self) -> System:
         """Return the sections with their coefficients."""
         place = _Place.at(self.frequency, self.dt, _spread(self.kind, self.order))
         return _chain(self, place, low=1.0, high=0.0)
 
 
-class HighPass(_Filter):
+class HighPass(_Pass):
     """High-pass of order 1 to 8 with -3 dB at ``frequency`` and a gain of 0 at 0 Hz.
 
     The gain is 1 far above ``frequency``. Kinds, units and errors are those of LowPass.
     """
-
-    frequency: Scalar = _frequency("cut-off frequency")
-    dt: float = sample_time()
-    order: int = _order()
-    kind: str = eqx.field(static=True, default="butterworth")
-    discretisation: str = eqx.field(static=True, default="bilinear")
 
     def resolved(self) -> System:
         """Return the sections with their coefficients."""
@@ -278,9 +272,7 @@ def _spread(kind: str, order: int) -> float:
     return 1.0 if kind == "butterworth" else 1.0 / math.sqrt(2.0 ** (1.0 / order) - 1.0)
 
 
-def _chain(
-    filter: LowPass | HighPass, place: _Place, *, low: float, high: float
-) -> System:
+def _chain(filter: _Pass, place: _Place, *, low: float, high: float) -> System:
     """Return the sections of a filter with poles at ``place``."""
     order, method = filter.order, filter.discretisation
     angles = [math.pi * (0.5 + k) / order for k in range(order // 2)]

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from ..control.devices import E727, NV200, Device
+from ..core.arrays import check_option
 from ..core.conversion import factor
 from .records.record import Record
 
@@ -114,10 +115,7 @@ def device_scale(
     all 0, a record that does not determine them or has the wrong sign, and for a record
     that the typed gains do not explain.
     """
-    if device not in DEVICES:
-        raise ValueError(
-            f"device is {device!r}; it must be one of {', '.join(DEVICES)}"
-        )
+    check_option("device", device, DEVICES)
     known = DEVICES[device]
     if unknown := [name for name in typed if name not in known.gains]:
         raise ValueError(

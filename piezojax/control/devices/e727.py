@@ -2,17 +2,17 @@
 
 import equinox as eqx
 
-from ...core.arrays import Scalar, check_order
+from ...core.arrays import Scalar, check_option, check_order
 from ...core.parameter import parameter, sample_time
 from ...dynamics.filters import LowPass, Notch
+from ...hardware import SlewLimit
 from .servo_loop import (
     FIXED_DT,
+    NO_SLEW,
     Device,
     ServoLoop,
-    SlewedSetpoint,
     in_series,
     inverse_or_off,
-    require_option,
     require_rate,
 )
 
@@ -95,7 +95,7 @@ class E727(Device):
     notch_bandwidth_2: Scalar = _bandwidth(2)
     filter_frequency: Scalar = _frequency("cut-off of the measurement's filter")
     slew_rate: Scalar = parameter(
-        "um/s", "slew rate of the setpoint", above=0.0, scale="log", default=1e9
+        "um/s", "slew rate of the setpoint", above=0.0, scale="log", default=NO_SLEW
     )
     dt: float = sample_time(default=FIXED_DT)
     notch_method: int = parameter(
@@ -110,9 +110,9 @@ class E727(Device):
     def __check_init__(self):
         require_rate(self)
         check_order("lower", self.lower, "upper", self.upper)
-        require_option("structure", self.structure, STRUCTURES)
-        require_option("notch_method", self.notch_method, tuple(NOTCH_METHODS))
-        require_option("filter_type", self.filter_type, (0, 1))
+        check_option("structure", self.structure, STRUCTURES)
+        check_option("notch_method", self.notch_method, NOTCH_METHODS)
+        check_option("filter_type", self.filter_type, (0, 1))
 
     def loop(self) -> ServoLoop:
         """Return the loop of the parameters as they are."""
@@ -125,7 +125,7 @@ class E727(Device):
         method = NOTCH_METHODS[self.notch_method]
         low_pass = LowPass(self.filter_frequency, self.dt, 2)
         return ServoLoop(
-            SlewedSetpoint(self.slew_rate * self.dt),
+            SlewLimit(self.slew_rate, self.dt),
             low_pass if self.filter_type else in_series(),
             in_series(*(Notch(*notch, self.dt, method) for notch in notches)),
             gain,

@@ -5,18 +5,18 @@ import dataclasses
 import equinox as eqx
 import jax.numpy as jnp
 
-from ...core.arrays import Scalar, check_order
+from ...core.arrays import Scalar, check_option, check_order
 from ...core.parameter import parameter, rounded_fields, sample_time
 from ...core.system import System
 from ...dynamics.filters import KINDS, LowPass, Notch
+from ...hardware import SlewLimit
 from .servo_loop import (
     FIXED_DT,
     INTEGRATIONS,
+    NO_SLEW,
     Device,
     ServoLoop,
-    SlewedSetpoint,
     in_series,
-    require_option,
     require_rate,
 )
 
@@ -129,8 +129,8 @@ class NV200(Device):
         check_order("avmin", self.avmin, "avmax", self.avmax)
         check_order("posmin", self.posmin, "posmax", self.posmax)
         check_order("notchb", self.notchb, "2 notchf", 2.0 * self.notchf, equal=True)
-        require_option("integration", self.integration, (*INTEGRATIONS, "half"))
-        require_option("setpoint_filter", self.setpoint_filter, KINDS)
+        check_option("integration", self.integration, (*INTEGRATIONS, "half"))
+        check_option("setpoint_filter", self.setpoint_filter, KINDS)
 
     def typed(self) -> "NV200":
         """Return the device with what can be typed in; the notch stays in its limits.
@@ -161,14 +161,14 @@ class NV200(Device):
         scale = jnp.where(self.scale > 0.0, self.scale, self._assumed_scale)
         range = self.posmax - self.posmin
         half = self.integration == "half"
-        most = jnp.where(self.sr < SLEW_OFF, 10.0 * self.sr * range * self.dt, 1e9)
+        rate = jnp.where(self.sr < SLEW_OFF, 10.0 * self.sr * range, NO_SLEW)
         low_pass: System | None = None
         if self.setlpon:
             low_pass = LowPass(self.setlpf, self.dt, 4, self.setpoint_filter)
         damping = 0.5 * self.notchb / self.notchf
         notch = Notch(self.notchf, damping, self.notch_depth, self.dt)
         return ServoLoop(
-            in_series(SlewedSetpoint(most), low_pass),
+            in_series(SlewLimit(rate, self.dt), low_pass),
             LowPass(self.poslpf, self.dt) if self.poslpon else in_series(),
             notch if self.notchon else in_series(),
             scale * self.kp,

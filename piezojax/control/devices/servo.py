@@ -3,16 +3,16 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from ...core.arrays import Scalar, check, check_order
+from ...core.arrays import Scalar, check, check_option, check_order
 from ...core.parameter import parameter, sample_time
 from ...dynamics.filters import LowPass, Notch
+from ...hardware import SlewLimit
 from .servo_loop import (
+    NO_SLEW,
     Device,
     ServoLoop,
-    SlewedSetpoint,
     in_series,
     inverse_or_off,
-    require_option,
 )
 
 FORMS = ("parallel", "standard")
@@ -89,7 +89,7 @@ class Servo(Device):
     notch_depth_2: Scalar = _depth(2)
     low_pass: Scalar = _frequency("cut-off of the low-pass")
     slew_rate: Scalar = parameter(
-        "um/s", "slew rate of the setpoint", above=0.0, scale="log", default=1e9
+        "um/s", "slew rate of the setpoint", above=0.0, scale="log", default=NO_SLEW
     )
     lower: Scalar = parameter("V", "minimum voltage", kw_only=True)
     upper: Scalar = parameter("V", "maximum voltage", kw_only=True)
@@ -102,8 +102,8 @@ class Servo(Device):
 
     def __check_init__(self):
         check_order("lower", self.lower, "upper", self.upper)
-        require_option("form", self.form, FORMS)
-        require_option("low_pass_order", self.low_pass_order, (0, 1, 2))
+        check_option("form", self.form, FORMS)
+        check_option("low_pass_order", self.low_pass_order, (0, 1, 2))
         for name, used in (
             ("notch_frequency_1", self.notch_depth_1),
             ("notch_frequency_2", self.notch_depth_2),
@@ -124,7 +124,7 @@ class Servo(Device):
         )
         low_pass = LowPass(self.low_pass, self.dt, max(self.low_pass_order, 1))
         return ServoLoop(
-            SlewedSetpoint(self.slew_rate * self.dt),
+            SlewLimit(self.slew_rate, self.dt),
             in_series(),
             in_series(
                 *(

@@ -1,17 +1,21 @@
 """Servo loop of a digital piezo controller: the order of blocks that devices share."""
 
-from typing import Any, NamedTuple
+import abc
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from ...core.arrays import Scalar, ScalarLike, State, as_array
+from ...core.arrays import Scalar, State, as_array, check_option
 from ...core.feedback import Observation
 from ...core.parameter import parameter, rounded_fields, sample_time
 from ...core.system import Affine, Designed, Series, System
 
 FIXED_DT = 5e-5
 """Sample time of devices with a fixed rate, s."""
+
+NO_SLEW = 1e9
+"""Slew rate (um/s) beyond every setpoint."""
 
 INTEGRATIONS = ("rectangular", "trapezoidal")
 ANTI_WINDUPS = ("none", "hold")
@@ -39,9 +43,9 @@ class Device(Designed):
         """Return the loop of the rounded parameters."""
         return self.typed().loop()
 
+    @abc.abstractmethod
     def loop(self) -> "ServoLoop":
         """Return the loop of the parameters as they are."""
-        raise NotImplementedError
 
 
 class ServoLoopState(NamedTuple):
@@ -90,8 +94,8 @@ class ServoLoop(System):
     anti_windup: str = eqx.field(static=True, default="none")
 
     def __check_init__(self):
-        require_option("integration", self.integration, INTEGRATIONS)
-        require_option("anti_windup", self.anti_windup, ANTI_WINDUPS)
+        check_option("integration", self.integration, INTEGRATIONS)
+        check_option("anti_windup", self.anti_windup, ANTI_WINDUPS)
 
     def init(self, input: Observation) -> ServoLoopState:
         reference = as_array(input.reference)
@@ -165,23 +169,3 @@ def require_rate(device: "Device") -> None:
             f"dt is {device.dt:g} s; {type(device).__name__} runs at 20 kHz, with dt = "
             f"{FIXED_DT:g} s: set 'rate' of the study to 20000"
         )
-
-
-def require_option(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
-    """Raise ValueError unless the option ``name`` has one of the allowed values."""
-    if value not in allowed:
-        shown = ", ".join(str(one) for one in allowed)
-        raise ValueError(f"{name} is {value!r}; it must be one of {shown}")
-
-
-class SlewedSetpoint(System):
-    """Setpoint that moves by at most ``most`` (um) in a sample."""
-
-    most: Scalar
-
-    def init(self, input: ScalarLike = 0.0) -> State:
-        return as_array(input)
-
-    def step(self, state: State, input: ScalarLike) -> tuple[State, Scalar]:
-        output = state + jnp.clip(input - state, -self.most, self.most)
-        return output, output
