@@ -37,6 +37,7 @@ from .identification import Record as Record
 from .identification import identify as identify
 from .identification import identify_all as identify_all
 from .identification import read_record as read_record
+from .identification import validate as validate
 from .reproduction import reproduce as reproduce
 from .sweeping import sweep as sweep
 from .tuning import load_result as load_result

@@ -32,7 +32,7 @@ from piezojax.study import read
 
 COMMANDS = {
     name: importlib.import_module(f"piezojax.cli.{name}").main
-    for name in ("tune", "identify", "reproduce")
+    for name in ("tune", "identify", "validate", "reproduce")
 }
 PNG = b"\x89PNG\r\n\x1a\n"
 STUDY = {
@@ -101,17 +101,31 @@ def record(tmp_path):
     return write_record(tmp_path)
 
 
-def write_record(folder):
-    """A stage with lag and no hysteresis, 300 samples; two amplitudes."""
+def write_record(folder, late=0):
+    """A stage with lag and no hysteresis, 300 samples; two amplitudes.
+
+    The output follows the input ``late`` samples later.
+    """
     steps = np.arange(300)
     drive = np.where(steps < 150, 20.0, 10.0) * (1.0 - np.cos(2 * np.pi * steps / 25))
-    lagged = np.convolve(drive, 0.5 ** np.arange(1, 12))[: steps.size]
+    lagged = np.convolve(drive, 0.5 ** np.arange(1, 12))
+    lagged = np.concatenate([np.zeros(late), lagged])[: steps.size]
     path = folder / "bench.csv"
     rows = zip(1e-3 * steps, drive, 0.12 * lagged + 4.0, strict=True)
     path.write_text(
         "time_s,drive_V,sensor_um\n"
         + "".join(f"{t:.4f},{u:.6f},{y:.6f}\n" for t, u, y in rows)
     )
+    return path
+
+
+def write_model(folder, gain=0.06):
+    """The stage of that record, one sample later and without the zero of its sensor."""
+    system = pj.series(
+        dynamics=pj.dynamics.ARMA([0.5], [gain]), calibration=pj.Affine(1.0, 0.0)
+    )
+    path = folder / "model.json"
+    pj.save(system, path, pj.About(record="first.csv", rate_Hz=1e3))
     return path
 
 
@@ -148,7 +162,10 @@ def test_defaults_are_those_of_the_functions():
 @pytest.mark.parametrize("command", COMMANDS)
 def test_python_m(command):
     # As typed, and what the user's shell sees: status, one line, no traceback.
-    argument = {"reproduce": ["--table", "9-9"]}.get(command, ["nowhere.csv"])
+    argument = {
+        "reproduce": ["--table", "9-9"],
+        "validate": ["nowhere.json", "nowhere.csv"],
+    }.get(command, ["nowhere.csv"])
     done = subprocess.run(
         [sys.executable, "-m", f"piezojax.{command}", *argument],
         capture_output=True,
@@ -164,6 +181,9 @@ def arguments_for(command, request):
         return [request.getfixturevalue("study")]
     if command == "identify":
         return [request.getfixturevalue("record"), *COLUMNS]
+    if command == "validate":
+        record = request.getfixturevalue("record")
+        return [write_model(record.parent), record, *COLUMNS]
     return ["--table", "5-3"]
 
 
@@ -193,6 +213,55 @@ def test_a_file_in_the_place_of_the_folder(command, request, tmp_path):
     result = call(command, *arguments_for(command, request), "--out", tmp_path / "out")
     failed(result, "cannot be written: File exists")
     assert (tmp_path / "out").read_text() == "mine"
+
+
+# validate
+
+
+def test_validate_writes_a_model_that_is_checked(tmp_path):
+    record = write_record(tmp_path, late=1)
+    model, out = write_model(tmp_path), tmp_path / "out"
+    printed = succeeded(call("validate", model, record, *COLUMNS, "--out", out)).stdout
+    assert names(out) == ["model.json", "validation.json", "validation.png"]
+    assert_pictures(out, "validation.png")
+    assert "input 'drive_V' from 0 to 39.84 V; output 'sensor_um'" in printed
+    assert "judged from" in printed
+    pj.load(out / "model.json")
+    about = pj.read_about(out / "model.json")
+    assert about.record == "first.csv"
+    assert about.checked == ["bench.csv"]
+    found = json.loads((out / "validation.json").read_text(encoding="utf-8"))
+    (check,) = found["records"]
+    assert check["zero"] == pytest.approx([4.0], abs=0.01)
+    assert found["alarms"] == []
+
+
+def test_validate_ends_with_an_alarm_for_another_stage(tmp_path):
+    record = write_record(tmp_path, late=1)
+    model, out = write_model(tmp_path, gain=0.03), tmp_path / "out"
+    result = call("validate", model, record, *COLUMNS, "--out", out)
+    assert result.exit_code == 3
+    assert "ALARM: bench.csv: the model does not hold on this record" in result.stdout
+    with pytest.raises(ValueError, match="a model of another stage"):
+        pj.load(out / "model.json")
+    again = call("validate", out / "model.json", record, *COLUMNS, "--quiet")
+    assert again.exit_code == 3
+    assert again.stdout == ""
+    assert "ALARM" in again.stderr
+
+
+def test_validate_bad_arguments(record, tmp_path):
+    model = write_model(tmp_path)
+    failed(call("validate", model), "Missing argument 'RECORD...'")
+    failed(call("validate", model, "no.csv"), "No such file or directory")
+    failed(
+        call("validate", model, record, *COLUMNS, "--estimate", "9"),
+        "'9' must be two sample numbers, as in 0:1200",
+    )
+    failed(
+        call("validate", model, record, *COLUMNS, "--estimate", "0:300"),
+        "estimate is 0:300; it must lie in 0:299",
+    )
 
 
 # tune

@@ -16,7 +16,7 @@ SUBPACKAGES = (
 """Subpackages from the ground up: each may import those before it, so that ``cli``
 alone imports ``report``."""
 
-ENTRIES = ("__init__", "tune", "identify", "sweep", "reproduce")
+ENTRIES = ("__init__", "tune", "identify", "validate", "sweep", "reproduce")
 """Modules at the top, which may import any subpackage and no subpackage may import."""
 
 

@@ -485,7 +485,7 @@ def test_a_cut_off_just_below_nyquist(study):
             "plant",
             {"record": "r.csv", "model": "coleman_hodgdon", "trian": [0, 9]},
             "plant.trian is unknown; allowed are record, model, time, input, output, "
-            "record_rate, train; did you mean 'train'?",
+            "record_rate, train, check; did you mean 'train'?",
         ),
         (
             "controller",

@@ -79,7 +79,7 @@ def test_a_record_in_other_units_is_converted(folder):
 
 def test_a_unit_that_cannot_be_converted_is_refused(folder):
     name = record_in("V", "counts", folder)
-    with pytest.raises(ValueError, match=r"of V_counts.csv is in counts; .*in um"):
+    with pytest.raises(ValueError, match=r"V_counts.csv is in counts, and um is"):
         case_of(folder, plant_of(name))
 
 
@@ -92,6 +92,42 @@ def test_a_record_at_another_rate_is_refused(folder):
             rate=2000.0,
             controller=STUDY["controller"] | {"dt": 5e-4},
         )
+
+
+def test_a_fitted_plant_is_checked_on_other_records(folder):
+    first, other = (record_in(*units, folder) for units in (("V", "um"), ("mV", "nm")))
+    case = case_of(folder, plant_of(first) | {"check": other})
+    assert case.plant_about.checked == [other]
+    assert case.plant_about.unsafe == []
+    assert case_of(folder, plant_of(first)).plant_about.checked == []
+
+
+def test_a_record_of_another_stage_is_an_alarm_of_the_model(folder):
+    first, name = record_in("V", "um", folder), "other.csv"
+    rows = np.loadtxt(folder / first, delimiter=",", skiprows=1)
+    rows[:, 2] *= 0.5
+    header = "time_s,drive_V,position_um"
+    np.savetxt(folder / name, rows, delimiter=",", header=header, comments="")
+    case = case_of(folder, plant_of(first) | {"check": [first, name]})
+    assert case.plant_about.checked == [first, name]
+    assert case.fit.report.alarms == []
+    assert any(
+        alarm.startswith("other.csv: the model does not hold")
+        for alarm in case.plant_about.unsafe
+    )
+
+
+def test_a_check_at_another_rate_or_unit_is_refused(folder):
+    first, name = record_in("V", "um", folder), "slower.csv"
+    rows = np.loadtxt(folder / first, delimiter=",", skiprows=1)
+    rows[:, 0] *= 2.0
+    header = "time_s,drive_V,position_um"
+    np.savetxt(folder / name, rows, delimiter=",", header=header, comments="")
+    with pytest.raises(ValueError, match=r"plant.check was made for 500 Hz"):
+        case_of(folder, plant_of(first) | {"check": name})
+    counts = record_in("V", "counts", folder)
+    with pytest.raises(ValueError, match=r"plant.check: the output of V_counts.csv"):
+        case_of(folder, plant_of(first) | {"check": counts})
 
 
 def fitted(volts="V", lengths="um"):
@@ -191,6 +227,8 @@ def test_gains_tell_their_units_and_a_study_checks_them(folder):
         ("mm", "um", 1e3),
         ("mrad", "urad", 1e3),
         ("um", "um", 1.0),
+        ("um", "nm", 1e3),
+        ("mV", "kV", 1e-6),
         ("nm", "V", None),
         ("counts", "um", None),
     ],

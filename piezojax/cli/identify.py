@@ -5,22 +5,12 @@ from pathlib import Path
 import click
 
 from .command import Command, common, print_alarms, results_folder, run
+from .records import SampleRange, print_columns, record_columns
 from .stopping import exit_interrupted
 from .terminal import Bar
 
 ALL = "all"
 """Value of ``--model`` that fits every model the records support."""
-
-
-class _SampleRange(click.ParamType):
-    name = "START:STOP"
-
-    def convert(self, value, param, ctx):
-        try:
-            start, stop = (int(number) for number in value.split(":"))
-        except ValueError:
-            self.fail(f"{value!r} must be two sample numbers, as in 0:1200", param, ctx)
-        return slice(start, stop)
 
 
 class _Gain(click.ParamType):
@@ -73,12 +63,7 @@ class _Gain(click.ParamType):
     help="With --response: unit of the response.",
 )
 @click.option("--among", help="With 'all': compare only these and linear models.")
-@click.option("--time", help="Time column, by name or number from zero.")
-@click.option("--input", default="0", show_default=True, help="Input column.")
-@click.option("--output", default="1", show_default=True, help="Output column.")
-@click.option("--rate", type=float, help="Sampling rate, Hz, without a time column.")
-@click.option("--period", type=int, help="Samples per period of a periodic input.")
-@click.option("--resample", type=float, help="Resample the record to this rate, Hz.")
+@record_columns
 @click.option(
     "--method", help="Method of the fit (default: the first that can fit the model)."
 )
@@ -111,13 +96,13 @@ class _Gain(click.ParamType):
     help="Largest number of optimiser steps.",
 )
 @click.option(
-    "--train", type=_SampleRange(), help="Samples to fit (default: first half)."
+    "--train", type=SampleRange(), help="Samples to fit (default: first half)."
 )
 @click.option(
-    "--validate", type=_SampleRange(), help="Samples to validate on (default: rest)."
+    "--validate", type=SampleRange(), help="Samples to validate on (default: rest)."
 )
 @click.option(
-    "--test", type=_SampleRange(), help="With 'all': samples held back from the choice."
+    "--test", type=SampleRange(), help="With 'all': samples held back from the choice."
 )
 @common
 def main(
@@ -183,6 +168,7 @@ def main(
         if model != ALL and (among is not None or test):
             raise ValueError("--among and --test need --model all")
         loaded = [read_record(record, **columns) for record in records]
+        print_columns(console, loaded)
         options = Options(order, window, oversample, steps)
         if controller is not None:
             measure(console, loaded)

@@ -15,7 +15,9 @@ class About(BaseModel):
     sampling rate. ``units`` maps the channels of the System to their units, and
     ``parameter_units`` its parameters, by path; "" is a unit that is not known.
     ``input_ranges`` are the least and greatest value of each input in the record.
-    ``error_bound`` bounds the error of a fitted model, and
+    ``error_bound`` bounds the error of a fitted model, ``residual_rms`` is the rms
+    error of each output on the validation part of its record, in the unit of the
+    output, and ``checked`` are the other records that it was validated on;
     ``standard_errors`` are those of its parameters, by path. ``unsafe`` lists the
     alarms raised when the System was made; ``load`` refuses a file with any. Keys of
     later versions are ignored.
@@ -30,6 +32,8 @@ class About(BaseModel):
     parameter_units: dict[str, str] = {}
     input_ranges: list[tuple[float, float]] = []
     error_bound: ErrorBound | None = None
+    residual_rms: list[float] = []
+    checked: list[str] = []
     standard_errors: dict[str, float] = {}
     unsafe: list[str] = []
 

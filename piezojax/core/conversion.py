@@ -2,7 +2,7 @@
 
 import re
 
-_IN = {
+_IN = {  # factors to the unit that names the kind
     "V": {"uV": 1e-6, "mV": 1e-3, "V": 1.0, "kV": 1e3},
     "um": {"pm": 1e-6, "nm": 1e-3, "um": 1.0, "mm": 1e3, "m": 1e6},
     "urad": {"nrad": 1e-3, "urad": 1.0, "mrad": 1e3, "rad": 1e6},
@@ -10,11 +10,16 @@ _IN = {
 
 
 def factor(unit: str, wanted: str) -> float | None:
-    """Return the factor from ``unit`` to ``wanted`` (V, um or urad).
+    """Return the factor from ``unit`` to ``wanted``, None if there is none, as nm to V.
 
-    None if there is none, as from nm to V.
+    Both are units of voltage, length or angle, or the same text.
     """
-    return 1.0 if unit == wanted else _IN.get(wanted, {}).get(unit)
+    if unit == wanted:
+        return 1.0
+    for known in _IN.values():
+        if unit in known and wanted in known:
+            return known[unit] / known[wanted]
+    return None
 
 
 def replaced(unit: str, units: dict[str, str]) -> str:

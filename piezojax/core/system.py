@@ -102,6 +102,15 @@ def rest_output(system: System, input: Any) -> Any:
     return system.step(system.init(input), input)[1]
 
 
+def accepts(system: System, example: Any) -> bool:
+    """Return whether ``system`` takes ``example`` as its input; nothing is computed."""
+    try:
+        eqx.filter_eval_shape(rest_output, system, example)
+    except (AttributeError, TypeError, ValueError, IndexError):
+        return False
+    return True
+
+
 class Series(System):
     """Systems in series; ``a >> b >> c`` creates one.
 

@@ -32,3 +32,6 @@ from .records.record import Record as Record
 from .records.record import read_record as read_record
 from .records.resample import average_periods as average_periods
 from .records.resample import resample as resample
+from .validation import Validation as Validation
+from .validation import ValidationReport as ValidationReport
+from .validation import validate as validate

@@ -137,6 +137,7 @@ class Fit:
                 for column in np.concatenate([one.inputs for one in self.records]).T
             ],
             error_bound=None if residuals is None else residuals.error_bound,
+            residual_rms=self.report.validation.each,
             standard_errors={
                 path: found.standard_error
                 for path, found in self.report.parameters.items()
@@ -301,13 +302,17 @@ def _fit_error(
 def _error_warnings(
     records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
 ) -> list[str]:
-    error = _errors(records, runs, part)
-    outputs = np.concatenate([r.outputs[part] for r in records])
-    deviation = np.sqrt(np.mean(np.var(outputs, axis=0)))
-    share = float(np.sqrt(np.mean(error**2)) / max(deviation, 1e-30))
+    outputs = np.concatenate([record.outputs[part] for record in records])
+    share = unexplained_share(_errors(records, runs, part), outputs)
     if share <= POOR:
         return []
     return [
         f"the model explains little: its validation error is {100.0 * share:.0f} % of "
         "the output's own deviation"
     ]
+
+
+def unexplained_share(errors: np.ndarray, outputs: np.ndarray) -> float:
+    """Return the rms of ``errors`` over the deviation of ``outputs``, [samples, p]."""
+    deviation = np.sqrt(np.mean(np.var(outputs, axis=0)))
+    return float(np.sqrt(np.mean(errors**2)) / max(deviation, 1e-30))

@@ -1,12 +1,11 @@
 """Case of a study: the files read, the plant fitted, the loop and space built."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 
 from ..catalog import CONTROLLERS, PLANTS, at_rate
@@ -19,8 +18,8 @@ from ..core.paths import declared, get, replace, static_fields
 from ..core.serial import from_data, read_about
 from ..core.serial import load as load_system
 from ..core.space import Space
-from ..core.system import System, rest_output
-from ..identification import Fit, identify, read_record
+from ..core.system import System, accepts
+from ..identification import Fit, Record, identify, read_record, validate
 from .ensemble import Ensemble, Stage, ensemble_of
 from .make_hardware import driven, make_actuator, make_amplifier, make_sensor, per_axis
 from .origin import check_origin, check_rate, in_study_units
@@ -78,7 +77,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     path = Path(path)
     if seed is not None:
         study = study.model_copy(update={"seed": seed})
-    plant, fit, about = _plant(study, path.parent)
+    plant, fit, about, notes_of_plant = _plant(study, path.parent)
     zero = per_axis(study, lambda axis: as_array(0.0))
     _check_role(plant, zero, "plant", "a voltage to a displacement")
     amplifier = make_amplifier(study)
@@ -114,7 +113,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         fit,
         ensemble,
         plants,
-        (*design_notes, *notes),
+        (*notes_of_plant, *design_notes, *notes),
         about,
         amplifier,
         {
@@ -137,30 +136,39 @@ def read(path: str | Path, seed: int | None = None) -> Case:
     return build(load(path), path, seed)
 
 
-def _plant(study: Study, folder: Path) -> tuple[System, Fit | None, About]:
-    """Return the plant, its fit if it has one, and its origin."""
+def _plant(
+    study: Study, folder: Path
+) -> tuple[System, Fit | None, About, Sequence[str]]:
+    """Return the plant, its fit if it has one, its origin, and notes of its check."""
     table = study.plant
     if "record" not in table:
         plant = _from_source(table, "plant", folder, PLANTS, study.rate)
         about = _about_file(table, folder)
         check_origin(about, study, "plant.file")
-        return plant, None, about
+        return plant, None, about, ()
     if set(table) & {"catalog", "file", "type"}:
         raise _source_error(table, "plant", ("catalog", "file", "type", "record"))
     description = validated(RecordPlant, table, "plant")
-    record = in_study_units(
-        read_record(
-            folder / description.record,
+
+    def read_as(path: Path, where: str) -> Record:
+        record = read_record(
+            folder / path,
             time=description.time,
             input=description.input,
             output=description.output,
             rate=description.record_rate,
         )
-    )
-    check_rate(1.0 / record.dt, study, "plant.record")
+        check_rate(1.0 / record.dt, study, where)
+        return in_study_units(record, where)
+
+    record = read_as(description.record, "plant.record")
+    others = [read_as(path, "plant.check") for path in description.check]
     train = slice(*description.train) if description.train else None
     fit = identify(record, description.model, train=train)
-    return fit.system, fit, fit.about
+    if not others:
+        return fit.system, fit, fit.about, ()
+    found = validate(fit.system, fit.about, others)
+    return fit.system, fit, found.about, found.report.notes
 
 
 def _about_file(table: Mapping[str, Any], folder: Path) -> About:
@@ -238,12 +246,8 @@ def _designed(
 
 def _check_role(system: System, example: Any, where: str, role: str) -> None:
     """Raise ValueError unless ``system`` accepts ``example`` as its input."""
-    try:
-        eqx.filter_eval_shape(rest_output, system, example)
-    except (AttributeError, TypeError, ValueError, IndexError):
-        raise ValueError(
-            f"{where} is a {type(system).__name__}; it must map {role}"
-        ) from None
+    if not accepts(system, example):
+        raise ValueError(f"{where} is a {type(system).__name__}; it must map {role}")
 
 
 def _check_rates(study: Study, system: System, name: str) -> None:

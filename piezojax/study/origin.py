@@ -1,41 +1,23 @@
 """Units and sampling rate of the records and files that a study names."""
 
-import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
 
 from ..core.about import About
-from ..core.conversion import factor
 from ..identification import Record
 from .schema import Study
 
 
-def in_study_units(record: Record) -> Record:
-    """Return ``record`` with its input in V and its output in um.
+def in_study_units(record: Record, where: str) -> Record:
+    """Return ``record``, named at the key ``where``, with input in V and output in um.
 
     Raises ValueError for a unit that cannot be converted.
     """
-    factors = {}
-    for side, units, wanted in (
-        ("input", record.input_units, "V"),
-        ("output", record.output_units, "um"),
-    ):
-        each = [factor(unit, wanted) for unit in units]
-        if None in each:
-            raise ValueError(
-                f"plant.record: the {side} of {record.source} is in {units[0]}; a "
-                f"study of one axis needs it in {wanted}: scale the column, and name "
-                f"it with its unit, as {side}_{wanted}"
-            )
-        factors[side] = np.array(each)
-    return dataclasses.replace(
-        record,
-        inputs=record.inputs * factors["input"],
-        outputs=record.outputs * factors["output"],
-        input_units="V",
-        output_units="um",
-    )
+    try:
+        return record.in_units(("V",), ("um",))
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def check_origin(about: About, study: Study, where: str) -> None:

@@ -1,7 +1,7 @@
 """Tables of a study that describe the stage: plant, drive, sensor, disturbance."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -18,7 +18,8 @@ class RecordPlant(Table):
 
     ``time``, ``input`` and ``output`` are columns, by name or number; ``train`` is the
     first sample of the fitted part and the sample after its last. ``record_rate`` is
-    the sampling rate of the record, Hz.
+    the sampling rate of the records, Hz. ``check`` are other records of the stage, with
+    the same columns, that the fitted plant is validated on.
     """
 
     record: Path
@@ -28,6 +29,12 @@ class RecordPlant(Table):
     output: str | int = 1
     record_rate: Positive | None = None
     train: tuple[int, int] | None = None
+    check: tuple[Path, ...] = ()
+
+    @field_validator("check", mode="before")
+    @classmethod
+    def _listed(cls, given: Any) -> Any:
+        return (given,) if isinstance(given, str) else given
 
     @field_validator("model")
     @classmethod

@@ -15,6 +15,7 @@ from ..solve.search_state import SearchState
 from ..study import Case
 from .data import Data
 from .evaluator import Evaluator
+from .model_alarms import unchecked
 from .objective import Objective
 from .result import (
     ConstraintOutcome,
@@ -182,6 +183,7 @@ def _warnings(
             for text in report.warnings
             if text not in report.alarms
         ]
+    found += unchecked(case.plant_about)
     if at_bound:
         found.append(f"at the edge of its bounds: {', '.join(at_bound)}")
     for where, figures in (("tuning", after), ("hold-out", holdout)):

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from ..analysis.stability import StabilityReports
+from ..core.about import About
 from ..core.error_bound import ErrorBound
-from ..identification.fit import FitReport
 
 DECADES = 5.0
 """Decades below the Nyquist frequency in which the model error is compared."""
@@ -17,19 +17,18 @@ lightly damped mode at more lines than the search does."""
 
 
 def model_alarms(
-    report: FitReport | None,
-    bound: ErrorBound | None,
-    limit: float,
-    stability: StabilityReports,
+    about: About, fitted: bool, limit: float, stability: StabilityReports
 ) -> Iterator[str]:
     """Yield the alarms of the model of a plant, each with a next step.
 
-    They are those of its fit (``report``; None for other plants), and one if the tuned
-    loop can be unstable, or its Ms can exceed ``limit``, within the ``bound`` on the
-    model's error. ``stability`` holds the linear loops "after".
+    They are those of its fit and of its check on other records, if it was ``fitted`` in
+    this study, and one if the tuned loop can be unstable, or its Ms can exceed
+    ``limit``, within the bound on the model's error. ``about`` is the origin of the
+    model; ``stability`` holds the linear loops "after".
     """
-    if report is not None:
-        yield from report.alarms
+    bound = about.error_bound
+    if fitted:
+        yield from about.unsafe
         if bound is None:
             yield (
                 "the record gives no bound on the error of the fitted plant: use a "
@@ -87,3 +86,15 @@ def _error_alarm(
             f"resonance that the model lacks could {result}: record a chirp of small "
             "amplitude up to half the rate, or tune for a lower bandwidth"
         )
+
+
+def unchecked(about: About) -> list[str]:
+    """Return a note if a fitted model was never checked on a second record."""
+    if about.record is None or about.checked:
+        return []
+    return [
+        f"the model of the plant was fitted to {about.record} and never checked on a "
+        "second record: if that is not a record of this stage as it is today, nothing "
+        "shows it; record the stage again and name the file in plant.check, or for a "
+        "plant from a file run python -m piezojax.validate"
+    ]

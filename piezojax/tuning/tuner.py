@@ -103,8 +103,8 @@ def _model_alarms(
     """Return the ``model_alarms`` of the plant of ``case``."""
     return list(
         model_alarms(
-            case.fit.report if case.fit else None,
-            case.plant_about.error_bound,
+            case.plant_about,
+            case.fit is not None,
             limits.get("sensitivity_peak", math.inf),
             stability,
         )

@@ -53,7 +53,11 @@ above FAR times the promise."""
 RAILED = 0.02
 """Share of samples at a limit of the voltage above which a run rails."""
 
-ROUTINE = ("this residual is a disturbance of the loop", "at the edge of its bounds")
+ROUTINE = (
+    "this residual is a disturbance of the loop",
+    "never checked on a second record",
+    "at the edge of its bounds",
+)
 """Parts of notes that every run has and that warn of nothing."""
 
 MODEL = inspect.signature(pj.identify).parameters["model"].default
@@ -61,11 +65,15 @@ MODEL = inspect.signature(pj.identify).parameters["model"].default
 
 @dataclasses.dataclass
 class Setup:
-    """A stage with its record as columns by name, and the study of it."""
+    """A stage with its record as columns by name, and the study of it.
+
+    ``check`` is a second record of the stage, if the study names one.
+    """
 
     stage: object
     columns: dict
     study: dict
+    check: dict = dataclasses.field(default_factory=dict)
 
 
 def setup(stage, design, kind="careful"):
@@ -112,8 +120,10 @@ def setup(stage, design, kind="careful"):
 
 def tuned(setup, folder):
     """Write the record and the study, and tune."""
-    header, table = ",".join(setup.columns), np.column_stack([*setup.columns.values()])
-    np.savetxt(folder / "record.csv", table, "%.9g", ",", header=header, comments="")
+    for name, columns in (("record.csv", setup.columns), ("check.csv", setup.check)):
+        if columns:
+            header, table = ",".join(columns), np.column_stack([*columns.values()])
+            np.savetxt(folder / name, table, "%.9g", ",", header=header, comments="")
     path = folder / "study.toml"
     path.write_text(tomli_w.dumps(setup.study), encoding="utf-8")
     return pj.tune(path)

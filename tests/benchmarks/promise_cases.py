@@ -56,8 +56,13 @@ def rated(make, number, factor):
 
 
 def of_another(make, number, other):
-    """The record of another stage, resampled to the rate of this one."""
+    """The record of another stage at the rate of this one, checked on one of this."""
     one = make(forty_stages.stage(number))
+    own = one.stage
+    voltages, readings = excitation.record(own, seed=1)
+    time = own.dt * np.arange(len(voltages))
+    one.check = dict(zip(one.columns, (time, voltages, readings), strict=True))
+    one.study["plant"]["check"] = "check.csv"
     strange = forty_stages.stage(other)
     u, y = excitation.record(strange)
     time = np.arange(0.0, (len(u) - 1) * strange.dt, one.stage.dt)

@@ -13,6 +13,7 @@ from piezojax.analysis.stability import (
     stability_reports,
 )
 from piezojax.control import PID
+from piezojax.core.about import About
 from piezojax.core.error_bound import ErrorBound
 from piezojax.core.progress import Silent
 from piezojax.dynamics import FirstOrderLag
@@ -158,7 +159,7 @@ def test_beyond_the_band_of_a_narrow_record_no_gains_are_searched():
     limit = 1.05 * exact
     assert alarming_peak(loop, narrow, sensitivity_peak=limit) == 0.0
     stability = stability_reports({"after": loop}, 1.0, DT)
-    (alarm,) = model_alarms(None, narrow, limit, stability)
+    (alarm,) = model_alarms(About(error_bound=narrow), False, limit, stability)
     assert "the record excites nothing" in alarm
     wide = narrow.model_copy(update={"excited": (True,) * 4})
     assert alarming_peak(loop, wide, sensitivity_peak=limit) == np.inf

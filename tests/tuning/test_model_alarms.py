@@ -5,9 +5,9 @@ import pytest
 
 import piezojax as pj
 from piezojax.analysis.stability import stability_reports
+from piezojax.core.about import About
 from piezojax.core.error_bound import ErrorBound
-from piezojax.identification.fit import FitReport
-from piezojax.tuning.model_alarms import model_alarms
+from piezojax.tuning.model_alarms import model_alarms, unchecked
 
 RATE, GAIN = 1000.0, 0.1
 
@@ -41,22 +41,32 @@ def worst_by_sampling(relative_at):
 
 def test_a_small_error_raises_no_alarm(stability):
     assert (
-        list(model_alarms(None, bound((0.05,) * 4, (True,) * 4), 2.0, stability)) == []
+        list(
+            model_alarms(
+                About(error_bound=bound((0.05,) * 4, (True,) * 4)),
+                False,
+                2.0,
+                stability,
+            )
+        )
+        == []
     )
-    assert list(model_alarms(None, None, 2.0, stability)) == []
+    assert list(model_alarms(About(), False, 2.0, stability)) == []
 
 
 def test_an_unexcited_band_under_the_loop_is_named(stability):
     # |T| is 0.16 at 100 Hz: a hidden resonance of 25 times the gain is too much.
     unseen = bound((0.05, 0.05, 25.0, 25.0), (True, True, False, False))
-    (alarm,) = model_alarms(None, unseen, 2.0, stability)
+    (alarm,) = model_alarms(About(error_bound=unseen), False, 2.0, stability)
     assert "the record excites nothing at 10" in alarm
     assert "make the loop unstable" in alarm
     assert "record a chirp" in alarm
 
 
 def test_the_worst_peak_is_that_of_sampled_errors(stability):
-    (alarm,) = model_alarms(None, bound((0.6,) * 4, (True,) * 4), 1.05, stability)
+    (alarm,) = model_alarms(
+        About(error_bound=bound((0.6,) * 4, (True,) * 4)), False, 1.05, stability
+    )
     expected = worst_by_sampling(lambda frequency: 0.6)
     assert f"raise Ms to {expected:.3g} (limit 1.05)" in alarm
     assert "0.6 times its own gain" in alarm
@@ -64,13 +74,21 @@ def test_the_worst_peak_is_that_of_sampled_errors(stability):
 
 def test_without_a_limit_on_the_peak_instability_still_counts(stability):
     often, always = (bound((share,) * 4, (True,) * 4) for share in (0.6, 1.5))
-    assert list(model_alarms(None, often, np.inf, stability)) == []
-    (alarm,) = model_alarms(None, always, np.inf, stability)
+    assert list(model_alarms(About(error_bound=often), False, np.inf, stability)) == []
+    (alarm,) = model_alarms(About(error_bound=always), False, np.inf, stability)
     assert "make the loop unstable" in alarm
 
 
 def test_alarms_of_the_fit_and_a_missing_bound_are_alarms(stability):
-    report = FitReport.model_construct(alarms=["wrong column"])
-    first, second = model_alarms(report, None, 2.0, stability)
+    about = About(unsafe=["wrong column"])
+    first, second = model_alarms(about, True, 2.0, stability)
     assert first == "wrong column"
     assert "gives no bound on the error" in second
+
+
+def test_a_model_that_was_never_checked_is_noted():
+    (note,) = unchecked(About(record="bench.csv"))
+    assert "fitted to bench.csv and never checked" in note
+    assert "plant.check" in note
+    assert unchecked(About(record="bench.csv", checked=["today.csv"])) == []
+    assert unchecked(About()) == []

@@ -111,4 +111,11 @@ def test_each_axis_has_its_own():
 
 
 def test_tuning_ends_with_the_alarm():
-    assert pj.tune(case_of((-20.0, 20.0))).result.alarms[0].startswith("the references")
+    case = case_of((-20.0, 20.0))
+    about = case.plant_about.model_copy(update={"record": "bench.csv"})
+    result = pj.tune(dataclasses.replace(case, plant_about=about)).result
+    assert result.alarms[0].startswith("the references")
+    assert any(
+        "fitted to bench.csv and never checked on a second record" in note
+        for note in result.warnings
+    )

@@ -5,9 +5,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ...core.conversion import factor
 from .columns import Column, Columns, ContentError
 from .formats import read_columns
 from .units import seconds_of, unit_of
@@ -41,7 +43,8 @@ class Record:
     ``inputs`` [samples, m] and ``outputs`` [samples, p] in ``input_units`` and
     ``output_units``, one unit per column. A single column may be given as [samples] and
     its unit as one text. ``dt`` is the sample time in s, ``source`` the origin named in
-    messages, ``period`` the number of samples in a period of a periodic input.
+    messages, ``period`` the number of samples in a period of a periodic input;
+    ``input_names`` and ``output_names`` are those of the columns in a file.
 
     Raises ValueError, naming column and sample, for columns of different length, too
     few samples, missing numbers, a constant column, a sample time that is not positive,
@@ -55,6 +58,8 @@ class Record:
     output_units: str | tuple[str, ...] = "um"
     source: str = ""
     period: int | None = None
+    input_names: tuple[str, ...] = ()
+    output_names: tuple[str, ...] = ()
 
     def __post_init__(self):
         for side in ("input", "output"):
@@ -154,6 +159,36 @@ class Record:
         """Range of the only output, largest minus smallest value."""
         return float(np.ptp(self.output))
 
+    def in_units(
+        self, input_units: Sequence[str], output_units: Sequence[str]
+    ) -> "Record":
+        """Return the record with its channels converted to these units.
+
+        Raises ValueError, naming the channel, for a unit that cannot be converted, and
+        for another number of channels.
+        """
+        changed: dict[str, Any] = {}
+        for side, wanted in (("input", input_units), ("output", output_units)):
+            units = getattr(self, f"{side}_units")
+            if len(units) != len(wanted):
+                raise ValueError(
+                    f"{self.source} has {len(units)} {side} columns; {len(wanted)} are "
+                    "needed"
+                )
+            factors = []
+            for unit, target in zip(units, wanted, strict=True):
+                found = factor(unit, target)
+                if found is None:
+                    raise ValueError(
+                        f"the {side} of {self.source} is in {unit}, and {target} is "
+                        "needed: scale the column, and name it with its unit, as "
+                        f"{side}_{target}"
+                    )
+                factors.append(found)
+            changed[f"{side}s"] = getattr(self, f"{side}s") * np.array(factors)
+            changed[f"{side}_units"] = tuple(wanted)
+        return dataclasses.replace(self, **changed)
+
     def until(self, stop: int) -> "Record":
         """Return the first ``stop`` samples as a record; errors as for Record."""
         return dataclasses.replace(
@@ -226,6 +261,8 @@ def read_record(
         output_units=tuple(unit_of(n, columns[n]) or "um" for n in outputs),
         source=path.name,
         period=period,
+        input_names=tuple(inputs),
+        output_names=tuple(outputs),
     )
 
 

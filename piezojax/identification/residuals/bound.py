@@ -126,13 +126,22 @@ def error_bound(
 ) -> ErrorBound:
     """Return the error bound of a model from its free ``runs`` over ``records``.
 
-    Every record has one input and one output, and so has its run. At lines that several
-    records excite the largest bound counts. Raises ValueError as ``relative_error``.
+    Every record has one input and one output, and so has its run. Raises ValueError as
+    ``relative_error``.
     """
-    bounds = [
-        _completed(relative_error(record, run, part), record)
-        for record, run in zip(records, runs, strict=True)
-    ]
+    return joined(
+        [
+            _completed(relative_error(record, run, part), record)
+            for record, run in zip(records, runs, strict=True)
+        ]
+    )
+
+
+def joined(bounds: Sequence[ErrorBound]) -> ErrorBound:
+    """Return one bound from those of several records.
+
+    At lines that several records excite the largest bound counts.
+    """
     if len(bounds) == 1:
         return bounds[0]
     lines = max(bounds, key=lambda bound: len(bound.frequency)).frequency

@@ -1,6 +1,7 @@
 """Residual analysis of a fit: report and warnings."""
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import BaseModel
@@ -40,6 +41,14 @@ class ResidualReport(BaseModel):
     error_bound: ErrorBound | None
 
 
+class Faults(NamedTuple):
+    """Bound on the error of a model, resonances that it lacks, and its warnings."""
+
+    bound: ErrorBound | None
+    peaks: list[Peak]
+    warnings: list[str]
+
+
 def residual_report(
     records: Sequence[Record],
     runs: Sequence[np.ndarray],
@@ -55,24 +64,42 @@ def residual_report(
         [(r.outputs - run)[validate] for r, run in zip(records, runs, strict=True)]
     )
     inputs = np.concatenate([record.inputs[validate] for record in records])
-    bound, relative = _relative(records, runs, validate)
+    faults = model_faults(records, runs, validate)
     report = ResidualReport(
         whiteness=[autocorrelation(error) for error in errors.T],
         input_correlation=[
             cross_correlation(error, input) for error in errors.T for input in inputs.T
         ],
-        peaks=[] if relative is None else unmodelled_peaks(relative),
-        coverage=coverage_of(records, bound),
+        peaks=faults.peaks,
+        coverage=coverage_of(records, faults.bound),
         unseen=unseen_in(records[0].inputs[:, 0], records[0].dt, train, validate),
-        error_bound=bound,
+        error_bound=faults.bound,
     )
     return report, [
-        *_peak_warnings(report),
-        *_response_warnings(report, relative),
-        *_gain_warnings(records, runs, validate),
+        *faults.warnings,
         *_coverage_warnings(report, records[0].dt),
         *_unseen_warnings(report),
     ]
+
+
+def model_faults(
+    records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
+) -> Faults:
+    """Return what the free ``runs`` [samples, p] over ``part`` show of the model.
+
+    Bound and peaks are those of ``ResidualReport``.
+    """
+    bound, relative = _relative(records, runs, part)
+    peaks = [] if relative is None else unmodelled_peaks(relative)
+    return Faults(
+        bound,
+        peaks,
+        [
+            *_peak_warnings(peaks),
+            *([] if peaks else _response_warnings(relative)),
+            *_gain_warnings(records, runs, part),
+        ],
+    )
 
 
 def _relative(
@@ -95,8 +122,8 @@ def _relative(
         return None, None
 
 
-def _peak_warnings(report: ResidualReport) -> Iterator[str]:
-    for peak in report.peaks:
+def _peak_warnings(peaks: Sequence[Peak]) -> Iterator[str]:
+    for peak in peaks:
         yield (
             f"the model leaves a peak at {peak.frequency_Hz:.4g} Hz, "
             f"{peak.times_gain:.3g} times its own gain there: a resonance is missing "
@@ -104,11 +131,9 @@ def _peak_warnings(report: ResidualReport) -> Iterator[str]:
         )
 
 
-def _response_warnings(
-    report: ResidualReport, found: RelativeError | None
-) -> Iterator[str]:
+def _response_warnings(found: RelativeError | None) -> Iterator[str]:
     """Warn of an octave in which the response is wrong by more than the gain."""
-    if found is None or report.peaks:
+    if found is None:
         return
     seen = found.gain > VISIBLE * found.gain[0]
     wrong = found.sure & (found.lower > LEAST) & seen

@@ -1,0 +1,82 @@
+"""Options of the commands that read records."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..identification import Record
+
+
+class SampleRange(click.ParamType):
+    """Two sample numbers as in ``0:1200``, converted to a slice."""
+
+    name = "START:STOP"
+
+    def convert(self, value, param, ctx):
+        """Return the slice of a text; fail with one line for any other text."""
+        try:
+            start, stop = (int(number) for number in value.split(":"))
+        except ValueError:
+            self.fail(f"{value!r} must be two sample numbers, as in 0:1200", param, ctx)
+        return slice(start, stop)
+
+
+def record_columns(function: Callable) -> Callable:
+    """Add the options of ``read_record``."""
+    for option in reversed(
+        (
+            click.option("--time", help="Time column, by name or number from zero."),
+            click.option(
+                "--input", default="0", show_default=True, help="Input column."
+            ),
+            click.option(
+                "--output", default="1", show_default=True, help="Output column."
+            ),
+            click.option(
+                "--rate", type=float, help="Sampling rate, Hz, without a time column."
+            ),
+            click.option(
+                "--period", type=int, help="Samples per period of a periodic input."
+            ),
+            click.option(
+                "--resample", type=float, help="Resample the record to this rate, Hz."
+            ),
+        )
+    ):
+        function = option(function)
+    return function
+
+
+def print_columns(console: Console, records: Iterable["Record"]) -> None:
+    """Print what was read: columns with their units and ranges, samples and rate."""
+    for record in records:
+        sides = "; ".join(
+            f"{role} {', '.join(columns)}"
+            for role, columns in (
+                ("input", _of(record.input_names, record.inputs, record.input_units)),
+                (
+                    "output",
+                    _of(record.output_names, record.outputs, record.output_units),
+                ),
+            )
+        )
+        console.print(
+            f"read {record.source}: {sides}; {record.samples} samples at "
+            f"{1.0 / record.dt:.6g} Hz",
+            soft_wrap=True,
+            markup=False,
+        )
+
+
+def _of(
+    names: Sequence[str], columns: "np.ndarray", units: str | tuple[str, ...]
+) -> list[str]:
+    return [
+        f"{name!r} from {column.min():.4g} to {column.max():.4g} {unit}"
+        for name, column, unit in zip(names, columns.T, units, strict=True)
+    ]

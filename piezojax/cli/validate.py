@@ -1,0 +1,64 @@
+"""``python -m piezojax.validate MODEL RECORD... --out DIR``."""
+
+from pathlib import Path
+
+import click
+
+from .command import Command, common, exit_unsafe, print_alarms, results_folder, run
+from .records import SampleRange, print_columns, record_columns
+from .terminal import Bar
+
+
+@click.command(cls=Command)
+@click.argument("model", type=click.Path(path_type=Path))
+@click.argument(
+    "records",
+    nargs=-1,
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="RECORD...",
+)
+@record_columns
+@click.option(
+    "--estimate",
+    type=SampleRange(),
+    help="Samples from which the state before each record and the zero of its sensor "
+    "are estimated (default: the first fifth).",
+)
+@common
+def main(model, records, estimate, out, seed, quiet, **columns):
+    """Judge a fitted MODEL on other RECORDs of its stage, and save it with the verdict.
+
+    No parameter of the model changes. The file model.json in the results carries the
+    alarms, and an error bound that also holds for these records: name it in a study.
+    """
+    del seed  # nothing is random
+
+    def body(console):
+        from ..core.serial import load, read_about
+        from ..identification import read_record, validate
+        from ..report.model_validation import (
+            input_lines,
+            validation_table,
+            write_validation,
+        )
+
+        system, about = load(model, accept_unsafe=True), read_about(model)
+        loaded = [read_record(record, **columns) for record in records]
+        print_columns(console, loaded)
+        with Bar(console) as bar, results_folder(out, model.stem) as folder:
+            bar.stage("judging the model")
+            found = validate(system, about, loaded, estimate=estimate)
+            bar.stage("drawing")
+            write_validation(found, folder)
+        report = found.report
+        print_alarms(console, report.alarms)
+        console.print(validation_table(report))
+        for line in input_lines(report):
+            console.print(line, soft_wrap=True)
+        for note in report.notes:
+            console.print(f"note: {note}", soft_wrap=True)
+        console.print(f"results in {folder}", soft_wrap=True)
+        exit_unsafe(report.alarms)
+
+    run(quiet, body)
