@@ -1,21 +1,19 @@
 """Judgement of a saved model on other records of its stage."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from pydantic import BaseModel
 
 from ..core.about import About
 from ..core.error_bound import ErrorBound
-from ..core.rollout import simulate
-from ..core.system import System, accepts
+from ..core.system import System, accepts, rest_output
+from .estimators.approach import levels_before, runs_after
 from .fit import POOR, unexplained_share
 from .records.record import LARGEST, Record
 from .residuals.bound import joined
@@ -26,15 +24,6 @@ SHARE = 0.2
 
 MOST = 20_000
 """Most samples of that part, if it is not given."""
-
-APPROACH = 2000
-"""Samples of the assumed motion before a record."""
-
-LEVELS = 9
-"""Levels of the input tried for each of the two turning points of that motion."""
-
-FINER = (-0.5, -0.25, 0.0, 0.25, 0.5)
-"""Levels around the best ones, in steps of the first grid."""
 
 WINDOWS = 40
 """Stretches in which the error is compared with amplitude and rate."""
@@ -199,8 +188,9 @@ def _judged(
     """Return the check of ``record``."""
     part = _part(record, estimate)
     rest = slice(part.stop, record.samples)
-    before = _levels_before(system, about, record, part)
-    run = _runs(system, record, before[None])[0]
+    inputs = _signals(system, record)
+    before = levels_before(system, inputs, record.outputs, part, _ranges(inputs, about))
+    run = _run(system, inputs, before)
     zero = np.mean((record.outputs - run)[part], axis=0)
     diverged = not np.all(np.isfinite(run))
     run = run + zero
@@ -213,7 +203,7 @@ def _judged(
         rate_Hz=1.0 / record.dt,
         estimated=(part.start, part.stop),
         judged=(rest.start, rest.stop),
-        before=[(float(a), float(b)) for a, b in before.T],
+        before=[(float(a), float(b)) for a, b in before.reshape(2, -1).T],
         zero=[0.0 if diverged else float(z) for z in zero],
         unit=record.output_unit,
         rmse=None if diverged else rmse,
@@ -246,83 +236,45 @@ def _part(record: Record, estimate: slice | None) -> slice:
     return slice(start, stop)
 
 
-def _levels_before(
-    system: System, about: About, record: Record, part: slice
-) -> np.ndarray:
-    """Return the two levels [2, m] of the inputs before the record that fit best."""
-    low, high = (f(record.inputs, axis=0) for f in (np.min, np.max))
-    if len(about.input_ranges) == low.size:
-        ranges = np.asarray(about.input_ranges)
-        low, high = np.minimum(low, ranges[:, 0]), np.maximum(high, ranges[:, 1])
+def _signals(system: System, record: Record) -> np.ndarray:
+    """Return the inputs as the model takes them, [samples] or [samples, m].
 
-    def best(candidates: np.ndarray) -> np.ndarray:
-        runs = _runs(system, record, candidates, part.stop)
-        # The zero is free: only the scatter of the error counts.
-        scatter = np.var(record.outputs[part] - runs[:, part], axis=1).sum(axis=-1)
-        return candidates[np.argmin(np.where(np.isfinite(scatter), scatter, np.inf))]
-
-    grid = np.linspace(0.0, 1.0, LEVELS)
-    shares = np.array([*product(grid, grid)])[:, :, None]
-    first = np.broadcast_to(record.inputs[0], (1, 2, low.size))
-    found = best(np.concatenate([first, low + shares * (high - low)]))
-    around = np.array([*product(FINER, FINER)])[:, :, None] * (high - low) * grid[1]
-    return best(np.clip(found + around, low, high))
-
-
-def _runs(
-    system: System, record: Record, levels: np.ndarray, stop: int | None = None
-) -> np.ndarray:
-    """Return the free runs [candidates, stop, p] after the ``levels``.
-
-    Samples of a run that diverges are NaN.
+    Raises ValueError for a model of other inputs or outputs.
     """
-    inputs = jnp.asarray(record.inputs[:stop])
-    single = inputs.shape[1] == 1 and accepts(system, inputs[0, 0])
-    if not single and not accepts(system, inputs[0]):
-        raise ValueError(
-            f"the model does not take the {inputs.shape[1]} input columns of "
-            f"{record.source} (--input)"
-        )
-    found = np.asarray(
-        _all_runs(
-            system, inputs[:, 0] if single else inputs, jnp.asarray(levels), single
-        )
+    columns = record.inputs.shape[1]
+    choices = [record.inputs[:, 0], record.inputs] if columns == 1 else [record.inputs]
+    for inputs in choices:
+        first = jnp.asarray(inputs[0])
+        if not accepts(system, first):
+            continue
+        output = eqx.filter_eval_shape(rest_output, system, first)
+        if math.prod(output.shape) != record.outputs.shape[1]:
+            raise ValueError(
+                f"the model has {math.prod(output.shape)} outputs and {record.source} "
+                f"{record.outputs.shape[1]}: name the columns of its outputs (--output)"
+            )
+        return inputs
+    raise ValueError(
+        f"the model does not take the {columns} input columns of {record.source} "
+        "(--input)"
     )
-    found = np.where(np.abs(found) < LARGEST, found, np.nan)
-    found = found[..., None] if found.ndim == 2 else found
-    if found.shape[-1] != record.outputs.shape[1]:
-        raise ValueError(
-            f"the model has {found.shape[-1]} outputs and {record.source} "
-            f"{record.outputs.shape[1]}: name the columns of its outputs (--output)"
-        )
-    return found
 
 
-@eqx.filter_jit
-def _all_runs(
-    system: System,
-    inputs: Float[Array, " samples *m"],
-    levels: Float[Array, " candidates 2 m"],
-    single: bool,
-) -> Array:
-    """Return the outputs after a slow motion from rest over both ``levels``.
+def _ranges(inputs: np.ndarray, about: About) -> np.ndarray:
+    """Return the ends [2] or [2, m] of the inputs, in this record and the model's."""
+    low, high = np.min(inputs, axis=0), np.max(inputs, axis=0)
+    if len(about.input_ranges) == np.size(low):
+        known = np.asarray(about.input_ranges).T.reshape(2, *np.shape(low))
+        low, high = np.minimum(low, known[0]), np.maximum(high, known[1])
+    return np.stack([low, high])
 
-    A plant maps u(k) to y(k+1), as in ``free_run``.
-    """
-    half = 0.5 - 0.5 * jnp.cos(jnp.linspace(0.0, jnp.pi, APPROACH // 2))[:, None]
 
-    def one(pair: Array) -> Array:
-        pair = pair[:, 0] if single else pair
-        way = half[:, 0] if single else half
-        first = pair[0] + (pair[1] - pair[0]) * way
-        second = pair[1] + (inputs[0] - pair[1]) * way
-        _, outputs = simulate(
-            system, jnp.concatenate([first, second, inputs]), system.init(pair[0])
-        )
-        begin = first.shape[0] + second.shape[0] - 1
-        return outputs[begin : begin + inputs.shape[0]]
-
-    return jax.vmap(one)(levels)
+def _run(system: System, inputs: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """Return the free run [samples, p] after ``levels``; NaN where it diverges."""
+    candidates = jnp.asarray(levels)[None]
+    found = np.asarray(runs_after(system, jnp.asarray(inputs), candidates))
+    found = found.reshape(len(inputs), -1)
+    return np.where(np.abs(found) < LARGEST, found, np.nan)
 
 
 def _by_input(record: Record, error: np.ndarray, part: slice) -> list[PartError]:
