@@ -225,7 +225,7 @@ def test_validate_writes_a_model_that_is_checked(tmp_path):
     assert names(out) == ["model.json", "validation.json", "validation.png"]
     assert_pictures(out, "validation.png")
     assert "input 'drive_V' from 0 to 39.84 V; output 'sensor_um'" in printed
-    assert "judged from" in printed
+    assert "% of span" in printed
     pj.load(out / "model.json")
     about = pj.read_about(out / "model.json")
     assert about.record == "first.csv"

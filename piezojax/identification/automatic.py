@@ -1,12 +1,14 @@
 """Default model: the hysteresis that describes a record best, and its dynamics."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
 from ..hysteresis.model import hystereses
 from .chain import dynamics_of, dynamics_parts, structure
-from .estimators.output_error import from_rest, output_error
+from .estimators.output_error import from_rest, output_error, starts_of
 from .records.record import Record
 
 HYSTERESES = (
@@ -34,22 +36,30 @@ STEPS = 24
 """Number of steps of a trial."""
 
 
-def automatic(record: Record, progress: Progress | None = None) -> str:
+def automatic(
+    record: Record, progress: Progress | None = None, beside: Sequence[Record] = ()
+) -> str:
     """Return the default chain for ``record``, the training samples.
 
-    The hysteresis is the one with the least error after short fits, which are made at a
-    lower sampling rate if that resolves the resonances.
+    The hysteresis is the one with the least error after short fits to ``record`` and
+    those ``beside`` it, which are made at a lower sampling rate if that resolves the
+    resonances.
     """
-    return f"{hysteresis_for(record, progress)}+{CREEP}+{dynamics_parts(record)}"
+    hysteresis = hysteresis_for([record, *beside], progress)
+    return f"{hysteresis}+{CREEP}+{dynamics_parts(record)}"
 
 
-def hysteresis_for(record: Record, progress: Progress | None = None) -> str:
-    """Return the name of the hysteresis in ``HYSTERESES`` that describes it best."""
+def hysteresis_for(records: Sequence[Record], progress: Progress | None = None) -> str:
+    """Return the name of the hysteresis in ``HYSTERESES`` that describes them best.
+
+    Dynamics and bounds are those of the first record.
+    """
     first, *others = HYSTERESES
-    if record.samples < LEAST:
+    if records[0].samples < LEAST:
         return first
     (progress or Silent()).stage("choosing the hysteresis")
-    slow = _slowed(record)
+    every = _slowing(records[0])
+    slow = [_slowed(record, every) for record in records]
     least, chosen = CLEARLY * _error(first, slow), first
     for name in others:
         error = _error(name, slow)
@@ -58,15 +68,20 @@ def hysteresis_for(record: Record, progress: Progress | None = None) -> str:
     return chosen
 
 
-def _slowed(record: Record) -> Record:
-    """Return ``record`` at the rate of a trial."""
-    import scipy.signal  # takes long to import
-
+def _slowing(record: Record) -> int:
+    """Return the number of samples of ``record`` in one of a trial."""
     every = record.samples // SAMPLES
     modes = dynamics_of(record).modes
     if modes:
         fastest = max(mode.frequency for mode in modes)
         every = min(every, int(1.0 / (RESOLVED * fastest * record.dt)))
+    return max(1, every)
+
+
+def _slowed(record: Record, every: int) -> Record:
+    """Return ``record`` with ``every`` so many samples made one."""
+    import scipy.signal  # takes long to import
+
     if every < 2:
         return record
     input, output = (
@@ -76,19 +91,30 @@ def _slowed(record: Record) -> Record:
     return Record(input, output, every * record.dt, source=record.source)
 
 
-def _error(name: str, record: Record) -> float:
-    """Return the rms error after a short fit.
+def _error(name: str, records: Sequence[Record]) -> float:
+    """Return the rms error after a short fit; with several records, after one to each.
 
-    It is infinite if there is no fit, or if the fitted hysteresis has no inverse over
-    the range of the input, which designs of controllers need.
+    The error of a fit to one of several is that on the others. It is infinite if there
+    is no fit, or if the fitted hysteresis has no inverse over the range of the input,
+    which designs of controllers need.
     """
-    shape = structure(f"{name}+{CREEP}+{dynamics_parts(record)}", record)
-    every = slice(0, record.samples)
-    try:
-        optimum = output_error(shape, [record], every, steps=STEPS)
-        system = shape.space.put(shape.system, as_array(optimum.units[0]))
-        hystereses(system)[0].inverse(record.input.min(), record.input.max())
-    except ValueError:
-        return np.inf
-    run = np.asarray(from_rest(system, as_array(record.input)))
-    return float(np.std(run - record.output))
+    first = records[0]
+    shape = structure(f"{name}+{CREEP}+{dynamics_parts(first)}", first)
+    squares = []
+    for record in records:
+        others = [other for other in records if other is not record]
+        every = slice(0, record.samples)
+        try:
+            system = output_error(shape, [record], every, steps=STEPS).system
+            hystereses(system)[0].inverse(first.input.min(), first.input.max())
+        except ValueError:
+            return np.inf
+        if not others:
+            run = np.asarray(from_rest(system, as_array(record.input)))
+            return float(np.std(run - record.output))
+        squares += [
+            np.mean((run[:, 0] - other.output) ** 2)
+            for other in others
+            for run in starts_of(system, [other], slice(0, other.samples))[1]
+        ]
+    return float(np.sqrt(np.mean(squares)))

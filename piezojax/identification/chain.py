@@ -22,6 +22,9 @@ LINEAR = ("dynamics", "lag", "delay")
 DEFAULT = "auto"
 """Model that is fitted by default (``automatic``)."""
 
+OFFSET = "calibration.offset"
+"""Parameter that stands for the zero of the sensor."""
+
 FRACTION = 0.2
 """Shortest delay, in samples, for which a model with a mode has a delay."""
 
@@ -143,7 +146,10 @@ def structure(name: str, record: Record) -> Structure:
         system,
         space,
         _starts(system, space, parts),
-        tuple(f"{place}.{path}" for place, part in parts.items() for path in part.own),
+        (
+            *(f"{place}.{path}" for place, part in parts.items() for path in part.own),
+            OFFSET,
+        ),
         tuple(path for path in bounds if path.split(".")[0] in LINEAR),
         shown.whitening if shown.modes else (),
     )

@@ -15,13 +15,13 @@ from ..core.paths import declared, parameters
 from ..core.progress import Progress, Silent
 from ..core.system import System
 from .automatic import automatic
-from .chain import DEFAULT, shown_dynamics, training_record
+from .chain import DEFAULT, shown_dynamics
 from .estimators.estimate import FittedParameter, LinearDetail, Options
 from .estimators.resonances import LinearDynamics
 from .methods import method_for
 from .plausibility import plausibility_warnings
 from .records.checks import record_warnings
-from .records.parts import check_compatible, train_and_validation
+from .records.parts import check_compatible, check_train, train_and_validation
 from .records.record import Record
 from .residuals.report import ResidualReport, residual_report
 
@@ -195,19 +195,23 @@ def identify(
     default is a chain with the resonances, lag and delay that the record shows, and
     with the hysteresis that describes it best (``automatic``).
     ``method`` is a name in METHODS; left out, it is the first that can fit the model.
-    The model is fitted over the samples ``train`` of each record (the first half if
-    left out) and validated by its free run on ``validate`` (the rest if left out).
+    The model is fitted over the samples ``train`` of each record (the first half of the
+    longest if left out) and validated by its free run on ``validate`` (the rest if left
+    out); a record without samples there is only fitted. Each of several records has a
+    zero and a state before it of its own. The records of the fit are the longest first.
     Raises ValueError for an unknown model or method, an empty part, records of
     different sample time or units, or if no start leads to a finite fit.
     """
     began = time.perf_counter()
     records = (records,) if isinstance(records, Record) else tuple(records)
     check_compatible(records)
-    train, validate = train_and_validation(
-        min(r.samples for r in records), train, validate
-    )
+    records = tuple(sorted(records, key=lambda record: -record.samples))
+    train, validate = train_and_validation(records[0].samples, train, validate)
+    check_train(records, train)
     if model == DEFAULT:
-        model = automatic(training_record(records, train), progress)
+        parts = [record.until(train.stop) for record in records]
+        parts.sort(key=lambda part: -part.span)
+        model = automatic(parts[0], progress, parts[1:])
     shown = shown_dynamics(records, train)
     chosen = method_for(model, method)
     estimate = chosen.estimate(

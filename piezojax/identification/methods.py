@@ -3,21 +3,24 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 
 from ..core.arrays import as_array
-from ..core.paths import parameters
+from ..core.paths import get, parameters, replace
 from ..core.progress import Progress
-from ..core.system import System
 from ..hysteresis.model import hystereses
-from .chain import structure, training_record
+from .chain import OFFSET, structure, training_record
 from .estimators.estimate import Estimate, FittedParameter, Options, bound_warning
 from .estimators.linear import by_frequency_response, by_subspace
 from .estimators.model_bouc_wen import bouc_wen
 from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
 from .estimators.neural import fit_neural_state_space
-from .estimators.output_error import Optimum, from_rest, output_error, values_and_errors
+from .estimators.output_error import (
+    Optimum,
+    free_runs,
+    output_error,
+    values_and_errors,
+)
 from .estimators.regression import instrumental_variables, least_squares
 from .estimators.steady_state import fit_structure, steady_response
 from .estimators.structure import Structure
@@ -34,14 +37,6 @@ to warn."""
 Records = Sequence[Record]
 
 
-def _free_runs(systems: Sequence[System], records: Records) -> tuple[np.ndarray, ...]:
-    run = eqx.filter_jit(from_rest)
-    return tuple(
-        np.asarray(run(system, as_array(record.input)))[:, None]
-        for system, record in zip(systems, records, strict=True)
-    )
-
-
 def _by_output_error(
     model: str, records: Records, train: slice, options: Options, progress: Progress
 ) -> Estimate:
@@ -49,19 +44,25 @@ def _by_output_error(
     optimum = output_error(
         shape, records, train, steps=options.steps, progress=progress
     )
-    systems = [
-        shape.space.put(shape.system, as_array(optimum.units[0][row]))
-        for row in np.asarray(optimum.problem.which)
-    ]
     named = {
         name: FittedParameter(value=float(value), standard_error=error)
         for name, value, error in zip(
-            optimum.names, *values_and_errors(optimum), strict=True
+            optimum.problem.space.paths, *values_and_errors(optimum), strict=True
         )
     }
+    system = optimum.system
+    runs, zeros = free_runs(system, records, train)
+    if len(records) > 1:
+        named |= {
+            f"zero of {record.source or i}": FittedParameter(
+                value=zero, standard_error=None
+            )
+            for i, (record, zero) in enumerate(zip(records, zeros, strict=True))
+        }
+        system = replace(system, {OFFSET: get(system, OFFSET) + zeros[0]})
     return Estimate(
-        systems[0],
-        _free_runs(systems, records),
+        system,
+        runs,
         named,
         _optimum_warnings(optimum, named, shape, options.steps),
         shape.order,
@@ -82,7 +83,7 @@ def _optimum_warnings(
         found.append(f"the fit had not converged after its {steps} steps")
     equal = optimum.units[optimum.losses <= optimum.losses[0] * (1.0 + EQUAL_LOSS)]
     spread = np.ptp(equal, axis=0)
-    for i, name in enumerate(optimum.names):
+    for i, name in enumerate(optimum.problem.space.paths):
         if name not in shown:
             found += bound_warning(name, optimum.units[0, i])
         if fitted[name].standard_error is None:
@@ -114,7 +115,7 @@ def _by_regression(estimator: Callable) -> Callable[..., Estimate]:
             for path, value in parameters(found.model).items()
             if path != "rest_input"
         }
-        runs = _free_runs([found.model], [record])
+        runs, _ = free_runs(found.model, [record], train)
         return Estimate(found.model, runs, named, [], len(named) - 2, True)
 
     return estimate
@@ -164,7 +165,7 @@ def _by_nonnegative_least_squares(
             found.values.items(), found.deviations, strict=True
         )
     }
-    runs = _free_runs([found.system], [record])
+    runs, _ = free_runs(found.system, [record], train)
     return Estimate(found.system, runs, named, found.warnings, 1, True)
 
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from ..core.about import About
 from ..core.error_bound import ErrorBound
 from ..core.system import System, accepts, rest_output
-from .estimators.approach import levels_before, runs_after
+from .estimators.approach import start_of
 from .fit import POOR, unexplained_share
 from .records.record import LARGEST, Record
 from .residuals.bound import joined
@@ -189,11 +189,11 @@ def _judged(
     part = _part(record, estimate)
     rest = slice(part.stop, record.samples)
     inputs = _signals(system, record)
-    before = levels_before(system, inputs, record.outputs, part, _ranges(inputs, about))
-    run = _run(system, inputs, before)
-    zero = np.mean((record.outputs - run)[part], axis=0)
+    start, run, zero = start_of(
+        system, inputs, record.outputs, part, _ranges(inputs, about)
+    )
+    run = np.where(np.abs(run) < LARGEST, run, np.nan)
     diverged = not np.all(np.isfinite(run))
-    run = run + zero
     error = (run - record.outputs)[rest]
     each = np.sqrt(np.mean(error**2, axis=0))
     rmse = float(np.sqrt(np.mean(each**2)))
@@ -203,7 +203,7 @@ def _judged(
         rate_Hz=1.0 / record.dt,
         estimated=(part.start, part.stop),
         judged=(rest.start, rest.stop),
-        before=[(float(a), float(b)) for a, b in before.reshape(2, -1).T],
+        before=[(float(a), float(b)) for a, b in np.reshape(start.levels, (2, -1)).T],
         zero=[0.0 if diverged else float(z) for z in zero],
         unit=record.output_unit,
         rmse=None if diverged else rmse,
@@ -267,14 +267,6 @@ def _ranges(inputs: np.ndarray, about: About) -> np.ndarray:
         known = np.asarray(about.input_ranges).T.reshape(2, *np.shape(low))
         low, high = np.minimum(low, known[0]), np.maximum(high, known[1])
     return np.stack([low, high])
-
-
-def _run(system: System, inputs: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """Return the free run [samples, p] after ``levels``; NaN where it diverges."""
-    candidates = jnp.asarray(levels)[None]
-    found = np.asarray(runs_after(system, jnp.asarray(inputs), candidates))
-    found = found.reshape(len(inputs), -1)
-    return np.where(np.abs(found) < LARGEST, found, np.nan)
 
 
 def _by_input(record: Record, error: np.ndarray, part: slice) -> list[PartError]:

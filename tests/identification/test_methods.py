@@ -108,7 +108,7 @@ def test_records_that_drive_one_channel_in_turn_are_stacked():
     assert len(fit.simulations) == 2
 
 
-def test_records_of_one_stage_share_all_but_what_came_before():
+def test_records_of_one_stage_share_all_but_zero_and_what_came_before():
     time = np.arange(600) * DT
     plant = {"a": 0.0077, "b": 0.1167, "c": -0.0487}
     records, rests = [], (-10.0, 25.0)
@@ -117,7 +117,7 @@ def test_records_of_one_stage_share_all_but_what_came_before():
         system = series(
             hysteresis=ColemanHodgdon(**plant, rest_input=rest),
             lag=FirstOrderLag(2.5e-3, DT),
-            calibration=Affine(1.0, -3.0),
+            calibration=Affine(1.0, -3.0 + 0.5 * number),
         )
         noise = NOISE * np.random.default_rng(number).standard_normal(u.size)
         y = np.asarray(free_run(system, jnp.asarray(u), rest)) + noise
@@ -127,8 +127,8 @@ def test_records_of_one_stage_share_all_but_what_came_before():
         found = fit.report.parameters[f"hysteresis.{name}"]
         assert abs(found.value - value) < 4.0 * found.standard_error
     assert fit.report.validation.rmse == pytest.approx(NOISE, rel=0.2)
-    for number in range(2):
-        assert f"hysteresis.rest_input of record {number}" in fit.report.parameters
+    zeros = [fit.report.parameters[f"zero of run {i}"].value for i in range(2)]
+    assert zeros[1] - zeros[0] == pytest.approx(0.5, abs=0.01)
     assert "hysteresis.rest_input" not in fit.report.parameters
 
 

@@ -10,7 +10,12 @@ from piezojax.catalog import p753
 from piezojax.core.paths import replace
 from piezojax.identification import free_run
 from piezojax.identification.chain import structure
-from piezojax.identification.estimators.output_error import problem_of
+from piezojax.identification.estimators.approach import run_after, start_columns
+from piezojax.identification.estimators.output_error import (
+    at_starts,
+    problem_of,
+    starts_of,
+)
 
 MODEL = "coleman_hodgdon+arma"
 
@@ -42,20 +47,51 @@ def test_noise_does_not_bias_the_p753():
     assert fit.report.validation.rmse == pytest.approx(p753.NOISE_RMS, rel=0.03)
 
 
+def several_records():
+    """Return the fit of a short and a long record, the point, and its records."""
+    records = [p753_record(100, 1), p753_record(160, 2)]
+    whole = structure(MODEL, records[1])
+    shape = whole.without(whole.own)
+    part = slice(20, 160)
+    problem = problem_of(shape, records, part)
+    unit = jnp.full(len(shape.space.paths), 0.4)
+    found, *_ = starts_of(shape.space.put(shape.system, unit), records, part)
+    return at_starts(problem, found), unit, records
+
+
 def test_residuals_of_records_of_different_length_leave_the_padding_out():
-    short, long = p753_record(100, 1), p753_record(160, 2)
-    shape = structure(MODEL, long)
-    problem, names = problem_of(shape, [short, long], slice(20, 160))
-    assert len(names) == len(shape.space.paths) + len(shape.own)
-    unknown = jnp.full(len(names), 0.4)
-    square = jnp.sum(jax.jit(lambda u: problem.residuals(u))(unknown) ** 2)
-    errors = []
-    for row, record in zip(np.asarray(problem.which), (short, long), strict=True):
-        system = shape.space.put(shape.system, unknown[row])
-        rest = system.parts[0].rest_input
-        run = free_run(system, jnp.asarray(record.input), rest)
-        errors.append(np.asarray(run - record.output)[20:])
-    np.testing.assert_allclose(square, np.mean(np.concatenate(errors) ** 2), rtol=1e-9)
+    problem, unit, records = several_records()
+    system = problem.space.put(problem.system, unit)
+    squares = 0.0
+    for row, record in enumerate(records):
+        u = jnp.asarray(record.input)
+        start = jax.tree.map(lambda leaf, row=row: leaf[row], problem.starts)
+        columns = np.asarray(start_columns(system, u, start))[:, 20:, 0].T
+        error = (record.output - np.asarray(run_after(system, u, start.levels)))[20:]
+        # The zero is free; the states cost what their prior says.
+        count = columns.shape[1] - 1
+        cost = np.eye(count, 1 + count, 1) * np.sqrt(start.variance)
+        rows = np.concatenate([columns, cost])
+        values = np.concatenate([error, np.zeros(count)])
+        amounts = np.linalg.lstsq(rows, values)[0]
+        squares += np.sum((values - rows @ amounts) ** 2)
+    expected = squares / (80 + 140)
+    residuals = jax.jit(lambda u: problem.residuals(u))(unit)
+    np.testing.assert_allclose(jnp.sum(residuals**2), expected, rtol=1e-7)
+
+
+def test_the_slope_of_the_squares_is_right_at_the_most_likely_starts():
+    # The Jacobian holds the responses to the starts; the gradient must not tell.
+    problem, unit, _ = several_records()
+
+    def squares(u):
+        return jnp.sum(problem.residuals(u) ** 2)
+
+    slope = jax.jacfwd(squares)(unit)
+    for i in range(unit.size):
+        step = 1e-6 * jnp.eye(unit.size)[i]
+        difference = (squares(unit + step) - squares(unit - step)) / 2e-6
+        assert slope[i] == pytest.approx(float(difference), rel=1e-3, abs=1e-6)
 
 
 def test_a_record_that_says_nothing_of_a_parameter_gives_it_no_error():

@@ -4,16 +4,21 @@ The last two turning points determine most of the state of a hysteresis. A recor
 them by its first part: the pair is taken whose free run scatters least about it.
 """
 
+import math
 from itertools import product
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from ...core.arrays import State
 from ...core.rollout import simulate
-from ...core.system import System
+from ...core.system import Series, System
+from ...hysteresis.model import hystereses
 
 SAMPLES = 1000
 """Samples of the motion."""
@@ -24,8 +29,18 @@ LEVELS = 9
 FINER = (-0.5, -0.25, 0.0, 0.25, 0.5)
 """Levels around the best ones, in steps of the first grid."""
 
-FAR = 1e30
-"""Error that stands for that of a run that diverges."""
+DEVIATION = 0.3
+"""Standard deviation of a linear state before a record, as a share of its difference
+between rest at both ends of the input's range."""
+
+REFINEMENTS = 3
+"""Estimates of the linear states, each with the variance that the last one left."""
+
+FEW = 3
+"""Most states of a hysteresis that are corrected as those of linear parts are."""
+
+RESOLVED = 1e-12
+"""Relative singular value of the normal equations of a start that is resolved."""
 
 
 def run_after(
@@ -37,16 +52,76 @@ def run_after(
     input. A plant maps u(k) to y(k+1), as in ``free_run``. A plant of scalar signals
     takes [samples] and [2], and returns [samples].
     """
+    return _run_from(system, inputs, _state_after(system, inputs[0], levels))
+
+
+def _state_after(system: System, first: Array, levels: Array) -> State:
+    """Return the state one sample before the record."""
     way = 0.5 - 0.5 * jnp.cos(jnp.linspace(0.0, jnp.pi, SAMPLES // 2))
-    way = way.reshape(-1, *[1] * (inputs.ndim - 1))
+    way = way.reshape(-1, *[1] * first.ndim)
     path = [
         levels[0] + (levels[1] - levels[0]) * way,
-        levels[1] + (inputs[0] - levels[1]) * way,
+        levels[1] + (first - levels[1]) * way,
     ]
-    _, outputs = simulate(
-        system, jnp.concatenate([*path, inputs]), system.init(levels[0])
+    state, _ = simulate(system, jnp.concatenate(path), system.init(levels[0]))
+    return state
+
+
+def _run_from(system: System, inputs: Array, state: State) -> Array:
+    """Return the outputs from the ``state`` one sample before the record on."""
+    _, outputs = simulate(system, jnp.concatenate([inputs[:1], inputs]), state)
+    return outputs[:-1]
+
+
+def linear_responses(
+    system: System,
+    inputs: Float[Array, " samples *m"],
+    levels: Float[Array, " 2 *m"],
+    ends: Float[Array, " 2 *m"],
+) -> Array:
+    """Return the free responses [states, samples, p] of the linear parts of ``system``.
+
+    Each is that to a deviation of one state before the record, as large as the state
+    differs at rest between both ``ends`` of the inputs. A hysteresis with many states
+    has none: its state is that of the path over ``levels``. The few states of others
+    fade along the path of the input, and nearly linearly.
+    """
+    state = _state_after(system, inputs[0], levels)
+    flat, unravel = ravel_pytree(_linear_states(system, state))
+    rests = [ravel_pytree(_linear_states(system, system.init(end)))[0] for end in ends]
+    size = jnp.abs(rests[1] - rests[0])
+
+    def run(linear: Array) -> Array:
+        return _run_from(system, inputs, _with_linear(system, state, unravel(linear)))
+
+    def response(deviation: Array) -> Array:
+        return jax.jvp(run, (flat,), (deviation,))[1]
+
+    return jax.vmap(response)(jnp.diag(size))
+
+
+def _is_corrected(system: System, state: State) -> bool:
+    count = sum(leaf.size for leaf in jax.tree.leaves(state))
+    return not hystereses(system) or count <= FEW
+
+
+def _linear_states(system: System, state: State) -> Any:
+    """Return the states of the parts of ``system`` that are corrected."""
+    if not isinstance(system, Series):
+        return state if _is_corrected(system, state) else ()
+    return [
+        _linear_states(part, own) for part, own in zip(system.parts, state, strict=True)
+    ]
+
+
+def _with_linear(system: System, state: State, linear: Any) -> State:
+    """Return ``state`` with the states of ``_linear_states`` replaced."""
+    if not isinstance(system, Series):
+        return linear if _is_corrected(system, state) else state
+    return tuple(
+        _with_linear(part, own, new)
+        for part, own, new in zip(system.parts, state, linear, strict=True)
     )
-    return outputs[SAMPLES - 1 : -1]
 
 
 @eqx.filter_jit
@@ -91,3 +166,94 @@ def levels_before(
     found = best(np.concatenate([first, low + shares * (high - low)]))
     finer = np.array([*product(FINER, FINER)]).reshape(-1, 2, *channels) * grid[1]
     return best(np.clip(found + finer * (high - low), low, high))
+
+
+class Start(eqx.Module):
+    """What came before a record: a slow motion over two levels of the input, and more.
+
+    ``ends`` are those of the range of the inputs. The zeros of the outputs and the
+    linear states before the record are as the record tells, where the errors that they
+    leave have the ``variance`` (``most_likely``).
+    """
+
+    levels: Float[Array, " 2 *m"]
+    ends: Float[Array, " 2 *m"]
+    variance: Float[Array, ""]
+
+
+def start_columns(
+    system: System, inputs: Float[Array, " samples *m"], start: Start
+) -> Float[Array, "k samples p"]:
+    """Return what is unknown before a record: zeros, then states of linear parts.
+
+    A zero has its unit, a state DEVIATION of its difference between rest at both ends.
+    """
+    responses = linear_responses(system, inputs, start.levels, start.ends)
+    outputs = math.prod(responses.shape[2:])
+    responses = responses.reshape(*responses.shape[:2], outputs)
+    zeros = jnp.broadcast_to(jnp.eye(outputs)[:, None], (outputs, len(inputs), outputs))
+    columns = jnp.concatenate([zeros, DEVIATION * responses])
+    return jnp.where(jnp.isfinite(columns), columns, 0.0)
+
+
+def most_likely(
+    columns: Float[Array, "k samples p"],
+    error: Float[Array, "samples p"],
+    counted: Float[Array, " samples"],
+    variance: Float[Array, ""],
+) -> Float[Array, " k"]:
+    """Return the amounts of ``columns`` that most likely are in ``error``.
+
+    The states have a standard deviation of 1 (DEVIATION of their difference between
+    both ends), the zeros any, and the other errors the ``variance``; only the samples
+    ``counted`` with 1 tell. It is the least-squares solution with the square of the
+    states' amounts, ``variance`` times, added (``state_amounts``).
+    """
+    seen = columns * counted[:, None]
+    normal = jnp.einsum("ksp,lsp->kl", seen, seen)
+    least = RESOLVED * jnp.max(jnp.diag(normal))
+    prior = jnp.full(len(columns), jnp.maximum(variance, least))
+    normal = normal + jnp.diag(prior.at[: error.shape[1]].set(least))
+    return jnp.linalg.solve(normal, jnp.einsum("ksp,sp->k", seen, error))
+
+
+@eqx.filter_jit
+def _fitted_run(
+    system: System, inputs: Array, outputs: Array, counted: Array, start: Start
+) -> tuple[Array, Array, Array]:
+    """Return the run [samples, p] from ``start``, the zeros, and the variance left."""
+    run = run_after(system, inputs, start.levels).reshape(outputs.shape)
+    columns = start_columns(system, inputs, start)
+    amounts = most_likely(columns, outputs - run, counted, start.variance)
+    run = run + jnp.einsum("ksp,k->sp", columns, amounts)
+    left = counted[:, None] * (outputs - run)
+    variance = jnp.sum(left**2) / (jnp.sum(counted) * outputs.shape[1])
+    return run, amounts[: outputs.shape[1]], variance
+
+
+def start_of(
+    system: System,
+    inputs: np.ndarray,
+    outputs: np.ndarray,
+    part: slice,
+    ranges: np.ndarray,
+) -> tuple[Start, np.ndarray, np.ndarray]:
+    """Return the start of a record from its samples ``part``, and the run from it.
+
+    Arguments as for ``levels_before``. Also the zeros [p]; the run is [samples, p].
+    """
+    levels = levels_before(system, inputs, outputs, part, ranges)
+    y = outputs.reshape(len(outputs), -1)
+    counted = np.zeros(len(y))
+    counted[part] = 1.0
+    u, z, of = (jnp.asarray(each) for each in (inputs, y, counted))
+
+    def started(variance: Array) -> Start:
+        return Start(jnp.asarray(levels), jnp.asarray(ranges), variance)
+
+    start = started(jnp.asarray(np.mean(np.var(y[part], axis=0))))
+    for _ in range(REFINEMENTS):
+        *_, variance = _fitted_run(system, u, z, of, start)
+        start = started(variance)
+    run, zero, _ = _fitted_run(system, u, z, of, start)
+    return start, np.asarray(run), np.asarray(zero)

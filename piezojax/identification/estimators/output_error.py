@@ -1,6 +1,5 @@
 """Fit of any System to records by its free-run simulation error."""
 
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -8,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from ...core.arrays import ScalarLike, as_array
 from ...core.progress import Progress, Silent
@@ -26,6 +25,7 @@ from ...solve.local_model import normal_equations
 from ...solve.multi_start import Patience, descend
 from ...solve.problem import linearised
 from ..records.record import Record
+from .approach import Start, most_likely, run_after, start_columns, start_of
 from .structure import Structure
 
 PARALLEL_STARTS = 4
@@ -36,6 +36,9 @@ TRIAL_STEPS = 12
 
 ROUGH_STEPS = 24
 """Number of steps of a fit from which another one starts."""
+
+PASSES = 3
+"""Searches for the start of each of several records, each with a fit after it."""
 
 TOLERANCE = 1e-10
 """Relative change of loss and point below which a descent ends."""
@@ -59,47 +62,71 @@ class Optimum(NamedTuple):
     """
 
     problem: "Problem"
-    names: tuple[str, ...]
     units: np.ndarray
     losses: np.ndarray
     finished: bool
+
+    @property
+    def system(self) -> System:
+        """The best System; with several records, at the zero of the first."""
+        problem = self.problem
+        return problem.space.put(problem.system, as_array(self.units[0]))
 
 
 class Problem(eqx.Module):
     """Fit of one System to several records, padded to one length with zero weights.
 
-    ``which`` [records, n] holds the indices of each record's parameters among the
-    unknowns. All records share them, except for the initial conditions of each. The
-    errors behind the filter ``whitening``, if it has coefficients, count ``share``
-    times.
+    A single record begins at rest. Each of several has a start of its own, stacked in
+    ``starts``. The errors behind the filter ``whitening``, if it has coefficients,
+    count ``share`` times.
     """
 
     system: System
     space: Space
-    which: Int[Array, "records n"]
     inputs: Float[Array, "records samples"]
     outputs: Float[Array, "records samples"]
     weights: Float[Array, "records samples"]
+    starts: Start | None
     whitening: Float[Array, " taps"]
     share: Float[Array, ""]
 
-    def simulated(self, unknown: Float[Array, " unknowns"]) -> Float[Array, "..."]:
-        """Return the free run of every record, [records, samples]."""
+    def errors(self, unit: Float[Array, " n"]) -> Float[Array, "records samples"]:
+        """Return the errors of the free run of every record."""
+        return self._errors_and_starts(unit)[0]
 
-        def one(unit, input):
-            return from_rest(self.space.put(self.system, unit), input)
+    def _errors_and_starts(self, unit: Array) -> tuple[Array, Array]:
+        """Return the errors, and how unlikely the state before each record is.
 
-        return jax.vmap(one)(unknown[self.which], self.inputs)
+        The columns of the starts are held at ``unit``: the gradient of the squares does
+        not depend on them where the amounts are the most likely ones (variable
+        projection as in Kaufman, BIT 15, 1975, 49-57).
+        """
+        system = self.space.put(self.system, unit)
+        if self.starts is None:
+            runs = jax.vmap(lambda input: from_rest(system, input))(self.inputs)
+            return runs - self.outputs, jnp.zeros((len(self.inputs), 0))
+        held = self.space.put(self.system, jax.lax.stop_gradient(unit))
 
-    def residuals(self, unknown: Float[Array, " unknowns"]) -> Float[Array, " all"]:
+        def one(input, output, weights, start):
+            run = run_after(system, input, start.levels).reshape(-1, 1)
+            error = _bounded(output[:, None] - run)
+            columns = start_columns(held, input, start)
+            counted = (weights > 0.0).astype(error.dtype)
+            amounts = most_likely(columns, error, counted, start.variance)
+            error = jnp.einsum("ksp,k->s", columns, amounts) - error[:, 0]
+            spread = jnp.sqrt(start.variance) * jnp.max(weights)
+            return error, spread * amounts[1:]
+
+        return jax.vmap(one)(self.inputs, self.outputs, self.weights, self.starts)
+
+    def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " all"]:
         """Return the weighted errors; their sum of squares is the mean square."""
-        error = self.simulated(unknown) - self.outputs
-        # A start that diverges must not affect the others of its batch.
-        error = jnp.where(jnp.isfinite(error), jnp.clip(error, -1e6, 1e6), 1e6)
-        counted = [self.weights * error]
+        error, unlikely = self._errors_and_starts(unit)
+        error = _bounded(error)
+        counted = [self.weights * error, unlikely]
         if self.whitening.size:
             counted.append(self.share * self.weights * self.whitened(error))
-        return jnp.concatenate(counted, axis=None)
+        return jnp.concatenate([part.ravel() for part in counted])
 
     def whitened(
         self, error: Float[Array, "records samples"]
@@ -111,13 +138,17 @@ class Problem(eqx.Module):
             white = white + tap * padded[:, last - error.shape[1] - i : last - i]
         return white
 
-    def balanced(self, unknown: Float[Array, " unknowns"]) -> "Problem":
-        """Return the problem in which both kinds of errors at ``unknown`` weigh the
-        same."""
-        error = self.simulated(unknown) - self.outputs
+    def balanced(self, unit: Float[Array, " n"]) -> "Problem":
+        """Return the problem in which both kinds of errors at ``unit`` weigh alike."""
+        error = self.errors(unit)
         plain = jnp.linalg.norm(self.weights * error)
         white = jnp.linalg.norm(self.weights * self.whitened(error))
         return eqx.tree_at(lambda problem: problem.share, self, plain / white)
+
+
+def _bounded(error: Array) -> Array:
+    """Return ``error`` so that a start that diverges does not affect its batch."""
+    return jnp.where(jnp.isfinite(error), jnp.clip(error, -1e6, 1e6), 1e6)
 
 
 def free_run(
@@ -140,20 +171,12 @@ def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n .
 
 def problem_of(
     structure: Structure, records: Sequence[Record], train: slice
-) -> tuple[Problem, tuple[str, ...]]:
-    """Return the fit of ``structure`` to ``records``, and the names of its unknowns.
+) -> Problem:
+    """Return the fit of ``structure`` to ``records``.
 
     Errors count over the samples ``train`` of each record.
     """
-    space, count = structure.space, len(records)
-
-    def name(path: str, row: int) -> str:
-        alone = path not in structure.own or count == 1
-        return path if alone else f"{path} of record {row}"
-
-    used = [[name(path, row) for path in space.paths] for row in range(count)]
-    names = list(dict.fromkeys(itertools.chain(*used)))
-    which = [[names.index(name) for name in row] for row in used]
+    count = len(records)
     samples = min(train.stop, max(record.samples for record in records))
     inputs, outputs, weights = np.zeros((3, count, samples))
     for row, record in enumerate(records):
@@ -162,17 +185,59 @@ def problem_of(
         outputs[row, :size] = record.output[:size]
         weights[row, train.start : size] = 1.0
     weights /= np.sqrt(np.sum(weights))
-    problem = Problem(
+    return Problem(
         structure.system,
-        space,
-        jnp.asarray(which),
+        structure.space,
         as_array(inputs),
         as_array(outputs),
         as_array(weights),
+        None,
         as_array(structure.whitening),
         as_array(0.0),
     )
-    return problem, tuple(names)
+
+
+def starts_of(
+    system: System, records: Sequence[Record], train: slice
+) -> tuple[list[Start], list[np.ndarray], list[float]]:
+    """Return the start of each of the ``records`` for ``system``.
+
+    Also the runs from them [samples, 1] and the zeros of the sensor.
+    """
+    ends = np.array([f([f(r.input) for r in records]) for f in (np.min, np.max)])
+    found, runs, zeros = [], [], []
+    for record in records:
+        part = slice(train.start, min(train.stop, record.samples))
+        start, run, zero = start_of(system, record.input, record.output, part, ends)
+        found.append(start)
+        runs.append(run)
+        zeros.append(float(zero[0]))
+    return found, runs, zeros
+
+
+def free_runs(
+    system: System, records: Sequence[Record], train: slice
+) -> tuple[tuple[np.ndarray, ...], list[float]]:
+    """Return the free run [samples, 1] of each of ``records``, and their zeros.
+
+    A single record begins at rest and has no zero of its own; the start of each of
+    several is as its samples ``train`` tell.
+    """
+    if len(records) > 1:
+        _, runs, zeros = starts_of(system, records, train)
+        return tuple(runs), zeros
+    run = eqx.filter_jit(from_rest)
+    return tuple(
+        np.asarray(run(system, as_array(r.input)))[:, None] for r in records
+    ), [0.0]
+
+
+def at_starts(problem: Problem, starts: Sequence[Start]) -> Problem:
+    """Return the problem whose records begin at the ``starts``."""
+    stacked = jax.tree.map(lambda *each: jnp.stack(each), *starts)
+    return eqx.tree_at(
+        lambda p: p.starts, problem, stacked, is_leaf=lambda leaf: leaf is None
+    )
 
 
 def output_error(
@@ -188,24 +253,41 @@ def output_error(
     Levenberg-Marquardt with the forward Jacobian, from all starts of the structure;
     after a few steps only the best continue, to at most ``steps``. The error counts
     over the samples ``train`` of each record; the model sees the input alone, from the
-    first sample on. Raises ValueError when no start leads to a finite simulation.
+    first sample on. With several records the state before each and the zero of each
+    take the place of the structure's ``own`` parameters. Raises ValueError when no
+    start leads to a finite simulation.
     """
     progress = progress or Silent()
-    problem, names = problem_of(structure, records, train)
-    starts = _starts_for_records(structure, problem)
-    progress.stage(f"compiling the fit of {len(names)} parameters")
-    rough = min(steps, ROUGH_STEPS) if structure.whitening else steps
-    units, losses, finished = _descended(problem, starts, rough, progress)
+    several = len(records) > 1
+    if several:
+        structure = structure.without(structure.own)
+    problem, starts = problem_of(structure, records, train), structure.starts
+    progress.stage(f"compiling the fit of {starts.shape[1]} parameters")
+    rough = min(steps, ROUGH_STEPS) if structure.whitening or several else steps
+    units, losses, finished = _inside(starts), np.zeros(len(starts)), False
+    rounds = PASSES if several else 1
+    for left in reversed(range(rounds)):
+        if several:
+            system = problem.space.put(problem.system, as_array(units[0]))
+            found, *_ = starts_of(system, records, train)
+            problem = at_starts(problem, found)
+        last = not left and not structure.whitening
+        units, losses, finished = _descended(
+            problem, _inside(units), steps if last else rough, progress
+        )
     if structure.whitening:
         # Errors of the hysteresis may have hidden a resonance from the first fit.
         problem = _balanced(problem, as_array(units[0]))
-        dynamics = [names.index(path) for path in structure.dynamics]
+        dynamics = [problem.space.paths.index(path) for path in structure.dynamics]
         again = units.copy()
         again[:, dynamics] = starts[0, dynamics]
-        starts = np.concatenate([again, units])[: len(units) + 1]
-        starts = np.clip(starts, INSIDE, 1.0 - INSIDE)
+        starts = _inside(np.concatenate([again, units])[: len(units) + 1])
         units, losses, finished = _descended(problem, starts, steps, progress)
-    return Optimum(problem, names, units, losses, finished)
+    return Optimum(problem, units, losses, finished)
+
+
+def _inside(units: np.ndarray) -> np.ndarray:
+    return np.clip(units, INSIDE, 1.0 - INSIDE)
 
 
 def _descended(
@@ -244,15 +326,6 @@ def _balanced(problem: Problem, unknown: Array) -> Problem:
     return problem.balanced(unknown)
 
 
-def _starts_for_records(structure: Structure, problem: Problem) -> np.ndarray:
-    """Return the starts, with the parameters in ``own`` repeated for every record."""
-    unknowns = int(np.max(problem.which)) + 1
-    starts = np.empty((len(structure.starts), unknowns))
-    for row in np.asarray(problem.which):
-        starts[:, row] = structure.starts
-    return starts
-
-
 @eqx.filter_jit
 def _normal_equations(
     problem: Problem, free: Float[Array, "points unknowns"]
@@ -263,18 +336,11 @@ def _normal_equations(
 
 @eqx.filter_jit
 def _sensitivity(problem: Problem, unit: Array) -> tuple[Array, Array, Array]:
-    """Return the unknowns' values and slopes, and the residuals' weighted Jacobian."""
+    """Return the parameters and their slopes, and the residuals' weighted Jacobian."""
     jacobian = jax.jacfwd(lambda unknown: problem.residuals(unknown))(unit)
-    slopes = jax.jacfwd(lambda u: _values(problem, u))(unit).diagonal()
-    return _values(problem, unit), slopes, jacobian
-
-
-def _values(problem: Problem, unit: Array) -> Array:
-    """Return the values of all unknowns at ``unit``."""
-    values = jnp.zeros_like(unit)
-    for row in problem.which:
-        values = values.at[row].set(problem.space.from_unit(unit[row]))
-    return values
+    from_unit = problem.space.from_unit
+    slopes = jax.jacfwd(lambda u: from_unit(u))(unit).diagonal()
+    return from_unit(unit), slopes, jacobian
 
 
 def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]:

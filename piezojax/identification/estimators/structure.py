@@ -1,17 +1,19 @@
 """Structure: the input of estimators that search a box of parameters."""
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
 
-from ...core.space import Space
+from ...core.space import Space, space_of
 from ...core.system import System
 
 
 class Structure(NamedTuple):
     """A model to fit: its System, the box of its parameters, starts in the box.
 
-    ``own`` holds the paths whose value differs from record to record. ``dynamics``
+    ``own`` holds the paths of the state before a record and of the sensor's zero, which
+    differ from record to record. ``dynamics``
     holds the paths of linear dynamics. ``whitening`` holds the coefficients of a
     filter that turns the errors into white noise; if it has any, the filtered errors
     count as much as the errors themselves, which are largest at low frequencies.
@@ -28,3 +30,10 @@ class Structure(NamedTuple):
     def order(self) -> int:
         """Number of parameters of linear dynamics."""
         return len(self.dynamics)
+
+    def without(self, paths: Collection[str]) -> "Structure":
+        """Return the structure with the parameters at ``paths`` fixed."""
+        ranges = self.space.ranges()
+        kept = {path: bounds for path, bounds in ranges.items() if path not in paths}
+        columns = [path in kept for path in ranges]
+        return self._replace(space=space_of(kept), starts=self.starts[:, columns])

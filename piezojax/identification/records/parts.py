@@ -42,6 +42,16 @@ def train_and_validation(
     return train, validate
 
 
+def check_train(records: tuple[Record, ...], train: slice) -> None:
+    """Raise ValueError if a record ends before the part to fit begins."""
+    for record in records:
+        if record.samples <= train.start:
+            raise ValueError(
+                f"train is {train.start}:{train.stop}; {record.source} has only "
+                f"{record.samples} samples"
+            )
+
+
 def _closed(part: slice, samples: int) -> slice:
     stop = samples if part.stop is None else part.stop
     return slice(part.start or 0, stop)
