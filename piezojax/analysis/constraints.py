@@ -1,7 +1,7 @@
 """Constraints on tuned gains: definitions, values and violations."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -9,15 +9,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..core.arrays import largest, smallest
+from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, TrackingFigures
 from .stability.differentiable import (
     Sensitivity,
+    bandwidth_of,
+    closed_loop_peak_of,
     delay_margin_of,
     disk_margin_of,
+    gain_margin_of,
     peak_of,
+    phase_margin_of,
+    references_followed,
+    sensitivities,
 )
 from .stability.model_error import worst_delay_margin, worst_sensitivity
-from .stability.operating_point import BRANCHES
+from .stability.operating_point import BRANCHES, OperatingPoint
+from .step_response import NAMES as STEPS
+from .step_response import StepFigures
 
 OFF = "off"
 """Limit in a study that switches a constraint off."""
@@ -34,18 +43,19 @@ MarginFigures = dict[str, Float[Array, "*plants branches"]]
 class LoopFigures(NamedTuple):
     """Figures of a loop from which constraints are evaluated.
 
-    ``tracking`` and ``extremes`` hold arrays [plants, references, draws]. ``extremes``
-    and ``margins``, those of ``margin_figures``, are None unless a limit needs them.
-    ``dt`` in s.
+    ``tracking`` and ``extremes`` hold arrays [plants, references, draws], ``steps``
+    arrays [plants, steps]. ``extremes``, ``margins``, those of ``margin_figures``, and
+    ``steps`` are None unless a limit needs them. ``dt`` in s.
     """
 
     tracking: TrackingFigures
     extremes: ExtremeFigures | None
     margins: MarginFigures | None
+    steps: StepFigures | None
     dt: float
 
 
-Source = Literal["tracking", "extremes", "margins"]
+Source = Literal["tracking", "extremes", "margins", "steps"]
 """Field of ``LoopFigures`` from which a constraint is evaluated."""
 
 
@@ -55,7 +65,7 @@ class Constraint(NamedTuple):
     ``values(source, dt)`` returns the values of the figure, with the plants on the
     first axis, from the field ``source`` of the LoopFigures and dt in s. A limit must
     lie above ``above`` and below ``below``. ``default`` is the limit of a study that
-    names none.
+    names none. ``one_axis`` tells that the figure is known for one axis only.
     """
 
     unit: str
@@ -65,6 +75,7 @@ class Constraint(NamedTuple):
     above: float = 0.0
     below: float = math.inf
     default: float | None = None
+    one_axis: bool = False
 
     def check(self, name: str, limit: Any) -> None:
         """Raise ValueError unless ``limit`` is a number in its bounds, or ``OFF``."""
@@ -111,28 +122,63 @@ def _disk(sensitivity: Sensitivity, error: Array | None) -> Array:
     return disk_margin_of(sensitivity)
 
 
+def _gain(sensitivity: Sensitivity, error: Array | None) -> Array:
+    """Return the gain margin of the model."""
+    del error
+    return gain_margin_of(sensitivity)
+
+
+def _phase(sensitivity: Sensitivity, error: Array | None) -> Array:
+    """Return the phase margin of the model."""
+    del error
+    return phase_margin_of(sensitivity)
+
+
 _MARGINS: dict[str, Callable[[Sensitivity, Array | None], Array]] = {
     "sensitivity_peak": _peak,
     "disk_margin": _disk,
     "delay_margin": _delay,
+    "gain_margin": _gain,
+    "phase_margin": _phase,
+}
+
+_FOLLOWING: dict[str, Callable[[Array, float], Array]] = {
+    "bandwidth": bandwidth_of,
+    "closed_loop_peak": lambda followed, dt: closed_loop_peak_of(followed),
 }
 
 
 def margin_figures(
-    names: Iterable[str],
-    sensitivity: Sensitivity,
+    names: Collection[str],
+    loop: Feedback,
+    point: OperatingPoint,
     error: Float[Array, " lines"] | None,
 ) -> MarginFigures:
     """Return the margins [branches] among the constraints ``names``.
 
-    ``sensitivity`` is S [branches, lines, axes, axes] of one plant; ``error`` bounds
-    the relative error of a plant of one axis, None if nothing is known of it.
+    They are those of ``loop`` linearised at ``point``; ``error`` bounds the relative
+    error of a plant of one axis, None if nothing is known of it.
     """
-    return {
-        name: jax.vmap(lambda found, of=_MARGINS[name]: of(found, error))(sensitivity)
-        for name in names
-        if name in _MARGINS
-    }
+    found: MarginFigures = {}
+    if not _MARGINS.keys().isdisjoint(names):
+        S = sensitivities(loop, point)
+        found |= {
+            name: jax.vmap(lambda one, of=of: of(one, error))(S)
+            for name, of in _MARGINS.items()
+            if name in names
+        }
+    if not _FOLLOWING.keys().isdisjoint(names):
+        followed, dt = references_followed(loop, point), point.sample_time(loop)
+        found |= {
+            name: jax.vmap(lambda one, of=of: of(one, dt))(followed)
+            for name, of in _FOLLOWING.items()
+            if name in names
+        }
+    return found
+
+
+def _margin(name: str) -> Callable[[MarginFigures, float], Array]:
+    return lambda found, dt: found[name]
 
 
 CONSTRAINTS: dict[str, Constraint] = {
@@ -140,18 +186,18 @@ CONSTRAINTS: dict[str, Constraint] = {
         "1",
         "at most",
         "margins",
-        lambda found, dt: found["sensitivity_peak"],
+        _margin("sensitivity_peak"),
         above=1.0,
         default=2.0,
     ),
     "disk_margin": Constraint(
-        "1", "at least", "margins", lambda found, dt: found["disk_margin"], below=2.0
+        "1", "at least", "margins", _margin("disk_margin"), below=2.0
     ),
     "delay_margin": Constraint(
         "samples",
         "at least",
         "margins",
-        lambda found, dt: found["delay_margin"],
+        _margin("delay_margin"),
         default=1.0,
     ),
     "peak_voltage": Constraint(
@@ -166,15 +212,40 @@ CONSTRAINTS: dict[str, Constraint] = {
     "overshoot": Constraint(
         "1", "at most", "extremes", lambda found, dt: _largest(found.overshoot)
     ),
+    "gain_margin": Constraint("dB", "at least", "margins", _margin("gain_margin")),
+    "phase_margin": Constraint(
+        "deg", "at least", "margins", _margin("phase_margin"), below=180.0
+    ),
+    "bandwidth": Constraint(
+        "Hz", "at least", "margins", _margin("bandwidth"), one_axis=True
+    ),
+    "closed_loop_peak": Constraint(
+        "1", "at most", "margins", _margin("closed_loop_peak"), one_axis=True
+    ),
+    "rise_time": Constraint(
+        "s", "at most", "steps", lambda found, dt: found.rise_time, one_axis=True
+    ),
+    "settling_time": Constraint(
+        "s", "at most", "steps", lambda found, dt: found.settling_time, one_axis=True
+    ),
+    "steady_state_error": Constraint(
+        "1",
+        "at most",
+        "steps",
+        lambda found, dt: found.steady_state_error,
+        one_axis=True,
+    ),
 }
 """Constraints by their name in a study; each holds for every plant and reference of
-the objective. The sensitivity peak, disk margin and delay margin (samples) are those of
-the loop, linearised at the highest reference on both branches of the hysteresis; for a
+the objective. The margins, the bandwidth (-3 dB) and the peak of y/r are those of the
+loop, linearised at the highest reference on both branches of the hysteresis; for a
 fitted plant the sensitivity peak and the delay margin are the worst within the error
-bound of its model. On several axes they are the largest singular value of S, a lower
-bound of the disk margin of all axes at once, and the least delay margin of one axis
-with the others closed. The others are the largest values in the runs; ``overshoot`` is
-a share of the range of the reference."""
+bound of its model. On several axes the peak is the largest singular value of S, the
+disk margin a lower bound of that of all axes at once, and gain, phase and delay margin
+are the least of one axis with the others closed. Times and the steady-state error, a
+share of the height, are those of the worst of four steps without noise
+(``step_response``). The others are the largest values in the runs; ``overshoot`` is a
+share of the range of the reference."""
 
 
 def limits_of(written: Mapping[str, Any]) -> dict[str, float]:
@@ -200,12 +271,16 @@ def uses(names: Iterable[str], source: Source) -> bool:
 def constraint_count(names: Iterable[str], plants: int, margin_plants: int) -> int:
     """Return the number of ``violations`` of the limits ``names``.
 
-    Runs are limited on ``plants``, margins on each branch of ``margin_plants``.
+    Runs are limited on ``plants``, and each of their steps, margins on each branch of
+    ``margin_plants``.
     """
-    margins = margin_plants * len(BRANCHES)
-    return sum(
-        margins if CONSTRAINTS[name].source == "margins" else plants for name in names
-    )
+    each = {
+        "margins": margin_plants * len(BRANCHES),
+        "steps": plants * len(STEPS),
+        "tracking": plants,
+        "extremes": plants,
+    }
+    return sum(each[CONSTRAINTS[name].source] for name in names)
 
 
 def violations(

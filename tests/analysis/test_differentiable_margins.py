@@ -17,9 +17,15 @@ from piezojax.analysis.stability import (
 from piezojax.analysis.stability.conserved import LinearLoop
 from piezojax.analysis.stability.differentiable import (
     UNLIMITED_DELAY,
+    UNLIMITED_GAIN,
+    bandwidth_of,
+    closed_loop_peak_of,
     delay_margin_of,
     disk_margin_of,
+    gain_margin_of,
     peak_of,
+    phase_margin_of,
+    references_followed,
     sensitivities,
 )
 from piezojax.analysis.stability.margins import report_of
@@ -65,6 +71,14 @@ def test_figures_are_those_of_the_exact_report(name, branch):
     assert peak_of(found) == pytest.approx(exact.sensitivity_peak, rel=5e-3)
     assert disk_margin_of(found) == pytest.approx(exact.disk_margin, rel=5e-3)
     assert delay_margin_of(found) == pytest.approx(exact.delay_margin_samples, rel=5e-3)
+    assert gain_margin_of(found) == pytest.approx(exact.gain_margin_dB, rel=5e-3)
+    assert phase_margin_of(found) == pytest.approx(exact.phase_margin_deg, rel=5e-3)
+    followed = jax.jit(lambda loop: references_followed(loop, 5.0))(loop)
+    followed = followed[BRANCHES.index(branch)]
+    found, exact = bandwidth_of(followed, p753.DT), exact.following
+    assert found == pytest.approx(exact.bandwidth_Hz, rel=5e-3)
+    found = closed_loop_peak_of(followed)
+    assert found == pytest.approx(exact.closed_loop_peak, rel=5e-3)
 
 
 def test_a_light_mode_is_seen_between_the_lines():
@@ -139,13 +153,30 @@ def test_a_loop_that_is_never_as_strong_as_1_has_no_delay_margin():
     assert delay_margin_of(found) == UNLIMITED_DELAY
 
 
+def test_a_loop_of_no_gain_has_the_largest_margins():
+    found = one_axis(jnp.ones(64, complex))
+    assert gain_margin_of(found) == UNLIMITED_GAIN
+    assert phase_margin_of(found) == 180.0
+
+
+def test_the_band_of_a_loop_that_never_falls_ends_at_the_nyquist_frequency():
+    assert bandwidth_of(jnp.ones(64, complex), 1e-3) == 500.0
+    # A loop that leaves most of the reference at rest has no band to speak of.
+    assert bandwidth_of(jnp.full(64, 0.5 + 0j), 1e-3) < 0.1
+
+
 def test_slopes_are_those_of_differences():
     @jax.jit
     def figures(integral):
-        found = sensitivity(replace(pid_loop(), {INTEGRAL: integral}), 5.0)
-        return jnp.stack([f(found) for f in (peak_of, disk_margin_of, delay_margin_of)])
+        loop = replace(pid_loop(), {INTEGRAL: integral})
+        found, followed = sensitivity(loop, 5.0), references_followed(loop, 5.0)[0]
+        both = (gain_margin_of, phase_margin_of)
+        return jnp.stack(
+            [f(found) for f in (peak_of, disk_margin_of, delay_margin_of, *both)]
+            + [bandwidth_of(followed, p753.DT), closed_loop_peak_of(followed)]
+        )
 
-    at, step = 2000.0, 1e-2
+    at, step = 9000.0, 1e-2
     difference = (figures(at + step) - figures(at - step)) / (2.0 * step)
     np.testing.assert_allclose(jax.jit(jax.jacfwd(figures))(at), difference, rtol=1e-5)
     np.testing.assert_allclose(jax.jit(jax.jacrev(figures))(at), difference, rtol=1e-5)

@@ -7,6 +7,7 @@ import control
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 from oracles import published, transfer
 
 import piezojax as pj
@@ -77,6 +78,32 @@ def test_the_transfer_function_is_that_of_the_equations(pair):
     ours = linear_loop(loop, 3.0)[0].response(2.0 * np.pi * frequency * DT)
     theirs = oracle(np.exp(2j * np.pi * frequency * DT))
     np.testing.assert_allclose(ours, theirs, rtol=1e-7)
+
+
+def test_following_is_that_of_a_run(pair):
+    """These loops are linear: an impulse of the reference tells y/r."""
+    loop, _, report = pair
+    samples = 24_000
+    impulse = np.full(samples + 1, 3.0)
+    impulse[1] += 1.0
+    _, log = pj.simulate(loop, pj.loop_inputs(jnp.asarray(impulse)), loop.init(3.0))
+    moved = np.asarray(log.displacement)[1:] - 3.0
+    assert np.abs(moved[-400:]).max() < 1e-9
+    hertz = np.arange(0.0, 10_000.0, 0.5)
+    found = np.abs(scipy.signal.freqz(moved, worN=hertz, fs=1.0 / DT)[1])
+    at = 2.0 * np.pi * hertz[1:] * DT
+    ours = np.abs(linear_loop(loop, 3.0)[0].followed.response(at))
+    np.testing.assert_allclose(ours, found[1:], rtol=1e-6, atol=1e-9)
+    for field, decibel in (("bandwidth_Hz", -3.0), ("bandwidth_1dB_Hz", -1.0)):
+        first = hertz[np.argmax(found < 10.0 ** (decibel / 20.0))]
+        assert first - 0.5 <= getattr(report.following, field) <= first
+    assert report.following.closed_loop_peak == pytest.approx(found.max(), rel=1e-4)
+
+
+def test_a_loop_that_rests_without_following_has_no_band():
+    report = pj.stability_report(around(pj.control.PID(0.5, 0.0, dt=DT)), 0.0)
+    assert report.following.bandwidth_Hz == 0.0
+    assert report.following.closed_loop_peak < 0.5
 
 
 def test_poles(pair):

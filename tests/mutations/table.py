@@ -113,7 +113,7 @@ MUTATIONS = (
     Mutation(
         "Ms on one branch",
         "analysis/stability/differentiable.py",
-        "jnp.asarray(list(BRANCHES.values()))",
+        "jnp.asarray([*BRANCHES.values()])",
         "jnp.asarray([*BRANCHES.values()][:1] * 2)",
         ("tests/analysis/test_differentiable_margins.py", "-k", "every_branch"),
     ),
@@ -127,9 +127,16 @@ MUTATIONS = (
     Mutation(
         "delay margin of a response without crossings with phase lead",
         "analysis/stability/differentiable.py",
-        "smallest(jnp.where(crosses, there",
-        "smallest(jnp.where(crosses & (there < jnp.pi), there",
+        "smallest(jnp.where(crosses, lag",
+        "smallest(jnp.where(crosses & (lag < jnp.pi), lag",
         ("tests/analysis/test_differentiable_margins.py", "-k", "lead"),
+    ),
+    Mutation(
+        "settled when the band is entered first",
+        "analysis/step_response.py",
+        "error.size - 1 - jnp.argmax(outside[::-1])",
+        "jnp.argmin(outside) - 1",
+        ("tests/analysis/test_step_response.py",),
     ),
     Mutation(
         "delay not counted by the limit",

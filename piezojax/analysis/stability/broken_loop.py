@@ -79,19 +79,23 @@ class BrokenLoop(System):
         )
 
     def step(self, state: BrokenState, input: Signal) -> tuple[BrokenState, Signal]:
-        controller, actuator, sensor, applied = self._answer(state)
-        plant, displacement = self._move(state, input)
-        state = BrokenState(controller, actuator, plant, sensor, displacement, applied)
-        return state, jax.tree.map(jnp.negative, applied)
+        state = self._stepped(state, input)
+        return state, jax.tree.map(jnp.negative, state.applied)
 
-    def closed(self, state: BrokenState, added: Signal) -> tuple[BrokenState, Signal]:
+    def closed(
+        self,
+        state: BrokenState,
+        added: Signal,
+        moved: tuple[Signal, Signal] | None = None,
+    ) -> tuple[BrokenState, Signal]:
         """Step with the loop closed for small motions, with ``added`` (V) at the plant.
 
         Return the voltage that acts there. It differs from that of the operating point
-        by ``added``, exactly; its derivative with respect to the state is that of the
-        actuator's voltage.
+        by ``added``, exactly; its derivative with respect to the state, and to what
+        r(k) and r(k+1) have ``moved`` from the reference, is that of the actuator's
+        voltage.
         """
-        controller, actuator, sensor, applied = self._answer(state)
+        controller, actuator, sensor, applied = self._answer(state, moved)
         acting = jax.tree.map(
             lambda held, new, more: held + (new - jax.lax.stop_gradient(new)) + more,
             self.start.voltage,
@@ -102,15 +106,32 @@ class BrokenLoop(System):
         state = BrokenState(controller, actuator, plant, sensor, displacement, applied)
         return state, acting
 
-    def _answer(self, state: BrokenState) -> tuple[State, State, State, Signal]:
-        """Return the states of controller, actuator and sensor, and the voltage."""
+    def _stepped(
+        self,
+        state: BrokenState,
+        input: Signal,
+        moved: tuple[Signal, Signal] | None = None,
+    ) -> BrokenState:
+        """Return the state after ``input`` at the plant; ``moved`` as for _answer."""
+        controller, actuator, sensor, applied = self._answer(state, moved)
+        plant, displacement = self._move(state, input)
+        return BrokenState(controller, actuator, plant, sensor, displacement, applied)
+
+    def _answer(
+        self, state: BrokenState, moved: tuple[Signal, Signal] | None = None
+    ) -> tuple[State, State, State, Signal]:
+        """Return the states of controller, actuator and sensor, and the voltage.
+
+        ``moved`` is what r(k) and r(k+1) differ from the reference.
+        """
         loop, reference = self.loop, _pushed(self.reference, self.reference_push)
         no_noise = jax.tree.map(jnp.zeros_like, state.displacement)
         sensor, measured = loop.sensor.step(
             state.sensor, (state.displacement, no_noise)
         )
         known = _pushed(state.applied, self.voltage_push)
-        observed = Observation(reference, reference, measured, known)
+        now, following = (_pushed(reference, by) for by in moved or (None, None))
+        observed = Observation(now, following, measured, known)
         controller, command = loop.controller.step(state.controller, observed)
         actuator, applied = loop.actuator.step(state.actuator, command)
         return controller, actuator, sensor, applied
@@ -137,6 +158,25 @@ class OutputCut(BrokenLoop):
         unmoved = jax.tree.map(jnp.zeros_like, self.start.voltage)
         after, _ = self.closed(state._replace(displacement=input), unmoved)
         return after, jax.tree.map(jnp.negative, state.displacement)
+
+
+class FollowedLoop(BrokenLoop):
+    """A BrokenLoop whose reference moves too.
+
+    Input: the voltage injected into the plant, V, and what r(k) and r(k+1) differ from
+    the reference, um. Output: that of a BrokenLoop, V, and the displacement y(k), um.
+    """
+
+    @property
+    def rest(self) -> Any:
+        """Input at the operating point."""
+        still = jax.tree.map(jnp.zeros_like, self.reference)
+        return self.start.voltage, still, still
+
+    def step(self, state: BrokenState, input: Any) -> tuple[BrokenState, Any]:
+        injected, *moved = input
+        after = self._stepped(state, injected, tuple(moved))
+        return after, (jax.tree.map(jnp.negative, after.applied), state.displacement)
 
 
 def _pushed(signal: Signal, push: Signal | None) -> Signal:

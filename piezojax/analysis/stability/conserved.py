@@ -16,7 +16,8 @@ length 1."""
 class LinearLoop(NamedTuple):
     """L of one axis as NumPy matrices: A [n, n], B [n], C [n]; ``dt`` in s.
 
-    ``conserved`` is the number of conserved modes that have been removed.
+    ``conserved`` is the number of conserved modes that have been removed. ``followed``
+    is the closed loop from its reference on, None if that is not known.
     """
 
     A: np.ndarray
@@ -24,6 +25,7 @@ class LinearLoop(NamedTuple):
     C: np.ndarray
     dt: float
     conserved: int = 0
+    followed: "FollowedReference | None" = None
 
     def closed(self) -> np.ndarray:
         """Return the state matrix of the closed loop."""
@@ -47,6 +49,31 @@ class LinearLoop(NamedTuple):
         """Return S = 1/(1+L) and T = L/(1+L), both [m, 1, 1], at z = exp(i angle)."""
         L = self.response(angle)[:, None, None]
         return 1.0 / (1.0 + L), L / (1.0 + L)
+
+
+class FollowedReference(NamedTuple):
+    """Closed loop of one axis from its reference to the displacement, as matrices.
+
+    A [n, n], B [n, 2] for r(k) and r(k+1), C [n] for y(k); ``dt`` in s. ``conserved``
+    is the number of conserved modes that have been removed.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    dt: float
+    conserved: int = 0
+
+    def closed(self) -> np.ndarray:
+        """Return the state matrix, that of a closed loop already."""
+        return self.A
+
+    def response(self, angle: np.ndarray) -> np.ndarray:
+        """Return y/r [m] at z = exp(i angle), angle [m] in rad/sample."""
+        z = np.exp(1j * np.atleast_1d(angle))
+        resolvent = z[:, None, None] * np.eye(len(self.A)) - self.A
+        drive = self.B[:, 0] + z[:, None] * self.B[:, 1]
+        return np.linalg.solve(resolvent, drive[..., None])[..., 0] @ self.C
 
 
 class LinearAxes(NamedTuple):
@@ -83,7 +110,7 @@ class LinearAxes(NamedTuple):
         return LinearLoop(A, self.B[:, axis], self.C[axis], self.dt, self.conserved)
 
 
-Matrices = TypeVar("Matrices", LinearLoop, LinearAxes)
+Matrices = TypeVar("Matrices", LinearLoop, LinearAxes, FollowedReference)
 
 
 def without_conserved(loop: Matrices) -> Matrices:
@@ -96,7 +123,7 @@ def without_conserved(loop: Matrices) -> Matrices:
     operating point and not its stability. They span the left null space of [A - I, B].
     All other modes stay, including uncontrollable and unobservable ones.
     """
-    A, B, C, dt, _ = loop
+    A, B, C, dt, *_ = loop
     rows = np.hstack([A - np.eye(len(A)), B.reshape(len(A), -1)])
     length = np.linalg.norm(rows, axis=1)
     length[length == 0.0] = 1.0

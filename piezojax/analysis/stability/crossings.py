@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-from .conserved import LinearAxes, LinearLoop
+from .conserved import FollowedReference, LinearAxes, LinearLoop
 
 PER_DECADE = 400
 """Grid points per decade, without the additional ones around the poles."""
@@ -19,7 +19,9 @@ _PEAKS = 8  # highest points of the grid that are refined
 Function = Callable[[np.ndarray], np.ndarray]
 
 
-def angle_grid(loop: LinearLoop | LinearAxes) -> np.ndarray:
+def angle_grid(
+    loop: LinearLoop | LinearAxes | FollowedReference, per_decade: int = PER_DECADE
+) -> np.ndarray:
     """Return angles (rad/sample) from far below the slowest pole to pi.
 
     The grid is logarithmic, and denser around each pole of the open and the closed
@@ -32,7 +34,7 @@ def angle_grid(loop: LinearLoop | LinearAxes) -> np.ndarray:
     logs = np.log(poles.astype(complex))
     rates = np.abs(logs)[np.abs(logs) > 1e-9]
     slowest = min(1e-2, rates.min(initial=1.0)) * 1e-3
-    count = int(PER_DECADE * np.log10(np.pi / slowest))
+    count = int(per_decade * np.log10(np.pi / slowest))
     around = np.abs(np.imag(logs))[:, None] + np.abs(np.real(logs))[:, None] * _AROUND
     near = np.unique(around[(around > slowest) & (around < np.pi)])
     return np.unique(

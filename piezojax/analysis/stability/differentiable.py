@@ -15,6 +15,7 @@ axis: 0.5 % for Q = 32 at 400 Hz. The response of a loop that rings for longer t
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -28,7 +29,7 @@ from ...core.feedback import Feedback
 from ...core.rollout import simulate
 from ...core.system import System
 from ...dynamics.linearise import linearise, split_static
-from .broken_loop import BrokenLoop, cut, open_loop
+from .broken_loop import BrokenLoop, BrokenState, cut, open_loop
 from .operating_point import BRANCHES, OperatingPoint
 
 DURATION = 0.2
@@ -42,6 +43,12 @@ line is a matrix."""
 UNLIMITED_DELAY = 1e6
 """Delay margin (samples) of a loop that no delay makes unstable: large, but finite so
 that its logarithm is."""
+
+UNLIMITED_GAIN = 120.0
+"""Gain margin (dB) of a loop that no gain makes unstable."""
+
+BAND = math.log(10.0) * -3.0 / 20.0
+"""Logarithm of |y/r| at the end of the band of a loop: -3 dB."""
 
 LEAST = 512
 """Least number of samples of the impulse response, for loops of a low rate."""
@@ -67,15 +74,31 @@ class SmallMotion(System):
         """Return the operating point: zero deviations."""
         return jax.tree.map(jnp.zeros_like, split_static(self.broken.init())[0])
 
-    def step(self, state: State, input: ScalarLike) -> tuple[State, Scalar]:
+    def step(self, state: State, input: Any) -> tuple[State, Scalar]:
         moving, held = split_static(self.broken.init())
 
-        def step(moving: State, added: Scalar) -> tuple[State, Scalar]:
-            state, voltage = self.broken.closed(eqx.combine(moving, held), added)
-            return split_static(state)[0], voltage
+        def step(moving: State, input: Any) -> tuple[State, Scalar]:
+            state, output = self._moved(eqx.combine(moving, held), input)
+            return split_static(state)[0], output
 
-        tangents = state, as_array(input)
-        return jax.jvp(step, (moving, jnp.zeros(())), tangents)[1]
+        input = jax.tree.map(as_array, input)
+        still = jax.tree.map(jnp.zeros_like, input)
+        return jax.jvp(step, (moving, still), (state, input))[1]
+
+    def _moved(self, state: BrokenState, input: Any) -> tuple[BrokenState, Scalar]:
+        return self.broken.closed(state, input)
+
+
+class SmallFollowing(SmallMotion):
+    """Closed loop linearised around an operating point, from its reference on.
+
+    Input: what r(k) and r(k+1) differ from the reference of ``broken``, um. Output:
+    what the displacement y(k) differs from it, um.
+    """
+
+    def _moved(self, state: BrokenState, input: Any) -> tuple[BrokenState, Scalar]:
+        unmoved = jnp.zeros_like(self.broken.start.voltage)
+        return self.broken.closed(state, unmoved, input)[0], state.displacement
 
 
 def sensitivity(
@@ -101,8 +124,28 @@ def sensitivities(
 
     The branch of ``at`` is ignored.
     """
-    sides = jnp.asarray(list(BRANCHES.values()))
-    return _responses(loop, OperatingPoint.at(at), sides, duration)
+    return _responses(loop, OperatingPoint.at(at), _sides(), duration)
+
+
+def references_followed(
+    loop: Feedback, at: Any = 0.0
+) -> Complex[Array, "branches lines"]:
+    """Return y/r of a loop of one axis, at the lines of ``sensitivities``.
+
+    It is the response of the displacement to a small impulse of the reference. ``at``
+    and the errors raised as for ``sensitivities``.
+    """
+    point = OperatingPoint.at(at)
+    samples = _samples(point.sample_time(loop))
+
+    def one(side: ScalarLike) -> Float[Array, " samples"]:
+        broken = cut(loop, point.signal, side, point.state)
+        # r(0) is known one sample before.
+        following = jnp.zeros(samples + 1).at[0].set(1.0)
+        now = jnp.zeros(samples + 1).at[1].set(1.0)
+        return simulate(SmallFollowing(broken), (now, following))[1][1:]
+
+    return jnp.fft.rfft(jax.vmap(one)(_sides()), PADDING * samples, axis=1)
 
 
 def sensitivity_peak(
@@ -126,6 +169,10 @@ def closed_loop_poles(loop: Feedback, at: Any = 0.0) -> Complex[Array, " order"]
 def lines(dt: float) -> np.ndarray:
     """Return the frequencies (Hz) of S of one axis for the default duration."""
     return np.fft.rfftfreq(PADDING * _samples(dt), dt)
+
+
+def _sides() -> Float[Array, " branches"]:
+    return jnp.asarray([*BRANCHES.values()])
 
 
 def _samples(dt: float) -> int:
@@ -240,17 +287,76 @@ def _product(left: Array, right: Array) -> Array:
 
 
 @jax.jit
+def gain_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
+    """Return the smallest gain above 1 that makes the loop unstable, in dB.
+
+    ``UNLIMITED_GAIN`` if there is none. On several axes it is the smallest margin of
+    one axis, with all others closed.
+    """
+    return _least_of_axes(_gain_margin, sensitivity)
+
+
+def _gain_margin(sensitivity: Complex[Array, " lines"]) -> Float[Array, ""]:
+    """Return the gain margin of one axis; crossings are interpolated."""
+    loop = 1.0 / sensitivity - 1.0
+    low, high = jnp.imag(loop[:-1]), jnp.imag(loop[1:])
+    crosses = low * high < 0.0
+    share = low / jnp.where(crosses, low - high, 1.0)
+    real = jnp.real(loop[:-1]) + share * jnp.real(loop[1:] - loop[:-1])
+    # L is real at the Nyquist frequency; a pole can leave the unit circle there too.
+    real = jnp.append(real, jnp.real(loop[-1]))
+    counts = jnp.append(crosses, True) & (real < 0.0) & (real > -1.0)
+    factors = 1.0 / jnp.where(counts, -real, 1.0)
+    decibel = 20.0 * jnp.log10(factors)
+    return smallest(jnp.where(counts, decibel, UNLIMITED_GAIN))
+
+
+@jax.jit
+def phase_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
+    """Return the smallest phase, lag or lead, that makes the loop unstable, in degrees.
+
+    180 if |L| never crosses 1. On several axes it is the smallest margin of one axis,
+    with all others closed.
+    """
+    return _least_of_axes(_phase_margin, sensitivity)
+
+
+def _phase_margin(sensitivity: Complex[Array, " lines"]) -> Float[Array, ""]:
+    """Return the phase margin of one axis."""
+    lag, _, crosses = _gain_crossings(sensitivity)
+    either = jnp.minimum(lag, 2.0 * jnp.pi - lag)
+    return smallest(jnp.where(crosses, jnp.degrees(either), 180.0))
+
+
+@jax.jit
 def delay_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
     """Return the delay margin in samples, ``UNLIMITED_DELAY`` if |L| never crosses 1.
 
     On several axes it is the smallest margin of one axis, with all others closed.
     """
-    axes = jnp.diagonal(sensitivity, axis1=-2, axis2=-1)
-    return smallest(jax.vmap(_delay_margin, in_axes=-1)(axes))
+    return _least_of_axes(_delay_margin, sensitivity)
 
 
 def _delay_margin(sensitivity: Complex[Array, " lines"]) -> Float[Array, ""]:
-    """Return the delay margin of one axis; crossings are interpolated."""
+    """Return the delay margin of one axis."""
+    lag, place, crosses = _gain_crossings(sensitivity)
+    return smallest(jnp.where(crosses, lag / place, UNLIMITED_DELAY))
+
+
+def _least_of_axes(
+    margin: Callable[[Array], Array], sensitivity: Sensitivity
+) -> Float[Array, ""]:
+    axes = jnp.diagonal(sensitivity, axis1=-2, axis2=-1)
+    return smallest(jax.vmap(margin, in_axes=-1)(axes))
+
+
+def _gain_crossings(
+    sensitivity: Complex[Array, " lines"],
+) -> tuple[Array, Array, Array]:
+    """Return the lag behind -1 and the place, rad, where |L| = 1 between two lines.
+
+    Both are interpolated. The third array tells between which lines |L| crosses 1.
+    """
     loop = 1.0 / sensitivity[1:] - 1.0
     angle = jnp.linspace(0.0, jnp.pi, sensitivity.size)[1:]
     gain = jnp.log(jnp.abs(loop))
@@ -260,5 +366,29 @@ def _delay_margin(sensitivity: Complex[Array, " lines"]) -> Float[Array, ""]:
     # Phase difference of two lines, wrapped to [-pi, pi).
     turn = jnp.mod(lag[1:] - lag[:-1] + jnp.pi, 2.0 * jnp.pi) - jnp.pi
     there = jnp.mod(lag[:-1] + share * turn, 2.0 * jnp.pi)
-    place = angle[:-1] + share * (angle[1:] - angle[:-1])
-    return smallest(jnp.where(crosses, there / place, UNLIMITED_DELAY))
+    return there, angle[:-1] + share * (angle[1:] - angle[:-1]), crosses
+
+
+@jax.jit
+def bandwidth_of(
+    followed: Complex[Array, " lines"], dt: ScalarLike
+) -> Float[Array, ""]:
+    """Return the lowest frequency, Hz, at which |y/r| falls below -3 dB.
+
+    It is interpolated between two lines, and the Nyquist frequency if |y/r| does not
+    fall below -3 dB. 0 Hz, where a line may already be below, counts as one line.
+    """
+    gain = jnp.log(jnp.abs(followed)) - BAND
+    below = gain < 0.0
+    at = jnp.argmax(below)
+    before = jnp.maximum(at - 1, 0)
+    share = gain[before] / jnp.where(gain[before] > 0.0, gain[before] - gain[at], 1.0)
+    line = before + jnp.where(gain[before] > 0.0, share, 1e-3)
+    line = jnp.where(jnp.any(below), line, followed.size - 1.0)
+    return line / (2.0 * dt * (followed.size - 1))
+
+
+@jax.jit
+def closed_loop_peak_of(followed: Complex[Array, " lines"]) -> Float[Array, ""]:
+    """Return the largest |y/r|."""
+    return largest(jnp.abs(followed))

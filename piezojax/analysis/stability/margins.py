@@ -13,9 +13,16 @@ from ...core.arrays import Scalar, Signal, as_array
 from ...core.feedback import Feedback, LoopState
 from ...dynamics import StateSpace
 from ...dynamics.linearise import linearise
-from .broken_loop import BrokenLoop, cut
-from .conserved import LinearAxes, LinearLoop, balanced, without_conserved
+from .broken_loop import BrokenLoop, FollowedLoop, cut
+from .conserved import (
+    FollowedReference,
+    LinearAxes,
+    LinearLoop,
+    balanced,
+    without_conserved,
+)
 from .crossings import angle_grid, peak, roots
+from .following import Following, following_of
 from .operating_point import OperatingPoint
 
 
@@ -48,6 +55,9 @@ class StabilityReport:
       disk margins, 2020;
     - ``sensitivity_peak``: Ms = max |S|; ``complementary_peak``: Mt = max |T|.
 
+    - ``following``: how the displacement follows small motions of the reference; None
+      where L alone is known.
+
     ``reference_um``, ``voltage_V`` and ``branch`` are the operating point. Frequencies
     in Hz, angles in degrees.
     """
@@ -72,6 +82,7 @@ class StabilityReport:
     sensitivity_peak_Hz: float | None  # noqa: N815
     complementary_peak: float | None
     complementary_peak_Hz: float | None  # noqa: N815
+    following: Following | None = None
     reference_um: float | None = None
     voltage_V: float | None = None  # noqa: N815
     branch: str | None = None
@@ -125,10 +136,13 @@ def linear_loop(loop: Feedback, at: Any = 0.0) -> tuple[LinearLoop, LoopState]:
     L is the argument of ``report_of`` and of plots. Arguments and errors are those of
     ``stability_report``; for several axes use ``linear_axes``.
     """
-    model, start = _model(loop, OperatingPoint.at(at))
-    return without_conserved(
-        balanced(LinearLoop(model.A, model.B[:, 0], model.C[0], model.dt))
-    ), start
+    A, B, C, D, dt, start = _matrices(loop, OperatingPoint.at(at), FollowedLoop)
+    cut = without_conserved(balanced(LinearLoop(A, B[:, 0], C[0], dt)))
+    # The voltage that the actuator returns closes the loop: u = -(C x + D r).
+    closed = A - np.outer(B[:, 0], C[0])
+    driven = B[:, 1:] - np.outer(B[:, 0], D[0, 1:])
+    followed = balanced(FollowedReference(closed, driven, C[1], dt))
+    return cut._replace(followed=without_conserved(followed)), start
 
 
 def linear_axes(
@@ -146,19 +160,28 @@ def linear_axes(
 def _model(
     loop: Feedback, point: OperatingPoint, kind: type[BrokenLoop] = BrokenLoop
 ) -> tuple[LinearAxes, LoopState]:
+    A, B, C, _, dt, start = _matrices(loop, point, kind)
+    return LinearAxes(A, B, C, dt), start
+
+
+def _matrices(
+    loop: Feedback, point: OperatingPoint, kind: type[BrokenLoop]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, LoopState]:
+    """Return A, B, C, D and the sample time of ``kind``, and the operating state."""
     reference, dt = point.signal, point.sample_time(loop)
     side = as_array(point.side)
     model, start = _linearised(loop, reference, side, point.state, dt, kind)
     point.check(start)
     A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
-    if not all(np.isfinite(m).all() for m in (A, B, C)):
+    if not all(np.isfinite(m).all() for m in (A, B, C, D)):
         shown = ", ".join(f"{float(r):g}" for r in jax.tree.leaves(reference))
         raise ValueError(
             f"the loop has no finite derivative at {shown} um; "
             "it cannot be linearised there"
         )
-    assert not D.any()  # the plant answers one sample later
-    return LinearAxes(A, B, C, dt), start
+    axes = len(jax.tree.leaves(start.voltage))
+    assert not D[:, :axes].any()  # the plant answers one sample later
+    return A, B, C, D, dt, start
 
 
 def report_of(loop: LinearLoop) -> StabilityReport:
@@ -167,6 +190,7 @@ def report_of(loop: LinearLoop) -> StabilityReport:
     figures: dict[str, Any] = dict.fromkeys(_FIGURES)
     if found["stable"]:
         figures |= _figures(loop)
+        figures["following"] = loop.followed and following_of(loop.followed)
     return StabilityReport(**(figures | found))
 
 

@@ -1,0 +1,136 @@
+"""Step tests of a loop of one axis: small and large steps, up and down."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..core.arrays import ScalarLike
+from ..core.feedback import Feedback, loop_inputs
+from ..core.rollout import simulate
+
+SMALL = 0.1
+"""Height of the small steps, as a share of that of the large ones."""
+
+NAMES = ("small step up", "small step down", "large step up", "large step down")
+
+BAND, FINE = 0.02, 0.001
+"""Settling bands around the reference, as shares of the height."""
+
+START, END = 0.1, 0.9
+"""Shares of the height between which a step rises."""
+
+LAST = 0.1
+"""Last part of a run, in which the steady-state error is taken."""
+
+
+class StepFigures(NamedTuple):
+    """Figures of step responses, by step.
+
+    - ``rise_time``: s from 10 to 90 % of the height;
+    - ``settling_time``, ``settling_time_fine``, ``settling_time_noise``: s from the
+      step until the displacement stays within 2 %, 0.1 % and the rms noise of the
+      sensor around the reference;
+    - ``overshoot``: largest excess over the reference, as a share of the height;
+    - ``steady_state_error``: mean distance from the reference in the last tenth of the
+      run, as a share of the height.
+
+    A time that is longer than the run is a number above its length, which falls as the
+    displacement gets nearer.
+    """
+
+    rise_time: Array
+    settling_time: Array
+    settling_time_fine: Array
+    settling_time_noise: Array
+    overshoot: Array
+    steady_state_error: Array
+
+
+def step_ends(references: np.ndarray) -> np.ndarray:
+    """Return the references (um) before and after each step of ``NAMES``, [4, 2].
+
+    The large ones go over the range in which the ``references`` are for nine tenths of
+    the time: their extremes may be short overshoots that no stage could hold.
+    """
+    low, high = np.quantile(references, [0.05, 0.95])
+    middle, half = (low + high) / 2.0, SMALL * (high - low) / 2.0
+    up = np.array([[middle - half, middle + half], [low, high]])
+    return np.stack([up[0], up[0, ::-1], up[1], up[1, ::-1]])
+
+
+def step_reference(ends: Array, samples: int) -> Array:
+    """Return a reference that steps from ``ends[0]`` to ``ends[1]`` at sample 1."""
+    return jnp.full(samples, ends[1]).at[0].set(ends[0])
+
+
+def step_figures(
+    loop: Feedback,
+    ends: Float[Array, "steps 2"],
+    samples: int,
+    dt: float,
+    noise: ScalarLike,
+) -> StepFigures:
+    """Return the figures [steps] of ``loop`` from rest, without noise; dt in s.
+
+    ``noise`` is the rms noise of the sensor, um. Differentiable almost everywhere.
+    """
+
+    def one(pair: Array) -> StepFigures:
+        inputs = loop_inputs(step_reference(pair, samples))
+        log = simulate(loop, inputs, loop.init(pair[0]))[1]
+        return figures_of(log.displacement, pair, dt, noise)
+
+    return jax.vmap(one)(ends)
+
+
+@jax.jit
+def figures_of(
+    displacement: Float[Array, " samples"],
+    ends: Float[Array, " 2"],
+    dt: ScalarLike,
+    noise: ScalarLike,
+) -> StepFigures:
+    """Return the figures of one run with ``step_reference``; arguments as above."""
+    height = ends[1] - ends[0]
+    # Sample 1 is the first at which the reference is the new one.
+    share = (displacement[1:] - ends[0]) / height
+    share = jnp.nan_to_num(share, nan=1e6, posinf=1e6, neginf=-1e6)
+    error = share - 1.0
+    last = max(1, round(LAST * error.size))
+    band = jnp.maximum(noise / jnp.abs(height), 1e-12)
+    return StepFigures(
+        dt * (_reached(share, END) - _reached(share, START)),
+        dt * _settled(error, BAND),
+        dt * _settled(error, FINE),
+        dt * _settled(error, band),
+        jnp.maximum(jnp.max(error), 0.0),
+        jnp.mean(jnp.abs(error[-last:])),
+    )
+
+
+def _reached(share: Float[Array, " samples"], level: float) -> Array:
+    """Return the first place at which ``share`` is above ``level``, in samples."""
+    above = share >= level
+    at = jnp.argmax(above)
+    here, before = share[at], jnp.where(at > 0, share[at - 1], 0.0)
+    rises = here > before
+    part = (here - level) / jnp.where(rises, here - before, 1.0)
+    place = at - jnp.where(rises, part, 0.0)
+    never = share.size * (1.0 + level - jnp.max(share))
+    return jnp.where(jnp.any(above), place, never)
+
+
+def _settled(error: Float[Array, " samples"], band: ScalarLike) -> Array:
+    """Return the place from which ``error`` stays within ``band``, in samples."""
+    size = jnp.abs(error)
+    outside = size > band
+    last = error.size - 1 - jnp.argmax(outside[::-1])
+    far, near = size[last], size[jnp.minimum(last + 1, error.size - 1)]
+    falls = far > near
+    place = last + (far - band) / jnp.where(falls, far - near, 1.0)
+    never = error.size * (1.0 + jnp.log(jnp.maximum(far / band, 1.0)))
+    settled = jnp.where(falls, place, never)
+    return jnp.where(jnp.any(outside), settled, 0.0)
