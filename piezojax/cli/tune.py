@@ -85,8 +85,10 @@ def _tune(
     from ..report.fit_pictures import write_fit
     from ..report.limit_bars import limit_text, write_limit
     from ..report.robustness import constraints_table, front_table
+    from ..report.step_pictures import steps_table
     from ..report.summary_tables import (
         beside_table,
+        following_table,
         gains_table,
         perturbed_text,
         sliding_text,
@@ -119,6 +121,10 @@ def _tune(
         console.print(beside_table(result))
     console.print(gains_table(result))
     console.print(stability_table(outcome.stability))
+    if outcome.stability.reports:
+        console.print(following_table(outcome.stability))
+    if outcome.steps[1]:
+        console.print(steps_table(outcome.steps))
     console.print(drive_table(outcome.drive, description.rate))
     if (line := sliding_text(result)) is not None:
         console.print(line, soft_wrap=True)

@@ -213,6 +213,27 @@ def stability_table(stability: StabilityReports) -> Table:
     return table
 
 
+def following_table(stability: StabilityReports) -> Table:
+    """Return how each loop of one axis follows its reference over frequency."""
+    table = Table(title="small motions of the reference, worse branch")
+    table.add_column("loop")
+    for title in ("bandwidth, -3 dB", "-1 dB", "closed-loop peak"):
+        table.add_column(title, justify="right")
+    for name, branches in stability.reports.items():
+        shown = "tuned" if name == "after" else name
+        each = [report.following for report in branches.values()]
+        if any(one is None for one in each):
+            table.add_row(shown, *_UNSTABLE[:3])
+            continue
+        least, inner = (
+            min(getattr(one, field) for one in each)
+            for field in ("bandwidth_Hz", "bandwidth_1dB_Hz")
+        )
+        peak = max(one.closed_loop_peak for one in each if one is not None)
+        table.add_row(shown, f"{least:.4g} Hz", f"{inner:.4g} Hz", f"{peak:.3f}")
+    return table
+
+
 _UNSTABLE = ("unstable", "-", "-", "-")
 
 

@@ -28,6 +28,7 @@ from .figures import (
     write,
 )
 from .robustness import front_figure, perturbed_figure
+from .step_pictures import steps_figure
 
 _MOST_TRACES = 3  # in the tracking picture
 _PERIODS = 4.0  # of the reference, drawn from the end of the run
@@ -54,6 +55,9 @@ def write_results(outcome: Outcome, folder: Path) -> None:
             "contour": contour_figure(
                 study, result.heading, contour_errors(study, runs)
             ),
+            "steps": steps_figure(outcome.step_runs, outcome.steps, result.heading)
+            if outcome.steps[1]
+            else None,
             "robustness": perturbed_figure(result.perturbed, result.heading),
             "pareto": front_figure(
                 result.front,
@@ -68,8 +72,10 @@ def write_results(outcome: Outcome, folder: Path) -> None:
 
 def write_numbers(outcome: Outcome, folder: Path) -> None:
     """Write result.json and gains.toml into ``folder``."""
-    before, after = outcome.drive
-    result = outcome.result.model_copy(update={"drive_before": before, "drive": after})
+    both = {"drive": outcome.drive, "steps": outcome.steps}
+    found = {f"{name}_before": before for name, (before, _) in both.items()}
+    found |= {name: after for name, (_, after) in both.items()}
+    result = outcome.result.model_copy(update=found)
     write_text(folder / RESULT_FILE, result.model_dump_json(indent=2) + "\n")
     save(outcome.controller, folder / GAINS_FILE, outcome.about)
 

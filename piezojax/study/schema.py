@@ -269,6 +269,11 @@ class Study(Table):
             if name not in CONSTRAINTS:
                 raise ValueError(unknown_key(f"constraints.{name}", name, CONSTRAINTS))
             CONSTRAINTS[name].check(f"constraints.{name}", limit)
+            if self.axes and CONSTRAINTS[name].one_axis:
+                raise ValueError(
+                    f"constraints.{name} is known for one axis only; this stage has "
+                    f"{len(self.axes.names)}"
+                )
         if self.pareto and self.pareto.constraint not in self.limits:
             raise ValueError(
                 f"pareto.constraint is {self.pareto.constraint!r}; "

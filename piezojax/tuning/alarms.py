@@ -20,6 +20,9 @@ HELD_OUT = 0.05
 """Relative excess over a limit in the hold-out that does not count, because its noise
 differs from that of tuning."""
 
+AMPLIFIED = 2.0
+"""Largest |y/r| without a note."""
+
 _TIGHTEN = "lower the upper bounds of the gains, or raise 'candidates' and 'steps'"
 
 
@@ -48,6 +51,20 @@ def alarms_of(
         *_holdout_alarms(result.holdout_constraints),
         *_plant_alarms(result.perturbed),
         *model,
+    ]
+
+
+def peak_notes(stability: StabilityReports) -> list[str]:
+    """Return a note if the tuned loop amplifies a part of its reference."""
+    reports = stability.reports.get("after", {}).values()
+    found = [report.following for report in reports if report.following is not None]
+    worst = max(found, key=lambda one: one.closed_loop_peak, default=None)
+    if worst is None or worst.closed_loop_peak <= AMPLIFIED:
+        return []
+    return [
+        f"a part of the reference at {worst.closed_loop_peak_Hz:.4g} Hz moves the "
+        f"stage {worst.closed_loop_peak:.3g} times as far: filter references that "
+        "contain this frequency, such as steps, or limit constraints.closed_loop_peak"
     ]
 
 
@@ -87,7 +104,15 @@ def _stability_alarms(
                 yield _missed(name, value, limits[name], f"the nominal plant{where}")
 
 
-_EXACT_FIGURES = ("sensitivity_peak", "delay_margin", "disk_margin")
+_EXACT_FIGURES = (
+    "sensitivity_peak",
+    "delay_margin",
+    "disk_margin",
+    "gain_margin",
+    "phase_margin",
+    "bandwidth",
+    "closed_loop_peak",
+)
 
 
 def exact_figures(
@@ -109,15 +134,28 @@ def exact_figures(
 
 
 def _figures(
-    report: Any, axes: Iterable[StabilityReport]
+    report: Any, axes: Sequence[StabilityReport]
 ) -> dict[str, float | None] | None:
     if not report.stable:
         return None
-    delays = [axis.delay_margin_samples for axis in axes]
-    return {
+
+    def least(name: str) -> float | None:
+        known = [getattr(axis, name) for axis in axes]
+        return min((margin for margin in known if margin is not None), default=None)
+
+    found = {
         "sensitivity_peak": report.sensitivity_peak,
-        "delay_margin": min((d for d in delays if d is not None), default=None),
+        "delay_margin": least("delay_margin_samples"),
         "disk_margin": report.disk_margin,
+        "gain_margin": least("gain_margin_dB"),
+        "phase_margin": least("phase_margin_deg"),
+    }
+    following = getattr(report, "following", None)
+    if following is None:
+        return found
+    return found | {
+        "bandwidth": following.bandwidth_Hz,
+        "closed_loop_peak": following.closed_loop_peak,
     }
 
 

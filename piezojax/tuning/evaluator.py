@@ -17,6 +17,7 @@ from ..analysis.constraints import (
 )
 from ..analysis.stability.differentiable import lines
 from ..analysis.stability.operating_point import OperatingPoint
+from ..analysis.step_response import StepFigures, step_ends
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, Extremes, TrackingFigures
@@ -24,9 +25,9 @@ from ..solve.clock import Clock
 from ..solve.multi_start import in_batches
 from ..study import Case, Stage
 from ..study.ensemble import Part
-from ..study.references import highest_reference
+from ..study.references import highest_reference, reference_signals
 from .data import held, own_stage
-from .objective import MARGIN_BLOCK, margins_on
+from .objective import MARGIN_BLOCK, StepTest, margins_on
 from .runs import Signals, evaluate
 
 CARRIED = 64
@@ -55,8 +56,9 @@ class Evaluator:
 
     ``start`` is the first sample that counts, ``limits`` are those of the study,
     ``model_error`` [lines] bounds the relative error of the plant if its record gives
-    a bound; ``margin_stages`` are those on which margins are limited, None for the
-    loop's own alone. ``clock`` measures the compile time.
+    a bound; ``step_test`` is that of limits on steps. ``margin_stages`` are those on
+    which margins are limited, None for the loop's own alone. ``clock`` measures the
+    compile time.
     """
 
     def __init__(self, clock: Clock, case: Case):
@@ -67,6 +69,7 @@ class Evaluator:
         bound = case.plant_about.error_bound
         self.model_error = bound and as_array(bound.supported(lines(study.dt)))
         self.margin_stages = drawn_stages(case, "margins")
+        self.step_test = step_test_of(case)
         # A program takes no more plants than the study draws.
         drawn = study.ensemble.holdout if study.ensemble else 1
         self._most = max(1, drawn, _count(self.margin_stages))
@@ -89,13 +92,17 @@ class Evaluator:
 
     @property
     def limits_on_runs(self) -> list[str]:
-        """Names of the limits that are not on margins."""
-        return [n for n in self.limits if CONSTRAINTS[n].source != "margins"]
+        """Names of the limits on runs of the references."""
+        return [
+            name
+            for name in self.limits
+            if CONSTRAINTS[name].source in ("tracking", "extremes")
+        ]
 
     def run_figures(self, loop: Feedback, signals: Signals) -> LoopFigures:
         """Return the figures of ``limits_on_runs`` on the plant of ``loop``."""
         tracking, extremes = self._runs(loop, signals, None)
-        return LoopFigures(tracking, extremes, None, dt=self._case.study.dt)
+        return LoopFigures(tracking, extremes, None, None, dt=self._case.study.dt)
 
     def limited(
         self,
@@ -110,8 +117,8 @@ class Evaluator:
         means the plant of the loop alone.
         """
         tracking, extremes = self._runs(loop, signals, stages)
-        margins = self._margins(loop, margin_stages)
-        return LoopFigures(tracking, extremes, margins, dt=self._case.study.dt)
+        margins, steps = self._margins(loop, margin_stages), self._steps(loop, stages)
+        return LoopFigures(tracking, extremes, margins, steps, self._case.study.dt)
 
     def _runs(
         self, loop: Feedback, signals: Signals, stages: Stage | None
@@ -198,6 +205,35 @@ class Evaluator:
         stages = own_stage(loop) if stages is None else stages
         width = 1 if study.axes else min(MARGIN_BLOCK, self._most)
         return self._on_each("margins", margins, width, loop, stages)
+
+    def _steps(self, loop: Feedback, stages: Stage | None) -> StepFigures | None:
+        """Return the figures of steps on ``stages``, or None if no limit needs them."""
+        test = self.step_test
+        if test is None or not uses(self.limits, "steps"):
+            return None
+
+        def steps(loop, stages, _):
+            return test.figures_on(
+                lambda stage: stage.around(loop) if stage else loop, stages
+            )
+
+        stages = own_stage(loop) if stages is None else stages
+        width = min(RUN_BLOCK, self._most)
+        return self._on_each("steps", steps, width, loop, stages)
+
+
+def step_test_of(case: Case) -> StepTest | None:
+    """Return the step test of ``case``, as long as its references; None for axes."""
+    study = case.study
+    if study.axes is not None:
+        return None
+    references = np.asarray(reference_signals(study))
+    return StepTest(
+        as_array(step_ends(references)),
+        as_array(study.sensor.noise_rms),
+        references.shape[1],
+        study.dt,
+    )
 
 
 def _count(stages: Stage | None) -> int:

@@ -51,6 +51,7 @@ def make_objective(
         over=table.ensemble.aggregate if table.ensemble else "mean",
         tail=table.ensemble.tail if table.ensemble else 1.0,
         highest=as_array(highest_reference(table)),
+        step_test=evaluator.step_test,
         dt=table.dt,
     )
 

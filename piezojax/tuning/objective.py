@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Literal, TypeVar
 
 import equinox as eqx
@@ -18,8 +18,8 @@ from ..analysis.constraints import (
     uses,
     violations,
 )
-from ..analysis.stability.differentiable import sensitivities
 from ..analysis.stability.operating_point import OperatingPoint
+from ..analysis.step_response import StepFigures, step_figures
 from ..core.arrays import as_array, largest
 from ..core.feedback import Feedback
 from ..core.metrics import Extremes, TrackingFigures
@@ -68,7 +68,7 @@ def _on_each(
 
 
 def margins_on(
-    limits: Iterable[str],
+    limits: Collection[str],
     loop_of: Callable[[Stage | None], Feedback],
     stages: Stage | None,
     point: OperatingPoint,
@@ -81,12 +81,33 @@ def margins_on(
     """
 
     def one(stage: Stage | None) -> MarginFigures:
-        found = sensitivities(loop_of(stage), point)
-        return margin_figures(limits, found, model_error)
+        return margin_figures(limits, loop_of(stage), point, model_error)
 
     # Of several axes a whole batch of matrices would not fit into memory.
     one_axis = jnp.ndim(point.reference) == 0
     return _on_each(one, stages, MARGIN_BLOCK if one_axis else 1)
+
+
+class StepTest(eqx.Module):
+    """Steps of the reference from rest: ``ends`` (um), and the ``noise`` of the sensor.
+
+    A run has a number of ``samples``, ``dt`` in s.
+    """
+
+    ends: Float[Array, "steps 2"]
+    noise: Float[Array, ""]
+    samples: int = eqx.field(static=True)
+    dt: float = eqx.field(static=True)
+
+    def figures(self, loop: Feedback) -> StepFigures:
+        """Return the figures [steps] of ``loop``."""
+        return step_figures(loop, self.ends, self.samples, self.dt, self.noise)
+
+    def figures_on(
+        self, loop_of: Callable[[Stage | None], Feedback], stages: Stage | None
+    ) -> StepFigures:
+        """Return the figures [plants, steps] on each of ``stages``."""
+        return _on_each(lambda stage: self.figures(loop_of(stage)), stages)
 
 
 class Objective(eqx.Module):
@@ -108,7 +129,8 @@ class Objective(eqx.Module):
     ``limits`` are the limits of constraints by name (``constraints.CONSTRAINTS``). They
     must hold on every stage; limits on margins must hold on every one of
     ``margin_stages``, at the reference ``highest`` (um), for all plants within the
-    relative error ``model_error`` [lines] of these. ``loss`` is an augmented
+    relative error ``model_error`` [lines] of these. ``step_test`` is that of limits on
+    steps, None on several axes. ``loss`` is an augmented
     Lagrangian with ``multipliers`` and ``penalty``.
     """
 
@@ -130,6 +152,7 @@ class Objective(eqx.Module):
     slew_weight: float = eqx.field(static=True, default=0.0)
     limits: dict[str, Array] = eqx.field(default_factory=dict)
     highest: Array | None = None
+    step_test: StepTest | None = None
     dt: float = eqx.field(static=True, default=1.0)
     multipliers: Float[Array, " constraints"] = eqx.field(
         default_factory=lambda: jnp.zeros(0)
@@ -202,7 +225,12 @@ class Objective(eqx.Module):
                 OperatingPoint(self.highest, dt=self.dt),
                 self.model_error,
             )
-        return LoopFigures(figures, extremes, margins, dt=self.dt), errors
+        steps = None
+        if self.step_test is not None and uses(self.limits, "steps"):
+            steps = self.step_test.figures_on(
+                lambda stage: loop_of(unit, stage), self.stages
+            )
+        return LoopFigures(figures, extremes, margins, steps, dt=self.dt), errors
 
     def _normalised(self, figures: TrackingFigures) -> Array:
         square = jnp.mean(figures.rms_error**2, axis=2)

@@ -11,7 +11,10 @@ import numpy as np
 
 from ..analysis.limit import LimitReport, performance_limit
 from ..analysis.stability import StabilityReports
+from ..analysis.step_response import NAMES as STEPS
+from ..analysis.step_response import figures_of, step_ends, step_reference
 from ..core.about import About
+from ..core.arrays import as_array
 from ..core.axes import axis_of
 from ..core.feedback import Feedback, LoopSample, loop_inputs
 from ..core.paths import parameters
@@ -23,6 +26,7 @@ from .coupling import Coupling, coupling_matrix
 from .drive import Drive, drive_of
 from .result import Result
 from .runs import Signals
+from .step_tests import StepResult, StepRun
 
 _BEYOND = 1e9  # um or V
 
@@ -37,8 +41,8 @@ class Outcome:
     ``before`` and ``after`` are the loops with the gains of the study and with the
     tuned gains; ``holdout`` are the held-out signals. ``baselines`` is None unless a
     budget for them was given. ``stability`` is that of both loops at the highest
-    reference. ``limit``, ``coupling`` and ``drive`` are computed when they are first
-    read, so that many studies can be tuned without them.
+    reference. ``limit``, ``coupling``, ``drive`` and ``steps`` are computed when they
+    are first read, so that many studies can be tuned without them.
     """
 
     result: Result
@@ -151,6 +155,55 @@ class Outcome:
                 study.by_axis(capacitance)[axis] if capacitance is not None else None,
             )
         return found
+
+    @cached_property
+    def step_runs(self) -> tuple[dict[str, StepRun], dict[str, StepRun]]:
+        """Runs of the steps by their name, before and after tuning.
+
+        They are as long as the references, without noise and disturbance, and empty on
+        several axes.
+        """
+        if self.case.study.axes is not None:
+            return {}, {}
+        signals, dt = self.holdout, self.case.study.dt
+        samples = signals.references.shape[1]
+        quiet = jnp.zeros_like(signals.noise[0, 0])
+        undisturbed = None if signals.disturbance is None else quiet
+        ends = step_ends(np.asarray(signals.references))
+
+        def run(loop: Feedback, pair: np.ndarray) -> StepRun:
+            reference = step_reference(as_array(pair), samples)
+            log = _log(loop, reference, quiet, undisturbed)
+            time = dt * np.arange(-1, samples - 1)
+            low, high = map(float, pair)
+            return StepRun((low, high), time, _finite(log.displacement))
+
+        before, after = (
+            {name: run(loop, pair) for name, pair in zip(STEPS, ends, strict=True)}
+            for loop in (self.before, self.after)
+        )
+        return before, after
+
+    @cached_property
+    def steps(self) -> tuple[dict[str, StepResult], dict[str, StepResult]]:
+        """Figures of ``step_runs``."""
+        noise = self.case.study.by_axis(self.case.study.sensor.noise_rms)[0]
+        before, after = (
+            {
+                name: StepResult.of(
+                    run,
+                    figures_of(
+                        as_array(run.displacement),
+                        as_array(run.ends),
+                        self.case.study.dt,
+                        noise,
+                    ),
+                )
+                for name, run in runs.items()
+            }
+            for runs in self.step_runs
+        )
+        return before, after
 
     def logs(self, runs: Iterable[int]) -> dict[int, Logs]:
         """Return the samples of both loops by the number of the reference in ``runs``.

@@ -15,6 +15,7 @@ from ..solve.search_state import Status
 from .drive import Drive
 from .objective import RAILED
 from .sliding import SlidingShare
+from .step_tests import StepResult
 
 RESULT_FILE = "result.json"
 GAINS_FILE = "gains.toml"
@@ -239,6 +240,10 @@ class Result(BaseModel):
     """Figures of the voltage at the piezo before tuning, by axis ("piezo" on one)."""
     drive: dict[str, Drive] = {}
     """The same figures of the tuned gains."""
+    steps_before: dict[str, StepResult] = {}
+    """Step tests before tuning, by step; none on several axes."""
+    steps: dict[str, StepResult] = {}
+    """The same steps with the tuned gains."""
     sliding_before: SlidingShare | None = None
     sliding: SlidingShare | None = None
     units: dict[str, str] = {}

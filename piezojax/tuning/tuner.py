@@ -9,7 +9,7 @@ from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
 from ..solve.clock import Clock
 from ..study import Case, read, shipped
-from .alarms import alarms_of
+from .alarms import alarms_of, peak_notes
 from .baselines import Budget, compare_baselines
 from .beside import figures_beside
 from .data import make_data
@@ -81,6 +81,7 @@ def tune(
         result.warnings += [note] if note else []
     except KeyboardInterrupt:
         result.status = "interrupted"
+    result.warnings += peak_notes(stability)
     limits = table.limits
     of_model = [
         *_model_alarms(case, limits, stability),

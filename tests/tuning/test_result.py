@@ -55,7 +55,7 @@ def figures(rms, saturated=0.0):
     names = [name for name in TrackingFigures._fields if name != "rms_error"]
     fields = dict.fromkeys(names, nothing) | {"saturated": nothing + saturated}
     tracking = TrackingFigures(rms_error=rms, **fields)
-    return LoopFigures(tracking, None, None, dt=1e-4)
+    return LoopFigures(tracking, None, None, None, dt=1e-4)
 
 
 DRIVEN = np.array([True, True, False])
