@@ -9,7 +9,9 @@ from .anticipation import Anticipation as Anticipation
 from .devices import E727 as E727
 from .devices import NV200 as NV200
 from .devices import Device as Device
+from .devices import PyRPL as PyRPL
 from .devices import Servo as Servo
+from .devices import Stabilizer as Stabilizer
 from .disturbance_observer import (
     DisturbanceObserverControl as DisturbanceObserverControl,
 )

@@ -180,9 +180,11 @@ def rounded(value: Any, step: float | None) -> Any:
     """
     if step is None:
         return value
-    # A step below 1 is the inverse of a whole number, which has no rounding error.
     nearest = jnp.round(value / step)
-    nearest = nearest / round(1.0 / step) if step < 1.0 else nearest * step
+    # A step may be the inverse of a whole number, which has no rounding error.
+    count = round(1.0 / step)
+    whole = abs(count * step - 1.0) < 1e-12
+    nearest = nearest / count if whole else nearest * step
     return jax.lax.stop_gradient(nearest) + (value - jax.lax.stop_gradient(value))
 
 

@@ -9,7 +9,7 @@ import pytest
 from oracles import vendor_loops
 
 import piezojax as pj
-from piezojax.control import E727, NV200, Servo
+from piezojax.control import E727, NV200, PyRPL, Servo, Stabilizer
 from piezojax.core.serial import from_data, to_data
 from piezojax.core.system import Affine
 from piezojax.report.summary_tables import gains_table
@@ -86,6 +86,27 @@ SERVOS = {
 }
 
 
+STABILIZERS = {
+    "integral": {"p": -1e-3, "i": 400.0},
+    "pid": {"p": -0.4, "i": 300.0, "d": 2e-6, "limit_d": 20.0},
+    "leaking": {"p": -0.4, "i": 300.0, "limit_i": 50.0},
+    "reversed": {"p": 0.1, "i": 40.0},
+    "limited": {"p": -2.0, "i": 9000.0, "minimum": -3.0, "maximum": 6.0},
+}
+RED_PITAYAS = {
+    "integral": {"p": 0.0, "i": -60.0},
+    "both": {"p": -0.3333, "i": -20.0013},
+    "filters": {
+        **{"p": -0.2, "i": -30.0, "filters": 2},
+        **{"filter_1": 1500.0, "filter_2": 4000.0},
+    },
+    "limited": {"p": -1.5, "i": -900.0, "min_voltage": -0.7, "max_voltage": 0.9},
+    "far": {"p": 0.0, "i": -3e4},
+}
+WIRES = {"sensor_gain": 0.1, "amplifier_gain": 15.0, "offset": 55.0}
+PITAYA = {"sensor_gain": 0.012, "amplifier_gain": 75.0, "offset": 55.0}
+
+
 def nv200(**options):
     return NV200(**RANGE, **options)
 
@@ -96,6 +117,14 @@ def e727(**options):
 
 def servo(**options):
     return Servo(**options, lower=SPAN[0], upper=SPAN[1], dt=DT)
+
+
+def stabilizer(**options):
+    return Stabilizer(**options, **WIRES)
+
+
+def pyrpl(**options):
+    return PyRPL(**options, **PITAYA, dt=DT)
 
 
 def expected_nv200(**options):
@@ -127,12 +156,28 @@ def expected_servo(**options):
     )
 
 
+def expected_stabilizer(**options):
+    wires = {"sensor": 0.1, "volts": 15.0, "offset": 55.0}
+    return vendor_loops.Stabilizer(REST, REST, 30.0, **wires, **options)
+
+
+def expected_pyrpl(**options):
+    named = {"min_voltage": "minimum", "max_voltage": "maximum"}
+    given = {named.get(name, name): value for name, value in options.items()}
+    count = given.pop("filters", 0)
+    cutoffs = [given.pop(f"filter_{n + 1}") for n in range(count)]
+    wires = {"sensor": 0.012, "volts": 75.0, "offset": 55.0, "dt": DT}
+    return vendor_loops.RedPitaya(REST, REST, 30.0, cutoffs=cutoffs, **wires, **given)
+
+
 CASES = {
     f"{make.__name__} {name}": (make, oracle, options)
     for make, oracle, table in (
         (nv200, expected_nv200, NV200S),
         (e727, expected_e727, E727S),
         (servo, expected_servo, SERVOS),
+        (stabilizer, expected_stabilizer, STABILIZERS),
+        (pyrpl, expected_pyrpl, RED_PITAYAS),
     )
     for name, options in table.items()
 }
@@ -182,6 +227,35 @@ def test_an_nv200_computes_with_three_decimals_and_whole_frequencies():
 def test_rounding_keeps_the_notch_within_its_limit():
     notch = nv200(notchf=100.4, notchb=200.8, notchon=1).typed()
     assert (float(notch.notchf), float(notch.notchb)) == (100.0, 200.0)
+
+
+def test_pyrpl_computes_with_its_registers():
+    typed = pyrpl(p=-0.12345, i=-20.0, filters=1, filter_1=1500.0).typed()
+    assert float(typed.p) * 2**12 == round(-0.12345 * 2**12)
+    assert float(typed.i) == pytest.approx(-20.0, abs=2.4e-3)
+    # 125 MHz / 2 pi over 2^14; the gradient is that of what was given.
+    assert float(typed.filter_1) == pytest.approx(1214.3, abs=0.1)
+    slope = jax.grad(lambda f: pyrpl(p=0.0, i=1.0, filter_1=f).typed().filter_1)
+    assert slope(1500.0) == 1.0
+
+
+def test_a_stabilizer_loses_small_errors():
+    """At 8 V the steps of single precision are 2^-9 codes: less error moves nothing."""
+    slow = stabilizer(p=-1e-6, i=1.0)
+    measured = np.full(400, REST)
+    rest = pj.Observation(REST, REST, REST, 55.0 + 15.0 * 8.0)
+
+    def last(error):
+        def step(state, measured):
+            seen = pj.Observation(REST + error, REST + error, measured, 30.0)
+            return slow.step(state, seen)
+
+        state = slow.init(rest)
+        return float(jax.lax.scan(step, state, measured)[1][-1]) - 175.0
+
+    exact = 15.0 * 0.1 * 1.28e-6 * 400
+    assert last(20.0) == pytest.approx(20.0 * exact, rel=0.2)
+    assert last(1.0) == 0.0
 
 
 def test_a_servo_at_a_low_rate_checks_what_is_on():
@@ -258,6 +332,11 @@ def test_a_measured_scale_raises_no_alarm():
         (lambda: nv200(setpoint_filter="bessel"), "setpoint_filter is 'bessel'"),
         (lambda: nv200(dt=1e-4), "dt is 0.0001 s; NV200 runs at 20 kHz"),
         (lambda: e727(proportional=0.0, integral_time=1.0), "proportional is 0"),
+        (lambda: pyrpl(p=3e3, i=0.0), "p in V/V is 3000; it must be .* at most 2048"),
+        (lambda: pyrpl(p=0.0, i=0.0, filters=5), "filters is 5"),
+        (lambda: pyrpl(p=0.0, i=0.0, min_voltage=0.5, max_voltage=0.2), "min_voltage"),
+        (lambda: stabilizer(p=1.0, i=-2.0), r"i in V/\(V s\) is -2; it must be"),
+        (lambda: stabilizer(p=1.0, i=1.0, minimum=3.0, maximum=2.0), "minimum is 3"),
         (lambda: e727(proportional=1.0, integral_time=1.0, notch_method=2), "0, 1"),
         (lambda: e727(proportional=1.0, integral_time=1.0, filter_type=99), "0, 1"),
         (lambda: e727(proportional=1.0, integral_time=1.0, structure="x"), "structure"),

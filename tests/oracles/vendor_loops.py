@@ -357,3 +357,114 @@ class GenericServo:
         direct += self.kd / self.dt * (error - self.last_error)
         self.last_error = error
         return self.command.step(direct, self.ki * self.dt * error)
+
+
+class Stabilizer:
+    """Simulate one channel of a Stabilizer: a biquad in single precision.
+
+    The gains are those of its PID representation of order I, the signals in V at the
+    converters; ``volts`` of the piezo belong to 1 V of the output.
+    """
+
+    CODES = np.float32(3200.0)
+
+    def __init__(
+        self,
+        reference,
+        measured,
+        applied,
+        *,
+        p,
+        i,
+        d=0.0,
+        limit_i=math.inf,
+        limit_d=math.inf,
+        minimum=-10.0,
+        maximum=10.0,
+        sensor,
+        volts,
+        offset=0.0,
+        dt=1.28e-6,
+    ):
+        """Begin at rest."""
+        one, tick = np.float32(1.0), np.float32(dt)
+        sign = np.copysign(1.0, p)
+        power = one / tick
+        gain_d = np.float32(sign * d) * power
+        loss_d = gain_d / np.float32(sign * limit_d)
+        power = power * tick
+        gain_p, loss_p = np.float32(p) * power, one
+        power = power * tick
+        gain_i = np.float32(sign * i) * power
+        loss_i = gain_i / np.float32(sign * limit_i)
+        share = one / (loss_i + loss_p + loss_d)
+        gain_i, gain_p, gain_d = gain_i * share, gain_p * share, gain_d * share
+        loss_p, loss_d = loss_p * share, loss_d * share
+        self.b = [gain_i + gain_p + gain_d, -gain_p - gain_d - gain_d, gain_d]
+        self.a = [loss_p + loss_d + loss_d, -loss_d]
+        self.sensor, self.volts, self.offset = sensor, volts, offset
+        self.ends = self.CODES * np.float32(minimum), self.CODES * np.float32(maximum)
+        self.x = [np.float32(3200.0 * sensor * measured)] * 2
+        self.y = [np.float32((applied - offset) / (volts / 3200.0))] * 2
+        assert all(c.dtype == np.float32 for c in (*self.b, *self.a, *self.x, *self.y))
+
+    def step(self, reference, measured):
+        """Return the voltage of this sample."""
+        x = np.float32(3200.0 * self.sensor * measured)
+        (b0, b1, b2), (a1, a2) = self.b, self.a
+        y = b0 * x + b1 * self.x[0] + b2 * self.x[1]
+        y = y + a1 * self.y[0] + a2 * self.y[1]
+        y = y - np.float32(3200.0 * self.sensor * reference) * (b0 + b1 + b2)
+        y = min(max(y, self.ends[0]), self.ends[1])
+        assert y.dtype == np.float32
+        self.x, self.y = [x, self.x[0]], [y, self.y[0]]
+        return self.offset + self.volts / 3200.0 * float(y)
+
+
+class RedPitaya:
+    """Simulate the PID module of PyRPL, sampled slowly, with its registers."""
+
+    CLOCK = 8e-9
+
+    def __init__(
+        self,
+        reference,
+        measured,
+        applied,
+        *,
+        p,
+        i,
+        sensor,
+        volts,
+        offset=0.0,
+        cutoffs=(),
+        minimum=-1.0,
+        maximum=1.0,
+        dt,
+    ):
+        """Begin at rest."""
+        self.p = round(p * 2**12) / 2**12
+        register = round(i * 2**32 * 2.0 * math.pi * self.CLOCK)
+        # In a cycle the integral grows by the error times register / 2^32.
+        self.rise = register / 2**32 * (dt / self.CLOCK)
+        base = 1.0 / (2.0 * math.pi * self.CLOCK)
+        self.filters = [
+            low_pass_1(base / 2 ** round(math.log2(base / cutoff)), dt)
+            for cutoff in cutoffs
+        ]
+        for each in self.filters:
+            each.settle(sensor * measured)
+        self.sensor, self.volts, self.offset = sensor, volts, offset
+        self.ends = minimum, maximum
+        error = sensor * (measured - reference)
+        self.sum = (applied - offset) / volts - self.p * error
+
+    def step(self, reference, measured):
+        """Return the voltage of this sample."""
+        found = self.sensor * measured
+        for each in self.filters:
+            found = each.step(found)
+        error = found - self.sensor * reference
+        self.sum = min(max(self.sum + self.rise * error, -4.0), 4.0)
+        output = min(max(self.p * error + self.sum, self.ends[0]), self.ends[1])
+        return self.offset + self.volts * output

@@ -17,6 +17,9 @@ FIXED_DT = 5e-5
 NO_SLEW = 1e9
 """Slew rate (um/s) beyond every setpoint."""
 
+NO_END = 1e9
+"""End of an integral (V) that runs on."""
+
 INTEGRATIONS = ("rectangular", "trapezoidal")
 ANTI_WINDUPS = ("none", "hold")
 
@@ -39,12 +42,12 @@ class Device(Designed):
         """What to resolve before the gains are typed in, each with a next step."""
         return ()
 
-    def resolved(self) -> "ServoLoop":
+    def resolved(self) -> System:
         """Return the loop of the rounded parameters."""
         return self.typed().loop()
 
     @abc.abstractmethod
-    def loop(self) -> "ServoLoop":
+    def loop(self) -> System:
         """Return the loop of the parameters as they are."""
 
 
@@ -70,7 +73,8 @@ class ServoLoop(System):
         u = output(P e + I sum(e) dt + D (e - e1)/dt + Fx s + Fv dr/dt + Fa d2r/dt2)
 
     with the previous error e1, clipped to ``lower`` and ``upper``. ``integration`` is
-    "rectangular" (backward) or "trapezoidal". The ``anti_windup`` "hold" is conditional
+    "rectangular" (backward) or "trapezoidal". The integral, with the voltage at rest in
+    it, stays between its ends. The ``anti_windup`` "hold" is conditional
     integration: no step drives a saturated output further; with "none" the integral
     runs on. Each filter has unit DC gain. Input an Observation, output in V. Raises
     ValueError for an unknown option.
@@ -90,6 +94,10 @@ class ServoLoop(System):
     acceleration_feedforward: Scalar = parameter(
         "V s^2/um", "feedforward Fa", default=0.0
     )
+    least_integral: Scalar = parameter(
+        "V", "lower end of the integral", default=-NO_END
+    )
+    most_integral: Scalar = parameter("V", "upper end of the integral", default=NO_END)
     integration: str = eqx.field(static=True, default="rectangular")
     anti_windup: str = eqx.field(static=True, default="none")
 
@@ -132,13 +140,15 @@ class ServoLoop(System):
             + self.velocity_feedforward * velocity
             + self.acceleration_feedforward * acceleration
         )
-        output, command = self.output.step(state.output, sum + state.integral + change)
-        kept = change
+        ends = self.least_integral, self.most_integral
+        held = jnp.clip(state.integral + change, *ends)
+        output, command = self.output.step(state.output, sum + held)
+        kept = held - state.integral
         if self.anti_windup == "hold":
             outward = ((command > self.upper) & (change > 0.0)) | (
                 (command < self.lower) & (change < 0.0)
             )
-            kept = jnp.where(outward, 0.0, change)
+            kept = jnp.where(outward, 0.0, kept)
         return ServoLoopState(
             setpoint,
             position,
