@@ -22,6 +22,11 @@ from ..core.space import Range
 Lags = tuple[Scalar, ...]
 
 
+LARGEST = 0.1
+"""Largest creep of one exponential in a fit. Piezos creep by a few per cent a decade; a
+larger gain would stand for a part of the hysteresis, and fail on another record."""
+
+
 def _relaxed(input: Scalar, lags: Lags, time_constants: tuple, dt: float) -> Lags:
     """Advance first-order lags of an input that is held between samples."""
     return tuple(
@@ -75,7 +80,7 @@ class ExponentialCreep(Fittable):
         times = np.geomspace(*_creep_times(extent), 4)
         return Recipe(
             cls((0.01,) * 4, times, extent.dt),
-            {f"gains.{i}": Range(-0.5, 0.5) for i in range(4)},
+            {f"gains.{i}": Range(-LARGEST, LARGEST) for i in range(4)},
         )
 
     def init(self, input: ScalarLike = 0.0) -> Lags:
