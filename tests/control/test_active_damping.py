@@ -1,5 +1,6 @@
 """Active damping against a loop of NumPy, and the damping that it adds."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -87,7 +88,7 @@ def test_it_is_the_loop_of_the_equations(scheme):
 
 
 def damping_of_the_mode(tested):
-    poles = np.asarray(closed_loop_poles(tested))
+    poles = np.asarray(eqx.filter_jit(closed_loop_poles)(tested))
     poles = np.log(poles[np.abs(poles) > 1e-9]) / DT
     near = poles[np.argmin(np.abs(np.abs(poles) - 2.0 * np.pi * FREQUENCY))]
     return -near.real / abs(near), abs(near) / (2.0 * np.pi)
