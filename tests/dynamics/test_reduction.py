@@ -134,7 +134,7 @@ def test_a_controller_on_such_a_model_stabilises_it(order):
     # Of 7 states it holds the whole stage of 15, of 8 its model only.
     plant = p558_control.stage("6") if order == 7 else model
     loop = p558_control.loop(controller, plant=plant)
-    linear, _ = linear_axes(loop, (0.0, 0.0, 0.0))
+    linear, *_ = linear_axes(loop, (0.0, 0.0, 0.0))
     assert np.abs(np.linalg.eigvals(linear.closed())).max() < 0.99
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from ...core.arrays import ScalarLike
 from ...core.feedback import Feedback
 from .axes_margins import MultiAxisReport, axes_report_of
-from .broken_loop import OutputCut
 from .conserved import LinearAxes, LinearLoop
 from .crossings import angle_grid
 from .margins import (
@@ -219,8 +218,7 @@ def _worse_branch(loop: Feedback, points: Sequence[OperatingPoint]) -> AxesStabi
 
 
 def _axes_stability(loop: Feedback, point: OperatingPoint) -> AxesStability:
-    model, start = linear_axes(loop, point)
-    behind, _ = linear_axes(loop, point, OutputCut)
+    model, behind, start = linear_axes(loop, point)
     report = dataclasses.replace(
         axes_report_of(model, behind),
         reference=tuple(float(r) for r in jax.tree.leaves(point.signal)),

@@ -25,7 +25,10 @@ branch."""
 
 
 class BrokenState(NamedTuple):
-    """State of a cut loop; ``applied`` is the actuator's last voltage, V."""
+    """State of a cut loop; ``applied`` is the actuator's last voltage, V.
+
+    The displacements come before the voltages, and both after all other states.
+    """
 
     controller: State
     actuator: State
@@ -138,26 +141,6 @@ class BrokenLoop(System):
 
     def _move(self, state: BrokenState, input: Signal) -> tuple[State, Signal]:
         return self.loop.plant.step(state.plant, _pushed(input, self.voltage_push))
-
-
-class OutputCut(BrokenLoop):
-    """A BrokenLoop cut behind its plant instead, where the sensor reads.
-
-    Input: the displacement that the sensor reads, um. Output: minus that of the plant,
-    um. Feeding back minus the output closes the loop. Its S maps a disturbance of the
-    displacement to the displacement; on several axes it differs from that of the cut
-    before the plant.
-    """
-
-    @property
-    def rest(self) -> Signal:
-        """Input at the operating point."""
-        return self.start.displacement
-
-    def step(self, state: BrokenState, input: Signal) -> tuple[BrokenState, Signal]:
-        unmoved = jax.tree.map(jnp.zeros_like, self.start.voltage)
-        after, _ = self.closed(state._replace(displacement=input), unmoved)
-        return after, jax.tree.map(jnp.negative, state.displacement)
 
 
 class FollowedLoop(BrokenLoop):

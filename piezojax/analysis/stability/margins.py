@@ -145,23 +145,34 @@ def linear_loop(loop: Feedback, at: Any = 0.0) -> tuple[LinearLoop, LoopState]:
     return cut._replace(followed=without_conserved(followed)), start
 
 
-def linear_axes(
-    loop: Feedback, at: Any, kind: type[BrokenLoop] = BrokenLoop
-) -> tuple[LinearAxes, LoopState]:
+def linear_axes(loop: Feedback, at: Any) -> tuple[LinearAxes, LinearAxes, LoopState]:
     """Return L of a loop cut in all its axes as matrices, and the operating state.
 
-    ``kind`` says where it is cut. Arguments and errors are those of
-    ``stability_report``.
+    It is first cut at the plant's inputs, then at the displacements. Arguments and
+    errors are those of ``stability_report``.
     """
-    model, start = _model(loop, OperatingPoint.at(at), kind)
-    return without_conserved(balanced(model)), start
+    A, B, C, _, dt, start = _matrices(loop, OperatingPoint.at(at), BrokenLoop)
+    cut = LinearAxes(A, B, C, dt)
+    before, behind = (
+        without_conserved(balanced(one)) for one in (cut, _cut_behind(cut))
+    )
+    return before, behind, start
 
 
-def _model(
-    loop: Feedback, point: OperatingPoint, kind: type[BrokenLoop] = BrokenLoop
-) -> tuple[LinearAxes, LoopState]:
-    A, B, C, _, dt, start = _matrices(loop, point, kind)
-    return LinearAxes(A, B, C, dt), start
+def _cut_behind(loop: LinearAxes) -> LinearAxes:
+    """Return L cut where the sensors read, of a loop cut at the plant's inputs.
+
+    Input: the displacements that the sensors read, um. Output: minus those of the
+    plant, um. Its S maps a disturbance of the displacements to them. The displacements
+    are states of the loop (``BrokenState``).
+    """
+    axes = len(loop.C)
+    read = slice(-2 * axes, -axes)
+    A = loop.closed()
+    B, A[:, read] = A[:, read].copy(), 0.0
+    C = np.zeros_like(loop.C)
+    C[:, read] = -np.eye(axes)
+    return LinearAxes(A, B, C, loop.dt)
 
 
 def _matrices(
