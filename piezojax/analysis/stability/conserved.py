@@ -3,10 +3,13 @@
 A conserved mode has its pole at z = 1, and no input moves it.
 """
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import linalg
+
+FEW = 50
+"""Lines below which a transfer function is solved one line at a time."""
 
 TOLERANCE = 1e-9
 """Largest singular value of a conserved direction, with rows of [A - I, B] scaled to
@@ -40,10 +43,7 @@ class LinearLoop(NamedTuple):
 
     def response(self, angle: np.ndarray) -> np.ndarray:
         """Return L [m] at z = exp(i angle), angle [m] in rad/sample."""
-        z = np.exp(1j * np.atleast_1d(angle))
-        resolvent = z[:, None, None] * np.eye(len(self.A)) - self.A
-        states = np.linalg.solve(resolvent, self.B[:, None] + 0j)
-        return states[..., 0] @ self.C
+        return _transfer(self.A, self.B[:, None], self.C[None], angle)[:, 0, 0]
 
     def closed_responses(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return S = 1/(1+L) and T = L/(1+L), both [m, 1, 1], at z = exp(i angle)."""
@@ -71,9 +71,8 @@ class FollowedReference(NamedTuple):
     def response(self, angle: np.ndarray) -> np.ndarray:
         """Return y/r [m] at z = exp(i angle), angle [m] in rad/sample."""
         z = np.exp(1j * np.atleast_1d(angle))
-        resolvent = z[:, None, None] * np.eye(len(self.A)) - self.A
-        drive = self.B[:, 0] + z[:, None] * self.B[:, 1]
-        return np.linalg.solve(resolvent, drive[..., None])[..., 0] @ self.C
+        each = _transfer(self.A, self.B, self.C[None], angle)[:, 0]
+        return each[:, 0] + z * each[:, 1]
 
 
 class LinearAxes(NamedTuple):
@@ -94,9 +93,7 @@ class LinearAxes(NamedTuple):
 
     def sensitivity(self, angle: np.ndarray) -> np.ndarray:
         """Return S = (I+L)^-1 [m, q, q] at exp(i angle), angle [m] in rad/sample."""
-        z = np.exp(1j * np.atleast_1d(angle))
-        resolvent = z[:, None, None] * np.eye(len(self.A)) - self.closed()
-        return np.eye(len(self.C)) - self.C @ np.linalg.solve(resolvent, self.B + 0j)
+        return np.eye(len(self.C)) - _transfer(self.closed(), self.B, self.C, angle)
 
     def closed_responses(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return S and T = I - S, both [m, q, q], at z = exp(i angle)."""
@@ -108,6 +105,25 @@ class LinearAxes(NamedTuple):
         others = np.arange(len(self.C)) != axis
         A = self.A - self.B[:, others] @ self.C[others]
         return LinearLoop(A, self.B[:, axis], self.C[axis], self.dt, self.conserved)
+
+
+def _transfer(
+    A: np.ndarray, B: np.ndarray, C: np.ndarray, angle: np.ndarray
+) -> np.ndarray:
+    """Return C (zI - A)^-1 B [m, p, q] at z = exp(i angle), angle [m] in rad/sample."""
+    z = np.exp(1j * np.atleast_1d(angle))
+    if len(z) < FEW or len(A) == 0:
+        resolvent = z[:, None, None] * np.eye(len(A)) - A
+        return C @ np.linalg.solve(resolvent, B + 0j)
+    # A triangular matrix is solved for all lines at once, row by row.
+    found: Any = linalg.schur(A, output="complex")
+    T, change = found
+    driven = change.conj().T @ B
+    states = np.zeros((len(A), len(z), B.shape[1]), complex)
+    for i in reversed(range(len(A))):
+        coupled = np.tensordot(T[i, i + 1 :], states[i + 1 :], axes=1)
+        states[i] = (driven[i] + coupled) / (z - T[i, i])[:, None]
+    return np.moveaxis(np.tensordot(C @ change, states, axes=1), 0, 1)
 
 
 Matrices = TypeVar("Matrices", LinearLoop, LinearAxes, FollowedReference)

@@ -48,17 +48,22 @@ def roots(function: Function, grid: np.ndarray, values: np.ndarray) -> np.ndarra
     ``values`` are those of ``function`` on ``grid``.
     """
     places = np.flatnonzero(values[:-1] * values[1:] < 0.0)
-    found = [
-        optimize.brentq(
-            lambda x: float(function(np.array([x]))[0]),
-            grid[i],
-            grid[i + 1],
-            xtol=1e-15,
-            rtol=np.float64(1e-14),
-        )
-        for i in places
-    ]
+    found = [_root(function, grid[i], grid[i + 1]) for i in places]
     return np.array([*found, *grid[values == 0.0]])
+
+
+def _root(function: Function, low: float, high: float) -> float:
+    """Return the zero between ``low`` and ``high``, to rounding."""
+
+    def at(x: float) -> float:
+        return float(function(np.array([x]))[0])
+
+    ends = at(low), at(high)
+    if ends[0] * ends[1] >= 0.0:
+        # The sign on the grid was that of a rounding error.
+        return low if abs(ends[0]) < abs(ends[1]) else high
+    found: Any = optimize.brentq(at, low, high, xtol=1e-15, rtol=np.float64(1e-14))
+    return float(found)
 
 
 def peak(
