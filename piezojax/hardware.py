@@ -12,7 +12,7 @@ from .core.system import System, rest_output
 
 
 class Saturation(System):
-    """Clips its input to ``[lower, upper]``.
+    """Saturation of a signal to ``[lower, upper]``.
 
     Raises ValueError unless ``lower`` is below ``upper``.
     """
@@ -31,7 +31,7 @@ class Saturation(System):
 
 
 class SlewLimit(System):
-    """Limits the rate at which its output follows its input."""
+    """Limit on the rate at which the output follows the input."""
 
     rate: Scalar = parameter("V/s", "slew rate", above=0.0, scale="log")
     dt: float = sample_time()
@@ -46,7 +46,7 @@ class SlewLimit(System):
 
 
 class Quantiser(System):
-    """Rounds its input to whole multiples of ``resolution`` (a DAC or ADC step).
+    """Rounding to whole multiples of ``resolution``, the step of a DAC or ADC.
 
     The gradient is that of the identity, so that a loop with converters can be tuned.
     """
@@ -65,7 +65,7 @@ class Quantiser(System):
 
 
 class Sensor(System):
-    """Adds noise to the displacement.
+    """Sensor that adds noise to the displacement.
 
     The input is ``(displacement, draw)``, in um and a random draw of unit variance. The
     output is the measurement ``displacement + noise_rms * draw`` in um. A Quantiser
@@ -83,10 +83,10 @@ class Sensor(System):
 
 
 class SensorResponse(System):
-    """Passes the displacement through ``dynamics``, and the noise draw unchanged.
+    """Dynamics of a sensor, which act on the displacement and not on the noise draw.
 
     Input and output are ``(displacement, draw)``, the input of the Sensor behind it.
-    ``dynamics`` maps um to um: a bandwidth, a delay.
+    ``dynamics`` maps um to um, such as a low-pass or a delay.
     """
 
     dynamics: System
@@ -110,7 +110,7 @@ class ChargeDriveState(NamedTuple):
 
 
 class ChargeDrive(System):
-    """Charge amplifier with grounded load: an actuator from a command v to a voltage u.
+    """Charge amplifier with grounded load, from a command v to a voltage u.
 
     The network C_s, R_s of the amplifier and the load C_L, R_L take up the same charge:
 

@@ -28,7 +28,7 @@ class AsymmetricPrandtlIshlinskii(Hysteresis, Fittable):
     The width in x of a play of q shrinks as x grows. The envelope functions of a
     generalised play skew a loop in the same way (Al Janaideh, Rakheja and Su 2009,
     Mechatronics 19(5)); here the model stays linear in the weights. Units, memory,
-    remaining parameters and errors as in PrandtlIshlinskii.
+    remaining parameters and errors are those of PrandtlIshlinskii.
     """
 
     rest_field: ClassVar[str | None] = "rest_input"

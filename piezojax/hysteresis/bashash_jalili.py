@@ -77,15 +77,15 @@ class BashashJalili(Hysteresis, Fittable):
     lower_output: Scalar = parameter("um", "output at the lower input")
     upper_input: Scalar = parameter("V", "upper input of the reference loop")
     upper_output: Scalar = parameter("um", "output at the upper input")
-    # (1 + alpha exp(-z)) z is flat first at z = 2, where alpha = e^2.
+    # The least alpha at which (1 + alpha exp(-z)) z has a flat point is e^2.
     rising_alpha: Scalar = parameter(
         "1", "bend of rising branches", above=-1.0, below=7.389056
     )
-    rising_tau: Scalar = parameter("1/V", "decay of that bend", least=0.0)
+    rising_tau: Scalar = parameter("1/V", "decay of the rising bend", least=0.0)
     falling_alpha: Scalar = parameter(
         "1", "bend of falling branches", above=-1.0, below=7.389056
     )
-    falling_tau: Scalar = parameter("1/V", "decay of that bend", least=0.0)
+    falling_tau: Scalar = parameter("1/V", "decay of the falling bend", least=0.0)
     depth: int = parameter(
         "1",
         "turning points remembered",
@@ -147,9 +147,9 @@ class BashashJalili(Hysteresis, Fittable):
         count = count + jnp.where(stores, 1.0, 0.0) - jnp.where(retraced, 1.0, 0.0)
         follows = ~turns | stores | retraced
 
-        # The branch heads for the point before the last one; beyond it, for the point
-        # two places earlier, and so on: every second point lies on this side, each
-        # outside the next.
+        # The branch heads for the second-last point. Beyond that point it heads for the
+        # point two places earlier, and so on. Every second point lies on this side of
+        # the input, the earlier ones further away.
         odd = count - 2.0 * jnp.floor(0.5 * count)
         wiped = jnp.zeros(())
         for i in range(1, slots - 1):
@@ -185,8 +185,8 @@ class BashashJalili(Hysteresis, Fittable):
         width, slope = extent.width, extent.slope
         if slope <= 0.0:
             raise ValueError(
-                "the output falls while the input rises; bashash_jalili needs one that "
-                "rises"
+                "the output falls while the input rises; bashash_jalili needs an "
+                "output that rises with the input"
             )
         # The reference loop spans the range of the record. The offset of the output
         # fixes one of its ends, so only the other is fitted.
@@ -242,7 +242,7 @@ class BashashJalili(Hysteresis, Fittable):
 
 
 def _picked(points: Points, count: Scalar, back: int) -> Scalar:
-    """Return the valid point at place ``back`` from the end; 1 is the last."""
+    """Return the valid point number ``back`` from the end; 1 is the last."""
     picked = points[2 - back]
     for i in range(3 - back, len(points) + 1 - back):
         picked = jnp.where(count == i + back, points[i], picked)

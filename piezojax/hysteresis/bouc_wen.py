@@ -23,17 +23,18 @@ class BoucWen(Hysteresis):
 
     ``z' = alpha y' - beta_gamma |y'| |z|^(nu - 1) z - beta_delta y' |z|^nu``
 
-    Of the usual factors beta, gamma, delta only two products act on the force. Each
-    step has ``substeps`` parts of fourth order, except parts where y' or z changes
-    sign. It is accurate as long as ``nu (|beta_gamma| + |beta_delta|) |z|^(nu - 1)``
-    times the displacement in a part is well below 1. Sources: Bouc 1967, Wen 1976.
+    Of the usual factors beta, gamma and delta, only the products beta gamma and beta
+    delta act on the force. A step is integrated in ``substeps`` parts, of fourth order
+    unless y' or z changes sign within the part. It is accurate if
+    ``nu (|beta_gamma| + |beta_delta|) |z|^(nu - 1)`` times the displacement in a part
+    is well below 1. Sources: Bouc 1967, Wen 1976.
 
     Loops close only in the limit of many cycles: there is no return-point memory, no
     wiping-out and no congruency, and the force drifts under repeated partial unloading.
     Its loops run clockwise, as for a dissipating force over a displacement; those of
     the displacement of a piezo over its voltage run counter-clockwise. The inverse is
-    InverseHysteresis, for forces below that at which z' = 0; no displacement produces a
-    larger one.
+    InverseHysteresis. It holds for forces below the one at which z' = 0; no
+    displacement produces a larger force.
 
     Raises ValueError for parameters outside their limits.
     """

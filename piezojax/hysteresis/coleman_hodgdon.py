@@ -43,7 +43,7 @@ class ColemanHodgdon(Hysteresis, Fittable):
     - ``"trapezoid"`` (3.10)-(3.16), second order in the input step, the default;
     - ``"quadratic"`` (3.17)-(3.29), third order where turning points fall on samples;
       the trapezoid step is taken right after a turning point or a pause;
-    - ``"voros"`` (2.11), explicit, first order: the earlier model the thesis compares;
+    - ``"voros"`` (2.11), explicit, first order: the earlier model of the thesis;
     - ``"exact"``, the closed form on each monotone branch.
 
     The memory fades along the path of the input and is not wiped out: there is no
@@ -223,4 +223,4 @@ class InverseColemanHodgdon(Inverse):
         return state.input + 4.0 * rise / (slope + root)
 
 
-_TINY = 1e-24  # keeps the gradient of the root finite where no voltage exists
+_TINY = 1e-24  # keeps the gradient of the root finite where no voltage is a solution

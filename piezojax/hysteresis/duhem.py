@@ -60,7 +60,7 @@ class Duhem(Hysteresis, Fittable):
     remembered: there is no return-point memory, no wiping-out and no congruency.
     Source: Oh and Bernstein 2005, IEEE Trans. Automat. Contr. 50(5).
 
-    The inverse is InverseHysteresis, if y rises with u on every branch.
+    If y rises with u on every branch, the inverse is InverseHysteresis.
 
     Raises ValueError for parameters outside their limits or an empty ``output``.
     """

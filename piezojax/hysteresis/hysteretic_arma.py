@@ -24,7 +24,7 @@ class HystereticARMA(Hysteresis):
     ``c`` (1/V), so that for a given c the model is linear in the other coefficients.
     ``moving_1`` and ``moving_2`` have equal length. ``rest_input`` and ``scheme`` as in
     ``ColemanHodgdon``; with the scheme "voros" this is the earlier model (2.11), with
-    which the thesis compares.
+    which the thesis compares its own.
 
     Raises ValueError for parameters outside their limits, numerators of different
     length or an unknown scheme.
@@ -71,8 +71,8 @@ class HystereticARMA(Hysteresis):
         """Raise ValueError: the output depends on past outputs."""
         del lower, upper
         raise ValueError(
-            "a HystereticARMA contains dynamics and has no inverse; cascade() returns "
-            "its hysteresis, which has one"
+            "a HystereticARMA contains dynamics and has no inverse; invert the "
+            "hysteresis that cascade() returns"
         )
 
     def cascade(self, tolerance: float = 1e-3) -> Series:

@@ -24,7 +24,7 @@ class HystereticOscillator(Hysteresis):
     """``mass y'' + damping y' + stiffness y + z = u``, z the Bouc-Wen force of y.
 
     The input u in N is held during the step; the output is y in m at its end. The
-    Runge-Kutta rule integrates it in the ``substeps`` of ``hysteresis``. Source: Noel &
+    Runge-Kutta rule takes the ``substeps`` of ``hysteresis``. Source: Noel &
     Schoukens, Hysteretic benchmark with a dynamic nonlinearity, 2016.
 
     Raises ValueError for parameters outside their limits.
@@ -39,8 +39,7 @@ class HystereticOscillator(Hysteresis):
     dt: float = sample_time()
 
     def init(self, input: ScalarLike = 0.0) -> OscillatorState:
-        """Return the state at rest under ``input`` (N), with no force of the
-        element."""
+        """Return the state at rest under ``input`` (N), the element without force."""
         still = jnp.zeros(())
         return OscillatorState(as_array(input) / self.stiffness, still, still)
 

@@ -45,23 +45,24 @@ class InverseHysteresis(Inverse):
     them reaches the wanted output, the nearer limit is returned. From any state the
     next output must rise with the input; it may have kinks.
 
-    Newton's method takes ``iterations`` steps. It starts from the field ``input`` of
-    the state, the last voltage, or without this field from the middle of the range. A
-    step that would leave the present bracket halves the bracket instead. Near the root
-    a step squares the error, elsewhere it halves it. There is no stopping test, so the
-    cost is fixed: one evaluation of the model and its slope per step. With the default
-    of 8 steps every monotone model of this package came within 1e-9 um of the wanted
-    output, for steps of a nanometre as for steps over most of the range. A model with
-    an explicit scheme (Duhem, NormalisedBoucWen, BoucWen) needs enough substeps: beyond
-    the limit of stability it is not monotone. The derivative is that of the implicit
-    function, exact to first order; second derivatives are not available.
+    Newton's method takes ``iterations`` steps. It starts from the last voltage, the
+    field ``input`` of the state, or from the middle of the range if the state has no
+    such field. A step that would leave the present bracket halves the bracket instead.
+    Near the root a step squares the error, elsewhere it halves it. There is no stopping
+    test, so the cost is fixed: one evaluation of the model and its slope per step. With
+    the default of 8 steps every monotone model of this package came within 1e-9 um of
+    the wanted output, for steps of a nanometre and for steps over most of the range. A
+    model with an explicit scheme (Duhem, NormalisedBoucWen, BoucWen) needs enough
+    substeps: beyond the limit of stability it is not monotone. The derivative is that
+    of the implicit function, exact to first order; second derivatives are not
+    available.
 
     If the output falls on any branch while the input rises between ``lower`` and
-    ``upper``, several voltages or none reach it, and no inverse exists. Examples are a
-    NormalisedBoucWen with ``k_x + 2 sigma rho k_w <= 0``, a ColemanHodgdon with ``a > 2
-    b |c|``, and plays without a memoryless part, whose output is constant after a turn.
-    The constructor simulates large and small reversals over the whole range and raises
-    ValueError, naming the place, if the output does not rise. The reversals are
+    ``upper``, several voltages or none reach an output, and no inverse exists. Examples
+    are a NormalisedBoucWen with ``k_x + 2 sigma rho k_w <= 0``, a ColemanHodgdon with
+    ``a > 2 b |c|``, and plays without a memoryless part, whose output is constant after
+    a turn. The constructor simulates large and small reversals over the whole range and
+    raises ValueError, naming the place, if the output does not rise. The reversals are
     samples: the test does not prove that every branch rises.
 
     Raises ValueError in this case, for parameters outside their limits or ``lower >=
@@ -106,7 +107,7 @@ class InverseHysteresis(Inverse):
             rises = slope > 0.0
             newton = voltage - error / jnp.where(rises, slope, 1.0)
             newton = jnp.clip(newton, lower, upper)
-            # A step of a few roundings has converged, also where it meets the bracket.
+            # A step of a few rounding errors has converged, also where the bracket ends.
             converged = jnp.abs(newton - voltage) <= CONVERGED * (upper - lower)
             inside = ((newton > low) & (newton < high)) | converged
             middle = 0.5 * (jnp.maximum(low, lower) + jnp.minimum(high, upper))
@@ -150,7 +151,7 @@ def check_rising(model: System, lower: ScalarLike, upper: ScalarLike) -> None:
 
 
 def _reversals(lower: float, upper: float) -> np.ndarray:
-    """Return a path of loops that shrink to the middle, then of small loops upwards."""
+    """Return inputs of loops that shrink to the middle, then of small rising loops."""
     shrinking = 0.5 + 0.5 * (-1.0) ** np.arange(1, 13) * np.linspace(1.0, 0.1, 12)
     steps = np.repeat(np.linspace(0.0, 1.0, 9), 2)[1:-1]
     climbing = steps - 0.05 * (np.arange(steps.size) % 2)

@@ -18,11 +18,11 @@ LEARNED_PLAYS, NEURONS = 5, 4
 """Play operators and neurons of a fitted learned operator."""
 
 SEEDS = 16
-"""Draws of the first weights of a fit, the same in every run.
+"""Number of random starts of a fit, the same in every run.
 
 On records simulated with a learned operator (tests/benchmarks/choice.py), all of 12
-starts ended in a worse optimum than the true one for two of three noise draws; of 16
-starts at least one did not.
+starts ended in a worse optimum than the true one for two of three noise draws. With 16
+starts, at least one start reached a better optimum.
 """
 
 
@@ -82,8 +82,8 @@ class LearnedOperator(Hysteresis, Fittable):
         regressors, neurons = len(self.thresholds) + 2, len(self.bias)
         for name, size, needed in (
             ("linear", len(self.linear), regressors),
-            ("mixing in each row", len(self.mixing[0]), regressors),
-            ("mixing in rows", len(self.mixing), neurons),
+            ("each row of mixing", len(self.mixing[0]), regressors),
+            ("each column of mixing", len(self.mixing), neurons),
             ("output", len(self.output), neurons),
         ):
             if size != needed:
@@ -183,7 +183,7 @@ def _dot(weights: Memory, values: Memory) -> Scalar:
 
 
 def _drawn(seed: int, count: int, height: float) -> dict[str, float]:
-    """Return initial weights of the neurons, small so that tanh is not saturated."""
+    """Return initial weights of the neurons, so small that tanh is not saturated."""
     draw = np.random.default_rng(seed).normal
     return {
         **{

@@ -31,12 +31,12 @@ LAWS: Laws = {
 }
 """All laws, in this order: minor loops close; larger extrema wipe out those between
 them; minor loops of one input range have one shape; speed does not matter; pauses do
-not matter; loops run in the sense of a piezo.
+not matter; loops run counter-clockwise, as for a piezo.
 """
 
 
 def turning_point_laws(*, without: tuple[str, ...] = ()) -> Laws:
-    """Return the laws of a model that remembers extrema, less those in ``without``."""
+    """Return the laws of a model that remembers extrema, except ``without``."""
     return {law: share for law, share in LAWS.items() if law not in without}
 
 
@@ -53,8 +53,8 @@ class Hysteresis(System):
 
     ``rest_field`` is the name of the field with the input before a record, or None. A
     free run starts at rest under that input; with None it starts at rest under the
-    first input of the record. ``laws`` are those that the model keeps with the
-    parameters of a piezo, such as those its recipe starts from.
+    first input of the record. ``laws`` are the laws that the model keeps with the
+    parameters of a piezo, such as the starting values of its recipe.
 
     ``dynamic`` is True if the output can change while the input rests: the model
     contains dynamics that cannot be separated from the hysteresis, and needs no lag
@@ -76,7 +76,7 @@ class Hysteresis(System):
 
 
 def hystereses(system: Any) -> list[Hysteresis]:
-    """Return every hysteresis model in the tree of ``system``, first to last."""
+    """Return every hysteresis model in the tree of ``system``, in order."""
 
     def is_hysteresis(part: Any) -> bool:
         return isinstance(part, Hysteresis)

@@ -144,8 +144,10 @@ def invert_plays(
 
 
 def _root(polynomial: Memory, value: Scalar, low: Scalar, high: Scalar) -> Scalar:
-    """Return x from low to high, both possibly infinite, where ``polynomial`` is
-    value."""
+    """Return x at which ``polynomial`` equals ``value``, between ``low`` and ``high``.
+
+    Either limit may be infinite.
+    """
     fixed, target, low, high = jax.lax.stop_gradient((polynomial, value, low, high))
     x = jnp.clip(target / jnp.where(fixed[0] > 0.0, fixed[0], jnp.inf), low, high)
     for _ in range(ITERATIONS):

@@ -35,7 +35,7 @@ ROUNDING = 1e-13
 
 
 class Preisach(Hysteresis, Designed):
-    """Weighted sum of relays, (2.1)-(2.2): the weights of the relays that are up.
+    """Weighted sum of relays, (2.1)-(2.2), which are up (1) or down (0).
 
     A relay goes up when the input rises through its alpha and down when it falls
     through its beta. Both range from ``low`` to ``high`` (V) in n equal cells.
@@ -160,7 +160,7 @@ def outputs(levels: Levels, *densities: Rows) -> tuple[Levels, ...]:
     totals = [jnp.zeros_like(levels) for _ in densities]
     for beta, weights in enumerate(zip(*densities, strict=True)):
         along = levels - beta
-        # Not jnp.clip: at an edge this has the slope of the cell above it.
+        # Unlike jnp.clip, this has the slope of the upper cell at an edge.
         up = jnp.where(along < 0.0, 0.0, jnp.where(along < 1.0, along, 1.0))
         totals = [t + own * up for t, own in zip(totals, weights, strict=True)]
     return tuple(totals)
@@ -196,7 +196,7 @@ class PlayLines(System):
         """Return the state before the first input."""
         if self.start == "saturated":
             return jnp.zeros_like(self.rows[0])
-        # Up where the middle between beta and alpha lies below the rest input.
+        # A relay is up if the mean of alpha and beta lies below the rest input.
         return self.position(self.rest_input) - 0.5 * self.widths
 
     def position(self, input: ScalarLike) -> Scalar:
@@ -239,7 +239,7 @@ class PlayLines(System):
         held, target = sign * held, sign * (as_array(wanted) - self.lowest)
         traverse = jax.tree.map(partial(jnp.where, up), self.upwards, self.downwards)
 
-        # Loops, not one array operation, for which XLA would recompute ``held``.
+        # Loops, because XLA would recompute ``held`` in a single array operation.
         def edge(last, row):
             _, here = row
             passed = jnp.sum(jnp.maximum(here.reached, held)) <= target

@@ -35,7 +35,7 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
     """Prandtl-Ishlinskii model whose thresholds grow with the rate of the input.
 
     ``y = P(x) + sum_i weights[i] play_i(x)`` with plays of the half-width
-    ``thresholds[i] + growth |dx/dt|`` (V); the rest as in ``PrandtlIshlinskii``.
+    ``thresholds[i] + growth |dx/dt|`` (V), otherwise a ``PrandtlIshlinskii``.
     Source: Al Janaideh and Krejci, Inverse rate-dependent Prandtl-Ishlinskii model for
     feedforward compensation of hysteresis in a piezomicropositioning actuator, 2013
     (IEEE/ASME Trans. Mechatronics 18(5)), with one growth for all plays, so that they
@@ -43,7 +43,7 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
     previous samples. The rate of the present step would depend on the input that the
     inverse seeks, and a play could widen faster than a fast step moves it.
 
-    Raises ValueError as ``PrandtlIshlinskii``.
+    Raises ValueError in the same cases as ``PrandtlIshlinskii``.
     """
 
     rest_field: ClassVar[str | None] = "rest_input"
@@ -117,8 +117,8 @@ class InverseRateDependentPrandtlIshlinskii(Inverse):
     """Voltage that moves a rate-dependent model to a wanted output.
 
     Input f(k) in um, output u(k) in V. The thresholds of the next step are known, so
-    that it is solved as in ``InversePrandtlIshlinskii``, exactly at every rate; state
-    and errors as there.
+    the step is inverted as in ``InversePrandtlIshlinskii``, exactly at every rate.
+    State and errors are those of that class.
     """
 
     model: RateDependentPrandtlIshlinskii

@@ -18,7 +18,7 @@ class RateDependentPreisach(Hysteresis, Designed):
     (um, n x n as in Preisach) with the share r^2 / (1 + r^2), r = (du/dt) / ``rate``.
     The share is 1/2 at ``rate`` and smooth where the input turns. du/dt is the rate
     over the last sample. The relays and their memory are those of ``slow``. Input in V,
-    output in um. The thesis represents mu by a neural network; this form is ours.
+    output in um. The thesis represents mu by a neural network instead.
 
     Raises ValueError for parameters outside their limits, weights that Preisach rejects
     or a number of cells other than that of ``slow``.
@@ -36,7 +36,7 @@ class RateDependentPreisach(Hysteresis, Designed):
         if self.fast_weights.shape[0] != self.slow.cells:
             raise ValueError(
                 f"fast_weights have {self.fast_weights.shape[0]} cells per side; "
-                f"the slow ones have {self.slow.cells}"
+                f"they must have {self.slow.cells}, as the weights of slow"
             )
 
     def resolved(self) -> System:
@@ -61,7 +61,7 @@ class _Blend(System):
     def step(self, state: Levels, input: ScalarLike) -> tuple[Levels, Scalar]:
         levels = self.slow.advance(state, input)
         slow, fast = outputs(levels, self.slow.rows, self.fast)
-        # In both, element 0 is the input.
+        # Element 0 of both is the input, in cells.
         share = fast_share((levels[0] - state[0]) / self.half_way)
         return levels, self.slow.lowest + jnp.sum(slow + share * (fast - slow))
 

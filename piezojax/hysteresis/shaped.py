@@ -31,7 +31,7 @@ class ShapedColemanHodgdon(Hysteresis, Fittable):
     ColemanHodgdon. As there, the virgin curve starts at ``rest_input``, and there is no
     return-point memory, no wiping-out and no congruency. The inverse is
     InverseHysteresis, if y rises on every branch. Loops run counter-clockwise, as for a
-    piezo, where p'(x) > |c| g(x), and clockwise where it is less.
+    piezo, where p'(x) > |c| g(x), and clockwise where p'(x) < |c| g(x).
 
     Raises ValueError for parameters outside their limits or empty polynomials.
     """

@@ -34,7 +34,7 @@ class StopPrandtlIshlinskii(Hysteresis, Fittable):
     it yields. ``polynomial`` and ``rest_input`` as in ``PrandtlIshlinskii``, but P has
     the slope of the axis of the loop, whereas with plays it has the slope right after a
     turning point. Because play and stop add up to x, ``as_plays`` returns the same
-    model with plays, which has the inverse. Source: Brokate and Sprekels, Hysteresis
+    model with plays, whose inverse is used. Source: Brokate and Sprekels, Hysteresis
     and Phase Transitions, 1996, section 2.1.
 
     Raises ValueError for parameters outside their limits, or a different number of

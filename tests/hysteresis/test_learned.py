@@ -117,7 +117,10 @@ def test_it_learns_a_loop_that_no_linear_model_follows(record):
     ("change", "message"),
     [
         ({"linear": (1.0,)}, "linear has 1 weights; with 2 plays and 3 neurons"),
-        ({"mixing": MIXING[:2]}, "mixing in rows has 2 weights; .* it must have 3"),
+        (
+            {"mixing": MIXING[:2]},
+            "each column of mixing has 2 weights; .* it must have 3",
+        ),
         ({"bias": (0.1, np.nan, 0.0)}, "bias is nan"),
         ({"thresholds": (0.0, 1.0)}, "thresholds is 0"),
         ({"scale": 0.0}, "scale in V is 0; it must be finite and above 0"),
