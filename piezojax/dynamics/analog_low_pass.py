@@ -17,10 +17,10 @@ class AnalogLowPass(Designed):
 
     Its gain is -3 dB at ``bandwidth``, which may lie above the Nyquist frequency. Input
     and output have the same unit. The step is exact for an input that is linear between
-    samples, as a displacement nearly is. For an input held between samples, as that of
-    an amplifier, the output is the mean of the true output over the sample that begins.
-    A plant that holds this mean moves correctly on average. Raises ValueError for
-    parameters outside their limits.
+    samples, as a displacement nearly is. For an input held between samples, such as
+    that of an amplifier, the output is the mean of the true output over the sample that
+    begins. A plant that holds this mean moves correctly on average. Raises ValueError
+    for parameters outside their limits.
     """
 
     bandwidth: Scalar = parameter(
@@ -39,8 +39,8 @@ class AnalogLowPass(Designed):
     def resolved(self) -> "ParallelLags":
         """Return the lags of the partial fractions.
 
-        With ``p`` a pole times dt, one sample multiplies the deviation of its lag by
-        exp(p), and a rise of the input adds -(exp(p) - 1) / p times the rise.
+        Let p be a pole times dt. In one sample the deviation of its lag is multiplied
+        by exp(p), and a rise of the input adds -(exp(p) - 1) / p times the rise.
         """
         poles, weights = _partial_fractions(self.order)
         p = 2.0 * math.pi * self.bandwidth * self.dt * poles
@@ -96,7 +96,7 @@ def _partial_fractions(order: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _parts(values: jax.Array, poles: np.ndarray) -> Rows:
-    """Return each value as its real part, and, for a complex pole, imaginary part."""
+    """Return the real part of each value and, for complex poles, the imaginary part."""
     return tuple(
         (value.real,) if abs(pole.imag) < 1e-9 else (value.real, value.imag)
         for value, pole in zip(values, poles, strict=True)

@@ -24,7 +24,7 @@ Lags = tuple[Scalar, ...]
 
 LARGEST = 0.1
 """Largest creep of one exponential in a fit. Piezos creep by a few per cent a decade; a
-larger gain would stand for a part of the hysteresis, and fail on another record."""
+larger gain would describe a part of the hysteresis, and fail on another record."""
 
 
 def _relaxed(input: Scalar, lags: Lags, time_constants: tuple, dt: float) -> Lags:
@@ -170,7 +170,7 @@ class SpringDamperCreep(Fittable):
     damping: Scalars = parameter(
         "N s/um", "damping of each damped spring", above=0.0, converter=as_scalars
     )
-    # Not declared: it may be infinite.
+    # Not a declared parameter, because it may be infinite.
     spring: Scalar = eqx.field(  # pyright: ignore[reportGeneralTypeIssues]
         converter=as_array
     )

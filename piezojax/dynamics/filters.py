@@ -1,7 +1,7 @@
 """Filters with frequencies in Hz: low-pass, high-pass, lead-lag, biquad and notch.
 
 Each is a section of first or second order, or a chain of them. A section is a
-continuous filter, discretised by the method of its name:
+continuous filter, discretised by one of these methods:
 
 - ``bilinear``: the bilinear transform, prewarped so that its frequencies are exact;
 - ``hold``: zero-order hold, exact for a section whose input is held between samples;
@@ -10,10 +10,10 @@ continuous filter, discretised by the method of its name:
   for a high-pass (Franklin, Powell and Workman, Digital Control of Dynamic Systems,
   1998, section 6.1).
 
-At rest the states of a section are its input and 0. Unlike the coefficients of a
-difference equation they keep the DC gain exactly at frequencies far below the rate.
-Numbers and derivatives are finite up to the Nyquist frequency: sine and cosine replace
-the tangent of the prewarped frequency.
+At rest the states of a section are its input and 0. In this form, unlike in that of a
+difference equation, the DC gain stays exact for cut-off frequencies far below the rate.
+Coefficients and derivatives are finite up to the Nyquist frequency: sine and cosine
+replace the tangent of the prewarped frequency.
 """
 
 import math
@@ -75,9 +75,9 @@ class _Pass(_Filter):
 class LowPass(_Pass):
     """Low-pass of order 1 to 8 with unit DC gain and -3 dB at ``frequency``.
 
-    The latter is exact for the bilinear transform. Its ``kind`` is "butterworth" or
-    "equal poles", which are all real. Input and output have the same unit. Raises
-    ValueError for parameters outside their limits and for an unknown name.
+    The gain at ``frequency`` is exact for the bilinear transform. The ``kind`` is
+    "butterworth", or "equal poles", which are real. Input and output have the same
+    unit. Raises ValueError for parameters outside their limits and for an unknown name.
     """
 
     def resolved(self) -> System:
@@ -121,9 +121,9 @@ class SecondOrderLowPass(_Filter):
 class FirstOrderLeadLag(_Filter):
     """``(s/v + 1) / (s/w + 1)`` with v = 2 pi zero_frequency, w = 2 pi frequency.
 
-    A lead if the zero lies below the pole; the gain far above both is w/v, at 0 Hz 1.
-    Input and output have the same unit. Raises ValueError for parameters outside their
-    limits.
+    It is a lead if the zero lies below the pole. The gain is 1 at 0 Hz and w/v far
+    above both. Input and output have the same unit. Raises ValueError for parameters
+    outside their limits.
     """
 
     zero_frequency: Scalar = _frequency("frequency of the zero")
@@ -296,7 +296,7 @@ def _first_order(
 ) -> FirstOrderSection:
     """Return ``(high s/w + low) / (s/w + 1)``.
 
-    ``zero`` is that of a matched section, if it is finite and not 0.
+    ``zero`` is the zero of a matched section if it is finite and not 0, else None.
     """
     if method == "bilinear":
         share = place.sine / (place.sine + place.cosine)
@@ -321,8 +321,8 @@ def _second_order(
 ) -> SecondOrderSection:
     """Return ``(high s^2/w^2 + middle s/w + low) / (s^2/w^2 + 2 damping s/w + 1)``.
 
-    ``shape`` is (low, middle, high). ``zeros`` are those of a matched section, if they
-    are finite and not 0.
+    ``shape`` is (low, middle, high). ``zeros`` are those of a matched section if they
+    are finite and not 0, else None.
     """
     low, middle, high = shape
     if method == "bilinear":

@@ -15,7 +15,7 @@ from .arma import ARMA
 class FirstOrderLag(Fittable):
     """``tau dy/dt + y = x`` for an input held between samples, unit DC gain.
 
-    y in the unit of x. Raises ValueError unless both parameters are positive.
+    y has the unit of x. Raises ValueError unless both parameters are positive.
     """
 
     part: ClassVar[Part] = Part(
@@ -65,7 +65,7 @@ class SecondOrderLag(Designed):
     """``y'' + 2 zeta w y' + w^2 y = w^2 x``, unit DC gain: the reference model (4.47).
 
     y has the unit of x; zeta may be above 1. The step is exact for an input held
-    between samples, and its output is that at the end of the sample. The state is y and
+    between samples, and its output is y at the end of the sample. The state is y and
     dy/dt. Raises ValueError for parameters outside their limits.
     """
 

@@ -30,7 +30,7 @@ def lags_of(system: Any) -> list[float]:
 def before_lag(
     output: Float[np.ndarray, "*batch samples"], time_constant: float, dt: float
 ) -> Float[np.ndarray, "*batch samples-1"]:
-    """Return the input of a first-order lag with this ``output``, less its last sample.
+    """Return the input of a first-order lag from its ``output``, one sample shorter.
 
     This inverts ``FirstOrderLag``, whose input is held between samples of ``dt`` s.
     """

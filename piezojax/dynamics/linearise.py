@@ -79,6 +79,6 @@ def sample_time(system: System) -> float:
         return times[0]
     named = ", ".join(f"{dt:g} s" for dt in sorted(set(times))) or "none"
     raise ValueError(
-        f"the sample time is not known: the parts of the {type(system).__name__} "
-        f"name {named}; give dt"
+        f"the sample time is not known: the sample times in the parts of the "
+        f"{type(system).__name__} are {named}; give dt"
     )

@@ -15,17 +15,17 @@ GUESSES = (Resonance(0.05, 0.1), Resonance(0.2, 0.1))
 per sample."""
 
 NEAR, NEAR_DAMPED, FADED = 0.002, 0.05, 0.1
-"""Largest relative changes that a fit makes to a resonance estimated from the record:
-of the frequency, NEAR or NEAR_DAMPED times the damping ratio if that is larger; of the
-damping ratio, FADED."""
+"""Largest relative changes that a fit makes to a resonance estimated from the record.
+The frequency changes by at most NEAR, or by NEAR_DAMPED times the damping ratio if that
+is larger; the damping ratio changes by at most FADED."""
 
 
 class Mode(Designed, Fittable):
     """``y'' + 2 damping w y' + w^2 y = w^2 x`` with w = 2 pi frequency, unit DC gain.
 
     The first resonance of a stage; y has the unit of x. It is the SecondOrderLag with
-    the frequency in Hz: exact for an input held between samples, and the output is that
-    at the end of the sample. Raises ValueError for parameters outside their limits.
+    the frequency in Hz: exact for an input held between samples, and the output is y at
+    the end of the sample. Raises ValueError for parameters outside their limits.
     """
 
     part: ClassVar[Part] = Part(
@@ -68,8 +68,9 @@ def mode_starts(extent: Extent) -> list[Resonance]:
 def mode_bounds(extent: Extent, mode: Resonance) -> dict[str, Range]:
     """Return the bounds of frequency and damping, near ``mode`` if the record shows it.
 
-    Its values were estimated from the errors at all frequencies. A fit of a free run
-    would change them, because the errors of the hysteresis are much larger there.
+    Frequency and damping of ``mode`` were estimated from the errors at all frequencies.
+    A fit of a free run would change them, because the errors of the hysteresis dominate
+    a free run.
     """
     if mode in extent.modes:
         off = max(NEAR, NEAR_DAMPED * mode.damping)

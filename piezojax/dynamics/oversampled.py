@@ -8,7 +8,7 @@ from ..core.system import System
 
 
 class Oversampled(System):
-    """``system`` stepped ``samples`` times under each input; returns the last output.
+    """``system`` stepped ``samples`` times for each input; the output is the last one.
 
     It models a stage behind a converter that holds the voltage of a slower loop. Raises
     ValueError unless ``samples`` is a whole number from 1 to 64.

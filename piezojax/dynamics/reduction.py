@@ -71,9 +71,9 @@ def fast_part(model: StateSpace, angle: float, share: float = 0.1) -> StateSpace
 
     A mode is slow if its natural frequency abs(log z) is below a tenth of ``angle``
     (rad per sample): a mode of creep, or an integrator with its pole at z = 1. The
-    slowest modes are removed, as many as change the response at ``angle`` by at most
-    the share ``share``. The gain at rest of the result differs from that of
-    ``model``.
+    slowest modes are removed, as many as possible while the response at ``angle``
+    changes by at most the share ``share``. The gain at rest of the result differs from
+    that of ``model``.
     """
     A, B, C = (np.asarray(matrix) for matrix in (model.A, model.B, model.C))
     rates = natural_frequencies(np.linalg.eigvals(A))
@@ -115,8 +115,8 @@ def _balance(model: StateSpace) -> _Balance:
     radius = np.abs(np.linalg.eigvals(A)).max()
     if radius >= 1.0:
         raise ValueError(
-            f"the model has a pole at radius {radius:.6g}; only a stable one, below 1, "
-            "can be balanced"
+            f"the model has a pole at radius {radius:.6g}; only a stable model, with "
+            "all poles inside the unit circle, can be balanced"
         )
     controllable = _root(linalg.solve_discrete_lyapunov(A, B @ B.T))
     observable = _root(linalg.solve_discrete_lyapunov(A.T, C.T @ C))

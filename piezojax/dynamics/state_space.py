@@ -92,7 +92,7 @@ class StateSpace(System):
         if (outputs, inputs) != (1, 1):
             raise ValueError(
                 f"the model has {inputs} inputs and {outputs} outputs; "
-                "a difference equation is for one of each"
+                "a difference equation needs one of each"
             )
         A, B, C, D = (np.asarray(m) for m in (self.A, self.B, self.C, self.D))
         if self.order == 0:

@@ -217,7 +217,7 @@ def test_what_is_refused():
         pj.stability_report(loop, 40.0)
     with pytest.raises(ValueError, match="branch 'up'; it must be one of"):
         OperatingPoint(branch="up")
-    with pytest.raises(ValueError, match=r"Affine name none; give dt"):
+    with pytest.raises(ValueError, match=r"Affine are none; give dt"):
         linearise(pj.core.system.Affine(2.0))
     two = pj.dynamics.FirstOrderLag(1.0, 1e-3) >> pj.dynamics.FirstOrderLag(1.0, 2e-3)
     with pytest.raises(ValueError, match=r"name 0\.001 s, 0\.002 s; give dt"):

@@ -142,7 +142,7 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match="order is 16; it must be between 1 and 15"):
         balanced_reduction(WHOLE, 16)
     unstable = StateSpace(1.1 * np.eye(3), np.eye(3), np.eye(3), np.zeros((3, 3)), 1e-3)
-    with pytest.raises(ValueError, match=r"a pole at radius 1\.1; only a stable one"):
+    with pytest.raises(ValueError, match=r"a pole at radius 1\.1; only a stable model"):
         balanced_reduction(unstable, 2)
     idle = StateSpace(block_diag(0.5, 0.4), [[1.0], [0.0]], [[1.0, 1.0]], [[0.0]], 1e-3)
     with pytest.raises(ValueError, match="order is 2; only 1 states connect"):
