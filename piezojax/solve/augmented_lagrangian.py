@@ -25,10 +25,10 @@ def penalty_terms(
     multipliers: Float[Array, " constraints"],
     penalty: Array,
 ) -> Float[Array, " constraints"]:
-    """Return the terms of the augmented Lagrangian, each as a number to be squared.
+    """Return the square roots of the penalty terms of the augmented Lagrangian.
 
-    The square of a term is ``penalty``/2 max(0, g + multiplier/penalty)^2, with the
-    violation g.
+    A penalty term is ``penalty``/2 max(0, g + multiplier/penalty)^2, with the violation
+    g.
     """
     shifted = violation + multipliers / penalty
     return jnp.sqrt(0.5 * penalty) * jnp.maximum(shifted, 0.0)
@@ -49,7 +49,7 @@ def with_zero_multipliers(problem: Problem) -> Problem:
 
 
 def rounds(problem: Problem, steps: int) -> Iterator[tuple[float, int, bool]]:
-    """Yield penalty, step limit and whether it is the last, for each round.
+    """Yield for each round its penalty, its step limit, and whether it is the last.
 
     A problem without limits takes one round.
     """

@@ -9,7 +9,7 @@ import jax
 
 
 class Clock:
-    """Wall time since construction; ``compile_s`` of it was spent compiling (s)."""
+    """Wall time since construction; ``compile_s`` (s) is the part spent compiling."""
 
     def __init__(self):
         self._began = time.perf_counter()
@@ -17,14 +17,14 @@ class Clock:
         self.compile_s = 0.0
 
     def compiled(self, function: Callable, *arguments: Any) -> Callable:
-        """Return ``function`` compiled for ``arguments``; count the time."""
+        """Compile ``function`` for ``arguments``; add the time to ``compile_s``."""
         start = time.perf_counter()
         program = jax.jit(function).lower(*arguments).compile()
         self.compile_s += time.perf_counter() - start
         return program
 
     def wait_for(self, program: Future) -> None:
-        """Wait for a program that another thread compiles; count the time."""
+        """Wait for a program that another thread compiles; add to ``compile_s``."""
         start = time.perf_counter()
         program.result()
         self.compile_s += time.perf_counter() - start

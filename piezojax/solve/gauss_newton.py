@@ -59,7 +59,7 @@ which the curvature of a control loop is 1 to 1e6."""
 SEQUENTIAL = Damping(
     first=1e-3, shrink=0.1, least=1e-9, grow=10.0, attempts=15, last=3e5
 )
-"""Rule for losses much cheaper than their derivatives, and a metric that scales the
+"""Rule for losses much cheaper than their derivatives, and for a metric that scales the
 curvature to unit diagonal."""
 
 TRUST_REGION = Damping(enough=0.01, good=0.99, shrink=1.0 / 3.5)
@@ -86,8 +86,8 @@ class Descent:
     """Descent from one start: its settings, best point and state between steps.
 
     It is ``done`` when the damping exceeds its last value, ``patience`` is exhausted,
-    or a step and its change of the loss fall below ``tolerance``, relative to point and
-    loss. ``losses`` holds the loss after each step.
+    or a step and the change of the loss fall below ``tolerance``, relative to the point
+    and the loss. ``losses`` holds the loss after each step.
     """
 
     point: np.ndarray

@@ -24,7 +24,7 @@ _guarded.defvjp(_guarded_forward, _guarded_backward)
 
 
 def with_finite_gradient(loss, *, forward: bool):
-    """Return ``loss`` of a vector, its gradient finite and computed with the value.
+    """Return ``loss`` of a vector with a finite gradient, computed with the value.
 
     The derivative of a diverged run is NaN and would spoil the memory of the optimiser;
     it is replaced by zero. ``forward`` selects forward mode, faster for few parameters
@@ -34,7 +34,7 @@ def with_finite_gradient(loss, *, forward: bool):
     def guarded(unit):
         fixed = jax.lax.stop_gradient(unit)
         if forward:
-            # Not linearize: it would store intermediate values of every sample.
+            # jax.linearize would store intermediate values of every sample.
             value, gradient = jax.vmap(
                 lambda direction: jax.jvp(loss, (fixed,), (direction,)),
                 out_axes=(None, 0),

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 EDGE = 1e-9
-"""Distance from a bound, as a share of the unit box, that counts as on it."""
+"""Distance, as a share of the unit box, within which a point lies on a bound."""
 
 LARGEST_CORRECTION = 0.5
 """Largest accepted correction as a share of its step."""

@@ -60,7 +60,8 @@ class LockstepDescent:
     def screen(self, problem: Problem, units: np.ndarray) -> tuple[np.ndarray, Verdict]:
         """Return loss, without multipliers, and verdict of any number of points.
 
-        The first call compiles the program, for as many points at once as it has.
+        The first call compiles the program for the number of its points, or for
+        ``at_once`` points if that is smaller.
         """
         if self._screening is None:
             self._width = min(self._at_once, len(units))

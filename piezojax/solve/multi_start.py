@@ -1,7 +1,7 @@
 """Multi-start: descents from many starts; a Cut may drop the worse ones.
 
-One loop, ``descend``, serves every search: of ``GaussNewton`` descents, or of those of
-an Optimiser (``BatchedDescents``). ``minimise`` adds the rounds of the augmented
+One loop, ``descend``, advances all Descents: those of ``GaussNewton`` and those of an
+Optimiser (``BatchedDescents``). ``minimise`` adds the rounds of the augmented
 Lagrangian; its strategies are ``successive_halving`` and ``lockstep``.
 """
 
@@ -28,8 +28,8 @@ keep all."""
 class Patience(NamedTuple):
     """Stopping rule: a descent ends if it gains too little in ``steps`` steps.
 
-    The gain is too small below ``gain`` plus the share ``share`` of the loss before
-    them.
+    The gain is too small if it is below ``gain`` plus ``share`` times the loss before
+    these steps.
     """
 
     steps: int
@@ -211,8 +211,8 @@ def minimise(
     """Improve ``state`` from ``starts`` by up to ``steps`` steps.
 
     With constraints the rounds of the augmented Lagrangian share these steps; each
-    round starts from the end of the previous one, and an end that violates a constraint
-    is pulled back towards the best point.
+    round starts from the end of the previous one. A last point that violates a
+    constraint is pulled back towards the best point.
     """
     strategy.prepare(len(starts), progress)
     progress.stage(f"tuning from {len(starts)} starts", steps)
@@ -246,7 +246,7 @@ def minimise(
 
 
 PULLS, SHARES = 2, np.linspace(0.125, 1.0, 8)
-"""Number of times that a segment is tried, and the places on it."""
+"""Number of passes over a segment, and the points tried, as shares of its length."""
 
 
 def _pull_back(

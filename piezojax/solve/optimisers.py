@@ -90,8 +90,8 @@ def _optimistix(
 
     def step(carry):
         state = eqx.combine(carry.state, fixed(carry.point))
-        # The step returns the loss of the previous point; the state has that of this
-        # one.
+        # The step returns the loss of the previous point; the state has the loss of the
+        # present one.
         point, state, _ = solver.step(
             objective, carry.point, None, options, state, frozenset()
         )
@@ -112,7 +112,7 @@ def _is_shape(leaf: Any) -> bool:
 
 
 def bfgs(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
-    """BFGS (optimistix) on the loss."""
+    """Return BFGS (optimistix) on the loss."""
     del residuals
     solver = optx.BFGS(rtol=tolerance, atol=tolerance)
     return _optimistix(solver, loss, lambda value: value, {})
@@ -121,7 +121,7 @@ def bfgs(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
 def levenberg_marquardt(
     loss: Function, residuals: Function, tolerance: float
 ) -> Optimiser:
-    """Levenberg-Marquardt (optimistix) on the residuals, forward Jacobian."""
+    """Return Levenberg-Marquardt (optimistix) on the residuals, forward Jacobian."""
     del loss
     # There are far more residuals than unknowns, so the normal equations are small. A
     # QR of the tall Jacobian takes most of a step, and many times more on a busy
@@ -135,7 +135,7 @@ def levenberg_marquardt(
 
 
 def lbfgsb(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
-    """L-BFGS-B (jaxopt) on the loss, with the bounds of the box."""
+    """Return L-BFGS-B (jaxopt) on the loss, with the bounds of the box."""
     del residuals
     with warnings.catch_warnings():
         # jaxopt announces on import that it is no longer maintained.

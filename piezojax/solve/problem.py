@@ -38,8 +38,8 @@ class Errors(NamedTuple):
     ``loss`` is minimised; ``errors`` are a sample of the errors of each run, ``added``
     the terms of the augmented Lagrangian. A weight is the derivative of the loss with
     respect to half the mean square of the errors of a run. With these weights, and 2
-    for the added terms, the squares have the gradient of the loss as far as it depends
-    on them.
+    for the added terms, half the sum of squares has the gradient of the loss, as far as
+    the loss depends on these terms.
     """
 
     loss: Float[Array, ""]

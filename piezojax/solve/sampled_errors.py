@@ -17,7 +17,7 @@ SAMPLES = 20_000
 LEAST_SPACING = 5
 """Least distance between two of these errors, in samples."""
 
-_ADDED = np.sqrt(2.0)  # the squares of the Lagrangian count fully, not half
+_ADDED = np.sqrt(2.0)  # the squared terms of the Lagrangian have the factor 1, not 1/2
 
 
 class Derivatives(NamedTuple):

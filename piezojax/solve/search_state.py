@@ -43,11 +43,11 @@ class SearchState:
     def update_best(
         self, units: np.ndarray, verdict: Verdict, evaluations: int | None = None
     ) -> None:
-        """Take the best of ``units`` if it is better than the present one.
+        """Take the best of ``units`` if it is better than the best point so far.
 
-        A point that satisfies the constraints is better than any that does not; among
-        points that do not, the least violation is best. ``evaluations`` is the number
-        of evaluations used, by default one per point.
+        A point that satisfies the constraints is better than any point that violates
+        one; among the latter, the least violation is best. ``evaluations`` is the
+        number of evaluations used, by default one per point.
         """
         ranks = rank(verdict)
         leader = int(np.argmin(ranks))

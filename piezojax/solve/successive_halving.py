@@ -22,10 +22,10 @@ from .sampled_errors import derivatives_at, errors_at, local_model, trials_of
 R = TypeVar("R")
 
 HALVING_STEPS = 3
-"""Steps after which the worse half of the descents is dropped."""
+"""Number of steps after which the worse half of the descents is dropped."""
 
 PATIENCE = 5
-"""Steps in which a descent must gain its tolerance."""
+"""Number of steps in which a descent must gain its tolerance."""
 
 POINTS = len(PARALLEL.multiples)
 """Points evaluated at once."""
