@@ -23,8 +23,8 @@ class ActiveDamping(System):
 
     - positive position feedback: ``SecondOrderLowPass`` near the resonance and a gain
       above 0 (Fanson and Caughey, AIAA J. 28, 1990);
-    - integral resonant control: ``LowPass`` of order 1 and a gain above 0, its form
-      without the feedthrough (Fleming, Aphale and Moheimani, IEEE Trans. Nanotechnol.
+    - integral resonant control: ``LowPass`` of order 1 and a gain above 0, the form
+      without feedthrough (Fleming, Aphale and Moheimani, IEEE Trans. Nanotechnol.
       9, 2010);
     - resonant shift: ``Affine`` 1 and a gain below 0, which stiffens the stage.
 

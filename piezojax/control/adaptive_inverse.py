@@ -27,15 +27,15 @@ class MotionTerms(System):
 
     Input um; output um, um/s, um/s^2, and um for each of ``thresholds`` (um). A stop
     operator follows its input and saturates at its threshold. It is the dual of the
-    play operator: the inverse of a Prandtl-Ishlinskii model is a weighted sum of its
-    output and the stops of that. The output of a hysteresis which moves the stage
-    through slow dynamics is ahead of y: the stops follow ``y + lead dy/dt``.
+    play operator: the inverse of a Prandtl-Ishlinskii model is a weighted sum of the
+    output of the model and of stops of this output. A hysteresis that moves the stage
+    through slow dynamics has an output ahead of y: the stops follow ``y + lead dy/dt``.
     """
 
     thresholds: Row = parameter(
         "um", "thresholds of the stop operators", above=0.0, converter=as_scalars
     )
-    lead: Scalar = parameter("s", "lead of what the stop operators follow", least=0.0)
+    lead: Scalar = parameter("s", "lead of the input of the stops", least=0.0)
     dt: float = sample_time()
 
     def init(self, input: ScalarLike = 0.0) -> TermsState:
@@ -87,8 +87,8 @@ class AdaptiveInverse(System):
     inverse control, Widrow and Walach 1996; stop operators for the inverse of a
     hysteresis, Kuhnen and Krejci 2007.
 
-    With a ``share`` of 0 only ``controller`` acts. It sees reference, measurement and
-    voltage less the part that was fed forward. Only changes of the motion are fed
+    With a ``share`` of 0 only ``controller`` acts. It sees the reference, measurement
+    and voltage less the parts that are fed forward. Only changes of the motion are fed
     forward, so a learned weight does not change the voltage at rest, and the stability
     margins at rest are those of ``controller``. While the stage moves, learning forms a
     second, slow loop that these margins do not include.
@@ -135,7 +135,7 @@ class AdaptiveInverse(System):
     dt: float = sample_time()
     lead: Scalar = parameter(
         "s",
-        "lead of what the stop operators follow",
+        "lead of the input of the stops",
         least=0.0,
         typical=(0.0, 5e-3),
         default=0.0,

@@ -80,9 +80,8 @@ class Allocation(System):
       ``weights`` q^2. They equal the pseudo-inverse where it satisfies the bounds;
       elsewhere they are shifted along the null space by the least amount.
 
-    Weights are 1 where left out. An actuator with equal bounds is locked (see
-    ``locked``): its effect is subtracted from the pose and the others produce the
-    remainder.
+    Weights are 1 by default. An actuator with equal bounds is locked (see ``locked``):
+    its effect is subtracted from the pose and the others produce the remainder.
 
     There is no iteration: the least-squares solution on each of the 3^n faces of the
     box of bounds is a fixed matrix times the pose, and the best one within the bounds

@@ -11,9 +11,9 @@ from .observer import Motion, Observer
 class AlphaBeta(Observer):
     """Fixed-gain observer of position and velocity (section 4.5.4.1).
 
-    Of an Observation it uses only z(k) in um; output a Motion. The position follows a
-    ramp without lag once ``beta`` has corrected the velocity; until then it lags by
-    (1 - alpha) / alpha samples.
+    Input an Observation, of which only z(k) in um is used; output a Motion. The
+    position follows a ramp without lag once ``beta`` has corrected the velocity; until
+    then it lags by (1 - alpha) / alpha samples.
     """
 
     alpha: Scalar = parameter(

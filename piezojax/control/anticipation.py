@@ -12,11 +12,11 @@ from ..core.system import System
 class Anticipation(System):
     """``controller`` with its reference advanced by ``lead`` samples.
 
-    A closed loop lags its reference by a time that its tuning fixes. A reference
+    A closed loop lags its reference by a time that depends on its tuning. A reference
     advanced by the same time removes the lag and leaves the feedback, its noise and its
-    margins unchanged. A lead of 1 gives r(k+1), which is known; a larger one
-    extrapolates the line through r(k) and r(k+1); 0 gives r(k). Input an Observation,
-    output that of ``controller``.
+    margins unchanged. A lead of 0 gives r(k), and a lead of 1 gives r(k+1), which is
+    known; a larger one extrapolates the line through r(k) and r(k+1). Input an
+    Observation, output that of ``controller``.
     """
 
     controller: System

@@ -1,4 +1,4 @@
-"""Initial controllers for an identified plant: stable, slow, and a start for tuning.
+"""Initial controllers for an identified plant: stable and slow, to start tuning from.
 
 A design is a function of a plant, the sample time of the loop in s and the limits of
 the actuator in V. Studies select it by its name in ``DESIGNS``. Each design is based on
@@ -25,8 +25,8 @@ def inversion_sliding_mode(
 ) -> InversionControl:
     """Return an inversion-based PID-based sliding mode control (PID-SMC).
 
-    Raises ValueError where the hysteresis has no inverse between ``limits`` (V), and as
-    ``design_model``; ``dt`` in s.
+    ``dt`` in s. Raises ValueError if the hysteresis has no inverse between ``limits``
+    (V), and in the cases of ``design_model``.
     """
     model = design_model(plant, dt, limits)
     inverse = model.inverse()
@@ -41,7 +41,8 @@ def disturbance_observer_sliding_mode(
 ) -> DisturbanceObserverControl:
     """Return a DOB-based PID-SMC on the mean slope of the plant between ``limits`` (V).
 
-    Raises ValueError where that is not positive, and as ``design_model``; ``dt`` in s.
+    ``dt`` in s. Raises ValueError if the slope is not positive, and in the cases of
+    ``design_model``.
     """
     model = design_model(plant, dt, limits)
     # The observer holds the whole gain from V to um; the model has unit gain.
@@ -68,8 +69,8 @@ def disturbance_observer_sliding_mode(
 def inversion_pid(plant: System, dt: float, limits: Limits) -> InversionControl:
     """Return an integral-dominated PID ahead of the inverse of the plant's hysteresis.
 
-    Raises ValueError where there is no inverse between ``limits`` (V), and as
-    ``design_model``; ``dt`` in s.
+    ``dt`` in s. Raises ValueError if there is no inverse between ``limits`` (V), and in
+    the cases of ``design_model``.
     """
     model = design_model(plant, dt, limits)
     inverse = model.inverse()

@@ -36,12 +36,12 @@ class NoInverseError(ValueError):
 class DesignModel(NamedTuple):
     """A plant as a static part, from V to um, and linear dynamics, from um to um.
 
-    ``hysteresis`` is that of the plant, None without one. ``static`` equals it, or is
-    a gain where the plant has no hysteresis or one that cannot be separated from its
-    dynamics. ``linear`` contains all other parts of the plant, unreduced; ``dynamics``
-    is its fast part reduced to second order, a_1, a_2 | b_0, b_1, b_2 with b_0 not zero
-    and zeros inside the unit circle. ``limits`` of the actuator in V; ``rest`` is the
-    output of ``static`` (um) in the middle of them; ``dt`` in s.
+    ``hysteresis`` is that of the plant, or None. ``static`` equals ``hysteresis``, or
+    is a gain if the plant has no hysteresis that can be separated from its dynamics.
+    ``linear`` contains all other parts of the plant, unreduced; ``dynamics`` is its
+    fast part reduced to second order, a_1, a_2 | b_0, b_1, b_2 with b_0 not zero and
+    zeros inside the unit circle. ``limits`` are those of the actuator (V); ``rest`` is
+    the output of ``static`` (um) in the middle between them; ``dt`` in s.
     """
 
     hysteresis: Hysteresis | None
@@ -55,7 +55,7 @@ class DesignModel(NamedTuple):
     def inverse(self) -> Inverse:
         """Return the inverse of the hysteresis between the limits, or of the gain.
 
-        Raises NoInverseError with the reason where the hysteresis has none.
+        Raises NoInverseError with the reason if the hysteresis has no inverse.
         """
         if self.hysteresis is None:
             assert isinstance(self.static, Affine)
@@ -77,7 +77,7 @@ class DesignModel(NamedTuple):
     def fastest_stable(
         self, make: Callable[[float], S], static: System | None = None
     ) -> S:
-        """Return ``make(pace)`` for the largest pace 1, 1/2, ... with a stable loop.
+        """Return ``make(pace)`` for the largest pace of 1, 1/2, ... with a stable loop.
 
         The loop contains all of ``linear``, behind ``static`` if given. It must stay
         stable with ``GAIN_MARGIN`` times the gain, because a resonance or a delay
@@ -98,16 +98,16 @@ class DesignModel(NamedTuple):
         raise ValueError(
             "the loop around the plant's linear part is unstable at any crossover down "
             f"to {SMALLEST_PACE * CROSSOVER / self.dt:g} rad/s; "
-            "a design needs slower control"
+            "no design is slower: give the controller as catalog, file or type"
         )
 
 
 def design_model(plant: System, dt: float, limits: tuple[float, float]) -> DesignModel:
     """Return the design model of ``plant`` for a loop with sample time ``dt`` (s).
 
-    ``limits`` of the actuator in V. Raises ValueError for a plant of several inputs or
-    outputs, with hysteresis that is not in series with the other parts or occurs
-    twice, or whose fast part is unstable or has no gain at rest.
+    ``limits`` are those of the actuator (V). Raises ValueError for a plant of several
+    inputs or outputs, with hysteresis that is not in series with the other parts or
+    occurs twice, or whose fast part is unstable or has no gain at rest.
     """
     hysteresis, others = _separated(plant)
     middle = as_array(np.mean(limits))
@@ -124,7 +124,7 @@ def design_model(plant: System, dt: float, limits: tuple[float, float]) -> Desig
 
 
 def _separated(plant: System) -> tuple[Hysteresis | None, tuple[System, ...]]:
-    """Return the hysteresis of ``plant``, None without one, and the other parts."""
+    """Return the hysteresis of ``plant``, or None, and the other parts."""
     parts = _in_series(plant)
     hysteretic = [part for part in parts if isinstance(part, Hysteresis)]
     if len(hystereses(plant)) != len(hysteretic) or len(hysteretic) > 1:
@@ -158,7 +158,7 @@ def _fast(system: System, input: Scalar, dt: float) -> StateSpace:
         raise ValueError("the plant's derivatives are not finite; a design needs them")
     # Creep and other modes near z = 1 act far below the crossover, where the integral
     # suppresses them like any drift. At the crossover the plant has the gain of its
-    # fast part, so a reduction to few states must not spend any on the slow modes.
+    # fast part, so a reduction to few states must not use any for the slow modes.
     fast = fast_part(whole, CROSSOVER)
     radius = np.max(np.abs(fast.poles()), initial=0.0)
     if radius >= 1.0:

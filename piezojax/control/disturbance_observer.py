@@ -40,8 +40,8 @@ class DisturbanceObserverControl(System):
     ``"printed"`` ((5.32) as printed, for n = 2, whose poles lie at -0.54 and -7.46
     times the cut-off). Input an Observation, output in V.
 
-    Raises ValueError for a model of one coefficient or with DC gain 0, for an unknown
-    name in ``coefficients``, and for printed ones of another order.
+    Raises ValueError for a model of one coefficient or with DC gain 0, for unknown
+    ``coefficients``, and for "printed" ones of an order other than 2.
     """
 
     part_units: ClassVar[PartUnits] = {"feedback": {"u": "um"}}
@@ -76,7 +76,7 @@ class DisturbanceObserverControl(System):
             raise ValueError("the model is a gain; it must have an order of at least 1")
         if self.coefficients == "printed" and self.order != 2:
             raise ValueError(
-                f"the model has the order {self.order}; printed coefficients are for 2"
+                f"the model has the order {self.order}; printed coefficients need 2"
             )
 
     @property

@@ -18,8 +18,8 @@ class Filtered(System):
     """``controller`` with the position estimated by ``filter`` in place of z(k).
 
     ``filter`` is an Observer, or one on each axis (``PerAxis``); its velocities are not
-    used. All parts of ``controller``, also a disturbance observer, see the filtered
-    position. Input an Observation, output that of ``controller``.
+    used. All parts of ``controller``, including a disturbance observer, see the
+    filtered position. Input an Observation, output that of ``controller``.
     """
 
     filter: System

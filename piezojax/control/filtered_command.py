@@ -19,8 +19,8 @@ class FilteredCommandState(NamedTuple):
 class FilteredCommand(System):
     """``controller`` with its command filtered by ``filter``, of unit DC gain.
 
-    Filters in series are one filter. The controller sees as applied its own last
-    command, plus the part that the actuator changed behind the filter, so that its
+    Filters in series are one filter. The applied voltage that the controller sees is
+    its own last command plus the change by the actuator behind the filter, so that its
     anti-windup responds to the limits and not to the filter. In ``InversionControl`` or
     ``FeedforwardFeedback`` the filter acts on the feedback alone. Input an Observation,
     output in the unit of the controller's command.

@@ -102,11 +102,11 @@ def learn(
 ) -> Trials:
     """Repeat ``reference`` (um) on ``system``, learning from trial to trial.
 
-    Each trial starts from the same rest. ``system`` is a stage, V to um, whose input u
-    is learned (y(k) is the output of the step with u(k)), or a Feedback loop, whose
-    reference is corrected to r + u. ``noise`` [trials, samples] is added to the
+    Each trial starts from the same state of rest. ``system`` is a stage, V to um, whose
+    input u is learned (y(k) is the output of the step with u(k)), or a Feedback loop,
+    whose reference is corrected to r + u. ``noise`` [trials, samples] is added to the
     measurement, for a stage in um, for a loop as unit-variance draws that its sensor
-    scales. ``feedforward`` of the first trial is zero if left out, as in (2.14). The
+    scales. ``feedforward`` of the first trial is zero by default, as in (2.14). The
     function is pure, and differentiable in ``law`` and ``system``. The returned errors
     are those of the true displacement.
 

@@ -141,7 +141,7 @@ def model_kalman(
 
     All in um: ``noise_rms`` of the sensor, ``process_rms`` of the random motion in a
     sample, ``drift_rms`` of the change of the drift in a sample. Raises ValueError for
-    a value that is not above 0 (``process_rms``: below 0).
+    a negative ``process_rms`` and for another value that is not above 0.
     """
     check("noise_rms in um", noise_rms, above=0.0)
     check("process_rms in um", process_rms, least=0.0)
@@ -170,7 +170,7 @@ def kinematic_kalman(
     check("noise_rms in um", noise_rms, above=0.0)
     check("acceleration_rms in um/s^2", acceleration_rms, above=0.0)
     check("sample time in s", dt, above=0.0)
-    # y(k-1) represents y(k) - dt dy/dt: the acceleration moves both, oppositely.
+    # y(k-1) represents y(k) - dt dy/dt: acceleration moves both, in opposite senses.
     push = 0.5 * float(acceleration_rms) * dt**2 * np.array([1.0, -1.0])
     model = ARMA((2.0, -1.0), (0.0,))
     A = np.array([[2.0, -1.0], [1.0, 0.0]])

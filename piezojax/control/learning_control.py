@@ -30,12 +30,12 @@ class LearningControl(System):
     """``feedback`` with its reference corrected from trial to trial, (2.14).
 
     A trial is a ``period`` of the reference. ``feedback``, any controller, sees r + u
-    in place of r. At its start a trial takes the corrections u that the ``LearningLaw``
-    with ``gain``, ``smoothing`` and ``lead`` gives for the last one; in the first u is
-    0. The law looks ahead in the trial, and its Q-filter has no phase;
-    ``RepetitiveControl`` learns without pause, in one endless trial. There is no rest
-    between trials, so the errors decay as long as their transients are shorter than a
-    period.
+    in place of r. At the start of each trial the ``LearningLaw`` with ``gain``,
+    ``smoothing`` and ``lead`` computes the corrections u from the trial before; in the
+    first trial u is 0. The law uses later samples of a trial, and its Q-filter has zero
+    phase; ``RepetitiveControl`` learns continuously, in one endless trial. The loop
+    does not rest between trials, so the errors decay as long as the transients are
+    shorter than a period.
 
     Input an Observation, output that of ``feedback``. At rest without error u is zero.
     Raises ValueError unless ``lead`` and ``smoothing`` are shorter than the period.

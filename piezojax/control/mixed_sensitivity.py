@@ -48,9 +48,9 @@ def mixed_sensitivity(
     gamma within 0.1 % of its infimum. The controller has the states of the model and of
     the weights.
 
-    The reference r enters the error without a filter, so the error determines r. Of the
-    two Riccati equations (Glover and Doyle, 1988; in discrete time Green and Limebeer,
-    1995, appendix B) that of the estimator then has the solution zero, provided that
+    The reference r enters the error without a filter, so the error determines r. The
+    second of the two Riccati equations, for the estimator (Glover and Doyle, 1988; in
+    discrete time Green and Limebeer, 1995, appendix B), then has the solution zero if
     the model and the weights are stable: an integrator in W1 must be leaky. Raises
     ValueError for an unstable model or weight, weights that are not scalar or have
     another ``dt``, and an effort weight that is not above 0.

@@ -45,8 +45,8 @@ class ModelReferenceSlidingMode(System):
     of the reference model; ``Anticipation`` compensates both.
 
     Input an Observation, whose next reference is not used; output in V. Raises
-    ValueError for a model without a_1, a surface of another length than n - 1, b_0 = 0
-    or an unknown inversion.
+    ValueError for a model without a_1, a surface that does not hold n - 1 weights, b_0
+    = 0 or an unknown inversion.
     """
 
     part_units: ClassVar[PartUnits] = {"law": {"s": "um", "v": "[u]"}}

@@ -64,9 +64,11 @@ class MultiAxisSlidingMode(Designed):
 
     At rest without disturbance the state is constant. If the DC gain of the model
     differs from that of the stage, a small error remains at s = 0, because the
-    prediction contains no disturbance, and the loop moves there slowly from the start.
+    prediction contains no disturbance, and the loop approaches it slowly from the
+    start.
 
-    Raises ValueError for matrices that are not [q, q] or a surface without p of them.
+    Raises ValueError for matrices that are not [q, q], or a surface that does not hold
+    p matrices.
     """
 
     part_units: ClassVar[PartUnits] = {"law": {"s": "um", "v": "[u]"}}

@@ -83,7 +83,7 @@ class NominalSlidingMode(System):
     def _advance(
         self, state: NominalState, input: Observation
     ) -> tuple[Scalar, Scalar, NominalState]:
-        """Return v without switching part, s, and the next state with the old law."""
+        """Return v without switching part, s, and the next state except the law's."""
         a1, a2 = (-a for a in self.model.autoregressive)
         y, r, r_next = input.measured, input.reference, input.next_reference
         model, modelled = self.model.step(state.model, input.applied)

@@ -26,9 +26,10 @@ class PreviewInverse(eqx.Module):
 
     The model (a_1, ... | b_0, ...) maps u(k) to y(k+1), as in a loop.
     ``w(k) = sum_j weights[j] r(k + 1 + delay + j)``, and ``causal`` maps w to u. The
-    output has one input for each sample of the reference, in the unit of the model's
-    input. The reference is constant before its first and after its last sample, and the
-    input before its first: a bumpless start. Compile it with ``eqx.filter_jit``.
+    output holds one input for each sample of the reference, in the unit of the model's
+    input. The reference is taken as constant before its first and after its last
+    sample, and the input before its first, for a bumpless start. Compile it with
+    ``eqx.filter_jit``.
     """
 
     causal: ARMA
@@ -37,7 +38,7 @@ class PreviewInverse(eqx.Module):
 
     @property
     def preview(self) -> int:
-        """Number of samples after k of which the reference is used."""
+        """Number of samples of the reference used beyond sample k."""
         return self.delay + self.weights.size
 
     def extrapolated(self) -> "ExtrapolatedInverse":
@@ -65,8 +66,8 @@ class ExtrapolatedInverse(System):
     """PreviewInverse inside a loop, which knows the reference up to r(k+1) only.
 
     The references beyond r(k+1) are those of the line through r(k) and r(k+1), so that
-    the few samples that the inverse looks ahead need not be known. The error of a
-    reference with the acceleration a is about a T^2 j^2 / 2 at j samples. Input r(k+1)
+    the few samples that the inverse looks ahead need not be known. At j samples the
+    error is about a T^2 j^2 / 2 for a reference with the acceleration a. Input r(k+1)
     in um, output in the unit of the model's input: the ``inverse`` of an
     ``InverseFeedforward`` or a ``FeedforwardFeedback``, alone or in series with an
     inverse hysteresis. ``weights``, ``delay`` and ``causal`` as in ``PreviewInverse``.
@@ -116,9 +117,9 @@ def zero_phase_inverse(model: ARMA, margin: float = 1.0) -> PreviewInverse:
     """Return the zero-phase-error tracking controller (ZPETC; Tomizuka, 1987).
 
     It cancels the zeros inside the circle of radius ``margin`` and the phase of the
-    others, B_u. From r to y then remains B_u(z) B_u(1/z) / B_u(1)^2, which has zero
-    phase at all frequencies and is 1 at rest. Its gain elsewhere is not 1. The inverse
-    uses one sample of preview for each zero of B_u beyond the model's delay. Raises
+    others, B_u. The response from r to y is then B_u(z) B_u(1/z) / B_u(1)^2, which has
+    zero phase at all frequencies and is 1 at rest, but not elsewhere. The inverse uses
+    one sample of preview for each zero of B_u beyond the model's delay. Raises
     ValueError for a margin outside (0, 1], a zero at z = 1 or b that are all zero.
     """
     scale, stable, unstable, delay = _split(model, margin)
@@ -131,7 +132,7 @@ def zero_phase_inverse(model: ARMA, margin: float = 1.0) -> PreviewInverse:
 
 
 def stable_inverse(model: ARMA, preview: int) -> PreviewInverse:
-    """Return the inverse with its unstable part run backwards over ``preview``.
+    """Return the inverse whose unstable part runs backwards over ``preview`` samples.
 
     1 / (1 - z_i/z) for a zero |z_i| > 1 is bounded as a series in z: the sum over j of
     -(z/z_i)^(j+1), which uses future references. The series is truncated after
@@ -144,7 +145,7 @@ def stable_inverse(model: ARMA, preview: int) -> PreviewInverse:
     zeros = np.roots(unstable)
     if np.any(np.abs(zeros) < 1.0 + 1e-9):
         raise ValueError(
-            "the model has a zero on the unit circle; no inverse of it is bounded"
+            "the model has a zero on the unit circle; it has no bounded inverse"
         )
     order = len(zeros)
     check("preview in samples", preview, least=order + 1.0)
@@ -170,7 +171,7 @@ def _numerator(model: ARMA) -> tuple[float, np.ndarray, int]:
     """Return the first nonzero b, all b from there divided by it, and its index."""
     b = np.trim_zeros(np.array([float(x) for x in model.moving]), "b")
     if b.size == 0:
-        raise ValueError("all b of the model are 0; one must be another number")
+        raise ValueError("all b of the model are 0; at least one must not be 0")
     delay = int(np.flatnonzero(b)[0])
     return float(b[delay]), b[delay:] / b[delay], delay
 

@@ -38,8 +38,8 @@ class RepetitiveControl(System):
     constant tau has a delay of about tau / dt; symmetric ``ARMA`` coefficients make Q
     exactly zero-phase.
 
-    Let T be the inner loop from r to z, and Q without its delay. The error of a linear
-    loop decays from period to period if ``|Q (1 - gain z^lead T)| < 1`` at all
+    Let T be the inner loop from r to z, and take Q without its delay. The error of a
+    linear loop decays from period to period if ``|Q (1 - gain z^lead T)| < 1`` at all
     frequencies. There is no anti-windup: an unreachable reference winds w up.
 
     Input an Observation, output that of ``feedback``. At rest without error w is zero.

@@ -26,5 +26,5 @@ def riccati(
         return (A @ moved, G + A @ gain @ A.T, H + A.T @ H @ moved), None
 
     (rest, _, X), _ = jax.lax.scan(double, (A, G, H), length=DOUBLINGS)
-    # The matrix that is doubled vanishes only if the closed loop is stable.
+    # The iterated A tends to zero only if the closed loop is stable.
     return 0.5 * (X + X.T), jnp.max(jnp.abs(jax.lax.stop_gradient(rest)))

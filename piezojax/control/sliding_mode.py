@@ -153,9 +153,9 @@ class ContinuousSlidingMode(System):
     """Sampled continuous design without a model: ``u = law(s)``.
 
     The sliding variable is s = ``surface`` e + de/dt in um/s with e = y - r, where y
-    and dy/dt come from ``filter``. It is the comparison of section 4.5.4.3, reference
-    [98] there, for which the thesis prints gains but no equation. The continuous design
-    needs no model. Input an Observation, output in V.
+    and dy/dt come from ``filter``. Section 4.5.4.3 compares with this controller
+    (reference [98] there); the thesis prints its gains but no equation. Input an
+    Observation, output in V.
     """
 
     part_units: ClassVar[PartUnits] = {"law": {"s": "um/s", "v": "[u]"}}

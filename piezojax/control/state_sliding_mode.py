@@ -43,23 +43,24 @@ class StateSlidingModeState(NamedTuple):
 class StateSlidingMode(Designed):
     """Sliding mode control of q axes on the estimated state of ``model``.
 
-    The first approach to the third item of future work in the thesis: state tracking
-    with state estimation, where ``MultiAxisSlidingMode`` tracks outputs. ``model`` has
-    q inputs, q outputs and any number of states; u(k) moves it to y(k+1) = C x(k+1). A
-    steady-state Kalman filter estimates x and a disturbance d of the inputs,
+    The controller tracks states with state estimation, the first approach under the
+    third item of future work in the thesis; ``MultiAxisSlidingMode`` tracks outputs.
+    ``model`` has q inputs, q outputs and any number of states; u(k) moves it to y(k+1)
+    = C x(k+1). A steady-state Kalman filter estimates x and a disturbance d of the
+    inputs,
 
     ``x(k+1) = A x(k) + B (u(k) + d(k) + w)``, ``d(k+1) = d(k) + n``, ``z = C x + v``,
 
-    with w of ``process``, n of ``drift``, both relative to v, the sensor noise of all
-    axes. The sliding variable s = B' P (x - N y_d) is zero in the state in which the
-    model rests at y_d, the output of ``reference_model`` from r(k) to y_d(k+1). P
-    solves the Riccati equation with the weights C' C and ``effort_weight``^2, and the
-    motion on s = 0 is stable for every weight. With the equivalent control, s(k+1) =
-    ``reaching`` s(k) + S B law(s). The estimate of d removes offsets, so the law may be
-    zero.
+    where w has the rms value ``process`` and n has ``drift``, both relative to that of
+    v, the sensor noise of all axes. The sliding variable s = B' P (x - N y_d) is zero
+    in the state in which the model rests at y_d, the output of ``reference_model`` from
+    r(k) to y_d(k+1). P solves the Riccati equation with the weights C' C and
+    ``effort_weight``^2, and the motion on s = 0 is stable for every weight. With the
+    equivalent control, s(k+1) = ``reaching`` s(k) + S B law(s). The estimate of d
+    removes offsets, so the law may be zero.
 
     Input an Observation of q axes, output a tuple of q commands. Raises ValueError for
-    a model with a direct transmission or with another number of inputs than outputs,
+    a model with a direct transmission or with different numbers of inputs and outputs,
     and for ``reaching`` that is not [q, q].
     """
 

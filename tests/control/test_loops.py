@@ -342,7 +342,7 @@ def observer(model=SECOND_ORDER, gain=0.1, cutoff=500.0, dt=DT, **options):
         ),
         (
             lambda: observer(FIRST_ORDER, coefficients="printed"),
-            "the model has the order 1; printed coefficients are for 2",
+            "the model has the order 1; printed coefficients need 2",
         ),
         (lambda: observer(gain=0.0), "gain in um/V is 0; it must be finite and"),
         (

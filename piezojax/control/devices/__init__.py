@@ -1,4 +1,4 @@
-"""Controllers of vendors, with the parameters that are typed into them."""
+"""Controllers of vendors, with the parameters as they are typed in."""
 
 from .e727 import E727 as E727
 from .nv200 import NV200 as NV200

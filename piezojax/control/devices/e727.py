@@ -65,12 +65,11 @@ class E727(Device):
     (0x05000000) is a Butterworth low-pass of order 2 if ``filter_type`` is 1. The slew
     rate (0x07000200) limits the setpoint.
 
-    Options for what the manual leaves open: ``structure`` "series", in which P
-    multiplies all terms, or "parallel"; ``anti_windup`` "none" or "hold". A notch is
+    Options that the manual does not specify: ``structure`` is "series", in which P
+    multiplies all terms, or "parallel"; ``anti_windup`` is "none" or "hold". A notch is
     ``(s^2 + 2 r k w s + w^2) / (s^2 + 2 k w s + w^2)`` with rejection r and bandwidth
-    k; with k = 1 the two laws that the manual allows agree. ``notch_method``
-    (0x08000600) is 0, bilinear, or 1, zero-order hold; method 2 of the device is not
-    modelled.
+    k; with k = 1 both readings of the manual agree. ``notch_method`` (0x08000600) is 0,
+    bilinear, or 1, zero-order hold; method 2 of the device is not modelled.
 
     Input an Observation, output in V. Raises ValueError for a value out of range.
     """
@@ -84,7 +83,9 @@ class E727(Device):
     derivative_time: Scalar = parameter(
         "s", "D", least=0.0, scale="log", typical=(1e-7, 1e-2), default=0.0
     )
-    scale: Scalar = parameter("V/um", "command for P = 1 and 1 um", kw_only=True)
+    scale: Scalar = parameter(
+        "V/um", "command for P = 1 and an error of 1 um", kw_only=True
+    )
     lower: Scalar = parameter("V", "minimum voltage", kw_only=True)
     upper: Scalar = parameter("V", "maximum voltage", kw_only=True)
     notch_frequency_1: Scalar = _frequency("frequency of notch 1")

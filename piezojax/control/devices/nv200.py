@@ -71,17 +71,16 @@ class NV200(Device):
     on with ``setlpon``, ``poslpon``, ``notchon``. ``kp``, ``ki``, ``kd`` and the
     feedforwards ``pcf_x``, ``pcf_v``, ``pcf_a`` are the numbers that are typed in, with
     three decimals. The manual does not give their scale: ``scale`` is in V per um for a
-    gain of 1, and ``device_scale`` measures it. If it is 0, the loop is taken to
-    normalise voltage and position by their ranges, and the scale is
-    (avmax - avmin) / (posmax - posmin). Blocks, ranges and rounding are those of the
-    vendor's manual and library (versions in docs/devices.md). The width of the notch
-    is exact for a depth of 0 and a frequency far below 20 kHz; at 4 kHz the notch is
-    24 % narrower.
+    gain of 1, and ``device_scale`` measures it. If it is 0, the loop is assumed to
+    normalise voltage and position by their ranges, and the scale is (avmax - avmin) /
+    (posmax - posmin). Blocks, ranges and rounding are those of the vendor's manual and
+    library (versions in docs/devices.md). The width of the notch is exact for a depth
+    of 0 and a frequency far below 20 kHz; at 4 kHz the notch is 24 % narrower.
 
-    Options for what the manual leaves open: ``integration`` "rectangular",
+    Options that the manual does not specify: ``integration`` is "rectangular",
     "trapezoidal" or "half" (rectangular with half the gain, as printed);
-    ``setpoint_filter`` "butterworth" or "equal poles"; ``notch_depth``, the gain at its
-    centre; ``anti_windup`` "none" or "hold".
+    ``setpoint_filter`` is "butterworth" or "equal poles"; ``notch_depth`` is the gain
+    at the centre of the notch; ``anti_windup`` is "none" or "hold".
 
     The analogue low-pass of the sensor (1.7 kHz) is part of the stage. Input an
     Observation, output in V. Raises ValueError for a value out of range.
@@ -133,9 +132,10 @@ class NV200(Device):
         check_option("setpoint_filter", self.setpoint_filter, KINDS)
 
     def typed(self) -> "NV200":
-        """Return the device with what can be typed in; the notch stays in its limits.
+        """Return the device with its parameters as rounded when they are typed in.
 
-        Rounding may make the notch a hertz wider than its limit of 2 notchf.
+        Rounding may make the notch a hertz wider than its limit of 2 notchf; the width
+        is then reduced to the limit.
         """
         width = jnp.minimum(self.notchb, 2.0 * jnp.floor(self.notchf))
         return rounded_fields(dataclasses.replace(self, notchb=width))
@@ -146,7 +146,7 @@ class NV200(Device):
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """A caution if the scale is assumed."""
+        """Caution that the scale is assumed, if it is."""
         if self.scale > 0.0:
             return ()
         return (

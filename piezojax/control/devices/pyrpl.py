@@ -53,12 +53,12 @@ class PyRPL(Device):
     integral stays between -4 and 4 V, the output between ``min_voltage`` and
     ``max_voltage``. The derivative is disabled in the gate array.
 
-    The gate array runs at 125 MHz; here the module is sampled at ``dt``, and its
-    delay, about 0.3 us with the converters, belongs to ``computation`` of the study.
-    ``sensor_gain`` and ``amplifier_gain`` are what stands between the box and the
-    stage, ``offset`` the piezo's voltage for an output of 0 V. Source: PyRPL's PID
-    module. Input an Observation, output in V. Raises ValueError for a value out of
-    range.
+    The gate array runs at 125 MHz; here the module is sampled at ``dt``, and its delay,
+    about 0.3 us with the converters, belongs to ``computation`` of the study.
+    ``sensor_gain`` and ``amplifier_gain`` are the gains between the device and the
+    stage, and ``offset`` is the voltage of the piezo at an output of 0 V. Source:
+    PyRPL's PID module. Input an Observation, output in V. Raises ValueError for a value
+    out of range.
     """
 
     p: Scalar = _gain("V/V", "proportional gain", STEP_P, MOST_P)

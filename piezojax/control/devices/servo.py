@@ -57,7 +57,8 @@ class Servo(Device):
     With the ``form`` "parallel" the PID is P e + I int e dt + D de/dt, with
     ``integral`` in V/(um s) and ``derivative`` in V s/um. With "standard" it is
     P (e + int e dt / Ti + Td de/dt), with the times Ti and Td, in s, in their places:
-    give a study the bounds of ``integral`` then. An integral of 0 is off in both.
+    a study must then give the bounds of ``integral``. In both forms an ``integral`` of
+    0 switches the integral off.
     ``feedforward`` multiplies the setpoint behind its slew limit. ``low_pass_order`` is
     0 for no low-pass, 1 or 2. ``anti_windup`` is "none" or "hold". Input an
     Observation, output in V. Raises ValueError for a value out of range.

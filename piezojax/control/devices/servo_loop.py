@@ -18,7 +18,7 @@ NO_SLEW = 1e9
 """Slew rate (um/s) beyond every setpoint."""
 
 NO_END = 1e9
-"""End of an integral (V) that runs on."""
+"""End of the range (V) of an integral without limits."""
 
 INTEGRATIONS = ("rectangular", "trapezoidal")
 ANTI_WINDUPS = ("none", "hold")
@@ -39,7 +39,7 @@ class Device(Designed):
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """What to resolve before the gains are typed in, each with a next step."""
+        """Problems to solve before the gains are typed in, each with a next step."""
         return ()
 
     def resolved(self) -> System:
@@ -73,10 +73,10 @@ class ServoLoop(System):
         u = output(P e + I sum(e) dt + D (e - e1)/dt + Fx s + Fv dr/dt + Fa d2r/dt2)
 
     with the previous error e1, clipped to ``lower`` and ``upper``. ``integration`` is
-    "rectangular" (backward) or "trapezoidal". The integral, with the voltage at rest in
-    it, stays between its ends. The ``anti_windup`` "hold" is conditional
+    "rectangular" (backward) or "trapezoidal". The integral, which includes the voltage
+    at rest, stays between its ends. The ``anti_windup`` "hold" is conditional
     integration: no step drives a saturated output further; with "none" the integral
-    runs on. Each filter has unit DC gain. Input an Observation, output in V. Raises
+    winds up. Each filter has unit DC gain. Input an Observation, output in V. Raises
     ValueError for an unknown option.
     """
 

@@ -39,10 +39,10 @@ class Stabilizer(Device):
     of the converters, as the firmware does: at 781 kHz a small integral gain loses
     small errors. The converters themselves are those of the study.
 
-    ``sensor_gain`` and ``amplifier_gain`` are what stands between the box and the
-    stage, ``offset`` the piezo's voltage for an output of 0 V. Source: firmware
-    stabilizer with idsp 0.21. Input an Observation, output in V. Raises ValueError for
-    a value out of range.
+    ``sensor_gain`` and ``amplifier_gain`` are the gains between the device and the
+    stage, and ``offset`` is the voltage of the piezo at an output of 0 V. Source:
+    firmware stabilizer with idsp 0.21. Input an Observation, output in V. Raises
+    ValueError for a value out of range.
     """
 
     p: Scalar = parameter("V/V", "proportional gain", scale="log")
