@@ -65,7 +65,7 @@ class Constraint(NamedTuple):
     ``values(source, dt)`` returns the values of the figure, with the plants on the
     first axis, from the field ``source`` of the LoopFigures and dt in s. A limit must
     lie above ``above`` and below ``below``. ``default`` is the limit of a study that
-    names none. ``one_axis`` tells that the figure is known for one axis only.
+    names none. ``one_axis`` is True if the figure is known for one axis only.
     """
 
     unit: str
@@ -157,7 +157,7 @@ def margin_figures(
     """Return the margins [branches] among the constraints ``names``.
 
     They are those of ``loop`` linearised at ``point``; ``error`` bounds the relative
-    error of a plant of one axis, None if nothing is known of it.
+    error of a plant of one axis; None if no bound is known.
     """
     found: MarginFigures = {}
     if not _MARGINS.keys().isdisjoint(names):
@@ -251,8 +251,8 @@ share of the range of the reference."""
 def limits_of(written: Mapping[str, Any]) -> dict[str, float]:
     """Return the limits in force: those ``written`` in a study, and the defaults.
 
-    A limit that is written as ``OFF`` is left out, so that a default applies unless the
-    study says otherwise.
+    A default applies unless the study sets another limit. A limit that is written as
+    ``OFF`` is left out.
     """
     defaults = {
         name: kind.default
@@ -271,8 +271,9 @@ def uses(names: Iterable[str], source: Source) -> bool:
 def constraint_count(names: Iterable[str], plants: int, margin_plants: int) -> int:
     """Return the number of ``violations`` of the limits ``names``.
 
-    Runs are limited on ``plants``, and each of their steps, margins on each branch of
-    ``margin_plants``.
+    A limit on runs counts once for each of ``plants``, a limit on steps once for each
+    of ``plants`` and step, a limit on margins once for each of ``margin_plants`` and
+    branch.
     """
     each = {
         "margins": margin_plants * len(BRANCHES),
@@ -286,7 +287,7 @@ def constraint_count(names: Iterable[str], plants: int, margin_plants: int) -> i
 def violations(
     limits: Mapping[str, Array | float], loop: LoopFigures
 ) -> Float[Array, " constraints"]:
-    """Return the ``excess`` over all ``limits``, of each plant and branch, in order."""
+    """Return the ``excess`` over each of ``limits`` on each plant, step or branch."""
     found = [
         excess(name, limit, CONSTRAINTS[name].read(loop)).ravel()
         for name, limit in limits.items()

@@ -86,7 +86,8 @@ def _watched(node: Any) -> Any:
 def sliding_mode_of(loop: Feedback) -> SlidingMode | ContinuousSlidingMode | None:
     """Return the sliding mode in the controller whose s is m e + de/dt.
 
-    None without one, with several, and for a SlidingMode of another order than two.
+    None if there is no sliding mode, if there are several, or if it is a SlidingMode
+    whose order is not two.
     """
     nodes = jax.tree.leaves(loop.controller, is_leaf=_is_sliding)
     modes = [node for node in nodes if _is_sliding(node)]
@@ -104,7 +105,7 @@ def sliding_parts(
     """Return the SlidingParts of ``loop`` along ``inputs`` from sample ``first`` on.
 
     The run starts at rest at the reference ``start`` (um). Raises ValueError if
-    ``sliding_mode_of`` the loop is None.
+    ``sliding_mode_of(loop)`` is None.
     """
     mode = sliding_mode_of(loop)
     if mode is None:

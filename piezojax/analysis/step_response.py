@@ -23,7 +23,7 @@ START, END = 0.1, 0.9
 """Shares of the height between which a step rises."""
 
 LAST = 0.1
-"""Last part of a run, in which the steady-state error is taken."""
+"""Share of a run, at its end, over which the steady-state error is averaged."""
 
 
 class StepFigures(NamedTuple):
@@ -37,8 +37,8 @@ class StepFigures(NamedTuple):
     - ``steady_state_error``: mean distance from the reference in the last tenth of the
       run, as a share of the height.
 
-    A time that is longer than the run is a number above its length, which falls as the
-    displacement gets nearer.
+    A time that is longer than the run is a number above the length of the run, which
+    falls as the displacement comes nearer to the reference.
     """
 
     rise_time: Array
@@ -52,8 +52,8 @@ class StepFigures(NamedTuple):
 def step_ends(references: np.ndarray) -> np.ndarray:
     """Return the references (um) before and after each step of ``NAMES``, [4, 2].
 
-    The large ones go over the range in which the ``references`` are for nine tenths of
-    the time: their extremes may be short overshoots that no stage could hold.
+    The large ones span the range in which the ``references`` are for nine tenths of the
+    time: the extremes may be short overshoots that no stage could hold.
     """
     low, high = np.quantile(references, [0.05, 0.95])
     middle, half = (low + high) / 2.0, SMALL * (high - low) / 2.0

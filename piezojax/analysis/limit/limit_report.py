@@ -11,7 +11,7 @@ NEAR = 1.5
 
 @dataclass(frozen=True)
 class Shares:
-    """Parts of an RMS error (um), whose squares sum to its square.
+    """Parts of an RMS error (um); their squares sum to the square of the error.
 
     ``noise`` is caused by the sensor's noise, and ``unpredicted`` by the part of the
     disturbance that the reference does not predict. ``predicted`` is the part that a
@@ -34,8 +34,8 @@ class LimitComparison:
     reference of the one controller with the least geometric mean over all references.
     ``disturbance`` is the whole of d, ``unpredicted`` the part that the reference does
     not predict. The spectrum of that part lies above the noise's up to ``bandwidth``
-    (Hz). ``tuned_shares`` is None if the loop is so nonlinear that its error has no
-    shares.
+    (Hz). ``tuned_shares`` is None if the loop is too nonlinear for its error to be the
+    sum of shares.
     """
 
     tuned: float

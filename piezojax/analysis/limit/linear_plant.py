@@ -77,7 +77,7 @@ class LinearPlant(System):
         A, B, C, D = (np.asarray(x) for x in (self.A, self.B, self.C, self.D))
         delay, first = 1, float(D)
         size = abs(first) + np.linalg.norm(C) * np.linalg.norm(B)
-        # Look ahead until the input acts: the zeros are those of the C and D there.
+        # Advance y until u acts on it directly: the zeros are those of this C and D.
         while abs(first) <= _NOTHING * size and delay <= len(A):
             delay, first, C = delay + 1, float(C @ B), C @ A
         if abs(first) <= _NOTHING * size:

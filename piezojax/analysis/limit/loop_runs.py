@@ -43,7 +43,7 @@ def noise_free_error(
     """Return the error (um) of ``loop`` around ``plant``, without noise.
 
     ``left`` (um) is the residual of the linear plant in each run and acts as a
-    disturbance. With the noise of the run, the error would equal that of the run.
+    disturbance. With the noise of the run, the error would equal the error of the run.
     ``left`` and the error are [references, draws, samples].
     """
     # The disturbance of sample k moves the displacement at k + 1.

@@ -14,7 +14,7 @@ TAPS = 100
 """Taps of the filter of the reference: 1 ms apart over a tenth of a second."""
 
 LEAST_SHARE = 1e-10
-"""Least power of a direction of the taps that is used, as a share of the largest."""
+"""Least power of a direction in which taps are fitted, as a share of the largest."""
 
 
 class ReferencePredictor:
@@ -54,7 +54,7 @@ class ReferencePredictor:
         return signals[..., self._start : self._start + self.count]
 
     def weights(self, signals: np.ndarray) -> np.ndarray:
-        """Return the taps of the filter, that of the earliest reference first.
+        """Return the taps of the filter, the earliest sample of the reference first.
 
         ``signals`` are [references, draws, samples]. The filter is fitted to the mean
         over the draws of each reference.

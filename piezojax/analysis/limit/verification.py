@@ -28,7 +28,7 @@ from .loop_runs import simulate_runs
 from .performance import SEGMENT
 from .wiener import common_response, error_shares, inner_response
 
-_TAIL = 1e-7  # of the largest tap: smaller taps at the end are cut off
+_TAIL = 1e-7  # share of the largest tap below which last taps are cut off
 
 
 class LimitInput(NamedTuple):
@@ -68,7 +68,7 @@ class LinearLimit(System):
         at, model, states, innovations = state
         loop = self.loop
         sensor, measured = loop.sensor.step(at.sensor, (at.displacement, input.noise))
-        # at.reference is reused for the model's displacement, a sample after its input.
+        # at.reference holds the model's displacement of the last step.
         innovation = measured - at.reference - input.prediction
         innovations = jnp.concatenate([innovation[None], innovations[:-1]])
         command = input.voltage - self.taps @ innovations
@@ -161,8 +161,8 @@ def _following_voltage(
     wanted = references - references[:, :1] - prediction
     margin = wanted.shape[1] // 2
     wanted = np.pad(wanted, ((0, 0), (margin, margin)), mode="edge")
-    # Without a ramp from end to end the record is periodic. The ramp is slow enough for
-    # the gain at rest.
+    # Without the ramp between its ends the record is periodic. The ramp is so slow that
+    # the gain at rest applies to it.
     ramp = np.linspace(wanted[:, 0], wanted[:, -1], wanted.shape[1], axis=1)
     plant = problem.plant.response(wanted.shape[1])
     voltage = np.fft.ifft(np.fft.fft(wanted - ramp) / plant).real

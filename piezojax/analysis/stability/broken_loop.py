@@ -94,9 +94,9 @@ class BrokenLoop(System):
         """Step with the loop closed for small motions, with ``added`` (V) at the plant.
 
         Return the voltage that acts there. It differs from that of the operating point
-        by ``added``, exactly; its derivative with respect to the state, and to what
-        r(k) and r(k+1) have ``moved`` from the reference, is that of the actuator's
-        voltage.
+        by ``added``, exactly. Its derivatives with respect to the state and to
+        ``moved``, the deviations of r(k) and r(k+1) from the reference, are those of
+        the actuator's voltage.
         """
         controller, actuator, sensor, applied = self._answer(state, moved)
         acting = jax.tree.map(
@@ -115,7 +115,7 @@ class BrokenLoop(System):
         input: Signal,
         moved: tuple[Signal, Signal] | None = None,
     ) -> BrokenState:
-        """Return the state after ``input`` at the plant; ``moved`` as for _answer."""
+        """Return the state after ``input`` at the plant; ``moved`` as in _answer."""
         controller, actuator, sensor, applied = self._answer(state, moved)
         plant, displacement = self._move(state, input)
         return BrokenState(controller, actuator, plant, sensor, displacement, applied)
@@ -125,7 +125,7 @@ class BrokenLoop(System):
     ) -> tuple[State, State, State, Signal]:
         """Return the states of controller, actuator and sensor, and the voltage.
 
-        ``moved`` is what r(k) and r(k+1) differ from the reference.
+        ``moved`` holds the deviations of r(k) and r(k+1) from the reference.
         """
         loop, reference = self.loop, _pushed(self.reference, self.reference_push)
         no_noise = jax.tree.map(jnp.zeros_like, state.displacement)
@@ -146,8 +146,9 @@ class BrokenLoop(System):
 class FollowedLoop(BrokenLoop):
     """A BrokenLoop whose reference moves too.
 
-    Input: the voltage injected into the plant, V, and what r(k) and r(k+1) differ from
-    the reference, um. Output: that of a BrokenLoop, V, and the displacement y(k), um.
+    Input: the voltage injected into the plant, V, and the deviations of r(k) and r(k+1)
+    from the reference, um. Output: that of a BrokenLoop, V, and the displacement y(k),
+    um.
     """
 
     @property
@@ -243,7 +244,7 @@ def open_loop(loop: Feedback, at: Any = 0.0) -> StateSpace:
 
     L has one input and one output for each axis. The closed loop is ``A - B C``, since
     D = 0: a plant responds one sample later. ``at`` as for ``broken_loop``; usable
-    inside ``jax.jit``. Raises ValueError as ``loop_sample_time`` and ``linearise``.
+    inside ``jax.jit``. Raises ValueError as ``loop_sample_time`` and ``linearise`` do.
     """
     point = OperatingPoint.at(at)
     dt = point.sample_time(loop)

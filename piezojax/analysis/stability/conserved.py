@@ -20,7 +20,7 @@ class LinearLoop(NamedTuple):
     """L of one axis as NumPy matrices: A [n, n], B [n], C [n]; ``dt`` in s.
 
     ``conserved`` is the number of conserved modes that have been removed. ``followed``
-    is the closed loop from its reference on, None if that is not known.
+    is the closed loop from reference to displacement, None if it is not known.
     """
 
     A: np.ndarray
@@ -65,7 +65,7 @@ class FollowedReference(NamedTuple):
     conserved: int = 0
 
     def closed(self) -> np.ndarray:
-        """Return the state matrix, that of a closed loop already."""
+        """Return the state matrix, which is that of the closed loop."""
         return self.A
 
     def response(self, angle: np.ndarray) -> np.ndarray:

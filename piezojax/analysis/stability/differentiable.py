@@ -90,10 +90,10 @@ class SmallMotion(System):
 
 
 class SmallFollowing(SmallMotion):
-    """Closed loop linearised around an operating point, from its reference on.
+    """Closed loop linearised around an operating point, from reference to displacement.
 
-    Input: what r(k) and r(k+1) differ from the reference of ``broken``, um. Output:
-    what the displacement y(k) differs from it, um.
+    Input: the deviations of r(k) and r(k+1) from the reference of ``broken``, um.
+    Output: the deviation of the displacement y(k) from it, um.
     """
 
     def _moved(self, state: BrokenState, input: Any) -> tuple[BrokenState, Scalar]:
@@ -120,7 +120,7 @@ def sensitivity(
 def sensitivities(
     loop: Feedback, at: Any = 0.0, duration: float | None = None
 ) -> Sensitivity:
-    """Return S [branches, lines, axes, axes]; otherwise as ``sensitivity``.
+    """Return S [branches, lines, axes, axes]; all else is as in ``sensitivity``.
 
     The branch of ``at`` is ignored.
     """
@@ -133,7 +133,7 @@ def references_followed(
     """Return y/r of a loop of one axis, at the lines of ``sensitivities``.
 
     It is the response of the displacement to a small impulse of the reference. ``at``
-    and the errors raised as for ``sensitivities``.
+    and the errors raised are those of ``sensitivities``.
     """
     point = OperatingPoint.at(at)
     samples = _samples(point.sample_time(loop))
@@ -151,7 +151,7 @@ def references_followed(
 def sensitivity_peak(
     loop: Feedback, at: Any = 0.0, duration: float | None = None
 ) -> Float[Array, ""]:
-    """Return Ms as ``peak_of``; arguments as for ``sensitivity``."""
+    """Return Ms as ``peak_of`` does; the arguments are those of ``sensitivity``."""
     return peak_of(sensitivity(loop, at, duration))
 
 
@@ -353,9 +353,10 @@ def _least_of_axes(
 def _gain_crossings(
     sensitivity: Complex[Array, " lines"],
 ) -> tuple[Array, Array, Array]:
-    """Return the lag behind -1 and the place, rad, where |L| = 1 between two lines.
+    """Return phase and frequency (rad/sample) at which |L| = 1 between two lines.
 
-    Both are interpolated. The third array tells between which lines |L| crosses 1.
+    The phase (rad) is the lag that would move L to -1. Both are interpolated. The third
+    array is True between the lines where |L| crosses 1.
     """
     loop = 1.0 / sensitivity[1:] - 1.0
     angle = jnp.linspace(0.0, jnp.pi, sensitivity.size)[1:]
@@ -375,8 +376,9 @@ def bandwidth_of(
 ) -> Float[Array, ""]:
     """Return the lowest frequency, Hz, at which |y/r| falls below -3 dB.
 
-    It is interpolated between two lines, and the Nyquist frequency if |y/r| does not
-    fall below -3 dB. 0 Hz, where a line may already be below, counts as one line.
+    It is interpolated between two lines. If |y/r| does not fall below -3 dB, it is the
+    Nyquist frequency; if it is below at 0 Hz already, 1e-3 of the distance of two
+    lines, so that its logarithm is finite.
     """
     gain = jnp.log(jnp.abs(followed)) - BAND
     below = gain < 0.0

@@ -1,4 +1,4 @@
-"""How a loop follows small motions of its reference, over frequency."""
+"""Closed-loop frequency response of the displacement to the reference."""
 
 import math
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ PER_DECADE = 100
 
 @dataclass(frozen=True)
 class Following:
-    """How the displacement follows small motions of the reference, on one axis.
+    """Bandwidth and peak of the response to small motions of the reference, one axis.
 
     y/r is that of the loop linearised on one branch of its hysteresis, with its
-    feedforward; a step leaves the branch, and is simulated instead (``step_response``).
+    feedforward. A step leaves the branch and is simulated instead (``step_response``).
 
     - ``bandwidth_Hz``, ``bandwidth_1dB_Hz``: lowest frequencies at which |y/r| falls
       below -3 dB and -1 dB; infinite if it does not below the Nyquist frequency;
@@ -31,7 +31,7 @@ class Following:
 
 
 def following_of(loop: FollowedReference) -> Following | None:
-    """Return the figures of ``loop``, None if a mode of it does not decay."""
+    """Return the figures of ``loop``, None if one of its modes does not decay."""
     if np.abs(np.linalg.eigvals(loop.A)).max(initial=0.0) >= 1.0:
         return None
 

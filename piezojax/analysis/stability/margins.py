@@ -55,8 +55,8 @@ class StabilityReport:
       disk margins, 2020;
     - ``sensitivity_peak``: Ms = max |S|; ``complementary_peak``: Mt = max |T|.
 
-    - ``following``: how the displacement follows small motions of the reference; None
-      where L alone is known.
+    - ``following``: bandwidth and peak of the response to small motions of the
+      reference; None if only L is known.
 
     ``reference_um``, ``voltage_V`` and ``branch`` are the operating point. Frequencies
     in Hz, angles in degrees.
@@ -160,7 +160,7 @@ def linear_axes(loop: Feedback, at: Any) -> tuple[LinearAxes, LinearAxes, LoopSt
 
 
 def _cut_behind(loop: LinearAxes) -> LinearAxes:
-    """Return L cut where the sensors read, of a loop cut at the plant's inputs.
+    """Return L cut at the displacements, from the loop cut at the plant's inputs.
 
     Input: the displacements that the sensors read, um. Output: minus those of the
     plant, um. Its S maps a disturbance of the displacements to them. The displacements
@@ -191,7 +191,7 @@ def _matrices(
             "it cannot be linearised there"
         )
     axes = len(jax.tree.leaves(start.voltage))
-    assert not D[:, :axes].any()  # the plant answers one sample later
+    assert not D[:, :axes].any()  # the plant responds one sample later
     return A, B, C, D, dt, start
 
 

@@ -42,7 +42,7 @@ class OperatingPoint:
 
     @classmethod
     def at(cls, place: Any) -> "OperatingPoint":
-        """Return ``place`` if it is an OperatingPoint, else rest at that reference."""
+        """Return ``place`` if it is an OperatingPoint, else rest at this reference."""
         return place if isinstance(place, OperatingPoint) else cls(place)
 
     @property
@@ -58,7 +58,7 @@ class OperatingPoint:
     def sample_time(self, loop: Feedback) -> float:
         """Return ``dt`` (s) if it is given, else the sample time of ``loop``.
 
-        Raises ValueError as ``loop_sample_time``.
+        Raises ValueError as ``loop_sample_time`` does.
         """
         return loop_sample_time(loop) if self.dt is None else self.dt
 
