@@ -35,12 +35,12 @@ class Case:
 
     ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
     names to the plants of a sweep, which replace the plant of the loop. ``notes`` are
-    sentences: on starts that differ from the controller of the study, and on a design
-    whose voltage stays within the record. ``plant_about`` is the origin of a plant from
-    a record or a file, with the bound on its error. ``amplifier`` maps the voltage of
-    the actuator to that of the piezo, both in V; it is part of the plant, and None if
-    the study has none. ``beside`` maps names to the controllers that the tuned one is
-    compared with.
+    sentences about starts that differ from the controller of the study, and about a
+    design whose voltage stays within the record. ``plant_about`` is the origin of a
+    plant from a record or a file, with the bound on its error. ``amplifier`` maps the
+    voltage of the actuator to that of the piezo, both in V; it is part of the plant,
+    and None if the study has none. ``beside`` maps names to the controllers to which
+    the tuned one is compared.
     """
 
     study: Study
@@ -190,7 +190,7 @@ def _swept_plants(study: Study, zero: Any) -> dict[str, System]:
 def _with_gains(
     controller: System, gains: Mapping[str, float], study: Study, where: str
 ) -> System:
-    """Return a ``controller`` of the rate of ``study`` with other ``gains``, by path.
+    """Return ``controller`` with other ``gains``, by path, for the rate of ``study``.
 
     Raises ValueError, starting with ``where``, for a wrong rate, path or value.
     """
@@ -213,9 +213,9 @@ def _designed(
 ) -> System:
     """Return the controller of a design.
 
-    A fitted hysteresis that has no inverse between the limits of the actuator may have
-    one over its record, beyond which it extrapolates: then the voltage stays within the
-    record, and ``note`` takes a sentence that says so.
+    A fitted hysteresis without an inverse between the limits of the actuator may have
+    one over the range of its record, beyond which it extrapolates. The voltage then
+    stays within the record, and ``note`` is called with a sentence on this.
     """
     design = DESIGNS[one_of(name, DESIGNS)]
     if study.axes is not None:

@@ -117,9 +117,9 @@ def ensemble_of(
 ) -> Ensemble | None:
     """Return the ensemble of ``study``, or None if the study has none.
 
-    Drawn plants have the ``amplifier`` of the nominal one in front. The files that the
-    study names lie in ``folder``. Raises ValueError for an unknown deviation or path,
-    and for a file without standard errors.
+    Drawn plants stand behind the same ``amplifier`` as the nominal one. The files that
+    the study names lie in ``folder``. Raises ValueError for an unknown deviation or
+    path, and for a file without standard errors.
     """
     table = study.ensemble
     if table is None:
@@ -135,7 +135,7 @@ def ensemble_of(
             plants = ", ".join(plant for plant in PLANTS if deviations_of(plant))
             raise ValueError(
                 "ensemble: plant.catalog must be one whose variations are known: "
-                f"{plants}; for others name paths, as plant.0.a"
+                f"{plants}; for other plants give paths, such as plant.0.a"
             )
         make = _behind(amplifier, PLANTS[name])
         for deviation in varied:
@@ -161,7 +161,7 @@ def ensemble_of(
 def _behind(
     amplifier: System | None, make: Callable[..., System]
 ) -> Callable[..., System]:
-    """Return ``make`` of a plant, with the plant behind ``amplifier``."""
+    """Return ``make`` with the plant that it makes behind ``amplifier``."""
 
     def made(**deviations: Any) -> System:
         return driven(amplifier, make(**deviations))

@@ -21,9 +21,9 @@ class EnsembleTable(Table):
     The objective includes the nominal stage and ``tune`` drawn stages. Margins are
     limited on the nominal stage and on ``margins`` drawn ones, the first of which are
     those of ``tune``: a search uses the worst, and all are checked at its end. The
-    tuned gains are evaluated on
-    ``holdout`` other stages. ``aggregate`` combines the objectives of the stages: their
-    mean, the worst, or the mean of the worst share ``tail`` (CVaR).
+    tuned gains are evaluated on ``holdout`` other stages. ``aggregate`` combines the
+    objectives of the stages: their mean, the worst, or the mean of the worst share
+    ``tail`` (CVaR).
     """
 
     spread: dict[str, Positive] = Field(default_factory=dict)
@@ -39,7 +39,7 @@ class EnsembleTable(Table):
     def _consistent(self) -> "EnsembleTable":
         if not (self.spread or self.range or self.standard_errors):
             raise ValueError(
-                "one of spread, range, standard_errors must name something"
+                "spread, range and standard_errors are empty; give at least one of them"
             )
         for name, (low, high) in self.range.items():
             if low >= high:

@@ -45,8 +45,8 @@ def make_actuator(study: Study) -> System:
 def make_amplifier(study: Study) -> System | None:
     """Return the delay and the bandwidth between actuator and plant, V to V.
 
-    The controller does not know the voltage behind them. None without either. Raises
-    ValueError for a delay above ``LONGEST`` samples.
+    The controller does not know the voltage behind them. None if the study has neither.
+    Raises ValueError for a delay above ``LONGEST`` samples.
     """
     table = study.actuator
 

@@ -21,8 +21,8 @@ def search_space(
 ) -> tuple[Feedback, Space, tuple[str, ...]]:
     """Return ``loop`` with the starts of the study, its Space, and notes on starts.
 
-    A parameter that only a pattern of ``tune`` matches may be 0 in the controller,
-    switched off, although 0 lies outside its logarithmic range. The search then
+    A parameter that only a pattern of ``tune`` matches may be 0 in the controller
+    (switched off), although 0 lies outside its logarithmic range. The search then
     starts from the lower bound of the range, and a note says so.
 
     Raises ValueError, naming the path, for a path that is not a scalar of the

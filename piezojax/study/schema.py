@@ -99,9 +99,10 @@ class TunedTable(RangeTable):
 
 
 class BesideTable(Table):
-    """Controller that is not tuned, with figures beside those of the tuned one.
+    """Controller that is not tuned, to compare the tuned one with.
 
-    ``controller`` is a table as that of the study. ``gains`` are values by path in it.
+    ``controller`` is a table like that of the study. ``gains`` are values by path in
+    it.
     """
 
     controller: dict[str, Any]
@@ -165,7 +166,7 @@ class Study(Table):
     ``rate`` is the sampling rate, Hz. ``tune`` names parameters to tune: paths in the
     loop, or patterns such as ``controller.feedback.*``. ``parameters`` names further
     ones. It also overrides the declared bounds, scales and starts. ``beside`` names
-    controllers that the tuned one is compared with.
+    controllers to which the tuned one is compared.
     """
 
     title: str

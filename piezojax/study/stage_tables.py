@@ -19,7 +19,7 @@ class RecordPlant(Table):
     ``time``, ``input`` and ``output`` are columns, by name or number; ``train`` is the
     first sample of the fitted part and the sample after its last. ``record_rate`` is
     the sampling rate of the records, Hz. ``check`` are other records of the stage, with
-    the same columns, that the fitted plant is validated on.
+    the same columns, on which the fitted plant is validated.
     """
 
     record: Path
@@ -47,9 +47,10 @@ class RecordPlant(Table):
 class ElectronicsTable(Table):
     """Electronics between the controller and the stage; each entry may be left out.
 
-    Of the converter, ``resolution`` is one step, or ``bits`` divide its ``range``; both
-    in the unit of the signal. ``bandwidth`` (Hz) and ``order`` (1 to 4) are those of a
-    Butterworth low-pass, ``delay`` is in s.
+    The step of the converter is ``resolution``, or its ``range`` divided by 2 to the
+    power of ``bits``; ``resolution`` and ``range`` are in the unit of the signal.
+    ``bandwidth`` (Hz) and ``order`` (1 to 4) are those of a Butterworth low-pass,
+    ``delay`` is in s.
     """
 
     resolution: ByAxis[Positive] | None = None

@@ -200,7 +200,7 @@ def test_shipped_studies_build_and_start_inside_their_bounds(name):
         ({"axes": {"names": ["Z", "z"], "units": ["um"] * 2}}, r"names are Z, z; "),
         ({"axes": {"names": ["Z", "R"], "units": ["um", "mm"]}}, r"'mm' is unknown"),
         ({"ensemble": {"spread": {"mass": 0.1}}}, r"mass is unknown; p558 varies in"),
-        ({"ensemble": {"spread": {}}}, r"ensemble: one of spread, range, standard_err"),
+        ({"ensemble": {"spread": {}}}, r"ensemble: spread, range and standard_err"),
         ({"controller": {"catalog": "p753_pid"}}, r"controller is a PID; it must map"),
     ],
 )  # fmt: skip
