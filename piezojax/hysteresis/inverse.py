@@ -107,7 +107,7 @@ class InverseHysteresis(Inverse):
             rises = slope > 0.0
             newton = voltage - error / jnp.where(rises, slope, 1.0)
             newton = jnp.clip(newton, lower, upper)
-            # A step of a few rounding errors has converged, also where the bracket ends.
+            # A step of rounding size has converged, even at an end of the bracket.
             converged = jnp.abs(newton - voltage) <= CONVERGED * (upper - lower)
             inside = ((newton > low) & (newton < high)) | converged
             middle = 0.5 * (jnp.maximum(low, lower) + jnp.minimum(high, upper))
