@@ -16,7 +16,7 @@ HYSTERESES = (
     "asymmetric_prandtl_ishlinskii",
     "normalised_bouc_wen",
 )
-"""Hysteresis models to choose from, that with the fewest parameters first. They
+"""Hysteresis models to choose from, the one with the fewest parameters first. They
 represent three classes of loops: around an anhysteretic curve, with a memory that is
 wiped out, and with a memory that decays along the input."""
 
@@ -42,7 +42,7 @@ def automatic(
     """Return the default chain for ``record``, the training samples.
 
     The hysteresis is the one with the least error after short fits to ``record`` and
-    those ``beside`` it, which are made at a lower sampling rate if that resolves the
+    the records ``beside`` it. These fits use a lower sampling rate if it resolves the
     resonances.
     """
     hysteresis = hysteresis_for([record, *beside], progress)
@@ -69,7 +69,7 @@ def hysteresis_for(records: Sequence[Record], progress: Progress | None = None) 
 
 
 def _slowing(record: Record) -> int:
-    """Return the number of samples of ``record`` in one of a trial."""
+    """Return the number of samples of ``record`` per sample of a trial."""
     every = record.samples // SAMPLES
     modes = dynamics_of(record).modes
     if modes:
@@ -79,7 +79,7 @@ def _slowing(record: Record) -> int:
 
 
 def _slowed(record: Record, every: int) -> Record:
-    """Return ``record`` with ``every`` so many samples made one."""
+    """Return ``record`` at a rate lower by the factor ``every``."""
     import scipy.signal  # takes long to import
 
     if every < 2:
@@ -92,11 +92,11 @@ def _slowed(record: Record, every: int) -> Record:
 
 
 def _error(name: str, records: Sequence[Record]) -> float:
-    """Return the rms error after a short fit; with several records, after one to each.
+    """Return the rms error of short fits, one to each of ``records``.
 
-    The error of a fit to one of several is that on the others. It is infinite if there
-    is no fit, or if the fitted hysteresis has no inverse over the range of the input,
-    which designs of controllers need.
+    With several records the error of a fit is that on the other records. It is infinite
+    if there is no fit, or if the fitted hysteresis has no inverse over the range of the
+    input, which designs of controllers need.
     """
     first = records[0]
     shape = structure(f"{name}+{CREEP}+{dynamics_parts(first)}", first)

@@ -158,7 +158,7 @@ def first_round(
             for excluded in untried
             if excluded.model in names
         )
-        raise ValueError(f"none of them can be tried: {reasons}")
+        raise ValueError(f"none of the named models can be tried: {reasons}")
     several = _not_single_channel(records)
     if several:
         return whole, [*(UntriedModel(name, several) for name in parts), *untried]
@@ -308,4 +308,5 @@ _OBJECTIONS = {
     PLAIN: partial(_objection_to_preisach, PLAIN),
     RATE_DEPENDENT: partial(_objection_to_preisach, RATE_DEPENDENT),
 }
-"""Functions that return why a model is not tried; without one it is always tried."""
+"""Functions that return the reason not to try a model, or None. A model without such a
+function is always tried."""

@@ -35,7 +35,7 @@ def identify_all(
     the richest creep and dynamics that the records support, a linear model, and the
     models that are not chains of parts. Further rounds fit the best few with other
     creeps or none, and with simpler dynamics. Failed and unsupported models are rows of
-    the report. ``train`` and ``validate`` are as in ``identify``; left out, they are
+    the report. ``train`` and ``validate`` are as in ``identify``; by default they are
     the halves of the samples before ``test``. ``done`` receives the ranking so far,
     marked as interrupted, after each fit. Ctrl-C ends the search and keeps the models
     fitted so far.
@@ -115,7 +115,7 @@ def _split(
         if part.start < test.stop and test.start < part.stop:
             raise ValueError(
                 f"test {test.start}:{test.stop} shares samples with {name} "
-                f"{part.start}:{part.stop}; it must hold others"
+                f"{part.start}:{part.stop}; they must not overlap"
             )
     return train, validate, test
 

@@ -104,8 +104,8 @@ def ranking(
 ) -> tuple[list[int], list[bool]]:
     """Return the order of the fits, best first, and whether each validates as well.
 
-    Fits whose ``validation`` errors are as good as the smallest come first. Both groups
-    are sorted by BIC, lowest first.
+    Fits whose ``validation`` errors are not significantly above the smallest come
+    first. Both groups are sorted by BIC, lowest first.
     """
     squares = [float(np.mean(np.concatenate(errors) ** 2)) for errors in validation]
     best = validation[int(np.argmin(squares))]

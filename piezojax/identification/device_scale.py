@@ -35,9 +35,11 @@ def _e727(option: str, **typed: Any) -> Device:
 
 
 class _Known(NamedTuple):
-    """How to make a device of scale 1 from an option and the gains typed into it.
+    """Device whose scale can be measured: constructor, gains and unknown option.
 
-    ``option`` is what the manual leaves open, ``values`` are its possible values.
+    ``make`` returns the device of scale 1 for an option and the gains typed into it.
+    ``option`` is a property that the manual does not specify, with the possible
+    ``values``.
     """
 
     make: Callable[..., Device]
@@ -72,7 +74,7 @@ class Measured(BaseModel):
 
 
 class DeviceScale(BaseModel):
-    """Gains of a device as they act, and the scale of the numbers typed in.
+    """Effective gains of a device, and the scale of the numbers typed in.
 
     ``proportional``, ``integral`` and ``derivative`` are the effective gains of a PID
     that integrates as the ``option`` says. ``scale`` is V per um for a gain of 1.
@@ -110,10 +112,10 @@ def device_scale(
     P e + I sum + D (e - e1)/dt plus a constant: no model of the stage is needed.
 
     The value of the device's option that fits best is returned; a note names others
-    that fit as well, and what to record. Raises ValueError for an unknown or missing
-    gain, an unknown device, a wrong unit or rate, more than one channel, gains that are
-    all 0, a record that does not determine them or has the wrong sign, and for a record
-    that the typed gains do not explain.
+    that fit as well, and the record that distinguishes them. Raises ValueError for an
+    unknown or missing gain, an unknown device, a wrong unit or rate, more than one
+    channel, gains that are all 0, a record that does not determine them or has the
+    wrong sign, and for a record that the typed gains do not explain.
     """
     check_option("device", device, DEVICES)
     known = DEVICES[device]
@@ -165,8 +167,8 @@ def device_scale(
     notes = []
     if alike:
         notes.append(
-            f"{known.option} may as well be {' or '.join(alike)}: to tell, record with "
-            "gains P, I and D above 0 together, P other than 1"
+            f"{known.option} may also be {' or '.join(alike)}: to distinguish them, "
+            "record with P, I and D all above 0 and P other than 1"
         )
     trapezoid = best == "trapezoidal"
     shift = np.array([[1.0, 0.5 * dt * trapezoid, 0.0], [0, 1, 0], [0, 0, 1]])
@@ -231,7 +233,7 @@ def _fit(error: np.ndarray, voltage: np.ndarray, dt: float, lag: int) -> _Fit:
     freedom = max(wanted.size - 4, 1)
     variance = float(left @ left) / freedom
     scatter = np.linalg.inv((columns / size).T @ (columns / size))
-    # Without noise the rounding of the numbers is what is left.
+    # Without noise only the rounding of the numbers remains.
     variance = max(variance, (1e-9 * float(np.std(wanted))) ** 2)
     covariance = variance * scatter / np.outer(size, size)
     return _Fit((solution / size)[:3], covariance[:3, :3], float(np.sqrt(variance)))

@@ -29,7 +29,7 @@ POOR = 0.2
 """Validation error, as a share of the output's deviation, above which to warn."""
 
 MISSED = 0.1
-"""Relative distance of all poles from a resonance from which a model lacks it."""
+"""Least relative distance of the nearest pole from a resonance that a model lacks."""
 
 
 class FitError(BaseModel):
@@ -173,7 +173,7 @@ class Fit:
         """The simulated output of the first record, which has only one."""
         if self.simulations[0].shape[1] != 1:
             raise ValueError(
-                f"the model has {self.simulations[0].shape[1]} outputs; this needs one"
+                f"the model has {self.simulations[0].shape[1]} outputs; it needs one"
             )
         return self.simulations[0][:, 0]
 
@@ -197,8 +197,8 @@ def identify(
     ``method`` is a name in METHODS; left out, it is the first that can fit the model.
     The model is fitted over the samples ``train`` of each record (the first half of the
     longest if left out) and validated by its free run on ``validate`` (the rest if left
-    out); a record without samples there is only fitted. Each of several records has a
-    zero and a state before it of its own. The records of the fit are the longest first.
+    out); a record without samples there is only fitted. Each of several records has its
+    own zero and its own state before it. The records of the fit are the longest first.
     Raises ValueError for an unknown model or method, an empty part, records of
     different sample time or units, or if no start leads to a finite fit.
     """
@@ -232,7 +232,7 @@ def identify(
         record_warnings,
         train=train,
         validate=validate,
-        # A resonance that shows was excited.
+        # A resonance that appears in the record was excited.
         order=0 if shown.modes else estimate.order,
         hysteresis=estimate.hysteresis,
     )

@@ -1,4 +1,4 @@
-"""Judgement of a saved model on other records of its stage."""
+"""Validation of a saved model on other records of its stage."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -29,13 +29,13 @@ WINDOWS = 40
 """Stretches in which the error is compared with amplitude and rate."""
 
 DISTINCT = 1.5
-"""Ratio of amplitudes or rates from which the errors at them are told apart."""
+"""Least ratio of amplitudes or rates for which errors are reported separately."""
 
 WORSE = 2.0
-"""Factor over the error on the model's own record from which a note says so."""
+"""Least ratio to the error on the model's own record that raises a note."""
 
 BEYOND = 0.1
-"""Share of the recorded range by which an input leaves it."""
+"""Share of the recorded range by which an input must leave it to raise a note."""
 
 
 class PartError(BaseModel):
@@ -125,7 +125,7 @@ def validate(
     """
     records = (records,) if isinstance(records, Record) else tuple(records)
     if not records:
-        raise ValueError("no record to judge the model on")
+        raise ValueError("there is no record to validate the model on")
     records = tuple(_as_of_model(record, about) for record in records)
     found = [_judged(system, about, record, estimate) for record in records]
     alarms, notes = (
@@ -303,9 +303,9 @@ def _by_input(record: Record, error: np.ndarray, part: slice) -> list[PartError]
 
 
 def _error_alarms(check: RecordCheck, about: About, share: float) -> Iterator[str]:
-    """Yield an alarm if the error is large against the motion, and unexpected.
+    """Yield an alarm if the error is large compared with the motion, and unexpected.
 
-    A record of small motions may hold little but the error that the fit had too.
+    On a record of small motions an error as small as that of the fit raises no alarm.
     """
     times = check.times_fit
     if share <= POOR or (times is not None and times <= WORSE):

@@ -64,7 +64,7 @@ def test_named_ones_are_tried_beside_linear_models():
 
 
 def test_named_ones_of_which_none_can_be_tried():
-    with pytest.raises(ValueError, match="none of them can be tried: bouc_wen: it nee"):
+    with pytest.raises(ValueError, match="none of the named models can be tried: bouc"):
         first_round([RICH], HALF, OPTIONS, ["bouc_wen"])
 
 

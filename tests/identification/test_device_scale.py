@@ -73,7 +73,7 @@ def test_an_integral_alone_does_not_tell_half_from_whole():
     found = device_scale("nv200", record, {"kp": 0.0, "ki": 70.0, "kd": 0.0})
     assert found.option == {"integration": "rectangular"}
     (note,) = found.notes
-    assert note.startswith("integration may as well be half: to tell, record with")
+    assert note.startswith("integration may also be half: to distinguish them, rec")
 
 
 @pytest.mark.parametrize("structure", ["series", "parallel"])

@@ -86,7 +86,7 @@ def test_several_outputs_have_an_error_each():
     each = np.sqrt(np.mean((fit.simulations[0] - outputs)[fit.validate] ** 2, axis=0))
     np.testing.assert_allclose(fit.report.validation.each, each)
     assert fit.report.validation.rmse == pytest.approx(np.sqrt(np.mean(each**2)))
-    with pytest.raises(ValueError, match="the model has 2 outputs; this needs one"):
+    with pytest.raises(ValueError, match="the model has 2 outputs; it needs one"):
         _ = fit.simulated
 
 

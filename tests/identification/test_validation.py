@@ -276,7 +276,7 @@ def test_records_that_cannot_be_judged(about, changes, estimate, message):
 def test_a_model_of_other_channels():
     u = excitation(500)
     two = np.stack([u, u + np.arange(500.0)], axis=1)
-    with pytest.raises(ValueError, match="no record to judge"):
+    with pytest.raises(ValueError, match="no record to validate"):
         validate(MODEL, ABOUT, [])
     with pytest.raises(ValueError, match=r"2 input columns; 1 are needed"):
         validate(MODEL, ABOUT, Record(two, u, DT, source="two.csv"))

@@ -1,7 +1,8 @@
-"""State of a stage before a record: that after a slow motion between two levels.
+"""State of a stage before a record, modelled by a slow motion between two levels.
 
-The last two turning points determine most of the state of a hysteresis. A record tells
-them by its first part: the pair is taken whose free run scatters least about it.
+The last two turning points determine most of the state of a hysteresis. They are
+estimated from the first part of a record: the free run of the pair that is chosen
+scatters least about this part.
 """
 
 import math
@@ -34,13 +35,14 @@ DEVIATION = 0.3
 between rest at both ends of the input's range."""
 
 REFINEMENTS = 3
-"""Estimates of the linear states, each with the variance that the last one left."""
+"""Number of estimates of the linear states, each with the residual variance of the
+estimate before."""
 
 FEW = 3
-"""Most states of a hysteresis that are corrected as those of linear parts are."""
+"""Largest number of states of a hysteresis that are corrected like linear states."""
 
 RESOLVED = 1e-12
-"""Relative singular value of the normal equations of a start that is resolved."""
+"""Least relative singular value that is resolved in the normal equations of a start."""
 
 
 def run_after(
@@ -68,7 +70,7 @@ def _state_after(system: System, first: Array, levels: Array) -> State:
 
 
 def _run_from(system: System, inputs: Array, state: State) -> Array:
-    """Return the outputs from the ``state`` one sample before the record on."""
+    """Return the outputs from ``state``, which is one sample before the record."""
     _, outputs = simulate(system, jnp.concatenate([inputs[:1], inputs]), state)
     return outputs[:-1]
 
@@ -81,10 +83,11 @@ def linear_responses(
 ) -> Array:
     """Return the free responses [states, samples, p] of the linear parts of ``system``.
 
-    Each is that to a deviation of one state before the record, as large as the state
-    differs at rest between both ``ends`` of the inputs. A hysteresis with many states
-    has none: its state is that of the path over ``levels``. The few states of others
-    fade along the path of the input, and nearly linearly.
+    Each is the response to a deviation of one state before the record. The deviation
+    equals the difference of this state between rest at both ``ends`` of the inputs. A
+    hysteresis with many states has no such response: the path over ``levels``
+    determines its state. The few states of other models fade along the path of the
+    input, nearly linearly.
     """
     state = _state_after(system, inputs[0], levels)
     flat, unravel = ravel_pytree(_linear_states(system, state))
@@ -169,11 +172,11 @@ def levels_before(
 
 
 class Start(eqx.Module):
-    """What came before a record: a slow motion over two levels of the input, and more.
+    """State before a record: after a slow motion over two levels of the input.
 
     ``ends`` are those of the range of the inputs. The zeros of the outputs and the
-    linear states before the record are as the record tells, where the errors that they
-    leave have the ``variance`` (``most_likely``).
+    linear states before the record are those that are ``most_likely`` if the other
+    errors have the ``variance``.
     """
 
     levels: Float[Array, " 2 *m"]
@@ -184,9 +187,10 @@ class Start(eqx.Module):
 def start_columns(
     system: System, inputs: Float[Array, " samples *m"], start: Start
 ) -> Float[Array, "k samples p"]:
-    """Return what is unknown before a record: zeros, then states of linear parts.
+    """Return the effect of the unknowns before a record: zeros, then linear states.
 
-    A zero has its unit, a state DEVIATION of its difference between rest at both ends.
+    A zero is 1 in the unit of the output. A state is DEVIATION times its difference
+    between rest at both ends.
     """
     responses = linear_responses(system, inputs, start.levels, start.ends)
     outputs = math.prod(responses.shape[2:])
@@ -202,12 +206,12 @@ def most_likely(
     counted: Float[Array, " samples"],
     variance: Float[Array, ""],
 ) -> Float[Array, " k"]:
-    """Return the amounts of ``columns`` that most likely are in ``error``.
+    """Return the most likely amounts of ``columns`` in ``error``.
 
-    The states have a standard deviation of 1 (DEVIATION of their difference between
-    both ends), the zeros any, and the other errors the ``variance``; only the samples
-    ``counted`` with 1 tell. It is the least-squares solution with the square of the
-    states' amounts, ``variance`` times, added (``state_amounts``).
+    The amounts of the states have a standard deviation of 1 (see ``start_columns``),
+    those of the zeros an infinite one, and the other errors have the ``variance``. Only
+    samples with ``counted`` equal to 1 are used. The amounts minimise the sum of the
+    squared errors plus ``variance`` times the squared amounts of the states.
     """
     seen = columns * counted[:, None]
     normal = jnp.einsum("ksp,lsp->kl", seen, seen)
@@ -238,9 +242,10 @@ def start_of(
     part: slice,
     ranges: np.ndarray,
 ) -> tuple[Start, np.ndarray, np.ndarray]:
-    """Return the start of a record from its samples ``part``, and the run from it.
+    """Return the start of a record, the run from it [samples, p], and the zeros [p].
 
-    Arguments as for ``levels_before``. Also the zeros [p]; the run is [samples, p].
+    The start is estimated on the samples ``part``. The arguments are those of
+    ``levels_before``.
     """
     levels = levels_before(system, inputs, outputs, part, ranges)
     y = outputs.reshape(len(outputs), -1)

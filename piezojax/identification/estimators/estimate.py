@@ -19,7 +19,7 @@ class FittedParameter(BaseModel):
 
 
 EDGE = 1e-3
-"""Distance to a bound, as a share of the range, within which a parameter is at it."""
+"""Distance, as a share of the range, within which a parameter is at a bound."""
 
 
 def bound_warning(name: str, place: float) -> list[str]:

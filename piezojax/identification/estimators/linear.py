@@ -50,7 +50,8 @@ def by_subspace(
 ) -> Estimate:
     """Fit a state-space model to records that each drive one input channel in turn.
 
-    MAP estimates of the Hankel-Toeplitz model, channel by channel, stacked (chapter 6).
+    Each channel has its MAP estimate of the Hankel-Toeplitz model; the models of the
+    channels are stacked (chapter 6).
     """
     del model
     progress.stage(f"regression with {options.window} past and future samples")

@@ -103,7 +103,7 @@ class PreisachFit(NamedTuple):
 def distinguishable_cells(record: Record, train: slice, model: str = PLAIN) -> int:
     """Return the number of cells per side that the samples ``train`` determine, or 0.
 
-    They determine the cells whichever of the histories STARTS came before the record.
+    They determine the cells for each of the histories STARTS before the record.
     """
     seen = _delayed_input(record.until(train.stop))
     return next(

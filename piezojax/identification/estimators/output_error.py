@@ -38,7 +38,7 @@ ROUGH_STEPS = 24
 """Number of steps of a fit from which another one starts."""
 
 PASSES = 3
-"""Searches for the start of each of several records, each with a fit after it."""
+"""Number of searches for the starts of several records, each followed by a fit."""
 
 TOLERANCE = 1e-10
 """Relative change of loss and point below which a descent ends."""
@@ -58,7 +58,7 @@ class Optimum(NamedTuple):
     """Results of all starts, best first.
 
     ``units`` [starts, n] are points in the unit box, ``losses`` their mean squares.
-    ``finished`` tells whether the best descent ended by itself.
+    ``finished`` is True if the best descent ended by itself.
     """
 
     problem: "Problem"
@@ -76,9 +76,9 @@ class Optimum(NamedTuple):
 class Problem(eqx.Module):
     """Fit of one System to several records, padded to one length with zero weights.
 
-    A single record begins at rest. Each of several has a start of its own, stacked in
-    ``starts``. The errors behind the filter ``whitening``, if it has coefficients,
-    count ``share`` times.
+    A single record begins at rest. Each of several records has its own start, stacked
+    in ``starts``. The errors behind the filter ``whitening``, if it has coefficients,
+    have the weight ``share``.
     """
 
     system: System
@@ -95,11 +95,11 @@ class Problem(eqx.Module):
         return self._errors_and_starts(unit)[0]
 
     def _errors_and_starts(self, unit: Array) -> tuple[Array, Array]:
-        """Return the errors, and how unlikely the state before each record is.
+        """Return the errors, and the prior residuals of the state before each record.
 
-        The columns of the starts are held at ``unit``: the gradient of the squares does
-        not depend on them where the amounts are the most likely ones (variable
-        projection as in Kaufman, BIT 15, 1975, 49-57).
+        The columns of the starts are not differentiated: at the most likely amounts the
+        gradient of the squares does not depend on them (variable projection as in
+        Kaufman, BIT 15, 1975, 49-57).
         """
         system = self.space.put(self.system, unit)
         if self.starts is None:
@@ -139,7 +139,7 @@ class Problem(eqx.Module):
         return white
 
     def balanced(self, unit: Float[Array, " n"]) -> "Problem":
-        """Return the problem in which both kinds of errors at ``unit`` weigh alike."""
+        """Return the problem with equal norms of both kinds of errors at ``unit``."""
         error = self.errors(unit)
         plain = jnp.linalg.norm(self.weights * error)
         white = jnp.linalg.norm(self.weights * self.whitened(error))
@@ -147,7 +147,7 @@ class Problem(eqx.Module):
 
 
 def _bounded(error: Array) -> Array:
-    """Return ``error`` so that a start that diverges does not affect its batch."""
+    """Limit ``error``, so that a start that diverges does not affect its batch."""
     return jnp.where(jnp.isfinite(error), jnp.clip(error, -1e6, 1e6), 1e6)
 
 
@@ -200,9 +200,9 @@ def problem_of(
 def starts_of(
     system: System, records: Sequence[Record], train: slice
 ) -> tuple[list[Start], list[np.ndarray], list[float]]:
-    """Return the start of each of the ``records`` for ``system``.
+    """Return starts, runs [samples, 1] and zeros of the sensor, one for each record.
 
-    Also the runs from them [samples, 1] and the zeros of the sensor.
+    The starts are estimated for ``system`` on the samples ``train``.
     """
     ends = np.array([f([f(r.input) for r in records]) for f in (np.min, np.max)])
     found, runs, zeros = [], [], []
@@ -220,8 +220,8 @@ def free_runs(
 ) -> tuple[tuple[np.ndarray, ...], list[float]]:
     """Return the free run [samples, 1] of each of ``records``, and their zeros.
 
-    A single record begins at rest and has no zero of its own; the start of each of
-    several is as its samples ``train`` tell.
+    A single record begins at rest and has no zero of its own; the starts of several
+    records are estimated on their samples ``train``.
     """
     if len(records) > 1:
         _, runs, zeros = starts_of(system, records, train)

@@ -66,11 +66,11 @@ def fit_rate_dependent_preisach(
     smoothing: float = 0.0,
     start: str = "virgin",
 ) -> RateDependentPreisach:
-    """Return the two densities, half way at ``rate`` (V/s), that fit ``record`` best.
+    """Return the two densities, of equal share at ``rate`` (V/s), that fit best.
 
     For a given rate the output (2.10) is linear in both densities. Each is fitted as in
-    fit_preisach. A record with a single speed does not determine both.
-    Raises ValueError as fit_preisach, and for ``rate <= 0``.
+    fit_preisach. A record with a single speed does not determine both. Raises
+    ValueError as fit_preisach does, and for ``rate <= 0``.
     """
     slow = empty(record, cells, limits, start)
     shape = RateDependentPreisach(slow, slow.weights, rate, record.dt)

@@ -46,13 +46,13 @@ class RecursiveLeastSquares(System):
     """Recursive least squares for the coefficients of a ``HystereticARMA``.
 
     The input is ``Measured``, the output the estimated ``HystereticARMA``. In a loop
-    the steps follow a plant that changes. ``c`` (1/V) is not estimated: take it from a
-    fit. ``forgetting`` is lambda in (0, 1]: a sample n samples old has the weight
-    lambda^n. ``prior`` is the variance of every coefficient before the first sample; a
-    larger one weakens the start at zero. The covariance is carried as a square root
-    (Potter's update), which stays positive over any run. Without noise, or at lambda =
-    1 and a large prior, the result is that of ``least_squares``, including its bias
-    under noise.
+    the estimate follows a plant that changes. ``c`` (1/V) is not estimated: take it
+    from a fit. ``forgetting`` is lambda in (0, 1]: a sample n samples old has the
+    weight lambda^n. ``prior`` is the variance of every coefficient before the first
+    sample; a larger one weakens the start at zero. The covariance is carried as a
+    square root (Potter's update), which stays positive over any run. Without noise, or
+    at lambda = 1 and a large prior, the result is that of ``least_squares``, including
+    its bias under noise.
 
     Raises ValueError for ``c >= 0``, forgetting outside (0, 1], a prior that is not
     positive, no coefficients or an unknown scheme.

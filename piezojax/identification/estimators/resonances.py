@@ -1,9 +1,9 @@
 """Linear dynamics that a record of a hysteretic stage shows: modes, lags, delay.
 
-The stage is taken as plays followed by a transfer function (a Hammerstein model), both
-fitted in turn to the signals above the slowest frequencies. The order is the lowest
-one whose errors are as white and small as those of the next; resonances and lags are
-read off from its poles.
+The stage is modelled as plays followed by a transfer function (a Hammerstein model),
+both fitted in turn to the signals above the slowest frequencies. The order is the
+lowest one whose errors are as white and small as those of the next; resonances and lags
+are read off from its poles.
 """
 
 from collections.abc import Sequence
@@ -90,7 +90,7 @@ def linear_dynamics(input: np.ndarray, output: np.ndarray, dt: float) -> LinearD
     """Return the linear dynamics that ``input`` and ``output`` [samples] show.
 
     ``dt`` in s. Signals that are too short or do not excite dynamics show none. The
-    last few results are kept, because several parts of a fit ask for the same.
+    last few results are kept, because several parts of a fit need the same ones.
     """
     return _found(
         np.asarray(input, float).tobytes(), np.asarray(output, float).tobytes(), dt

@@ -31,8 +31,8 @@ TOLERANCE = 1e-9
 """Relative change of loss and parameters below which a descent ends."""
 
 RULE = TRUST_REGION._replace(good=0.75)
-"""Rule of the damping: a step with 3/4 of the predicted decrease may grow. The default
-0.99 keeps the steps through a curved valley short."""
+"""Rule of the damping: it falls after a step that achieves 3/4 of the predicted
+decrease. The default of 0.99 keeps the steps through a curved valley short."""
 
 
 @eqx.filter_jit

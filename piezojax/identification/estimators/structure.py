@@ -13,10 +13,10 @@ class Structure(NamedTuple):
     """A model to fit: its System, the box of its parameters, starts in the box.
 
     ``own`` holds the paths of the state before a record and of the sensor's zero, which
-    differ from record to record. ``dynamics``
-    holds the paths of linear dynamics. ``whitening`` holds the coefficients of a
-    filter that turns the errors into white noise; if it has any, the filtered errors
-    count as much as the errors themselves, which are largest at low frequencies.
+    differ from record to record. ``dynamics`` holds the paths of linear dynamics.
+    ``whitening`` holds the coefficients of a filter that turns the errors into white
+    noise; if it has any, the filtered errors count as much as the errors themselves,
+    which are largest at low frequencies.
     """
 
     system: System

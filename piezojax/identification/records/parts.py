@@ -27,7 +27,7 @@ def check_compatible(records: tuple[Record, ...]) -> None:
 def train_and_validation(
     samples: int, train: slice | None, validate: slice | None
 ) -> tuple[slice, slice]:
-    """Return the parts to fit and to validate on; left out, they are halves.
+    """Return the parts to fit and to validate on, by default the halves of a record.
 
     Raises ValueError for a part that is empty or outside of the ``samples``.
     """

@@ -135,7 +135,7 @@ class Record:
         if columns.shape[1] != 1:
             raise ValueError(
                 f"{self.source}: the record has {columns.shape[1]} {side}s; "
-                "this needs one"
+                "it needs one"
             )
         return columns[:, 0]
 

@@ -16,7 +16,7 @@ NEW = 1e-3
 line counts as new."""
 
 BEYOND = 0.15
-"""Part of the input's training range by which a sample lies outside of it."""
+"""Share of the input's training range by which a sample must leave it to count."""
 
 OFTEN = 0.01
 """Share of such samples in the validation part that counts as another range."""

@@ -85,9 +85,10 @@ def residual_report(
 def model_faults(
     records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
 ) -> Faults:
-    """Return what the free ``runs`` [samples, p] over ``part`` show of the model.
+    """Return bound, peaks and warnings from the free ``runs`` [samples, p].
 
-    Bound and peaks are those of ``ResidualReport``.
+    Bound and peaks are those of ``ResidualReport``. The bound holds for the whole
+    records; peaks and warnings are those over ``part``.
     """
     bound, relative = _relative(records, runs, part)
     peaks = [] if relative is None else unmodelled_peaks(relative)
