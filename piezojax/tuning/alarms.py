@@ -55,16 +55,16 @@ def alarms_of(
 
 
 def peak_notes(stability: StabilityReports) -> list[str]:
-    """Return a note if the tuned loop amplifies a part of its reference."""
+    """Return a note if the tuned loop amplifies a frequency of its reference."""
     reports = stability.reports.get("after", {}).values()
     found = [report.following for report in reports if report.following is not None]
     worst = max(found, key=lambda one: one.closed_loop_peak, default=None)
     if worst is None or worst.closed_loop_peak <= AMPLIFIED:
         return []
     return [
-        f"a part of the reference at {worst.closed_loop_peak_Hz:.4g} Hz moves the "
-        f"stage {worst.closed_loop_peak:.3g} times as far: filter references that "
-        "contain this frequency, such as steps, or limit constraints.closed_loop_peak"
+        f"the tuned loop amplifies references at {worst.closed_loop_peak_Hz:.4g} Hz by "
+        f"{worst.closed_loop_peak:.3g}: filter references that contain this frequency, "
+        "such as steps, or limit constraints.closed_loop_peak"
     ]
 
 

@@ -64,7 +64,7 @@ def _of_plants(errors: np.ndarray) -> dict[str, Any]:
 def _errors(figures: LoopFigures, driven: np.ndarray) -> np.ndarray:
     """Return, by plant, the geometric mean over references of the RMS error, um.
 
-    It is infinite where a run diverges or rails.
+    It is infinite where a run diverges or stays at a voltage limit.
     """
     logarithms, lost = log_errors(figures.tracking)
     means = np.exp(np.mean(logarithms[:, driven], axis=1))

@@ -21,10 +21,10 @@ class TunedStudy(BaseModel):
 
     ``before_um`` and ``after_um`` are those on held-out noise, ``unseen_before_um`` and
     ``unseen_um`` those on held-out references with held-out noise; None where a run
-    diverges or rails. ``perturbed`` holds the figures on the held-out plants of an
-    ensemble. ``tuned`` is the number of tuned parameters. ``alarms`` are the reasons
-    not to use the gains. A study that could not be tuned has the status "failed" and
-    the reason in ``alarms``.
+    diverges or stays at a voltage limit. ``perturbed`` holds the figures on the
+    held-out plants of an ensemble. ``tuned`` is the number of tuned parameters.
+    ``alarms`` are the reasons not to use the gains. A study that could not be tuned has
+    the status "failed" and the reason in ``alarms``.
     """
 
     study: str
@@ -56,7 +56,8 @@ class TunedStudy(BaseModel):
     def perturbed_um(self) -> float | None:
         """Error of the tuned gains on the median held-out plant, um.
 
-        None without such plants, or if a run diverges or rails on any of them.
+        None without such plants, or if a run on any of them diverges or stays at a
+        voltage limit.
         """
         if self.perturbed is None or self.perturbed.unstable:
             return None
@@ -68,9 +69,9 @@ class ComparisonResult(BaseModel):
 
     ``better`` and ``unseen_better`` are the geometric means of ``ratio`` and
     ``unseen_ratio`` over the rows of a controller, None where one of its runs diverges
-    or rails or one of its rows failed. ``best`` is the controller with the lowest error
-    after tuning at each rate (Hz), ``best_perturbed`` that with the lowest error on the
-    median held-out plant.
+    or stays at a voltage limit, or one of its rows failed. ``best`` is the controller
+    with the lowest error after tuning at each rate (Hz), ``best_perturbed`` that with
+    the lowest error on the median held-out plant.
     """
 
     title: str

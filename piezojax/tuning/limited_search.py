@@ -1,4 +1,4 @@
-"""Search of a study within its limits, judged by the exact margins."""
+"""Search of a study within its limits, checked by the exact margins."""
 
 import numpy as np
 
@@ -37,8 +37,8 @@ def search_within_limits(
 
     The defaults among the limits are rarely active, and margins in every loss cost time
     to compile. Unless the study limits a margin itself, the box is searched without
-    them first, and again with them if the result violates any. Of many plants on which
-    margins are limited a search uses only the worst.
+    them first, and again with them if the result violates any. If margins are limited
+    on many plants, a search uses only the worst of them.
     """
     study = case.study
     own = {
@@ -71,7 +71,7 @@ def search_within_limits(
     return _repeated(every, case, evaluator, carried, again, strategy, progress)
 
 
-INTERRUPTED = StabilityReports(problems={"after": "they were interrupted"})
+INTERRUPTED = StabilityReports(problems={"after": "their computation was interrupted"})
 
 
 def exact_stability(case: Case, search: SearchState) -> StabilityReports:

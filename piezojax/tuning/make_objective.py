@@ -61,8 +61,8 @@ def _scale(
 ) -> np.ndarray:
     """Return the scale (um) of the error of each trace: its RMS error before tuning.
 
-    If the start diverges or rails, the scale is ``otherwise``, or, without it, the
-    standard deviation of the reference.
+    If the start diverges or stays at a voltage limit, the scale is ``otherwise``, or,
+    without it, the standard deviation of the reference.
     """
     rms = np.sqrt(np.mean(before.rms_error**2, axis=1))
     if np.all(np.isfinite(rms)) and np.max(before.saturated) <= RAILED:

@@ -196,7 +196,7 @@ def _warnings(
 
 
 def worse_than_the_start(before: Scores, after: Scores) -> list[str]:
-    """Return a note if gains within the limits track worse than those of the start."""
+    """Return a note if gains within the limits track worse than the start."""
     if not (before.stable and after.stable):
         return []
     was, found = before.geomean_rms_um, after.geomean_rms_um
@@ -205,5 +205,5 @@ def worse_than_the_start(before: Scores, after: Scores) -> list[str]:
     return [
         f"the tuned gains track worse than the start, {1e3 * found:.4g} nm against "
         f"{1e3 * was:.4g} nm: the start does not keep the limits, or fails on a drawn "
-        "plant; if the limits allow more, raise 'candidates', 'starts' and 'steps'"
+        "plant; to search longer, raise 'candidates', 'starts' and 'steps'"
     ]

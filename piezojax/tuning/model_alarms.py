@@ -94,7 +94,7 @@ def unchecked(about: About) -> list[str]:
         return []
     return [
         f"the model of the plant was fitted to {about.record} and never checked on a "
-        "second record: if that is not a record of this stage as it is today, nothing "
-        "shows it; record the stage again and name the file in plant.check, or for a "
-        "plant from a file run python -m piezojax.validate"
+        "second record: nothing shows that it holds for this stage today; record the "
+        "stage again and name the file in plant.check, or for a plant from a file run "
+        "python -m piezojax.validate"
     ]

@@ -36,7 +36,7 @@ Aggregate = Literal["geometric_mean", "mean_square", "worst"]
 Over = Literal["mean", "worst", "cvar"]
 
 RAILED = 0.9
-"""Share of saturated samples above which a run counts as railed."""
+"""Share of saturated samples above which a run counts as staying at a voltage limit."""
 
 MARGIN_BLOCK = BLOCK // 2
 """Plants whose margins are computed at once; each has two branches."""
@@ -83,7 +83,7 @@ def margins_on(
     def one(stage: Stage | None) -> MarginFigures:
         return margin_figures(limits, loop_of(stage), point, model_error)
 
-    # Of several axes a whole batch of matrices would not fit into memory.
+    # With several axes a whole batch of matrices would not fit into memory.
     one_axis = jnp.ndim(point.reference) == 0
     return _on_each(one, stages, MARGIN_BLOCK if one_axis else 1)
 
@@ -117,9 +117,9 @@ class Objective(eqx.Module):
     which has one value for each stage and reference. ``aggregate`` joins the
     references: ``geometric_mean`` (mean of logarithms: a tenfold improvement counts the
     same on every reference), ``mean_square``, or ``worst`` (a smooth maximum of the
-    logarithms). ``weights`` are those of the references (equal if left out). A
-    ``resting`` trace, of an axis that should not move, counts only for the part of its
-    error above its scale.
+    logarithms). ``weights`` are those of the references (equal if left out). Of a
+    ``resting`` trace, that of an axis that should not move, only the part of the error
+    above its scale counts.
 
     ``stages``, stacked on a leading axis, replace the loop's own. ``over`` joins them:
     their mean, the worst, or the mean of the worst share ``tail``. ``effort_weight``
@@ -167,7 +167,7 @@ class Objective(eqx.Module):
 
     @property
     def constraints(self) -> int:
-        """Number of constraints, those of every limit, plant and branch."""
+        """Number of constraints: one for every limit, plant and step or branch."""
         return constraint_count(
             self.limits, self.scale.shape[0], _count(self.margin_stages)
         )
@@ -181,7 +181,7 @@ class Objective(eqx.Module):
         return dataclasses.replace(self, penalty=penalty)
 
     def on_margin_stages(self, stages: Stage | None) -> "Objective":
-        """Return the objective with margins limited on ``stages``, if these are any."""
+        """Return the objective with margins limited on ``stages``, if any."""
         return (
             self if stages is None else dataclasses.replace(self, margin_stages=stages)
         )
@@ -285,7 +285,7 @@ class Objective(eqx.Module):
         return penalty_terms(violation, multipliers, self.penalty)
 
     def loss(self, unit: Float[Array, " n"]) -> Float[Array, ""]:
-        """Return the loss; ``FAILED_LOSS`` where the loop diverges or rails."""
+        """Return the loss; ``FAILED_LOSS`` if a run diverges or stays at a limit."""
         return self.value_and_verdict(unit)[0]
 
     def value_and_verdict(

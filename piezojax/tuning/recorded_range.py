@@ -1,4 +1,4 @@
-"""Alarms of a study whose voltages are not those of the record of its plant."""
+"""Alarms for voltages of a study that the record of its plant does not cover."""
 
 from collections.abc import Iterator
 
@@ -46,6 +46,6 @@ def recorded_range_alarms(case: Case, data: Data) -> Iterator[str]:
                 f"the record of the plant{of_axis} covers {low:.4g} to {high:.4g} V, "
                 f"the actuator {lower:g} to {upper:g} V: if one of them is the voltage "
                 "before an amplifier, multiply it by the gain; if not, record the "
-                "range that is used, or set actuator.lower and actuator.upper to what "
-                "was recorded"
+                "range that is used, or set actuator.lower and actuator.upper to the "
+                "recorded range"
             )

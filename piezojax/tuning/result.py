@@ -36,7 +36,7 @@ class Scores(BaseModel):
 
     @property
     def stable(self) -> bool:
-        """Whether every run stayed finite and no run railed (see ``RAILED``)."""
+        """Whether all runs are finite and none stays at a limit (see ``RAILED``)."""
         railed = max(self.saturated_percent.values()) > 100.0 * RAILED
         return self.geomean_rms_um is not None and not railed
 
@@ -102,13 +102,14 @@ class Perturbed(BaseModel):
     """Figures of the tuned gains on perturbed plants, drawn for the hold-out.
 
     ``unstable_before`` and ``unstable`` count the plants on which a run diverges or
-    rails. ``geomeans_before_um`` and ``geomeans_um`` hold, by plant, the geometric mean
-    of the errors of the driven axes, None where a loop is unstable. ``geomean_rms_um``
-    and ``worst_rms_um`` are the median and the largest of ``geomeans_um``.
-    ``median_better`` and ``worst_better`` are the median and the smallest ratio of the
-    geometric means before and after, over the plants on which both loops are stable;
-    ``coupling_better`` is the median ratio of the axes at rest. ``constraints`` holds
-    the outcomes of the limits on these plants, ``values`` the limited figures by plant.
+    stays at a voltage limit. ``geomeans_before_um`` and ``geomeans_um`` hold, by plant,
+    the geometric mean of the errors of the driven axes, None where a loop is unstable.
+    ``geomean_rms_um`` and ``worst_rms_um`` are the median and the largest of
+    ``geomeans_um``. ``median_better`` and ``worst_better`` are the median and the
+    smallest ratio of the geometric means before and after, over the plants on which
+    both loops are stable; ``coupling_better`` is the median ratio of the axes at rest.
+    ``constraints`` holds the outcomes of the limits on these plants, ``values`` the
+    limited figures by plant.
     """
 
     plants: int
@@ -181,9 +182,9 @@ class Beside(BaseModel):
     ``nominal_rms_um`` is the geometric mean of the errors of the driven axes over all
     references of the hold-out, on the nominal plant; ``geomean_rms_um`` and
     ``worst_rms_um`` are its median and its largest value over ``plants`` held-out
-    plants. They are None if a run diverges or rails, on ``unstable`` of the plants.
-    ``sensitivity_peak`` is the largest on these plants, on the nominal one without
-    them; None if it is not limited.
+    plants. They are None if a run diverges or stays at a voltage limit, on ``unstable``
+    of the plants. ``sensitivity_peak`` is the largest on these plants, on the nominal
+    one without them; None if it is not limited.
     """
 
     nominal_rms_um: float | None
@@ -208,10 +209,10 @@ class Result(BaseModel):
     hold-out; ``front`` is the Pareto front, and ``perturbed`` the figures of the gains
     on the held-out plants of its ensemble. ``beside`` holds the figures of the
     controllers that the study names, then those "before" and "tuned".
-    ``sliding_before`` and ``sliding`` tell how much of the sliding variable is tracking
-    error, None for other controllers. ``history`` holds the lowest loss of each start
-    after each step, and ``times_s`` the time (s) from the start of the search to the
-    end of that step.
+    ``sliding_before`` and ``sliding`` hold the share of the tracking error in the
+    sliding variable, None for other controllers. ``history`` holds the lowest loss of
+    each start after each step, and ``times_s`` the time (s) from the start of the
+    search to the end of that step.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -294,7 +295,7 @@ def log_errors(figures: TrackingFigures) -> tuple[np.ndarray, np.ndarray]:
     """Return ln of the RMS errors (um) [plants, traces], and the lost plants.
 
     The error of a trace is that of its worst draw. A plant is lost if a run on it
-    diverges or rails.
+    diverges or stays at a voltage limit.
     """
     rms = np.max(np.asarray(figures.rms_error), axis=2)
     railed = np.max(np.asarray(figures.saturated), axis=(1, 2)) > RAILED

@@ -38,7 +38,7 @@ class Signals(eqx.Module):
         return self.references[:, 0]
 
     def on(self, stage: Stage | None) -> "Signals":
-        """Return the signals with the holding inputs of ``stage``, if it is another."""
+        """Return the signals with the holding inputs of ``stage``, if any."""
         if stage is None:
             return self
         return dataclasses.replace(self, holding=stage.holding)

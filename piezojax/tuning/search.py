@@ -54,8 +54,8 @@ def search_box(
 
     ``also`` are further points [points, n] that may become starts.
     ``Ctrl-C`` ends the search with the best point so far; the strategy is None if it
-    was not compiled yet. Raises ValueError if the loop diverges or rails at every point
-    tried.
+    was not compiled yet. Raises ValueError if the loop diverges or stays at a voltage
+    limit at every point tried.
     """
     own, table = np.asarray(case.space.start(case.loop)), case.study.optimiser
     search = SearchState(own, starts=own[None])

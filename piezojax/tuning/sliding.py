@@ -18,10 +18,10 @@ class SlidingShare(BaseModel):
     """Parts of the sliding variable of a loop, means over the tuning references.
 
     ``share``, from 0 to 1, is the mean square of the error terms m e + de/dt over the
-    sum of the mean squares of error terms and rest. The RMS values of s, of the error
-    terms and of the rest are in um/s. The rest is the lag of the observer behind the
-    reference, and noise. All values are those under held-out noise, None for a loop
-    that diverges.
+    sum of the mean squares of the error terms and of the rest. The RMS values of s, of
+    the error terms and of the rest are in um/s. The rest is the lag of the observer
+    behind the reference, and noise. All values are those under held-out noise, None for
+    a loop that diverges.
     """
 
     share: float | None

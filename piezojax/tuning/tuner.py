@@ -35,12 +35,12 @@ def tune(
 ) -> Outcome:
     """Tune the controller of a study and evaluate it on held-out noise and references.
 
-    ``study`` is a Case, the path of a study file, or None for the default study. With
-    a budget as ``baselines``, the baselines are run on the same objective afterwards.
+    ``study`` is a Case, the path of a study file, or None for the default study. With a
+    budget as ``baselines``, the baselines are run on the same objective afterwards.
     ``Ctrl-C`` ends the search and keeps the best gains found so far. A start that
-    diverges or rails is replaced by the best of the candidates. Raises ValueError if
-    a reference is beyond the stroke of the stage, or if neither the start nor any
-    candidate gives a stable loop.
+    diverges or stays at a voltage limit is replaced by the best of the candidates.
+    Raises ValueError if a reference is beyond the stroke of the stage, or if neither
+    the start nor any candidate gives a stable loop.
     """
     progress = progress or Silent()
     clock = Clock()

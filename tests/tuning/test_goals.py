@@ -91,7 +91,7 @@ def test_a_loop_that_amplifies_its_reference_has_a_note():
     (note,) = peak_notes(stability_reports({"after": amplifying}, 5.0))
     report = pj.stability_report(amplifying, 5.0).following
     assert report.closed_loop_peak > 2.0
-    assert " times as far: filter references" in note
+    assert "the tuned loop amplifies references at" in note
     assert peak_notes(stability_reports({"after": slow}, 5.0)) == []
     assert peak_notes(stability_reports({"before": amplifying}, 5.0)) == []
 

@@ -88,7 +88,7 @@ def test_a_record_of_a_small_part_of_the_range_raises_one():
         "the record of the plant covers 0 to 34.65 V, the actuator -20 to 120 V: if "
         "one of them is the voltage before an amplifier, multiply it by the gain; if "
         "not, record the range that is used, or set actuator.lower and actuator.upper "
-        "to what was recorded"
+        "to the recorded range"
     ]
     limits = {"actuator": {"lower": 0.0, "upper": 0.99 * width}}
     assert alarms((0.0, 0.99 * width), **small, **limits) == []

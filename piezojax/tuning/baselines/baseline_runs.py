@@ -91,7 +91,7 @@ def holdout_geomean(loop: Feedback, data: Data, start: int) -> float | None:
     """Return the geometric mean of the RMS errors on the tuning references, um.
 
     The noise is that of the hold-out, and the axes are the driven ones. None if the
-    loop diverges or rails.
+    loop diverges or stays at a voltage limit.
     """
     figures = _figures(loop, data.holdout, start)
     chosen = [i for i, t in enumerate(data.traces[: data.tuned]) if t.driven]
