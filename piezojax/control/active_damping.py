@@ -9,7 +9,7 @@ from ..core.system import System
 
 
 class ActiveDampingState(NamedTuple):
-    """States of the controller and the filter, and the last part for damping, [u]."""
+    """States of the controller and the filter, and the last damping command, [u]."""
 
     controller: State
     filter: State
@@ -29,8 +29,8 @@ class ActiveDamping(System):
     - resonant shift: ``Affine`` 1 and a gain below 0, which stiffens the stage.
 
     With a gain above 0, the product of gain and static gain of the stage must be below
-    1 for stability. The controller receives the applied voltage less the part for
-    damping, so that its anti-windup responds to the limits. Input an Observation,
+    1 for stability. The controller receives the applied voltage less the damping
+    command, so that its anti-windup responds to the limits. Input an Observation,
     output in the unit of the controller's command.
     """
 

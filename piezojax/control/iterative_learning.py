@@ -102,7 +102,7 @@ def learn(
 ) -> Trials:
     """Repeat ``reference`` (um) on ``system``, learning from trial to trial.
 
-    Each trial starts from the same state of rest. ``system`` is a stage, V to um, whose
+    Each trial starts from the same state at rest. ``system`` is a stage, V to um, whose
     input u is learned (y(k) is the output of the step with u(k)), or a Feedback loop,
     whose reference is corrected to r + u. ``noise`` [trials, samples] is added to the
     measurement, for a stage in um, for a loop as unit-variance draws that its sensor

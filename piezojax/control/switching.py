@@ -62,7 +62,7 @@ class SwitchingPID(SwitchingLaw):
     The law of (4.43), (5.18), (7.33) and (8.34). With several axes s and v are tuples
     of one scalar per axis, and a gain is a matrix or a scalar for all axes.
     ``anti_windup`` drives the integral by the difference of the applied and the last
-    commanded v (back-calculation), of each axis by its own; the thesis has none.
+    commanded v (back-calculation), for each axis separately; the thesis has none.
     """
 
     proportional: Gain = parameter(

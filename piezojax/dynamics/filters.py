@@ -6,7 +6,7 @@ continuous filter, discretised by one of these methods:
 - ``bilinear``: the bilinear transform, prewarped so that its frequencies are exact;
 - ``hold``: zero-order hold, exact for a section whose input is held between samples;
 - ``matched``: poles and zeros are those of the continuous section, z = exp(s dt); zeros
-  at infinity go to z = -1, and the gain is right at 0 Hz, or at the Nyquist frequency
+  at infinity go to z = -1, and the gain is exact at 0 Hz, or at the Nyquist frequency
   for a high-pass (Franklin, Powell and Workman, Digital Control of Dynamic Systems,
   1998, section 6.1).
 

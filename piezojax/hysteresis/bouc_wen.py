@@ -48,7 +48,7 @@ class BoucWen(Hysteresis):
     substeps: int = parts_of_a_step()
 
     def rate(self, force: Scalar, velocity: Scalar) -> Scalar:
-        """Return z' at force z and velocity y'; along a path, dz from dy."""
+        """Return z' at force z and velocity y', or dz for a step dy of a path."""
         # At z = 0, |z|^nu has no derivative with respect to nu, nor to z if nu < 1.
         loaded = force != 0.0
         power = jnp.where(

@@ -22,7 +22,7 @@ SEEDS = 16
 
 On records simulated with a learned operator (tests/benchmarks/choice.py), all of 12
 starts ended in a worse optimum than the true one for two of three noise draws. With 16
-starts, at least one start reached a better optimum.
+starts, at least one start reached an optimum as good as the true one.
 """
 
 

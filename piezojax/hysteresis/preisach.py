@@ -114,8 +114,8 @@ def check_weights(name: str, weights: Matrix) -> None:
 def rows_of(weights: Matrix) -> Rows:
     """Return the weights of all lines in each cell of beta.
 
-    Element k belongs to line k, of the cells whose alpha is k cells above beta; it is 0
-    beyond the end of the line.
+    Element k belongs to line k: the cells whose alpha lies k cells above their beta. It
+    is 0 beyond the end of the line.
     """
     cells = weights.shape[0]
     column = np.arange(cells)

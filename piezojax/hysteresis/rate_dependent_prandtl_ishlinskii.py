@@ -35,7 +35,7 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
     """Prandtl-Ishlinskii model whose thresholds grow with the rate of the input.
 
     ``y = P(x) + sum_i weights[i] play_i(x)`` with plays of the half-width
-    ``thresholds[i] + growth |dx/dt|`` (V), otherwise a ``PrandtlIshlinskii``.
+    ``thresholds[i] + growth |dx/dt|`` (V). All else is as in ``PrandtlIshlinskii``.
     Source: Al Janaideh and Krejci, Inverse rate-dependent Prandtl-Ishlinskii model for
     feedforward compensation of hysteresis in a piezomicropositioning actuator, 2013
     (IEEE/ASME Trans. Mechatronics 18(5)), with one growth for all plays, so that they

@@ -48,7 +48,7 @@ class PyRPL(Device):
     The output is ``p e + 2 pi i int e dt`` of the error e, the filtered input less the
     set point: a loop that raises the output when the reading is too low has negative
     gains. ``i`` is the frequency at which the integral has the gain 1. Gains are
-    rounded as the registers do. The first ``filters`` of four low-passes of order 1 are
+    rounded as in the registers. The first ``filters`` of four low-passes of order 1 are
     on, with the cut-offs that the module has: 125 MHz / 2 pi over a power of two. The
     integral stays between -4 and 4 V, the output between ``min_voltage`` and
     ``max_voltage``. The derivative is disabled in the gate array.

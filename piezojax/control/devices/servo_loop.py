@@ -34,7 +34,7 @@ class Device(Designed):
     dt: eqx.AbstractVar[float]
 
     def typed(self) -> "Device":
-        """Return the device with its parameters rounded to what can be typed in."""
+        """Return the device with its parameters rounded as they are typed in."""
         return rounded_fields(self)
 
     @property
