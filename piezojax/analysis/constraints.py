@@ -44,8 +44,8 @@ class LoopFigures(NamedTuple):
     """Figures of a loop from which constraints are evaluated.
 
     ``tracking`` and ``extremes`` hold arrays [plants, references, draws], ``steps``
-    arrays [plants, steps]. ``extremes``, ``margins``, those of ``margin_figures``, and
-    ``steps`` are None unless a limit needs them. ``dt`` in s.
+    arrays [plants, steps]. ``margins`` are those of ``margin_figures``. ``extremes``,
+    ``margins`` and ``steps`` are None unless a limit needs them. ``dt`` in s.
     """
 
     tracking: TrackingFigures
@@ -117,7 +117,7 @@ def _delay(sensitivity: Sensitivity, error: Array | None) -> Array:
 
 
 def _disk(sensitivity: Sensitivity, error: Array | None) -> Array:
-    """Return the disk margin of the model, which is itself a margin for its error."""
+    """Return the disk margin of the model, itself a margin for errors of the model."""
     del error
     return disk_margin_of(sensitivity)
 

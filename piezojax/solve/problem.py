@@ -97,7 +97,7 @@ class Problem(Protocol):
         ...
 
     def residuals(self, unit: Unit) -> Float[Array, " residuals"]:
-        """Return residuals whose squares sum to the loss, for a loss of this form."""
+        """Return residuals whose squares sum to the loss, if it has this form."""
         ...
 
 

@@ -223,7 +223,10 @@ class Evaluator:
 
 
 def step_test_of(case: Case) -> StepTest | None:
-    """Return the step test of ``case``, as long as its references; None for axes."""
+    """Return the step test of ``case``, or None on several axes.
+
+    It is as long as the references.
+    """
     study = case.study
     if study.axes is not None:
         return None

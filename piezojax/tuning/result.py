@@ -177,7 +177,7 @@ class Perturbed(BaseModel):
 
 
 class Beside(BaseModel):
-    """Figures of a controller on the hold-out, to compare controllers by.
+    """Figures of a controller on the hold-out, for a comparison of controllers.
 
     ``nominal_rms_um`` is the geometric mean of the errors of the driven axes over all
     references of the hold-out, on the nominal plant; ``geomean_rms_um`` and

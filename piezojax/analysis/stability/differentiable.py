@@ -41,8 +41,8 @@ PADDING = 4
 line is a matrix."""
 
 UNLIMITED_DELAY = 1e6
-"""Delay margin (samples) of a loop that no delay makes unstable: large, but finite so
-that its logarithm is."""
+"""Delay margin (samples) of a loop that no delay makes unstable: large, but with a
+finite logarithm."""
 
 UNLIMITED_GAIN = 120.0
 """Gain margin (dB) of a loop that no gain makes unstable."""
