@@ -15,7 +15,7 @@ LAGS = 6
 """Number of delays tried, from 0 samples on, of the voltage against the error."""
 
 CLEAR = 9.0
-"""Least difference of chi^2 that tells one value of an option from another."""
+"""Least difference of chi^2 that distinguishes two values of an option."""
 
 UNEXPLAINED = 0.05
 """Largest share of the voltage that the gains may leave unexplained."""

@@ -72,7 +72,7 @@ def _relation(record: Record) -> Iterator[str]:
         return
     response, power = found.response[clear], explained[clear]
     sign = np.sign(response[0].real)
-    # From 90 degrees on, a lag cannot be told from a lead.
+    # Beyond 90 degrees a lag cannot be distinguished from a lead.
     slow = np.logical_and.accumulate(sign * np.real(response) > 0.0)
     response, power = response[slow], power[slow]
     if sign < 0.0 and correlation < 0.0:

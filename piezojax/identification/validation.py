@@ -20,13 +20,13 @@ from .residuals.bound import joined
 from .residuals.report import model_faults
 
 SHARE = 0.2
-"""Part of a record, from its beginning, from which state and zero are estimated."""
+"""First share of a record, on which its initial state and zero are estimated."""
 
 MOST = 20_000
 """Most samples of that part, if it is not given."""
 
 WINDOWS = 40
-"""Stretches in which the error is compared with amplitude and rate."""
+"""Number of stretches in which the error is compared with amplitude and rate."""
 
 DISTINCT = 1.5
 """Least ratio of amplitudes or rates for which errors are reported separately."""
@@ -91,7 +91,7 @@ class ValidationReport(BaseModel):
 
 @dataclass(frozen=True)
 class Validation:
-    """A model judged on ``records``, with its ``runs`` [samples, p] over them.
+    """A model validated on ``records``, with its ``runs`` [samples, p] over them.
 
     ``about`` is the origin of the model with what these records add: their names, the
     alarms, and an error bound that also holds for them.
@@ -111,17 +111,17 @@ def validate(
     *,
     estimate: slice | None = None,
 ) -> Validation:
-    """Judge ``system`` by its free runs over other ``records`` of its stage.
+    """Validate ``system`` by its free runs over other ``records`` of its stage.
 
     The state before each record, and the zero of its sensor, are estimated on the
     samples ``estimate`` (by default the first fifth, at most 20 000 samples); the
-    errors count over what follows. The state is that after a slow motion from rest
-    between two levels of the input, the levels with the least error. No parameter of
-    the model changes.
+    errors count over the samples that follow. The state is that after a slow motion
+    from rest between two levels of the input, the levels with the least error. No
+    parameter of the model changes.
 
     Raises ValueError if there is no record, for units that cannot be converted to those
-    of the model, another sampling rate, an ``estimate`` that leaves nothing to judge,
-    and a model that does not take the inputs of the records.
+    of the model, another sampling rate, an ``estimate`` that leaves no samples for the
+    errors, and a model that does not take the inputs of the records.
     """
     records = (records,) if isinstance(records, Record) else tuple(records)
     if not records:
@@ -231,7 +231,7 @@ def _part(record: Record, estimate: slice | None) -> slice:
     if stop is None or not 0 <= start < stop < samples:
         raise ValueError(
             f"estimate is {start}:{stop}; it must lie in 0:{samples - 1}, the samples "
-            f"of {record.source}, and leave samples to judge"
+            f"of {record.source}, and leave samples for the errors"
         )
     return slice(start, stop)
 

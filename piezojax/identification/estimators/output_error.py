@@ -250,12 +250,12 @@ def output_error(
 ) -> Optimum:
     """Fit ``structure`` to ``records`` by the mean square of the free-run error.
 
-    Levenberg-Marquardt with the forward Jacobian, from all starts of the structure;
-    after a few steps only the best continue, to at most ``steps``. The error counts
-    over the samples ``train`` of each record; the model sees the input alone, from the
-    first sample on. With several records the state before each and the zero of each
-    take the place of the structure's ``own`` parameters. Raises ValueError when no
-    start leads to a finite simulation.
+    Levenberg-Marquardt with the forward Jacobian descends from all starts of the
+    structure; after a few steps only the best continue, up to ``steps`` steps. The
+    error counts over the samples ``train`` of each record; the model sees the input
+    alone, from the first sample on. With several records the state before each and the
+    zero of each take the place of the structure's ``own`` parameters. Raises ValueError
+    when no start leads to a finite simulation.
     """
     progress = progress or Silent()
     several = len(records) > 1

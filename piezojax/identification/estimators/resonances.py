@@ -55,7 +55,7 @@ HIGHEST = 0.45
 """Largest frequency of a mode, cycles per sample."""
 
 DAMPED = 0.5
-"""Damping ratio from which on a pair of poles is no resonance."""
+"""Damping ratio above which a pair of poles is not a resonance."""
 
 EXPLAINED = 0.02
 """Least share of the output's power, in the octave around a mode, that the model of

@@ -71,10 +71,11 @@ def refined(
 ) -> tuple[StateSpace, Float[np.ndarray, " steps"]]:
     """Return ``model`` moved to fit ``measured`` best, and the cost of each step.
 
-    Levenberg-Marquardt over modes whose poles are ``sigmoid(a) exp(j b)``, stable
-    whatever a and b are, from the modes of ``model``, which must have as many poles as
-    states. Its matrices are blocks of one mode each, in the order and scale of the
-    start: models refined from one start can be compared block by block.
+    The descent is Levenberg-Marquardt over modes whose poles are
+    ``sigmoid(a) exp(j b)``, stable for all a and b. It starts from the modes of
+    ``model``, which must have as many poles as states. The matrices are blocks of one
+    mode each, in the order and scale of the start: models refined from one start can be
+    compared block by block.
     """
     modes, costs = _descend(_modes_of(model), _data(measured), steps)
     return _model_of(modes, measured.dt), np.array(costs)

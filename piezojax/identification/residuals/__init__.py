@@ -1,1 +1,1 @@
-"""Analysis of the residual of a fit: what the model does not explain."""
+"""Residual analysis of a fit: error bound, correlations, peaks and coverage."""

@@ -26,20 +26,20 @@ LEAST = 1e-10
 interval tells whether it suffices."""
 
 LEAKAGE = 4.0
-"""Power that a line leaks through a Hann window into one at a distance of d lines,
+"""Power that a line leaks through a Hann window into a line at a distance of d lines,
 times d^6, with a factor of ten to spare."""
 
 CERTAIN = 1.0
-"""Half-width of the interval of the relative error from which on a line counts as not
-excited, unless the error itself is sure."""
+"""Half-width of the interval of the relative error above which a line counts as not
+excited, unless the error itself is certain."""
 
 AVERAGES = 8
 """Segments without overlap into which a record is divided."""
 
 
 ABSORBED = 0.05
-"""Least error at an excited line that limits a missing mode: the fitted parameters may
-absorb as much of its smooth error."""
+"""Least error at an excited line in the limit on a missing mode, because the fitted
+parameters may absorb as much of the smooth error of the mode."""
 
 WIDTH = 0.01
 """Relative width of the bands of a bound: half the width of a peak of 1 % damping."""
@@ -66,7 +66,7 @@ class RelativeError(NamedTuple):
 
     @property
     def sure(self) -> np.ndarray:
-        """Whether the error [lines] is above 0, with certainty at all lines at once."""
+        """Whether the error [lines] is surely above 0, for all lines at once."""
         return self.error > 2.0 * self.margin
 
     @property

@@ -25,7 +25,7 @@ OFTEN = 0.01
 class Coverage(BaseModel):
     """Band (Hz) that the records excite, and the range of their input.
 
-    The band is None if no line can be told from noise.
+    The band is None if no line can be distinguished from noise.
     """
 
     band_Hz: tuple[float, float] | None  # noqa: N815
