@@ -151,11 +151,13 @@ def _fast(system: System, input: Scalar, dt: float) -> StateSpace:
     if whole.D.shape != (1, 1):
         outputs, inputs = whole.D.shape
         raise ValueError(
-            f"the plant has {inputs} inputs and {outputs} outputs; a design is for one "
+            f"the plant has {inputs} inputs and {outputs} outputs; a design needs one "
             "of each"
         )
     if not all(np.all(np.isfinite(m)) for m in (whole.A, whole.B, whole.C, whole.D)):
-        raise ValueError("the plant's derivatives are not finite; a design needs them")
+        raise ValueError(
+            "the plant's derivatives are not finite; a design needs finite ones"
+        )
     # Creep and other modes near z = 1 act far below the crossover, where the integral
     # suppresses them like any drift. At the crossover the plant has the gain of its
     # fast part, so a reduction to few states must not use any for the slow modes.

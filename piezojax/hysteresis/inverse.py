@@ -91,7 +91,7 @@ class InverseHysteresis(Inverse):
             jax.lax.stop_gradient, (self.model, state, wanted, self.lower, self.upper)
         )
 
-        def missed(voltage: Scalar) -> tuple[Scalar, Scalar]:
+        def error_and_slope(voltage: Scalar) -> tuple[Scalar, Scalar]:
             output, slope = jax.jvp(
                 lambda v: still.step(still_state, v)[1],
                 (voltage,),
@@ -101,7 +101,7 @@ class InverseHysteresis(Inverse):
 
         def newton_step(_: Any, bracket: tuple[Scalar, Scalar, Scalar]) -> Any:
             low, high, voltage = bracket
-            error, slope = missed(voltage)
+            error, slope = error_and_slope(voltage)
             low = jnp.where(error <= 0.0, voltage, low)
             high = jnp.where(error >= 0.0, voltage, high)
             rises = slope > 0.0
@@ -119,7 +119,7 @@ class InverseHysteresis(Inverse):
         first = getattr(still_state, "input", 0.5 * (lower + upper))
         start = (2.0 * lower - upper, 2.0 * upper - lower, first)
         voltage = jax.lax.fori_loop(0, self.iterations, newton_step, start)[2]
-        _, slope = missed(voltage)
+        _, slope = error_and_slope(voltage)
         slope = jnp.where(slope > 0.0, slope, 1.0)
         output = self.model.step(state, voltage)[1]
         return jnp.clip(voltage - (output - wanted) / slope, self.lower, self.upper)
@@ -135,7 +135,7 @@ def check_rising(model: System, lower: ScalarLike, upper: ScalarLike) -> None:
     if any(isinstance(leaf, Tracer) for leaf in leaves):
         return
     path = _reversals(float(lower), float(upper))
-    outputs = _along(model, as_array(path))
+    outputs = _outputs_along(model, as_array(path))
     if isinstance(outputs, Tracer):
         return
     outputs = np.asarray(outputs)
@@ -161,5 +161,5 @@ def _reversals(lower: float, upper: float) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _along(model: System, path: Float[Array, " samples"]) -> Array:
+def _outputs_along(model: System, path: Float[Array, " samples"]) -> Array:
     return simulate(model, path, model.init(path[0]))[1]

@@ -131,7 +131,7 @@ class LearnedOperator(Hysteresis, Fittable):
         count = LEARNED_PLAYS + 2
         height = 0.5 * extent.slope * extent.width  # um for half the range of the input
         reach = 3.0 * abs(height)
-        starts = [_drawn(seed, count, height) for seed in range(SEEDS)]
+        starts = [_initial_weights(seed, count, height) for seed in range(SEEDS)]
         first = starts[0]
         return Recipe(
             cls(
@@ -182,7 +182,7 @@ def _dot(weights: Memory, values: Memory) -> Scalar:
     return sum((w * v for w, v in zip(weights, values, strict=True)), as_array(0.0))
 
 
-def _drawn(seed: int, count: int, height: float) -> dict[str, float]:
+def _initial_weights(seed: int, count: int, height: float) -> dict[str, float]:
     """Return initial weights of the neurons, so small that tanh is not saturated."""
     draw = np.random.default_rng(seed).normal
     return {

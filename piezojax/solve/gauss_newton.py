@@ -199,7 +199,7 @@ class GaussNewton:
             points = np.stack(list(asked.values()))
             taken += len(points) * points.shape[1]
             answers = zip(asked, self._evaluate(points), strict=True)
-            more = {step: _sent(step, trials) for step, trials in answers}
+            more = {step: _next_points(step, trials) for step, trials in answers}
             asked = {step: new for step, new in more.items() if new is not None}
         every = self._descents
         return DescentStatus(
@@ -227,7 +227,7 @@ class GaussNewton:
         self._places = self._places[rows]
 
 
-def _sent(
+def _next_points(
     step: Generator[np.ndarray, Trials, None], trials: Trials
 ) -> np.ndarray | None:
     """Send ``trials`` to a step; return its next points, or None at its end."""

@@ -89,16 +89,16 @@ def descend(
     step, bests = 0, []
     while True:
         step += 1
-        standing = descents.advance()
-        watch(standing)
-        bests.append(float(np.min(standing.losses)))
-        if np.all(standing.done) or (patience and patience.exhausted(bests)):
-            return standing, True
+        status = descents.advance()
+        watch(status)
+        bests.append(float(np.min(status.losses)))
+        if np.all(status.done) or (patience and patience.exhausted(bests)):
+            return status, True
         if step >= steps:
-            return standing, False
-        count = cut(step, len(standing.losses)) if cut else None
+            return status, False
+        count = cut(step, len(status.losses)) if cut else None
         if count is not None:
-            descents.keep(np.argsort(standing.losses, kind="stable")[:count])
+            descents.keep(np.argsort(status.losses, kind="stable")[:count])
             bests = []
 
 
@@ -220,29 +220,29 @@ def minimise(
     multipliers = jnp.zeros((len(starts), strategy.constraints))
     for penalty, share, last in rounds(problem, steps):
 
-        def watch(standing: DescentStatus, places: np.ndarray = places) -> None:
-            state.add_step(standing.verdict, places[standing.places])
-            state.update_best(standing.units, standing.verdict, standing.evaluations)
+        def watch(status: DescentStatus, places: np.ndarray = places) -> None:
+            state.add_step(status.verdict, places[status.places])
+            state.update_best(status.units, status.verdict, status.evaluations)
             progress.advance(state.loss)
 
         problem = problem.with_penalty(penalty)
         descents, evaluations = strategy.begin(problem, units, multipliers)
         state.evaluations += evaluations
-        standing, ended = descend(
+        status, ended = descend(
             descents, share, watch, cut=strategy.cut, patience=strategy.patience
         )
         if last:
             state.status = "converged" if ended else state.status
-            for end in standing.units[standing.verdict.violation > TOLERANCE]:
+            for end in status.units[status.verdict.violation > TOLERANCE]:
                 _pull_back(strategy, problem, end, state)
         else:
-            best = np.argsort(standing.losses, kind="stable")[: strategy.finalists]
+            best = np.argsort(status.losses, kind="stable")[: strategy.finalists]
             multipliers = update_multipliers(
-                as_array(standing.verdict.violations[best]),
-                multipliers[standing.places[best]],
+                as_array(status.verdict.violations[best]),
+                multipliers[status.places[best]],
                 as_array(penalty),
             )
-            units, places = standing.units[best], places[standing.places[best]]
+            units, places = status.units[best], places[status.places[best]]
 
 
 PULLS, SHARES = 2, np.linspace(0.125, 1.0, 8)

@@ -93,7 +93,7 @@ def _stability_alarms(
     if why is not None and any(name in limits for name in _EXACT_FIGURES):
         yield (
             f"the margins of the tuned loop are unknown, because {why}: test the gains "
-            "with little amplitude first, or switch the limits off in [constraints]"
+            "at a small amplitude first, or switch the limits off in [constraints]"
         )
     for where, figures in exact_figures(stability).items():
         if figures is None:

@@ -131,12 +131,12 @@ def plant_response(
     the response to voltage k.
     """
 
-    moved = np.asarray(_answers(plant, voltage, rest))
+    moved = np.asarray(_responses(plant, voltage, rest))
     return np.concatenate([np.zeros((len(moved), 1)), moved[:, :-1]], axis=1)
 
 
 @jax.jit
-def _answers(plant: LinearPlant, voltage: jax.Array, rest: jax.Array) -> jax.Array:
+def _responses(plant: LinearPlant, voltage: jax.Array, rest: jax.Array) -> jax.Array:
     def one(voltage, rest):
         resting = plant.at(rest, 0.0)
         return simulate(resting, voltage, resting.init(rest))[1]

@@ -317,7 +317,10 @@ def _descended(
     losses = 2.0 * standing.losses[order]
     units = np.asarray(squash(as_array(standing.units[order])))
     if losses[0] >= FAILED_LOSS:
-        raise ValueError("no start led to a finite simulation of the record")
+        raise ValueError(
+            "no start led to a finite simulation of the record: check its columns and "
+            "units, or fit another model"
+        )
     return units, losses, finished
 
 
