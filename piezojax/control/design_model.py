@@ -155,9 +155,7 @@ def _fast(system: System, input: Scalar, dt: float) -> StateSpace:
             "of each"
         )
     if not all(np.all(np.isfinite(m)) for m in (whole.A, whole.B, whole.C, whole.D)):
-        raise ValueError(
-            "the plant's derivatives are not finite; a design needs finite ones"
-        )
+        raise ValueError("a derivative of the plant is not finite; a design needs all")
     # Creep and other modes near z = 1 act far below the crossover, where the integral
     # suppresses them like any drift. At the crossover the plant has the gain of its
     # fast part, so a reduction to few states must not use any for the slow modes.

@@ -220,7 +220,7 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match=r"Affine are none; give dt"):
         linearise(pj.core.system.Affine(2.0))
     two = pj.dynamics.FirstOrderLag(1.0, 1e-3) >> pj.dynamics.FirstOrderLag(1.0, 2e-3)
-    with pytest.raises(ValueError, match=r"name 0\.001 s, 0\.002 s; give dt"):
+    with pytest.raises(ValueError, match=r"are 0\.001 s, 0\.002 s; give dt"):
         linearise(two)
     assert linearise(two, dt=1e-3).A.shape == (2, 2)
 

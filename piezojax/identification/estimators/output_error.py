@@ -304,18 +304,16 @@ def _descended(
         for start in np.asarray(unsquash(as_array(starts)))
     ]
     progress.stage(f"fitting from {len(starts)} starts", steps)
-    standing, finished = descend(
+    status, finished = descend(
         GaussNewton(descents, evaluate),
         steps,
-        lambda standing: progress.advance(
-            float(np.sqrt(2.0 * np.min(standing.losses)))
-        ),
+        lambda status: progress.advance(float(np.sqrt(2.0 * np.min(status.losses)))),
         cut=lambda step, running: width if step == TRIAL_STEPS else None,
         patience=STALLED,
     )
-    order = np.argsort(standing.losses)[:width]
-    losses = 2.0 * standing.losses[order]
-    units = np.asarray(squash(as_array(standing.units[order])))
+    order = np.argsort(status.losses)[:width]
+    losses = 2.0 * status.losses[order]
+    units = np.asarray(squash(as_array(status.units[order])))
     if losses[0] >= FAILED_LOSS:
         raise ValueError(
             "no start led to a finite simulation of the record: check its columns and "
