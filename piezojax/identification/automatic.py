@@ -42,7 +42,7 @@ def automatic(
     """Return the default chain for ``record``, the training samples.
 
     The hysteresis is the one with the least error after short fits to ``record`` and
-    the records ``beside`` it. These fits use a lower sampling rate if it resolves the
+    those ``beside`` it, which are made at a lower sampling rate if that resolves the
     resonances.
     """
     hysteresis = hysteresis_for([record, *beside], progress)
@@ -92,11 +92,11 @@ def _slowed(record: Record, every: int) -> Record:
 
 
 def _error(name: str, records: Sequence[Record]) -> float:
-    """Return the rms error of short fits, one to each of ``records``.
+    """Return the rms error after a short fit; with several records, after one to each.
 
-    With several records the error of a fit is that on the other records. It is infinite
-    if there is no fit, or if the fitted hysteresis has no inverse over the range of the
-    input, which designs of controllers need.
+    The error of a fit to one of several is that on the others. It is infinite if there
+    is no fit, or if the fitted hysteresis has no inverse over the range of the input,
+    which designs of controllers need.
     """
     first = records[0]
     shape = structure(f"{name}+{CREEP}+{dynamics_parts(first)}", first)

@@ -115,9 +115,9 @@ def validate(
 
     The state before each record, and the zero of its sensor, are estimated on the
     samples ``estimate`` (by default the first fifth, at most 20 000 samples); the
-    errors count over the samples that follow. The state is that after a slow motion
-    from rest between two levels of the input, the levels with the least error. No
-    parameter of the model changes.
+    errors count over what follows. The state is that after a slow motion from rest
+    between two levels of the input, the levels with the least error. No parameter of
+    the model changes.
 
     Raises ValueError if there is no record, for units that cannot be converted to those
     of the model, another sampling rate, an ``estimate`` that leaves no samples for the

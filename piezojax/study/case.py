@@ -35,12 +35,12 @@ class Case:
 
     ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
     names to the plants of a sweep, which replace the plant of the loop. ``notes`` are
-    sentences about starts that differ from the controller of the study, and about a
-    design whose voltage stays within the record. ``plant_about`` is the origin of a
-    plant from a record or a file, with the bound on its error. ``amplifier`` maps the
-    voltage of the actuator to that of the piezo, both in V; it is part of the plant,
-    and None if the study has none. ``beside`` maps names to the controllers to which
-    the tuned one is compared.
+    sentences: on starts that differ from the controller of the study, and on a design
+    whose voltage stays within the record. ``plant_about`` is the origin of a plant from
+    a record or a file, with the bound on its error. ``amplifier`` maps the voltage of
+    the actuator to that of the piezo, both in V; it is part of the plant, and None if
+    the study has none. ``beside`` maps names to the controllers that the tuned one is
+    compared with.
     """
 
     study: Study

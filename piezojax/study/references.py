@@ -29,7 +29,7 @@ def _signal(study: Study, name: str, time_s: Array) -> Array:
 
 
 def highest_reference(study: Study) -> float | tuple[float, ...]:
-    """Return the highest value of all references, um; a tuple on several axes.
+    """Return the highest value of all references, um; a tuple on a stage with axes.
 
     It is the operating point of the margins of a study.
     """

@@ -19,7 +19,7 @@ class RecordPlant(Table):
     ``time``, ``input`` and ``output`` are columns, by name or number; ``train`` is the
     first sample of the fitted part and the sample after its last. ``record_rate`` is
     the sampling rate of the records, Hz. ``check`` are other records of the stage, with
-    the same columns, on which the fitted plant is validated.
+    the same columns, that the fitted plant is validated on.
     """
 
     record: Path

@@ -1,8 +1,7 @@
-"""State of a stage before a record, modelled by a slow motion between two levels.
+"""State of a stage before a record: that after a slow motion between two levels.
 
-The last two turning points determine most of the state of a hysteresis. They are
-estimated from the first part of a record: the free run of the pair that is chosen
-scatters least about this part.
+The last two turning points determine most of the state of a hysteresis. A record tells
+them by its first part: the pair is taken whose free run scatters least about it.
 """
 
 import math
@@ -172,7 +171,7 @@ def levels_before(
 
 
 class Start(eqx.Module):
-    """State before a record: after a slow motion over two levels of the input.
+    """What came before a record: a slow motion over two levels of the input, and more.
 
     ``ends`` are those of the range of the inputs. The zeros of the outputs and the
     linear states before the record are those that are ``most_likely`` if the other
