@@ -1,4 +1,4 @@
-"""CONTRIBUTING.md followed to the letter, in a package outside piezojax."""
+"""Test of the recipes of CONTRIBUTING.md, copied into a package outside piezojax."""
 
 import json
 import os
@@ -65,7 +65,7 @@ def page():
 
 @pytest.fixture(scope="module")
 def lab(page, tmp_path_factory):
-    """Install the page's package: its modules, and the entry points that it names."""
+    """Install the package that the page describes: its modules and entry points."""
     files, tables = page
     folder = tmp_path_factory.mktemp("site")
     (folder / "my_lab").mkdir()
@@ -128,9 +128,9 @@ for line in json.loads(sys.argv[2]):
 
 
 def in_turn(lab, command, *lines, cwd):
-    """Run a command with each of ``lines`` in one process, which imports once.
+    """Run a command with each of ``lines`` in one process, to import only once.
 
-    Return the process, what each printed up to its end, and the status of each.
+    Return the process, and the output and exit status of each run.
     """
     done = python(lab, "-c", IN_TURN, command, json.dumps(lines), cwd=cwd)
     assert done.returncode == 0, done.stderr
@@ -157,7 +157,7 @@ def test_a_model_is_saved_inverted_listed_fitted_tried_and_drawn(lab, tmp_path):
     )
     done, (listed, _, tried), statuses = in_turn(lab, "identify", *lines, cwd=tmp_path)
     assert statuses == [0, 0, 0], done.stderr
-    assert "Dahl: a line less a bounded part" in listed
+    assert "Dahl: a line minus a bounded part" in listed
     report = json.loads((tmp_path / "fit" / "fit.json").read_text())
     assert report["validation"]["rmse"] < 0.006
     for name, true in (("slope", 0.1), ("height", 0.2), ("rate", 0.2)):
@@ -175,7 +175,7 @@ def study(page, limit):
     return STUDY.format(controller="\n".join(["[controller]", *keys, ""]), limit=limit)
 
 
-def test_a_controller_a_constraint_and_a_stage_meet_in_a_study(page, lab, tmp_path):
+def test_a_study_uses_the_controller_the_constraint_and_the_stage(page, lab, tmp_path):
     (tmp_path / "study.toml").write_text(study(page, 1e6))
     (tmp_path / "wrong.toml").write_text(study(page, -1.0))
     lines = [(f"{name}.toml", "--out", name) for name in ("study", "wrong")]
@@ -192,7 +192,7 @@ def test_a_controller_a_constraint_and_a_stage_meet_in_a_study(page, lab, tmp_pa
     assert gains["type"] == "LeadLag"
 
 
-def test_the_lead_lag_is_that_of_the_bilinear_transform(page, tmp_path, monkeypatch):
+def test_the_lead_lag_equals_the_bilinear_transform_of_scipy(page, tmp_path, monkeypatch):
     from scipy import signal
 
     import piezojax as pj

@@ -419,7 +419,7 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     assert load(path).gain == 2.0
 
 
-ALARMS = ["Ms 3.1 is above its limit 2", "SW30 rails"]
+ALARMS = ["Ms 3.1 is above its limit 2", "SW30 stays at a voltage limit"]
 
 
 @pytest.mark.parametrize("name", ["a.toml", "a.json"])

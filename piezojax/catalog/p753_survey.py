@@ -191,7 +191,7 @@ def adaptive_pi() -> Anticipation:
     """Return ``simc_pi`` in an AdaptiveInverse, um to V.
 
     The inverse leads the stage by the lag of the sensor; a negative lead of the
-    reference takes that back.
+    reference compensates this lead.
     """
     return Anticipation(p753.with_adaptive_inverse(simc_pi()), (0.0,))
 

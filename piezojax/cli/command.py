@@ -86,7 +86,7 @@ def run(quiet: bool, body: Callable[[Console], Any]) -> None:
         where = f"{error.filename}: " if error.filename else ""
         raise _one_line(f"{where}{error.strerror or error}") from None
     except KeyboardInterrupt:
-        click.echo("interrupted; files that were finished are kept", err=True)
+        click.echo("interrupted; finished files are kept", err=True)
         exit_interrupted()
 
 

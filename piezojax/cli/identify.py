@@ -44,7 +44,7 @@ class _Gain(click.ParamType):
     "gains",
     multiple=True,
     type=_Gain(),
-    help="With --controller: a gain typed in when it recorded; give each.",
+    help="With --controller: a gain during the record, as ki=70; repeat for each gain.",
 )
 @click.option(
     "--response",
@@ -102,7 +102,7 @@ class _Gain(click.ParamType):
     "--validate", type=SampleRange(), help="Samples to validate on (default: rest)."
 )
 @click.option(
-    "--test", type=SampleRange(), help="With 'all': samples held back from the choice."
+    "--test", type=SampleRange(), help="With 'all': samples for a hold-out error."
 )
 @common
 def main(

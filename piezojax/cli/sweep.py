@@ -39,7 +39,7 @@ def _shard(context: click.Context, option: click.Parameter, text: str) -> tuple:
     "--samples",
     type=click.IntRange(min=1),
     default=None,
-    help="Number of points; without [sweep], of the study's [parameters].",
+    help="Number of random points; without [sweep] from the box of [parameters].",
 )
 @click.option(
     "--dask",

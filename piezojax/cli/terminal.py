@@ -70,7 +70,7 @@ class Bar:
     def finish(self) -> None:
         """Ignore the first Ctrl-C or SIGTERM from here on, while results are written.
 
-        A pending one is ignored too: the work is complete.
+        A pending one is ignored too, because the work is complete.
         """
         self._finishing = True
 

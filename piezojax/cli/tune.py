@@ -47,9 +47,9 @@ def main(
     comparison (controllers and rates in one file, as comparison/p753), are tuned one
     after another, each into its own folder, and end in one table and picture.
 
-    Exit status 3 means that the run finished with an alarm: the gains violate a limit,
-    rail, diverge or rest on a model that is not validated. The alarms are printed
-    first, and gains.toml loads with accept_unsafe only.
+    Exit status 3 means that the run finished with an alarm: the loop violates a limit,
+    diverges or stays at a voltage limit, or the model is not validated. The alarms are
+    printed first, and gains.toml loads with accept_unsafe only.
     """
 
     def body(console: Console) -> None:

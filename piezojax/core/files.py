@@ -70,14 +70,14 @@ def _moved_to(path: Path, durable: bool) -> Iterator[Path]:
         if durable:
             with open(file, "rb+") as written:
                 os.fsync(written.fileno())
-        os.chmod(file, 0o644)  # until here only the owner may read it
+        os.chmod(file, 0o644)  # a temporary file is readable by its owner alone
         os.replace(file, path)
     if durable:
         _sync_folder(path.parent)
 
 
 def _sync_folder(folder: Path) -> None:
-    """Sync the list of names in ``folder`` to the disk, where the system can."""
+    """Sync the list of names in ``folder`` to the disk, if the system supports it."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:

@@ -34,8 +34,8 @@ class Parameter:
     stands for a unit that only an outer System knows (see ``System.part_units``). A
     frequency with ``below_nyquist`` must be below pi / dt in rad/s or 0.5 / dt in Hz,
     with the sample time dt of the declaring System. A ``whole`` parameter is an
-    integer, such as a count. ``step`` is the difference of two values that can be typed
-    into a device.
+    integer, such as a count. ``step`` is the smallest difference between two values
+    that a device accepts.
     """
 
     unit: str

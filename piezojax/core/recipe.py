@@ -26,8 +26,8 @@ class Extent(NamedTuple):
     """Ranges of the signals of a record, from which a recipe computes bounds.
 
     ``modes``, ``lags`` and ``delay`` are the linear dynamics that the record shows,
-    from which a recipe takes its starting values; the strongest comes first. They are
-    empty, and the delay None, where nothing was found or looked for.
+    from which a recipe takes its starting values, the strongest resonance first. They
+    are empty, and the delay None, if none were found or no search was made.
     """
 
     low: float  # V

@@ -44,7 +44,7 @@ def claimed(folder: Path) -> Iterator[bool]:
     """Mark ``folder`` as in use; yield whether it holds nothing else.
 
     Of several processes that claim an empty folder at the same time, at most one
-    finds nothing else in it. Raises OSError if the folder cannot be written.
+    receives True. Raises OSError if the folder cannot be written.
     """
     with temporary(folder / _CLAIM) as claim:
         yield all(entry.absolute() == claim for entry in folder.iterdir())

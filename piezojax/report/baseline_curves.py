@@ -18,14 +18,14 @@ from .figures import AFTER, add_title, figure, plain_tick_labels, plot_style, wr
 def baselines_table(baselines: Baselines) -> Table:
     """Return a table of the methods: loss, held-out error, runs and wall time.
 
-    Two columns hold the time (s) at which the search of piezojax had a loss as low as a
-    baseline, and the ratio of the baseline's wall time to it.
+    Two columns hold the time (s) at which the search of piezojax reached the loss of a
+    baseline, and the ratio of the wall time of the baseline to this time.
     """
     table = Table(
         title=Text(
             f"{baselines.title}\nbaselines on the same objective: "
             "error is the geometric mean on held-out noise\n"
-            "(as good: time at which piezojax had a loss as low; sooner: ratio)"
+            "(as good: time at which piezojax reached this loss; sooner: ratio)"
         )
     )
     table.add_column("method")
@@ -59,8 +59,8 @@ def baselines_text(baselines: Baselines) -> str:
     return (
         f"as good as {best.method}, the best baseline, after {best.reached_s:.1f} s "
         f"instead of {best.wall_s:.1f} s: {_times(best.ratio)} sooner, {running} "
-        f"without compiling, {_times(best.ratio_cpu)} in processor time, {near} "
-        "sooner than the baseline came within 0.001 of its final loss"
+        f"without compiling, {_times(best.ratio_cpu)} in processor time; {near} sooner "
+        "than the time at which the baseline was within 0.001 of its final loss"
     )
 
 

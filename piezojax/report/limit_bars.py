@@ -27,7 +27,7 @@ CAUSES: dict[str | None, str] = {
     "predicted": "leaves an error that a linear filter of the reference would cancel",
     None: "is too nonlinear to name a cause",
 }
-"""Explanations of a large error, by the share that exceeds the limit's most."""
+"""Explanations of a large error, by the share that exceeds that of the limit most."""
 
 
 def write_limit(report: LimitReport | str, folder: Path, title: str = "") -> None:
@@ -40,7 +40,7 @@ def write_limit(report: LimitReport | str, folder: Path, title: str = "") -> Non
 
 
 NO_LIMIT = 1e4
-"""Ratio of the tuned error to the limit above which the limit is that of rounding."""
+"""Ratio of the tuned error to the limit above which the limit is a rounding error."""
 
 
 def limit_text(report: LimitReport | str) -> str:
@@ -49,8 +49,8 @@ def limit_text(report: LimitReport | str) -> str:
         return f"note: no limit of linear control: {report}"
     if report.ratio > NO_LIMIT:
         return (
-            "limit of linear control: none to speak of, because the study disturbs the "
-            "stage by nothing that a controller with preview would not cancel"
+            "limit of linear control: zero up to rounding, because a controller with "
+            "preview would cancel every disturbance of the study"
         )
     count = len(report.references)
     lines = [
@@ -75,8 +75,8 @@ def limit_text(report: LimitReport | str) -> str:
     ]
     if below:
         lines.append(
-            f"note: {', '.join(below)}: below the limit, which a controller that is "
-            "nonlinear or knows more of the stage can reach"
+            f"note: {', '.join(below)}: below the limit, which is possible for a "
+            "nonlinear controller or one with a better model of the stage"
         )
     return "\n".join(lines)
 
@@ -105,7 +105,7 @@ def _errors(ax: Axes, report: LimitReport) -> None:
     limits = np.array([1e3 * report.references[name].limit for name in names])
     ax.hlines(rows, limits, NEAR * limits, color=MEASURED, lw=0.8)
     ax.set(
-        xlabel=f"rms error (nm); lines end {NEAR:g} times above the limit",
+        xlabel=f"rms error (nm); lines end at {NEAR:g} times the limit",
         yticks=rows,
         yticklabels=names,
         ylim=(-0.6, len(names) + 1.4),  # room for the legend

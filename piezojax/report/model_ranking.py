@@ -151,12 +151,12 @@ def ranking_notes(report: RankingReport) -> list[str]:
     notes.append(f"best: {report.best} ({report.rule})")
     if report.test is None:
         notes.append(
-            "the choice used the validation part: its error there is not a held-out "
-            "figure; --test START:STOP holds samples back for one"
+            "the choice used the validation part, so the error there is not a held-out "
+            "error; --test START:STOP reserves samples for one"
         )
     else:
         notes.append(
-            f"its error on the test part, which neither fits nor choice used: "
+            "its error on the test part, which neither the fits nor the choice used: "
             f"{report.test.rmse:.4g} {report.test.unit}, "
             f"{report.test.rmse_percent_of_span:.2f} % of span"
         )

@@ -24,7 +24,7 @@ def write_response(found: ResponseModel, folder: Path) -> None:
 
 
 def modal_figure(found: ResponseModel) -> Figure:
-    """Draw the measured and the fitted response, and what the model leaves."""
+    """Draw the measured response, the response of the model, and the residual."""
     response, fit = found.response, found.fit
     hertz, unit = response.frequency, response.unit.replace("um", "µm")
     picture = figure(6.6, 6.4)

@@ -28,7 +28,7 @@ _ROOM = 4.0  # settling times shown
 def steps_table(steps: Loops) -> Table:
     """Return the figures of the steps (StepResult) of each loop.
 
-    Of a step up and the same step down the worse figure is shown.
+    Each figure is the worse one of the step up and the same step down.
     """
     table = Table(title="steps without noise, the worse of up and down")
     table.add_column("step", no_wrap=True)

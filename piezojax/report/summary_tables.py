@@ -89,7 +89,7 @@ _MOST_ROWS = 12  # above it, axes at rest have only their geometric mean
 
 
 def beside_table(result: Result) -> Table:
-    """Return the hold-out's errors of the controllers beside and the tuned one, nm."""
+    """Return the table of held-out errors (nm) of the tuned and the other controllers."""
     plants = result.beside["tuned"].plants
     title = "rms tracking error on the hold-out, nm: geometric mean over all references"
     if plants:
@@ -214,7 +214,7 @@ def stability_table(stability: StabilityReports) -> Table:
 
 
 def following_table(stability: StabilityReports) -> Table:
-    """Return how each loop of one axis follows its reference over frequency."""
+    """Return the table of the closed-loop response of each loop of one axis."""
     table = Table(title="small motions of the reference, worse branch")
     table.add_column("loop")
     for title in ("bandwidth, -3 dB", "-1 dB", "closed-loop peak"):
@@ -306,7 +306,7 @@ def _scope(report: FitReport) -> list[str]:
         return []
     coverage, bound = residuals.coverage, residuals.error_bound
     if coverage.band_Hz is None:
-        return ["the record excites no frequency that can be told from noise"]
+        return ["the record excites no frequency above its noise"]
     low, high = coverage.input_range
     inside = [
         error
@@ -325,8 +325,8 @@ def _place_of_the_lag(report: FitReport) -> list[str]:
     if report.model.split("+")[-1] != "lag":
         return []
     return [
-        "a record cannot tell the lag of the sensor from that of the stage; a "
-        "controller holds the sensor's reading, and the tip may move differently"
+        "a record does not distinguish a lag of the sensor from a lag of the stage; the "
+        "loop controls the reading of the sensor, and the tip may move differently"
     ]
 
 

@@ -191,7 +191,7 @@ def hysteresis_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
         )
     right.set(
         xlabel=f"reference ({unit})",
-        ylabel=f"{_quantity(trace)} less reference ({small})",
+        ylabel=f"{_quantity(trace)} minus reference ({small})",
         title=f"{name}: error in closed loop\n",
     )
     legend_above(right)

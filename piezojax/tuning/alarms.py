@@ -78,7 +78,7 @@ def _run_alarms(scores: Mapping[str, Scores | None]) -> Iterable[str]:
             for name, share in part.saturated_percent.items()
             if share > 100.0 * RAILED and name not in lost
         ]
-        for names, what in ((lost, "diverges"), (railed, "rails")):
+        for names, what in ((lost, "diverges"), (railed, "stays at a voltage limit")):
             if names:
                 yield (
                     f"the tuned loop {what} on {where} runs of {', '.join(names)}: "
@@ -214,7 +214,7 @@ def _missed(name: str, value: float | None, limit: float, where: str) -> str:
 def _plant_alarms(perturbed: Perturbed | None) -> Iterable[str]:
     if perturbed is not None and perturbed.unstable:
         yield (
-            f"the tuned loop diverges or rails on {perturbed.unstable} of "
-            f"{perturbed.plants} perturbed plants: raise ensemble.tune, or tighten "
-            "constraints.sensitivity_peak"
+            "the tuned loop diverges or stays at a voltage limit on "
+            f"{perturbed.unstable} of {perturbed.plants} perturbed plants: raise "
+            "ensemble.tune, or tighten constraints.sensitivity_peak"
         )

@@ -99,14 +99,14 @@ def _starts(losses: np.ndarray, count: int, search: SearchState) -> np.ndarray:
     stable = losses < FAILED_LOSS
     if not stable.any():
         raise ValueError(
-            f"the loop diverges or rails at the start and all {losses.size - 1} points "
-            "tried in the box: lower the bounds of the gains, raise 'candidates', or "
-            "check the plant's sign and sample rate"
+            "the loop diverges or stays at a voltage limit at the start and at all "
+            f"{losses.size - 1} points tried in the box: lower the bounds of the gains, "
+            "raise 'candidates', or check the plant's sign and sample rate"
         )
     if not stable[0]:
         search.warnings.append(
-            "the study's own start diverges or rails; tuning began from the best of "
-            f"{losses.size - 1} other points of the box instead"
+            "the study's own start diverges or stays at a voltage limit; tuning began "
+            f"from the best of {losses.size - 1} other points of the box instead"
         )
     best = 1 + np.argsort(losses[1:], kind="stable")
     order = np.concatenate([[0], best])

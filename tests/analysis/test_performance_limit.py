@@ -333,7 +333,7 @@ def test_a_limit_of_rounding_is_no_limit():
     rows = {"A": comparison(4.0, 1e-12, Shares(3.9, 0.5, 0.7))}
     nothing = Curves(np.zeros(0), np.zeros((1, 0)), 1.0, *np.zeros((2, 1, 0)))
     report = LimitReport(rows, DT, NOISE, 10.0, SLOPE, 1.0, 1.1, nothing)
-    assert limit_text(report).startswith("limit of linear control: none to speak of")
+    assert limit_text(report).startswith("limit of linear control: zero up to rounding")
 
 
 def test_what_went_wrong_is_said(tmp_path):

@@ -11,7 +11,7 @@ each stage:
   study, the unseen ones included; promised by the hold-out, obtained on the sensed
   displacement without noise. ``tip`` is that of the tip, ahead of the sensor's lag;
 - their ratio, and the largest ratio of one reference;
-- Ms as printed, and whether the run rails or is lost.
+- Ms as printed, and whether a run stays at a voltage limit or is lost.
 
 Alarms and notes stand above the table, with each stage when it ends.
 
@@ -51,7 +51,7 @@ LOST = 0.2
 above FAR times the promise."""
 
 RAILED = 0.02
-"""Share of samples at a limit of the voltage above which a run rails."""
+"""Share of samples at a voltage limit above which a run counts as saturated."""
 
 ROUTINE = (
     "this residual is a disturbance of the loop",
@@ -278,7 +278,7 @@ def table_of(lines):
         lengths = [f"{1e3 * line[key]:.4g}" for key in ("promised", "obtained", "tip")]
         ratios = [f"{line[key]:.4g}" for key in ("ratio", "worst")]
         peak = "" if line["peak"] is None else f"{line['peak']:.2f}"
-        run = "lost" if line["lost"] else "rails" if line["railed"] else ""
+        run = "lost" if line["lost"] else "at limit" if line["railed"] else ""
         table.add_row(line["name"], *lengths, *ratios, peak, run)
     return table
 
@@ -297,7 +297,7 @@ def summary(lines):
         f"{len(lines)} stages, {len(lines) - len(silent)} with an alarm",
         f"without an alarm: ratio {np.median(ratios):.2f} in the median, "
         f"{max(ratios):.2f} at most, {worst:.2f} for one reference",
-        f"lost or railing without an alarm: {len(lost)} (bar 0) {lost}",
+        f"lost or at a voltage limit without an alarm: {len(lost)} (bar 0) {lost}",
         f"without an alarm within {CLOSE}: {len(kept)} (bar {KEPT} of 40)",
         f"without an alarm above {FAR:g}: {len(far)} (bar 0) {far}",
         f"alarms on promises that hold: {len(false)} (bar {FALSE}) {false}",

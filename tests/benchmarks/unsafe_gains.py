@@ -10,8 +10,8 @@ code with piezojax, and this must hold:
 - every eigenvalue inside the unit circle, on the branches of the plays at the highest
   point of the references;
 - peak of the sensitivity and delay margin within the limits of the study;
-- no run of the references, the unseen ones included and with new noise, that rails,
-  leaves its limits of voltage and slew, or has an error above the promised one.
+- with new noise, no run of a reference, seen or unseen, stays at a voltage limit,
+  exceeds the limits of voltage and slew, or has an error above the promised one.
 
 The bar: none of 200.
 """
@@ -44,7 +44,7 @@ CLOSE = 0.02
 """Relative error of a margin by which it may miss its limit."""
 
 RAILED = 0.02
-"""Share of samples at a limit of the voltage above which a run rails."""
+"""Share of samples at a voltage limit above which a run counts as saturated."""
 
 FAR = 1.3
 """Ratio of obtained to promised error above which a promise is broken."""
@@ -135,7 +135,8 @@ def run_faults(case, loop, references, promised):
                 yield f"{key}: {value:.3g} um for a promise of {promised[key]}"
         ends = (u[start:] <= LOWER) | (u[start:] >= UPPER)
         if ends.mean(axis=0).max() > RAILED:
-            yield f"{name} rails, {100.0 * ends.mean(axis=0).max():.0f} % of samples"
+            share = 100.0 * ends.mean(axis=0).max()
+            yield f"{name} is at a voltage limit in {share:.0f} % of its samples"
         figures = {
             "peak_voltage": np.abs(u).max(),
             "peak_slew": np.abs(np.diff(u, axis=0)).max() / DT,

@@ -68,7 +68,7 @@ MUTATIONS = (
     ),
     # Objective and evaluation
     Mutation(
-        "railing needs all runs",
+        "a lost plant needs saturation in all runs",
         "tuning/objective.py",
         "railed = jnp.any(",
         "railed = jnp.all(",

@@ -38,7 +38,7 @@ class Case(NamedTuple):
 
 
 NAMED = Case()
-"""The stage on which a tuned loop once went from rail to rail."""
+"""The stage on which the voltage of a tuned loop once jumped from limit to limit."""
 
 
 def grid(count=60):

@@ -98,7 +98,10 @@ def test_safe_gains_raise_no_alarm():
     ("changes", "message"),
     [
         ({"after": scores(rms=None)}, "diverges on tuning runs of SW30: reduce the"),
-        ({"holdout": scores(saturated=91.0)}, "rails on hold-out runs of SW30: reduce"),
+        (
+            {"holdout": scores(saturated=91.0)},
+            "stays at a voltage limit on hold-out runs of SW30: reduce",
+        ),
         ({"unseen": scores(rms=None)}, "diverges on unseen runs of SW30"),
         ({"coupling": scores(rms=None)}, "diverges on resting runs of SW30"),
         (
@@ -115,7 +118,8 @@ def test_safe_gains_raise_no_alarm():
         ),
         (
             {"perturbed": perturbed(unstable=2)},
-            "diverges or rails on 2 of 9 perturbed plants: raise ensemble.tune",
+            "diverges or stays at a voltage limit on 2 of 9 perturbed plants: raise "
+            "ensemble.tune",
         ),
     ],
 )
@@ -160,9 +164,11 @@ def test_limits_at_least_have_their_own_side():
     assert "disk_margin is 0.85 on the hold-out, below its limit 1" in alarm
 
 
-def test_a_run_rails_from_a_share_of_its_samples():
+def test_a_run_is_saturated_from_a_share_of_its_samples():
     (alarm,) = alarms(changed(holdout=scores(saturated=90.1)))
-    assert alarm.startswith("the tuned loop rails on hold-out runs of SW30")
+    assert alarm.startswith(
+        "the tuned loop stays at a voltage limit on hold-out runs of SW30"
+    )
     assert alarms(changed(holdout=scores(saturated=89.9))) == []
 
 

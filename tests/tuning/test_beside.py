@@ -117,7 +117,7 @@ def test_gains_are_those_of_the_study(perturbed):
     assert found["slower PI"].nominal_rms_um > 2.0 * found["PI by rule"].nominal_rms_um
 
 
-def test_a_controller_that_rails_has_no_error(perturbed):
+def test_a_saturated_controller_has_no_error(perturbed):
     wrong = perturbed[2]["PI of the wrong sign"]
     errors = wrong.nominal_rms_um, wrong.geomean_rms_um, wrong.worst_rms_um
     assert (*errors, wrong.unstable) == (None, None, None, 3)

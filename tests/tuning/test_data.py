@@ -169,7 +169,7 @@ def test_a_perturbed_plant_starts_at_rest_where_it_is_tuned(still):
     np.testing.assert_allclose(figures.rms_error, 0.0, atol=1e-12)
 
 
-# Railing
+# Saturated runs
 
 
 def objective_of(case, signals, **options):
@@ -182,7 +182,7 @@ def objective_of(case, signals, **options):
 @pytest.mark.parametrize(
     ("heights", "lost"), [((1.0, 2.0), False), ((1.0, 500.0), True)]
 )
-def test_one_run_that_rails_is_enough(heights, lost):
+def test_one_saturated_run_gives_an_infinite_error(heights, lost):
     """120 V hold 18 um: at 500 um the actuator stays at its limit, at 2 um never."""
     case = case_of()
     references = jnp.asarray(heights)[:, None] * jnp.ones(400)

@@ -318,7 +318,8 @@ def test_a_diverging_start_is_replaced_and_said():
     assert result.before.geomean_rms_um is None
     assert result.before.per_reference_rms_um == {"SIN50": None, "SW50": None}
     assert any(
-        "the study's own start diverges or rails; tuning began from the best of 4"
+        "the study's own start diverges or stays at a voltage limit; tuning began "
+        "from the best of 4"
         in text
         for text in result.warnings
     )
@@ -334,11 +335,13 @@ def test_a_box_in_which_everything_diverges():
         f"parameters/{INTEGRAL}": {"lower": 3e6, "upper": 1e7, "start": 5e6},
     }
     with pytest.raises(
-        ValueError, match="the loop diverges or rails at the start and"
+        ValueError,
+        match="the loop diverges or stays at a voltage limit at the start and",
     ) as got:
         pj.tune(case_of(changes))
     assert str(got.value) == (
-        "the loop diverges or rails at the start and all 4 points tried in the box: "
+        "the loop diverges or stays at a voltage limit at the start and at all 4 points "
+        "tried in the box: "
         "lower the bounds of the gains, raise 'candidates', or check the plant's sign "
         "and sample rate"
     )
@@ -465,7 +468,7 @@ def test_a_study_that_is_not_there(tmp_path):
         pj.tune(tmp_path / "no.toml")
 
 
-def test_a_box_in_which_every_loop_rails_is_refused_or_called_unstable():
+def test_a_box_of_saturated_loops_is_refused_or_called_unstable():
     bounds = {"lower": 3e6, "upper": 1e7, "start": 5e6}
     try:
         result = pj.tune(case_of({f"parameters/{INTEGRAL}": bounds})).result
@@ -474,7 +477,7 @@ def test_a_box_in_which_every_loop_rails_is_refused_or_called_unstable():
     assert not result.before.stable
 
 
-def test_a_start_that_rails_is_said():
+def test_a_saturated_start_has_a_warning():
     changes = {
         f"parameters/{INTEGRAL}/upper": 1e7,
         f"parameters/{INTEGRAL}/start": 5e6,
