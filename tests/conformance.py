@@ -170,7 +170,7 @@ class KeepsTheProtocol:
         assert runs.outputs.dtype == jnp.float64
         assert np.max(np.abs(np.diff(runs.outputs[1, :6], axis=0))) > 0.0
 
-    def test_its_gradient_is_that_of_differences(self, runs):
+    def test_its_gradient_equals_finite_differences(self, runs):
         assert np.all(np.isfinite(runs.found))
         np.testing.assert_allclose(
             runs.found, runs.expected, rtol=1e-5, atol=1e-8 * runs.size

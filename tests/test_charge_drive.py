@@ -44,7 +44,7 @@ def after(state, drive, inputs):
 
 
 @pytest.mark.parametrize("frequency", [0.05, 0.5, 5.0, 50.0])
-def test_a_linear_load_is_that_of_the_printed_transfer_function(frequency):
+def test_a_linear_load_has_the_printed_transfer_function(frequency):
     drive = ChargeDrive(Affine(), 0.8, 0.2, 0.5, 1e-3)
     w = 2.0 * np.pi * frequency
     period = round(1e3 / frequency)
@@ -59,7 +59,7 @@ def test_a_linear_load_is_that_of_the_printed_transfer_function(frequency):
     np.testing.assert_allclose(found, expected, rtol=0.01)
 
 
-def test_matched_times_make_it_a_gain():
+def test_equal_time_constants_give_a_gain():
     inputs = np.cumsum(np.random.default_rng(1).normal(size=2_000))
     drive = ChargeDrive(Affine(), 0.7, 0.1, 0.1, DT)
     np.testing.assert_allclose(
@@ -67,7 +67,7 @@ def test_matched_times_make_it_a_gain():
     )
 
 
-def test_a_hysteretic_load_is_the_loop_of_the_equations():
+def test_a_hysteretic_load_equals_the_equations():
     drive = ChargeDrive(LOAD, 1.1, 0.02, 0.025, DT)
     time = DT * np.arange(20_000)
     inputs = 25.0 * (1.0 - np.cos(2 * np.pi * 7.0 * time)) + 5.0 * np.sin(200.0 * time)
@@ -92,13 +92,13 @@ def loop_width(corner_time):
     return 100.0 * np.abs(rising - falling).max() / np.ptp(y)
 
 
-def test_charge_takes_the_hysteresis_out_above_its_corner_and_not_below():
+def test_charge_control_removes_hysteresis_above_its_corner_only():
     charge, voltage = loop_width(1.0), loop_width(5e-4)  # 0.16 and 320 Hz
     assert voltage > 8.0
     assert charge < 0.11 * voltage  # the 89 % of section 2.5.1
 
 
-def test_a_loop_with_it_starts_at_rest_and_stays_there():
+def test_a_loop_with_a_charge_drive_stays_at_rest():
     @jax.jit
     def run(reference):
         loop = Feedback(
@@ -111,7 +111,7 @@ def test_a_loop_with_it_starts_at_rest_and_stays_there():
         np.testing.assert_allclose(samples.displacement, level, rtol=0.0, atol=1e-7)
 
 
-def test_gradients_are_those_of_differences_and_finite_at_rest():
+def test_gradients_equal_finite_differences_and_are_finite_at_rest():
     command = signals.sine(signals.time_grid(0.02, p753.RATE), 100.0, 20.0)
     start = rest()
 
@@ -130,7 +130,7 @@ def test_gradients_are_those_of_differences_and_finite_at_rest():
     np.testing.assert_array_equal(found, 0.0)
 
 
-def test_at_rest_its_output_is_its_static_gain():
+def test_at_rest_the_output_is_the_static_gain():
     drive = ChargeDrive(LOAD, 0.8, 0.2, 0.5, DT)
     held = response(drive, jnp.full(100, 10.0))
     np.testing.assert_allclose(held, 0.8 * 0.5 / 0.2 * 10.0, rtol=0.0, atol=1e-9)

@@ -142,7 +142,7 @@ def test_help(command):
         assert option in result.stdout
 
 
-def test_help_names_what_can_be_chosen():
+def test_help_names_the_choices():
     assert "STUDY" in call("tune", "--help").stdout
     assert all(table in call("reproduce", "--help").stdout for table in TABLES)
     text = call("identify", "--help").stdout
@@ -160,7 +160,7 @@ def test_defaults_are_those_of_the_functions():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_python_m(command):
+def test_python_m_returns_status_and_one_line(command):
     # As typed, and what the user's shell sees: status, one line, no traceback.
     argument = {
         "reproduce": ["--table", "9-9"],
@@ -208,7 +208,7 @@ def test_a_folder_that_cannot_be_written_is_refused(command, request, tmp_path):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_file_in_the_place_of_the_folder(command, request, tmp_path):
+def test_a_file_in_place_of_the_folder_is_refused(command, request, tmp_path):
     (tmp_path / "out").write_text("mine")
     result = call(command, *arguments_for(command, request), "--out", tmp_path / "out")
     failed(result, "cannot be written: File exists")
@@ -218,7 +218,7 @@ def test_a_file_in_the_place_of_the_folder(command, request, tmp_path):
 # validate
 
 
-def test_validate_writes_a_model_that_is_checked(tmp_path):
+def test_validate_writes_a_checked_model(tmp_path):
     record = write_record(tmp_path, late=1)
     model, out = write_model(tmp_path), tmp_path / "out"
     printed = succeeded(call("validate", model, record, *COLUMNS, "--out", out)).stdout
@@ -318,7 +318,7 @@ def test_tune_result_and_gains_load(tuned):
     assert raw["holdout"]["geomean_rms_um"] < raw["holdout_before"]["geomean_rms_um"]
 
 
-def test_tune_tells_where_it_stands_and_ends_with_a_table(tuned):
+def test_tune_reports_progress_and_ends_with_a_table(tuned):
     printed, out = tuned
     lines = printed.stdout.splitlines()
     assert lines[0] == "reading small.toml"
@@ -331,7 +331,7 @@ def test_tune_tells_where_it_stands_and_ends_with_a_table(tuned):
     assert " ".join(text.split()).endswith(str(out))
 
 
-def test_tuned_gains_can_be_tuned_again(tuned, tmp_path):
+def test_tuned_gains_are_the_start_of_another_search(tuned, tmp_path):
     _, out = tuned
     (tmp_path / "gains.toml").write_bytes((out / "gains.toml").read_bytes())
     case = read(write_study(tmp_path, controller={"file": "gains.toml"}))
@@ -340,7 +340,7 @@ def test_tuned_gains_can_be_tuned_again(tuned, tmp_path):
     )
 
 
-def test_quiet_seeded_and_without_a_folder(study, monkeypatch):
+def test_quiet_and_seed_without_a_folder(study, monkeypatch):
     monkeypatch.chdir(study.parent)
     used = study.parent / "results" / "small"
     used.mkdir(parents=True)
@@ -367,7 +367,7 @@ def test_tune_bad_studies(tmp_path):
     failed(call("tune", path, *out, "--quiet"), "no.csv: No such file or directory")
 
 
-def test_tune_a_box_in_which_everything_diverges(tmp_path):
+def test_tune_refuses_a_box_of_diverging_loops(tmp_path):
     path = write_study(
         tmp_path,
         actuator={"lower": -1e300, "upper": 1e300},
@@ -388,7 +388,7 @@ def assert_interrupted(out):
     return result
 
 
-def test_ctrl_c_in_mid_run(study, tmp_path, monkeypatch):
+def test_ctrl_c_during_the_search_keeps_the_best_gains(study, tmp_path, monkeypatch):
     def press(self, best):
         raise KeyboardInterrupt
 
@@ -401,7 +401,7 @@ def test_ctrl_c_in_mid_run(study, tmp_path, monkeypatch):
     assert len(assert_interrupted(tmp_path / "out").history) == 1
 
 
-def test_ctrl_c_waits_for_the_next_word_of_progress():
+def test_ctrl_c_waits_for_the_next_progress_report():
     with Bar(console(quiet=True)) as bar:
         bar.stage("compiling")
         signal.raise_signal(signal.SIGINT)
@@ -410,7 +410,7 @@ def test_ctrl_c_waits_for_the_next_word_of_progress():
         bar.stage("judging")  # the press is spent: what was found can be judged
 
 
-def test_ctrl_c_while_judging_loses_nothing(study, tmp_path, monkeypatch):
+def test_ctrl_c_during_the_evaluation_loses_nothing(study, tmp_path, monkeypatch):
     stage = Bar.stage
 
     def press(self, text, steps=0):
@@ -449,7 +449,7 @@ def test_sigterm_acts_as_ctrl_c(study, tmp_path, monkeypatch):
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_the_second_sigterm_is_left_to_the_system():
+def test_the_second_sigterm_has_the_default_handler():
     with Bar(console(quiet=True)) as bar:
         terminate()
         assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
@@ -457,7 +457,7 @@ def test_the_second_sigterm_is_left_to_the_system():
             bar.stage("judging")
 
 
-def test_reproduce_keeps_the_tables_that_are_finished(made_up, tmp_path, monkeypatch):
+def test_reproduce_keeps_finished_tables(made_up, tmp_path, monkeypatch):
     stage = Bar.stage
 
     def send(self, text, steps=0):
@@ -475,7 +475,7 @@ def test_reproduce_keeps_the_tables_that_are_finished(made_up, tmp_path, monkeyp
     assert "interrupted" in result.stdout
 
 
-def test_identify_all_keeps_the_models_that_are_fitted(record, tmp_path, monkeypatch):
+def test_identify_all_keeps_fitted_models(record, tmp_path, monkeypatch):
     advance = Bar.stage
 
     def send(self, text, steps=0):
@@ -507,14 +507,14 @@ def test_ctrl_c_twice_acts_at_once():
             signal.raise_signal(signal.SIGINT)
 
 
-def test_ctrl_c_is_left_as_it_was():
+def test_the_handler_of_ctrl_c_is_restored():
     before = signal.getsignal(signal.SIGINT)
     with Bar(console(quiet=True)):
         assert signal.getsignal(signal.SIGINT) != before
     assert signal.getsignal(signal.SIGINT) == before
 
 
-def test_ctrl_c_before_anything_is_found(study, tmp_path, monkeypatch):
+def test_ctrl_c_before_the_first_result(study, tmp_path, monkeypatch):
     def press(self, text, steps=0):
         raise KeyboardInterrupt
 
@@ -524,7 +524,7 @@ def test_ctrl_c_before_anything_is_found(study, tmp_path, monkeypatch):
     assert "Traceback" not in result.output
 
 
-def test_ctrl_c_while_drawing_loses_no_result(study, tmp_path, monkeypatch):
+def test_ctrl_c_while_drawing_keeps_the_result(study, tmp_path, monkeypatch):
     def press(*_):
         raise KeyboardInterrupt
 
@@ -602,7 +602,7 @@ def test_fit_json_has_the_agreed_keys(identified):
         assert set(parameter) == {"value", "standard_error"}
 
 
-def test_the_model_is_a_plant_for_a_study(identified, tmp_path):
+def test_the_model_is_a_plant_of_a_study(identified, tmp_path):
     _, out = identified
     fit = json.loads((out / "fit.json").read_text(encoding="utf-8"))
     model = pj.load(out / "model.json")
@@ -699,7 +699,7 @@ def test_reproduce_writes_its_results(made_up, tmp_path):
     assert "geometric-mean ratio 1.100" in result.stdout
 
 
-def test_reproduce_all_tables_or_each_once(made_up, tmp_path):
+def test_reproduce_simulates_each_table_once(made_up, tmp_path):
     succeeded(call("reproduce", "--out", tmp_path / "a", "--quiet"))
     assert made_up == list(TABLES)
     rates = (tmp_path / "a" / f"{FIGURE}.csv").read_text().splitlines()
@@ -756,7 +756,7 @@ def test_bad_input_leaves_no_empty_folder(record, tmp_path):
     assert not out.exists()
 
 
-def test_an_early_ctrl_c_is_acknowledged(study, tmp_path, monkeypatch):
+def test_an_early_ctrl_c_prints_one_line(study, tmp_path, monkeypatch):
     def press(self, text, steps=0):
         raise KeyboardInterrupt
 
@@ -766,14 +766,14 @@ def test_an_early_ctrl_c_is_acknowledged(study, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("title", ["gain [um/V]", "a [bold] stage", "[/um] per volt"])
-def test_titles_with_brackets(tuned, title):
+def test_titles_with_brackets_are_not_markup(tuned, title):
     result = pj.load_result(tuned[1]).model_copy(update={"title": title})
     stream = io.StringIO()
     Console(file=stream, width=200).print(tuning_table(result))
     assert title in stream.getvalue()
 
 
-def test_names_with_brackets(tmp_path):
+def test_names_with_brackets_are_not_markup(tmp_path):
     path = write_study(tmp_path, name="run[bold]1.toml", rate=10_000.0)
     result = call("tune", path, "--out", tmp_path / "out")
     assert result.exit_code == 1
@@ -786,7 +786,7 @@ def test_a_long_path_is_printed_in_one_piece(made_up, tmp_path):
     assert str(out) in result.stdout
 
 
-def test_a_full_disk_is_said_in_one_line(study, tmp_path, monkeypatch):
+def test_a_full_disk_gives_one_line(study, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 

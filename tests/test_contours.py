@@ -42,7 +42,7 @@ def bend(angles, radii=(5.0, 5.0)):
 # ---- contours ----
 
 
-def test_circle_is_one_from_its_first_sample():
+def test_a_circle_is_exact_from_its_first_sample():
     path = contours.circle(TIME, 5.0, (4.0, 3.0), (1.0, -2.0), rise=0.2)
     x, y = np.asarray(path).T
     on = ((x - 5.0) / 4.0) ** 2 + ((y - 1.0) / 3.0) ** 2
@@ -54,7 +54,7 @@ def test_circle_is_one_from_its_first_sample():
 
 
 @pytest.mark.parametrize("path", [contours.circle, contours.lissajous, contours.raster])
-def test_a_rise_leaves_no_jump_in_speed(path):
+def test_a_rise_removes_the_jump_in_speed(path):
     for rise, jump in ((0.0, True), (0.2, False)):
         speed = np.diff(np.asarray(path(TIME, rise=rise)), axis=0)
         first = np.abs(speed[0]).max() / np.abs(speed).max()
@@ -62,7 +62,7 @@ def test_a_rise_leaves_no_jump_in_speed(path):
 
 
 @pytest.mark.parametrize(("cycles"), [(1, 1), (5, 4), (4, 5), (3, 1), (1, 2), (2, 1)])
-def test_lissajous_closes_after_a_period_and_does_not_run_back(cycles):
+def test_a_lissajous_closes_after_a_period_without_retracing(cycles):
     time = jnp.arange(2001) / 2000.0
     path = np.asarray(contours.lissajous(time, 1.0, cycles))
     np.testing.assert_allclose(path[0], path[-1], atol=1e-12)
@@ -75,7 +75,7 @@ def test_lissajous_closes_after_a_period_and_does_not_run_back(cycles):
     assert speed.min() > 0.02 * speed.max()
 
 
-def test_raster_is_triangles_at_constant_speed():
+def test_a_raster_has_triangles_at_constant_speed():
     path = contours.raster(TIME, 10.0, (5.0, 2.0), (1.0, 3.0), lines=8, turnaround=0.0)
     turns = np.asarray(TIME) * 10.0
     fast = 1.0 + 10.0 * _tri(turns)
@@ -87,7 +87,7 @@ def _tri(turns):
     return np.interp(turns % 1.0, [0.0, 0.5, 1.0], [0.0, 1.0, 0.0])
 
 
-def test_turnarounds_are_of_constant_acceleration_and_keep_the_range():
+def test_turnarounds_have_constant_acceleration_and_keep_the_range():
     time = jnp.arange(20_000) / 20_000.0
     share = 0.2
     x = np.asarray(contours.raster(time, 2.0, 5.0, turnaround=share))[:, 0]
@@ -103,7 +103,7 @@ def test_turnarounds_are_of_constant_acceleration_and_keep_the_range():
     np.testing.assert_allclose(straight.mean(), 1.0 - 2.0 * share, atol=0.01)
 
 
-def test_stairs_step_in_the_turns_only():
+def test_stairs_rise_in_the_turns_only():
     path = contours.raster(TIME, 10.0, 5.0, lines=5, turnaround=0.1, stepped=True)
     y = np.asarray(path)[:, 1]
     levels = y.reshape(20, 100)[:, 50]  # the middle of each line
@@ -115,7 +115,7 @@ def test_stairs_step_in_the_turns_only():
 
 
 @pytest.mark.parametrize("stepped", [False, True])
-def test_gradients_of_a_raster_are_finite_differences(stepped):
+def test_gradients_of_a_raster_equal_finite_differences(stepped):
     time = TIME[1:700]
 
     @jax.jit
@@ -131,7 +131,7 @@ def test_gradients_of_a_raster_are_finite_differences(stepped):
         np.testing.assert_allclose(slope[i], difference, rtol=2e-5)
 
 
-def test_gradients_of_a_circle_are_the_closed_form():
+def test_gradients_of_a_circle_equal_the_closed_form():
     frequency, radius = 3.0, 4.0
     dx = jax.jacfwd(contours.circle, argnums=(1, 2))(TIME, frequency, radius)
     t = np.asarray(TIME)
@@ -156,7 +156,7 @@ def test_gradients_of_a_circle_are_the_closed_form():
         ("Rx+Ry:RASTER10/0.25 Z:SIN1", {"Rx": "SCAN10", "Ry": "TRI0.25", "Z": "SIN1"}),
     ],
 )
-def test_names_are_shorthands_of_two_signals(name, expected):
+def test_names_stand_for_two_signals(name, expected):
     assert motions.parse(name, AXES) == expected
     amplitudes, offsets = (5.0, 50.0, 40.0), (0.0, 1.0, 2.0)
     spelled = " ".join(f"{axis}:{kind}" for axis, kind in expected.items())
@@ -179,7 +179,7 @@ def test_names_are_shorthands_of_two_signals(name, expected):
         ("Rx+Ry:RASTER10/2", contours.raster(TIME, 10.0, lines=5)),
     ],
 )
-def test_names_are_the_functions(name, path):
+def test_named_contours_equal_the_functions(name, path):
     found = motions.motion(name, TIME, AXES, (5.0,) * 3, (0.0,) * 3)
     np.testing.assert_allclose(found[:, 1:], path, atol=1e-9)
     np.testing.assert_array_equal(found[:, 0], 0.0)
@@ -227,7 +227,7 @@ def test_bad_arguments_are_refused(make, message):
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.parametrize(("gain", "lag"), [(1.0, 0.3), (0.9, 0.0), (1.1, 0.5)])
-def test_on_a_circle_only_the_gain_counts_not_the_lag(gain, lag, direction):
+def test_the_error_on_a_circle_excludes_the_lag(gain, lag, direction):
     angles = direction * 2.0 * np.pi * 5.0 * np.asarray(TIME)
     reference, found = bend(angles), gain * bend(angles - direction * lag)
     run = sample_of(reference, found)
@@ -237,14 +237,14 @@ def test_on_a_circle_only_the_gain_counts_not_the_lag(gain, lag, direction):
     np.testing.assert_allclose(exact, abs(gain - 1.0) * 5.0, atol=1e-6)
 
 
-def test_on_a_line_the_error_along_it_does_not_count():
+def test_the_error_along_a_line_does_not_count():
     along, across = np.array([0.8, 0.6]), np.array([-0.6, 0.8])
     reference = 30.0 * np.asarray(TIME)[:, None] * along
     run = sample_of(reference, reference - 2.0 * along + 0.25 * across)
     np.testing.assert_allclose(figures(ContourError(), run), 0.25, rtol=1e-9)
 
 
-def test_at_rest_and_on_return_the_whole_distance_counts():
+def test_at_rest_and_at_reversals_the_whole_distance_counts():
     still = np.zeros((50, 2)) + 3.0
     run = sample_of(still, still + [0.3, 0.4])
     np.testing.assert_allclose(figures(ContourError(), run), 0.5, rtol=1e-12)
@@ -275,7 +275,7 @@ def wavy(seed=1):
 
 
 @pytest.mark.parametrize("start", [0, 1, 2, 150, 398])
-def test_figures_are_those_of_an_oracle(start):
+def test_figures_equal_those_of_an_oracle(start):
     reference, found = wavy()
     expected = circles(reference, found)[max(start - 1, 0) :]
     three = [np.insert(points, 1, 99.0, axis=1) for points in (reference, found)]
@@ -284,7 +284,7 @@ def test_figures_are_those_of_an_oracle(start):
     np.testing.assert_allclose(result.peak, expected.max(), rtol=1e-7)
 
 
-def test_it_is_near_the_exact_distance_from_the_whole_path():
+def test_the_error_is_close_to_the_distance_from_the_path():
     reference, _ = wavy()
     found = reference[:-3] + [0.02, -0.03]  # 3 samples late, and off
     exact = distance_to(found[100:], reference)
@@ -299,7 +299,7 @@ def test_a_run_that_ends_before_the_start_has_no_figures():
     assert np.all(np.isnan(result))
 
 
-def test_gradient_is_finite_differences_and_zero_where_perfect():
+def test_gradient_equals_finite_differences_and_is_zero_without_error():
     reference, found = wavy()
 
     def total(displacement):

@@ -192,7 +192,9 @@ def test_a_study_uses_the_controller_the_constraint_and_the_stage(page, lab, tmp
     assert gains["type"] == "LeadLag"
 
 
-def test_the_lead_lag_equals_the_bilinear_transform_of_scipy(page, tmp_path, monkeypatch):
+def test_the_lead_lag_equals_the_bilinear_transform_of_scipy(
+    page, tmp_path, monkeypatch
+):
     from scipy import signal
 
     import piezojax as pj

@@ -58,7 +58,7 @@ ERRORS = {
 }
 
 
-def test_matrix_holds_each_axis_driven_alone():
+def test_the_matrix_contains_each_axis_driven_alone():
     found = coupling_matrix(study_of(), ERRORS)
     expected = [
         [0.5, 0.01, 0.02],
@@ -72,7 +72,7 @@ def test_matrix_holds_each_axis_driven_alone():
     np.testing.assert_allclose(found.percent, shares, rtol=1e-12)
 
 
-def test_what_is_not_driven_alone_is_not_known():
+def test_axes_never_driven_alone_are_unknown():
     driven_alone = {name: e for name, e in ERRORS.items() if not name.startswith("Rx:")}
     found = coupling_matrix(study_of(), driven_alone).errors
     assert np.all(np.isnan(found[1]))
@@ -90,13 +90,13 @@ def test_one_axis_has_no_coupling():
     assert contour_figure(study, "", []) is None
 
 
-def test_frequencies_of_contours_are_checked_as_others():
+def test_frequencies_of_contours_are_checked():
     references = BASE["references"] | {"tune": ["Rx+Ry:CIRCLE300"]}
     with pytest.raises(ValueError, match="CIRCLE300 is not below half the rate"):
         study_of(BASE | {"references": references})
 
 
-def test_traces_of_a_contour_are_both_its_axes():
+def test_a_contour_gives_traces_of_both_axes():
     traces = [t for t in traces_of(study_of()) if t.name.startswith("Rx+Ry")]
     assert [(t.name, t.driven) for t in traces] == [
         ("Rx+Ry:CIRCLE10 (Z)", False),
@@ -141,7 +141,7 @@ def texts(ax):
     return [text.get_text() for text in ax.texts]
 
 
-def test_coupling_picture_says_shares_and_amounts_with_units():
+def test_coupling_picture_has_shares_and_values_with_units():
     study = study_of()
     with plot_style():
         picture = coupling_figure(outcome_of(study).coupling, study.title)
@@ -200,7 +200,7 @@ def test_contour_picture_magnifies_the_distance_not_the_lag():
     assert labels[1].endswith("nrad rms")
 
 
-def test_results_of_several_axes_come_with_both_pictures(tmp_path):
+def test_results_of_several_axes_have_both_pictures(tmp_path):
     references = BASE["references"] | {"tune": ["Rx+Ry:CIRCLE10"], "unseen": []}
     case = build(study_of(BASE | {"references": references}), "small.toml", seed=None)
     time = signals.time_grid(0.2, 500.0)

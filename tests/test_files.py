@@ -49,9 +49,7 @@ def interrupt(*_):
 @pytest.mark.parametrize(
     ("fault", "kind"), [(disk_full, DiskFullError), (interrupt, KeyboardInterrupt)]
 )
-def test_a_fault_in_the_middle_leaves_the_old_file(
-    tmp_path, monkeypatch, step, fault, kind
-):
+def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch, step, fault, kind):
     path = tmp_path / "result.json"
     write_text(path, "old")
     if step == "write_bytes":
@@ -70,14 +68,14 @@ def test_a_fault_in_the_middle_leaves_the_old_file(
     assert names(tmp_path) == ["result.json"]
 
 
-def test_fresh_folder_is_made_with_its_parents(tmp_path):
+def test_a_fresh_folder_is_created_with_its_parents(tmp_path):
     path = tmp_path / "a" / "b"
     assert fresh_folder(path) == path
     assert path.is_dir()
     assert names(path) == []
 
 
-def test_an_empty_folder_will_do(tmp_path):
+def test_an_empty_folder_is_accepted(tmp_path):
     assert fresh_folder(tmp_path) == tmp_path
     assert names(tmp_path) == []
 
@@ -92,7 +90,7 @@ def test_a_used_folder_is_refused_and_left_alone(tmp_path, occupant):
     assert (tmp_path / occupant).read_text() == "mine"
 
 
-def test_a_file_is_no_folder(tmp_path):
+def test_a_file_is_refused_as_a_folder(tmp_path):
     path = tmp_path / "out"
     path.write_text("mine")
     with pytest.raises(ValueError, match=f"--out {path} cannot be written: File exi"):
@@ -119,7 +117,7 @@ def test_a_folder_without_permission(tmp_path, below):
         tmp_path.chmod(0o700)
 
 
-def test_a_folder_that_takes_no_files(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
@@ -173,17 +171,19 @@ def litter(litter_names, tmp_path):
     return folder
 
 
-def test_a_killed_run_leaves_nothing_after_the_next(litter):
+def test_the_next_run_removes_files_of_a_killed_run(litter):
     assert numbered_folder(litter) == litter
     assert names(litter) == []
 
 
-def test_a_folder_of_a_killed_run_is_taken_again(litter):
+def test_a_folder_of_a_killed_run_is_used_again(litter):
     assert fresh_folder(litter) == litter
     assert names(litter) == []
 
 
-def test_results_of_a_killed_run_are_kept_and_its_litter_is_not(litter, litter_names):
+def test_results_of_a_killed_run_are_kept_and_its_temporary_files_are_not(
+    litter, litter_names
+):
     inner = litter / "models" / "lag"
     inner.mkdir(parents=True)
     (inner / "fit.json").write_text("{}")
@@ -195,7 +195,7 @@ def test_results_of_a_killed_run_are_kept_and_its_litter_is_not(litter, litter_n
     assert names(inner) == ["fit.json"]
 
 
-def test_files_in_use_are_left_alone(tmp_path):
+def test_files_in_use_are_kept(tmp_path):
     with temporary(tmp_path / "result.json") as own:
         # The parent of this process runs for as long as this one.
         process, parent = f".{os.getpid()}.", f".{os.getppid()}."
@@ -206,7 +206,7 @@ def test_files_in_use_are_left_alone(tmp_path):
     assert names(tmp_path) == [other.name]
 
 
-def test_a_file_of_an_earlier_process_with_our_number_is_stale(tmp_path):
+def test_a_file_of_an_earlier_process_with_this_number_is_stale(tmp_path):
     with temporary(tmp_path / "result.json") as own:
         name = own.name
     (tmp_path / name).touch()
@@ -225,13 +225,13 @@ def test_files_of_another_machine_are_judged_by_their_age(tmp_path, age, left):
 
 
 @pytest.mark.parametrize("name", [".hidden.part", "a.host.1.0123abcd.part", ".nfs01"])
-def test_files_of_others_are_left_alone(tmp_path, name):
+def test_files_of_other_users_are_kept(tmp_path, name):
     (tmp_path / name).touch()
     remove_stale(tmp_path)
     assert names(tmp_path) == [name]
 
 
-def test_a_folder_in_use_is_not_taken(tmp_path):
+def test_a_folder_in_use_is_refused(tmp_path):
     stem = tmp_path / "p753"
     stem.mkdir()
     with claimed(stem) as alone:

@@ -45,7 +45,7 @@ def test_saturation_passes_the_gradient_only_inside():
         assert 0.0 <= jax.grad(lambda u: output(limits, u))(edge) <= 1.0
 
 
-def test_slew_limit_moves_by_no_more_than_its_rate():
+def test_slew_limit_bounds_the_rate():
     rate, inputs = 1e5, rough(10.0)
     expected, last = [], 0.0
     for input in inputs:
@@ -58,12 +58,12 @@ def test_slew_limit_moves_by_no_more_than_its_rate():
     assert np.any(np.abs(outputs - inputs) < 1e-12)  # where it keeps up
 
 
-def test_slew_limit_starts_where_it_is_told():
+def test_slew_limit_starts_at_the_given_value():
     limit = SlewLimit(1.0, DT)
     assert limit.step(limit.init(80.0), 80.0)[1] == 80.0
 
 
-def test_gradient_of_the_slew_limit_is_that_of_differences():
+def test_gradient_of_the_slew_limit_equals_finite_differences():
     inputs, weights = rough(10.0, 50), rough(1.0, 50)
 
     def loss(rate):
@@ -99,7 +99,7 @@ def test_sensor_scales_the_draws():
     np.testing.assert_array_equal(measured, displacement + 0.012 * draws)
 
 
-def test_a_sensor_with_converter_rounds_what_is_noisy():
+def test_a_sensor_with_converter_rounds_the_noisy_value():
     chain = Sensor(0.3) >> Quantiser(1.0)
     state = chain.init((0.0, 0.0))
     assert float(chain.step(state, (5.0, 1.0))[1]) == 5.0

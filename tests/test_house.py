@@ -91,13 +91,13 @@ def test_subpackages_import_downwards_and_share_no_names():
     assert violations(Path(piezojax.__file__).parent) == []
 
 
-def test_every_subpackage_is_there():
+def test_every_subpackage_is_listed():
     package = Path(piezojax.__file__).parent
     subpackages = {parts[0] for parts in modules(package)}
     assert subpackages == {*SUBPACKAGES, *ENTRIES}
 
 
-def test_pictures_are_drawn_without_computing():
+def test_reports_do_not_compute():
     """A report draws numbers that it is given: nothing there simulates or solves."""
     for path in (Path(piezojax.__file__).parent / "report").glob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))

@@ -121,7 +121,7 @@ def started(loop):
 
 @pytest.mark.parametrize("design", DESIGNS)
 @pytest.mark.parametrize("model", models())
-def test_every_model_has_every_design_or_the_reason_why_not(model, design):
+def test_every_model_has_every_design_or_a_reason(model, design):
     reason = REFUSED.get((model, design))
     if reason:
         with pytest.raises(ValueError, match=reason) as caught:

@@ -31,7 +31,7 @@ def figures(metric, samples):
 
 
 @pytest.mark.parametrize("start", [0, 1, 100, SAMPLES - 1])
-def test_figures_are_those_of_the_window(start):
+def test_figures_count_the_window(start):
     run = record()
     found = figures(Tracking(start), run)
     error = np.asarray(run.displacement - run.reference)[start:]
@@ -52,13 +52,13 @@ def test_figures_are_those_of_the_window(start):
         np.testing.assert_allclose(getattr(found, name), value, rtol=1e-12, atol=1e-15)
 
 
-def test_a_run_of_which_nothing_counts_is_not_perfect():
+def test_a_run_without_counted_samples_has_nan_figures():
     found = figures(Tracking(SAMPLES), record())
     assert all(np.isnan(found[:4]))
     assert all(np.isfinite(found[4:]))
 
 
-def test_tolerance_says_what_counts_as_saturated():
+def test_the_tolerance_defines_saturation():
     run = record()
     shortfall = np.abs(run.command - run.voltage)
     for tolerance in (0.01, 0.1, 50.0):
@@ -67,7 +67,7 @@ def test_tolerance_says_what_counts_as_saturated():
     assert figures(Tracking(tolerance=0.01), run).saturated > 0.5
 
 
-def test_both_signs_of_a_shortfall_count():
+def test_saturation_counts_at_both_limits():
     run = record()
     mirrored = run._replace(command=-run.command, voltage=-run.voltage)
     assert figures(Tracking(), run) == figures(Tracking(), mirrored)
@@ -94,7 +94,7 @@ def test_gradient_at_zero_error_is_zero():
     np.testing.assert_array_equal(smooth(run.displacement), np.zeros(SAMPLES))
 
 
-def test_gradient_is_the_closed_form():
+def test_gradient_equals_the_closed_form():
     run = record()
     slope = jax.grad(
         lambda d: figures(Tracking(100), run._replace(displacement=d)).rms_error
@@ -110,7 +110,7 @@ def test_figures_are_float64():
     assert {value.dtype for value in found} == {jnp.dtype("float64")}
 
 
-def test_extremes_are_those_of_the_whole_run():
+def test_extremes_cover_the_whole_run():
     run = record()
     found = figures(Extremes(), run)
     swing = np.ptp(run.reference)
@@ -120,7 +120,7 @@ def test_extremes_are_those_of_the_whole_run():
     assert beyond > 0.0
 
 
-def test_below_the_reference_and_at_rest_nothing_overshoots():
+def test_there_is_no_overshoot_below_the_reference_or_at_rest():
     run = record()
     below = run._replace(displacement=run.reference - 1.0)
     assert figures(Extremes(), below).overshoot == 0.0
@@ -128,13 +128,13 @@ def test_below_the_reference_and_at_rest_nothing_overshoots():
     assert figures(Extremes(), still).overshoot == 0.0
 
 
-def test_a_pair_of_metrics_gives_the_figures_of_each():
+def test_a_pair_of_metrics_gives_both_figures():
     run, first, second = record(), Tracking(100), Extremes()
     found = figures(MetricPair(first, second), run)
     assert found == (figures(first, run), figures(second, run))
 
 
-def test_the_root_is_flat_at_zero():
+def test_the_root_has_slope_zero_at_zero():
     assert root(jnp.asarray(9.0)) == 3.0
     assert root(jnp.asarray(0.0)) == jax.grad(root)(0.0) == 0.0
     assert np.isnan(root(jnp.asarray(np.nan)))

@@ -17,7 +17,7 @@ REST = (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("order", mirror.ORDERS)
-def test_the_stage_is_the_model_a_sample_late(order):
+def test_the_stage_is_the_model_with_a_sample_of_delay(order):
     model, stage = mirror.model(order), mirror.stage(order=order)
     drive = np.random.default_rng(0).standard_normal((200, 3))
     A, B, C, D = (np.asarray(getattr(model, name)) for name in "ABCD")
@@ -31,7 +31,7 @@ def test_the_stage_is_the_model_a_sample_late(order):
     np.testing.assert_allclose(stage.dc_gain(), model.dc_gain(), rtol=1e-8)
 
 
-def test_an_order_that_is_not_there():
+def test_an_unknown_order_is_refused():
     with pytest.raises(ValueError, match=r"order is 13; it must be one of \[12, 24\]"):
         mirror.model(13)
 
@@ -53,7 +53,7 @@ def test_margins(loop):
 
 
 @pytest.mark.slow
-def test_it_follows_sines_and_starts_at_rest(loop):
+def test_the_loop_follows_sines_and_starts_at_rest(loop):
     start = (0.2, -0.1, 0.3)
     time = mirror.DT * np.arange(3_200)
     sines = [0.5 * np.sin(2.0 * math.pi * hertz * time) for hertz in (10, 20, 30)]

@@ -9,7 +9,7 @@ AXES = ("Z", "Rx", "Ry")
 TIME = signals.time_grid(1.0, 500.0)
 
 
-def test_named_axes_move_and_the_others_rest_at_their_offset():
+def test_axes_without_a_signal_rest_at_their_offset():
     found = motions.motion(
         "Z:SIN2 Ry:SW10", TIME, AXES, (5.0, 6.0, 7.0), (1.0, 2.0, 3.0)
     )
@@ -28,6 +28,6 @@ def test_named_axes_move_and_the_others_rest_at_their_offset():
         ("Z:WAVE3", r"signal 'WAVE3' is unknown"),
     ],
 )
-def test_what_is_no_motion_is_refused(name, message):
+def test_bad_motions_are_refused(name, message):
     with pytest.raises(ValueError, match=message):
         motions.parse(name, AXES)

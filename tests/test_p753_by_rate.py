@@ -45,7 +45,7 @@ OURS = {"bang-bang": {"control_weight"}}
 
 
 @pytest.mark.parametrize("name", SAME)
-def test_printed_gains_where_they_are_printed(name):
+def test_printed_rates_have_the_printed_gains(name):
     make, source, rates = SAME[name]
     for rate in rates:
         expected = parameters(source(rate))
@@ -56,7 +56,7 @@ def test_printed_gains_where_they_are_printed(name):
             np.testing.assert_allclose(found[path], value, rtol=1e-15, err_msg=path)
 
 
-def test_scaled_gains_are_the_same_loop_in_samples():
+def test_scaled_gains_give_the_same_loop_in_samples():
     near, far = p753_by_rate.inversion(20_000), p753_by_rate.inversion(5_000)
     power = {"law.proportional": 1, "law.integral": 0, "law.derivative": 2}
     for name, exponent in (power | {"surface": -1}).items():
@@ -116,7 +116,7 @@ SERIES = tuple(mantissa * 10.0**power for power in range(4) for mantissa in (1, 
 
 
 @pytest.mark.parametrize("rate", p753_by_rate.BANG_BANG_CONTROL_WEIGHT)
-def test_the_weight_of_bang_bang_is_the_first_of_its_series_off_the_limits(rate):
+def test_the_weight_of_bang_bang_is_the_first_without_saturation(rate):
     loop = Feedback(
         p753_by_rate.bang_bang(rate),
         p753_by_rate.chapter4_plant(rate=rate),

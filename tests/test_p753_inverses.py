@@ -18,7 +18,7 @@ def record():
     return p753_inverses.record_of(p753.plant(), INPUT)
 
 
-def test_the_excitation_is_in_range_from_rest():
+def test_the_excitation_starts_at_rest_and_stays_in_range():
     full = p753_inverses.excitation()
     low, high = p753.VOLTAGE_LIMITS
     assert full[0] == 0.0
@@ -26,7 +26,7 @@ def test_the_excitation_is_in_range_from_rest():
     assert high - 5.0 < full.max() < high
 
 
-def test_the_preisach_stage_is_of_the_size_of_the_printed_one():
+def test_the_preisach_stage_has_the_size_of_the_printed_one():
     model = p753_inverses.preisach(8)
     path = np.concatenate([np.linspace(0.0, 120.0, 61), np.linspace(120.0, -20.0, 71)])
     output = np.asarray(p753_inverses.response(model, path))
@@ -35,14 +35,14 @@ def test_the_preisach_stage_is_of_the_size_of_the_printed_one():
     assert 0.9 < np.ptp(output) / np.ptp(printed) < 1.2
 
 
-def test_the_printed_hysteresis_is_fitted_again(record):
+def test_the_printed_hysteresis_is_recovered(record):
     found = p753_inverses.fitted_coleman_hodgdon(record)
     for name, value in p753.HYSTERESIS_CHAPTER_5.items():
         np.testing.assert_allclose(getattr(found, name), value, rtol=0.02)
     np.testing.assert_allclose(found.rest_output, 0.0, atol=0.005)
 
 
-def test_both_inverses_go_into_the_printed_controller(record):
+def test_both_inverses_work_in_the_printed_controller(record):
     model = p753_inverses.fitted_preisach(record, 6)
     assert (model.low, model.high) == p753.VOLTAGE_LIMITS
     assert np.all(model.weights >= 0.0)

@@ -53,7 +53,7 @@ def test_every_path_leads_to_its_leaf(loop):
         assert get(loop, path) is value
 
 
-def test_replace_changes_one_leaf_and_no_other(loop):
+def test_replace_changes_one_leaf_only(loop):
     before = parameters(loop)
     for path in before:
         after = parameters(replace(loop, {path: 0.123}))
@@ -137,7 +137,7 @@ def test_only_array_leaves_are_parameters(path):
         get(p753.loop(p753.pid()), path)
 
 
-def test_static_fields_are_found_wherever_they_are():
+def test_static_fields_are_found_at_any_depth():
     plant = series(lag=FirstOrderLag(1e-3, 1e-4), pause=Delay(3))
     loop = Feedback(p753.pid(), plant, p753.actuator(), Affine())
     assert static_fields(loop, "dt") == [5e-5, 1e-4]
@@ -170,7 +170,7 @@ def test_declarations_are_found_by_path():
     assert declared(inner >> Affine(), "0.bank.gains.0").meaning == "gains"
 
 
-def test_declarations_know_the_nyquist_frequency():
+def test_declarations_use_the_nyquist_frequency():
     for dt in (1e-3, 1e-4):
         bank = Bank((1.0,), 5.0, 3.0, dt)
         assert declared(bank, "corner").below == np.pi / dt
@@ -225,7 +225,7 @@ class Outer(System):
         return self.inner.step(state, input)
 
 
-def test_units_come_from_the_systems_around():
+def test_units_come_from_the_outer_systems():
     alone = Gain(1.0)
     assert declared(alone, "gain") is dict(declarations(Gain))["gain"]
     assert declared(Outer(alone), "inner.gain").unit == "[u] s/um"
@@ -282,11 +282,11 @@ def test_no_gain_of_a_loop_has_an_open_unit(controller):
 @pytest.mark.parametrize(
     "path", ["bare", "bare.gains", "nothing", "corner.x", "gains.7", "gains.0.x", ""]
 )
-def test_nothing_is_declared_there(path):
+def test_undeclared_paths_have_no_declaration(path):
     assert declared(Bank((1.0,), 5.0, 3.0, 1e-3), path) is None
 
 
-def test_patterns_match_across_dots_and_keep_the_order():
+def test_patterns_match_dots_and_keep_the_order():
     loop = p753.loop(p753.pid())
     every = list(parameters(loop))
     assert matching(loop, "*") == every

@@ -82,7 +82,7 @@ def case(tmp_path, controller, path, plant, rate, axes=None):
 
 
 @pytest.mark.parametrize("name", ONE)
-def test_a_study_of_one_axis_reaches_it(name, tmp_path):
+def test_a_study_of_one_axis_names_the_scheme(name, tmp_path):
     controller, path, plant = ONE[name]
     found = case(tmp_path, controller, path, plant, p753.RATE)
     assert found.space.paths == (path,)
@@ -90,7 +90,7 @@ def test_a_study_of_one_axis_reaches_it(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", AXES)
-def test_a_study_of_three_axes_reaches_it(name, tmp_path):
+def test_a_study_of_three_axes_names_the_scheme(name, tmp_path):
     *names, rate = AXES[name]
     units = ("um", "um", "um") if "mirror" in name else ("um", "urad", "urad")
     found = case(

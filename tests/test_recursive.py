@@ -48,7 +48,7 @@ def test_updates_give_the_posterior(step):
     np.testing.assert_allclose(covariance / scale, expected / scale, atol=1e-8)
 
 
-def test_several_targets_are_as_many_relations():
+def test_several_targets_equal_separate_relations():
     rows, targets = relation(50)
     targets = np.column_stack([targets, 2.0 * targets**2])
     weights, covariance = np.zeros((2, 4)), np.eye(4)
@@ -59,7 +59,7 @@ def test_several_targets_are_as_many_relations():
         np.testing.assert_allclose(found, mean, rtol=1e-9, atol=1e-12)
 
 
-def test_root_stays_right_over_a_long_run_with_forgetting():
+def test_the_root_update_is_accurate_over_a_long_run_with_forgetting():
     """The covariance itself turns indefinite here."""
     forgetting, prior, count = 0.99, 1e10, 100_000
     rows, targets = relation(count)

@@ -53,7 +53,7 @@ def fresh(monkeypatch):
     monkeypatch.setattr(registry, "_registered", dict(registry._registered))
 
 
-def test_a_registered_class_is_listed_and_tried_and_fitted(fresh):
+def test_a_registered_class_is_listed_tried_and_fitted(fresh):
     kind = pj.register(line())
     assert list(registry.parts()).index("straight") == len(parts_at("hysteresis")) - 1
     assert parts_at("hysteresis")[-1] == "straight"
@@ -71,7 +71,7 @@ def test_a_registered_class_is_saved_and_loaded(fresh, tmp_path):
     assert float(back.parts[0].slope) == 2.0
 
 
-def test_a_class_that_is_not_registered_is_not_saved(tmp_path):
+def test_an_unregistered_class_is_not_saved(tmp_path):
     message = "Straight cannot be saved; register its class with piezojax.regis"
     with pytest.raises(ValueError, match=message):
         pj.save(line()(2.0), tmp_path / "a.json")
@@ -80,7 +80,7 @@ def test_a_class_that_is_not_registered_is_not_saved(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_what_load_would_refuse_is_not_saved(tmp_path):
+def test_invalid_systems_are_not_saved(tmp_path):
     lag = pj.core.paths.replace(
         pj.dynamics.FirstOrderLag(1e-3, 1e-4), {"time_constant": -1.0}
     )
@@ -89,7 +89,7 @@ def test_what_load_would_refuse_is_not_saved(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_names_and_places_that_are_refused(fresh):
+def test_bad_names_and_places_are_refused(fresh):
     with pytest.raises(ValueError, match="place is 'attic'; it must be one of hyster"):
         pj.register(line(place="attic"))
     with pytest.raises(ValueError, match="name is 'lag', the name of FirstOrderLag"):
@@ -99,7 +99,7 @@ def test_names_and_places_that_are_refused(fresh):
         pj.register(taken)
 
 
-def test_an_entry_point_makes_its_classes_known(tmp_path):
+def test_an_entry_point_registers_its_classes(tmp_path):
     (tmp_path / "outside.py").write_text(
         "import equinox as eqx\n"
         "from piezojax import System\n"

@@ -53,7 +53,7 @@ def dense():
 
 
 @pytest.mark.parametrize("segment", [1, 7, 100, SAMPLES - 1, 5000])
-def test_metric_is_that_of_the_stacked_outputs(segment, dense):
+def test_metric_equals_that_of_the_stacked_outputs(segment, dense):
     run = jax.jit(
         lambda plant: simulate(plant, VOLTAGES, metric=WeightedSum(), segment=segment)
     )
@@ -89,7 +89,7 @@ def loop():
     return p753.loop(p753.inversion())
 
 
-def test_tracking_is_that_of_the_stacked_samples(loop):
+def test_tracking_equals_that_of_the_stacked_samples(loop):
     inputs, start = loop_inputs(REFERENCE, NOISE), 333
 
     @jax.jit
@@ -114,7 +114,7 @@ def test_tracking_is_that_of_the_stacked_samples(loop):
 
 
 @pytest.mark.parametrize("every", [1, 2, 20, 50, SAMPLES, 3 * SAMPLES])
-def test_decimated_log_is_every_nth_output(every, dense):
+def test_a_decimated_log_has_every_nth_output(every, dense):
     state, outputs = jax.jit(lambda p: simulate(p, VOLTAGES, every=every))(PLANT)
     np.testing.assert_allclose(outputs, dense[1][::every], rtol=0.0, atol=1e-12)
     assert_same(state, dense[0])
@@ -135,7 +135,7 @@ def test_decimated_log_of_a_loop_has_all_its_columns(loop):
     assert_same(coarse, jax.tree.map(lambda x: x[::20], fine))
 
 
-def test_two_halves_are_the_whole(dense):
+def test_two_halves_equal_the_whole(dense):
     run = jax.jit(simulate)
     half, first = run(PLANT, VOLTAGES[:525])
     state, second = run(PLANT, VOLTAGES[525:], half)
@@ -151,14 +151,14 @@ def test_default_start_is_at_rest(dense):
 
 
 @pytest.mark.parametrize("options", [{}, {"every": 3}, {"metric": Tracking(2)}])
-def test_jit_is_eager(options, loop):
+def test_jit_equals_eager(options, loop):
     inputs, state = loop_inputs(REFERENCE[:10], NOISE[:10]), loop.init(0.0)
     eager = simulate(loop, inputs, state, **options)
     compiled = jax.jit(lambda loop: simulate(loop, inputs, state, **options))(loop)
     assert_same(eager, compiled)
 
 
-def test_eager_is_a_python_loop():
+def test_eager_equals_a_python_loop():
     state, outputs = PLANT.init(0.0), []
     for voltage in VOLTAGES[:5]:
         state, output = PLANT.step(state, voltage)
@@ -175,7 +175,7 @@ one_lane = jax.jit(lane)
 
 
 @pytest.mark.parametrize("lanes", [1, 5, 64, 130])
-def test_blocks_are_lanes_one_by_one(lanes):
+def test_blocks_equal_single_lanes(lanes):
     share = jnp.linspace(0.1, 1.0, lanes)
     plants = jax.vmap(lambda share: ColemanHodgdon(0.01 * share, 0.1, -0.05))(share)
     batch = plants, {"voltage": share}
@@ -187,13 +187,13 @@ def test_blocks_are_lanes_one_by_one(lanes):
 
 
 @pytest.mark.parametrize("size", [1, 3, 10, 11])
-def test_blocks_of_any_size_give_the_same(size):
+def test_blocks_of_any_size_give_the_same_result(size):
     values = jnp.arange(20.0).reshape(10, 2)
     found = in_blocks(lambda x, y: (x.sum(), 2.0 * y), values, values[:, 0], size=size)
     assert_same(found, (values.sum(axis=1), 2.0 * values[:, 0]))
 
 
-def test_gradient_through_blocks_is_that_of_vmap():
+def test_gradient_through_blocks_equals_that_of_vmap():
     scales = jnp.linspace(0.1, 1.0, 20)
 
     def total(mapped):
@@ -238,7 +238,7 @@ def growth(function):
     return (sizes[1] - sizes[0]) / 7000
 
 
-def test_memory_of_the_gradient_is_flat_in_time():
+def test_memory_of_the_gradient_does_not_grow_with_time():
     def accumulated(plant, voltages):
         return simulate(plant, voltages, metric=WeightedSum())[1]
 
@@ -272,7 +272,7 @@ def test_a_metric_counts_every_sample_beside_a_decimated_log(every, dense):
     assert_same(state, dense[0])
 
 
-def test_a_metric_and_a_stretch_longer_than_the_run_are_refused():
+def test_a_metric_with_a_block_longer_than_the_run_is_refused():
     with pytest.raises(ValueError, match=f"every is 2000; the run has {SAMPLES}"):
         simulate(PLANT, VOLTAGES, every=2000, metric=WeightedSum())
 

@@ -50,7 +50,7 @@ print(outputs.dtype)
 """
 
 
-def test_doubles_are_on():
+def test_float64_is_enabled():
     assert jax.config.read("jax_enable_x64")
     assert jnp.zeros(()).dtype == jnp.float64
 
@@ -69,7 +69,7 @@ def test_a_fresh_import_sets_every_flag_once_and_keeps_no_programs():
     assert "Warning" not in done.stderr
 
 
-def test_the_users_own_flags_are_kept():
+def test_flags_of_the_user_are_kept():
     own = "--xla_cpu_prefer_vector_width=256 --xla_cpu_enable_fast_math=false"
     done = python(
         "import jax, piezojax, os, jax.numpy as jnp; print(os.environ['XLA_FLAGS'])"
@@ -109,7 +109,7 @@ def test_no_warning_if_the_flags_were_there_before():
     assert "Warning" not in done.stderr
 
 
-def test_programs_are_kept_where_asked(tmp_path):
+def test_compiled_programs_are_kept_in_the_given_folder(tmp_path):
     folder = tmp_path / "cache"
     done = python(
         "import piezojax, jax, jax.numpy as jnp\n"
@@ -136,7 +136,7 @@ def test_programs_are_kept_where_asked(tmp_path):
         ("1.0.0", ""),
     ],
 )
-def test_flags_are_set_only_where_they_are_known(version, expected, monkeypatch):
+def test_flags_are_set_for_known_versions_only(version, expected, monkeypatch):
     # An unknown flag would abort the process.
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.delenv(_runtime.CACHE_VARIABLE, raising=False)
@@ -146,7 +146,7 @@ def test_flags_are_set_only_where_they_are_known(version, expected, monkeypatch)
     assert os.environ["XLA_FLAGS"] == expected
 
 
-def test_threads_simulate_side_by_side_if_asked_in_time():
+def test_threads_simulate_simultaneously_if_asked_before_the_backend_starts():
     done = python(
         "from piezojax.core import runtime as _runtime\n"
         "import jax.numpy as jnp\n"
@@ -178,13 +178,13 @@ def imported_by(code):
     return set(done.stdout.splitlines()[-1].split())
 
 
-def test_an_import_takes_nothing_heavy_along():
+def test_an_import_loads_no_heavy_packages():
     modules = imported_by("import piezojax")
     assert "piezojax.core.runtime" in modules
     assert modules.isdisjoint({"jax", "scipy", "numpy", "pydantic", *LATER})
 
 
-def test_names_that_are_used_take_along_what_they_need():
+def test_used_names_load_their_packages():
     simulation = imported_by("import piezojax; piezojax.simulate; piezojax.PerAxis")
     assert {"jax", "equinox"} < simulation
     assert simulation.isdisjoint({"scipy", "pydantic", *LATER})

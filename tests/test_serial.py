@@ -199,7 +199,7 @@ NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 
 @settings(max_examples=100, deadline=None)
 @given(NUMBERS, NUMBERS)
-def test_no_digit_is_lost(gain, offset):
+def test_no_digit_is_lost_in_memory(gain, offset):
     data = to_data(pj.core.system.Affine(gain, offset))
     back = from_data(json.loads(json.dumps(data)))
     assert (float(back.gain), float(back.offset)) == (gain, offset)
@@ -271,7 +271,7 @@ EXECUTABLE = [
 
 
 @pytest.mark.parametrize("kind", EXECUTABLE)
-def test_only_systems_are_built(kind):
+def test_only_systems_are_constructed(kind):
     message = message_for({"type": kind})
     assert message.startswith(f"system.type is {kind!r}; it must be one of ARMA, Act")
 
@@ -296,7 +296,7 @@ def test_unknown_key():
 
 
 @pytest.mark.parametrize("key", ["_kinds", "__class__", "init", "step"])
-def test_methods_and_hidden_names_are_no_keys(key):
+def test_methods_and_private_names_are_not_keys(key):
     assert message_for({"type": "Affine", key: 1.0}).startswith(
         f"system.{key} is unknown"
     )
@@ -363,7 +363,7 @@ def test_bad_values(data, message):
         ({"samples": 1}, "system.parts.1 needs a key 'type' with one of ARMA"),
     ],
 )
-def test_messages_lead_to_the_nested_table(part, message):
+def test_messages_name_the_nested_table(part, message):
     data = {"type": "Series", "parts": [{"type": "Affine"}, part]}
     assert message_for(data).startswith(message)
 
@@ -423,7 +423,7 @@ ALARMS = ["Ms 3.1 is above its limit 2", "SW30 stays at a voltage limit"]
 
 
 @pytest.mark.parametrize("name", ["a.toml", "a.json"])
-def test_a_file_says_where_its_system_is_from(tmp_path, name):
+def test_a_file_contains_the_origin_of_its_system(tmp_path, name):
     about = pj.About(study="mine", seed=3, rate_Hz=2e4, units={"command": "V"})
     save(pj.core.system.Affine(2.0), tmp_path / name, about)
     assert load(tmp_path / name) == pj.core.system.Affine(2.0)
@@ -531,7 +531,7 @@ def outcomes():
         ("a list for the whole", "type"),
     ],
 )
-def test_wrong_types_as_users_meet_them(outcomes, name, key):
+def test_wrong_types_without_type_checks(outcomes, name, key):
     kind, message = outcomes[name]
     assert kind == "ValueError"
     assert "\n" not in message

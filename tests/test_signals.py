@@ -24,7 +24,7 @@ def test_time_grid_counts_from_zero(second):
 
 
 @pytest.mark.parametrize("kind", signals.SIGNALS)
-def test_signals_are_of_one_type(kind, second):
+def test_all_signals_have_one_type(kind, second):
     # With weak types among them, a compiled loop would be compiled twice.
     assert not signals.SIGNALS[kind](second).weak_type
 
@@ -46,7 +46,7 @@ def test_bad_time_grids_are_refused(duration, rate, message):
 
 
 @pytest.mark.parametrize("name", signals.THESIS)
-def test_thesis_references_are_the_published_ones(name, second):
+def test_thesis_references_equal_the_published_ones(name, second):
     expected = oracle.ten_references(n_extra=0)[name]
     found = signals.signal(name, second)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11)
@@ -91,7 +91,7 @@ def test_start_is_at_the_offset(kind, second):
 
 
 @pytest.mark.parametrize("kind", ["SIN", "SCAN", "PWSW", "CHIRP"])
-def test_start_is_without_speed(kind, second):
+def test_start_has_zero_speed(kind, second):
     values = signals.SIGNALS[kind](second, frequency=10.0)
     assert abs(values[1] - values[0]) < 0.01 * np.abs(np.diff(values)).max()
 
@@ -125,7 +125,7 @@ def test_multisine_peaks_near_its_amplitude(second):
     assert 3.0 < np.abs(values - 1.0).max() < 5.0
 
 
-def test_multisine_holds_equal_tones_up_to_its_frequency(second):
+def test_multisine_has_equal_tones_up_to_its_frequency(second):
     spectrum = np.abs(np.fft.rfft(signals.signal("MULTISINE100", second)))
     tones = np.arange(5, 101, 5)
     np.testing.assert_allclose(spectrum[tones], spectrum[5], rtol=1e-9)
@@ -151,7 +151,7 @@ def test_triangle_has_one_speed(second):
     np.testing.assert_allclose(speeds, 2.0 * 10.0 * 10.0, rtol=1e-6)
 
 
-def test_prbs_holds_its_level_for_a_slot_and_depends_on_its_seed(second):
+def test_prbs_holds_its_level_and_depends_on_its_seed(second):
     values = np.asarray(signals.signal("PRBS100", second))
     slots = values.reshape(100, 200)
     np.testing.assert_array_equal(slots, slots[:, :1] + np.zeros((1, 200)))
@@ -177,7 +177,7 @@ def test_every_signal_is_finite_and_bounded(kind, frequency, amplitude, offset):
 
 
 @pytest.mark.parametrize("kind", signals.SIGNALS)
-def test_a_batch_of_frequencies_is_a_loop_over_them(kind):
+def test_a_batch_of_frequencies_equals_a_loop(kind):
     time = signals.time_grid(0.05, RATE)
     frequencies = jnp.array([10.0, 33.3, 400.0])
     batch = jax.vmap(signals.SIGNALS[kind], in_axes=(None, 0))(time, frequencies)
@@ -216,7 +216,7 @@ def test_a_name_without_number_keeps_the_default_frequency(second):
     )
 
 
-def test_gradient_of_the_amplitude_is_the_shape(second):
+def test_gradient_by_the_amplitude_is_the_shape(second):
     shape = (signals.sine(second) - 0.0) / 5.0
     found = jax.jacfwd(lambda a: signals.sine(second, 10.0, a))(5.0)
     np.testing.assert_allclose(found, shape, rtol=0.0, atol=1e-14)

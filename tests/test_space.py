@@ -57,7 +57,7 @@ def test_from_unit_never_leaves_the_bounds(several, point):
 
 @examples
 @given(BOXES, st.sampled_from([0.0, 1.0]))
-def test_corners_are_the_bounds_themselves(several, side):
+def test_corners_are_the_bounds(several, side):
     space = box_of(several)
     values = space.from_unit(jnp.full(len(several), side))
     expected = space.upper if side else space.lower
@@ -84,7 +84,7 @@ def test_from_unit_undoes_to_unit(several, point):
 
 @examples
 @given(bounds(), UNIT, UNIT)
-def test_larger_in_the_box_is_larger_in_the_parameter(bound, one, other):
+def test_the_map_is_increasing(bound, one, other):
     assume(abs(one - other) > 1e-6)
     space = box_of([bound])
     low, high = (
@@ -105,7 +105,7 @@ def test_middle_of_each_scale():
 
 
 @pytest.mark.parametrize("outside", [-0.2, 1.3])
-def test_beyond_the_unit_cube_the_bounds_still_hold(outside):
+def test_points_outside_the_unit_cube_stay_within_the_bounds(outside):
     space = space_of({"a": Range(1.0, 2.0), "b": Range(1.0, 2.0, "log")})
     values = np.asarray(space.from_unit(jnp.full(2, outside)))
     assert set(values) == {1.0 if outside < 0 else 2.0}
@@ -152,7 +152,7 @@ def box(**changes):
     ],
 )
 @pytest.mark.parametrize("scale", sorted(SCALES))
-def test_bounds_that_are_none(lower, upper, scale):
+def test_bad_bounds_are_refused(lower, upper, scale):
     message = (
         f"controller.gain: bounds are {lower:g} and {upper:g}; "
         "they must be finite and the lower below the upper"
@@ -162,7 +162,7 @@ def test_bounds_that_are_none(lower, upper, scale):
 
 
 @pytest.mark.parametrize("lower", [0.0, -1.0])
-def test_log_needs_what_is_positive(lower):
+def test_log_scale_needs_positive_bounds(lower):
     message = (
         f"controller.gain: the lower bound is {lower:g}; "
         "with scale 'log' it must be above 0"
@@ -174,7 +174,7 @@ def test_log_needs_what_is_positive(lower):
 @pytest.mark.parametrize(
     ("lower", "upper"), [(0.0, 0.5), (0.5, 1.0), (-0.5, 0.5), (0.5, 3.0)]
 )
-def test_logit_needs_what_lies_between_0_and_1(lower, upper):
+def test_logit_scale_needs_bounds_between_0_and_1(lower, upper):
     message = (
         f"controller.gain: the bounds are {lower:g} and {upper:g}; "
         "with scale 'logit' they must lie between 0 and 1"
@@ -191,7 +191,7 @@ def test_the_first_bad_path_is_named():
 GAIN = space_of({"gain": Range(1.0, 10.0, "log"), "offset": Range(-1.0, 1.0)})
 
 
-def test_start_is_where_the_system_lies():
+def test_the_start_is_that_of_the_system():
     unit = GAIN.start(Affine(gain=10.0**0.25, offset=0.5))
     np.testing.assert_allclose(unit, [0.25, 0.75], rtol=1e-12)
 
@@ -215,7 +215,7 @@ def test_start_on_a_bound_is_moved_inside(gain, place):
     assert np.isfinite(unsquash(unit)).all()
 
 
-def test_start_names_a_parameter_that_is_not_there():
+def test_start_names_an_unknown_parameter():
     with pytest.raises(ValueError, match=r"no parameter 'gian'; .* gain"):
         space_of({"gian": Range(0.0, 1.0)}).start(Affine())
 

@@ -99,7 +99,7 @@ def refusal(study):
 # What is right
 
 
-def test_there_are_studies():
+def test_the_package_contains_studies():
     assert DEFAULT in SHIPPED
     assert len(SHIPPED) >= 2
 
@@ -166,7 +166,7 @@ def test_a_small_study(study):
     np.testing.assert_array_equal(case.space.upper, [5.0, 2e4])
 
 
-def test_what_may_be_left_out(study):
+def test_optional_entries_have_defaults(study):
     gone = ("seed", "sensor", "objective", "optimiser", "references/unseen")
     case = read(study(dict.fromkeys(gone, GONE)))
     assert case.study.seed == 0
@@ -201,21 +201,21 @@ def declared_range(path):
     return Range(*declared.typical, declared.scale)
 
 
-def test_a_path_alone_takes_the_declared_range(study):
+def test_a_path_without_a_range_has_the_declared_range(study):
     case = read(study({"parameters": GONE, "tune": [INTEGRAL, PROPORTIONAL]}))
     assert case.space.ranges() == {
         path: declared_range(path) for path in (INTEGRAL, PROPORTIONAL)
     }
 
 
-def test_a_table_keeps_what_it_says_and_takes_the_rest(study):
+def test_a_partial_range_is_completed_by_the_declaration(study):
     tables = {PROPORTIONAL: {"lower": 0.2}, INTEGRAL: {"scale": "linear"}}
     found = read(study({"parameters": tables})).space.ranges()
     assert found[PROPORTIONAL] == replace(declared_range(PROPORTIONAL), lower=0.2)
     assert found[INTEGRAL] == replace(declared_range(INTEGRAL), scale="linear")
 
 
-def test_a_pattern_takes_every_parameter_below(study):
+def test_a_pattern_adds_every_matching_parameter(study):
     tables = {"controller.derivative": {"start": 1e-5, "upper": 1e-3}}
     starts = {"anti_windup": 10.0, "derivative_filter": 1e-4}
     tables |= {f"controller.{name}": {"start": s} for name, s in starts.items()}
@@ -231,7 +231,7 @@ def test_a_pattern_takes_every_parameter_below(study):
     assert float(get(case.loop, "controller.anti_windup")) == 10.0
 
 
-def test_a_pattern_starts_what_is_switched_off_at_its_lower_bound(study):
+def test_a_pattern_starts_a_parameter_of_zero_at_its_lower_bound(study):
     stock = {"type": "PID", "proportional": 1.0, "integral": 9.0, "dt": 5e-5}
     changes = {"controller": stock, "parameters": GONE, "tune": ["controller.*"]}
     case = read(study(changes))
@@ -247,7 +247,7 @@ def test_a_pattern_starts_what_is_switched_off_at_its_lower_bound(study):
     assert read(study({})).notes == ()
 
 
-def test_a_pattern_takes_a_start_outside_the_declared_range(study):
+def test_a_pattern_widens_the_declared_range_to_the_start(study):
     stock = {"type": "PID", "proportional": 1.0, "integral": 9.0, "dt": 5e-5}
     stock |= {"derivative": 1e-12, "derivative_filter": 1e-4, "anti_windup": 10.0}
     changes = {"controller": stock, "parameters": GONE, "tune": ["controller.*"]}
@@ -320,7 +320,7 @@ def test_a_declared_range_ends_below_nyquist(study):
         ("controller.*", "tune is 'controller.*': Input should be a valid tuple"),
     ],
 )
-def test_names_that_cannot_be_tuned(refusal, tune, message):
+def test_names_that_cannot_be_tuned_are_refused(refusal, tune, message):
     assert refusal({"tune": tune}).startswith(message)
 
 
@@ -337,7 +337,7 @@ def test_a_parameter_without_a_declared_range_needs_bounds(refusal):
     assert message.startswith("tune: controller.model.* has no declared range; name")
 
 
-def test_an_array_is_no_number_to_tune(refusal):
+def test_an_array_cannot_be_tuned(refusal):
     ones = {key: [[1.0]] for key in "ABCD"}
     law = {"type": "StateSpace", **ones, "dt": 5e-5}
     controller = {"type": "StateSpaceController", "law": law}
@@ -373,7 +373,7 @@ def test_converters_and_slew_limit(study):
     assert float(get(case.loop, "sensor.converter.resolution")) == 0.001
 
 
-def test_files_lie_beside_the_study(study, tmp_path, monkeypatch):
+def test_paths_are_relative_to_the_study(study, tmp_path, monkeypatch):
     path = study({"plant": {"file": "plant.json"}, "controller": {"file": "c.toml"}})
     save(p753.plant(), path.parent / "plant.json")
     save(p753.pid(), path.parent / "c.toml")
@@ -398,7 +398,7 @@ def test_an_unsafe_file_is_refused_unless_the_study_accepts_it(study, refusal, w
     )
 
 
-def test_a_design_for_the_plant_at_hand(study):
+def test_a_design_for_the_plant_of_the_study(study):
     plant = {
         "type": "Series",
         "parts": [
@@ -422,7 +422,7 @@ def test_a_design_for_the_plant_at_hand(study):
     assert float(case.loop.controller.gain) == pytest.approx((top - bottom) / 140.0)
 
 
-def test_a_cut_off_just_below_nyquist(study):
+def test_a_cut_off_below_nyquist_is_accepted(study):
     changes = {
         "controller": {"catalog": "p753_disturbance_observer"},
         "parameters": {"controller.cutoff": {"lower": 1.0, "upper": 62_831.8}},
@@ -730,7 +730,7 @@ def test_values_of_another_type(refusal, place, value, message):
         *("actuator/lower", "actuator/upper", "references/tune"),
     ],
 )
-def test_what_must_not_be_missing(refusal, place):
+def test_missing_entries_are_refused(refusal, place):
     assert refusal({place: GONE}) == f"{place.replace('/', '.')} is missing"
 
 
@@ -744,7 +744,7 @@ def test_what_must_not_be_missing(refusal, place):
     ],
 )
 @pytest.mark.parametrize("reader", [load, load_comparison_study])
-def test_a_file_that_is_no_study(tmp_path, text, message, reader):
+def test_a_file_without_a_study_is_refused(tmp_path, text, message, reader):
     path = tmp_path / "stage.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
@@ -754,7 +754,7 @@ def test_a_file_that_is_no_study(tmp_path, text, message, reader):
     assert not is_comparison_study(path)
 
 
-def test_more_samples_than_the_memory_holds(refusal, study):
+def test_more_samples_than_the_memory_are_refused(refusal, study):
     # 3 references of 1 + 2 * 2 signals of 8 bytes: 1.2e-7 GB a sample.
     assert refusal({"references/duration": 1e4}) == (
         "references.duration is 10000 s: at 20000 Hz the signals of all references "
@@ -764,7 +764,7 @@ def test_more_samples_than_the_memory_holds(refusal, study):
     assert load(study({"references/duration": 6e3})).references.duration == 6e3
 
 
-def test_as_many_samples_as_the_memory_holds(study, monkeypatch):
+def test_as_many_samples_as_the_memory_are_accepted(study, monkeypatch):
     # 2000 samples of 15 signals of 8 bytes, in GB.
     monkeypatch.setattr("piezojax.study.schema.MEMORY_GB", 0.1 * 20_000 * 15 * 8e-9)
     assert load(study({"references/duration": 0.1})).references.duration == 0.1
@@ -780,7 +780,7 @@ def test_a_reference_at_half_the_rate(refusal):
     assert message == "references: SIN10000 is not below half the rate, 10000 Hz"
 
 
-def test_a_front_has_two_limits_at_least(study, refusal):
+def test_a_front_has_at_least_two_limits(study, refusal):
     front = {"constraint": "effort", "limits": [20.0, 30.0]}
     limit = {"constraints": {"effort": 30.0}}
     assert load(study(limit | {"pareto": front})).pareto.limits == (20.0, 30.0)
@@ -820,7 +820,7 @@ def test_a_plant_made_for_another_rate(refusal):
 
 
 @pytest.mark.parametrize("method", ["geometric_mean", "worst"])
-def test_least_squares_needs_squares(refusal, method):
+def test_least_squares_needs_a_squared_objective(refusal, method):
     message = refusal(
         {"optimiser/method": "levenberg_marquardt", "objective/aggregate": method}
     )
@@ -840,7 +840,7 @@ def test_least_squares_needs_squares(refusal, method):
         ({"catalog": "p753", "type": "Affine"}, "catalog, type"),
     ],
 )
-def test_exactly_one_choice(refusal, where, table, keys):
+def test_exactly_one_choice_is_required(refusal, where, table, keys):
     last = "record" if where == "plant" else "design"
     assert refusal({where: table}) == (
         f"{where} has the keys {keys}; it must have exactly one of "
@@ -928,7 +928,7 @@ def study_of_a_bent_plant(study, monkeypatch):
     return written
 
 
-def test_a_design_keeps_to_the_record_where_the_model_falls_beyond(
+def test_a_design_keeps_to_the_record_if_the_model_falls_outside(
     study_of_a_bent_plant,
 ):
     case = read(study_of_a_bent_plant(80.0))
@@ -941,7 +941,7 @@ def test_a_design_keeps_to_the_record_where_the_model_falls_beyond(
     )
 
 
-def test_a_design_is_refused_where_the_model_falls_within_the_record(
+def test_a_design_is_refused_if_the_model_falls_within_the_record(
     study_of_a_bent_plant,
 ):
     message = r"controller\.design: no inverse of the hysteresis from -20 to 120 V"
@@ -957,14 +957,14 @@ def test_a_design_is_refused_where_the_model_falls_within_the_record(
         (b"", "title is missing"),
     ],
 )
-def test_files_that_are_no_study(tmp_path, content, message):
+def test_files_without_a_study_are_refused(tmp_path, content, message):
     path = tmp_path / "a.toml"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=re.escape(message)):
         load(path)
 
 
-def test_studies_that_are_not_there(tmp_path):
+def test_unknown_studies_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"study .*a.toml: No such file or directory"):
         load(tmp_path / "a.toml")
     with pytest.raises(ValueError, match=r"study .*: Is a directory"):
@@ -1058,13 +1058,13 @@ def outcomes(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", UNSAID)
-def test_what_should_be_said(outcomes, name):
+def test_messages_without_type_checks(outcomes, name):
     kind, message = outcomes[name]
     assert kind == "ValueError"
     assert UNSAID[name][1] in message
     assert not message.startswith(":")
 
 
-def test_shipped_takes_a_name_and_no_path():
+def test_shipped_accepts_a_name_and_no_path():
     with pytest.raises(ValueError, match="is unknown; there are "):
         shipped("../pyproject")

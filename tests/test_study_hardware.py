@@ -100,7 +100,7 @@ def numpy_loop(reference, draws):
     return np.array(moved), np.array(voltages)
 
 
-def test_the_whole_hardware_in_a_loop():
+def test_all_hardware_in_a_loop_equals_numpy():
     loop = case_of(LINEAR, OTHER).loop
     random = np.random.default_rng(4)
     reference = np.repeat(random.uniform(0.0, 16.0, 8), 100)
@@ -140,7 +140,7 @@ def written(angle):
     return plant * controller * amplifier * sensor
 
 
-def test_margins_hold_the_electronics():
+def test_margins_include_the_electronics():
     loop = case_of(LINEAR).loop
     report = stability_report(loop, 3.0)
     angle = np.linspace(1e-4, np.pi, 400_000)
@@ -160,7 +160,7 @@ def test_margins_hold_the_electronics():
     assert bare.sensitivity_peak < 0.9 * report.sensitivity_peak
 
 
-def test_converters_leave_the_margins_as_they_are():
+def test_converters_do_not_change_the_margins():
     """No voltage of the DAC holds the reference exactly: 3.14159 lies between two."""
     coarse = {"actuator": {"bits": 8}, "sensor": {"resolution": 0.01}}
     smooth, rounded = (
@@ -171,7 +171,7 @@ def test_converters_leave_the_margins_as_they_are():
     assert rounded.voltage_V == pytest.approx(3.14159, rel=1e-9)
 
 
-def test_gradients_by_the_hardware_are_those_of_differences():
+def test_gradients_by_the_hardware_equal_finite_differences():
     loop = case_of(LINEAR).loop
     paths = [
         "plant.amplifier.low_pass.bandwidth",
@@ -204,7 +204,7 @@ def test_a_study_without_electronics_has_the_same_systems():
     assert case_of().amplifier is None
 
 
-def test_paths_of_the_plant_stay():
+def test_paths_of_the_plant_do_not_change():
     plant = {
         "type": "Series",
         "parts": [{"type": "Affine", "gain": 0.2}, STUDY["plant"]],
@@ -220,7 +220,7 @@ def test_paths_of_the_plant_stay():
     assert float(get(loop, "plant.stage.time_constant")) == TAU
 
 
-def test_an_ensemble_keeps_the_amplifier():
+def test_plants_of_an_ensemble_keep_the_amplifier():
     case = case_of(
         {"actuator": {"bandwidth": 500.0, "delay": 1e-4}},
         plant={"catalog": "p753_stage"},
@@ -245,7 +245,7 @@ def test_an_ensemble_keeps_the_amplifier():
         ({"range": {"plant.amplifier.delay.delay": [0.0, 2.5e-4]}}, "at most 0.0002"),
     ],
 )
-def test_an_ensemble_beyond_what_a_part_allows_is_refused(table, bound):
+def test_an_ensemble_beyond_the_limits_of_a_part_is_refused(table, bound):
     message = rf"ensemble.*amplifier.delay.delay: delay in s is .*{bound}"
     with pytest.raises(ValueError, match=message):
         case_of({"actuator": {"delay": 1e-4}}, ensemble=table)
@@ -285,7 +285,7 @@ def test_every_entry_may_differ_by_axis():
     assert float(get(loop, "sensor.y.converter.resolution")) == 0.02
 
 
-def test_the_lower_slew_rate_holds():
+def test_the_lower_slew_rate_applies():
     current = {"current_limit": 0.01, "capacitance": 1e-6}
     for rate, expected in ((5e3, 5e3), (2e4, 1e4)):
         case = case_of({"actuator": {"slew_rate": rate, **current}})
@@ -348,7 +348,7 @@ def test_the_limit_refuses_a_sensor_with_dynamics():
         ),
     ],
 )
-def test_what_is_refused(table, entries, message):
+def test_bad_hardware_is_refused(table, entries, message):
     with pytest.raises(ValueError, match=message) as caught:
         build(validated(Study, tables({table: entries}), ""), "small.toml")
     assert "\n" not in str(caught.value)

@@ -121,7 +121,7 @@ def test_negative_delay_is_refused():
         Delay(-1)
 
 
-def test_a_long_delay_compiles_as_few_operations():
+def test_a_long_delay_compiles_to_few_operations():
     def operations(samples):
         system = Delay(samples)
         step = jax.make_jaxpr(system.step)(system.init(0.0), 1.0)
@@ -132,7 +132,7 @@ def test_a_long_delay_compiles_as_few_operations():
 
 
 @pytest.mark.parametrize("samples", [1001, 10**9, 10**30])
-def test_a_delay_beyond_reason_is_refused(samples):
+def test_a_delay_of_too_many_samples_is_refused(samples):
     with pytest.raises(ValueError, match=r"samples is 1.*; it must .*at most 1000"):
         Delay(samples)
 
@@ -215,7 +215,7 @@ holding = jax.jit(holding_input)
 )
 @settings(max_examples=20, deadline=None)
 @given(output=st.floats(-2.0, 15.0))
-def test_holding_input_holds(name, output):
+def test_holding_input_keeps_the_plant_at_rest(name, output):
     plant = ELEMENTS[name]
     assert abs(rest_output(plant, holding(plant, output)) - output) < 1e-10
 
@@ -280,7 +280,7 @@ start_at_each = jax.jit(jax.vmap(start_at, in_axes=(None, 0)))
 
 
 @pytest.mark.parametrize("loop", LOOPS.values(), ids=LOOPS)
-def test_a_loop_started_at_a_reference_stays_there(loop):
+def test_a_loop_started_at_a_reference_stays_at_rest(loop):
     references = np.array([-1.5, 0.0, 0.3, 5.0, 12.0])
     samples = start_at_each(loop, references)
     for moved in (samples.displacement, samples.measured):

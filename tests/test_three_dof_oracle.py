@@ -53,14 +53,14 @@ def test_driven_axes(case):
     ("name", "rms_of_rx_and_ry"),
     [("dob_smc", [0.74, 0.51]), ("nominal_smc", [4.24, 3.64])],
 )
-def test_printed_models_track_worse(name, rms_of_rx_and_ry):
+def test_printed_models_have_larger_errors(name, rms_of_rx_and_ry):
     references = three_dof.table_sines(2.0)[:, 1:, 0]  # 1 Hz in Rx, then in Ry
     y = three_dof.simulate(name, references, plant=HYSTERESIS, arx="printed")["y"]
     rms = np.diag(three_dof.tracking_rms(y, references)[:, 1:])
     np.testing.assert_allclose(rms, rms_of_rx_and_ry, rtol=0.02)
 
 
-def test_pid_against_the_low_frequency_limit():
+def test_the_pid_has_the_low_frequency_limit():
     # u is about the reference over the DC gain, so e = u' / I at 1 Hz.
     A, B, C = three_dof.stacked()
     dc = np.diag(C @ np.linalg.solve(np.eye(9) - A, B))
@@ -82,7 +82,7 @@ def test_steps():
     np.testing.assert_allclose(settled, [114.0, 42.0, 44.0], atol=4.0)
 
 
-def test_dead_beat_state_obeys_the_sliding_dynamics():
+def test_the_dead_beat_state_satisfies_the_sliding_dynamics():
     # From a plant away from rest, nothing else acting: s(k+1) = PHI s(k) + SB usw(k).
     plant, controller = three_dof.Plant(()), three_dof.PIDSMC("dynamic", False)
     plant.x = np.linspace(-1.0, 1.0, 9)
@@ -120,12 +120,12 @@ def test_constants_of_chapter_7():
 
 
 @pytest.mark.parametrize("name", ["pid", "pid_smc", "dob_smc", "nominal_smc"])
-def test_rest_stays_rest(name):
+def test_a_loop_at_rest_stays_at_rest(name):
     logs = three_dof.simulate(name, np.zeros((11, 3)), plant={"delay": 1})
     assert all(np.all(log == 0.0) for log in logs.values())
 
 
-def test_catalogue_prints_the_same_plant():
+def test_the_catalogue_has_the_same_plant():
     for (A, B, C), model in zip(three_dof.PLANT, p558.CHAPTER_7, strict=True):
         for mine, printed in zip((A, B, C), ("A", "B", "C"), strict=True):
             np.testing.assert_array_equal(mine, model[printed])

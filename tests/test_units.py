@@ -154,7 +154,7 @@ def models(folder):
     return found
 
 
-def test_a_model_tells_the_units_of_channels_and_parameters(models, folder):
+def test_a_model_has_the_units_of_channels_and_parameters(models, folder):
     for (volts, lengths), name in models.items():
         plain = json.loads((folder / name).read_text(encoding="utf-8"))
         about = plain["about"]
@@ -189,7 +189,7 @@ def test_a_model_in_other_units_or_at_another_rate_is_refused(models, folder):
         )
 
 
-def test_gains_tell_their_units_and_a_study_checks_them(folder):
+def test_gains_have_units_and_a_study_checks_them(folder):
     lag = {"type": "FirstOrderLag", "time_constant": 3e-3, "dt": DT}
     outcome = pj.tune(case_of(folder, lag, seed=4))
     pj.save(outcome.controller, folder / "gains.toml", outcome.about)

@@ -89,7 +89,7 @@ _MOST_ROWS = 12  # above it, axes at rest have only their geometric mean
 
 
 def beside_table(result: Result) -> Table:
-    """Return the table of held-out errors (nm) of the tuned and the other controllers."""
+    """Return the table of held-out errors (nm) of the tuned and other controllers."""
     plants = result.beside["tuned"].plants
     title = "rms tracking error on the hold-out, nm: geometric mean over all references"
     if plants:
@@ -325,8 +325,8 @@ def _place_of_the_lag(report: FitReport) -> list[str]:
     if report.model.split("+")[-1] != "lag":
         return []
     return [
-        "a record does not distinguish a lag of the sensor from a lag of the stage; the "
-        "loop controls the reading of the sensor, and the tip may move differently"
+        "a record does not distinguish a lag of the sensor from a lag of the stage; "
+        "the loop controls the reading of the sensor, and the tip may move differently"
     ]
 
 

@@ -100,8 +100,8 @@ def _starts(losses: np.ndarray, count: int, search: SearchState) -> np.ndarray:
     if not stable.any():
         raise ValueError(
             "the loop diverges or stays at a voltage limit at the start and at all "
-            f"{losses.size - 1} points tried in the box: lower the bounds of the gains, "
-            "raise 'candidates', or check the plant's sign and sample rate"
+            f"{losses.size - 1} points tried in the box: lower the bounds of the "
+            "gains, raise 'candidates', or check the plant's sign and sample rate"
         )
     if not stable[0]:
         search.warnings.append(

@@ -62,7 +62,7 @@ LOOPS = {
 
 @pytest.mark.parametrize("branch", BRANCHES)
 @pytest.mark.parametrize("name", LOOPS)
-def test_figures_are_those_of_the_exact_report(name, branch):
+def test_figures_equal_the_exact_report(name, branch):
     loop = LOOPS[name]()
     point = OperatingPoint(5.0, branch)
     exact = stability_report(loop, point)
@@ -81,7 +81,7 @@ def test_figures_are_those_of_the_exact_report(name, branch):
     assert found == pytest.approx(exact.closed_loop_peak, rel=5e-3)
 
 
-def test_a_light_mode_is_seen_between_the_lines():
+def test_a_lightly_damped_mode_between_two_lines_is_found():
     """Its peak is 7 Hz wide, in the middle of two lines of the impulse response."""
     dt = 1e-4
     loop = pj.Feedback(
@@ -95,7 +95,7 @@ def test_a_light_mode_is_seen_between_the_lines():
     assert sensitivity_peak(loop) == pytest.approx(exact, rel=0.08)
 
 
-def test_every_branch_is_the_exact_report_s():
+def test_every_branch_equals_the_exact_report():
     # The branches differ: one of them cannot stand for both.
     reports = [stability_report(pid_loop(), OperatingPoint(5.0, b)) for b in BRANCHES]
     exact = [report.sensitivity_peak for report in reports]
@@ -146,26 +146,26 @@ def test_the_two_sources_of_a_peak_agree_within_the_stated_error(integral):
     assert found < exact.sensitivity_peak * (1.0 + 1e-6)
 
 
-def test_a_loop_that_is_never_as_strong_as_1_has_no_delay_margin():
+def test_a_loop_with_gain_below_1_has_no_delay_margin():
     weak = pj.control.PID(0.01, 0.0, dt=p753.DT)
     loop = pj.Feedback(weak, p753.plant(), p753.actuator(), pj.Sensor(0.0))
     found = sensitivity(loop, 0.0)
     assert delay_margin_of(found) == UNLIMITED_DELAY
 
 
-def test_a_loop_of_no_gain_has_the_largest_margins():
+def test_a_loop_without_gain_has_the_largest_margins():
     found = one_axis(jnp.ones(64, complex))
     assert gain_margin_of(found) == UNLIMITED_GAIN
     assert phase_margin_of(found) == 180.0
 
 
-def test_the_band_of_a_loop_that_never_falls_ends_at_the_nyquist_frequency():
+def test_a_bandwidth_beyond_nyquist_ends_at_the_nyquist_frequency():
     assert bandwidth_of(jnp.ones(64, complex), 1e-3) == 500.0
     # A loop that leaves most of the reference at rest has no band to speak of.
     assert bandwidth_of(jnp.full(64, 0.5 + 0j), 1e-3) < 0.1
 
 
-def test_slopes_are_those_of_differences():
+def test_gradients_equal_finite_differences():
     @jax.jit
     def figures(integral):
         loop = replace(pid_loop(), {INTEGRAL: integral})
@@ -182,7 +182,7 @@ def test_slopes_are_those_of_differences():
     np.testing.assert_allclose(jax.jit(jax.jacrev(figures))(at), difference, rtol=1e-5)
 
 
-def test_an_unstable_loop_is_a_barrier_with_a_slope():
+def test_an_unstable_loop_gives_a_barrier_with_a_gradient():
     def peak(integral):
         return jnp.log(peak_of(sensitivity(pid_loop(integral), 5.0)))
 
@@ -213,7 +213,7 @@ def coupled(gains, coupling=0.4):
     return jnp.concatenate([jnp.zeros((1, 2, 2)), S])
 
 
-def test_figures_of_two_axes_are_those_of_numpy():
+def test_figures_of_two_axes_equal_those_of_numpy():
     S = coupled(jnp.array([0.12, 0.2]))
     largest = np.linalg.svd(S, compute_uv=False)[:, 0].max()
     disk = np.linalg.svd(S - 0.5 * np.eye(2), compute_uv=False)[:, 0].max()
@@ -242,7 +242,7 @@ def test_a_delay_beyond_the_margin_of_one_axis_makes_two_axes_unstable():
     assert math.floor(second) == whole
 
 
-def test_slopes_of_two_axes_are_those_of_differences():
+def test_gradients_of_two_axes_equal_finite_differences():
     @jax.jit
     def figures(gains):
         return jnp.stack([figure(coupled(gains)) for figure in FIGURES])
@@ -255,7 +255,7 @@ def test_slopes_of_two_axes_are_those_of_differences():
     np.testing.assert_allclose(jax.jit(jax.jacrev(figures))(at), forward, rtol=1e-9)
 
 
-def test_equal_singular_values_have_a_slope():
+def test_equal_singular_values_have_a_gradient():
     """Two equal axes: the slope along both gains is that of one axis."""
 
     def peak(gain):
@@ -277,7 +277,7 @@ def three_axes():
     return jax.jit(lambda loop: sensitivities(loop, rest))(loop), exact
 
 
-def test_three_axes_are_those_of_the_exact_report(three_axes):
+def test_figures_of_three_axes_equal_the_exact_report(three_axes):
     found, exact = three_axes
     assert found.shape[0] == len(exact)
     for S, report in zip(found, exact, strict=True):

@@ -72,7 +72,7 @@ def pair(request):
     return loop, written(request.param), pj.stability_report(loop, 3.0)
 
 
-def test_the_transfer_function_is_that_of_the_equations(pair):
+def test_the_transfer_function_equals_the_equations(pair):
     loop, oracle, _ = pair
     frequency = np.geomspace(1.0, 10_000.0, 200)
     ours = linear_loop(loop, 3.0)[0].response(2.0 * np.pi * frequency * DT)
@@ -80,7 +80,7 @@ def test_the_transfer_function_is_that_of_the_equations(pair):
     np.testing.assert_allclose(ours, theirs, rtol=1e-7)
 
 
-def test_following_is_that_of_a_run(pair):
+def test_the_closed_loop_response_equals_that_of_a_run(pair):
     """These loops are linear: an impulse of the reference tells y/r."""
     loop, _, report = pair
     samples = 24_000
@@ -100,7 +100,7 @@ def test_following_is_that_of_a_run(pair):
     assert report.following.closed_loop_peak == pytest.approx(found.max(), rel=1e-4)
 
 
-def test_a_loop_that_rests_without_following_has_no_band():
+def test_a_loop_that_does_not_follow_has_no_bandwidth():
     report = pj.stability_report(around(pj.control.PID(0.5, 0.0, dt=DT)), 0.0)
     assert report.following.bandwidth_Hz == 0.0
     assert report.following.closed_loop_peak < 0.5
@@ -195,7 +195,7 @@ def error_growth(loop, samples=4_000):
 
 
 @pytest.mark.parametrize("name", ["pid, hard", "disturbance observer"])
-def test_added_delay_makes_it_unstable_where_the_margin_says(name):
+def test_a_delay_beyond_the_margin_makes_the_loop_unstable(name):
     make, argument = LOOPS[name]
     report = pj.stability_report(loop_of(name))
     assert 1.0 < report.delay_margin_samples < 50.0
@@ -207,7 +207,7 @@ def test_added_delay_makes_it_unstable_where_the_margin_says(name):
 
 
 @pytest.mark.parametrize("name", ["pid, hard", "disturbance observer"])
-def test_a_higher_gain_makes_it_unstable_where_the_margin_says(name):
+def test_a_gain_beyond_the_margin_makes_the_loop_unstable(name):
     make, argument = LOOPS[name]
     margin = pj.stability_report(loop_of(name)).gain_margin
     below, above = (around(make(argument), gain=margin * x) for x in (0.98, 1.02))
@@ -216,7 +216,7 @@ def test_a_higher_gain_makes_it_unstable_where_the_margin_says(name):
     assert error_growth(below) < 1.0 < error_growth(above)
 
 
-def test_the_slowest_pole_is_the_decay_of_a_run():
+def test_the_slowest_pole_equals_the_decay_of_a_run():
     report = pj.stability_report(loop_of("disturbance observer"))
     samples = 12_000
     kick = jnp.zeros(samples).at[0].set(1.0)
@@ -241,7 +241,7 @@ def test_an_unstable_loop_has_poles_and_no_margins():
     json.dumps(report.as_dict(), allow_nan=False)
 
 
-def test_a_loop_that_nothing_makes_unstable():
+def test_a_loop_without_crossover_has_a_gain_margin_only():
     """L = 0.5 p, a circle of radius 0.5: only the gain can grow too large."""
     one = np.ones(1)
     report = report_of(LinearLoop(np.zeros((1, 1)), one, 0.5 * one, DT))
@@ -257,7 +257,7 @@ def test_a_loop_that_nothing_makes_unstable():
     assert json.loads(json.dumps(values, allow_nan=False)) == values
 
 
-def test_positive_feedback_becomes_unstable_at_rest():
+def test_positive_feedback_becomes_unstable_at_frequency_zero():
     one = np.ones(1)
     report = report_of(LinearLoop(np.array([[0.5]]), one, -0.25 * one, DT))
     assert report.gain_margin == pytest.approx(2.0)
@@ -273,7 +273,7 @@ def test_a_conditionally_stable_loop_can_lose_too_much_gain():
     assert report.gain_margin == pytest.approx(4.4)
 
 
-def test_curves_are_the_responses_of_the_equations():
+def test_curves_equal_the_responses_of_the_equations():
     loop, oracle = loop_of("pid, all"), written("pid, all")
     reports = stability_reports({"after": loop}, 3.0)
     (curves,) = reports.curves("after", 2.5).values()
@@ -287,7 +287,7 @@ def test_curves_are_the_responses_of_the_equations():
     np.testing.assert_allclose(curves.T, L / (1.0 + L), rtol=1e-6)
 
 
-def test_branches_that_differ_have_their_own_curves():
+def test_different_branches_have_separate_curves():
     loop = pj.Feedback(
         p753.pid(), p753.plant(), p753.actuator(), pj.hardware.Sensor(0.0)
     )
@@ -309,7 +309,7 @@ def test_the_default_reference_is_the_middle():
     assert default != other
 
 
-def test_curves_of_several_axes_are_those_of_each():
+def test_curves_of_several_axes_equal_those_of_each_axis():
     both = {
         name: pj.Feedback(
             pj.PerAxis(tuple(pid(n) for n in names)),

@@ -38,12 +38,12 @@ def test_worst_sensitivity_is_the_largest_over_errors():
     assert np.all(np.isfinite(found))
 
 
-def test_no_error_leaves_the_sensitivity():
+def test_a_zero_error_does_not_change_the_sensitivity():
     found = worst_sensitivity(jnp.asarray(S), jnp.zeros(LINES))
     np.testing.assert_allclose(found, np.abs(S), rtol=1e-12)
 
 
-def test_worst_sensitivity_grows_on_beyond_instability():
+def test_worst_sensitivity_grows_beyond_instability():
     shares = jnp.asarray([0.98, 0.99, 1.0, 2.0, 25.0])
     found = np.asarray(worst_sensitivity(jnp.full(5, 0.5 + 0j), 2.0 * shares))
     assert np.all(np.diff(found) > 0.0)
@@ -59,7 +59,7 @@ def closest(line, bound, delays):
 
 
 @pytest.mark.parametrize("line", range(0, LINES, 4))
-def test_worst_delay_margin_is_the_first_delay_that_can_be_unstable(line):
+def test_worst_delay_margin_is_the_smallest_delay_that_can_be_unstable(line):
     bound = BOUND[line]
     found = float(
         worst_delay_margin(
@@ -79,14 +79,14 @@ def test_worst_delay_margin_is_the_first_delay_that_can_be_unstable(line):
         assert zero.any()
 
 
-def test_all_three_outcomes_of_a_delay_are_tried():
+def test_the_cases_cover_all_three_outcomes_of_a_delay():
     found = np.asarray(worst_delay_margin(*map(jnp.asarray, (S, BOUND, ANGLE))))[::4]
     assert (found == UNLIMITED_DELAY).any()
     assert (found == 0.0).any()
     assert ((found > 0.0) & (found < UNLIMITED_DELAY)).any()
 
 
-def test_a_delay_reaches_the_point_exactly():
+def test_a_delay_reaches_the_critical_point_exactly():
     found = np.asarray(worst_delay_margin(*map(jnp.asarray, (S, BOUND, ANGLE))))
     finite = (found > 0.0) & (found < UNLIMITED_DELAY)
     point = -1.0 / L[finite] * np.exp(1j * ANGLE[finite] * found[finite])
@@ -97,7 +97,7 @@ def test_a_delay_reaches_the_point_exactly():
     ("sensitivity", "bound", "expected"),
     [(0.0, 0.5, UNLIMITED_DELAY), (0.0, 1.5, 0.0), (1.0, 25.0, UNLIMITED_DELAY)],
 )
-def test_loops_of_infinite_gain_and_of_none(sensitivity, bound, expected):
+def test_loops_with_infinite_and_zero_gain(sensitivity, bound, expected):
     arguments = (jnp.asarray([sensitivity + 0j]), jnp.asarray([bound]))
     assert worst_delay_margin(*arguments, jnp.zeros(1))[0] == expected
     assert worst_delay_margin(*arguments, jnp.ones(1))[0] == expected
@@ -111,7 +111,7 @@ def test_a_small_loop_gain_of_phase_zero_needs_a_delay(loop):
 
 
 @pytest.mark.parametrize("figure", ["sensitivity", "delay"])
-def test_slopes_are_those_of_finite_differences(figure):
+def test_gradients_equal_finite_differences(figure):
     def value(scale):
         loop = 1.0 / (1.0 + scale * jnp.asarray(L))
         if figure == "sensitivity":
@@ -155,7 +155,7 @@ def test_a_narrow_record_bounds_nothing_above_its_band():
     np.testing.assert_array_equal(found, [0.3, 0.0, 0.0, 0.0])
 
 
-def test_a_bound_survives_plain_data():
+def test_a_bound_is_saved_and_loaded():
     assert ErrorBound.model_validate(BOUNDS.model_dump(mode="json")) == BOUNDS
     assert ErrorBound.model_validate_json(BOUNDS.model_dump_json()) == BOUNDS
 
@@ -170,6 +170,6 @@ def test_a_bound_survives_plain_data():
         ({"relative": (0.1, np.nan, 0.1, 0.1)}, "finite number"),
     ],
 )
-def test_bounds_that_are_refused(change, message):
+def test_bad_bounds_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         ErrorBound.model_validate(BOUNDS.model_dump() | change)

@@ -211,7 +211,7 @@ def worst_phases(matrix):
     return -best.fun, np.exp(1j * np.append(best.x, 0.0))
 
 
-def test_the_margin_of_all_axes_at_once_is_reached_and_no_less(pair):
+def test_the_smallest_destabilising_change_equals_the_margin_of_all_axes(pair):
     report, L = pair
     at = report.disk_margin_Hz
     matrix = response(L, at)[0]
@@ -244,7 +244,7 @@ def loop():
     return p558_control.loop(p558_control.multi_axis())
 
 
-def test_a_free_run_is_what_the_matrices_predict(loop):
+def test_a_free_run_equals_the_prediction_of_the_matrices(loop):
     # As the reports have it, before its states are balanced.
     A, B, C, _, dt, _ = _matrices(loop, OperatingPoint(REST), BrokenLoop)
     model = LinearAxes(A, B, C, dt)
@@ -295,7 +295,7 @@ def test_the_printed_sign_of_phi_is_unstable(loop):
     assert json.loads(json.dumps(values, allow_nan=False)) == values
 
 
-def test_limits_of_every_axis_are_taken_out(loop):
+def test_limits_of_every_axis_are_removed(loop):
     def limits(loop):
         leaves = jax.tree.leaves(
             loop.actuator, is_leaf=lambda x: isinstance(x, pj.hardware.Saturation)
@@ -320,7 +320,7 @@ def scalar_loops():
     ]
 
 
-def test_axes_without_coupling_have_their_own_margins():
+def test_uncoupled_axes_have_the_margins_of_scalar_loops():
     loops = scalar_loops()
     A, B, C = (
         block_diag(*(getattr(x, name).reshape(1, 1) for x in loops)) for name in "ABC"

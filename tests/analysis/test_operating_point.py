@@ -38,7 +38,7 @@ def linear(slope):
     return pj.series(slope=pj.core.system.Affine(slope), dynamics=dynamics)
 
 
-def test_linearising_a_linear_system_returns_it():
+def test_linearising_a_linear_system_returns_its_matrices():
     rng = np.random.default_rng(3)
     A, B, C, D = (rng.normal(size=s) for s in ((3, 3), (3, 2), (2, 3), (2, 2)))
     system = pj.dynamics.StateSpace(A, B, C, D, 1e-3)
@@ -48,7 +48,7 @@ def test_linearising_a_linear_system_returns_it():
     assert found.dt == 1e-3
 
 
-def test_derivatives_of_a_nonlinear_system_are_differences():
+def test_derivatives_of_a_nonlinear_system_equal_finite_differences():
     oscillator = pj.hysteresis.HystereticOscillator(
         2.0, 10.0, 5e4, pj.hysteresis.BoucWen(5e4, 1e3, 0.8e3), 1.0 / 750.0
     )
@@ -68,7 +68,7 @@ def test_derivatives_of_a_nonlinear_system_are_differences():
 
 
 @pytest.mark.parametrize("branch", list(SIDES))
-def test_hysteresis_counts_with_the_slope_of_its_branch(branch):
+def test_hysteresis_is_linearised_to_the_slope_of_its_branch(branch):
     """b + s (a x + c y) on the virgin curve, and no pole of its memory."""
     report = pj.stability_report(p753.loop(pid()), OperatingPoint(5.0, branch))
     x = report.voltage_V
@@ -86,7 +86,7 @@ def test_hysteresis_counts_with_the_slope_of_its_branch(branch):
     np.testing.assert_allclose(poles[0], poles[1], atol=1e-6)
 
 
-def test_an_inverse_hysteresis_takes_the_branch_of_the_plant():
+def test_an_inverse_hysteresis_has_the_branch_of_the_plant():
     """With the model equal to the plant both slopes cancel, up, down and anywhere."""
     loop = p753.loop(p753.inversion())
     reports = [
@@ -99,7 +99,7 @@ def test_an_inverse_hysteresis_takes_the_branch_of_the_plant():
     np.testing.assert_allclose(peaks, peaks[0], rtol=1e-7)
 
 
-def test_plays_engage_on_the_way_up_and_rest_on_the_way_down():
+def test_plays_move_on_the_ascending_branch_only():
     plant = pj.hysteresis.PrandtlIshlinskii((0.1,), (2.0, 5.0), (0.02, 0.03))
     loop = loop_of(plant >> pj.dynamics.ARMA(published.T2_P, published.T2_G))
     for branch, slope in (("ascending", 0.15), ("descending", 0.1)):
@@ -108,7 +108,7 @@ def test_plays_engage_on_the_way_up_and_rest_on_the_way_down():
         assert report.sensitivity_peak == pytest.approx(twin.sensitivity_peak, rel=1e-6)
 
 
-def test_the_cut_closed_again_is_the_loop():
+def test_closing_the_cut_loop_gives_the_closed_loop():
     loop = p753.loop(p753.disturbance_observer(), 0.0)
     samples = 200
     kick = jnp.zeros(samples).at[0].set(0.01)
@@ -132,7 +132,7 @@ def test_the_cut_closed_again_is_the_loop():
     np.testing.assert_allclose(seen, log.displacement, atol=1e-9)
 
 
-def test_what_is_injected_is_hidden_from_the_observer():
+def test_the_injected_voltage_is_hidden_from_the_observer():
     """The controller remembers its own voltage: only the plant's state is moved."""
     loop = p753.loop(p753.disturbance_observer(), 0.0)
     broken = broken_loop(loop, 4.0)
@@ -144,7 +144,7 @@ def test_what_is_injected_is_hidden_from_the_observer():
         assert all(float(x) == float(y) for x, y in zip(*pair, strict=True))
 
 
-def test_limits_and_converters_do_not_count_for_small_motions():
+def test_limits_and_converters_are_not_linearised():
     plain = pj.stability_report(loop_of(linear(0.15)), 0.0)
     parts = (
         pj.hardware.Saturation(0.0, 100.0),
@@ -189,7 +189,7 @@ def test_poles_are_differentiable():
     assert float(slope) == pytest.approx(float(difference), rel=1e-4)
 
 
-def test_eager_is_jit():
+def test_jit_equals_eager():
     plant = linear(0.15)
     compiled = jax.jit(lambda plant, u: linearise(plant, u, dt=5e-5))(plant, 3.0)
     eager = linearise(plant, 3.0, dt=5e-5)
@@ -199,7 +199,7 @@ def test_eager_is_jit():
         )
 
 
-def test_the_response_is_that_of_the_report():
+def test_the_response_equals_that_of_the_report():
     loop = loop_of(linear(0.15))
     report = pj.stability_report(loop, 2.0)
     hertz = jnp.array([report.phase_crossover_Hz])
@@ -211,7 +211,7 @@ def test_the_response_is_that_of_the_report():
     )
 
 
-def test_what_is_refused():
+def test_bad_operating_points_are_refused():
     loop = loop_of(linear(0.15))
     with pytest.raises(ValueError, match=r"cannot rest at 40 um.*rests at 18 um"):
         pj.stability_report(loop, 40.0)
@@ -225,7 +225,7 @@ def test_what_is_refused():
     assert linearise(two, dt=1e-3).A.shape == (2, 2)
 
 
-def test_a_comparison_says_what_it_cannot_do(tmp_path):
+def test_a_comparison_names_the_reason_without_margins(tmp_path):
     loop = loop_of(linear(0.15))
     found = stability_reports({"before": loop_of(linear(0.1)), "after": loop}, 15.0)
     assert "cannot rest at 15 um" in found.problems["before"]

@@ -69,7 +69,7 @@ def riccati(variance):
     return 0.5 * (-b + np.sqrt(b**2 + 4.0 * variance * DRIVEN**2))
 
 
-def test_a_linear_loop_is_seen_as_it_is(linear, disturbance):
+def test_the_analysis_of_a_linear_loop_equals_its_definition(linear, disturbance):
     assert isinstance(linear, LimitReport)
     assert linear.gain == pytest.approx(SLOPE, rel=0.02)
     assert linear.delay == pytest.approx(1.0, abs=1e-9)
@@ -82,7 +82,7 @@ def test_a_linear_loop_is_seen_as_it_is(linear, disturbance):
         assert found.unpredicted <= found.disturbance < whole + 0.02 * 5.0
 
 
-def test_the_limit_is_that_of_the_scalar_riccati_equation(linear):
+def test_the_limit_equals_the_scalar_riccati_equation(linear):
     known = np.sqrt(riccati(NOISE**2))
     for found in linear.references.values():
         # The drawn disturbance is not its model: 45 segments make a spectrum.
@@ -90,7 +90,7 @@ def test_the_limit_is_that_of_the_scalar_riccati_equation(linear):
         assert found.limit <= found.one_controller <= 1.03 * known
 
 
-def test_curves_and_bandwidth_are_those_of_the_spectra(linear):
+def test_curves_and_bandwidth_equal_the_known_spectra(linear):
     """The disturbance has DRIVEN^2 / |1 - MEMORY z^-1|^2, the noise is white."""
     line = np.arccos((1.0 + MEMORY**2 - (DRIVEN / NOISE) ** 2) / (2.0 * MEMORY)) / (
         2.0 * np.pi * DT
@@ -104,7 +104,7 @@ def test_curves_and_bandwidth_are_those_of_the_spectra(linear):
         assert curves.frequency[np.flatnonzero(above)[-1]] == found.bandwidth
 
 
-def test_errors_and_their_shares_are_those_of_the_loop(linear, disturbance):
+def test_errors_and_shares_equal_those_of_the_loop(linear, disturbance):
     references, noise = driving()
     # The error of y(k + 1) = SLOPE u(k) + d(k), u an integral of r - z.
     loop = [1.0, 8000.0 * DT * SLOPE - 1.0]
@@ -130,7 +130,7 @@ def test_errors_and_their_shares_are_those_of_the_loop(linear, disturbance):
         assert found.ratio > NEAR
 
 
-def test_a_better_controller_comes_nearer(linear, disturbance):
+def test_a_better_controller_is_closer_to_the_limit(linear, disturbance):
     # Of a constant reference nothing has to be followed: what is left is feedback.
     references, noise = driving()
     flat = np.full_like(references, 5.0)
@@ -183,7 +183,7 @@ def test_a_hysteretic_stage(tmp_path):
     assert "note: on SIN10" in text
 
 
-def test_what_a_plant_remembers_or_never_moves_is_left_out():
+def test_memory_and_uncontrollable_states_are_removed():
     class Counting(pj.System):
         """A slope and a ramp of its own, which no voltage moves."""
 
@@ -206,7 +206,7 @@ def test_what_a_plant_remembers_or_never_moves_is_left_out():
     np.testing.assert_allclose(np.sort(poles), [0.0, np.exp(-0.4)], atol=1e-9)
 
 
-def test_what_stands_in_the_way_of_a_controller():
+def test_delays_and_zeros_of_a_plant_are_found():
     """Delays and zeros of plants written as functions of 1/z, and slow creep."""
     moving, autoregressive = (0.0050811, -0.0036354, 0.010553), (1.6035, -0.61995)
     dynamics = pj.dynamics.ARMA(autoregressive, moving)
@@ -229,7 +229,7 @@ def test_what_stands_in_the_way_of_a_controller():
         still.delay_and_zeros()
 
 
-def test_spectra_hold_the_variance():
+def test_spectra_sum_to_the_variance():
     random = np.random.default_rng(1)
     drawn = random.standard_normal((2, 3, 40_000)) * np.array([[[1.0]], [[3.0]]])
     coloured = signal.lfilter([1.0], [1.0, -0.6], drawn)
@@ -242,7 +242,7 @@ def test_spectra_hold_the_variance():
     assert np.abs(shape.reshape(64, -1).mean(axis=1) - 1.0).max() < 0.15
 
 
-def test_a_filter_of_the_reference_is_predicted_and_nothing_else():
+def test_only_a_linear_filter_of_the_reference_is_predicted():
     time = np.arange(10_000) * DT
     names = ("SIN1", "SIN10", "SW30", "PWSW10")
     moving = np.stack([references_of.signal(name, jnp.asarray(time)) for name in names])
@@ -269,7 +269,7 @@ def test_a_filter_of_the_reference_is_predicted_and_nothing_else():
     np.testing.assert_array_equal(still.unpredicted(signals), still.centred(signals))
 
 
-def test_what_has_no_limit():
+def test_loops_without_a_limit_are_refused():
     references, noise = driving(samples=500)
     loop = loop_of(pj.core.system.Affine(SLOPE))
     with pytest.raises(ValueError, match="without sensor noise"):
@@ -307,7 +307,7 @@ def comparison(tuned, limit, shares):
     return LimitComparison(tuned, limit, 1.1 * limit, 0.3, 0.02, 200.0, shares, least)
 
 
-def test_the_words_name_what_exceeds():
+def test_the_text_names_the_share_that_exceeds_the_limit():
     rows = {
         "A": comparison(4.0, 2.0, Shares(3.9, 0.5, 0.7)),
         "B": comparison(4.0, 2.0, Shares(1.2, 3.7, 0.7)),
@@ -329,14 +329,14 @@ def test_the_words_name_what_exceeds():
     assert "D" not in text.split("\n", 1)[1]
 
 
-def test_a_limit_of_rounding_is_no_limit():
+def test_a_limit_of_rounding_size_is_reported_as_zero():
     rows = {"A": comparison(4.0, 1e-12, Shares(3.9, 0.5, 0.7))}
     nothing = Curves(np.zeros(0), np.zeros((1, 0)), 1.0, *np.zeros((2, 1, 0)))
     report = LimitReport(rows, DT, NOISE, 10.0, SLOPE, 1.0, 1.1, nothing)
     assert limit_text(report).startswith("limit of linear control: zero up to rounding")
 
 
-def test_what_went_wrong_is_said(tmp_path):
+def test_the_text_states_the_reason_for_no_limit(tmp_path):
     write_limit("the stage sleeps", tmp_path)
     data = json.loads((tmp_path / "limit.json").read_text(encoding="utf-8"))
     assert data == {"problem": "the stage sleeps"}

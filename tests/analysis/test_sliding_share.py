@@ -39,7 +39,7 @@ def runs(loop):
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_parts_are_those_of_a_plain_filter(name):
+def test_parts_equal_those_of_a_plain_filter(name):
     loop = around(CONTROLLERS[name])
     samples, parts = runs(loop)
     mode = sliding_mode_of(loop)
@@ -64,7 +64,7 @@ def test_parts_are_those_of_a_plain_filter(name):
     assert 0.05 < share < 0.95
 
 
-def test_an_observer_without_velocity_leaves_the_rate_of_the_reference():
+def test_without_a_velocity_estimate_the_rate_of_the_reference_remains():
     controller = p753.disturbance_observer()
     feedback = dataclasses.replace(
         controller.feedback, surface=1.0, filter=AlphaBeta(0.99, 1e-9, DT)
@@ -76,7 +76,7 @@ def test_an_observer_without_velocity_leaves_the_rate_of_the_reference():
     assert parts.rest > 0.2 * parts.sliding
 
 
-def test_other_controllers_have_no_such_variable():
+def test_other_controllers_have_no_sliding_variable():
     assert sliding_mode_of(around(p753.pid())) is None
     with pytest.raises(ValueError, match="no sliding variable m e"):
         sliding_parts(around(p753.pid()), loop_inputs(REFERENCE), REFERENCE[0], 0)

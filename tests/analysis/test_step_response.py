@@ -39,7 +39,7 @@ def test_a_first_order_lag():
 
 
 @pytest.mark.parametrize("damping", [0.1, 0.3, 0.7])
-def test_a_mode_is_that_of_python_control(damping):
+def test_a_mode_equals_that_of_python_control(damping):
     w = 2.0 * np.pi * 100.0
     system = control.tf([w**2], [1.0, 2.0 * damping * w, w**2])
     time = DT * np.arange(20_000)
@@ -52,7 +52,7 @@ def test_a_mode_is_that_of_python_control(damping):
     assert found.overshoot == pytest.approx(over, rel=1e-3)
 
 
-def test_what_never_settles_takes_longer_than_the_run_and_says_how_far():
+def test_an_unsettled_step_has_settling_time_beyond_the_run():
     near, far = figures(np.full(1_000, 0.95)), figures(np.full(1_000, 0.5))
     assert 1_000 * DT < near.settling_time < far.settling_time
     assert far.rise_time > 1_000 * DT
@@ -62,13 +62,13 @@ def test_what_never_settles_takes_longer_than_the_run_and_says_how_far():
     assert 1_000 * DT < short.rise_time < far.rise_time
 
 
-def test_what_diverges_is_finite():
+def test_a_diverging_step_has_finite_figures():
     found = figures(np.concatenate([np.ones(10), np.full(990, np.nan)]))
     assert all(np.isfinite(value) for value in found)
     assert found.overshoot > 1e5
 
 
-def test_the_steps_span_most_of_the_references():
+def test_the_steps_span_nine_tenths_of_the_references():
     references = np.stack([np.linspace(0.0, 10.0, 101), np.linspace(0.0, 10.0, 101)])
     small_up, small_down, up, down = step_ends(references)
     np.testing.assert_allclose(up, [0.5, 9.5])
@@ -81,7 +81,7 @@ def loop(integral):
     return p753.loop(pj.control.PID(0.5, integral, 0.0, 1e-4, 100.0, dt=p753.DT))
 
 
-def test_each_step_is_a_run_of_the_loop_and_has_a_slope():
+def test_each_step_equals_a_run_of_the_loop_and_has_a_gradient():
     ends = jnp.asarray([[4.0, 6.0], [6.0, 4.0]])
 
     def steps(integral):

@@ -44,20 +44,20 @@ def test_hysteresis_and_lag_behind_an_actuator():
     assert found == pytest.approx(driven(weights, radii, 2e-3), rel=2e-3)
 
 
-def test_limits_of_the_actuator_hold():
+def test_the_limits_of_the_actuator_bound_the_stroke():
     stage = Saturation(-10.0, 30.0) >> Affine(0.5, 1.0)
     assert bounds(stroke_of(stage, LOW, HIGH)) == pytest.approx([-4.0, 16.0])
     falling = Saturation(-10.0, 30.0) >> Affine(-0.5, 1.0)
     assert bounds(stroke_of(falling, LOW, HIGH)) == pytest.approx([-14.0, 6.0])
 
 
-def test_the_whole_creep_counts():
+def test_the_stroke_includes_all_creep():
     # The drive takes 25 ms, the slowest creep 100 s.
     stage = ExponentialCreep((0.1, 0.2), (1.0, 100.0), DT, direct=0.5)
     assert bounds(stroke_of(stage, LOW, HIGH)) == pytest.approx([-16.0, 96.0])
 
 
-def test_axes_that_push_each_other():
+def test_coupled_axes():
     gains = np.array([[1.0, -0.3], [0.2, 2.0]])
     lower, upper = np.array([-1.0, 0.0]), np.array([3.0, 10.0])
     ends = [[a, b] for a in (lower[0], upper[0]) for b in (lower[1], upper[1])]
@@ -79,7 +79,7 @@ class Shared(System):
         return state, tuple(x / load for x in input)
 
 
-def test_an_axis_reaches_farthest_alone():
+def test_the_stroke_of_an_axis_is_that_of_driving_it_alone():
     found = stroke_of(Shared(), (-1.0, -1.0), (1.0, 1.0))
     np.testing.assert_allclose(found.highest, 0.5)
     np.testing.assert_allclose(found.lowest, -0.5)
@@ -102,19 +102,19 @@ class Walking(System):
 
 
 @pytest.mark.parametrize(("drift", "noise"), [(1e-3, 0.0), (-1e-3, 0.0), (0.0, 0.1)])
-def test_noise_and_drift_narrow_no_stroke(drift, noise):
+def test_noise_and_drift_do_not_change_the_stroke(drift, noise):
     lowest, highest = bounds(stroke_of(Walking(drift, noise), LOW, HIGH))
     least = 3.0 * noise + 1e-2
     assert lowest < LOW[0] + least
     assert highest > HIGH[0] - least
 
 
-def test_a_stage_that_never_rests_has_no_bounds():
+def test_a_stage_without_rest_has_no_bounds():
     integrator = ARMA((1.0,), (1.0,))
     assert bounds(stroke_of(integrator, LOW, HIGH)) == [-np.inf, np.inf]
 
 
-def test_one_axis_without_bounds_leaves_the_other():
+def test_one_axis_without_bounds_does_not_affect_the_other():
     lost = PerAxis((Affine(2.0), ARMA((1.0,), (1.0,))))
     found = stroke_of(lost, (-1.0, -1.0), (1.0, 1.0))
     np.testing.assert_array_equal(found.lowest, [-2.0, -np.inf])

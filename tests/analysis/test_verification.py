@@ -21,7 +21,7 @@ def loop_of(plant, integral):
     return pj.Feedback(controller, plant, limits, pj.hardware.Sensor(0.012))
 
 
-def test_on_a_linear_stage_at_once():
+def test_a_linear_stage_reaches_the_prediction_in_the_first_round():
     draws = np.random.default_rng(3).standard_normal(SAMPLES)
     disturbance = signal.lfilter([0.004], [1.0, -0.99], draws)
     stage = pj.series(
@@ -38,7 +38,7 @@ def test_on_a_linear_stage_at_once():
     assert report.references["SIN10"].tuned > 10.0 * found.simulated[0]
 
 
-def test_on_a_hysteretic_stage_once_it_has_met_its_own_disturbance():
+def test_a_hysteretic_stage_reaches_the_prediction_in_later_rounds():
     model = pj.hysteresis.ColemanHodgdon(0.0077, 0.1167, -0.0487)
     stage = pj.series(hysteresis=model, lag=pj.dynamics.FirstOrderLag(5e-4, DT))
     first, *_, last = verify_limit(
@@ -49,7 +49,7 @@ def test_on_a_hysteretic_stage_once_it_has_met_its_own_disturbance():
     assert worst[1] < worst[0]
 
 
-def test_what_cannot_be_attained():
+def test_verification_needs_sensor_noise():
     loop = loop_of(pj.core.system.Affine(0.15), 4000.0)
     quiet = pj.Feedback(
         loop.controller, loop.plant, loop.actuator, pj.hardware.Sensor(0.0)

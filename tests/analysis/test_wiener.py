@@ -50,7 +50,7 @@ def test_a_factor_is_stable_with_a_stable_inverse():
             outer_factor(np.abs(wrong))
 
 
-def test_the_inner_part_is_delay_and_zeros_outside():
+def test_the_inner_part_is_the_delay_and_the_zeros_outside():
     plant = response((0.0, 0.0, 1.0, -2.0), (1.0, -0.9))
     found = inner_of((0.0, 0.0, 1.0, -2.0))
     np.testing.assert_allclose(np.abs(found), 1.0, rtol=1e-12)
@@ -66,7 +66,7 @@ def test_the_inner_part_is_delay_and_zeros_outside():
     assert slow_delay(1, pair) == pytest.approx(slope, rel=1e-4)
 
 
-def test_a_white_disturbance_cannot_be_foreseen():
+def test_a_white_disturbance_is_unpredictable():
     spectrum = np.full(POINTS, 0.7)
     assert least(spectrum, 0.2, W) == pytest.approx(0.7, rel=1e-12)
     # Without the delay it can be weighed against the noise.
@@ -75,7 +75,7 @@ def test_a_white_disturbance_cannot_be_foreseen():
 
 @pytest.mark.parametrize("a", [0.5, 0.99])
 @pytest.mark.parametrize("variance", [0.01, 1.0, 100.0])
-def test_a_unit_delay_costs_what_the_scalar_riccati_equation_says(a, variance):
+def test_a_unit_delay_has_the_cost_of_the_scalar_riccati_equation(a, variance):
     # p = a^2 p s / (p + s) + 1, solved for p > 0.
     b = variance * (1.0 - a**2) - 1.0
     p = 0.5 * (-b + np.sqrt(b**2 + 4.0 * variance))
@@ -83,7 +83,7 @@ def test_a_unit_delay_costs_what_the_scalar_riccati_equation_says(a, variance):
 
 
 @pytest.mark.parametrize("zero", [1.2, 3.0, -2.0])
-def test_a_zero_outside_the_circle_raises_it_by_the_known_factor(zero):
+def test_a_zero_outside_the_circle_raises_the_error_by_the_known_factor(zero):
     # The part of V outside P_i H2 is spanned by the kernels at w = 0 and w = 1/zero.
     a, b = 0.9, 1.0 / zero
     factor = 1.0 + a**2 * (1.0 - b**2) / (1.0 - a * b) ** 2
@@ -142,7 +142,7 @@ PLANTS = {
 
 @pytest.mark.parametrize("name", list(PLANTS))
 @pytest.mark.parametrize("variance", [1e-3, 1.0])
-def test_it_is_cheap_control_lqg(name, variance):
+def test_the_limit_equals_cheap_control_lqg(name, variance):
     model = ((0.0, 1.0, 0.3), (1.0, -1.9, 0.905))
     spectrum = 0.02 * np.abs(response(*model)) ** 2
     found = least(spectrum, variance, inner_of(PLANTS[name][0]))
@@ -153,7 +153,7 @@ def test_it_is_cheap_control_lqg(name, variance):
     assert found == pytest.approx(priced[1], rel=1e-3)
 
 
-def test_less_noise_less_error():
+def test_the_error_falls_with_the_noise():
     inner = inner_of(PLANTS["zeros outside"][0])
     errors = [least(ar1(0.98), variance, inner) for variance in (10.0, 1.0, 0.1, 0.0)]
     assert np.all(np.diff(errors) < 0.0)
@@ -167,7 +167,7 @@ def drawn():
     return signal.lfilter([1.0], [1.0, -0.98], draws), 2.0 * noise
 
 
-def test_the_best_controller_in_a_loop_reaches_it(drawn):
+def test_the_best_controller_reaches_the_limit_in_a_loop(drawn):
     numerator, denominator = PLANTS["zeros outside"]
     plant = response(numerator, denominator)
     T = best_response(ar1(0.98), 4.0, inner_of(numerator))
@@ -191,7 +191,7 @@ def test_the_best_controller_in_a_loop_reaches_it(drawn):
     assert abs(squares.mean() - predicted) < 4.0 * spread
 
 
-def test_no_other_linear_controller_beats_it(drawn):
+def test_no_other_linear_controller_has_a_smaller_error(drawn):
     d, n = drawn
     bound = least(ar1(0.98), 4.0, W)
     found = []

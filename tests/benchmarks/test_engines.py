@@ -51,7 +51,7 @@ def test_c_and_numpy_agree_on_three_axes(lanes):
     )
 
 
-def test_numba_has_one_loop():
+def test_numba_runs_the_first_loop_only():
     with pytest.raises(engines.UnavailableError, match="not written for numba"):
         engines.NumbaEngine(loop_three_dof.THREE_DOF_PID_SMC)
 

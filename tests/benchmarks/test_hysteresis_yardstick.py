@@ -31,12 +31,12 @@ def c_engine(problem, what):
 YARDSTICKS = [name for name in hysteresis.MODELS if hysteresis.has_yardstick(name)]
 
 
-def test_the_first_models_have_a_yardstick():
+def test_the_first_models_have_a_reference_in_c():
     assert {"coleman_hodgdon", *hysteresis.OTHERS} <= set(YARDSTICKS)
 
 
 @pytest.mark.parametrize("name", YARDSTICKS)
-def test_each_model(name):
+def test_each_model_equals_c(name):
     problem = hysteresis.Problem(name, LANES, STEPS)
     c = c_engine(problem, "forward").run()
     run = hysteresis.PiezojaxEngine(problem, "run").run()
@@ -47,7 +47,7 @@ def test_each_model(name):
 # One macro of C makes all gradients of the functions that the test before compares.
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["coleman_hodgdon", "bashash_jalili", "duhem"])
-def test_gradients(name):
+def test_gradients_equal_c(name):
     problem = hysteresis.Problem(name, LANES, STEPS)
     differences = c_engine(problem, "gradient").run()
     mode = hysteresis.modes("gradient", len(problem.sizes))[0]
@@ -59,7 +59,7 @@ def test_gradients(name):
     )
 
 
-def test_the_command(tmp_path, monkeypatch):
+def test_the_command_writes_rows(tmp_path, monkeypatch):
     monkeypatch.setattr(hysteresis.throughput, "pin_to_one_core", lambda: 1)
     file = tmp_path / "out.json"
     name = "coleman_hodgdon"
@@ -76,14 +76,14 @@ def test_the_command(tmp_path, monkeypatch):
     assert set(hysteresis.within(rows)) == {(name, "forward"), (name, "gradient")}
 
 
-def test_models_without_a_function_in_c_are_said(monkeypatch):
+def test_models_without_a_function_in_c_are_listed(monkeypatch):
     problem = hysteresis.Problem("coleman_hodgdon", 2, 10)
     problem.name = "unwritten"
     with pytest.raises(engines.UnavailableError, match="has no unwritten"):
         c_engine(problem, "forward")
 
 
-def test_a_model_without_a_yardstick_is_listed(tmp_path, monkeypatch, capsys):
+def test_a_model_without_a_reference_in_c_is_listed(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(hysteresis.throughput, "pin_to_one_core", lambda: 1)
     monkeypatch.setattr(hysteresis, "has_yardstick", lambda name: False)
     arguments = ["--json", str(tmp_path / "out.json"), "--models", "duhem"]

@@ -53,7 +53,7 @@ def coefficients(scheme):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_it_is_the_loop_of_the_equations(scheme):
+def test_the_loop_equals_the_equations(scheme):
     samples = 600
     reference = 4.0 + 4.0 * np.sign(np.sin(2 * np.pi * 90.0 * DT * np.arange(samples)))
     reference[:5] = 0.0
@@ -107,7 +107,7 @@ def test_negative_feedback_shifts_the_mode_upwards():
     assert frequency == pytest.approx(expected, rel=0.02)
 
 
-def test_it_starts_at_rest():
+def test_the_loop_starts_at_rest():
     tested = loop("positive position feedback")
     reference = np.full(50, 1.0)
     _, log = pj.simulate(

@@ -69,7 +69,7 @@ def run(loop, wanted, draws):
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_loop_is_least_squares_over_all_it_has_seen(name):
+def test_the_loop_equals_least_squares_over_all_past_samples(name):
     controller, kind, gains = CONTROLLERS[name]
     inner = make_controller(kind, gains, p753.RATE)
     expected = closed_loop(
@@ -89,7 +89,7 @@ def test_loop_is_least_squares_over_all_it_has_seen(name):
     assert np.abs(alone.displacement - found.displacement).max() > 0.05
 
 
-def test_without_a_share_it_is_the_controller():
+def test_with_a_share_of_zero_the_loop_equals_the_controller():
     printed = p753.disturbance_observer()
     adaptive = p753.adaptive_disturbance_observer()
     _, expected = run(around(printed), reference(), DRAWS)
@@ -99,7 +99,7 @@ def test_without_a_share_it_is_the_controller():
     )
 
 
-def test_gain_poles_and_hysteresis_that_are_off_are_learned():
+def test_deviations_of_gain_poles_and_hysteresis_are_learned():
     stage = p753_stage.stage(gain=0.2, poles=-0.2, hysteresis=0.2)
     controller = p753.adaptive_disturbance_observer()
     errors = []
@@ -111,7 +111,7 @@ def test_gain_poles_and_hysteresis_that_are_off_are_learned():
     assert errors[1] < errors[0] / 4.0
 
 
-def test_stops_follow_what_moves_the_stage():
+def test_stops_follow_the_input_of_the_dynamics():
     """Behind its slow pole the stage lags the hysteresis by a twentieth of a cycle."""
     stage = p753_stage.stage(poles=-0.2, hysteresis=0.2)
     wanted = 5.0 - 2.5 * np.cos(2.0 * np.pi * 50.0 * np.arange(SAMPLES + 1) * p753.DT)
@@ -127,7 +127,7 @@ def test_stops_follow_what_moves_the_stage():
     assert errors[1] < errors[0] / 2.0, errors
 
 
-def test_at_rest_nothing_moves_and_margins_are_those_of_the_controller():
+def test_at_rest_weights_are_constant_and_margins_equal_the_controllers():
     inner = CONTROLLERS["pid"][0]
     whole = adaptive(inner, memory=0.1, share=1.0)
     loop = around(whole)
@@ -142,7 +142,7 @@ def test_at_rest_nothing_moves_and_margins_are_those_of_the_controller():
     np.testing.assert_allclose(peaks[1], peaks[0], rtol=1e-9)
 
 
-def test_slopes_are_those_of_differences_and_jit_is_eager():
+def test_gradients_equal_finite_differences_and_jit_is_eager():
     wanted, draws = reference(801), DRAWS[:800]
 
     def error(scale):
@@ -172,7 +172,7 @@ def test_slopes_are_those_of_differences_and_jit_is_eager():
         np.testing.assert_allclose(left, right, rtol=1e-12, atol=1e-12)
 
 
-def test_what_was_learned_is_forgotten_and_a_certain_weight_is_held():
+def test_forgetting_restores_the_prior_covariance():
     """With the row at zero the covariance goes back to its start."""
     learner = RecursiveWeights((1.0, 2.0), (0.5, 0.0), 0.1, 0.01, 1e-3)
     rows = np.random.default_rng(1).normal(size=(100, 2))
@@ -215,6 +215,6 @@ def test_what_was_learned_is_forgotten_and_a_certain_weight_is_held():
         ({"dt": 0.0}, "dt in s is 0"),
     ],
 )
-def test_what_cannot_be_is_refused(changes, message):
+def test_impossible_values_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         adaptive(CONTROLLERS["pid"][0], **changes)

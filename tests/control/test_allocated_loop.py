@@ -65,7 +65,7 @@ def rms(log):
 
 
 @pytest.mark.parametrize("locked", [False, True])
-def test_alike_they_are_three_axes_apart(locked):
+def test_equal_actuators_give_three_uncoupled_axes(locked):
     # Geometry and dynamics commute: each axis answers as one actuator does.
     found = run(p558_actuators.axes_stage(ALIKE, allocation(locked)))
     expected = run(PerAxis(tuple(part.parts[1] for part in ALIKE[:3])))
@@ -75,7 +75,7 @@ def test_alike_they_are_three_axes_apart(locked):
         )
 
 
-def test_all_four_follow_and_three_of_them_as_well():
+def test_four_actuators_and_any_three_follow_the_reference():
     logs = [
         run(p558_actuators.axes_stage(EACH_ITS_OWN, allocation(locked)))
         for locked in (False, True)
@@ -105,7 +105,7 @@ def test_a_loop_starts_at_rest_on_its_pose(locked):
     np.testing.assert_allclose(rest_output(plant, command), pose, atol=1e-9)
 
 
-def test_the_catalogued_stage_is_the_geometry_of_its_actuators():
+def test_the_catalogued_stage_has_the_geometry_of_its_actuators():
     time = np.arange(300)[:, None] / 100.0
     poses = (1.0 - np.cos(np.pi * time)) * [15.0, 40.0, -30.0]
 
@@ -149,13 +149,13 @@ def test_gradient_in_closed_loop_is_finite_differences():
     np.testing.assert_allclose(slope, difference, rtol=1e-5)
 
 
-def test_a_packed_system_is_the_system():
+def test_a_packed_system_equals_the_system():
     matrix = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
     _, found = Packed(LinearMap(matrix)).step((), (jnp.asarray(1.0), jnp.asarray(-2.0)))
     assert isinstance(found, tuple)
     np.testing.assert_allclose(found, matrix @ [1.0, -2.0], rtol=1e-15)
 
 
-def test_there_must_be_four():
+def test_another_number_of_actuators_is_refused():
     with pytest.raises(ValueError, match="3 actuators; there must be 4"):
         p558_actuators.axes_stage(ALIKE[:3])

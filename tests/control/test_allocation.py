@@ -52,7 +52,7 @@ def feasible():
     return oracle.out_of_reach(oracle.PLATE, [0.0] * 4, [50.0] * 4, POSES) < 1e-6
 
 
-def test_the_plate_is_that_of_the_notes():
+def test_the_geometry_equals_the_documentation():
     np.testing.assert_allclose(PLATE.geometry, oracle.PLATE, rtol=0, atol=1e-12)
     np.testing.assert_allclose(
         p558_actuators.elongations(), oracle.ELONGATIONS, rtol=1e-12
@@ -67,14 +67,14 @@ def test_share_of_poses_reached(method):
     assert abs(reached.mean() - SHARES[method]) < 0.02
 
 
-def test_bounded_makes_every_pose_that_can_be_made(bounded, feasible):
+def test_bounded_reaches_every_reachable_pose(bounded, feasible):
     error = missed(bounded)
     assert 0.6 < feasible.mean() < 0.7
     assert error[feasible].max() < 1e-9
     assert error[~feasible].min() > 1e-6
 
 
-def test_poses_on_the_edge_of_reach_are_made_within_bounds():
+def test_poses_at_the_edge_of_reach_stay_within_bounds():
     # Rounding puts such commands a little outside, and the pose a little out of reach.
     draw = np.random.default_rng(11)
     commands = np.clip(draw.uniform(-25.0, 75.0, (4000, 4)), 0.0, 50.0)
@@ -84,7 +84,7 @@ def test_poses_on_the_edge_of_reach_are_made_within_bounds():
     assert found.commands.max() == 50.0
 
 
-def test_bounded_shifts_along_the_twist_no_further_than_needed(bounded):
+def test_bounded_uses_the_smallest_sufficient_twist(bounded):
     expected, possible = oracle.shifted(POSES)
     found, expected = bounded.commands[possible], expected[possible]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
@@ -102,12 +102,12 @@ def assert_least(poses, errors, axis_weights):
         assert abs(np.sqrt(axis_weights @ error**2) - least) < 1e-6
 
 
-def test_bounded_misses_other_poses_by_the_least(bounded, feasible):
+def test_bounded_has_the_least_error_out_of_reach(bounded, feasible):
     errors = bounded.error[~feasible][:300]
     assert_least(POSES[~feasible][:300], errors, np.ones(3))
 
 
-def test_weights_of_axes_say_what_is_missed(bounded, feasible):
+def test_axis_weights_distribute_the_error_out_of_reach(bounded, feasible):
     axis_weights, poses = np.array([400.0, 1.0, 2.0]), POSES[~feasible][:300]
     lower, upper = np.zeros(4), np.full(4, 50.0)
     weighted = Allocation(oracle.PLATE, lower, upper, axis_weights=axis_weights)
@@ -117,7 +117,7 @@ def test_weights_of_axes_say_what_is_missed(bounded, feasible):
     assert z.mean() < 0.7 * before.mean()
 
 
-def test_minimum_norm_is_the_pseudo_inverse_cut_off():
+def test_minimum_norm_is_the_clipped_pseudo_inverse():
     found = allocate_all(p558_actuators.allocation("minimum_norm"), POSES)
     expected = np.clip(POSES @ oracle.ELONGATIONS.T, 0.0, 50.0)
     np.testing.assert_allclose(found.commands, expected, rtol=0, atol=1e-9)
@@ -126,7 +126,7 @@ def test_minimum_norm_is_the_pseudo_inverse_cut_off():
     np.testing.assert_allclose(found.error, POSES - made, rtol=0, atol=1e-9)
 
 
-def test_weights_spare_an_actuator():
+def test_actuator_weights_relieve_an_actuator():
     weights, far = np.array([10.0, 1.0, 1.0, 2.0]), np.full(4, 1e3)
     by = oracle.PLATE / weights
     right = by.T @ np.linalg.inv(by @ oracle.PLATE.T)
@@ -161,7 +161,7 @@ def test_any_geometry_has_the_least_error_then_the_least_effort(axes, actuators)
 
 
 @pytest.mark.parametrize("at", LOCKED_SHARES)
-def test_a_locked_actuator_is_survived(at):
+def test_a_locked_actuator_leaves_the_stated_share(at):
     lower, upper = [at, 0.0, 0.0, 0.0], [at, 50.0, 50.0, 50.0]
     feasible = oracle.out_of_reach(oracle.PLATE, lower, upper, POSES) < 1e-6
     for method in METHODS:
@@ -182,7 +182,7 @@ def test_a_locked_actuator_is_survived(at):
         )
 
 
-def test_any_one_of_the_four_locked_costs_no_pose_but_a_twist():
+def test_a_locked_actuator_changes_the_twist_of_reachable_poses_only():
     # A batch over failures: bounds are arrays.
     stuck = np.eye(4, dtype=bool)
     lower, upper = np.where(stuck, 25.0, 0.0), np.where(stuck, 25.0, 50.0)
@@ -199,7 +199,7 @@ def test_any_one_of_the_four_locked_costs_no_pose_but_a_twist():
     assert np.abs(twist).min() > 0.9
 
 
-def test_two_locked_actuators_leave_the_least_error():
+def test_two_locked_actuators_give_the_least_error():
     allocation = PLATE.locked(1, 10.0).locked(3, 40.0)
     found = allocate(allocation, [25.0, 60.0, 20.0])
     left = np.array([25.0, 60.0, 20.0]) - oracle.PLATE[:, [1, 3]] @ [10.0, 40.0]
@@ -241,7 +241,7 @@ def slopes_and_differences(at, directions, method):
 @pytest.mark.parametrize("lock", [None, 20.0])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("place", PLACES)
-def test_slopes_are_those_of_differences(place, method, lock):
+def test_gradients_equal_finite_differences(place, method, lock):
     allocation = p558_actuators.allocation(method)
     by_lower, by_upper = np.eye(11)[3:7], np.eye(11)[7:]
     if lock is not None:
@@ -290,7 +290,7 @@ def test_bounds_are_never_exceeded(pose, method):
 
 @settings(max_examples=50)
 @given(pose=anywhere)
-def test_no_method_comes_closer_than_bounded(pose):
+def test_no_method_has_a_smaller_error_than_bounded(pose):
     least = np.linalg.norm(allocate(PLATE, pose).error)
     cut = allocate(p558_actuators.allocation("minimum_norm"), pose)
     assert least <= np.linalg.norm(cut.error) + 1e-9
@@ -298,7 +298,7 @@ def test_no_method_comes_closer_than_bounded(pose):
 
 @settings(max_examples=50)
 @given(pose=anywhere)
-def test_what_is_made_is_made_again(pose):
+def test_a_reached_pose_is_a_fixed_point(pose):
     found = allocate(PLATE, pose)
     again = allocate(PLATE, found.pose)
     np.testing.assert_allclose(again.pose, found.pose, rtol=0, atol=1e-8)
@@ -315,14 +315,14 @@ def test_commands_scale_with_pose_and_bounds(pose, scale):
 
 @settings(max_examples=50)
 @given(pose=anywhere)
-def test_a_turned_plate_has_turned_commands(pose):
+def test_a_rotated_plate_has_rotated_commands(pose):
     z, rx, ry = pose
     found = allocate(PLATE, np.array([z, -ry, rx])).commands
     expected = allocate(PLATE, pose).commands[TURNED]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
 
 
-def test_commands_do_not_jump():
+def test_commands_are_continuous_in_the_pose():
     # Twice across all faces of reach, in steps of 0.2 urad and 0.05 um.
     s = np.linspace(0.0, 2.0 * np.pi, 20_001)
     poses = np.stack([25 + 40 * np.sin(s), 500 * np.sin(2 * s), 400 * np.cos(3 * s)], 1)
@@ -334,7 +334,7 @@ def test_commands_do_not_jump():
         assert np.all(jump < 5.0 * step + 1e-6)
 
 
-def test_jit_and_batch_are_eager(bounded):
+def test_jit_and_batch_equal_eager(bounded):
     commands = PLATE.step((), POSES[3])[1]
     for found in (bounded.commands[3], allocate(PLATE, POSES[3]).commands):
         np.testing.assert_allclose(found, commands, rtol=0, atol=1e-11)
@@ -370,7 +370,7 @@ WITHIN, SHIFTED = motion(25.0, 100.0, 60.0), motion(40.0, 150.0, 20.0)
         (WITHIN, 25.0, "bounded"),
     ],
 )
-def test_four_alike_behind_the_allocation_are_three_axes_apart(poses, lock, method):
+def test_equal_actuators_behind_the_allocation_are_uncoupled_axes(poses, lock, method):
     model = actuator()
     stage = p558_actuators.stage(model, method)
     if lock is not None:
@@ -385,7 +385,7 @@ def test_four_alike_behind_the_allocation_are_three_axes_apart(poses, lock, meth
         np.testing.assert_allclose(found[:, axis], expected[:, 0], rtol=0, atol=1e-9)
 
 
-def test_that_motion_needs_the_shift():
+def test_the_motion_requires_the_null_space_shift():
     exceeded = np.abs(SHIFTED @ oracle.ELONGATIONS.T - 25.0).max(axis=1) > 25.0
     assert exceeded.sum() > 50
     assert oracle.shifted(SHIFTED)[1].all()
@@ -394,7 +394,7 @@ def test_that_motion_needs_the_shift():
     assert np.abs(cut - whole).max() > 10.0
 
 
-def test_a_stage_at_rest_stays_there():
+def test_a_stage_at_rest_stays_at_rest():
     model = actuator()
     A, B, C = map(np.asarray, (model.A, model.B, model.C))
     gain = (C @ np.linalg.solve(np.eye(len(A)) - A, B)).item()
@@ -405,7 +405,7 @@ def test_a_stage_at_rest_stays_there():
 
 
 @pytest.mark.parametrize("suffix", ["toml", "json"])
-def test_files_give_the_stage_back(tmp_path, suffix):
+def test_the_stage_is_saved_and_loaded(tmp_path, suffix):
     stage = p558_actuators.stage(actuator())
     weighted = Allocation(
         oracle.PLATE, np.zeros(4), np.ones(4), "weighted", (1.0, 2.0, 3.0, 4.0)
@@ -470,6 +470,6 @@ def made(geometry=oracle.PLATE, lower=(0.0,) * 4, upper=(50.0,) * 4, **options):
         ),
     ],
 )
-def test_what_cannot_be_allocated_is_refused(make, message):
+def test_bad_allocations_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()

@@ -101,7 +101,7 @@ def around(controller, rate):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_loop_is_that_of_the_equations(name):
+def test_the_loop_equals_the_equations(name):
     controller, oracle = CASES[name]
     found = run(around(controller, RATE), jnp.asarray(BEYOND))
     expected = closed_loop(
@@ -123,7 +123,7 @@ LATE = {**CASES, "super-twisting": (p753_survey.super_twisting(), None)}
 
 
 @pytest.mark.parametrize("name", LATE)
-def test_the_stage_comes_back_sooner(name):
+def test_the_stage_returns_sooner_with_anti_windup(name):
     def late(rate):
         found = run(around(LATE[name][0], rate), jnp.asarray(BEYOND))
         return np.mean((found.voltage == 120.0) & (BEYOND[:-1] < 14.0))
@@ -178,7 +178,7 @@ def on_three_axes(name, rate):
 
 
 @pytest.mark.parametrize("name", AXES)
-def test_three_axes_are_those_of_the_equations(name):
+def test_three_axes_equal_the_equations(name):
     _, kind, options = AXES[name]
     gains = options["gains"] | {"anti_windup": 5.0}
     expected = three_dof.simulate(

@@ -21,7 +21,7 @@ def seen(reference, following):
 
 
 @pytest.mark.parametrize("lead", [0.0, 1.0, -0.5, 2.25])
-def test_a_straight_line_is_shown_ahead_by_the_lead(lead):
+def test_a_ramp_is_advanced_by_the_lead(lead):
     def line(k):
         return jnp.asarray(3.0 + 0.5 * k)
 
@@ -40,7 +40,7 @@ def test_each_axis_has_its_own_lead():
     np.testing.assert_array_equal(following, (3.0, 7.0))
 
 
-def test_a_lead_takes_the_delay_off_a_follower():
+def test_a_lead_compensates_the_delay_of_a_loop():
     """A loop that is two samples late follows a slow sine without error at lead 2."""
 
     class Follower(pj.System):
@@ -66,6 +66,6 @@ def test_a_lead_takes_the_delay_off_a_follower():
     assert errors[2.0] < 1.5e-3
 
 
-def test_what_is_no_lead_is_refused():
+def test_bad_leads_are_refused():
     with pytest.raises(ValueError, match="lead in samples is inf; it must be finite"):
         pj.control.Anticipation(Echo(), (np.inf,))

@@ -90,7 +90,7 @@ def run(loop, reference):
 
 @pytest.mark.parametrize("order", MODELS)
 @pytest.mark.parametrize("kind", MAKE)
-def test_a_loop_of_any_order_is_that_of_the_matrices(kind, order):
+def test_a_loop_of_any_order_equals_the_matrix_form(kind, order):
     gains = gains_of(order)
     reference = signals.ten_references()["SIN50"][: SAMPLES + 1]
     loop = Feedback(MAKE[kind](gains), p753.plant(), p753.actuator(), Sensor(NOISE_RMS))

@@ -26,13 +26,13 @@ def output(law, s):
     return law.step(law.init(0.0), s)[1]
 
 
-def test_it_is_a_line_inside_the_layer_and_a_constant_outside():
+def test_the_law_is_linear_inside_the_layer_and_constant_outside():
     s = jnp.asarray([-1e9, -201.0, -200.0, -50.0, 0.0, 100.0, 200.0, 201.0, 1e9])
     expected = [3.0, 3.0, 3.0, 0.75, 0.0, -1.5, -3.0, -3.0, -3.0]
     np.testing.assert_allclose(jax.vmap(lambda s: output(LAW, s))(s), expected)
 
 
-def test_slopes_are_finite_everywhere_and_right_inside():
+def test_gradients_are_finite_everywhere_and_right_inside():
     slope = jax.grad(output, argnums=(0, 1))
     law, by_s = slope(LAW, 50.0)
     np.testing.assert_allclose(
@@ -45,7 +45,7 @@ def test_slopes_are_finite_everywhere_and_right_inside():
     assert (law.gain, law.width, by_s) == (-1.0, 0.0, 0.0)
 
 
-def test_a_layer_of_no_width_is_bang_bang_switching():
+def test_a_layer_of_zero_width_equals_bang_bang_switching():
     printed = chapter4.bang_bang()
     thin = eqx.tree_at(
         lambda c: (c.law, c.control_weight, c.model),

@@ -219,7 +219,7 @@ def loop_of(case):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_loop_is_the_published_one(name):
+def test_the_loop_equals_the_published_one(name):
     case = CASES[name]
     references, draws, samples = samples_of(name)
     for lane in range(2):
@@ -255,7 +255,7 @@ def test_a_start_at_rest_stays_at_rest(name):
     np.testing.assert_allclose(samples.command[2, :start], voltage, rtol=0.0, atol=1e-6)
 
 
-def test_bang_bang_starts_from_what_holds_the_stage():
+def test_bang_bang_starts_from_the_holding_voltage():
     controller = catalog.bang_bang()
     seen = Observation(*map(jnp.asarray, (5.0, 5.0, 5.0, 31.0)))
     state = controller.init(seen)
@@ -291,7 +291,7 @@ def test_gradients_of_bang_bang_are_finite_where_it_switches(level):
     assert np.any(jax.tree.leaves(slopes.controller)[0] != 0.0)
 
 
-def test_both_inverses_are_that_of_b0_without_weight_and_keep_their_cost():
+def test_both_inverses_minimise_their_cost():
     b0, error, control = jnp.asarray([0.02, 2.0, 0.3])
     for form in INVERSIONS.values():
         np.testing.assert_allclose(form(b0, error, 0.0 * b0), 50.0, rtol=1e-12)
@@ -309,7 +309,7 @@ def test_both_inverses_are_that_of_b0_without_weight_and_keep_their_cost():
 
 
 @pytest.mark.parametrize("rate", MODELS)
-def test_the_printed_inverse_diverges_where_tikhonov_decays(rate):
+def test_the_printed_inverse_diverges_and_the_tikhonov_inverse_decays(rate):
     b0, b1, b2 = MODELS[rate][2:]
     weight = TRACKING[rate][3]
     moduli = {

@@ -196,7 +196,7 @@ def commands(controller, references, measurements):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_device_is_the_loop_of_its_equations(case):
+def test_a_device_equals_the_loop_of_its_equations(case):
     make, oracle, options = CASES[case]
     random = np.random.default_rng(7)
     references = REST + 25.0 * (np.arange(SAMPLES) > 20) * (np.arange(SAMPLES) < 260)
@@ -215,7 +215,7 @@ def test_a_device_is_the_loop_of_its_equations(case):
         assert 10 < np.sum(np.isin(expected, SPAN)) < SAMPLES - 50
 
 
-def test_an_nv200_computes_with_three_decimals_and_whole_frequencies():
+def test_an_nv200_rounds_to_three_decimals_and_whole_frequencies():
     typed = nv200(kp=0.0204, ki=70.0004, notchf=811.4, notchb=399.6, notchon=1)
     exact = nv200(kp=0.02, ki=70.0, notchf=811.0, notchb=400.0, notchon=1)
     signals = REST + np.arange(50.0), np.full(50, REST)
@@ -229,7 +229,7 @@ def test_rounding_keeps_the_notch_within_its_limit():
     assert (float(notch.notchf), float(notch.notchb)) == (100.0, 200.0)
 
 
-def test_pyrpl_computes_with_its_registers():
+def test_pyrpl_rounds_to_its_registers():
     typed = pyrpl(p=-0.12345, i=-20.0, filters=1, filter_1=1500.0).typed()
     assert float(typed.p) * 2**12 == round(-0.12345 * 2**12)
     assert float(typed.i) == pytest.approx(-20.0, abs=2.4e-3)
@@ -239,7 +239,7 @@ def test_pyrpl_computes_with_its_registers():
     assert slope(1500.0) == 1.0
 
 
-def test_a_stabilizer_loses_small_errors():
+def test_a_stabilizer_ignores_small_errors():
     """At 8 V the steps of single precision are 2^-9 codes: less error moves nothing."""
     slow = stabilizer(p=-1e-6, i=1.0)
     measured = np.full(400, REST)
@@ -258,7 +258,7 @@ def test_a_stabilizer_loses_small_errors():
     assert last(1.0) == 0.0
 
 
-def test_a_servo_at_a_low_rate_checks_what_is_on():
+def test_a_servo_at_a_low_rate_checks_active_filters_only():
     limits = {"lower": 0.0, "upper": 100.0, "dt": 1e-3}
     assert float(Servo(1.0, 100.0, **limits).notch_frequency_1) == 1000.0
     with pytest.raises(ValueError, match=r"notch_frequency_1 is 1000; .* below 500"):
@@ -298,7 +298,7 @@ STUDY = {
 }
 
 
-def test_a_study_tunes_what_can_be_typed_in():
+def test_a_study_tunes_the_values_of_the_device():
     outcome = pj.tune(build(Study.model_validate(STUDY), "study.toml"))
     gains = outcome.result.gains
     for value in gains.values():

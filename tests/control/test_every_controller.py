@@ -203,14 +203,14 @@ def runs(name):
 
 
 @pytest.mark.parametrize("name", RUN)
-def test_a_start_at_rest_is_bumpless_and_stays(name):
+def test_a_start_at_rest_is_bumpless_and_stays_at_rest(name):
     commands = runs(name).commands[2]
     expected = np.broadcast_to(np.asarray(rest_of(name)[1])[..., None], commands.shape)
     np.testing.assert_allclose(commands, expected, rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", RUN)
-def test_compiled_lanes_are_eager_steps(name):
+def test_compiled_lanes_equal_eager_steps(name):
     found, seen = runs(name), observations(name, 1.0)
     controller, state = resolve(found.changed), found.changed.init(at(seen, 0))
     for k in range(3):
@@ -222,7 +222,7 @@ def test_compiled_lanes_are_eager_steps(name):
 
 
 @pytest.mark.parametrize("name", RUN)
-def test_its_gradient_is_that_of_differences(name):
+def test_its_gradient_equals_finite_differences(name):
     found = runs(name)
     assert np.all(np.isfinite(found.gradients))
     floor = 1e-7 * np.sum(np.abs(found.commands[0]))
@@ -230,7 +230,7 @@ def test_its_gradient_is_that_of_differences(name):
 
 
 @pytest.mark.parametrize("name", STARTS)
-def test_a_saved_controller_comes_back(name, monkeypatch):
+def test_a_controller_is_saved_and_loaded(name, monkeypatch):
     registry.kinds()
     monkeypatch.setattr(registry, "_registered", dict(registry._registered))
     registry.register(Leaking)
@@ -294,7 +294,7 @@ REFUSALS = [
 
 
 @pytest.mark.parametrize(("example", "name", "value"), REFUSALS)
-def test_a_value_that_is_not_allowed_is_refused_by_name(example, name, value):
+def test_a_refused_value_is_named(example, name, value):
     before = getattr(example, name)
     after = jax.tree.map(
         lambda one: np.full(np.shape(one), value) if np.shape(one) else value, before

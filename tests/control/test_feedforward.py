@@ -42,7 +42,7 @@ def around(controller, plant, actuator=None):
     return Feedback(controller, plant, actuator or p753.actuator(), Sensor(0.0))
 
 
-def test_it_inverts_the_hysteresis_it_models():
+def test_an_exact_model_cancels_the_hysteresis():
     samples = run(around(InverseFeedforward(INVERSE), p753.hysteresis()), REFERENCE)
     np.testing.assert_allclose(
         samples.displacement, samples.reference, rtol=0.0, atol=1e-9
@@ -50,7 +50,7 @@ def test_it_inverts_the_hysteresis_it_models():
     assert np.ptp(samples.displacement) > 9.9
 
 
-def test_feedforward_alone_is_feedforward_beside_a_silent_feedback():
+def test_feedforward_alone_equals_feedforward_with_zero_feedback():
     plant = p753.plant()
     alone = run(around(InverseFeedforward(INVERSE), plant), REFERENCE)
     beside = run(around(FeedforwardFeedback(INVERSE, SILENT), plant), REFERENCE)
@@ -71,7 +71,7 @@ def test_a_wrong_model_starts_without_a_bump(feedback):
     assert abs(samples.voltage[0] - 45.0) > 1.0
 
 
-def test_the_feedback_sees_its_own_share_of_what_was_applied():
+def test_the_feedback_receives_its_share_of_the_applied_voltage():
     # A drive that clips: the anti-windup is to see the shortfall and no more.
     controller = FeedforwardFeedback(Affine(9.0), p753.pid())
     start = Observation(*map(jnp.asarray, (1.0, 1.0, 1.0, 12.0)))
@@ -84,7 +84,7 @@ def test_the_feedback_sees_its_own_share_of_what_was_applied():
     np.testing.assert_allclose(command, 12.0 - 2.0 * 100.0 * p753.DT, rtol=1e-12)
 
 
-def test_feedback_makes_up_for_limits():
+def test_feedback_compensates_for_limits():
     low = Saturation(-20.0, 60.0)  # SIN10 needs up to 68 V
     controller = FeedforwardFeedback(INVERSE, p753.pid())
     samples = run(around(controller, p753.plant(), low), REFERENCE)

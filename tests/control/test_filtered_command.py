@@ -46,7 +46,7 @@ def run(controller):
     return jax.lax.scan(step, (start, 0.0), (REFERENCE, MEASURED))[1]
 
 
-def test_it_is_the_pid_and_then_the_notch():
+def test_the_command_is_the_pid_followed_by_the_notch():
     b, a = scipy.signal.iirnotch(3000.0, 1.5, 1.0 / DT)
     # The notch of SciPy with tan(width / 2) = damping sin(angle).
     angle = 2.0 * np.pi * 3000.0 * DT
@@ -64,12 +64,12 @@ def test_it_is_the_pid_and_then_the_notch():
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 
 
-def test_a_filter_that_passes_everything_changes_nothing():
+def test_an_all_pass_filter_changes_nothing():
     alone, filtered = run(pid()), run(FilteredCommand(pid(), Affine()))
     np.testing.assert_allclose(filtered, alone, rtol=0.0, atol=1e-12)
 
 
-def test_filters_in_series_are_one_filter():
+def test_filters_in_series_equal_one_filter():
     both = Notch(3000.0, 0.5, 0.1, DT) >> SecondOrderLowPass(5000.0, 0.7, DT)
     controller = FilteredCommand(pid(), both)
     resting = Observation(*np.full((4, 5), [[1.0], [1.0], [1.0], [7.0]]))

@@ -103,7 +103,7 @@ def assert_close(found, expected, names, rtol, atol):
 
 
 @pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
-def test_reverse_is_forward_and_finite(loop, run):
+def test_reverse_mode_equals_forward_mode_and_is_finite(loop, run):
     reverse = loop.reverse(loop.values, run)[1] * loop.scale
     forward = loop.forward(loop.values, run) * loop.scale
     assert np.all(np.isfinite(reverse))
@@ -114,7 +114,7 @@ def test_reverse_is_forward_and_finite(loop, run):
 @pytest.mark.parametrize(
     "name", ["with noise", "turning points on samples", "a jump", "saturation"]
 )
-def test_gradient_is_that_of_differences(loop, name):
+def test_gradient_equals_finite_differences(loop, name):
     loss, gradient = loop.reverse(loop.values, RUNS[name])
     gradient = np.asarray(gradient) * loop.scale
     each = np.stack([differences(loop, RUNS[name], step) for step in STEPS])
@@ -127,14 +127,14 @@ def test_gradient_is_that_of_differences(loop, name):
 
 
 @pytest.mark.parametrize("name", ["rest at zero", "rest at 5 um"])
-def test_no_parameter_moves_a_loop_at_rest(loop, name):
+def test_gradients_of_a_loop_at_rest_are_zero(loop, name):
     loss, gradient = loop.reverse(loop.values, RUNS[name])
     assert loss < 1e-9
     np.testing.assert_allclose(gradient * loop.scale, 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_the_runs_are_what_they_are_called(loop, name):
+def test_the_runs_have_the_named_properties(loop, name):
     points = np.tile(loop.values, (4 * loop.values.size, 1))
     figures = jax.tree.map(lambda x: x[0], loop.batch(points, RUNS[name]))
     if name == "saturation":

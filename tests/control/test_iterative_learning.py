@@ -61,7 +61,7 @@ def learned(law, start):
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_trials_are_those_of_the_matrices_and_contract(name):
+def test_trials_equal_the_matrices_and_contract(name):
     law = LAWS[name]
     stage = response_matrix()
     lead, smooth = law_matrices(law)
@@ -94,7 +94,7 @@ def test_trials_are_those_of_the_matrices_and_contract(name):
         assert np.all(np.array(distances[1:]) <= norm * np.array(distances[:-1]))
 
 
-def test_the_condition_in_frequency_tells_growth_from_decay():
+def test_the_frequency_condition_separates_growth_from_decay():
     z = np.exp(1j * np.linspace(1e-3, np.pi, 500))
     stage = (B[0] + B[1] / z + B[2] / z**2) / (1.0 - A[0] / z - A[1] / z**2)
 
@@ -112,7 +112,7 @@ def test_the_condition_in_frequency_tells_growth_from_decay():
     assert learned(bad, start).rms_error[-1] > learned(bad, start).rms_error[0]
 
 
-def test_a_loop_on_the_hysteretic_stage_learns_despite_its_noise():
+def test_learning_reduces_the_error_of_a_hysteretic_stage_with_noise():
     reference = signals.sine(signals.time_grid(0.1, p753.RATE), 10.0)
     draws = jnp.asarray(np.random.default_rng(6).normal(size=(8, reference.size)))
     trials = jax.jit(lambda law, loop: learn(law, loop, reference, 8, draws))
@@ -124,7 +124,7 @@ def test_a_loop_on_the_hysteretic_stage_learns_despite_its_noise():
     assert found.feedforward.shape == reference.shape
 
 
-def test_gradients_are_those_of_differences_and_finite_for_a_perfect_trial():
+def test_gradients_equal_finite_differences_and_finite_for_a_perfect_trial():
     law = LAWS["with filter"]
 
     def loss(gain, weight, stage_b, reference):

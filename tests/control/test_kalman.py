@@ -57,7 +57,7 @@ def alpha_beta_of(index):
 
 
 @pytest.mark.parametrize("index", [1e-4, 0.01, 0.3, 5.0])
-def test_the_kinematic_filter_is_the_alpha_beta_filter_of_kalata(index):
+def test_the_kinematic_filter_equals_the_alpha_beta_filter_of_kalata(index):
     alpha, beta = alpha_beta_of(index)
     kalman = kinematic_kalman(0.012, index * 0.012 / DT**2, DT)
     np.testing.assert_allclose(kalman.gain, (alpha, alpha - beta, 0.0), rtol=1e-8)
@@ -92,7 +92,7 @@ def covariances(a, n, noise, process, drift, samples):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_the_gain_is_where_the_recursion_settles(name):
+def test_the_gain_is_the_limit_of_the_recursion(name):
     a, b = MODELS[name]
     kalman = model_kalman(ARMA(a, b), 0.012, 1e-3, 1e-3, DT)
     expected, _ = covariances(a, max(len(a), 2), 0.012, 1e-3, 1e-3, 2_000)
@@ -100,7 +100,7 @@ def test_the_gain_is_where_the_recursion_settles(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_the_estimate_is_that_of_the_matrix_filter(name):
+def test_the_estimate_equals_that_of_the_matrix_filter(name):
     a, b = MODELS[name]
     kalman = model_kalman(ARMA(a, b), 0.012, 1e-3, 1e-4, DT)
     applied, measured = 10.0 * np.sin(np.arange(SAMPLES) / 100), DRAWS[0]
@@ -117,7 +117,7 @@ def test_the_estimate_is_that_of_the_matrix_filter(name):
     )
 
 
-def test_the_error_is_the_predicted_one_and_below_the_kinematic_filter():
+def test_the_error_equals_the_prediction_and_is_below_the_kinematic_filter():
     noise, process, drift = 0.012, 1e-3, 1e-4
     voltage = 20.0 * np.sin(np.arange(SAMPLES) * 0.3)  # fast: only the model knows
     y, d, truth = [0.0, 0.0], 0.0, []
@@ -154,7 +154,7 @@ def test_the_error_is_the_predicted_one_and_below_the_kinematic_filter():
     ],
     ids=["alpha-beta", "kinematic", "model", "model alone"],
 )
-def test_an_observer_at_rest_stays_there(observer):
+def test_an_observer_at_rest_stays_at_rest(observer):
     seen = at_rest(5.0, 31.0)
     state = observer.init(seen)
     for _ in range(3):
@@ -166,7 +166,7 @@ def test_an_observer_at_rest_stays_there(observer):
 GAIN = tuple(map(float, p753.kalman(STAGE).gain))
 
 
-def test_the_gain_is_that_of_the_algebraic_equation():
+def test_the_gain_solves_the_algebraic_riccati_equation():
     A = np.array([[*MODEL_A, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     Q = np.diag([1e-6, 0.0, 1e-6])
     P = linalg.solve_discrete_are(A.T, np.eye(3)[:, :1], Q, [[0.012**2]])
@@ -218,7 +218,7 @@ def run(loop, reference):
 
 
 @pytest.mark.parametrize("name", LOOPS)
-def test_controllers_take_it_for_their_filter(name):
+def test_controllers_accept_it_as_their_filter(name):
     controller, gains, kind = LOOPS[name]
     reference = signals.ten_references()["PWSW30"]
     found = run(p753.loop(controller), reference)

@@ -54,7 +54,7 @@ def trials():
     return np.array(outputs), np.array(commands)
 
 
-def test_the_run_is_that_of_the_trials_and_learns():
+def test_the_run_equals_the_trials_and_learns():
     loop = Feedback(controller(), ARMA((0.5,), (0.5,)), Affine(), Sensor(NOISE))
     found = run(loop)
     y, u = trials()
@@ -64,6 +64,6 @@ def test_the_run_is_that_of_the_trials_and_learns():
     assert rms[-1] < 0.5 * rms[0]
 
 
-def test_a_period_shorter_than_what_it_looks_ahead_is_refused():
+def test_a_period_shorter_than_the_preview_is_refused():
     with pytest.raises(ValueError, match=r"reach 40 samples ahead; .* the period, 40"):
         controller(lead=38)

@@ -129,7 +129,7 @@ def around(controller, plant):
 
 @pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS)
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_loop_is_the_published_one(name, plant):
+def test_the_loop_equals_the_published_one(name, plant):
     controller, kind, gains = CONTROLLERS[name]
     references = REFERENCES[name]()
     if plant is PLANTS["delayed"]:
@@ -165,7 +165,7 @@ def test_a_start_away_from_zero_holds_the_stage(name):
         assert sample.command == pytest.approx(float(holding.voltage), rel=1e-9)
 
 
-def test_the_model_of_the_inverse_is_the_stage_also_after_clipping():
+def test_the_model_of_the_inverse_equals_the_stage_after_clipping():
     loop = around(p753.inversion(), p753.plant())
     state, samples = run(loop, hard_references()[-1:])
     clipped = samples.command != samples.voltage
@@ -181,7 +181,7 @@ def test_the_model_of_the_inverse_is_the_stage_also_after_clipping():
     assert np.abs(error[0, -200:]).max() < 0.5
 
 
-def test_anti_windup_brings_the_stage_back_sooner():
+def test_anti_windup_returns_the_stage_sooner():
     reference = hard_references()[-1:]
     late = []
     for rate in (0.0, 1e3):
@@ -191,7 +191,7 @@ def test_anti_windup_brings_the_stage_back_sooner():
     assert late[1] < 0.1 * late[0]
 
 
-def test_unit_weights_are_the_pid_of_the_error():
+def test_unit_weights_give_the_pid_of_the_error():
     def plain(state, seen):
         """What the PID was before it had weights, from its equations."""
         integral, rate, last, command = state
@@ -225,7 +225,7 @@ def test_unit_weights_are_the_pid_of_the_error():
         assert getattr(weighted_pid(1.0, 1.0), name) == value
 
 
-def test_weights_leave_the_answer_to_noise_alone():
+def test_weights_do_not_change_the_response_to_noise():
     """At a reference of zero there is nothing to weigh."""
     references = np.zeros((1, SAMPLES + 1))
     loops = [around(c, p753.plant()) for c in (pid(), weighted_pid(50.0, -20.0))]
@@ -248,7 +248,7 @@ def observed(observer, measured):
     return simulate(observer, seen, observer.init(rest))[1]
 
 
-def test_alpha_beta_is_the_published_filter():
+def test_alpha_beta_equals_the_published_filter():
     measured = np.cumsum(DRAWS)[:2000]
     oracle = control.AlphaBeta(0.1, 1e-4, p753.DT)
     expected = np.array([oracle.step(z) for z in measured])
@@ -257,7 +257,7 @@ def test_alpha_beta_is_the_published_filter():
     np.testing.assert_allclose(found.velocity, expected[:, 1], rtol=1e-9, atol=1e-6)
 
 
-def test_q_filter_is_the_published_one():
+def test_q_filter_equals_the_published_one():
     for name, corrected in (("corrected", True), ("printed", False)):
         controller = p753.disturbance_observer(coefficients=name)
         expected = control.q_filter(

@@ -120,7 +120,7 @@ def test_the_loop_is_stable(name):
     assert np.abs(poles).max() < 1.0
 
 
-def test_gamma_is_the_bound_that_the_zeros_set():
+def test_gamma_equals_the_bound_from_the_zeros():
     # With hardly any weight on effort only the zeros of G outside the circle, -1.3 and
     # infinity (the delay), bound W1 S, which is W1 there: Nevanlinna and Pick.
     weight = first_order_weight(100.0, 3_000.0, 0.3, DT)
@@ -133,7 +133,7 @@ def test_gamma_is_the_bound_that_the_zeros_set():
     np.testing.assert_allclose(design.gamma, np.sqrt(squares.real.max()), rtol=2e-3)
 
 
-def test_a_heavier_effort_weight_asks_for_less():
+def test_a_larger_effort_weight_reduces_the_effort():
     weight = first_order_weight(**ERROR, dt=DT)
     w = grid()
     efforts = []
@@ -160,7 +160,7 @@ def run(loop, reference, draws):
 
 
 @pytest.mark.parametrize("start", [0.0, 3.0])
-def test_the_loop_is_that_of_numpy_and_starts_without_a_jump(start):
+def test_the_loop_equals_numpy_and_starts_without_a_bump(start):
     law = designed("two weights").controller.law
     stage = ARMA(*MODEL)
     loop = Feedback(StateSpaceController(law), stage, p753.actuator(), Sensor(0.012))
@@ -188,7 +188,7 @@ def test_the_loop_is_that_of_numpy_and_starts_without_a_jump(start):
     np.testing.assert_allclose(found.voltage[:100], rest, rtol=0.0, atol=1e-9)
 
 
-def test_it_tracks_the_stage_behind_the_inverse_hysteresis():
+def test_the_loop_tracks_with_the_inverse_hysteresis():
     loop = p753.loop(p753.mixed_sensitivity_inversion())
     reference = jnp.asarray(signals.ten_references()["SIN10"][:8_000])
     found = run(loop, reference, jnp.zeros(reference.size))

@@ -141,7 +141,7 @@ def samples_of(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_loop_is_the_published_one(name):
+def test_the_loop_equals_the_published_one(name):
     case = CASES[name]
     noise = DRAWS * [0.0008, 0.013, 0.013]
     expected = three_dof.simulate(case.name, MOVING, noise, **case.options)
@@ -173,7 +173,7 @@ def test_a_start_at_a_reference_is_without_a_bump(name):
     np.testing.assert_allclose(samples.displacement[1, 0], HELD, rtol=0.0, atol=1e-8)
 
 
-def test_at_rest_u1_alone_moves_each_axis_by_itself():
+def test_in_steady_state_u1_decouples_the_axes():
     # T1(1) = I: the dc gain from the desired outputs to those of the model.
     A, B, C = three_dof.stacked()
     dc_gain = C @ np.linalg.solve(np.eye(9) - A, B)
@@ -210,7 +210,7 @@ LEAVES = {
 
 
 @pytest.mark.parametrize("name", LEAVES)
-def test_gradients_are_those_of_finite_differences(name):
+def test_gradients_equal_finite_differences(name):
     loop, widths = LEAVES[name]
     values = jnp.stack([paths.get(loop, path) for path in widths])
     inputs = loop_inputs(jnp.asarray(MOVING[:LENGTH]), jnp.asarray(DRAWS[:LENGTH]))
@@ -235,7 +235,7 @@ def test_gradients_are_those_of_finite_differences(name):
 
 
 @pytest.mark.parametrize("name", ["multi-axis, dynamic, filtered"])
-def test_compiled_steps_are_the_eager_ones(name):
+def test_compiled_steps_equal_eager_ones(name):
     controller = CASES[name].controller
 
     def two_steps(reference):
@@ -256,7 +256,7 @@ def test_compiled_steps_are_the_eager_ones(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_saved_loop_comes_back(name, tmp_path):
+def test_a_loop_is_saved_and_loaded(name, tmp_path):
     loop = catalog.loop(CASES[name].controller)
     save(loop, tmp_path / "loop.json")
     assert eqx.tree_equal(load(tmp_path / "loop.json"), loop)
@@ -265,7 +265,7 @@ def test_a_saved_loop_comes_back(name, tmp_path):
 # The parts
 
 
-def test_observability_form_answers_as_the_state_space_does():
+def test_observability_form_has_the_response_of_the_state_space():
     A, B, C = three_dof.stacked()
     model = observability_form(p558.model("7"))
     impulse = np.zeros((6, 3))

@@ -44,7 +44,7 @@ def phased(controller, wave):
 
 
 @pytest.mark.parametrize("amplitude", [5.0, 10.0, 40.0])
-def test_the_first_harmonic_is_that_of_the_describing_function(amplitude):
+def test_the_first_harmonic_equals_the_describing_function(amplitude):
     samples = 8_000
     turns = 2.0 * np.pi * np.arange(2 * samples) / samples
     u = phased(
@@ -85,7 +85,7 @@ class Phased:
         self.pid.applied(v)
 
 
-def test_a_loop_at_its_limits_is_that_of_the_equations():
+def test_a_saturated_loop_equals_the_equations():
     @jax.jit
     def run(loop, reference):
         inputs = LoopInput(reference[1:], jnp.zeros(SAMPLES))

@@ -48,7 +48,7 @@ def test_the_sliding_variable_has_the_poles(name):
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12)
 
 
-def test_the_catalogued_loop_is_that_of_the_equations():
+def test_the_catalogued_loop_equals_the_equations():
     controller = p753_survey.pole_placement()
     law = controller.law
     gains = smc_gains("smc", "5-3")

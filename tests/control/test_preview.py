@@ -67,7 +67,7 @@ def transfer(name, kind, **options):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_zero_phase_is_zero_phase(name):
+def test_the_zero_phase_inverse_has_zero_phase(name):
     w, found = transfer(name, "zero_phase")
     zeros = np.roots(np.trim_zeros(MODELS[name][1]))
     outside = zeros[np.abs(zeros) > 1.0]
@@ -80,7 +80,7 @@ def test_zero_phase_is_zero_phase(name):
     np.testing.assert_allclose(found[0], 1.0, rtol=1e-9)
 
 
-def test_a_margin_leaves_slow_zeros_alone():
+def test_zeros_near_the_unit_circle_are_not_cancelled():
     model = ARMA((0.5,), (1.0, 0.95))  # a zero that would ring, if cancelled
     reference = jnp.asarray(np.eye(1, 400, 200)[0])
     ringing = INVERSES["zero_phase"](model)(reference)
@@ -98,7 +98,7 @@ def test_stable_inversion_is_exact_with_enough_preview(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_its_error_falls_geometrically_with_the_preview(name):
+def test_the_error_falls_geometrically_with_the_preview(name):
     lengths = np.arange(10, 54, 4)
     errors = []
     for preview in lengths:
@@ -109,7 +109,7 @@ def test_its_error_falls_geometrically_with_the_preview(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_the_direct_inverse_diverges_where_the_others_do_not(name):
+def test_the_direct_inverse_diverges_and_the_others_do_not(name):
     reference = jnp.asarray(smooth())
     direct = inverse(name, "direct")(reference)
     assert np.abs(direct[-1]) > 1e30
@@ -119,7 +119,7 @@ def test_the_direct_inverse_diverges_where_the_others_do_not(name):
 
 
 @pytest.mark.parametrize("kind", STABLE)
-def test_all_are_the_exact_inverse_of_stable_zeros(kind):
+def test_all_methods_invert_stable_zeros_exactly(kind):
     model = ARMA((1.5, -0.56), (0.02, 0.01))
     reference = smooth()
     input = INVERSES[kind](model, **STABLE[kind])(jnp.asarray(reference))
@@ -135,7 +135,7 @@ def test_a_start_at_rest_stays_at_rest(name, kind):
     np.testing.assert_allclose(input, 5.0 / model.dc_gain(), rtol=1e-9)
 
 
-def test_the_reference_is_used_as_far_ahead_as_said_and_held_at_the_end():
+def test_the_preview_has_the_stated_length_and_holds_the_last_reference():
     made = INVERSES["stable"](ARMA(*MODELS["delayed, zeros on both sides"]), preview=8)
     assert made.preview == 1 + 8
     slope = jax.jacobian(made)(jnp.zeros(40))
@@ -146,7 +146,7 @@ def test_the_reference_is_used_as_far_ahead_as_said_and_held_at_the_end():
     np.testing.assert_allclose(made(jnp.asarray(smooth(40))), held[:40], atol=1e-12)
 
 
-def test_it_batches_and_jit_changes_nothing():
+def test_batches_and_jit_equal_eager():
     made = INVERSES["zero_phase"](ARMA(*MODELS["printed (5.33)"]))
     batch = jnp.stack([jnp.asarray(smooth(200)), jnp.linspace(0.0, 5.0, 200)])
     found = jax.jit(jax.vmap(made))(batch)
@@ -171,7 +171,7 @@ def test_it_batches_and_jit_changes_nothing():
         ),
     ],
 )
-def test_what_has_no_such_inverse_is_refused(kind, model, options, message):
+def test_models_without_an_inverse_are_refused(kind, model, options, message):
     with pytest.raises(ValueError, match=message):
         INVERSES[kind](ARMA(*model), **options)
 
@@ -201,7 +201,7 @@ class Feedforward:
         """There is no feedback."""
 
 
-def test_inside_a_loop_it_extrapolates():
+def test_inside_a_loop_the_reference_is_extrapolated():
     reference = signals.sine(50, 5.0, 0.1 + 1.0 / p753.RATE)
     inverse = p753_survey.preview_feedforward_pid().inverse
     loop = p753.loop(InverseFeedforward(inverse), 0.0)

@@ -72,7 +72,7 @@ ALL = np.linspace(1e-3, PERIOD / 2, 2_000)
 
 
 @pytest.mark.parametrize(("gain", "lead"), [(1.0, 2), (0.5, 2)])
-def test_errors_contract_to_what_the_filter_leaves(gain, lead):
+def test_errors_contract_to_the_residual_of_the_filter(gain, lead):
     slowest = np.abs(factor(ALL, gain, lead)).max()
     assert slowest < 0.8
     found = harmonics(errors_of(learning(gain, lead)))
@@ -90,14 +90,14 @@ def test_errors_contract_to_what_the_filter_leaves(gain, lead):
     assert np.abs(found[-1, 0]) < 0.1 * np.abs(found[0, 0])
 
 
-def test_errors_grow_where_the_condition_fails():
+def test_errors_grow_if_the_condition_is_violated():
     assert np.abs(factor(ALL, 3.0, 0)).max() > 1.2
     found = np.reshape(errors_of(learning(3.0, 0)), (PERIODS, PERIOD))
     rms = np.sqrt(np.mean(found**2, axis=1))
     assert rms[-1] > 100.0 * rms[1]
 
 
-def test_without_gain_it_is_the_feedback_alone():
+def test_with_zero_gain_the_loop_equals_the_feedback():
     controller = RepetitiveControl(INNER, FirstOrderLag(5e-3, DT), 0.0, PERIOD, 4, 5)
     np.testing.assert_array_equal(
         errors_of(loop_of(controller)), errors_of(loop_of(INNER))
@@ -131,7 +131,7 @@ def test_counts_must_be_whole(name):
         RepetitiveControl(INNER, Affine(), **counts)
 
 
-def test_the_longest_lead_that_is_allowed_still_learns():
+def test_the_longest_allowed_lead_learns():
     controller = RepetitiveControl(INNER, Affine(), 0.1, PERIOD, PERIOD - 1)
     state = loop_of(controller).init(0.0)
     assert state.controller.line.shape == (PERIOD,)

@@ -109,7 +109,7 @@ def run(loop, start, following, draws):
     return packed(simulate(loop, inputs, loop.init(start))[1])
 
 
-def test_the_loop_is_that_of_the_equations():
+def test_the_loop_equals_the_equations():
     displacement, command = expected()
     draws = tuple(jnp.asarray((NOISE / p558.NOISE_RMS).T))
     found = run(
@@ -123,7 +123,7 @@ def test_the_loop_is_that_of_the_equations():
     np.testing.assert_allclose(found.command, command, rtol=0.0, atol=1e-8)
 
 
-def test_a_start_at_rest_stays_there():
+def test_a_start_at_rest_stays_at_rest():
     start = np.array([5.0, -3.0, 2.0])
     zero = (jnp.zeros(SAMPLES),) * 3
     held = tuple(jnp.full(SAMPLES, value) for value in start)

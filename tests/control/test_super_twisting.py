@@ -17,7 +17,7 @@ from piezojax.control import (
 DT = 1e-4
 
 
-def test_far_from_the_layer_it_is_the_published_law():
+def test_far_from_the_layer_the_law_equals_the_published_one():
     law = SuperTwisting(2.0, 300.0, 1e-6, DT)
     s = np.repeat([400.0, -900.0, 25.0], 10)
     found = simulate(law, jnp.asarray(s), law.init(0.0))[1]
@@ -26,7 +26,7 @@ def test_far_from_the_layer_it_is_the_published_law():
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
-def test_inside_the_layer_it_is_proportional_integral():
+def test_inside_the_layer_the_law_is_proportional_integral():
     law = SuperTwisting(2.0, 300.0, 100.0, DT)
     s = np.random.default_rng(5).normal(size=50) * 1e-4
     found = simulate(law, jnp.asarray(s), law.init(0.0))[1]
@@ -35,7 +35,7 @@ def test_inside_the_layer_it_is_proportional_integral():
 
 
 @pytest.mark.parametrize("layer", [1e-3, 0.1])
-def test_it_brings_s_to_zero_against_a_ramp_without_chatter(layer):
+def test_s_reaches_zero_against_a_ramp_without_chatter(layer):
     # ds/dt = v + d, |dd/dt| <= 8 < sign_gain: a second-order sliding mode.
     law = SuperTwisting(6.0, 12.0, layer, DT)
 
@@ -51,7 +51,7 @@ def test_it_brings_s_to_zero_against_a_ramp_without_chatter(layer):
     assert np.ptp(np.diff(v[-2_000:])) < 1e-6
 
 
-def test_at_rest_it_rests_and_its_slopes_are_those_of_differences():
+def test_the_law_rests_and_its_gradients_equal_finite_differences():
     law = SuperTwisting(2.0, 300.0, 100.0, DT)
     assert law.step(law.init(0.0), 0.0) == (0.0, 0.0)
 

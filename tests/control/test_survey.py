@@ -113,7 +113,7 @@ def samples_of(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_loop_is_that_of_the_equations(name):
+def test_the_loop_equals_the_equations(name):
     samples = samples_of(name)
     for lane in range(2):
         expected = closed_loop(
@@ -154,7 +154,7 @@ LEVELS = {
 
 
 @pytest.mark.parametrize("name", LEVELS)
-def test_start_values_hold_sin10(name):
+def test_start_values_track_sin10(name):
     samples = samples_of(name)
     error = samples.displacement[0] - samples.reference[0]
     rms = np.sqrt(np.mean(error[SAMPLES // 2 :] ** 2))
@@ -183,7 +183,7 @@ references = {{ tune = ["SIN10"], duration = 0.1, settle = 0.05 }}
         "p753_repetitive",
     ],
 )
-def test_a_study_finds_the_controller_and_all_of_its_parameters(name, tmp_path):
+def test_a_study_names_the_controller_and_all_of_its_parameters(name, tmp_path):
     controller = CONTROLLERS[name]()
     text = STUDY.format(name=name)
     for path, value in paths.parameters(controller).items():

@@ -44,7 +44,7 @@ def law_of(bound):
     return replace(controlled(2.0), {"bound": bound}).resolved().law
 
 
-def test_at_the_same_bound_it_is_the_design_of_scipy():
+def test_at_the_same_bound_the_design_equals_that_of_scipy():
     expected = response(DESIGN.controller.law, FREQUENCY)
     found = response(law_of(DESIGN.gamma), FREQUENCY)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
@@ -71,11 +71,11 @@ def test_the_weighted_responses_keep_the_bound(factor):
         assert np.max(size) > 0.9 * bound
 
 
-def test_a_bound_without_a_controller_gives_no_numbers():
+def test_an_infeasible_bound_gives_nan():
     assert np.all(np.isnan(law_of(0.98 * DESIGN.gamma).C))
 
 
-def test_slopes_are_those_of_differences():
+def test_gradients_equal_finite_differences():
     control = controlled(1.2 * DESIGN.gamma)
     names: tuple[str, ...] = ("low", "crossover", "high", "effort_weight", "bound")
     start = jnp.array([getattr(control, name) for name in names])
@@ -93,7 +93,7 @@ def test_slopes_are_those_of_differences():
     np.testing.assert_allclose(slopes[0], expected, rtol=1e-4, atol=1e-7)
 
 
-def test_without_a_bound_it_is_the_h2_design():
+def test_without_a_bound_the_design_is_h2():
     a, b = (np.asarray(part) for part in (MODEL.autoregressive, MODEL.moving))
     weight = first_order_weight(**WEIGHT, dt=DT)
     Aw, Bw, Cw, Dw = (float(m[0, 0]) for m in (weight.A, weight.B, weight.C, weight.D))

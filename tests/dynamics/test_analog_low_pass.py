@@ -34,7 +34,7 @@ def stepped(matrices, inputs, start):
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
-def test_it_is_exact_for_an_input_that_is_linear_between_samples(order):
+def test_a_low_pass_is_exact_for_an_input_that_is_linear_between_samples(order):
     """Also for a cut-off far below the rate, and for one above Nyquist's."""
     for bandwidth in (3.0, 900.0, 4e4):
         expected = stepped(discrete(order, bandwidth, "foh"), INPUT, 0.7)

@@ -38,7 +38,7 @@ def rough(samples=2000):
 
 
 @pytest.mark.parametrize(("a", "b"), ORDERS.values(), ids=ORDERS)
-def test_any_order_is_the_difference_equation(a, b):
+def test_any_order_equals_the_difference_equation(a, b):
     expected = oracle.arma(rough(), a, b)
     np.testing.assert_allclose(
         response(ARMA(a, b), rough(), 0.0), expected, rtol=0.0, atol=1e-12
@@ -46,7 +46,7 @@ def test_any_order_is_the_difference_equation(a, b):
 
 
 @pytest.mark.parametrize(("a", "b"), ORDERS.values(), ids=ORDERS)
-def test_any_order_is_lfilter(a, b):
+def test_any_order_equals_lfilter(a, b):
     expected = signal.lfilter(b, [1.0, *(-c for c in a)], rough())
     np.testing.assert_allclose(
         response(ARMA(a, b), rough(), 0.0), expected, rtol=0.0, atol=1e-12
@@ -61,7 +61,7 @@ def test_rest_stays_at_rest(a, b, level):
     np.testing.assert_allclose(outputs, gain * level, rtol=0.0, atol=1e-11)
 
 
-def test_a_start_at_rest_is_a_long_wait_before():
+def test_a_start_at_rest_equals_a_long_run_before():
     model = ARMA(MODEL_533_A, MODEL_533_B)
     waited = response(model, np.concatenate([np.full(2000, 4.0), rough()]), 0.0)
     np.testing.assert_allclose(
@@ -70,7 +70,7 @@ def test_a_start_at_rest_is_a_long_wait_before():
 
 
 @pytest.mark.parametrize(("a", "b"), ORDERS.values(), ids=ORDERS)
-def test_dc_gain_is_that_of_the_transfer_function(a, b):
+def test_dc_gain_equals_that_of_the_transfer_function(a, b):
     _, gain = signal.freqz(b, [1.0, *(-c for c in a)], worN=[0.0])
     found = ARMA(a, b).dc_gain()
     np.testing.assert_allclose(found, gain[0].real, rtol=1e-12)
@@ -81,7 +81,7 @@ def roots(values):
     return np.sort_complex(np.asarray(values, complex))
 
 
-def test_poles_and_zeros_are_those_of_a_known_filter():
+def test_poles_and_zeros_equal_those_of_a_known_filter():
     zeros, poles = [0.5, -2.0], [0.9, 0.3 + 0.4j, 0.3 - 0.4j]
     b, denominator = signal.zpk2tf(zeros, poles, 0.25)
     model = ARMA(tuple(-denominator[1:]), tuple(b))
@@ -89,7 +89,7 @@ def test_poles_and_zeros_are_those_of_a_known_filter():
     np.testing.assert_allclose(roots(model.zeros()), roots(zeros), atol=1e-12)
 
 
-def test_no_memory_has_no_poles_and_zeros():
+def test_without_memory_there_are_no_poles_and_zeros():
     assert ARMA((), (2.0,)).poles().size == ARMA((), (2.0,)).zeros().size == 0
 
 

@@ -48,7 +48,7 @@ def test_a_step_creeps_with_the_logarithm_of_time(decades):
     assert np.max(np.abs(ripple)) < 0.03 * 0.02
 
 
-def test_a_held_force_stretches_damped_springs_exactly():
+def test_damped_springs_are_exact_for_a_held_force():
     stiffness, damping, spring, force = (40.0, 90.0), (8.0, 300.0), 6.0, 2.5
     levels = np.array([0.0, 30.0, -10.0, 55.0])
     u = np.repeat(levels, 250)

@@ -65,7 +65,7 @@ def fit():
     )
 
 
-def test_the_loop_is_recovered(fit):
+def test_the_hysteresis_is_recovered(fit):
     hysteresis = fit.system.parts[0]
     found = free_run(hysteresis, jnp.asarray(INPUTS["walk"]), 0.0)[1:]
     h = TRUTH["walk"][1][:-1]
@@ -84,7 +84,7 @@ def test_the_creep_is_recovered(fit):
 
 
 @pytest.mark.parametrize("row", [0, 1], ids=INPUTS)
-def test_an_unseen_hold_is_predicted_to_a_twentieth_of_its_creep(fit, row):
+def test_an_unseen_hold_is_predicted_within_a_twentieth_of_its_creep(fit, row):
     y = list(TRUTH.values())[row][0][HELD]
     found = fit.simulations[row][HELD, 0]
     creep = abs(y[-1] - y[0])

@@ -19,7 +19,7 @@ def response(system, inputs, start):
 
 
 @pytest.mark.parametrize("samples", [0.0, 0.4, 1.0, 2.7, 4.0])
-def test_it_interpolates_between_samples(samples):
+def test_a_delay_interpolates_between_samples(samples):
     at = np.arange(40) - samples
     expected = np.interp(at, np.arange(-10, 40), np.r_[np.full(10, 0.5), INPUT])
     found = response(FractionalDelay(samples * DT, DT, 4), INPUT, 0.5)

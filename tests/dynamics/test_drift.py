@@ -30,7 +30,7 @@ def response(system, inputs, start):
     return simulate(system, inputs, system.init(start))[1]
 
 
-def test_a_warmer_room_expands_the_stage_slowly():
+def test_a_temperature_step_expands_the_stage_slowly():
     time = DT * np.arange(1, 401)
     found = response(DRIFT, np.full(400, 25.0), 22.0)
     expected = 0.15 * 3.0 * (1.0 - np.exp(-time / 40.0))
@@ -47,7 +47,7 @@ def test_voltage_and_temperature_drive_one_stage():
     assert abs(found[-1] - response(STAGE, u, 40.0)[-1]) > 0.2
 
 
-def test_in_an_even_temperature_nothing_drifts():
+def test_at_constant_temperature_there_is_no_drift():
     both = (Select(0) >> STAGE) + (Select(1) >> DRIFT)
     found = response(both, (np.full(20, 40.0), np.full(20, 23.0)), (40.0, 23.0))
     np.testing.assert_allclose(found, found[0], atol=1e-12)

@@ -131,7 +131,7 @@ def responses(shares, inputs, start, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_filter_is_the_discretisation_of_its_equation(method):
+def test_a_filter_equals_the_discretisation_of_its_equation(method):
     inputs = 2.0 + np.random.default_rng(3).normal(size=400)
     place = warped if method == "bilinear" else lambda f: 2.0 * np.pi * f
     shares = (0.01, 0.2, 0.5, 0.9, 0.999)
@@ -150,7 +150,7 @@ def test_a_filter_is_the_discretisation_of_its_equation(method):
 
 
 @pytest.mark.parametrize("share", [0.05, 0.8])
-def test_designs_of_scipy(share):
+def test_filters_equal_the_designs_of_scipy(share):
     frequency = share * NYQUIST
     inputs = np.random.default_rng(4).normal(size=300)
     for (make, btype), order in itertools.product(
@@ -209,7 +209,7 @@ def test_rest_stays_exactly_at_rest(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_slopes_are_those_of_differences_and_finite_up_to_nyquist(method):
+def test_gradients_equal_finite_differences_up_to_nyquist(method):
     shares = np.array([*SHARES, 1.0 - 1e-6, 1.0 - 1e-9])
     inputs = jnp.asarray(np.random.default_rng(5).normal(size=40))
 
@@ -235,7 +235,7 @@ def test_slopes_are_those_of_differences_and_finite_up_to_nyquist(method):
         )
 
 
-def test_the_damping_has_a_slope_through_critical_damping():
+def test_the_gradient_by_damping_is_finite_at_critical_damping():
     inputs = jnp.asarray(np.random.default_rng(6).normal(size=30))
 
     def last(damping):

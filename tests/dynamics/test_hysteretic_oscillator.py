@@ -49,7 +49,7 @@ def force(samples=60, seed=0):
     [{}, {"delta": 0.4}, {"beta": 30.0, "nu": 1.7}],
     ids=["benchmark", "saturating", "bent"],
 )
-def test_held_force_moves_it_as_the_differential_equations_say(changed):
+def test_a_held_force_gives_the_solution_of_the_differential_equations(changed):
     values = tuple((TRUE | changed).values())
     point, expected = (0.0, 0.0, 0.0), []
     for held in force():
@@ -66,7 +66,7 @@ def test_held_force_moves_it_as_the_differential_equations_say(changed):
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-4 * np.std(expected))
 
 
-def test_without_bend_it_is_the_linear_oscillator():
+def test_without_hysteresis_it_equals_the_linear_oscillator():
     # The element is then a spring beside the other.
     stiffness = TRUE["stiffness"] + TRUE["alpha"]
     continuous = (
@@ -84,7 +84,7 @@ def test_without_bend_it_is_the_linear_oscillator():
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6 * np.std(expected))
 
 
-def test_finer_samples_of_the_same_held_force_change_nothing():
+def test_finer_samples_of_the_same_held_force_give_the_same_motion():
     coarse = displacement(model(substeps=4), force())
     fine = displacement(model(dt=DT / 4, substeps=1), np.repeat(force(), 4))
     np.testing.assert_allclose(fine[3::4], coarse, rtol=0.0, atol=1e-15)

@@ -22,7 +22,7 @@ def response(system, inputs, start):
 
 
 @pytest.mark.parametrize("tau", [1e-6, DT, 1e-3, 10.0])
-def test_step_response_is_the_closed_form(tau):
+def test_step_response_equals_the_closed_form(tau):
     time = DT * np.arange(1, 1001)  # output k is that at the end of sample k
     outputs = response(FirstOrderLag(tau, DT), np.full(1000, 7.0), 2.0)
     expected = 7.0 - 5.0 * np.exp(-time / tau)
@@ -48,7 +48,7 @@ def test_rest_stays_at_rest(tau, level):
 
 
 @pytest.mark.parametrize("tau", [DT / 10.0, 1e-3])
-def test_as_arma_is_the_same_lag(tau):
+def test_as_arma_equals_the_lag(tau):
     inputs = np.random.default_rng(7).normal(size=500)
     lag = FirstOrderLag(tau, DT)
     np.testing.assert_allclose(
@@ -60,7 +60,7 @@ def test_as_arma_is_the_same_lag(tau):
     assert np.isclose(lag.as_arma().dc_gain(), 1.0, rtol=1e-12, atol=0.0)
 
 
-def test_pole_and_its_gradient_are_the_closed_form():
+def test_pole_and_its_gradient_equal_the_closed_form():
     tau = 2e-3
     found, slope = jax.value_and_grad(lambda tau: FirstOrderLag(tau, DT).pole())(tau)
     np.testing.assert_allclose(found, np.exp(-DT / tau), rtol=1e-15)
@@ -82,7 +82,7 @@ def test_bad_times_are_refused(tau, dt, message):
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.25, 0.7, 1.0, 1.0 + 1e-7, 1.001, 3.0])
-def test_second_order_is_the_held_transfer_function(damping):
+def test_second_order_equals_the_held_transfer_function(damping):
     inputs = np.random.default_rng(8).normal(size=400)
     found = response(SecondOrderLag(3000.0, damping, DT), inputs, 0.0)
     matrices = map(

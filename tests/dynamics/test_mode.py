@@ -39,19 +39,19 @@ def by_matrix_exponential(frequency, damping, inputs, rest):
     ("frequency", "damping"),
     [(300.0, 0.005), (780.0, 0.02), (4000.0, 0.1), (7000.0, 0.3), (50.0, 1.5)],
 )
-def test_it_is_the_held_oscillator(frequency, damping):
+def test_a_mode_equals_the_oscillator_with_held_input(frequency, damping):
     expected = by_matrix_exponential(frequency, damping, INPUT, 2.0)
     found = response(Mode(frequency, damping, DT), INPUT, 2.0)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 
 
-def test_it_rests_at_its_input():
+def test_a_mode_rests_at_its_input():
     np.testing.assert_array_equal(
         response(Mode(780.0, 0.02, DT), np.full(50, 7.0), 7.0), 7.0
     )
 
 
-def test_its_gradient_is_that_of_differences():
+def test_its_gradient_equals_finite_differences():
     def last(parameters):
         return jnp.sum(response(Mode(*parameters, DT), INPUT) ** 2)
 
@@ -75,7 +75,7 @@ def test_bad_parameters_are_refused(arguments, message):
         Mode(*arguments)
 
 
-def test_a_saved_mode_is_the_same(tmp_path):
+def test_a_mode_is_saved_and_loaded(tmp_path):
     save(Mode(780.0, 0.02, DT), tmp_path / "mode.json")
     back = load(tmp_path / "mode.json")
     assert (float(back.frequency), float(back.damping), back.dt) == (780.0, 0.02, DT)
@@ -84,7 +84,7 @@ def test_a_saved_mode_is_the_same(tmp_path):
 EXTENT = Extent(0.0, 100.0, (0.0, 0.0), 0.12, 0.0, 12.0, DT, 2.0)
 
 
-def test_a_fit_starts_from_the_strongest_resonance_and_stays_near():
+def test_a_fit_starts_from_the_strongest_resonance_with_narrow_bounds():
     found = (Resonance(780.0, 0.02), Resonance(1900.0, 0.05))
     recipe = parts()["mode"].recipe(EXTENT._replace(modes=found))
     assert float(recipe.system.frequency) == 780.0
@@ -101,7 +101,7 @@ def test_without_a_resonance_a_fit_starts_from_guesses_inside_the_bounds():
             assert bound.lower < value < bound.upper
 
 
-def test_a_chain_holds_a_mode_a_lag_and_a_delay():
+def test_a_chain_contains_a_mode_a_lag_and_a_delay():
     shape = structure(
         "coleman_hodgdon+exponential_creep+mode+lag+delay",
         Record(INPUT, 0.12 * INPUT, DT),
@@ -132,7 +132,7 @@ def modes(frequency, damping, sensor):
 
 @pytest.mark.parametrize("sensor", [1e-5, 1e-4, 3e-3])
 @pytest.mark.parametrize(("frequency", "damping"), [(300.0, 0.005), (4000.0, 0.1)])
-def test_a_mode_and_its_sensor_are_discretised_in_one(frequency, damping, sensor):
+def test_a_mode_and_its_sensor_are_discretised_together(frequency, damping, sensor):
     expected = by_three_states(frequency, damping, sensor, INPUT, 2.0)
     found = response(modes(frequency, damping, sensor), INPUT, 2.0)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
@@ -173,7 +173,7 @@ def test_bad_modes_are_refused(lists, message):
         Modes(*lists)
 
 
-def test_modes_start_from_what_the_record_shows():
+def test_modes_start_from_the_resonances_of_the_record():
     seen = (Resonance(780.0, 0.02, -0.1), Resonance(300.0, 0.05, 1.1))
     extent = EXTENT._replace(modes=seen, lags=(1e-3,))
     recipe = parts()["modes"].recipe(extent)

@@ -54,7 +54,7 @@ def inputs(samples, width=None, seed=1):
 
 
 @pytest.mark.parametrize(("m", "p"), [(1, 1), (2, 1), (1, 2), (3, 2)])
-def test_response_is_the_recursion(m, p):
+def test_response_equals_the_recursion(m, p):
     values = numbers(m=m, p=p)
     driven = inputs(40, None if m == 1 else m)
     state, expected = np.zeros(3), []
@@ -79,7 +79,7 @@ def test_response_is_the_recursion(m, p):
     )
 
 
-def test_without_neurons_it_is_the_linear_state_space():
+def test_without_neurons_it_equals_the_linear_state_space():
     values = numbers(m=2, p=2)
     values["neuron_output"] = np.zeros((3, 4))
     driven = inputs(50, 2)
@@ -93,7 +93,7 @@ def test_without_neurons_it_is_the_linear_state_space():
     )
 
 
-def test_rest_is_where_it_settles():
+def test_the_rest_state_is_the_settled_state():
     system, held = model(), 5.0
     state = system.init(held)
     after, output = system.step(state, held)
@@ -108,7 +108,7 @@ def test_rest_of_several_inputs():
     np.testing.assert_allclose(output, response(system, np.tile(held, (300, 1)))[-1])
 
 
-def test_without_a_rest_it_starts_from_zero():
+def test_without_a_rest_state_it_starts_from_zero():
     values = numbers() | {"state_matrix": np.eye(3), "neuron_output": np.zeros((3, 4))}
     np.testing.assert_array_equal(NeuralStateSpace(**values).init(1.0), np.zeros(3))
 
@@ -143,7 +143,7 @@ def test_numbers_that_are_not_finite_are_refused(name):
         NeuralStateSpace(**numbers() | {name: np.nan * numbers()[name]})
 
 
-def test_shapes_that_do_not_belong_together_are_refused():
+def test_inconsistent_shapes_are_refused():
     message = (
         r"neuron_state has shape \(4, 2\); with 3 states, 4 neurons, 1 inputs and "
         r"1 outputs it must be \(4, 3\)"

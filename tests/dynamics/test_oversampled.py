@@ -14,7 +14,7 @@ STAGE = p753.plant()
 
 
 @pytest.mark.parametrize("samples", [1, 4, 20])
-def test_output_is_every_nth_of_the_stage_under_a_held_input(samples):
+def test_output_equals_every_nth_output_under_a_held_input(samples):
     inputs = 40.0 + 40.0 * np.random.default_rng(3).uniform(-1.0, 1.0, 50)
     found = simulate(Oversampled(STAGE, samples), jnp.asarray(inputs))[1]
     repeated = simulate(STAGE, jnp.asarray(np.repeat(inputs, samples)))[1]

@@ -56,7 +56,7 @@ def reduced(request):
     return balanced_reduction(WHOLE, request.param)
 
 
-def test_hankel_singular_values_are_those_of_the_hankel_matrix():
+def test_hankel_singular_values_equal_those_of_the_hankel_matrix():
     h = impulse_response(WHOLE, 599)
     hankel = h[np.arange(300)[:, None] + np.arange(300)]
     whole = hankel.transpose(0, 2, 1, 3).reshape(900, 900)
@@ -81,7 +81,7 @@ def test_the_difference_is_within_its_bounds(reduced):
     assert left_out[0] < worst < reduced.error_bound
 
 
-def test_every_state_kept_changes_nothing():
+def test_keeping_all_states_changes_nothing():
     kept = balanced_reduction(WHOLE, 15)
     assert kept.error_bound == 0.0
     np.testing.assert_allclose(
@@ -106,7 +106,7 @@ def test_any_number_of_states_in_observability_form(reduced, more):
 
 
 @pytest.mark.parametrize(("chapter", "lags"), [("7", 3), ("6", 5)])
-def test_as_many_states_as_rows_are_the_printed_form(chapter, lags):
+def test_as_many_states_as_rows_give_the_printed_form(chapter, lags):
     model = p558.model(chapter)
     A, C = np.asarray(model.A), np.asarray(model.C)
     form = observability_form(model)
@@ -138,7 +138,7 @@ def test_a_controller_on_such_a_model_stabilises_it(order):
     assert np.abs(np.linalg.eigvals(linear.closed())).max() < 0.99
 
 
-def test_what_is_refused():
+def test_bad_reductions_are_refused():
     with pytest.raises(ValueError, match="order is 16; it must be between 1 and 15"):
         balanced_reduction(WHOLE, 16)
     unstable = StateSpace(1.1 * np.eye(3), np.eye(3), np.eye(3), np.zeros((3, 3)), 1e-3)
@@ -174,7 +174,7 @@ def single(poles, residues, through):
     )
 
 
-def test_creep_and_memory_are_left_out_of_the_fast_part():
+def test_creep_and_memory_are_not_in_the_fast_part():
     # A lag of 3 samples, creep by 10 % in 1000 and 5 % in 5000 samples, a memory.
     lag, creep, slower = np.exp([-1 / 3, -1 / 1000, -1 / 5000])
     whole = single(
@@ -199,7 +199,7 @@ def test_a_slow_plant_keeps_its_dynamics():
     assert fast_part(integrator, 0.1) is integrator
 
 
-def test_no_more_states_than_connect():
+def test_unconnected_states_are_removed():
     lag = single([0.7], [0.3], 0.0)
     assert pj.dynamics.reduced(lag, 2) is lag
     hidden = single([0.7, 0.5, 0.2], [0.3, 0.0, 0.0], 0.1)

@@ -64,7 +64,7 @@ def plain(u):
     return np.array(outputs)
 
 
-def test_the_response_is_that_of_a_plain_loop(system):
+def test_the_response_equals_a_plain_loop(system):
     u = drive()
     for run in (simulate, jax.jit(simulate)):
         found = run(system, u, system.init())[1]
@@ -72,13 +72,13 @@ def test_the_response_is_that_of_a_plain_loop(system):
 
 
 @pytest.mark.parametrize(("level", "index"), [(0.0, 0), (0.5, 0), (1.0, 1), (9.0, 2)])
-def test_at_a_level_it_is_that_level_s_model(system, level, index):
+def test_at_a_level_the_model_of_that_level_applies(system, level, index):
     for name, expected in zip("ABCD", MATRICES[index], strict=True):
         found = getattr(system.at(jnp.asarray(level)), name)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
 
 
-def test_equal_models_are_one_linear_model():
+def test_equal_models_give_one_linear_model():
     model = StateSpace(*MATRICES[0], DT)
     system = AmplitudeScheduled((model,) * 2, (1.0, 2.0), TIME_CONSTANT)
     expected = oracle.simulate(*MATRICES[0], drive(), np.zeros(4))
@@ -86,7 +86,7 @@ def test_equal_models_are_one_linear_model():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
-def test_it_decays_whatever_the_level_does(system):
+def test_the_state_decays_for_any_level(system):
     # Interpolated rotations are contractions: the state shrinks at every single step.
     state = np.random.default_rng(3).standard_normal(4)
     for level in np.random.default_rng(5).uniform(0.0, 4.0, 50):

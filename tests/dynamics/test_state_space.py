@@ -41,7 +41,7 @@ def both(request):
     return drawn(3, request.param)
 
 
-def test_the_response_is_that_of_the_equation(both):
+def test_the_response_equals_the_equation(both):
     (A, B, C, D), model = both
     u = inputs(B.shape[1])
     expected = oracle.simulate(A, B, C, D, u, np.zeros(len(A)))
@@ -50,14 +50,14 @@ def test_the_response_is_that_of_the_equation(both):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
 
-def test_the_response_is_scipy_s(both):
+def test_the_response_equals_that_of_scipy(both):
     (A, B, C, D), model = both
     u = inputs(B.shape[1])
     _, expected, _ = signal.dlsim((A, B, C, D, DT), u)
     np.testing.assert_allclose(simulate(model, u)[1], expected, rtol=0, atol=1e-10)
 
 
-def test_gain_at_rest_is_the_closed_form(both):
+def test_dc_gain_equals_the_closed_form(both):
     (A, B, C, D), model = both
     level = jnp.arange(1.0, 1.0 + B.shape[1])
     gain = C @ np.linalg.solve(np.eye(len(A)) - A, B) + D
@@ -65,7 +65,7 @@ def test_gain_at_rest_is_the_closed_form(both):
     np.testing.assert_allclose(model.dc_gain(), gain, rtol=1e-9, atol=1e-12)
 
 
-def test_frequency_response_is_scipy_s(both):
+def test_frequency_response_equals_that_of_scipy(both):
     (A, B, C, D), model = both
     frequency = np.linspace(0.0, 240.0, 50)
     found = model.frequency_response(frequency)
@@ -100,7 +100,7 @@ def test_poles_are_those_of_a_known_filter():
     )
 
 
-def test_ahead_answers_with_the_next_output():
+def test_ahead_returns_the_next_output():
     model = p558.model("7")
     u = jnp.asarray(inputs(3, 50))
     _, now = simulate(model, u, model.init())
@@ -117,7 +117,7 @@ def test_an_algebraic_loop_is_refused(both):
         both[1].one_step_ahead()
 
 
-def test_stacked_channels_answer_as_their_sum():
+def test_stacked_channels_have_the_sum_of_the_responses():
     channels = [drawn(seed, (3 + seed, 1, 3))[1] for seed in range(3)]
     u = inputs(3)
     whole = simulate(stacked(channels), u)[1]
@@ -128,7 +128,7 @@ def test_stacked_channels_answer_as_their_sum():
 
 @settings(max_examples=30)
 @given(st.integers(0, 10_000), st.integers(1, 8), st.floats(0.5, 1.8))
-def test_stabilised_reflects_what_lies_outside(seed, order, largest):
+def test_stabilised_reflects_poles_outside_the_circle(seed, order, largest):
     (A, B, C, D), _ = drawn(seed, (order, 1, 1))
     model = StateSpace(A * largest / 0.9, B, C, D, DT)
     before, (after, moved) = model.poles(), stabilised(model)
@@ -151,7 +151,7 @@ def test_a_pole_on_the_circle_moves_inside():
 
 
 @pytest.mark.parametrize("name", ["model.json", "model.toml"])
-def test_a_saved_model_loads_back(tmp_path, name):
+def test_a_model_is_saved_and_loaded(tmp_path, name):
     model = p558.model("6")
     save(model, tmp_path / name)
     back = load(tmp_path / name)
@@ -199,7 +199,7 @@ def test_a_file_with_a_bad_matrix_is_refused(value, message):
         from_data({**data, "A": value})
 
 
-def test_channels_that_do_not_fit_are_refused():
+def test_inconsistent_channels_are_refused():
     two, three = drawn(1, (2, 1, 2))[1], drawn(1, (2, 1, 3))[1]
     with pytest.raises(ValueError, match=r"channels differ in .*\(2, 0.002\), \(3, 0."):
         stacked([two, three])

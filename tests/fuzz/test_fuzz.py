@@ -13,7 +13,7 @@ RUN = Path(__file__).with_name("run.py")
 MODEL = corpus.Case("model", "a.json", b'{"type": "Affine"}')
 
 
-def test_mutated_files_work_or_are_refused_in_one_line():
+def test_mutated_files_work_or_give_one_line_errors():
     # In a process of its own: here the annotations are checked before the values.
     command = [sys.executable, str(RUN), "--cases", "300", "--seed", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -24,7 +24,7 @@ def test_mutated_files_work_or_are_refused_in_one_line():
             assert f"{kind:8} {status:24}" in done.stdout
 
 
-def test_a_case_is_always_the_same():
+def test_a_case_is_reproducible():
     cases = [corpus.case(7, number) for number in range(20)]
     assert cases == [corpus.case(7, number) for number in range(20)]
     assert cases != [corpus.case(8, number) for number in range(20)]
@@ -50,7 +50,7 @@ def raising(error):
         (lambda path: time.sleep(2.0), "too slow"),
     ],
 )
-def test_faults_are_seen(monkeypatch, tmp_path, load, status):
+def test_faults_are_detected(monkeypatch, tmp_path, load, status):
     monkeypatch.setattr(check, "load_system", load)
     monkeypatch.setattr(check, "LIMIT", 0.05)
     outcome = check.run(MODEL, tmp_path)

@@ -43,14 +43,14 @@ def rounded(low, high):
 
 @settings(max_examples=60)
 @given(st.lists(rounded(-30.0, 140.0), min_size=SAMPLES, max_size=SAMPLES))
-def test_any_path_is_that_of_the_list_of_branches(path):
+def test_any_path_equals_the_list_of_branches(path):
     np.testing.assert_allclose(
         response(model(), np.array(path)), expected(path), atol=1e-9
     )
 
 
 @pytest.mark.parametrize("depth", [1, 2, 4])
-def test_nested_deeper_than_remembered(depth):
+def test_loops_nested_deeper_than_the_memory(depth):
     # Ever smaller loops, three times as many as fit, and out again past all of them.
     turns = 50.0 + 45.0 * (-0.8) ** np.arange(SAMPLES // 2)
     path = np.concatenate([turns, turns[::-1]])
@@ -62,7 +62,7 @@ def test_nested_deeper_than_remembered(depth):
     np.testing.assert_allclose(found[-2:], deep[-2:], atol=1e-9)
 
 
-def test_a_loop_beyond_the_memory_has_no_width_and_no_jump():
+def test_a_loop_beyond_the_memory_has_neither_width_nor_jump():
     system = model(depth=1)
     fine = np.interp(
         np.arange(0, 5, 0.01), range(6), [0.0, 80.0, 40.0, 60.0, 20.0, 70.0]
@@ -88,7 +88,7 @@ def test_straight_branches_have_no_hysteresis():
 
 
 @pytest.mark.parametrize("input", [-10.0, 0.0, 30.0, 100.0, 120.0])
-def test_rest_is_rest_and_every_way_from_it_is_continuous(input):
+def test_rest_is_constant_and_paths_from_it_are_continuous(input):
     system = model()
     state = system.init(input)
     step = jax.jit(lambda state, v: system.step(state, v))

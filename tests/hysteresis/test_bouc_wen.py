@@ -51,7 +51,7 @@ def test_force_solves_the_differential_equation(shape):
 
 
 @pytest.mark.parametrize("shape", ["benchmark", "saturating"])
-def test_branches_of_unit_nu_are_the_closed_form(shape):
+def test_branches_of_unit_nu_equal_the_closed_form(shape):
     beta_gamma, beta_delta, _ = SHAPES[shape]
     up = np.linspace(1e-4, 2e-3, 20)
     rising = [
@@ -75,7 +75,7 @@ def test_order_of_convergence_on_a_branch():
     np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 4, atol=0.4)
 
 
-def test_without_bend_it_is_a_spring():
+def test_without_hysteresis_it_equals_a_spring():
     path = walk(50)
     np.testing.assert_allclose(
         force(BoucWen(ALPHA, 0.0, 0.0), path), ALPHA * path, rtol=0.0, atol=1e-10
@@ -83,7 +83,7 @@ def test_without_bend_it_is_a_spring():
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_only_the_path_matters_not_the_speed(shape):
+def test_the_force_is_independent_of_the_speed(shape):
     path = walk(40)
     slow = np.repeat(path, 5)
     np.testing.assert_array_equal(
@@ -136,7 +136,7 @@ def test_force_stays_bounded_and_cycles_dissipate(nu, share, seed):
 
 
 @pytest.mark.parametrize("displacement", [-2e-3, 0.0, 1e-3])
-def test_rest_is_without_force(displacement):
+def test_the_force_at_rest_is_zero(displacement):
     state = model().init(displacement)
     after, found = model().step(state, displacement)
     assert float(found) == float(state.force) == 0.0

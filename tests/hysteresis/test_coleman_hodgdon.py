@@ -52,7 +52,7 @@ INPUTS = {"rough": draws(SECOND), "sine": sine(SECOND, 10), "pauses": pauses()}
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("inputs", INPUTS.values(), ids=INPUTS)
-def test_each_scheme_is_the_published_recursion(scheme, inputs):
+def test_each_scheme_equals_the_published_recursion(scheme, inputs):
     outputs = response(model(scheme), inputs)
     expected = getattr(oracle, scheme)(inputs, *HYSTERESIS)
     np.testing.assert_allclose(outputs, expected, rtol=0.0, atol=1e-9)
@@ -110,7 +110,7 @@ def test_quadratic_takes_trapezoid_steps_where_the_direction_turns():
 
 
 @pytest.mark.parametrize("scheme", ["trapezoid", "voros", "exact"])
-def test_repeated_samples_do_not_matter(scheme):
+def test_repeated_samples_do_not_change_the_output(scheme):
     inputs = draws(100)
     slow = response(model(scheme), np.repeat(inputs, 3))
     for start in range(3):
@@ -128,7 +128,7 @@ def test_quadratic_takes_trapezoid_steps_after_a_pause():
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("rest", [(0.0, 0.0), (12.0, 3.0)])
-def test_rest_is_on_the_loading_curve(scheme, rest):
+def test_the_rest_state_is_on_the_loading_curve(scheme, rest):
     stage = model(scheme, rest_input=rest[0], rest_output=rest[1])
     for voltage in (-15.0, 0.0, 12.0, 90.0):
         state = stage.init(voltage)
@@ -141,7 +141,7 @@ def test_rest_is_on_the_loading_curve(scheme, rest):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_slope_at_rest_is_that_of_the_rising_branch(scheme):
+def test_slope_at_rest_equals_that_of_the_rising_branch(scheme):
     a, b, c = HYSTERESIS
     stage = model(scheme)
     state = stage.init(40.0)
@@ -195,7 +195,7 @@ def test_model_then_inverse_is_the_identity():
     np.testing.assert_allclose(found, voltages, rtol=0.0, atol=1e-8)
 
 
-def test_inverse_is_the_corrected_equation():
+def test_inverse_equals_the_corrected_equation():
     noise = np.random.default_rng(4).normal(0.0, 0.012, SECOND)
     wanted = 5.0 * (1.0 - np.cos(2.0 * np.pi * np.arange(SECOND) / 2000)) + noise
     found = response(InverseColemanHodgdon(model()), wanted)
@@ -227,7 +227,7 @@ def test_gradient_of_the_inverse_is_finite(change):
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
 
 
-def test_gradient_of_the_inverse_is_the_reciprocal_slope():
+def test_gradient_of_the_inverse_equals_the_reciprocal_slope():
     stage = model()
     state = stage.init(30.0)
     forward = jax.grad(lambda x: stage.step(state, x)[1])

@@ -85,7 +85,7 @@ def falling(x, u):
     return f - g
 
 
-def test_the_step_is_the_rule_of_kutta():
+def test_the_step_equals_the_rule_of_kutta():
     path = walk(40, 20.0)
     path[0] = 3.0
     found = response(curved(), path, path[0])
@@ -96,7 +96,7 @@ def test_the_step_is_the_rule_of_kutta():
     np.testing.assert_allclose(found, h, rtol=0.0, atol=1e-12)
 
 
-def test_it_solves_the_differential_equation_in_fourth_order():
+def test_the_step_has_fourth_order_convergence():
     corners = [3.0, 60.0, 20.0, 50.0, 10.0]
     x = oracle.along(corners, 0.5, rising, falling)
     assert np.all(x > 0.0)  # no branch crosses the kink
@@ -111,14 +111,14 @@ def test_it_solves_the_differential_equation_in_fourth_order():
     assert 11.0 < errors[0] / errors[1] < 22.0
 
 
-def test_linear_surfaces_are_coleman_hodgdon():
+def test_linear_surfaces_give_coleman_hodgdon():
     path = drive()
     exact = ColemanHodgdon(A, B, C, 4.0, 1.0, scheme="exact")
     found = response(coleman_hodgdon(rest_input=4.0, rest_memory=1.0), path, path[0])
     np.testing.assert_allclose(found, response(exact, path, path[0]), atol=1e-7)
 
 
-def test_surfaces_of_the_input_are_shaped_coleman_hodgdon():
+def test_surfaces_of_the_input_give_shaped_coleman_hodgdon():
     path = np.linspace(40.0, 70.0, 128)  # its step is of second order only
     path = np.concatenate([path, path[::-1]])
     shaped = ShapedColemanHodgdon(PULL, SLOPE, C, 4.0, 1.0)
@@ -129,7 +129,7 @@ def test_surfaces_of_the_input_are_shaped_coleman_hodgdon():
 
 @pytest.mark.parametrize("nu", [1, 2])
 @pytest.mark.parametrize("substeps", [1, 3])
-def test_a_modulus_is_bouc_wen(nu, substeps):
+def test_a_modulus_gives_bouc_wen(nu, substeps):
     path = walk(60, 30.0)
     path[0] = 0.0
     classical = BoucWen(ALPHA, GAMMA, DELTA, nu, substeps=substeps)
@@ -138,7 +138,7 @@ def test_a_modulus_is_bouc_wen(nu, substeps):
 
 
 @pytest.mark.parametrize("input", [-30.0, 3.0, 80.0])
-def test_rest_is_on_the_virgin_curve(input):
+def test_the_rest_state_is_on_the_virgin_curve(input):
     system = curved()
     x = oracle.along([3.0, input], 0.5, rising, falling)[-1]
     state = system.init(input)
@@ -147,7 +147,7 @@ def test_rest_is_on_the_virgin_curve(input):
     assert jax.tree.all(jax.tree.map(lambda a, b: bool(a == b), state, after))
 
 
-def test_slope_at_rest_is_that_of_the_rising_branch():
+def test_slope_at_rest_equals_that_of_the_rising_branch():
     system = coleman_hodgdon()
     state = system.init(40.0)
     found = jax.grad(lambda u: system.step(state, u)[1])(40.0)

@@ -176,7 +176,7 @@ def missed(inverse, inputs):
 
 
 @pytest.mark.parametrize("name", STARTS)
-def test_its_inverse_reaches_what_is_wanted_or_has_a_reason(name):
+def test_the_inverse_reaches_every_output_or_raises_the_reason(name):
     system = STARTS[name]()
     if system.dynamic:
         with pytest.raises(ValueError, match="contains dynamics and has no inverse"):
@@ -188,7 +188,7 @@ def test_its_inverse_reaches_what_is_wanted_or_has_a_reason(name):
 
 
 @pytest.mark.parametrize("kind", FITTABLE.values(), ids=FITTABLE)
-def test_it_is_a_hysteresis_that_names_known_laws(kind):
+def test_the_model_declares_known_laws(kind):
     assert issubclass(kind, Hysteresis)
     assert set(kind.laws) <= set(LAWS)
     system = recipe_of(kind)

@@ -40,13 +40,13 @@ def made(**changes):
 
 
 @pytest.mark.parametrize("scheme", ["trapezoid", "quadratic", "voros"])
-def test_the_equation_step_by_step(scheme):
+def test_each_step_equals_the_equation(scheme):
     _, found = simulate(made(scheme=scheme), jnp.asarray(VOLTAGE))
     expected = regression.model(VOLTAGE, -0.05, POLES, FIRST, SECOND, scheme, 0.7)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
 
 
-def test_under_its_rest_input_it_holds_the_offset():
+def test_the_output_at_the_rest_input_is_the_offset():
     system = made(rest_input=-12.0)
     output = system.step(system.init(-12.0), -12.0)[1]
     np.testing.assert_allclose(output, 0.7, rtol=1e-12)
@@ -55,7 +55,7 @@ def test_under_its_rest_input_it_holds_the_offset():
 # One hysteresis
 
 
-def test_one_hysteresis_and_dynamics_come_back():
+def test_one_hysteresis_and_its_dynamics_are_recovered():
     moving = (0.1, -0.2, 0.12)  # DC gain 1 behind these poles
     one = series(
         hysteresis=ColemanHodgdon(0.0077, 0.1167, -0.05),
@@ -93,7 +93,7 @@ def test_two_hystereses_are_projected_on_request_only():
         (((1.0, -1.0), (2.0, -2.0)), "the shared numerator sums to 0"),
     ],
 )
-def test_no_single_hysteresis(numerators, message):
+def test_models_without_a_single_hysteresis_are_refused(numerators, message):
     first, second = numerators
     with pytest.raises(ValueError, match=message):
         made(moving_1=first, moving_2=second).cascade()

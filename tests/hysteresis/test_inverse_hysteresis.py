@@ -86,7 +86,7 @@ def test_steps_of_a_nanometre(inverse):
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-9)
 
 
-def test_what_cannot_be_reached_gives_the_end(inverse):
+def test_an_unreachable_output_gives_a_limit(inverse):
     wanted = jnp.array([3.0, 1e3, 4.0, -1e3] * 6)
     voltages, found = voltages_and_outputs(inverse, wanted)
     np.testing.assert_array_equal(voltages[1::4], UPPER)
@@ -94,7 +94,7 @@ def test_what_cannot_be_reached_gives_the_end(inverse):
     np.testing.assert_allclose(found[0::2], wanted[0::2], rtol=0.0, atol=1e-9)
 
 
-def test_it_is_the_closed_form():
+def test_the_numerical_inverse_equals_the_closed_form():
     wanted = jnp.asarray(np.random.default_rng(1).uniform(0.5, 8.0, 24))
     closed = InverseColemanHodgdon(MODELS["trapezoid"])
     numerical = InverseHysteresis(MODELS["trapezoid"], LOWER, UPPER)
@@ -123,7 +123,7 @@ DIFFERENTIATED = ["shaped", "extrema"]
 
 
 @pytest.mark.parametrize("name", DIFFERENTIATED)
-def test_gradients_are_those_of_differences(name):
+def test_gradients_equal_finite_differences(name):
     wanted = jnp.array([3.0, 6.0, 2.0, 2.5, 2.2, 5.0])
     arguments = (InverseHysteresis(MODELS[name], LOWER, UPPER), wanted)
     leaves, tree = jax.tree.flatten(arguments)
@@ -159,7 +159,7 @@ def test_gradient_at_rest_and_out_of_reach_is_finite(name):
     np.testing.assert_array_equal(found[1] != 0.0, np.abs(wanted) < 100.0)
 
 
-def test_it_rests_where_it_starts():
+def test_the_inverse_at_rest_stays_at_rest():
     inverse = InverseHysteresis(MODELS["shaped"], LOWER, UPPER)
     state = inverse.init(4.0)
     after, voltage = inverse.step(state, 4.0)
@@ -196,7 +196,7 @@ def test_bad_parameters_are_refused(changed, message):
         InverseHysteresis(**{**good, **changed})
 
 
-def test_it_drops_into_the_controller_of_the_closed_form():
+def test_the_inverse_works_in_the_controller_of_the_closed_form():
     model = MODELS["trapezoid"]
     plant = series(hysteresis=model, dynamics=ARMA((0.3, 0.05), (0.6, 0.04, 0.01)))
     pid = PID(0.2, 500.0, dt=1 / 20_000)
@@ -216,7 +216,7 @@ def test_it_drops_into_the_controller_of_the_closed_form():
     )
 
 
-def test_it_can_be_saved(tmp_path):
+def test_the_inverse_is_saved_and_loaded(tmp_path):
     inverse = InverseHysteresis(MODELS["bouc_wen"], LOWER, UPPER, iterations=9)
     save(inverse, tmp_path / "inverse.json")
     back = load(tmp_path / "inverse.json")

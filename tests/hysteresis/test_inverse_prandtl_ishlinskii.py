@@ -119,7 +119,7 @@ def test_model_then_inverse_is_the_identity(name):
     np.testing.assert_allclose(found, voltages, rtol=0.0, atol=1e-8)
 
 
-def test_inverse_is_the_operator_of_krejci_and_kuhnen():
+def test_inverse_equals_the_operator_of_krejci_and_kuhnen():
     inverse = inverse_of(MODELS["plain linear"])
     steps = np.random.default_rng(4).normal(size=400)
     wanted = 4.0 + 0.6 * np.cumsum(steps)
@@ -129,7 +129,7 @@ def test_inverse_is_the_operator_of_krejci_and_kuhnen():
     np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
-def test_a_clipped_voltage_is_made_up_for(model):
+def test_the_inverse_is_exact_after_a_clipped_voltage(model):
     # The state is the model's: whatever was applied, the next step is right.
     inverse = inverse_of(model)
     state = inverse.init(3.0)
@@ -141,7 +141,7 @@ def test_a_clipped_voltage_is_made_up_for(model):
 
 
 @pytest.mark.parametrize("wanted", [-3.0, 0.0, 4.0, 12.0])
-def test_inverse_rests_where_it_starts(model, wanted):
+def test_the_inverse_at_rest_stays_at_rest(model, wanted):
     inverse = inverse_of(model)
     state = inverse.init(wanted)
     after, voltage = inverse.step(state, wanted)
@@ -150,7 +150,7 @@ def test_inverse_rests_where_it_starts(model, wanted):
     np.testing.assert_allclose(rest_output(model, voltage), wanted, atol=1e-10)
 
 
-def test_eager_is_jitted(model):
+def test_jit_equals_eager(model):
     inverse = inverse_of(model)
     state = model.step(model.init(30.0), 55.0)[0]
     jitted = jax.jit(lambda s, f: inverse.solve(s, f))
@@ -159,7 +159,7 @@ def test_eager_is_jitted(model):
         np.testing.assert_allclose(jitted(state, wanted), eager, rtol=1e-12)
 
 
-def test_gradient_of_the_inverse_is_the_reciprocal_slope(model):
+def test_gradient_of_the_inverse_equals_the_reciprocal_slope(model):
     state = model.step(model.init(30.0), 55.0)[0]
     inverse = inverse_of(model)
     for wanted in (9.0, 6.0, 1.0):
@@ -169,7 +169,7 @@ def test_gradient_of_the_inverse_is_the_reciprocal_slope(model):
         np.testing.assert_allclose(back, 1.0 / forward, rtol=1e-9)
 
 
-def test_gradients_of_the_parameters_are_central_differences():
+def test_gradients_of_the_parameters_equal_central_differences():
     model = MODELS["rated cubic"]
     leaves, tree = jax.tree.flatten(model)
     state = model.step(model.init(30.0), 31.0)[0]
@@ -229,6 +229,6 @@ def test_a_model_without_an_inverse_is_refused(build, message):
         inverse_of(build())
 
 
-def test_a_curved_inverse_is_no_operator():
+def test_a_polynomial_inverse_has_no_operator_form():
     with pytest.raises(ValueError, match="polynomial has 3 terms; only with a linear"):
         inverse_of(MODELS["plain cubic"]).operator()

@@ -78,7 +78,7 @@ def test_model_then_inverse_is_the_identity(voltages):
     np.testing.assert_allclose(found, voltages, rtol=0, atol=1e-9)
 
 
-def test_with_twenty_cells_it_is_as_exact():
+def test_the_inverse_is_exact_with_twenty_cells():
     model = stage(weights(3, 20))
     wanted = np.random.default_rng(4).uniform(0.0, 1.0, 400) * model.weights.sum()
     reached = _run(Series((InversePreisach(model), model)), LOWEST + wanted)
@@ -100,7 +100,7 @@ def stepped(system, input):
 
 
 @pytest.mark.parametrize(("wanted", "end"), [(-5.0, LOW), (1e3, HIGH)])
-def test_what_is_out_of_reach_gives_the_end_of_the_range(wanted, end):
+def test_an_unreachable_output_gives_the_end_of_the_range(wanted, end):
     inverse = InversePreisach(stage(weights(0)))
     state = stepped(inverse, 1.0)[0][0]
     voltage, slope = voltage_and_slope(inverse, state, wanted)
@@ -110,7 +110,7 @@ def test_what_is_out_of_reach_gives_the_end_of_the_range(wanted, end):
 
 @pytest.mark.parametrize("density", [weights(0), np.tril(weights(5), -1)])
 @pytest.mark.parametrize("wanted", [-0.9, 0.0, 1.2])
-def test_it_rests_where_it_starts(density, wanted):
+def test_the_inverse_at_rest_stays_at_rest(density, wanted):
     inverse = InversePreisach(stage(density))
     states, voltages = stepped(inverse, wanted)
     np.testing.assert_allclose(states[1], states[0], rtol=0, atol=1e-14)
@@ -120,7 +120,7 @@ def test_it_rests_where_it_starts(density, wanted):
     np.testing.assert_allclose(reached, wanted, rtol=0, atol=1e-12)
 
 
-def test_across_a_flat_stretch_it_still_gives_the_output():
+def test_the_inverse_reaches_outputs_across_a_flat_section():
     # Nothing without hysteresis: the output is flat after each turn.
     model = stage(np.tril(weights(5), -1))
     share = np.array([0.1, 0.6, 0.6, 0.3, 0.8, 0.35, 0.35])
@@ -129,7 +129,7 @@ def test_across_a_flat_stretch_it_still_gives_the_output():
     np.testing.assert_allclose(reached, wanted, rtol=0, atol=1e-11)
 
 
-def test_gradients_are_central_differences():
+def test_gradients_equal_central_differences():
     model = stage(weights(0))
     state = run_to(model, np.array([15.0, 80.0, 40.0, 61.0]))
     now = float(output_and_slope(model, state, 61.0)[0])
@@ -154,7 +154,7 @@ def test_gradients_are_central_differences():
                 np.testing.assert_allclose(gradient[index], slope, rtol=1e-5, atol=1e-6)
 
 
-def test_gradient_is_the_reciprocal_slope_at_rest_too():
+def test_gradient_at_rest_equals_the_reciprocal_slope():
     model = stage(weights(0))
     state = run_to(model, np.array([15.0, 80.0, 40.0, 61.0]))
     now = float(output_and_slope(model, state, 61.0)[0])
@@ -168,7 +168,7 @@ def test_gradient_is_the_reciprocal_slope_at_rest_too():
     np.testing.assert_allclose(at_rest, 1.0 / rising, rtol=1e-9)
 
 
-def test_sliding_mode_with_the_inverse_is_the_oracle_s_loop():
+def test_sliding_mode_with_the_inverse_equals_the_oracle():
     # The inverse of another material than the stage's: Coleman and Hodgdon's.
     samples, noise_rms = 20_000, 0.012
     density = np.tril(np.full((4, 4), 0.8)) + 3.0 * np.eye(4)

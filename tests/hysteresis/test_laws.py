@@ -227,12 +227,12 @@ shares = st.floats(0.0, 1.0).map(lambda share: round(share, 3))
 @pytest.mark.parametrize(("name", "law"), KEPT)
 @settings(max_examples=10)
 @given(example=st.lists(shares, min_size=SHARES, max_size=SHARES))
-def test_the_law_holds(name, law, example):
+def test_the_declared_laws_hold(name, law, example):
     assert LAWS[law](ROWS[name].system, example) <= ROWS[name].keeps[law]
 
 
 @pytest.mark.parametrize(("name", "law"), BROKEN)
-def test_the_law_is_broken_and_the_docs_say_so(name, law):
+def test_the_broken_laws_are_documented(name, law):
     row = ROWS[name]
     example, least = row.breaks[law]
     assert LAWS[law](row.system, example) >= least

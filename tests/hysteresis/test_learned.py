@@ -46,7 +46,7 @@ def driven(x):
     return np.array(LINEAR) @ s + np.array(OUTPUT) @ hidden
 
 
-def test_against_its_equation_in_a_plain_loop():
+def test_the_response_equals_the_equation():
     x = drive(300)
     n = driven(x)
     y = [n[0] / (1.0 - sum(A))] * 2
@@ -55,7 +55,7 @@ def test_against_its_equation_in_a_plain_loop():
     np.testing.assert_allclose(response(MODEL, x), y[2:], atol=1e-11)
 
 
-def test_it_is_its_own_dynamics():
+def test_the_operator_contains_its_dynamics():
     assert chain("learned_operator") == ["learned_operator"]
     assert chain("prandtl_ishlinskii") == ["prandtl_ishlinskii", "lag"]
 
@@ -104,7 +104,7 @@ def linear_error(record, train, validate, taps=25):
 
 
 @pytest.mark.slow
-def test_it_learns_a_loop_that_no_linear_model_follows(record):
+def test_the_operator_fits_a_loop_that_no_linear_model_fits(record):
     train, validate = slice(0, 600), slice(600, 900)
     fit = identify(record, "learned_operator", train=train, validate=validate)
     assert len(fit.report.parameters) < 60

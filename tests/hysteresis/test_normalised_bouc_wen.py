@@ -55,7 +55,7 @@ def test_the_exact_scheme_solves_the_differential_equation(shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_the_runge_kutta_scheme_nears_it(shape):
+def test_the_runge_kutta_scheme_converges_to_the_exact_scheme(shape):
     path = walk(20)
     expected = oracle.bounded(path, RHO, *SHAPES[shape])
     found = memory(model(shape, substeps=16), path)
@@ -76,7 +76,7 @@ def test_order_of_convergence_on_a_branch():
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_its_memory_is_the_force_of_the_classical_model(shape):
+def test_the_memory_equals_the_force_of_the_classical_model(shape):
     path = walk(30)
     sigma, n = SHAPES[shape]
     # w = z / limit, limit = (alpha / (beta_gamma + beta_delta))^(1/n).
@@ -87,7 +87,7 @@ def test_its_memory_is_the_force_of_the_classical_model(shape):
     )
 
 
-def test_its_memory_stays_within_one():
+def test_the_memory_stays_within_one():
     found = memory(model("plain", scheme="exact"), 1e3 * walk(40))
     assert np.max(np.abs(found)) <= 1.0 + 1e-9
     np.testing.assert_allclose(np.max(found), 1.0, atol=1e-9)
@@ -105,7 +105,7 @@ def test_the_exact_scheme_needs_no_fine_steps():
 
 @pytest.mark.parametrize("scheme", ["runge_kutta", "exact"])
 @pytest.mark.parametrize("input", [-30.0, 0.0, 80.0])
-def test_rest_is_on_the_virgin_curve(scheme, input):
+def test_the_rest_state_is_on_the_virgin_curve(scheme, input):
     system = model("plain", scheme=scheme)
     state = system.init(input)
     virgin = np.sign(input) * (1.0 - np.exp(-RHO * abs(input)))
@@ -115,7 +115,7 @@ def test_rest_is_on_the_virgin_curve(scheme, input):
     assert float(after.input) == input
 
 
-def test_slope_at_rest_is_that_of_the_rising_branch():
+def test_slope_at_rest_equals_that_of_the_rising_branch():
     system = model("plain", scheme="exact")
     state = system.init(40.0)
     found = jax.grad(lambda x: system.step(state, x)[1])(40.0)

@@ -60,7 +60,7 @@ def expected(x, skewed):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_against_backlashes_in_a_plain_loop(name):
+def test_the_response_equals_plays_in_a_plain_loop(name):
     x = drive()
     x[0] = 12.0  # the only step from the virgin state that init takes
     found = response(MODELS[name](), x, x[0])

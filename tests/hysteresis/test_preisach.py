@@ -59,7 +59,7 @@ on_grid = st.integers(-2, 22).map(lambda step: 5.0 * step)
 
 
 @pytest.mark.parametrize("start", ["virgin", "saturated"])
-def test_against_relays_one_by_one(start):
+def test_the_output_equals_the_sum_of_relays(start):
     # Between relays that lie 5 V apart along each diagonal: no rounding to agree on.
     x = 5.0 * np.random.default_rng(1).integers(-2, 23, LENGTH)
     rest = 30.0 if start == "virgin" else None
@@ -68,7 +68,7 @@ def test_against_relays_one_by_one(start):
     np.testing.assert_allclose(response(model(start), x), expected, atol=1e-12)
 
 
-def test_between_relays_their_number_goes_to_infinity():
+def test_the_output_is_the_limit_of_many_relays():
     x = np.random.default_rng(2).uniform(LOW, HIGH, 60)
     found = response(model(), x) - LOWEST
     for parts in (10, 100):
@@ -122,7 +122,7 @@ def test_loops_of_figure_2_2_between_the_same_inputs_are_congruent():
 
 @settings(max_examples=50)
 @given(st.lists(inputs, min_size=2, max_size=8))
-def test_it_does_not_matter_how_fast_the_input_moves(corners):
+def test_the_output_is_independent_of_the_speed(corners):
     at = np.arange(0, len(corners) - 1 + 1e-9, 1 / 32)
     slow = np.interp(at, range(len(corners)), corners)
     coarse, fine = response(model(), corners), response(model(), slow)
@@ -131,7 +131,7 @@ def test_it_does_not_matter_how_fast_the_input_moves(corners):
 
 @settings(max_examples=50)
 @given(st.lists(st.floats(0.0, 1.0), max_size=6), inputs, inputs, inputs)
-def test_a_larger_loop_wipes_out_the_smaller_ones_before_it(small, x, y, end):
+def test_a_larger_loop_wipes_out_earlier_smaller_ones(small, x, y, end):
     low, high = sorted((x, y))
     between = [low + share * (high - low) for share in small]
     rich = response(model(), [x, *between, low, high, end])[-1]
@@ -151,7 +151,7 @@ def test_loops_between_the_same_inputs_are_congruent(before, x, y):
 
 @settings(max_examples=50)
 @given(st.lists(inputs, max_size=5), inputs, inputs, inputs)
-def test_it_returns_to_the_point_where_it_turned(before, x, y, z):
+def test_minor_loops_return_to_their_turning_point(before, x, y, z):
     # An excursion from the middle down to above the last turn, and back.
     turn, excursion, point = sorted((x, y, z))
     found = response(model(), [*before, turn, point, excursion, point])
@@ -160,7 +160,7 @@ def test_it_returns_to_the_point_where_it_turned(before, x, y, z):
 
 @settings(max_examples=50)
 @given(st.lists(on_grid, min_size=3, max_size=4))
-def test_a_closed_cycle_takes_energy_and_gives_none(corners):
+def test_a_closed_cycle_dissipates_energy(corners):
     # Corners and samples lie where the output may bend: the trapezoid rule is exact.
     cycle = sampled([*corners, corners[0]])
     path = np.concatenate([cycle, cycle[1:]])
@@ -179,7 +179,7 @@ def test_the_output_rises_with_the_input(inputs):
     assert np.all(rise * change >= -1e-12)
 
 
-def test_all_down_and_all_up_are_the_least_and_the_largest_output():
+def test_all_relays_down_and_up_give_the_extreme_outputs():
     ends = response(model(), [-10.0, 110.0, -10.0])
     total = LOWEST + WEIGHTS.sum()
     np.testing.assert_allclose(ends, [LOWEST, total, LOWEST], rtol=0, atol=1e-12)
@@ -197,7 +197,7 @@ def loss(system, path):
 gradients = jax.jit(jax.grad(loss, argnums=(0, 1)))
 
 
-def test_gradients_at_rest_and_on_edges_are_those_of_one_side():
+def test_gradients_at_rest_and_on_edges_are_one_sided():
     for input in (LOW, LOW + SIZE, HIGH):
         found = gradients(model(rest=input), jnp.full(PATH.size, input))
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
@@ -207,7 +207,7 @@ def test_gradients_at_rest_and_on_edges_are_those_of_one_side():
     np.testing.assert_allclose(found[1:], slope[1:], rtol=1e-12)
 
 
-def test_it_is_saved_and_read_back():
+def test_the_model_is_saved_and_loaded():
     system = InversePreisach(model("saturated"))
     again = from_data(to_data(system))
     assert jax.tree.structure(again) == jax.tree.structure(system)

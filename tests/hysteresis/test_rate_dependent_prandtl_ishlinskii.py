@@ -39,7 +39,7 @@ def area(hertz):
     return abs(np.sum(0.5 * (y + np.roll(y, -1)) * (np.roll(x, -1) - x)))
 
 
-def test_against_backlashes_in_a_plain_loop():
+def test_the_response_equals_plays_in_a_plain_loop():
     x = sine(7.0) + 10.0 * np.sin(2.0 * np.pi * 61.0 * DT * np.arange(SAMPLES))
     plays = oracle.rate_dependent_plays(x, THRESHOLDS, GROWTH, DT, REST)
     expected = POLYNOMIAL[0] * x + POLYNOMIAL[1] * x**2 + plays @ np.array(WEIGHTS)
@@ -51,7 +51,7 @@ def test_a_loop_widens_with_its_frequency():
     assert areas[0] * 1.05 < areas[1] < areas[2] / 1.05
 
 
-def test_a_slow_input_finds_the_plain_model():
+def test_a_slow_input_gives_the_rate_independent_model():
     x = 50.0 + 50.0 * np.sin(np.linspace(0.0, 6.0, SAMPLES))
     slow = RateDependentPrandtlIshlinskii(
         POLYNOMIAL, THRESHOLDS, WEIGHTS, GROWTH, 1e6, REST

@@ -28,7 +28,7 @@ def response(system, inputs):
     return simulate(system, inputs, system.init(inputs[0]))[1]
 
 
-def test_against_relays_whose_weights_go_with_the_rate():
+def test_the_output_equals_relays_with_rate_dependent_weights():
     # Multiples of 5 V, between which the relays lie.
     x = 5.0 * np.random.default_rng(1).integers(-2, 19, 100)
     rate = np.diff(x, prepend=x[0]) / DT / RATE
@@ -40,7 +40,7 @@ def test_against_relays_whose_weights_go_with_the_rate():
     np.testing.assert_allclose(response(model(), x), expected, rtol=0, atol=1e-12)
 
 
-def test_slow_and_fast_are_the_two_densities():
+def test_slow_and_fast_inputs_have_the_two_densities():
     x = np.random.default_rng(2).uniform(LOW, HIGH, 100)
     for rate, weights in ((1e12, SLOW), (1e-6, FAST)):
         plain = response(Preisach(weights, LOW, HIGH, LOWEST, REST), x)
@@ -49,7 +49,7 @@ def test_slow_and_fast_are_the_two_densities():
         np.testing.assert_allclose(found[moving], plain[moving], rtol=0, atol=1e-9)
 
 
-def test_at_rest_it_is_the_slow_one_and_stays():
+def test_at_rest_the_slow_density_applies():
     system = model()
     state = system.init(33.0)
     after, output = system.step(state, 33.0)

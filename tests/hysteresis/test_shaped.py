@@ -31,7 +31,7 @@ def drive(samples=400):
     return 40.0 + 30.0 * np.sin(2 * np.pi * time) * np.exp(-0.3 * time)
 
 
-def test_against_a_plain_loop():
+def test_the_response_equals_a_plain_loop():
     x = drive()
     system = model()
     first = float(system.init(x[0]).output)
@@ -52,7 +52,7 @@ def test_the_virgin_curve_solves_the_differential_equation(target):
     np.testing.assert_allclose(model().init(target).output, end, rtol=1e-8)
 
 
-def test_linear_shape_functions_are_coleman_hodgdon():
+def test_linear_shape_functions_give_coleman_hodgdon():
     x = drive()
     plain = ColemanHodgdon(0.0077, 0.1167, -0.0487)
     shaped = ShapedColemanHodgdon((0.0, 0.0077), (0.1167,), -0.0487)

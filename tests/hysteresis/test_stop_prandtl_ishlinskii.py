@@ -41,14 +41,14 @@ def test_play_and_stop_add_up_to_the_input():
     )
 
 
-def test_against_springs_with_sliders_in_a_plain_loop():
+def test_the_response_equals_springs_with_sliders():
     expected = sum(p * X ** (i + 1) for i, p in enumerate(POLYNOMIAL)) - sum(
         w * oracle.stop(X, r, REST) for w, r in zip(WEIGHTS, THRESHOLDS, strict=True)
     )
     np.testing.assert_allclose(response(MODEL, X), expected, atol=1e-11)
 
 
-def test_it_is_inverted_as_plays():
+def test_the_inverse_is_that_of_plays():
     inverse = InversePrandtlIshlinskii(MODEL.as_plays())
     np.testing.assert_allclose(response(MODEL, response(inverse, X / 8.0)), X / 8.0)
 

@@ -40,7 +40,7 @@ def reasons(untried):
     return {one.model: one.reason for one in untried}
 
 
-def test_every_hysteresis_is_tried_with_what_the_record_shows():
+def test_every_hysteresis_is_tried_with_the_dynamics_of_the_record():
     found, untried = first_round([RICH], HALF, OPTIONS)
     chains = [
         f"{name}+exponential_creep{'' if name in OWN_DYNAMICS else '+arma'}"
@@ -51,7 +51,7 @@ def test_every_hysteresis_is_tried_with_what_the_record_shows():
     assert set(reasons(untried)) >= {"bouc_wen", "neural_state_space"}
 
 
-def test_named_ones_are_tried_beside_linear_models():
+def test_named_models_are_tried_with_linear_models():
     names = ["hysteretic_arma", "prandtl_ishlinskii", "bouc_wen"]
     found, untried = first_round([RICH], HALF, OPTIONS, names)
     assert set(models(found)) == {
@@ -63,12 +63,12 @@ def test_named_ones_are_tried_beside_linear_models():
     assert set(reasons(untried)) == {"bouc_wen"}
 
 
-def test_named_ones_of_which_none_can_be_tried():
+def test_named_models_that_cannot_be_tried_are_refused():
     with pytest.raises(ValueError, match="none of the named models can be tried: bouc"):
         first_round([RICH], HALF, OPTIONS, ["bouc_wen"])
 
 
-def test_nothing_is_dropped_in_silence():
+def test_every_omitted_model_has_a_reason():
     for record in (RICH, ONE, sines((2.0,), period=500), sines((3.0,), 200)):
         found, untried = first_round([record], slice(0, record.samples // 2), OPTIONS)
         named = {part for model in models(found) for part in model.split("+")}
@@ -77,7 +77,7 @@ def test_nothing_is_dropped_in_silence():
         assert all(reasons(untried).values())
 
 
-def test_one_frequency_carries_no_second_order_dynamics():
+def test_one_frequency_excludes_second_order_dynamics():
     found, untried = first_round([ONE], HALF, OPTIONS)
     assert "1 frequency in the training part" in reasons(untried)["arma"]
     assert "state_space" in reasons(untried)
@@ -88,7 +88,7 @@ def test_one_frequency_carries_no_second_order_dynamics():
     )
 
 
-def test_a_short_record_shows_no_creep():
+def test_a_short_record_excludes_creep():
     found, untried = first_round([RICH], slice(0, 900), OPTIONS)
     assert not any("creep" in model for model in models(found))
     assert "lasts 0.9 s" in reasons(untried)["exponential_creep"]
@@ -108,7 +108,7 @@ def test_later_rounds_try_other_creeps_and_simpler_dynamics():
         assert later(["coleman_hodgdon+lag"]) == []
 
 
-def test_a_model_with_past_outputs_stands_without_dynamics():
+def test_a_model_with_past_outputs_has_no_further_dynamics():
     for name in OWN_DYNAMICS:
         found, _ = first_round([RICH], HALF, OPTIONS, [name])
         assert f"{name}+exponential_creep" in models(found)
@@ -116,7 +116,7 @@ def test_a_model_with_past_outputs_stands_without_dynamics():
         assert dynamics([f"{name}+exponential_creep"]) == []
 
 
-def test_several_inputs_leave_the_linear_model():
+def test_several_inputs_allow_the_linear_model_only():
     time = np.arange(2000)
     inputs = np.stack([np.sin(0.1 * time), np.cos(0.23 * time)], axis=1)
     record = Record(inputs, inputs @ [[1.0, 0.2], [0.1, 2.0]], 1e-3, period=1000)

@@ -85,7 +85,7 @@ def test_a_good_record_gives_no_warning(name, order):
 
 @pytest.mark.parametrize("bits", [10, 12, 16])
 @pytest.mark.parametrize("name", GOOD)
-def test_nor_does_the_resolution_of_a_converter(name, bits):
+def test_a_converter_gives_no_warning(name, bits):
     def converted(signal):
         step = 2.0 * np.max(np.abs(signal)) / 2**bits
         return step * np.round(signal / step)
@@ -135,9 +135,7 @@ def test_a_clipped_input_among_several():
     phase=st.floats(0.0, 1.0),
     wave=st.sampled_from([lambda x: np.sin(2.0 * np.pi * x), triangle]),
 )
-def test_a_rounded_wave_is_never_taken_for_a_clipped_one(
-    amplitude, period, phase, wave
-):
+def test_a_rounded_wave_is_not_clipped(amplitude, period, phase, wave):
     signal = np.round(amplitude * wave(np.arange(SAMPLES) / period + phase))
     if np.ptp(signal) > 0:
         record = Record(signal, SINE, DT)
@@ -149,7 +147,7 @@ def test_a_rounded_wave_is_never_taken_for_a_clipped_one(
     period=st.floats(1.7, 3.2).map(lambda x: 10.0**x),
     share=st.floats(0.3, 0.9),
 )
-def test_a_rounded_wave_cut_off_is_always_found(amplitude, period, share):
+def test_a_clipped_rounded_wave_is_found(amplitude, period, share):
     wave = np.round(amplitude * np.sin(2.0 * np.pi * np.arange(SAMPLES) / period))
     limit = np.round(share * amplitude)
     text = "; ".join(warnings(Record(SINE, np.minimum(wave, limit), DT)))
@@ -185,14 +183,14 @@ def test_full_cycles_are_counted(periods, wave, noise):
     assert cycles(signal + noise * np.ptp(signal) * scatter) == int(periods)
 
 
-def test_small_loops_count_and_ripple_does_not():
+def test_small_loops_count_as_cycles_and_ripple_does_not():
     peaks = [0.0, 100.0, 0.0, 80.0, 10.0, 60.0, 20.0, 50.0, 20.0]
     drive = np.interp(np.linspace(0.0, 8.0, 900), np.arange(9), peaks)
     assert cycles(drive) == 4
     assert cycles(drive + 4.0 * np.sin(np.arange(900))) == 4
 
 
-def test_there_and_back_is_a_cycle_and_there_is_none():
+def test_a_motion_and_its_return_are_one_cycle():
     assert cycles(np.sin(np.linspace(0.0, np.pi, 100))) == 1
     assert cycles(np.linspace(0.0, 1.0, 100)) == 0
     assert cycles(np.zeros(100)) == 0
@@ -225,7 +223,7 @@ def test_a_sine_does_not_excite_dynamics(frequency, noise, hysteresis):
 
 
 @pytest.mark.parametrize("lines", [1, 2, 3, 5])
-def test_each_frequency_tells_two_parameters(lines):
+def test_each_frequency_determines_two_parameters(lines):
     frequencies = 7.0 * np.arange(1, lines + 1)
     drive = np.sum(np.sin(2.0 * np.pi * np.outer(TIME, frequencies)), axis=1)
     record = record_of(drive)
@@ -240,7 +238,7 @@ def test_each_frequency_tells_two_parameters(lines):
     assert not any("exciting" in text for text in warnings(record, order=2 * lines))
 
 
-def test_one_frequency_says_little_of_hysteresis():
+def test_one_frequency_is_poor_excitation_for_hysteresis():
     text = "; ".join(warnings(record_of(SINE)))
     assert "input has essentially one frequency: only the shape of the loop" in text
     assert warnings(record_of(SINE), hysteresis=False) == []
@@ -253,7 +251,7 @@ def test_the_poor_input_of_two_is_named():
     assert found[0].startswith("input 1 is not exciting enough")
 
 
-def test_only_the_training_part_counts():
+def test_only_the_training_part_is_checked():
     drive = np.where(TIME < 2.0, SINE, GOOD["chirp"])
     assert any("exciting" in text for text in warnings(record_of(drive), order=4))
     rich = record_warnings(

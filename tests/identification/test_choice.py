@@ -53,7 +53,7 @@ def check_recovered(found, plant, clean):
     assert np.sqrt(np.mean(error**2)) < 0.5 * NOISE
 
 
-def test_the_model_that_made_a_record_is_chosen():
+def test_the_model_of_the_simulated_record_is_chosen():
     # Among a linear one and one that holds it and has four parameters more.
     record, plant, clean = made_by_coleman_hodgdon()
     among = ["coleman_hodgdon", "shaped_coleman_hodgdon"]
@@ -92,7 +92,7 @@ def made_by_plays(name, **more):
     return Record(input, clean + noise, DT, source="made up"), plant, clean
 
 
-def test_stops_are_chosen_as_the_plays_that_they_are():
+def test_stops_are_chosen_as_equivalent_plays():
     record, plant, clean = made_by_plays(
         "stop_prandtl_ishlinskii", **{"polynomial.0": 0.152}
     )
@@ -112,7 +112,7 @@ def test_stops_are_chosen_as_the_plays_that_they_are():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
-def test_the_micromanipulator():
+def test_the_models_of_the_micromanipulator():
     # Its sensor's noise is 0.067 um, cycles differ by as much.
     if MICROMANIPULATOR.is_file():
         columns = np.loadtxt(MICROMANIPULATOR)

@@ -32,7 +32,7 @@ TONES = sum(np.sin(2 * np.pi * f * TIME + f) for f in (2.0, 9.0, 31.0, 77.0))
 RICH = Record(TONES, 0.1 * TONES + 1.0, 1e-3, source="made up")
 
 
-def test_a_name_that_is_no_hysteresis():
+def test_an_unknown_hysteresis_is_refused():
     with pytest.raises(ValueError, match="'lag' is not a hysteresis model; there"):
         identify_all(RICH, hysteresis=["lag"])
 
@@ -77,7 +77,7 @@ def made(monkeypatch):
     return install
 
 
-def test_of_two_ways_to_write_one_model_the_first_is_chosen(made, monkeypatch):
+def test_the_first_of_two_equivalent_models_is_chosen(made, monkeypatch):
     made()
     monkeypatch.setitem(BIAS, "prandtl_ishlinskii", 1e-4)
     monkeypatch.setitem(BIAS, "stop_prandtl_ishlinskii", 2e-4)
@@ -96,7 +96,7 @@ def test_of_two_ways_to_write_one_model_the_first_is_chosen(made, monkeypatch):
     )
 
 
-def test_the_best_is_chosen_and_the_others_are_there(made):
+def test_the_best_model_is_chosen_and_the_others_are_kept(made):
     made()
     found = identify_all(RICH)
     report = found.report
@@ -112,7 +112,7 @@ def test_the_best_is_chosen_and_the_others_are_there(made):
     assert not report.interrupted
 
 
-def test_a_model_that_fails_is_a_row_with_its_error(made):
+def test_a_failed_model_is_a_row_with_its_error(made):
     made({"prandtl_ishlinskii+": ValueError("no start"), "shaped": RuntimeError("xla")})
     rows = {row.model: row for row in identify_all(RICH).report.rows}
     failed = [row for row in rows.values() if row.status == "failed"]
@@ -120,7 +120,7 @@ def test_a_model_that_fails_is_a_row_with_its_error(made):
     assert any(row.status == "fitted" for row in rows.values())
 
 
-def test_a_fit_that_is_not_finite_has_failed(made, monkeypatch):
+def test_a_fit_with_non_finite_values_has_failed(made, monkeypatch):
     made()
 
     def fit(records, model, **more):
@@ -135,13 +135,13 @@ def test_a_fit_that_is_not_finite_has_failed(made, monkeypatch):
     assert (row.status, row.note) == ("failed", "its free run is not finite")
 
 
-def test_nothing_fitted_at_all(made):
+def test_no_fitted_model_is_an_error(made):
     made({"": ValueError("nothing helps")})
     with pytest.raises(ValueError, match=r"no model could be fitted .*nothing helps"):
         identify_all(RICH)
 
 
-def test_ctrl_c_keeps_what_is_fitted(made):
+def test_ctrl_c_keeps_the_fitted_models(made):
     made({"prandtl_ishlinskii": KeyboardInterrupt()})
     report = identify_all(RICH).report
     assert report.interrupted
@@ -209,7 +209,7 @@ def test_progress_counts_the_models(made):
 # A part that the choice does not see
 
 
-def test_the_test_part_is_kept_from_fits_and_choice(made):
+def test_fits_and_choice_do_not_use_the_test_part(made):
     made()
     report = identify_all(RICH, test=slice(1600, None)).report
     assert (report.train, report.validation) == ((0, 800), (800, 1600))
@@ -221,7 +221,7 @@ def test_the_test_part_is_kept_from_fits_and_choice(made):
     assert "held-out" not in notes
 
 
-def test_without_a_test_part_the_choice_is_said_to_have_seen_it_all(made):
+def test_without_a_test_part_a_note_says_that_there_is_no_held_out_error(made):
     made()
     notes = " ".join(ranking_notes(identify_all(RICH).report))
     assert "--test START:STOP holds samples" in notes
@@ -247,7 +247,7 @@ def test_bad_test_parts(parts, message):
 # What is written
 
 
-def test_the_files(made, tmp_path):
+def test_the_files_of_a_comparison(made, tmp_path):
     made({"shaped": ValueError("no start")})
     found = identify_all(RICH)
     write_ranking(found, tmp_path)
@@ -288,7 +288,7 @@ def file(tmp_path):
     return path
 
 
-def test_the_command(made, file, tmp_path):
+def test_the_command_writes_and_prints_a_comparison(made, file, tmp_path):
     made()
     out = tmp_path / "out"
     arguments = ("--time", "time_s", "--input", "1", "--output", "2", "--model", "all")
@@ -317,7 +317,7 @@ def test_the_command(made, file, tmp_path):
         (("--among", ""), "--among and --test need --model all"),
     ],
 )
-def test_options_that_do_not_go_together(file, arguments, message):
+def test_inconsistent_options_are_refused(file, arguments, message):
     result = call(file, *arguments)
     assert result.exit_code == 1
     assert message in result.stderr

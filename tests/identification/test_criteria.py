@@ -30,7 +30,7 @@ def test_the_correlation_time_of_an_autoregressive_process(pole):
     assert found == pytest.approx(expected, rel=0.1)
 
 
-def test_the_correlation_time_tells_the_scatter_of_a_mean():
+def test_the_correlation_time_predicts_the_variance_of_a_mean():
     # What an effective number of samples is for, on independent draws.
     rows = np.stack([autoregressive(0.9, 2000, seed) for seed in range(300)])
     worth = np.mean([row.size / correlation_time(row) for row in rows])
@@ -51,7 +51,7 @@ def test_effective_samples_add_up_over_records():
     assert 200 < one <= 400
 
 
-def test_the_criteria_by_hand():
+def test_the_criteria_equal_their_formulas():
     found = criteria(np.array([0.25, 4.0]), np.array([80.0, 20.0]), 3)
     misfit = 80.0 * np.log(0.25) + 20.0 * np.log(4.0)
     assert found.aic == pytest.approx(misfit + 6.0)
@@ -64,7 +64,7 @@ def test_a_perfect_fit_has_finite_criteria():
     assert np.isfinite(found.bic)
 
 
-def test_units_do_not_change_what_a_parameter_is_worth():
+def test_units_do_not_change_the_penalty_of_a_parameter():
     squares, samples = np.array([0.3]), np.array([70.0])
     for scale in (1.0, 1e6):
         one = criteria(scale * squares, samples, 5)
@@ -72,7 +72,7 @@ def test_units_do_not_change_what_a_parameter_is_worth():
         assert other.bic - one.bic == pytest.approx(70.0 * np.log(0.9) + np.log(70.0))
 
 
-def test_noise_that_both_share_does_not_hide_a_worse_model():
+def test_common_noise_does_not_hide_a_worse_model():
     rng = np.random.default_rng(2)
     noise = rng.standard_normal((4000, 1))
     worse = [noise + 0.2 * rng.standard_normal((4000, 1))]
@@ -83,7 +83,7 @@ def test_noise_that_both_share_does_not_hide_a_worse_model():
     assert validates_as_well([noise], [noise])
 
 
-def test_a_slow_difference_is_not_taken_for_many():
+def test_a_correlated_difference_counts_as_few_samples():
     drift = autoregressive(0.99, 2000)
     drift = (drift - np.mean(drift)) / np.std(drift) + 0.3
     best = 2.0 * np.ones((2000, 1))
@@ -93,7 +93,7 @@ def test_a_slow_difference_is_not_taken_for_many():
     assert not validates_as_well([np.sqrt(best**2 + 0.5 * shuffled[:, None])], [best])
 
 
-def test_more_parameters_do_not_win_by_themselves():
+def test_more_parameters_alone_do_not_win():
     noise = np.random.default_rng(4).standard_normal((500, 1))
     errors = [[noise], [0.999 * noise], [3.0 * noise]]
     training = [1.0, 0.998, 0.5]
@@ -109,7 +109,7 @@ def test_more_parameters_do_not_win_by_themselves():
     assert well == [True, True, False]
 
 
-def test_two_ways_to_write_one_model_are_one():
+def test_equivalent_models_count_as_one():
     rng = np.random.default_rng(7)
     noise = rng.standard_normal((500, 1))
     near = noise + 0.05 * rng.standard_normal((500, 1))
@@ -121,7 +121,7 @@ def test_two_ways_to_write_one_model_are_one():
     assert first_equivalent(bics, counts, errors) == [0, 0, 2, 3, 4, 0]
 
 
-def test_alike_is_said_of_the_first_not_of_a_neighbour():
+def test_equivalence_is_relative_to_the_first_model():
     # Each comes close to the one before, but the last not to the first.
     noise = np.random.default_rng(8).standard_normal((500, 1))
     errors = [[noise * (1.0 + share)] for share in (0.0, 0.08, 0.16)]

@@ -45,7 +45,7 @@ def nv200(integration="rectangular", scale=SCALE, **typed):
 
 @pytest.mark.parametrize("integration", ["rectangular", "trapezoidal", "half"])
 @pytest.mark.parametrize("lag", [0, 2])
-def test_an_nv200_of_three_decimals(integration, lag):
+def test_the_scale_of_an_nv200_from_three_decimals(integration, lag):
     typed, scale = {"kp": 6.0, "ki": 7000.0, "kd": 0.001}, 0.017
     record = recorded(nv200(integration, scale, **typed), 3, lag)
     found = device_scale("nv200", record, typed)
@@ -59,7 +59,7 @@ def test_an_nv200_of_three_decimals(integration, lag):
     assert found.notes == []
 
 
-def test_gains_without_a_scale_are_within_their_bars():
+def test_gains_without_a_scale_are_within_their_tolerances():
     """kp and kd to 1 %, ki to 1e-4, also where the numbers typed in are wrong."""
     record = recorded(nv200(kp=0.06, kd=1e-5), 3)
     found = device_scale("nv200", record, {"kp": 0.06, "ki": 70.0, "kd": 0.0})
@@ -68,7 +68,7 @@ def test_gains_without_a_scale_are_within_their_bars():
     assert found.derivative.value == pytest.approx(SCALE * 1e-5, rel=0.01)
 
 
-def test_an_integral_alone_does_not_tell_half_from_whole():
+def test_an_integral_alone_does_not_determine_the_integration_rule():
     record = recorded(nv200(kp=0.0, kd=0.0), 3)
     found = device_scale("nv200", record, {"kp": 0.0, "ki": 70.0, "kd": 0.0})
     assert found.option == {"integration": "rectangular"}
@@ -77,7 +77,7 @@ def test_an_integral_alone_does_not_tell_half_from_whole():
 
 
 @pytest.mark.parametrize("structure", ["series", "parallel"])
-def test_an_e727_in_series_or_parallel(structure):
+def test_the_structure_of_an_e727_is_found(structure):
     typed = {"proportional": 0.1, "integral_time": 2e-3, "derivative_time": 1e-5}
     if structure == "parallel":
         typed |= {"integral_time": 2e-2, "derivative_time": 1e-6}
@@ -98,7 +98,7 @@ def test_noise_widens_the_standard_errors():
     assert abs(loud.value - SCALE) < 6.0 * loud.standard_error
 
 
-def test_the_command_prints_and_writes_what_was_measured(tmp_path, monkeypatch):
+def test_the_command_prints_and_writes_the_scale(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     record = recorded(nv200(kd=0.0), 3)
     table = np.column_stack([record.inputs, record.outputs])
@@ -152,6 +152,6 @@ RECORD = recorded(nv200(), 3)
         ),
     ],
 )
-def test_records_that_do_not_serve_are_refused(device, record, typed, message):
+def test_unsuitable_records_are_refused(device, record, typed, message):
     with pytest.raises(ValueError, match=message):
         device_scale(device, record, typed)

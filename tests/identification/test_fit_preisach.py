@@ -57,14 +57,14 @@ def record(start="virgin", noise=0.0, dynamics=False):
 
 
 @pytest.mark.parametrize("start", ["virgin", "saturated"])
-def test_a_known_density_is_found_again(start):
+def test_a_known_density_is_recovered(start):
     found = fit_preisach(record(start), CELLS, limits=(LOW, HIGH), start=start)
     np.testing.assert_allclose(found.weights, WEIGHTS, rtol=0, atol=1e-9)
     np.testing.assert_allclose(found.lowest, LOWEST, rtol=0, atol=1e-9)
     assert (found.low, found.high, found.start) == (LOW, HIGH, start)
 
 
-def test_behind_known_dynamics_too():
+def test_a_density_before_known_dynamics_is_recovered():
     found = fit_preisach(
         record(dynamics=True), CELLS, limits=(LOW, HIGH), dynamics=DYNAMICS
     )
@@ -72,7 +72,7 @@ def test_behind_known_dynamics_too():
     np.testing.assert_allclose(found.lowest, LOWEST, rtol=0, atol=1e-8)
 
 
-def test_two_densities_are_told_apart_by_the_pace():
+def test_two_densities_are_recovered_at_two_rates():
     input = np.concatenate([INPUT, drive(6)])
     plant = RateDependentPreisach(material(), FAST, RATE, DT)
     paces = Record(input, np.asarray(response(plant, input)), DT)
@@ -85,12 +85,12 @@ def test_two_densities_are_told_apart_by_the_pace():
         fit_rate_dependent_preisach(paces, 0.0, CELLS)
 
 
-def test_from_a_part_of_the_record():
+def test_the_fit_uses_the_given_part_of_the_record():
     found = fit_preisach(record(), CELLS, train=slice(100, None, 2), limits=(LOW, HIGH))
     np.testing.assert_allclose(found.weights, WEIGHTS, rtol=0, atol=1e-8)
 
 
-def test_under_noise_no_weight_is_negative_and_the_output_is_right():
+def test_with_noise_weights_are_non_negative_and_the_output_fits():
     # More cells than the material has, and much noise: plain least squares goes below.
     noisy = record(noise=0.1)
     found = fit_preisach(noisy, 2 * CELLS, limits=(LOW, HIGH))
@@ -101,7 +101,7 @@ def test_under_noise_no_weight_is_negative_and_the_output_is_right():
     assert np.sqrt(np.mean(error**2)) < 0.04
 
 
-def test_smoothing_evens_the_weights_out():
+def test_smoothing_reduces_the_roughness_of_the_weights():
     noisy = record(noise=0.1)
 
     def roughness(smoothing):
@@ -113,7 +113,7 @@ def test_smoothing_evens_the_weights_out():
     assert roughness(1.0) < 0.3 * roughness(0.0)
 
 
-def test_the_limits_are_those_of_the_record_if_left_out():
+def test_the_default_limits_are_those_of_the_record():
     found = fit_preisach(record(), 4)
     assert (found.low, found.high) == (INPUT.min(), INPUT.max())
 

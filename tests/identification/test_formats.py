@@ -71,7 +71,7 @@ def refused(path, message):
     codec=st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "cp1252"]),
     remark=st.sampled_from(["", "# bench 3, run 2; 1.5 V\n", "%\n% note\n"]),
 )
-def test_dialects(separator, decimal, header, units, ends, codec, remark):
+def test_text_dialects(separator, decimal, header, units, ends, codec, remark):
     text = remark + table_text(separator, decimal, header, header and units)
     content = text.replace("\r\n", "\n").replace("\n", ends).encode(codec)
     columns = parsed(decoded(content))
@@ -100,13 +100,13 @@ def test_a_comma_before_a_blank_separates():
     assert_columns(columns, {"t": [0.5, 1.5], "u": [1.0, 2.0]})
 
 
-def test_thousands_are_not_taken_for_decimals():
+def test_thousands_separators_are_not_decimals():
     columns = parsed("t;u\n0,5;1,5\n1,5;1.234\n2,5;2,5\n")
     assert columns["t"].fault is None
     assert columns["u"].fault == "sample 1: '1.234' is not a number"
 
 
-def test_a_column_of_text_leaves_the_others_alone():
+def test_a_column_of_text_does_not_affect_the_others():
     columns = parsed("t;state;u\n0,5;on;1,5\n1,5;off;2,5\n")
     np.testing.assert_array_equal(columns["u"].values, [1.5, 2.5])
     assert columns["state"].fault == "sample 0: 'on' is not a number"
@@ -119,11 +119,11 @@ def test_empty_cells_are_missing_numbers_and_empty_names_are_counted():
     np.testing.assert_array_equal(columns["y"].values, [1.5, np.nan])
 
 
-def test_separators_at_the_ends_of_lines_are_no_columns():
+def test_separators_at_line_ends_are_not_columns():
     assert_columns(parsed("t;u\n1;2;\n3;4;\n"), {"t": [1.0, 3.0], "u": [2.0, 4.0]})
 
 
-def test_a_row_of_broken_numbers_is_no_row_of_units():
+def test_a_row_of_broken_numbers_is_not_a_row_of_units():
     columns = parsed("t;u;y\n1;overload;2\n3;4;5\n")
     assert columns["u"].fault == "sample 0: 'overload' is not a number"
     assert columns["u"].unit is None
@@ -333,7 +333,7 @@ def test_a_text_table_of_another_name_is_one_clear_error(tmp_path, suffix):
     refused(path, f"cannot be read: it is not {FORMATS[suffix].content}")
 
 
-def test_an_unknown_suffix_lists_those_known(tmp_path):
+def test_an_unknown_suffix_lists_the_known_ones(tmp_path):
     for name, suffix in (("record.doc", ".doc"), ("record", "")):
         message = (
             f"its suffix {suffix!r} is unknown; it must be one of .csv, .txt, .dat"
@@ -393,7 +393,7 @@ def test_labview_text(tmp_path, x_columns, decimal, separator):
     assert (record.input_unit, record.output_unit) == ("V", "um")
 
 
-def test_several_labview_segments_are_told_apart(tmp_path):
+def test_several_labview_segments_are_separated(tmp_path):
     path = tmp_path / "record.lvm"
     head, body = lvm_text().split("***End_of_Header***\t\r\n\t\r\n")
     path.write_text(
@@ -404,7 +404,7 @@ def test_several_labview_segments_are_told_apart(tmp_path):
     np.testing.assert_array_equal(columns["1/sensor"].values, SENSOR)
 
 
-def test_what_a_tdms_file_says_of_its_channels(tmp_path):
+def test_names_and_units_of_tdms_channels(tmp_path):
     path = tmp_path / "record.tdms"
     with TdmsWriter(path) as writer:
         for name, unit, values in (("u", "mV", DRIVE), ("y", "µm", SENSOR)):
@@ -431,7 +431,7 @@ def test_a_tdms_increment_as_number_and_as_text(tmp_path, step):
 
 
 @pytest.mark.parametrize("step", ["fast", -1.0, float("inf")])
-def test_a_tdms_increment_that_is_no_time(tmp_path, step):
+def test_a_bad_tdms_increment_is_refused(tmp_path, step):
     tdms_step(tmp_path / "record.tdms", step)
     message = f"the time step of 'u' is {step!r}; it must be a number above 0"
     refused(tmp_path / "record.tdms", message)

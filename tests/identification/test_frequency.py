@@ -58,7 +58,7 @@ def test_without_noise_the_response_is_exact():
     assert found.variance.max() < 1e-9
 
 
-def test_as_many_records_as_inputs_give_the_quotient_of_spectra():
+def test_as_many_records_as_inputs_give_the_ratio_of_spectra():
     records = [measured(0), measured(1)]
     U, Y = (
         np.stack([np.fft.rfft(x.reshape(4, PERIOD, -1).mean(0), axis=0) for x in side])
@@ -69,7 +69,7 @@ def test_as_many_records_as_inputs_give_the_quotient_of_spectra():
     np.testing.assert_allclose(found.response, expected, rtol=1e-7, atol=1e-9)
 
 
-def test_the_variance_is_the_scatter_over_noise_draws():
+def test_the_variance_equals_that_over_noise_draws():
     quotients = []
     for draw in range(30):
         records = [measured(0), measured(1), measured(2)]
@@ -97,7 +97,7 @@ def test_weights_favour_the_better_record():
     assert error[1] < 0.1 * error[0]
 
 
-def test_power_turns_a_response_error_into_an_output_error():
+def test_input_power_converts_a_response_error_to_an_output_error():
     records = [measured(seed, 0.0) for seed in range(3)]
     found = empirical_response(records)
     change = 0.3 * found.response
@@ -134,12 +134,12 @@ def test_the_descent_lowers_the_cost_to_the_noise(fit):
     assert fit.costs[-1] == pytest.approx(left / 2, rel=0.15)
 
 
-def test_singular_values_drop_behind_the_order(fit):
+def test_singular_values_drop_after_the_order(fit):
     ratios = fit.singular_values[1:] / fit.singular_values[:-1]
     assert np.argmin(ratios[:12]) == 4
 
 
-def test_periodic_errors_are_those_of_scipy(fit):
+def test_periodic_errors_equal_those_of_scipy(fit):
     records = [measured(7), measured(8)]
     model = [np.asarray(getattr(fit.model, name)) for name in "ABCD"]
     found = periodic_errors(fit.model, records)
@@ -193,7 +193,7 @@ def test_bad_records_are_refused(records, weights, message):
         empirical_response(records, weights)
 
 
-def test_inputs_that_are_alike_are_refused():
+def test_dependent_inputs_are_refused():
     with pytest.raises(ValueError, match=r"inputs are not independent at 3\.9.* Hz"):
         empirical_response([measured(0), measured(0)])
 

@@ -97,12 +97,12 @@ def test_a_known_plant_is_found(fits, path):
 
 
 @pytest.mark.parametrize("path", TRUTH)
-def test_standard_errors_are_the_scatter_over_noise_draws(fits, path):
+def test_standard_errors_equal_the_scatter_over_noise_draws(fits, path):
     value, error = values(fits, path)
     assert 0.5 < np.std(value, ddof=1) / np.mean(error) < 2.0
 
 
-def test_what_is_left_is_the_noise(fits):
+def test_the_residual_is_the_noise(fits):
     for fit in fits:
         for part in (fit.report.train, fit.report.validation):
             assert part.rmse == pytest.approx(NOISE, rel=0.1)
@@ -112,7 +112,7 @@ def test_what_is_left_is_the_noise(fits):
             )
 
 
-def test_the_errors_are_those_of_the_simulation_shown(fits):
+def test_the_errors_are_those_of_the_returned_simulation(fits):
     fit = fits[0]
     error = fit.simulated - fit.record.output
     rms = [np.sqrt(np.mean(error[part] ** 2)) for part in (TRAIN, slice(900, SAMPLES))]
@@ -128,7 +128,7 @@ def test_a_rich_record_gives_no_warning(fits):
             assert "rest_" in text or "excites nothing above" in text
 
 
-def test_the_simulation_sees_the_input_alone(fits):
+def test_the_simulation_uses_the_input_alone(fits):
     fit = fits[0]
     before = fit.system.parts[0].rest_input
     again = free_run(fit.system, jnp.asarray(INPUT), before)
@@ -136,7 +136,7 @@ def test_the_simulation_sees_the_input_alone(fits):
 
 
 @pytest.mark.parametrize("name", ["model.json", "model.toml"])
-def test_a_saved_model_simulates_the_same(fits, tmp_path, name):
+def test_a_saved_model_gives_the_same_simulation(fits, tmp_path, name):
     fit = fits[0]
     save(fit.system, tmp_path / name)
     back = load(tmp_path / name)
@@ -157,7 +157,7 @@ def test_the_report_has_the_agreed_keys(fits):
         assert set(parameter) == {"value", "standard_error"}
 
 
-def test_what_lies_outside_training_has_no_say(clean, fits):
+def test_samples_outside_training_do_not_change_the_fit(clean, fits):
     output = noisy(clean, 0)
     output[TRAIN.stop :] += 50.0
     fit = identify(record_of(INPUT, output), MODEL, train=TRAIN)
@@ -166,7 +166,7 @@ def test_what_lies_outside_training_has_no_say(clean, fits):
     assert fit.report.validation.rmse == pytest.approx(50.0, rel=1e-3)
 
 
-def test_other_units_change_nothing_but_the_units(clean, fits):
+def test_other_units_change_the_units_only(clean, fits):
     fit = identify(record_of(1e3 * INPUT, 1e-3 * noisy(clean, 0)), MODEL, train=TRAIN)
     for path, factor in {
         "hysteresis.a": 1e-9,
@@ -206,7 +206,7 @@ def shipped_fit():
 
 
 @pytest.mark.slow
-def test_the_shipped_record_is_simulated_to_less_than_a_percent(shipped_fit):
+def test_the_error_on_the_shipped_record_is_below_one_percent(shipped_fit):
     report = shipped_fit.report
     assert report.validation.rmse <= 0.40
     assert report.validation.rmse_percent_of_span < 1.0
@@ -231,7 +231,7 @@ def test_the_lag_of_the_shipped_record(shipped_fit):
 
 
 @pytest.mark.parametrize("model", ["bashash_jalili", "prandtl_ishlinskii"])
-def test_every_hysteresis_is_warned_of_one_frequency(model):
+def test_every_hysteresis_has_a_warning_for_one_frequency(model):
     input = 50.0 - 50.0 * np.cos(0.05 * np.arange(400))
     fit = identify(record_of(input, 0.1 * input), model, options=Options(steps=1))
     assert any("one frequency: only the shape" in w for w in fit.report.warnings)
@@ -279,33 +279,33 @@ def test_bad_parts(record, parts, message):
         identify(record, **parts)
 
 
-def test_a_part_with_an_open_end(clean, fits):
+def test_a_part_without_an_end(clean, fits):
     fit = identify(
         record_of(INPUT, noisy(clean, 0)), model=MODEL, train=slice(None, TRAIN.stop)
     )
     assert fit.report.parameters == fits[0].report.parameters
 
 
-def test_the_rest_point_is_found_or_said_to_be_ambiguous(fits):
+def test_the_rest_point_is_found_or_has_a_warning(fits):
     for fit in fits:
         rest = fit.report.parameters["hysteresis.rest_input"]
         found = abs(rest.value - REST) < 4.0 * rest.standard_error
         assert found or any("rest_input" in text for text in fit.report.warnings)
 
 
-def test_a_stage_that_moves_backwards_is_fitted_as_well(clean):
+def test_a_stage_with_negative_gain_is_fitted(clean):
     fit = identify(record_of(INPUT, -noisy(clean, 0)), MODEL, train=TRAIN)
     assert fit.report.validation.rmse == pytest.approx(NOISE, rel=0.1)
 
 
-def test_a_model_that_explains_nothing_is_said_to():
+def test_a_model_that_explains_nothing_has_a_warning():
     measured = np.random.default_rng(5).standard_normal(SAMPLES)
     fit = identify(record_of(INPUT, measured), MODEL, train=TRAIN)
     assert fit.report.validation.rmse > 0.2 * np.std(measured)
     assert any("error" in text or "fit" in text for text in fit.report.warnings)
 
 
-def test_validation_on_training_samples_is_said(clean):
+def test_validation_on_training_samples_has_a_warning(clean):
     record = record_of(INPUT, noisy(clean, 0))
     try:
         fit = identify(record, MODEL, train=TRAIN, validate=slice(600, 900))

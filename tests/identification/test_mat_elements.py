@@ -28,7 +28,7 @@ def written(**options):
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_right_files_pass(packed):
+def test_valid_files_pass(packed):
     check_elements(written(do_compression=packed, oned_as="column"))
     check_elements(written()[:128])  # no variable at all
 

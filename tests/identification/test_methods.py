@@ -53,7 +53,7 @@ def record(period=PERIOD, **changes):
 
 
 @pytest.mark.parametrize("method", ["subspace", "frequency_response"])
-def test_a_linear_plant_is_found_and_fits_into_a_loop(method):
+def test_a_linear_plant_is_identified_and_used_in_a_loop(method):
     fit = identify(
         record(),
         "state_space",
@@ -77,7 +77,7 @@ def test_a_linear_plant_is_found_and_fits_into_a_loop(method):
     np.testing.assert_allclose(again[PERIOD:], fit.simulated[PERIOD:], atol=5 * NOISE)
 
 
-def test_several_outputs_have_an_error_each():
+def test_every_output_has_an_error():
     u = multisine(1)
     outputs = np.stack([answered(u), answered(u, gain=4.0, seed=1)], axis=1)
     fit = identify(record(outputs=outputs), "state_space", options=Options(order=2))
@@ -108,7 +108,7 @@ def test_records_that_drive_one_channel_in_turn_are_stacked():
     assert len(fit.simulations) == 2
 
 
-def test_records_of_one_stage_share_all_but_zero_and_what_came_before():
+def test_records_of_one_stage_share_all_but_zero_and_initial_state():
     time = np.arange(600) * DT
     plant = {"a": 0.0077, "b": 0.1167, "c": -0.0487}
     records, rests = [], (-10.0, 25.0)
@@ -143,7 +143,7 @@ def test_a_periodic_record_trains_a_black_box():
     assert fit.report.validation.rmse < 10 * NOISE
 
 
-def test_the_one_regression_that_noise_does_not_bias_is_the_default():
+def test_the_default_regression_is_not_biased_by_noise():
     u = multisine(1)
     record = Record(u, answered(u), DT, source="lab")
     fit = identify(record, "hysteretic_arma")
@@ -167,7 +167,7 @@ def test_the_one_regression_that_noise_does_not_bias_is_the_default():
         ("coleman_hodgdon", "subspace", "cannot fit 'coleman_hodgdon'; output_error"),
     ],
 )
-def test_methods_that_do_not_go(model, method, message):
+def test_methods_that_do_not_suit_the_model_are_refused(model, method, message):
     with pytest.raises(ValueError, match=message) as error:
         identify(record(), model, method=method)
     if method not in METHODS:
@@ -189,6 +189,6 @@ def test_methods_that_do_not_go(model, method, message):
         ),
     ],
 )
-def test_records_that_do_not_go(records, model, message):
+def test_records_that_do_not_suit_the_method_are_refused(records, model, message):
     with pytest.raises(ValueError, match=message):
         identify(records, model)

@@ -86,14 +86,16 @@ def test_every_excited_line_is_used(known):
     assert frequency.size == 3839
 
 
-def test_one_linear_model_is_as_good_as_the_published_one(linear, mirror):
+def test_one_linear_model_reaches_the_published_errors(linear, mirror):
     assert np.abs(linear.model.poles()).max() < 1.0
     for level, error in errors(linear.model, mirror).items():
         assert error < 1.08 * LINEAR[level], level
 
 
 @pytest.mark.usefixtures("optimised")
-def test_dynamics_that_follow_the_level_beat_every_linear_model(linear, known, mirror):
+def test_scheduled_dynamics_have_smaller_errors_than_linear_models(
+    linear, known, mirror
+):
     model = fit_scheduled(list(known.values()), linear.model, steps=2)
     for level, error in errors(model, mirror).items():
         assert error < 0.7 * LINEAR[level], level

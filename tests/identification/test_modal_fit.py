@@ -53,7 +53,7 @@ def test_the_modes_of_a_stage_are_found(seed):
     assert np.median(np.abs(fit.fitted / exact - 1.0)) < 0.01
 
 
-def test_the_noise_is_seen_without_a_model():
+def test_the_noise_is_estimated_without_a_model():
     stage, values = measured(1001)
     exact = np.abs(modal_responses.response(stage, LINES))
     expected = np.hypot(stage.noise[0] * exact, stage.noise[1])
@@ -61,7 +61,7 @@ def test_the_noise_is_seen_without_a_model():
     assert 0.8 < np.median(ratio) < 1.25
 
 
-def test_a_lag_is_told_from_a_mode():
+def test_a_lag_is_distinguished_from_a_mode():
     stage = modal_responses.stage(1000)
     s = 2j * np.pi * LINES
     values = modal_responses.measured(stage, LINES, 3) / (1.0 + 2e-4 * s)
@@ -89,7 +89,7 @@ def test_the_system_has_the_response_of_the_stage():
     np.testing.assert_allclose(ours, exact, rtol=0.05, atol=2e-3 * abs(exact[0]))
 
 
-def test_held_responses_lose_the_hold_and_not_their_delay():
+def test_the_hold_is_removed_from_held_responses_and_the_delay_is_not():
     stage, values = measured(1000)
     turn = np.pi * LINES / RATE
     hold = np.sinc(turn / np.pi) * np.exp(-1j * turn)
@@ -100,7 +100,7 @@ def test_held_responses_lose_the_hold_and_not_their_delay():
     assert delay.value == pytest.approx(stage.delay, abs=4.0 * delay.standard_error)
 
 
-def test_the_bound_holds_the_truth():
+def test_the_bound_contains_the_true_error():
     stage, found = measured(1002)[0], model_of(1002)
     exact = modal_responses.response(stage, LINES)
     error = np.abs(exact / found.fit.fitted - 1.0)
@@ -145,7 +145,7 @@ def test_files_of_analysers(tmp_path, head):
         ("f,gain_1,gain_2,phase_deg", 20, "'gain_1' and 'gain_2' are both a magnitude"),
     ],
 )
-def test_files_that_are_refused(tmp_path, head, rows, message):
+def test_bad_files_are_refused(tmp_path, head, rows, message):
     columns = [1.0 + np.arange(rows), *np.ones((head.count(","), rows))]
     table = np.column_stack(columns)
     np.savetxt(tmp_path / "r.csv", table, "%g", ",", header=head, comments="")
@@ -162,7 +162,7 @@ def test_files_that_are_refused(tmp_path, head, rows, message):
         (1.0 + np.arange(9), np.full(9, np.nan), "line 0 is not a finite number"),
     ],
 )
-def test_responses_that_are_refused(frequency, values, message):
+def test_bad_responses_are_refused(frequency, values, message):
     with pytest.raises(ValueError, match=message):
         FrequencyResponse(frequency, values)
 
@@ -201,7 +201,7 @@ def test_the_command_writes_a_model_that_a_study_reads(tmp_path, monkeypatch):
     assert "--response takes one RECORD, and a --rate" in refused.output
 
 
-def test_a_magnitude_in_decibels_must_say_so(tmp_path):
+def test_a_magnitude_in_decibels_needs_its_unit(tmp_path):
     table = np.column_stack([LINES, np.full(LINES.size, -20.0), np.zeros(LINES.size)])
     head = "f,gain,phase_deg"
     np.savetxt(tmp_path / "r.csv", table, "%g", ",", header=head, comments="")
@@ -209,7 +209,7 @@ def test_a_magnitude_in_decibels_must_say_so(tmp_path):
         read_response(tmp_path / "r.csv")
 
 
-def test_few_lines_and_no_noise_are_not_fitted_by_many_modes():
+def test_few_lines_without_noise_are_fitted_by_few_modes():
     stage = modal_responses.stage(1000)
     few = np.linspace(0.5, 1.5, 12) * stage.frequency[0]
     exact = modal_responses.response(stage, few)

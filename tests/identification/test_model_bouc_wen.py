@@ -65,7 +65,7 @@ def of_two_starts(record):
     return structure._replace(starts=structure.starts[:2])
 
 
-def test_all_parameters_are_recovered_from_a_made_record():
+def test_all_parameters_are_recovered_from_a_simulated_record():
     factor = 16
     fine = resample(made(1), factor)
     system, errors = fit_structure(of_two_starts(fine), fine, steps=60)
@@ -96,7 +96,7 @@ def test_linear_oscillator_is_found_exactly():
     np.testing.assert_allclose(found, [2.0, 40.0, 1e5], rtol=1e-9)
 
 
-def test_starts_lie_in_the_box_and_share_out_the_stiffness():
+def test_starts_are_in_the_box_and_divide_the_stiffness():
     record = made(1)
     structure = bouc_wen(record)
     mass, _, stiffness = linear_oscillator(record)
@@ -107,7 +107,7 @@ def test_starts_lie_in_the_box_and_share_out_the_stiffness():
         np.testing.assert_allclose([named["mass"], both], [mass, stiffness], rtol=1e-9)
 
 
-def test_a_record_of_something_else_is_refused():
+def test_a_record_of_another_system_is_refused():
     force = oracle.multisine(512, LINES, 50.0, 3)
     with pytest.raises(ValueError, match="made: the best linear oscillator has mass"):
         bouc_wen(record_of(force, -1e-5 * force))
@@ -134,7 +134,7 @@ def benchmark():
 
 
 @pytest.mark.slow
-def test_truth_reproduces_the_shared_record_to_its_noise(benchmark):
+def test_the_true_model_reproduces_the_shared_record(benchmark):
     mean, _ = benchmark
     made = oracle.steady_displacement(mean.input, 1.0 / RATE, oracle.BENCHMARK)
     # Noise of 7.4e-6 m, averaged over four periods.

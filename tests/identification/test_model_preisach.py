@@ -68,7 +68,7 @@ def fit():
     return identify(record_of(INPUT), "preisach", train=TRAIN)
 
 
-def test_weights_and_lag_are_found_again(fit):
+def test_weights_and_lag_are_recovered(fit):
     found = fit.report.parameters
     assert fit.count == len(found) == CELLS * (CELLS + 1) // 2 + 2
     truth = {
@@ -94,7 +94,7 @@ def paces():
     )
 
 
-def test_both_densities_the_rate_and_the_lag_are_found_again(paces):
+def test_both_densities_the_rate_and_the_lag_are_recovered(paces):
     found = paces.report.parameters
     assert paces.count == len(found) == CELLS * (CELLS + 1) + 3
     truth = {
@@ -110,21 +110,21 @@ def test_both_densities_the_rate_and_the_lag_are_found_again(paces):
     assert 0.7 < np.std(far) < 1.4
 
 
-def test_one_pace_does_not_tell_two_densities_apart():
+def test_one_rate_does_not_determine_two_densities():
     steps = np.where(np.arange(1200) // 50 % 2, -2.0, 2.0)
     input = np.concatenate([[0.0], np.cumsum(steps)])
     record = Record(input, 0.1 * input, DT)
     assert distinguishable_cells(record, slice(0, 900), RATE_DEPENDENT) == 0
 
 
-def test_what_is_written_is_the_plant(fit, tmp_path):
+def test_the_saved_model_is_the_plant(fit, tmp_path):
     write_fit(fit, tmp_path)
     again = load(tmp_path / "model.json")
     run = free_run(again, jnp.asarray(INPUT), INPUT[0])
     np.testing.assert_allclose(run, fit.simulated, rtol=0, atol=1e-12)
 
 
-def test_cells_are_as_fine_as_the_turning_points_tell():
+def test_the_turning_points_determine_the_number_of_cells():
     # Of one loop, of one loop in another, and of all of them.
     once = 50.0 - 50.0 * np.cos(np.linspace(0.0, 6.0 * np.pi, 600))
     twice = np.concatenate([once, np.interp(once, [0.0, 100.0], [0.0, 55.0])])
@@ -136,7 +136,7 @@ def test_cells_are_as_fine_as_the_turning_points_tell():
     assert found[0] <= found[1] < found[2] == CELLS
 
 
-def test_the_way_from_a_virgin_start_is_not_relied_upon(monkeypatch):
+def test_the_initial_loading_does_not_add_cells(monkeypatch):
     # One amplitude: a virgin material passes more cells on the way to the first corner.
     record = read_record(
         shipped().parent / "data" / "micromanipulator.csv",
@@ -150,7 +150,7 @@ def test_the_way_from_a_virgin_start_is_not_relied_upon(monkeypatch):
     assert distinguishable_cells(record, slice(0, 1200)) == 4
 
 
-def test_a_record_of_one_loop_supports_none():
+def test_a_record_of_one_loop_is_refused():
     once = 50.0 - 50.0 * np.cos(np.linspace(0.0, 6.0 * np.pi, 600))
     record = Record(once, 0.1 * once, DT, source="one tone")
     half = slice(0, 300)
@@ -162,7 +162,7 @@ def test_a_record_of_one_loop_supports_none():
         identify(record, "preisach", train=half)
 
 
-def test_it_takes_one_record_of_one_input():
+def test_several_records_or_inputs_are_refused():
     record = Record(INPUT, 0.1 * INPUT, DT)
     both = np.stack([INPUT, INPUT[::-1]], axis=1)
     for records, reason in (

@@ -52,7 +52,7 @@ def share(system, record):
     return np.sqrt(np.mean(error**2, axis=0)) / np.std(record.outputs, axis=0)
 
 
-def test_start_is_the_linear_system_that_made_the_record():
+def test_start_equals_the_linear_system_of_the_record():
     start = neural_start(record(linear, 2, 3), 3, 4)
     for seed in (0, 1):
         fresh = record(linear, 2, 3, seed, offset=0.4)
@@ -64,7 +64,7 @@ def test_start_is_the_linear_system_that_made_the_record():
     )
 
 
-def test_start_is_stable_where_the_record_is_noise():
+def test_start_is_stable_for_a_record_of_noise():
     rubbish = Record(noise(1), noise(1, 1), 1e-3, period=SAMPLES)
     start = neural_start(rubbish, 10, 1)
     assert np.max(np.abs(np.linalg.eigvals(start.state_matrix))) < 1.0
@@ -76,7 +76,7 @@ def bent(state, u):
     return state, 5.0 + 2.0 * state
 
 
-def test_training_finds_what_no_linear_model_can():
+def test_training_fits_a_loop_that_no_linear_model_fits():
     made = record(bent, 1, 1)
     # Of three draws of four neurons, the first ends in a poor minimum.
     fitted = fit_neural_state_space(made, 1, 4, starts=3, steps=60)
@@ -105,7 +105,7 @@ def test_several_inputs_and_outputs_are_trained_at_once():
     assert np.max(share(fitted, fresh)) < 0.02
 
 
-def test_no_start_is_refused():
+def test_zero_starts_are_refused():
     with pytest.raises(ValueError, match="starts is 0; it must be at least 1"):
         fit_neural_state_space(record(bent, 1, 1), 1, 4, starts=0)
 

@@ -177,7 +177,7 @@ def refused(path, message, **columns):
         ("Tektronix MSO4000", "there are TIME, CH1, CH2"),
     ],
 )
-def test_a_column_that_counts_is_no_signal(tmp_path, name, message):
+def test_a_column_of_sample_numbers_is_not_a_signal(tmp_path, name, message):
     path = tmp_path / "scope.csv"
     path.write_text(EXPORTS[name][0])
     refused(path, message)
@@ -193,7 +193,7 @@ def test_an_interval_that_contradicts_the_times(tmp_path):
     )
 
 
-def test_codes_of_a_converter_are_no_volts(tmp_path):
+def test_codes_of_a_converter_are_refused(tmp_path):
     path = tmp_path / "scope.csv"
     text = TEKTRONIX_MSO + rows(TIME, np.round(25.0 * DRIVE), SENSOR, end=",")
     path.write_text(text)
@@ -201,7 +201,7 @@ def test_codes_of_a_converter_are_no_volts(tmp_path):
     refused(path, message, input="CH1", output="CH2")
 
 
-def test_a_broken_sample_is_no_preamble(tmp_path):
+def test_a_broken_sample_is_not_a_preamble(tmp_path):
     path = tmp_path / "scope.csv"
     text = rows(TIME, DRIVE, SENSOR)
     path.write_text("t,u,y\n" + text.replace(text.split(",")[0], "late", 1))
@@ -254,7 +254,7 @@ def test_a_rate_beside_the_arrays(tmp_path, suffix, name, value):
         ({"dt": 1e-3, "fs": 5e4}, "contradict each other: dt (0.001 s), fs (2e-05 s)"),
     ],
 )
-def test_a_rate_that_is_none(tmp_path, scalars, message):
+def test_a_bad_rate_is_refused(tmp_path, scalars, message):
     path = tmp_path / "record.h5"
     with h5py.File(path, "w") as file:
         file["u"], file["y"] = DRIVE, SENSOR

@@ -32,7 +32,7 @@ def p753_record(samples, seed):
 
 
 @pytest.mark.slow
-def test_noise_does_not_bias_the_p753():
+def test_noise_does_not_bias_the_fit_of_the_p753():
     record = p753_record(20_000, 1)
     fit = identify(record, MODEL, train=slice(0, 18_000))
     truth = p753.plant()
@@ -59,7 +59,7 @@ def several_records():
     return at_starts(problem, found), unit, records
 
 
-def test_residuals_of_records_of_different_length_leave_the_padding_out():
+def test_residuals_of_records_of_different_length_exclude_the_padding():
     problem, unit, records = several_records()
     system = problem.space.put(problem.system, unit)
     squares = 0.0
@@ -80,7 +80,7 @@ def test_residuals_of_records_of_different_length_leave_the_padding_out():
     np.testing.assert_allclose(jnp.sum(residuals**2), expected, rtol=1e-7)
 
 
-def test_the_slope_of_the_squares_is_right_at_the_most_likely_starts():
+def test_the_gradient_of_the_squares_is_right_at_the_most_likely_starts():
     # The Jacobian holds the responses to the starts; the gradient must not tell.
     problem, unit, _ = several_records()
 
@@ -94,7 +94,7 @@ def test_the_slope_of_the_squares_is_right_at_the_most_likely_starts():
         assert slope[i] == pytest.approx(float(difference), rel=1e-3, abs=1e-6)
 
 
-def test_a_record_that_says_nothing_of_a_parameter_gives_it_no_error():
+def test_an_undetermined_parameter_has_no_standard_error():
     # Without motion below 30 V the rest point is out of sight.
     time = np.arange(600) * p753.DT
     u = 50.0 + 15.0 * np.sin(2 * np.pi * 100.0 * time)
@@ -107,7 +107,7 @@ def test_a_record_that_says_nothing_of_a_parameter_gives_it_no_error():
 
 
 @pytest.mark.slow
-def test_hysteresis_creep_lag_and_delay_are_told_apart():
+def test_hysteresis_creep_lag_and_delay_are_recovered():
     # Three frequencies a decade apart: a lag and a delay turn with frequency, a loop
     # of hysteresis does not, creep fades with it.
     model, dt = "coleman_hodgdon+logarithmic_creep+lag+delay", 2e-3

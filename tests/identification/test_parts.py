@@ -28,7 +28,7 @@ def excitation():
 INPUT = excitation()
 
 
-def test_the_chain_computes_what_its_parts_say():
+def test_the_chain_equals_the_equations_of_its_parts():
     # Plays on the thresholds of the fit, widened by the rate; one damped spring.
     weights, growth, stiffness, time_constant = np.full(10, 0.004), 0.04, 12.0, 2.0
     shape = structure(

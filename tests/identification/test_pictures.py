@@ -17,7 +17,7 @@ def measured():
     return EmpiricalResponse(frequency, response, variance, np.ones((50, 3, 3)), 2e-3)
 
 
-def test_the_order_divides_the_singular_values(tmp_path):
+def test_the_picture_separates_the_singular_values_at_the_order(tmp_path):
     values = 10.0 * 0.5 ** np.arange(80)
     with plot_style():
         picture = singular_values_figure(values, 5, "title")
@@ -30,7 +30,7 @@ def test_the_order_divides_the_singular_values(tmp_path):
     assert (tmp_path / "values.png").stat().st_size > 1000
 
 
-def test_a_bode_plot_has_a_panel_an_entry_and_a_band(measured, tmp_path):
+def test_a_bode_plot_has_one_panel_per_entry_with_a_band(measured, tmp_path):
     model = p558.model("7")
     with plot_style():
         fitted = np.asarray(model.frequency_response(measured.frequency))

@@ -77,19 +77,19 @@ def test_columns_by_name_by_number_and_by_number_as_text(write):
     assert_is_the_record(read_record(str(path), time=0, input="drive_V", output=2))
 
 
-def test_the_order_of_the_columns_is_free(write):
+def test_the_columns_may_have_any_order(write):
     rows = [row[::-1] for row in ROWS]
     path = write(text_of(rows, HEADER[::-1]))
     assert_is_the_record(read_record(path, **COLUMNS))
 
 
-def test_a_column_called_by_a_digit_goes_before_the_number(write):
+def test_a_column_named_by_a_digit_precedes_the_number(write):
     rows = [[row[0], row[2], row[1]] for row in ROWS]
     path = write(text_of(rows, ["time", "2", "drive"]))
     assert_is_the_record(read_record(path, time="time", input="drive", output="2"))
 
 
-def test_without_time_the_rate_counts(write):
+def test_without_time_the_rate_is_used(write):
     path = write(text_of([row[1:] for row in ROWS], HEADER[1:]))
     record = read_record(path, rate=250.0)
     np.testing.assert_array_equal(record.input, DRIVE)
@@ -137,14 +137,14 @@ def test_units_come_from_the_names(write, header, units):
     assert (record.input_unit, record.output_unit) == units
 
 
-def test_what_a_record_says_about_itself(write):
+def test_properties_of_a_record(write):
     record = read_record(write(text_of(ROWS), "stage.csv"), **COLUMNS)
     assert record.source == "stage.csv"
     assert record.span == pytest.approx(2.0, rel=1e-2)
     np.testing.assert_allclose(record.time, TIME, atol=1e-15)
 
 
-def test_small_jitter_of_the_clock_is_no_fault(write):
+def test_small_jitter_of_the_clock_is_accepted(write):
     jitter = 2e-7 * np.random.default_rng(1).uniform(-1.0, 1.0, SAMPLES)
     rows = [
         [repr(float(t)), *row[1:]] for t, row in zip(TIME + jitter, ROWS, strict=True)
@@ -166,7 +166,7 @@ def test_missing_file(tmp_path):
     refused(tmp_path / "nowhere.csv", "No such file or directory")
 
 
-def test_a_folder_is_no_record(tmp_path):
+def test_a_folder_is_refused(tmp_path):
     folder = tmp_path / "folder.csv"
     folder.mkdir()
     refused(folder, "Is a directory")
@@ -189,7 +189,7 @@ def test_binary_garbage(write, name):
 
 @pytest.mark.parametrize("role", ["time", "input", "output"])
 @pytest.mark.parametrize("key", ["voltage", 3, "3"])
-def test_missing_column_lists_what_there_is(write, role, key):
+def test_a_missing_column_lists_the_columns(write, role, key):
     refused(
         write(text_of(ROWS)),
         f"{role} column {key!r} is missing; there are time_s, drive_V, sensor_um",
@@ -220,7 +220,7 @@ def test_missing_time(write, cell):
     )
 
 
-def test_missing_numbers_in_other_columns_do_not_matter(write):
+def test_missing_numbers_in_other_columns_are_accepted(write):
     rows = [[*row, ""] for row in ROWS]
     record = read_record(write(text_of(rows, [*HEADER, "remark"])), **COLUMNS)
     assert_is_the_record(record)
@@ -259,7 +259,7 @@ def test_short_record(write, samples):
     )
 
 
-def test_the_shortest_record_that_will_do(write):
+def test_the_shortest_accepted_record(write):
     record = read_record(write(text_of(ROWS[:SHORTEST])), **COLUMNS)
     assert record.input.size == SHORTEST
 
@@ -347,14 +347,14 @@ def test_npz_with_pickled_objects_is_not_opened(tmp_path):
         ({"period": 61}, "the period is 61 samples; it must lie in 2..60"),
     ],
 )
-def test_a_record_made_by_hand_is_checked_too(change, message):
+def test_a_record_from_arrays_is_checked(change, message):
     good = {"inputs": DRIVE, "outputs": SENSOR, "dt": 1e-3, "source": "bench"}
     assert Record(**good).span > 0
     with pytest.raises(ValueError, match="^bench: .*" + re.escape(message)):
         Record(**(good | change))
 
 
-def test_missing_numbers_name_the_column_as_the_file_does(write):
+def test_missing_numbers_have_the_column_name_of_the_file(write):
     refused(write(text_of(changed(17, 1, ""))), "drive_V")
 
 
@@ -364,12 +364,12 @@ def test_repeated_column_names(write):
     refused(path, "'t'", rate=1000.0, input=1, output=2)
 
 
-def test_one_column_for_two_roles(write):
+def test_one_column_for_two_signals_is_refused(write):
     # The default input is column 0, which is the time in most files.
     refused(write(text_of(ROWS)), "time_s", time="time_s", output=2)
 
 
-def test_time_in_milliseconds_is_not_taken_for_seconds(write):
+def test_time_in_milliseconds_is_converted_or_refused(write):
     path = write(text_of(ROWS, ["time_ms", "drive_V", "sensor_um"]))
     try:
         record = read_record(path, time=0, input=1, output=2)
@@ -378,7 +378,7 @@ def test_time_in_milliseconds_is_not_taken_for_seconds(write):
     assert record.dt == pytest.approx(1e-6)
 
 
-def test_a_unit_in_brackets_is_not_taken_for_micrometres(write):
+def test_a_unit_in_brackets_is_read(write):
     path = write(text_of(ROWS, ["time [s]", "drive [V]", "sensor [nm]"]))
     assert read_record(path, time=0, input=1, output=2).output_unit == "nm"
 
@@ -394,7 +394,7 @@ def test_npz_time_of_another_length(write_npz):
     refused(path, "length", time="t", input="u", output="y")
 
 
-def test_npz_remark_does_not_spoil_the_columns(write_npz):
+def test_an_npz_remark_does_not_affect_the_columns(write_npz):
     path = write_npz(t=TIME, u=DRIVE, y=SENSOR, remark="bench 3")
     assert_is_the_record(read_record(path, time="t", input="u", output="y"))
 
@@ -449,7 +449,7 @@ def test_several_columns(two_axes, input, output):
     assert record.output_units == ("um", "nm")
 
 
-def test_a_name_with_a_comma_is_one_column_if_it_is_there(two_axes):
+def test_an_existing_name_with_a_comma_is_one_column(two_axes):
     record = read_record(two_axes, time="t", input="y, drive_mV", output="y_nm")
     np.testing.assert_array_equal(record.input, SENSOR)
 
@@ -511,7 +511,7 @@ def test_a_rate_beside_the_time_must_agree(write, rate):
 
 
 @pytest.mark.parametrize("rate", [250.0, 1001.5, 998.5, 1e6])
-def test_a_rate_against_the_time_is_refused(write, rate):
+def test_a_rate_that_contradicts_the_time_is_refused(write, rate):
     refused(
         write(text_of(ROWS)),
         f"the sample rate is 1000 Hz by column 'time_s' and {rate:.6g} Hz by the rate; "
@@ -538,7 +538,7 @@ def uneven():
     ], time
 
 
-def test_uneven_time_is_refused_with_the_way_out(write):
+def test_uneven_time_is_refused_with_a_remedy(write):
     rows, _ = uneven()
     refused(
         write(text_of(rows)),
@@ -585,7 +585,7 @@ def test_impossible_resampling(write, rate):
 
 
 @pytest.mark.parametrize(("rate", "samples"), [(1e11, "5.9e+09"), (1e300, "5.9e+298")])
-def test_resampling_to_more_samples_than_a_memory_holds(write, rate, samples):
+def test_resampling_beyond_the_memory_is_refused(write, rate, samples):
     refused(
         write(text_of(ROWS)),
         f"resample is {rate:g} Hz: 0.059 s would be {samples} samples; at most 1e+08",
@@ -605,7 +605,7 @@ def test_resampling_does_not_sort_time(write):
     )
 
 
-def test_a_column_of_time_is_no_signal(tmp_path):
+def test_a_time_column_is_not_a_signal(tmp_path):
     path = tmp_path / "clock.csv"
     rows = [f"{0.1 * k:.1f},{k % 7},{k % 5}" for k in range(60)]
     for header in ("time_s,u,y", "Time (s),u,y", "time,u,y"):

@@ -81,7 +81,7 @@ def poles(model):
 
 
 @pytest.mark.parametrize("scheme", ["trapezoid", "quadratic", "voros"])
-def test_rows_are_those_of_the_equation(short, scheme):
+def test_rows_equal_the_equation(short, scheme):
     expected = regression.rows(short.input, short.output, C, scheme)
     found = rows(short, C, Orders(scheme=scheme), short.output)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-10)
@@ -100,7 +100,7 @@ def test_rows_of_another_order(short):
 
 @pytest.mark.parametrize("scheme", ["trapezoid", "quadratic"])
 @pytest.mark.parametrize("estimator", [least_squares, instrumental_variables])
-def test_without_noise_the_truth_comes_back(scheme, estimator):
+def test_without_noise_the_parameters_are_recovered(scheme, estimator):
     record = record_of(scheme, duration=0.2, offset=-1.5)
     found = estimator(record, Orders(scheme=scheme), c=BOUNDS)
     np.testing.assert_allclose(
@@ -112,7 +112,7 @@ def test_without_noise_the_truth_comes_back(scheme, estimator):
     assert found.model.scheme == scheme
 
 
-def test_the_bounds_of_c_may_be_left_to_the_record(short):
+def test_the_record_determines_the_bounds_of_c(short):
     found = least_squares(short)
     assert float(found.model.c) == pytest.approx(C, rel=1e-6)
 
@@ -129,7 +129,7 @@ def test_the_wrong_scheme_leaves_an_error(short):
     assert voros.simulation_rms > 1e3 * trapezoid.simulation_rms
 
 
-def test_samples_outside_training_have_no_say(short):
+def test_samples_outside_training_do_not_change_the_fit(short):
     spoiled = Record(
         short.input,
         np.where(np.arange(short.samples) < 3000, short.output, 99.0),
@@ -175,25 +175,25 @@ def test_least_squares_is_biased(plain):
         assert away > 50.0 * float(plain.standard_errors.autoregressive[i])
 
 
-def test_even_at_the_true_c_least_squares_is_biased(noisy):
+def test_least_squares_is_biased_at_the_true_c(noisy):
     found = poles(least_squares(noisy[0], c=C).model)
     assert abs(found[0] / POLES[0] - 1.0) > 0.5
 
 
-def test_instrumental_variables_are_not(refined):
+def test_instrumental_variables_are_unbiased(refined):
     for found in refined:
         np.testing.assert_allclose(poles(found.model), POLES, rtol=0.01)
         assert float(found.model.c) == pytest.approx(C, rel=0.02)
 
 
-def test_what_instrumental_variables_leave_is_the_noise(refined, plain):
+def test_the_residual_of_instrumental_variables_is_the_noise(refined, plain):
     for found in refined:
         assert found.simulation_rms == pytest.approx(p753.NOISE_RMS, rel=0.02)
     assert plain.simulation_rms > 3.0 * p753.NOISE_RMS
     assert plain.one_step_rms < refined[0].one_step_rms  # what it does minimise
 
 
-def test_standard_errors_tell_how_far_the_truth_is(refined):
+def test_standard_errors_cover_the_true_values(refined):
     away = np.array(
         [
             (numbers(fit.model) - numbers(truth())) / numbers(fit.standard_errors)
@@ -205,12 +205,12 @@ def test_standard_errors_tell_how_far_the_truth_is(refined):
     assert np.max(np.abs(away)) < 5.0
 
 
-def test_errors_that_no_theory_gives_are_missing(plain, refined):
+def test_standard_errors_without_a_theory_are_missing(plain, refined):
     assert np.isnan(plain.standard_errors.c)
     assert np.isnan(refined[0].standard_errors.rest_input)
 
 
-def test_the_estimate_is_a_plant_that_can_be_saved(refined, tmp_path):
+def test_the_estimate_is_a_plant_and_is_saved(refined, tmp_path):
     model = refined[0].model
     save(model, tmp_path / "model.toml")
     voltage = jnp.asarray(decaying_triangles(0.1))
@@ -224,7 +224,7 @@ def test_the_estimate_is_a_plant_that_can_be_saved(refined, tmp_path):
 
 
 @pytest.mark.parametrize("seed", [None, 3])
-def test_recursive_least_squares_ends_at_the_batch(seed):
+def test_recursive_least_squares_ends_at_the_batch_estimate(seed):
     record = record_of(seed=seed, duration=0.2, offset=-1.5)
     models = recursive_least_squares(record, RecursiveLeastSquares(C, prior=1e12))
     batch = least_squares(record, train=slice(1, None), c=C).model
@@ -262,7 +262,7 @@ def test_a_forgetting_estimator_follows_a_plant_that_changes():
     assert abs(ends[1.0] - 1.5) > 0.05
 
 
-def test_one_step_alone_is_one_step_of_the_run(short):
+def test_one_step_equals_one_step_of_the_run(short):
     estimator = RecursiveLeastSquares(C, 0.98, prior=10.0)
     models = recursive_least_squares(short, estimator)
     state = estimator.init(Measured(short.input[0], short.output[0]))
@@ -292,7 +292,7 @@ def test_bad_requests(short, estimator, options, message):
         estimator(short, **options)
 
 
-def test_an_input_that_rests_tells_nothing(short):
+def test_a_constant_input_is_refused(short):
     still = np.where(np.arange(short.samples) < 2000, 0.0, short.input)
     record = Record(still, short.output, short.dt)
     with pytest.raises(ValueError, match="does not determine the coefficients"):

@@ -45,7 +45,7 @@ def record(periods=1, **changed):
 
 
 @pytest.mark.parametrize("factor", [1, 2, 7])
-def test_samples_between_are_those_of_the_tones(factor):
+def test_interpolated_samples_equal_the_tones(factor):
     found = resample(record(), factor)
     time = DT / factor * np.arange(factor * SAMPLES)
     assert (found.dt, found.period) == (DT / factor, factor * SAMPLES)
@@ -57,7 +57,7 @@ def test_samples_between_are_those_of_the_tones(factor):
 
 
 @pytest.mark.parametrize("samples", [64, 65])
-def test_the_own_samples_of_any_output_stay(samples):
+def test_existing_samples_are_kept(samples):
     draw = np.random.default_rng(0).standard_normal((2, samples))
     whole = Record(*draw, DT, period=samples)
     found = resample(whole, 4).output[::4]
@@ -74,7 +74,7 @@ def test_means_are_over_the_periods_after_the_first():
     assert found.period == found.samples == SAMPLES
 
 
-def test_the_rest_after_the_last_period_is_left_out():
+def test_samples_after_the_last_period_are_omitted():
     whole = record(3)
     longer = record(
         inputs=np.concatenate([whole.inputs, np.full((9, 1), 1e6)]),

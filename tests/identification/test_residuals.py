@@ -136,7 +136,7 @@ def test_the_model_of_another_stage_is_named(factor):
     assert any("is that of another stage or unit" in text for text in warnings)
 
 
-def test_frequencies_that_only_validation_holds_are_named():
+def test_frequencies_of_the_validation_part_alone_are_named():
     input = np.concatenate([excitation(1, 200.0), excitation(2, 1500.0)])[
         SAMPLES // 2 : 3 * SAMPLES // 2
     ]
@@ -148,7 +148,7 @@ def test_frequencies_that_only_validation_holds_are_named():
     assert any("frequencies from" in text and "--train" in text for text in warnings)
 
 
-def test_amplitudes_that_only_validation_holds_are_named():
+def test_amplitudes_of_the_validation_part_alone_are_named():
     input = INPUT.copy()
     input[HALVES[1]] = 40.0 + 2.0 * (input[HALVES[1]] - 40.0)
     report, warnings = analysed(input, answer(STAGE, input), answer(STAGE, input))
@@ -188,7 +188,7 @@ def true_error(stage, model, frequency):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_bound_holds_the_true_error(seed):
+def test_the_bound_contains_the_true_error(seed):
     model = product(lag(1.2e-3), mode(760.0, 0.03))
     input = excitation(seed)
     record = Record(input, noisy(answer(STAGE, input), seed), DT)
@@ -205,7 +205,7 @@ def test_the_bound_holds_the_true_error(seed):
     assert np.all((bound >= 0.999 * found.upper)[clear])
 
 
-def test_what_is_not_excited_is_limited_by_its_neighbour():
+def test_the_bound_of_unexcited_lines_follows_from_their_neighbours():
     input = excitation(top=400.0)
     record = Record(input, noisy(answer(STAGE, input)), DT)
     bound = error_bound([record], [answer(STAGE, input)], WHOLE)
@@ -247,7 +247,7 @@ def test_a_hidden_mode_of_the_allowed_share_stays_below_the_bound():
         assert np.all(error[below] <= 1.05 * np.maximum(bound.at(lines)[below], share))
 
 
-def test_periodic_records_give_their_own_lines():
+def test_periodic_records_have_their_excited_lines():
     period = 2048
     input = np.tile(excitation(samples=period), 8)
     runs = [answer(stage, input) for stage in (STAGE, SLOW)]
@@ -276,7 +276,7 @@ def test_of_several_records_the_larger_error_counts():
 # Statistics
 
 
-def test_autocorrelation_is_that_of_the_sums():
+def test_autocorrelation_equals_the_sums():
     white = np.random.default_rng(0).normal(size=300)
     signal = np.asarray(scipy.signal.lfilter([1.0], [1.0, 0.5], white))
     centred = signal - signal.mean()
@@ -290,7 +290,7 @@ def test_autocorrelation_is_that_of_the_sums():
     assert found.bound == pytest.approx(3.54 / np.sqrt(300))
 
 
-def test_cross_correlation_looks_at_earlier_inputs():
+def test_cross_correlation_uses_earlier_inputs():
     input = np.random.default_rng(0).normal(size=2000)
     found = cross_correlation(np.roll(input, 7), input)
     assert found.lag == 7
@@ -298,7 +298,7 @@ def test_cross_correlation_looks_at_earlier_inputs():
     assert found.significant
 
 
-def test_the_bound_of_the_correlation_counts_the_colour_of_both():
+def test_the_bound_of_the_correlation_includes_both_spectra():
     """Independent coloured signals seldom exceed it; the bound for white ones often."""
     random = np.random.default_rng(4)
     exceeded = naive = 0
@@ -359,7 +359,7 @@ def short():
     return Record(INPUT[:6000], OUTPUT[:6000], DT, source="made up")
 
 
-def test_a_fit_without_the_mode_is_alarmed_and_one_with_it_is_not(short, tmp_path):
+def test_only_a_fit_without_the_mode_has_an_alarm(short, tmp_path):
     fits = [identify(short, model) for model in ("lag", "mode+lag")]
     poor, right = (fit.report for fit in fits)
     assert any("leaves a peak at 7" in text for text in poor.warnings)

@@ -38,7 +38,7 @@ def test_a_resonance_is_found(case):
 
 
 @pytest.mark.parametrize("excitation", records.EXCITATIONS)
-def test_a_stage_without_a_resonance_shows_none(excitation):
+def test_a_stage_without_a_resonance_has_none(excitation):
     case = records.Case(excitation, frequency=None, seconds=1.0, noise=0.005)
     assert dynamics_parts(record(case)) == "lag"
     assert dynamics_of(record(case)).modes == ()
@@ -61,27 +61,27 @@ def test_the_named_stage_is_fitted_by_default():
         assert parameter.standard_error > 0.0
 
 
-def test_a_delay_is_told_from_a_resonance():
+def test_a_delay_is_distinguished_from_a_resonance():
     input, output = records.measured(records.Case("PRBS", lag=0.0, seconds=1.0))
     found = linear_dynamics(input, np.r_[np.full(3, output[0]), output[:-3]], DT)
     check(found.modes[0], records.NAMED)
     assert found.delay == pytest.approx(3 * DT, abs=0.2 * DT)
 
 
-def test_the_slope_is_that_of_the_loop_and_not_of_the_overshoot():
+def test_the_slope_is_that_of_the_hysteresis_and_not_of_the_overshoot():
     input, output = records.measured(records.Case("steps", lag=0.0, seconds=1.0))
     found = linear_dynamics(input, -output, DT)
     assert found.slope == pytest.approx(-records.SLOPE, rel=0.4)
 
 
 @pytest.mark.parametrize("samples", [100, 5000])
-def test_one_sine_shows_no_resonance(samples):
+def test_a_single_sine_gives_no_resonance(samples):
     time = DT * np.arange(samples)
     input = 50.0 - 40.0 * np.cos(2 * np.pi * 50.0 * time)
     assert linear_dynamics(input, records.plays(input), DT).modes == ()
 
 
-def test_too_short_a_record_shows_nothing():
+def test_a_short_record_gives_no_resonance():
     input = np.random.default_rng(0).standard_normal(100)
     assert linear_dynamics(input, input, DT) == LinearDynamics()
 

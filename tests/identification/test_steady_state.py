@@ -32,14 +32,14 @@ def record(output=None, **changed):
     return Record(INPUT, output, DT, source="lag", **{"period": SAMPLES} | changed)
 
 
-def test_response_is_that_of_the_transfer_function():
+def test_response_equals_the_transfer_function():
     lag = FirstOrderLag(-DT / np.log(0.8), DT)
     found = steady_response(lag, jnp.asarray(INPUT), SAMPLES)
     np.testing.assert_allclose(found, settled(0.8), rtol=0.0, atol=1e-11)
 
 
 @pytest.mark.parametrize("settle", [0, 1, 50])
-def test_settling_runs_through_the_end_of_the_period_from_rest(settle):
+def test_settling_starts_from_rest_before_the_end_of_the_period(settle):
     lag = FirstOrderLag(-DT / np.log(0.9), DT)
     driven = np.concatenate([INPUT[SAMPLES - settle :], INPUT])
     expected = lfilter([0.1], [1.0, -0.9], driven)[settle:]
@@ -61,14 +61,14 @@ def test_fit_finds_the_lag_and_survives_a_start_that_diverges():
     assert not errors[1] < 1.0
 
 
-def test_units_do_not_matter():
+def test_units_do_not_change_the_fit():
     found, _ = fit_steady_state(
         put, STARTS * jnp.array([1.0, 1e-6]), record(1e-6 * settled(0.8))
     )
     np.testing.assert_allclose(found, [0.8, 0.2e-6], rtol=1e-8)
 
 
-def test_the_fit_averages_noise_out():
+def test_the_fit_averages_the_noise():
     noise = 0.01 * np.random.default_rng(1).standard_normal(SAMPLES)
     found, errors = fit_steady_state(put, STARTS, record(settled(0.8) + noise))
     np.testing.assert_allclose(found, [0.8, 0.2], rtol=0.05)

@@ -76,7 +76,7 @@ def test_the_regression_holds_for_a_model_without_noise():
 
 
 @pytest.mark.parametrize(("variance", "prior"), [(1.0, 10.0), (0.01, 1.0), (5.0, 0.1)])
-def test_the_recursion_is_ridge_regression(variance, prior):
+def test_the_recursion_equals_ridge_regression(variance, prior):
     X, Y, _ = rows()
     theta, P = subspace.recursive(X, Y, variance, prior)
     at_once = subspace.maximum_a_posteriori(X, Y, variance, prior)
@@ -86,7 +86,7 @@ def test_the_recursion_is_ridge_regression(variance, prior):
     np.testing.assert_allclose(P, np.linalg.inv(information), rtol=0, atol=1e-10)
 
 
-def test_ridge_regression_is_least_squares_with_rows_for_the_prior():
+def test_ridge_regression_equals_least_squares_with_prior_rows():
     X, Y, _ = rows()
     more = np.vstack([X, np.sqrt(0.5 / 2.0) * np.eye(7)])
     expected = linalg.lstsq(more, np.vstack([Y, np.zeros((7, 3))]))[0].T
@@ -94,7 +94,7 @@ def test_ridge_regression_is_least_squares_with_rows_for_the_prior():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
 
-def test_the_prior_weighs_less_with_more_rows():
+def test_the_weight_of_the_prior_falls_with_more_rows():
     errors = []
     for count in (20, 200, 2000):
         X, Y, theta = rows(count=count)
@@ -103,7 +103,7 @@ def test_the_prior_weighs_less_with_more_rows():
     assert errors[2] < 0.02
 
 
-def test_the_realisation_has_the_markov_parameters_it_was_made_from():
+def test_the_realisation_has_the_given_markov_parameters():
     for model in p558.channels("6"):
         true = true_markov(model, 59)[:, :, 0]
         found, moved = subspace.realised(true, model.order, DT)
@@ -121,7 +121,7 @@ def test_singular_values_end_at_the_order():
     assert subspace.order_at_gap(values, 10) == 4
 
 
-def test_a_growing_response_is_made_stable_and_said_to_be():
+def test_an_unstable_response_is_stabilised_with_a_note():
     growing = (1.05 ** np.arange(30.0))[:, None]
     model, moved = subspace.realised(growing, 1, DT)
     assert moved == 1
@@ -164,7 +164,7 @@ def test_without_a_prior_a_noisy_chirp_is_not_enough(fits, channel):
     )
 
 
-def test_what_an_input_leaves_open_is_said():
+def test_undetermined_directions_have_a_note():
     model, draw = p558.channels("7")[0], np.random.default_rng(3)
     rich = measured(model, draw.standard_normal(1000))
     assert subspace.identify_channel(rich, 5, 3).notes == ()
@@ -173,7 +173,7 @@ def test_what_an_input_leaves_open_is_said():
     assert note.startswith("the input excites 2 of the 10 directions of 10 samples")
 
 
-def test_a_projection_is_said():
+def test_a_projection_has_a_note():
     model, steps = p558.channels("7")[0], np.random.default_rng(3).standard_normal(500)
     record = measured(model, steps)
 
@@ -201,7 +201,7 @@ def test_any_estimate_can_be_used(fits):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8)
 
 
-def test_simulation_errors_are_those_of_a_plain_loop(fits):
+def test_simulation_errors_equal_those_of_a_plain_loop(fits):
     model, true = fits["7"][0].model, p558.channels("7")[0]
     record = measured(true, chirp(0)[:800], 5)
     A, B, C, D = matrices(model)
@@ -214,7 +214,7 @@ def test_simulation_errors_are_those_of_a_plain_loop(fits):
     )
 
 
-def test_p_and_order_are_chosen_on_a_record_not_fitted():
+def test_p_and_order_are_chosen_on_another_record():
     true = p558.channels("6")[1]
     train, validate = measured(true, chirp(1), 1), measured(true, chirp(1)[::-1], 2)
     orders, ps = (1, 2, 3, 4, 6), (4, 8, 20)

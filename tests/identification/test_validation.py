@@ -76,7 +76,7 @@ def record(y, u, **changes):
 
 
 @pytest.mark.parametrize("before", [(0.0,), (0.0, 100.0), (0.0, 100.0, 0.0)])
-def test_the_right_model_leaves_only_noise(before):
+def test_the_residual_of_the_right_model_is_noise(before):
     u = excitation()
     found = validate(MODEL, ABOUT, record(moved(u, before) + 0.7, u))
     (check,) = found.report.records
@@ -88,7 +88,7 @@ def test_the_right_model_leaves_only_noise(before):
     assert check.judged == (1200, 6000)
 
 
-def test_the_state_before_the_record_is_worth_estimating():
+def test_estimating_the_state_before_the_record_reduces_the_error():
     # Motions within an inner loop do not erase the path before them.
     u = excitation(low=40.0, high=60.0)
     y = moved(u, (0.0, 100.0))
@@ -99,7 +99,7 @@ def test_the_state_before_the_record_is_worth_estimating():
     assert np.std((from_rest - y)[1200:]) > 4.0 * NOISE
 
 
-def test_the_run_is_the_record_shifted_by_the_zero():
+def test_the_simulation_is_shifted_by_the_zero():
     u = excitation(2000)
     y = moved(u)
     found = validate(MODEL, ABOUT, record(y, u))
@@ -107,7 +107,7 @@ def test_the_run_is_the_record_shifted_by_the_zero():
     np.testing.assert_allclose(other.runs[0], found.runs[0] + 3.0, atol=1e-12)
 
 
-def test_errors_are_those_of_the_part_that_was_not_estimated_on():
+def test_errors_exclude_the_estimation_part():
     u = excitation()
     y = moved(u)
     spoiled = y.copy()
@@ -195,7 +195,7 @@ def test_errors_by_amplitude_and_rate():
     )
 
 
-def test_the_bound_holds_for_both_records():
+def test_the_bound_contains_the_error_on_both_records():
     u = excitation()
     lines = np.linspace(50.0, 5000.0, 100)
     old = ErrorBound(

@@ -34,7 +34,7 @@ def test_a_periodic_record_gives_the_exact_response():
 
 
 @pytest.mark.parametrize("period", [None, 500])
-def test_the_variance_is_the_scatter_over_draws_of_the_noise(period):
+def test_the_variance_equals_that_over_noise_draws(period):
     samples = 8000
     flat = np.exp(2j * np.pi * np.random.default_rng(2).uniform(size=249))
     tones = np.fft.irfft(np.r_[0.0, flat, 0.0], 500) * np.sqrt(500.0)
@@ -60,7 +60,7 @@ def test_welch_finds_a_resonance():
     assert peak == pytest.approx(4900.0 / (2 * np.pi), abs=1.0 / (2048 * DT))
 
 
-def test_lines_without_input_are_left_out():
+def test_lines_without_input_are_omitted():
     input = np.sin(2 * np.pi * 7 * np.arange(1000) / 100)
     found = spectral_response(input, 2.0 * input, DT, period=100)
     np.testing.assert_allclose(found.frequency, [700.0])

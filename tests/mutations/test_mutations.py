@@ -15,7 +15,7 @@ def test_names_differ():
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.name)
-def test_a_mutation_still_has_its_place(mutation):
+def test_every_mutation_applies_to_the_code(mutation):
     text = (ROOT / "piezojax" / mutation.file).read_text(encoding="utf-8")
     assert text.count(mutation.old) == 1
     assert mutation.new != mutation.old
@@ -25,7 +25,7 @@ def test_a_mutation_still_has_its_place(mutation):
 
 
 @pytest.mark.parametrize("file", MODULES)
-def test_a_sampled_module_and_its_tests_are_there(file):
+def test_sampled_modules_and_their_tests_exist(file):
     assert (ROOT / "piezojax" / file).is_file()
     files = [part for part in MODULES[file] if part.endswith(".py")]
     assert files

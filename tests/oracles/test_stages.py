@@ -55,7 +55,7 @@ def plain(**changes):
 
 
 @pytest.mark.parametrize("kind", ["plays", "drifting"])
-def test_plays_are_the_textbook_loop(kind):
+def test_plays_equal_the_textbook_loop(kind):
     table = forty_stages.KINDS[kind](np.random.default_rng(3))
     path, outputs, before = wandering(), [], 0.0
     positions = [0.0] * len(table)
@@ -73,7 +73,7 @@ def test_plays_are_the_textbook_loop(kind):
     np.testing.assert_allclose(memorised("plays", path, table), outputs, atol=1e-13)
 
 
-def test_slipping_elements_balance_the_input():
+def test_elasto_slide_elements_balance_the_input():
     table = forty_stages.slipping_elements(np.random.default_rng(4))
     path = wandering()
     q, forces = 0.0, np.zeros(len(table) - 1)
@@ -95,7 +95,7 @@ def test_slipping_elements_balance_the_input():
     )
 
 
-def test_the_preisach_operator_counts_its_relays():
+def test_the_preisach_operator_equals_its_relays():
     table = forty_stages.relay_grid(np.random.default_rng(5))
     cells, each = len(table) - 2, 20
     corners = table[1:]
@@ -157,7 +157,7 @@ LOOPS = np.concatenate(
 
 
 @pytest.mark.parametrize("kind", forty_stages.KINDS)
-def test_minor_loops_close_where_they_must(kind):
+def test_minor_loops_close_in_models_with_return_point_memory(kind):
     table = forty_stages.KINDS[kind](np.random.default_rng(7))
     operator = "plays" if kind == "drifting" else kind
     found = memorised(operator, LOOPS, table)
@@ -201,7 +201,7 @@ def test_a_mode_rings_at_its_frequency_and_damping():
     assert decay / omega == pytest.approx(0.02, rel=0.02)
 
 
-def test_modes_of_either_sign_add_up_to_their_transfer_function():
+def test_modes_of_either_sign_have_their_transfer_function():
     modes = np.array([[500.0, 0.05, 1.06], [1400.0, 0.03, -0.06]])
     stage = plain(modes=modes, sensor_lag=2e-4)
     frequency = 900.0
@@ -253,7 +253,7 @@ def test_the_delay_shifts_the_response(delay):
     np.testing.assert_allclose(tips, expected, atol=1e-6)
 
 
-def test_the_amplifier_slews():
+def test_the_amplifier_limits_the_slew_rate():
     stage = plain(slew=1e4)
     tips = stage.respond(np.full(400, 50.0))[1]
     # The ramp ends after 5 ms, and a mode follows a ramp with a lag of 2 zeta / w.
@@ -273,7 +273,7 @@ def test_readings_are_multiples_of_the_converter_with_its_noise():
     )
 
 
-def test_a_step_and_a_whole_record_agree():
+def test_single_steps_equal_a_whole_record():
     one, all_at_once = (forty_stages.stage(8) for _ in range(2))
     voltages, readings = excitation.record(all_at_once, "timid", seed=2)
     first = one.reset(voltages[0], 2)
@@ -289,7 +289,7 @@ def test_voltages_are_limited():
 # The forty, and their records
 
 
-def test_the_forty_have_their_strokes_and_loops():
+def test_the_forty_stages_have_their_strokes_and_loops():
     widths = []
     for number in range(forty_stages.COUNT):
         stage = forty_stages.stage(number)
@@ -326,7 +326,7 @@ def test_records_stay_within_the_limits(kind):
     assert (share > 1e-3) == (kind in ("careful", "timid"))
 
 
-def test_the_audited_stage_is_that_of_the_audit():
+def test_the_audited_stage_has_the_numbers_of_the_audit():
     p = forty_stages.audited().parameters
     assert len(p.table) == 25
     assert (p.modes[0, 0], p.modes[0, 1], p.sensor_lag) == (780.0, 0.02, 1e-3)

@@ -82,7 +82,7 @@ def test_jacobian_against_finite_differences(problem):
     assert np.all(np.abs(np.asarray(slope)).max(axis=0) > 0.0)
 
 
-def test_no_step_follows_a_slope_that_is_not_believed(problem, monkeypatch):
+def test_steps_ignore_slopes_beyond_the_limit(problem, monkeypatch):
     def wild(self, point):
         return jnp.stack([jnp.exp(1e3 * point[0]), jnp.nan * point[1], point[2]])
 
@@ -96,7 +96,7 @@ def test_no_step_follows_a_slope_that_is_not_believed(problem, monkeypatch):
     assert slope[2, 2] > 0.0
 
 
-def test_uncounted_cells_do_not_move_the_fit(problem):
+def test_uncounted_cells_do_not_change_the_fit(problem):
     counts = problem.counts.at[0].set(0.0)
     half = eqx.tree_at(lambda p: p.counts, problem, counts)
     spoilt = eqx.tree_at(lambda p: p.paper, half, half.paper.at[0].multiply(7.0))
@@ -107,7 +107,7 @@ def test_uncounted_cells_do_not_move_the_fit(problem):
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_halves_are_disjoint_complete_and_alike(name):
+def test_halves_are_disjoint_complete_and_similar(name):
     experiment = EXPERIMENTS[name]
     halves = experiment.cells()
     assert tuple(halves) == HALVES
@@ -149,7 +149,7 @@ def every_cell(name):
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_number_of_every_loop_may_be_doubted(name):
+def test_every_number_of_every_loop_is_a_candidate(name):
     free = {"error_weight", "autoregressive", "rest_input", "rest_output"}
     free |= {"correction", "anti_windup"}
     cells = every_cell(name)
@@ -190,7 +190,7 @@ def test_the_number_of_candidates():
         ("K_e", "inversion", {}),
     ],
 )
-def test_only_the_doubted_number_is_replaced(doubt, column, expected):
+def test_only_the_suspect_number_is_replaced(doubt, column, expected):
     """``expected``: the leaves that change, in the lane of one table or in both."""
     cells = [printed("ch5", t)["SIN50", column] for t in ("5-3", "5-5")]
     made = lanes.lanes_of(cells, short=True)[0]
@@ -208,7 +208,7 @@ def test_only_the_doubted_number_is_replaced(doubt, column, expected):
     }
 
 
-def test_sw_of_another_size_is_followed_by_all_that_follow_it():
+def test_a_scaled_sw_is_the_reference_of_all_its_cells():
     cells = [
         printed(chapter, table)[row, column]
         for row in ("SW50", "SIN50")
@@ -242,7 +242,7 @@ def test_sw_of_another_size_is_followed_by_all_that_follow_it():
         )
 
 
-def test_a_doubted_reference_model_is_what_the_error_is_held_against():
+def test_errors_are_relative_to_the_scaled_reference_model():
     cell = printed("ch4", "4-5")["SIN50", "model_reference"]
     made = lanes.lanes_of([cell], short=True)[0]
     other = made.scaled(dict.fromkeys(CANDIDATES, 1.0) | {"zeta, 4.5.4.3": 2.0})
@@ -254,7 +254,7 @@ def test_a_doubted_reference_model_is_what_the_error_is_held_against():
     assert not np.allclose(made.target()[:, 0], wanted, atol=1e-3)
 
 
-def test_the_sensor_shakes_the_stage_and_is_not_in_the_error(problem):
+def test_sensor_noise_moves_the_stage_and_is_not_in_the_error(problem):
     values = {n: float(v) for n, v in problem.space.named(problem.start).items()}
     errors = eqx.filter_jit(problem.errors)
     quiet, loud = (
@@ -276,7 +276,7 @@ def test_the_sensor_shakes_the_stage_and_is_not_in_the_error(problem):
     assert 0.0 < abs(float(loud[0] - quiet[0])) < 0.03
 
 
-def test_what_is_in_doubt_is_not_pulled_towards_print(problem, monkeypatch):
+def test_suspect_numbers_have_no_penalty(problem, monkeypatch):
     one = eqx.tree_at(lambda p: p.counts, problem, jnp.ones(1))
     moved = one.start.at[one.stage + 2].add(-0.2).at[0].add(0.1)
     monkeypatch.setattr(Problem, "log_ratios", lambda *_: jnp.zeros(1))
@@ -295,7 +295,7 @@ def test_geometric_mean_ratio_counts_both_directions():
     assert geomean(np.log([1.0, 4.0])) == pytest.approx(2.0)
 
 
-def test_all_held_out_cells_of_a_half_are_judged_together():
+def test_the_held_out_ratio_covers_all_cells_of_a_half():
     def swap(half, ratios):
         cells = [Cell("5-3", f"row {i}", "pid", "um", 2.0, 2.0 * r) for i, r in ratios]
         return HalfFit(half, 1.0, {}, (), (), [], cells, [])

@@ -58,7 +58,7 @@ def test_a_few_printed_numbers(table, row, column, paper):
     assert printed("ch3", table)[row, column].paper == paper
 
 
-def test_the_truth_is_the_exact_hysteresis_and_unit_dynamics():
+def test_the_stage_is_the_exact_hysteresis_with_unit_dc_gain():
     voltage = 35.0 * (1.0 - np.cos(np.linspace(0.0, 30.0, 500)))
     parameters = (0.0064, 0.1144, -0.0305)
     inner = hysteresis.exact(voltage, *parameters)
@@ -77,7 +77,7 @@ def cells():
 
 
 @pytest.mark.slow
-def test_no_error_is_below_the_noise_it_holds(cells):
+def test_no_error_is_below_the_sensor_noise(cells):
     assert len(cells) == 44
     assert all(cell.sim > 0.98 * p753.NOISE_RMS for cell in cells.values())
 
@@ -92,7 +92,7 @@ def test_the_earlier_model_is_worse_as_printed(cells):
 
 
 @pytest.mark.slow
-def test_the_trapezoid_is_as_good_as_the_truth_far_beyond_its_record(cells):
+def test_the_errors_of_the_trapezoid_are_those_of_the_noise(cells):
     for row in ROWS:
         assert cells["3-6", row, "trapezoid"].sim < 1.1 * p753.NOISE_RMS
         again = replace(cells["3-6", row, "trapezoid"], table="3-7")
@@ -100,7 +100,7 @@ def test_the_trapezoid_is_as_good_as_the_truth_far_beyond_its_record(cells):
 
 
 @pytest.mark.slow
-def test_what_is_not_reproduced_shows(cells):
+def test_the_printed_errors_are_not_reproduced(cells):
     summary = summarise(list(cells.values()))
     for table, columns in chapter3.TABLES.items():
         assert set(summary[table].columns) == set(columns)

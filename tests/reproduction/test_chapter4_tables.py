@@ -50,7 +50,7 @@ def test_a_few_printed_numbers(table, row, column, paper):
 # What is measured
 
 
-def test_figures_of_a_closed_form_step():
+def test_figures_of_a_step_equal_the_closed_form():
     rate, w, zeta = 50_000.0, 1_000.0, 0.5
     time = np.arange(2_000) / rate
     ratio = np.sqrt(1.0 - zeta**2)
@@ -73,7 +73,7 @@ def test_a_response_outside_the_band_never_settles():
     assert chapter4.step_figures(np.full(9, 5.05), 1e3).settling == 0.0
 
 
-def test_chatter_is_that_of_the_second_half():
+def test_chatter_is_computed_over_the_second_half():
     found = chapter4.chatter([90.0, -90.0, 3.0, 7.0, 4.0, 3.0])
     assert found == (4.0, 5.0)
 
@@ -87,7 +87,7 @@ def steps():
     return {(cell.row, cell.column): cell for cell in cells}
 
 
-def test_every_number_of_the_figures_is_there(steps):
+def test_every_number_of_the_figures_is_present(steps):
     assert list(steps) == [key for table in FIGURES for key in printed("ch4", table)]
 
 
@@ -116,7 +116,7 @@ def test_model_reference_agrees_with_print(tables):
 
 
 @pytest.mark.slow
-def test_every_cell_whose_gains_are_printed_is_there(tables):
+def test_every_cell_with_printed_gains_is_present(tables):
     for table, cells in tables.items():
         columns = chapter4.COLUMNS[table]
         places = [(cell.row, cell.column) for cell in cells]
@@ -126,7 +126,7 @@ def test_every_cell_whose_gains_are_printed_is_there(tables):
 
 
 @pytest.mark.slow
-def test_a_cell_against_a_loop_written_from_the_equations(tables):
+def test_a_cell_equals_a_loop_from_the_equations(tables):
     poles = (1.6531, -0.6758)
     plant = {
         "hysteresis": HYSTERESIS,

@@ -31,7 +31,7 @@ def driven(tables):
 
 
 @pytest.mark.slow
-def test_every_cell_is_there(tables):
+def test_every_cell_is_present(tables):
     for table, cells in tables.items():
         places = [(c.row, c.column) for c in cells]
         assert places == [(row, column) for row in ROWS for column in p558.OUTPUTS]
@@ -40,7 +40,7 @@ def test_every_cell_is_there(tables):
 
 
 @pytest.mark.slow
-def test_the_paper_s_numbers_are_those_of_the_printed_tables(tables):
+def test_the_data_equal_the_printed_tables(tables):
     if not PRINTED.is_file():
         pytest.skip(f"{PRINTED} is not here")
     with PRINTED.open(encoding="utf-8") as file:
@@ -64,11 +64,11 @@ def test_the_prior_predicts_the_driven_axis_better(driven, row):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", ["1Hz_ch1", "1Hz_ch2", "5Hz_ch2"])
-def test_the_level_of_the_driven_axes_is_that_of_print(driven, row):
+def test_the_level_of_the_driven_axes_agrees_with_print(driven, row):
     assert 0.5 < driven["6-7"][row].ratio < 2.0
 
 
-def test_the_stand_in_is_the_printed_model_behind_a_hysteresis():
+def test_the_stage_is_the_printed_model_behind_a_hysteresis():
     stage = p558.channels("6")[1]
     command = chapter6._sine(1, 5)[:300]
     record = chapter6._record(stage, 1, command)

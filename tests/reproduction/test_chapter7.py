@@ -42,14 +42,14 @@ def driven(cell, controller):
     return [cell[row, f"{controller}:{row.split('_')[1]}"] for row in ROWS]
 
 
-def test_every_cell_is_there(table):
+def test_every_cell_is_present(table):
     places = [(c.row, c.column) for c in table]
     columns = [f"{name}:{axis}" for name in OPTIONS for axis in p558.OUTPUTS]
     assert sorted(places) == sorted((row, column) for row in ROWS for column in columns)
     assert all(math.isfinite(c.sim) and c.sim > 0 for c in table)
 
 
-def test_the_paper_s_numbers_are_those_of_the_printed_tables(table):
+def test_the_data_equal_the_printed_tables(table):
     if not PRINTED.is_file():
         pytest.skip(f"{PRINTED} is not here")
     with PRINTED.open(encoding="utf-8") as file:
@@ -61,17 +61,17 @@ def test_the_paper_s_numbers_are_those_of_the_printed_tables(table):
 # The bars
 
 
-def test_the_pid_follows_as_printed(groups):
+def test_the_errors_of_the_pid_agree_with_print(groups):
     assert groups["pid driven"]["cells"] == 9
     assert groups["pid driven"]["geomean_ratio"] <= 1.15
 
 
-def test_the_sliding_mode_control_follows_as_printed(groups):
+def test_the_errors_of_the_sliding_mode_control_agree_with_print(groups):
     assert groups["pid_smc driven"]["cells"] == 9
     assert groups["pid_smc driven"]["geomean_ratio"] <= 1.6
 
 
-def test_the_sliding_mode_control_follows_better_nine_times_of_nine(cell):
+def test_the_sliding_mode_control_is_better_in_nine_cells_of_nine(cell):
     pairs = zip(driven(cell, "pid_smc"), driven(cell, "pid"), strict=True)
     for smc, pid in pairs:
         assert smc.paper < pid.paper
@@ -82,7 +82,7 @@ def test_the_sliding_mode_control_follows_better_nine_times_of_nine(cell):
 
 
 @pytest.mark.parametrize("controller", OPTIONS)
-def test_cells_are_those_of_a_loop_written_from_the_equations(cell, controller):
+def test_cells_equal_a_loop_from_the_equations(cell, controller):
     runs = list(three_dof.references())
     chosen = ["drive_Z_5Hz", "drive_Rx_10Hz", "drive_Ry_1Hz"]
     targets = oracle.table_sines()[:, [0, 1, 2], [1, 2, 0]]
@@ -113,7 +113,7 @@ def test_transposed_couplings_agree_better_than_those_as_printed(cell):
     assert np.mean(logs) < 0.5 * np.mean(exchanged)
 
 
-def test_the_printed_table_is_whole_on_a_narrow_terminal(table):
+def test_the_table_is_complete_on_a_narrow_terminal(table):
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(reproduction_table("7-4", table, summarise(table)["7-4"]))
     text = console.export_text()
@@ -143,7 +143,7 @@ def test_the_combined_experiment():
         assert 1.0 < found[axis, "pid_smc"].ratio < 2.5
 
 
-def test_what_the_axes_follow():
+def test_references_of_the_axes():
     runs = three_dof.references()
     np.testing.assert_allclose(
         runs["drive_Rx_5Hz"], oracle.table_sines()[:-1, 1, 1], rtol=0, atol=1e-12

@@ -33,7 +33,7 @@ def driven(cell, controller):
     return [cell[row, f"{controller}:{row.split('_')[1]}"] for row in ROWS]
 
 
-def test_every_cell_is_there(tables):
+def test_every_cell_is_present(tables):
     for table, cells in tables.items():
         places = [(c.row, c.column) for c in cells]
         columns = [f"{CONTROLLERS[table]}:{axis}" for axis in p558.OUTPUTS]
@@ -41,7 +41,7 @@ def test_every_cell_is_there(tables):
         assert all(math.isfinite(c.sim) and c.sim > 0 for c in cells)
 
 
-def test_the_paper_s_numbers_are_those_of_the_printed_tables(tables):
+def test_the_data_equal_the_printed_tables(tables):
     if not PRINTED.is_file():
         pytest.skip(f"{PRINTED} is not here")
     with PRINTED.open(encoding="utf-8") as file:
@@ -53,7 +53,7 @@ def test_the_paper_s_numbers_are_those_of_the_printed_tables(tables):
     assert {(c.table, c.row, c.column, c.unit, c.paper) for c in cells} == printed
 
 
-def test_the_observer_makes_it_better_nine_times_of_nine(cell):
+def test_the_observer_reduces_the_error_in_nine_cells_of_nine(cell):
     pairs = zip(driven(cell, "dob_smc"), driven(cell, "nominal_smc"), strict=True)
     for observed, nominal in pairs:
         assert observed.paper < nominal.paper
@@ -71,7 +71,7 @@ def test_the_levels_are_lower_than_print(tables):
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS.values())
-def test_cells_are_those_of_a_loop_written_from_the_equations(cell, controller):
+def test_cells_equal_a_loop_from_the_equations(cell, controller):
     runs = list(three_dof.references())
     chosen = ["drive_Z_5Hz", "drive_Rx_10Hz", "drive_Ry_1Hz"]
     targets = oracle.table_sines()[:, [0, 1, 2], [1, 2, 0]]

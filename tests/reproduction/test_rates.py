@@ -12,20 +12,20 @@ def errors():
     return errors_by_rate(("SIN10", "SIN50"))
 
 
-def test_every_printed_set_of_gains_is_there(errors):
+def test_every_printed_set_of_gains_is_present(errors):
     found = {(e.column, e.rate) for e in errors}
     assert found == {(c, rate) for c, rates in RATES.items() for rate in rates}
     assert sorted({e.rate for e in errors}) == [1000, 2000, 5000, 10000, 20000]
 
 
-def test_the_shared_cells_are_those_of_the_tables(errors):
+def test_the_shared_cells_equal_those_of_the_tables(errors):
     cells = {(c.row, c.column): c.sim for c in chapter4.cells("4-5")}
     for each in errors:
         if each.rate == 20_000:
             assert each.error == pytest.approx(cells[each.row, each.column], rel=1e-6)
 
 
-def test_model_reference_is_the_better_one_the_more_so_at_low_rates(errors):
+def test_the_advantage_of_model_reference_grows_towards_low_rates(errors):
     error = {(e.column, e.rate, e.row): e.error for e in errors}
     for row in ("SIN10", "SIN50"):
         gains = [
@@ -36,7 +36,7 @@ def test_model_reference_is_the_better_one_the_more_so_at_low_rates(errors):
         assert gains[0] > 1.0
 
 
-def test_file_and_picture_hold_every_error(errors):
+def test_file_and_picture_contain_every_error(errors):
     lines = list(csv.DictReader(rates_as_csv(errors).splitlines()))
     assert len(lines) == len(errors)
     assert float(lines[0]["sim_um"]) == pytest.approx(errors[0].error, rel=1e-5)

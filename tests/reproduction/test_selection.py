@@ -59,7 +59,7 @@ def analytic(monkeypatch):
     monkeypatch.setattr(Problem, "errors", errors)
 
 
-def test_the_wrong_print_is_found_two_decades_off():
+def test_a_misprint_of_two_decades_is_found():
     choice = select(made_up({"print 3": jnp.asarray(0.03)}, 0.05))
     assert choice.suspects == ("print 3",)
     first, last = choice.rounds
@@ -71,7 +71,7 @@ def test_the_wrong_print_is_found_two_decades_off():
 
 
 @pytest.mark.parametrize("scatter", [0.0, 0.05])
-def test_nothing_is_doubted_where_nothing_is_wrong(scatter):
+def test_without_a_misprint_nothing_is_selected(scatter):
     problem = made_up({}, scatter)
     choice = select(problem)
     assert choice.suspects == ()
@@ -79,7 +79,7 @@ def test_nothing_is_doubted_where_nothing_is_wrong(scatter):
     np.testing.assert_array_equal(choice.point[STAGE:], problem.start[STAGE:])
 
 
-def test_no_more_than_the_most_are_taken(monkeypatch):
+def test_at_most_the_largest_number_is_selected(monkeypatch):
     monkeypatch.setattr(selection, "MAX_SUSPECTS", 1)
     wrong = {"print 1": jnp.asarray(10.0), "print 3": jnp.asarray(0.03)}
     choice = select(made_up(wrong, 0.0))
@@ -87,7 +87,7 @@ def test_no_more_than_the_most_are_taken(monkeypatch):
     assert choice.suspects[0] in wrong
 
 
-def test_a_cell_is_predicted_without_itself():
+def test_cross_validation_excludes_the_predicted_cell():
     problem = made_up({}, 0.0)
     free, begin = range(STAGE), [problem.start]
     assert cross_validated(problem, free, begin) < 1.05

@@ -42,7 +42,7 @@ def cell(tables):
 
 
 @pytest.mark.slow
-def test_every_cell_is_there(tables):
+def test_every_cell_is_present(tables):
     for name, cells in tables.items():
         places = [(c.row, c.column) for c in cells]
         assert places == [(row, column) for row in THESIS for column in COLUMNS]
@@ -52,7 +52,7 @@ def test_every_cell_is_there(tables):
 
 
 @pytest.mark.slow
-def test_the_paper_s_numbers_are_those_of_the_printed_tables(cell):
+def test_the_data_equal_the_printed_tables(cell):
     if not PRINTED.is_file():
         pytest.skip(f"{PRINTED} is not here; the numbers below are checked anyway")
     with PRINTED.open(encoding="utf-8") as file:
@@ -106,7 +106,7 @@ def oracle_reference(name, samples):
     ids="-".join,
 )
 @pytest.mark.slow
-def test_cells_against_a_loop_written_from_the_equations(cell, place):
+def test_cells_equal_a_loop_from_the_equations(cell, place):
     table, row, column = place
     reference = oracle_reference(row, round(2.0 * window(row) * published.RATE))
     kind = COLUMNS[column]
@@ -137,7 +137,7 @@ def test_cells_against_a_loop_written_from_the_equations(cell, place):
         ("SW50", 1.2),
     ],
 )
-def test_errors_count_over_whole_repeats_of_at_least_a_second(name, seconds):
+def test_errors_count_over_whole_periods_of_at_least_a_second(name, seconds):
     assert window(name) == pytest.approx(seconds, rel=1e-12)
 
 
@@ -171,7 +171,7 @@ def cell_of(table, column, paper, sim):
     return Cell(table, "SIN1", column, "um", paper, sim)
 
 
-def test_ratios_of_a_made_up_table():
+def test_ratios_of_a_synthetic_table():
     cells = [
         cell_of("9-1", "pid", 1.0, 2.0),
         cell_of("9-1", "pid", 1.0, 0.5),
@@ -206,7 +206,7 @@ def test_summary_has_the_agreed_keys(summary, tables):
 
 
 @pytest.mark.slow
-def test_csv_has_the_agreed_header_and_loses_no_digit_that_counts(tables):
+def test_csv_has_the_agreed_header_and_enough_digits(tables):
     cells = tables["5-3"]
     lines = as_csv(cells).splitlines()
     assert lines[0] == "table,row,column,unit,paper,sim"

@@ -101,7 +101,7 @@ def test_every_start_finds_the_minimum(solved):
     assert np.all(views.loss[-1] < 1e-7)
 
 
-def test_no_iterate_leaves_the_cube(solved):
+def test_iterates_stay_in_the_cube(solved):
     _, _, views = solved
     assert np.all((views.unit >= 0.0) & (views.unit <= 1.0))
 
@@ -110,13 +110,13 @@ def losses_of(problem, views):
     return np.stack([jax.vmap(problem.loss)(units) for units in views.unit[:30]])
 
 
-def test_the_loss_shown_is_never_better_than_the_point_shown(solved):
+def test_the_reported_loss_is_not_below_that_of_the_reported_point(solved):
     _, problem, views = solved
     expected = losses_of(problem, views)
     assert np.all(views.loss[:30] >= expected * (1.0 - 1e-9) - 1e-12)
 
 
-def test_the_loss_shown_is_that_of_the_point_shown(solved):
+def test_the_reported_loss_is_that_of_the_reported_point(solved):
     _, problem, views = solved
     expected = losses_of(problem, views)
     np.testing.assert_allclose(views.loss[:30], expected, rtol=1e-6, atol=1e-12)
@@ -149,7 +149,7 @@ def test_lbfgsb_reaches_a_minimum_on_a_bound():
 
 
 @pytest.mark.parametrize("method", ["bfgs", "levenberg_marquardt"])
-def test_the_others_come_close_to_a_minimum_on_a_bound(method):
+def test_the_other_methods_approach_a_minimum_on_a_bound(method):
     views = run(method, ON_A_BOUND, starts_of(ON_A_BOUND))
     assert np.all((views.unit >= 0.0) & (views.unit <= 1.0))
     assert np.all(views.unit[-1][:, 0] < 1e-2)
@@ -212,7 +212,7 @@ def wavy(unit):
 
 
 @pytest.mark.parametrize("forward", [True, False])
-def test_gradient_is_the_gradient(forward):
+def test_the_safe_gradient_equals_the_gradient(forward):
     guarded = with_finite_gradient(wavy, forward=forward)
     for unit in np.random.default_rng(0).uniform(0.0, 1.0, (5, 4)):
         value, slope = jax.value_and_grad(guarded)(jnp.asarray(unit))
@@ -220,7 +220,7 @@ def test_gradient_is_the_gradient(forward):
         np.testing.assert_allclose(slope, jax.grad(wavy)(unit), rtol=1e-12)
 
 
-def test_forward_and_reverse_agree_under_vmap_and_chain_rule():
+def test_forward_and_reverse_mode_agree_under_vmap_and_chain_rule():
     units = jnp.asarray(np.random.default_rng(1).uniform(0.0, 1.0, (6, 3)))
     expected = jax.vmap(jax.grad(lambda u: jnp.exp(wavy(u**2))))(units)
     for forward in (True, False):
@@ -230,7 +230,7 @@ def test_forward_and_reverse_agree_under_vmap_and_chain_rule():
 
 
 @pytest.mark.parametrize("forward", [True, False])
-def test_a_diverged_run_has_no_slope(forward):
+def test_a_diverged_run_has_zero_gradient(forward):
     loss = diverging_beyond(0.5, PROBLEMS["quadratic"])
     guarded = jax.value_and_grad(with_finite_gradient(loss, forward=forward))
     value, slope = guarded(jnp.array([0.6, 0.2, 0.2]))
@@ -244,7 +244,7 @@ def test_a_diverged_run_has_no_slope(forward):
 
 
 @pytest.mark.parametrize("forward", [True, False])
-def test_an_infinite_slope_is_no_slope(forward):
+def test_an_infinite_gradient_is_replaced(forward):
     guarded = with_finite_gradient(lambda u: jnp.sqrt(u[0]) + u[1], forward=forward)
     value, slope = jax.value_and_grad(guarded)(jnp.array([0.0, 2.0]))
     assert value == 2.0
@@ -281,7 +281,7 @@ def _fit_in_unit_box(residuals, unit, steps):
 @pytest.mark.parametrize(
     ("residuals", "unit"), [(_rosenbrock, (0.2, 0.8)), (_quadratic, (0.9, 0.1, 0.2))]
 )
-def test_gauss_newton_takes_the_steps_of_optimistix(residuals, unit):
+def test_gauss_newton_equals_optimistix(residuals, unit):
     ours, done = _fit_in_unit_box(residuals, unit, 60)
     optimistix = METHODS["levenberg_marquardt"](residuals, residuals, TOLERANCE)
     theirs = _views(optimistix, unit, 60)
@@ -291,7 +291,7 @@ def test_gauss_newton_takes_the_steps_of_optimistix(residuals, unit):
     assert ours[-1, -1] < 1e-10
 
 
-def test_descents_side_by_side_take_the_steps_of_each_alone():
+def test_simultaneous_descents_equal_separate_descents():
     """Of three starts, two in a program; the second one ends before the others."""
     starts = np.array([[0.9, 0.1, 0.2], [0.3, 0.7, 0.55], [0.2, 0.2, 0.9]])
     program = jax.jit(lambda points: normal_equations(linearised(_quadratic), points))
@@ -305,7 +305,7 @@ def test_descents_side_by_side_take_the_steps_of_each_alone():
     assert [standing.evaluations for standing in together[:3]] == [3, 3, 2]
 
 
-def test_a_parameter_that_does_nothing_stays_where_it_is():
+def test_a_parameter_without_effect_does_not_move():
     blind = lambda unit: _quadratic(unit.at[0].set(0.3))  # noqa: E731
     found, done = _fit_in_unit_box(blind, (0.9, 0.1, 0.2), 80)
     assert done
@@ -319,7 +319,7 @@ def test_a_start_without_finite_slopes_is_done():
     np.testing.assert_allclose(found[-1][:2], (0.2, 0.3))
 
 
-def test_without_bounds_the_step_of_a_line_is_the_minimum():
+def test_a_linear_problem_without_bounds_takes_one_step():
     """Linear residuals, almost no damping: one step leads to lstsq's solution."""
     matrix = np.random.default_rng(2).standard_normal((9, 3))
     target = 50.0 * np.random.default_rng(3).standard_normal(9)

@@ -33,7 +33,7 @@ def chunks(out):
 
 
 @pytest.mark.slow
-def test_a_sweep_killed_again_and_again_loses_nothing(write, tmp_path):
+def test_a_repeatedly_killed_sweep_loses_nothing(write, tmp_path):
     path, out = write(MANY), tmp_path / "killed"
     whole = pj.sweep(path)
     assert whole is not None
@@ -57,7 +57,7 @@ def test_a_sweep_killed_again_and_again_loses_nothing(write, tmp_path):
 
 
 @pytest.mark.slow
-def test_workers_of_a_cluster_give_the_same_and_may_be_killed(write, tmp_path):
+def test_workers_of_a_cluster_give_the_same_result_when_killed(write, tmp_path):
     path = write(MANY | {"samples": 700})
     whole = pj.sweep(path)
     assert whole is not None

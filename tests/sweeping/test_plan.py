@@ -51,7 +51,7 @@ def test_samples_are_spread_on_the_scale_of_each_parameter(case_of, method):
         assert sorted(np.floor(64.0 * share).astype(int)) == list(range(64))
 
 
-def test_sobol_points_fill_every_box_alike(case_of):
+def test_sobol_points_fill_every_box_equally(case_of):
     table = {"method": "sobol", "samples": 64, "parameters": BOX}
     values = np.log(Plan(case_of(table)).values(0, 64))
     low = np.log([bound["lower"] for bound in BOX.values()])
@@ -69,13 +69,13 @@ def test_points_depend_on_study_and_seed_alone(write):
     assert not np.array_equal(first, other)
 
 
-def test_samples_of_the_own_box_need_no_table(write):
+def test_samples_of_the_tuning_box_need_no_table(write):
     plan = Plan(read_swept(write(None), samples=10))
     assert (plan.method, plan.points) == ("sobol", 10)
     assert [axis.path for axis in plan.axes] == list(PARAMETERS)
 
 
-def test_what_a_table_leaves_out_is_declared(case_of):
+def test_omitted_entries_come_from_the_declarations(case_of):
     known = dict(declarations(control.PID))["integral"]
     tables = {"controller.integral": {"count": 3}, LAG: {"values": [1e-3, 2e-3]}}
     integral, lag = Plan(case_of({"parameters": tables})).axes
@@ -85,7 +85,7 @@ def test_what_a_table_leaves_out_is_declared(case_of):
     assert lag.range == Range(1e-3, 2e-3, unit="s")
 
 
-def test_the_own_box_keeps_bounds_scale_and_unit(write):
+def test_the_tuning_box_keeps_bounds_scale_and_unit(write):
     axes = Plan(read_swept(write(None), samples=10)).axes
     assert {axis.path: axis.range for axis in axes} == {
         "controller.proportional": Range(0.1, 5.0, "log", unit="V/um"),
@@ -93,7 +93,7 @@ def test_the_own_box_keeps_bounds_scale_and_unit(write):
     }
 
 
-def test_chunks_and_shards_share_out_every_point_once(case_of):
+def test_chunks_and_shards_contain_every_point_once(case_of):
     plan = Plan(case_of({"method": "sobol", "samples": 1000}))
     spans = [plan.span(chunk) for chunk in range(plan.chunks)]
     assert plan.chunks > 4
@@ -176,7 +176,7 @@ def test_bad_tables_of_samples_are_refused(case_of, table, message):
         Plan(case_of(table))
 
 
-def test_without_a_table_the_error_says_what_to_add(case_of):
+def test_without_a_table_the_error_names_the_missing_keys(case_of):
     with pytest.raises(ValueError, match=r"no table \[sweep\]: add .* or give --sampl"):
         Plan(case_of(None))
 

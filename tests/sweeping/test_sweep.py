@@ -49,7 +49,7 @@ def failed(result, message):
     assert message in result.stderr
 
 
-def test_grid_is_what_evaluate_gives_point_by_point(case_of):
+def test_a_grid_equals_single_evaluations(case_of):
     case = case_of(GRID | {"metrics": ALL})
     found = pj.sweep(case)
     assert found is not None
@@ -74,7 +74,7 @@ def test_grid_is_what_evaluate_gives_point_by_point(case_of):
                 )
 
 
-def test_trajectories_are_every_nth_sample(case_of):
+def test_trajectories_have_every_nth_sample(case_of):
     every = 7
     case = case_of(CHUNKED | {"every": every}, holdout_draws=2)
     found = pj.sweep(case)
@@ -125,7 +125,7 @@ def test_samples_carry_their_parameters(case_of):
 
 
 @pytest.mark.slow
-def test_sensitivity_is_that_of_the_stability_report(case_of):
+def test_sensitivity_equals_that_of_the_stability_report(case_of):
     table = {
         "metrics": ["sensitivity_peak"],
         "plants": ["p753", "p753_chapter4"],
@@ -200,7 +200,7 @@ def test_several_axes_have_a_dimension(case_of, tmp_path):
         Simulator(case_of(table | {"metrics": ["sensitivity_peak"]}, **AXES))
 
 
-def test_shards_merge_into_the_whole_bit_for_bit(case_of, tmp_path):
+def test_merged_shards_equal_the_whole_sweep_bit_for_bit(case_of, tmp_path):
     case = case_of(SAMPLED | {"chunk": 1})  # rounded up to a block of 64
     run_sweep(case, tmp_path / "whole")
     done = [
@@ -215,7 +215,7 @@ def test_shards_merge_into_the_whole_bit_for_bit(case_of, tmp_path):
     assert pj.sweep(case, out=tmp_path / "other", shard=(2, 2)) is None
 
 
-def test_damaged_and_missing_chunks_are_done_again(case_of, tmp_path):
+def test_damaged_and_missing_chunks_are_simulated_again(case_of, tmp_path):
     case = case_of(SAMPLED)
     run_sweep(case, tmp_path / "a")
     whole = opened(tmp_path / "a")
@@ -238,7 +238,7 @@ def test_damaged_and_missing_chunks_are_done_again(case_of, tmp_path):
     assert_same_bits(whole, opened(tmp_path / "a"))
 
 
-def test_what_is_half_written_is_no_chunk(case_of, tmp_path):
+def test_a_partially_written_chunk_is_ignored(case_of, tmp_path):
     case = case_of(SAMPLED)
     (tmp_path / "a" / "chunks").mkdir(parents=True)
     (tmp_path / "a" / "chunks" / ".00000000.chunk.x").write_bytes(b"half")
@@ -246,7 +246,7 @@ def test_what_is_half_written_is_no_chunk(case_of, tmp_path):
     assert run_sweep(case, tmp_path / "a").simulated == 3
 
 
-def test_an_interrupted_sweep_goes_on(case_of, tmp_path):
+def test_an_interrupted_sweep_continues(case_of, tmp_path):
     case = case_of(SAMPLED)
     run_sweep(case, tmp_path / "whole")
 
@@ -294,7 +294,7 @@ def test_foreign_folders_and_chunks_are_refused(case_of, write, tmp_path):
         run_sweep(case, tmp_path / "c")
 
 
-def test_one_program_runs_every_chunk(case_of):
+def test_all_chunks_use_one_compiled_program(case_of):
     simulator = Simulator(case_of(SAMPLED))
     device = jax.devices()[0]
     simulator.compile(device)

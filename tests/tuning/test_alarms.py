@@ -123,7 +123,7 @@ def test_safe_gains_raise_no_alarm():
         ),
     ],
 )
-def test_a_cause_and_a_next_step(changes, message):
+def test_every_alarm_has_a_cause_and_a_next_step(changes, message):
     (alarm,) = alarms(changed(**changes))
     assert message in alarm
 
@@ -142,7 +142,7 @@ def test_a_cause_and_a_next_step(changes, message):
         ),
     ],
 )
-def test_exact_margins(stability, message):
+def test_exact_margins_beyond_a_limit_raise_an_alarm(stability, message):
     found = alarms(stability=stability)
     assert message in found[0]
     # Without limits on margins only an unstable loop is an alarm.
@@ -151,7 +151,7 @@ def test_exact_margins(stability, message):
     assert bool(unlimited) == ("unstable" in message)
 
 
-def test_limits_at_least_have_their_own_side():
+def test_lower_limits_are_violated_from_below():
     exact = report_of(integrator(0.2)).delay_margin_samples
     for factor, expected in ((0.995, 0), (1.005, 0), (1.03, 1)):
         limits = {"delay_margin": factor * exact}
@@ -172,7 +172,7 @@ def test_a_run_is_saturated_from_a_share_of_its_samples():
     assert alarms(changed(holdout=scores(saturated=89.9))) == []
 
 
-def test_each_branch_counts():
+def test_each_branch_is_checked():
     branches = {
         "ascending": report_of(integrator(2.0)),
         "descending": report_of(integrator(0.45)),
@@ -184,7 +184,7 @@ def test_each_branch_counts():
     assert "on the nominal plant on the descending branch" in second
 
 
-def test_exact_margins_replace_those_of_the_nominal_plant_alone():
+def test_exact_margins_replace_those_of_the_nominal_plant_only():
     def missed(*values):
         figure = outcome("sensitivity_peak", values, 2.0)
         return changed(constraints={"sensitivity_peak": figure})
@@ -196,7 +196,7 @@ def test_exact_margins_replace_those_of_the_nominal_plant_alone():
     assert any("2.1 on 1 of 1 tuned" in a for a in alarms(missed(2.1), unknown))
 
 
-def test_the_cut_at_the_displacements_counts_on_several_axes():
+def test_the_cut_at_the_displacements_is_checked_on_several_axes():
     """Two linear loops stand for the cuts: only the one behind exceeds the limit."""
     A, B, C = np.zeros((1, 1)), np.array([[1.0, 0.0]]), np.array([[0.1], [0.9]])
     before = LinearAxes(A, B, C, 1e-4)
@@ -209,19 +209,19 @@ def test_the_cut_at_the_displacements_counts_on_several_axes():
     assert alarm.startswith(f"sensitivity_peak is {peaks[1]:.3g} on the nominal plant,")
 
 
-def test_a_margin_that_is_not_a_number_is_an_alarm():
+def test_a_margin_of_nan_is_an_alarm():
     report = replace(report_of(integrator(0.1)), sensitivity_peak=math.nan)
     stability = StabilityReports(reports={"after": {"descending": report}})
     (alarm,) = alarms(stability=stability)
     assert alarm.startswith("sensitivity_peak is nan on the nominal plant on the desc")
 
 
-def test_alarms_of_a_fit_are_those_of_the_gains():
+def test_alarms_of_a_fit_are_alarms_of_the_gains():
     missed = ["the model misses a mode at 780 Hz: add it"]
     assert alarms(model=missed) == missed
 
 
-def test_json_holds_null_for_what_is_no_number(tmp_path):
+def test_json_contains_null_for_nan(tmp_path):
     content = {"a": [1.0, math.nan], "b": (math.inf,), "c": {"d": "x", "e": None}}
     write_json(tmp_path / "a.json", content)
     assert json.loads((tmp_path / "a.json").read_text()) == {

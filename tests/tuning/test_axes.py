@@ -63,7 +63,7 @@ def outcome(tmp_path_factory):
     return pj.tune(written(tmp_path_factory.mktemp("axes"), STUDY))
 
 
-def test_each_axis_under_each_reference_is_a_trace(tmp_path):
+def test_each_axis_with_each_reference_is_a_trace(tmp_path):
     found = traces_of(load(written(tmp_path, STUDY)))
     assert [trace.name for trace in found] == [
         "Z:SIN5", "Z:SIN5 (Rx)", "Z:SIN5 (Ry)",
@@ -75,7 +75,7 @@ def test_each_axis_under_each_reference_is_a_trace(tmp_path):
     assert [trace.unit for trace in found[:3]] == ["um", "urad", "urad"]
 
 
-def test_driven_axes_are_scored_apart_from_those_at_rest(outcome):
+def test_driven_axes_are_evaluated_separately(outcome):
     result = outcome.result
     driven = ["Z:SIN5", "Z:SIN5 Rx:SIN10 (Z)", "Z:SIN5 Rx:SIN10 (Rx)"]
     assert list(result.holdout.per_reference_rms_um) == driven
@@ -87,7 +87,7 @@ def test_driven_axes_are_scored_apart_from_those_at_rest(outcome):
     assert result.coupling.worst_rms_um < 0.2
 
 
-def test_figures_are_those_of_the_loop_itself(outcome):
+def test_figures_equal_those_of_a_run(outcome):
     """The error of a trace against a plain run of the tuned loop."""
     case, signals = outcome.case, outcome.holdout
     loop, reference = outcome.after, signals.references[1]
@@ -101,7 +101,7 @@ def test_figures_are_those_of_the_loop_itself(outcome):
         assert found[f"Z:SIN5 Rx:SIN10 ({name})"] == pytest.approx(rms, rel=1e-9)
 
 
-def test_perturbed_plants_are_judged_one_by_one(outcome):
+def test_perturbed_plants_are_evaluated_separately(outcome):
     """Median and worst factor against runs of both loops on each plant."""
     found = outcome.result.perturbed
     assert (found.plants, found.unstable_before, found.unstable) == (5, 0, 0)
@@ -138,7 +138,7 @@ def test_perturbed_plants_are_judged_one_by_one(outcome):
     assert found.worst_better == pytest.approx(min(factors), rel=1e-9)
 
 
-def test_gains_and_result_load_back(outcome, tmp_path):
+def test_gains_and_result_are_saved_and_loaded(outcome, tmp_path):
     pj.save(outcome.controller, tmp_path / "gains.toml")
     assert jax.tree.all(
         jax.tree.map(
@@ -149,7 +149,7 @@ def test_gains_and_result_load_back(outcome, tmp_path):
     assert pj.load_result(tmp_path) == outcome.result
 
 
-def test_deviations_do_what_they_are_called():
+def test_deviations_change_the_named_property():
     tenth = jnp.full(3, 0.1)
     ones = (jnp.asarray(1.0),) * 3
 
@@ -163,7 +163,7 @@ def test_deviations_do_what_they_are_called():
     assert np.abs(at_rest(coupling=tenth) - nominal).max() > 1e-4
 
 
-def test_draws_are_those_of_the_seed_and_differ_by_part(tmp_path):
+def test_draws_depend_on_the_seed_and_the_part(tmp_path):
     path = written(tmp_path, STUDY)
     first, again, other = (read(path, seed).ensemble for seed in (1, 1, 2))
 
@@ -209,7 +209,7 @@ def test_a_bad_study_is_refused(tables, message, tmp_path):
         read(written(tmp_path, changed(**tables)))
 
 
-def test_an_ensemble_needs_a_plant_whose_variations_are_known(tmp_path):
+def test_an_ensemble_needs_a_plant_with_deviations(tmp_path):
     text = shipped("p753_dob").read_text(encoding="utf-8")
     text = text.replace('"p753_stage"', '"p753"')
     path = tmp_path / "study.toml"

@@ -92,7 +92,7 @@ STAGES = {"integrator": integrating, "lag": lagging}
 
 
 @pytest.mark.parametrize("name", STAGES)
-def test_the_ultimate_gain_and_period_are_those_of_the_closed_form(name):
+def test_the_ultimate_gain_and_period_equal_the_closed_form(name):
     loop, gain, period = STAGES[name]()
     found = ultimate_by_gain(
         loop, step=0.1, span=200.0, dt=DT, samples=4000, clock=Clock()
@@ -102,7 +102,7 @@ def test_the_ultimate_gain_and_period_are_those_of_the_closed_form(name):
 
 
 @pytest.mark.parametrize("name", STAGES)
-def test_the_relay_finds_nearly_the_same(name):
+def test_the_relay_gives_nearly_the_same(name):
     loop, gain, period = STAGES[name]()
     found = ultimate_by_relay(
         loop, height=5.0, hysteresis=0.0, dt=DT, noise=np.zeros(4000), clock=Clock()
@@ -127,7 +127,7 @@ def switching(noise, hysteresis, height=5.0):
 
 
 @pytest.mark.parametrize(("noise_rms", "hysteresis"), [(0.0, 0.01), (0.02, 0.06)])
-def test_the_relay_switches_as_in_a_loop_by_hand(noise_rms, hysteresis):
+def test_the_relay_equals_a_plain_loop(noise_rms, hysteresis):
     draws = np.random.default_rng(0).standard_normal(4000)
     found = ultimate_by_relay(
         loop_of(Integrator(RISE, DT), noise_rms),
@@ -148,7 +148,7 @@ def test_the_relay_switches_as_in_a_loop_by_hand(noise_rms, hysteresis):
         assert found.gain == pytest.approx(20.0 / (np.pi * amplitude), rel=1e-9)
 
 
-def test_numbers_of_the_rules_by_hand():
+def test_the_rules_equal_their_published_tables():
     """K_u = 8 V/um, T_u = 0.4 ms, by the tables of the papers."""
     ultimate = Ultimate(8.0, 4e-4)
     pi = ZIEGLER_NICHOLS["PI"].pid(ultimate, 1e-5)
@@ -165,7 +165,7 @@ def test_numbers_of_the_rules_by_hand():
     assert float(slow.derivative) == pytest.approx(8.0 / 2.2 * 4e-4 / 6.3)
 
 
-def test_the_catalogued_rule_is_this_one():
+def test_the_catalogued_rule_equals_this_rule():
     for rate, ultimate in p753_by_rate.ULTIMATE.items():
         known = p753_by_rate.ziegler_nichols(rate)
         found = ZIEGLER_NICHOLS["PI"].pid(Ultimate(*ultimate), 1.0 / rate)
@@ -189,7 +189,7 @@ def test_amplitude_of_a_cycle_with_harmonics():
     assert period == pytest.approx(20 * DT, rel=1e-9)
 
 
-def test_a_relay_keeps_its_side_within_its_hysteresis():
+def test_a_relay_does_not_switch_within_its_hysteresis():
     relay = Relay(2.0, 0.5)
 
     def seen(error):

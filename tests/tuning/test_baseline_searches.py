@@ -80,7 +80,7 @@ def test_the_budget_ends_a_search(name):
     assert found.stop in ("evaluations", "maxfevals")
 
 
-def test_nelder_and_mead_take_every_start():
+def test_nelder_mead_searches_from_every_start():
     """Two bowls: the one at the second start is the deeper."""
 
     class Two(eqx.Module):
@@ -97,7 +97,7 @@ def test_nelder_and_mead_take_every_start():
     np.testing.assert_allclose(both, 0.1, atol=1e-3)
 
 
-def test_a_history_says_when_a_loss_was_reached():
+def test_a_history_has_the_time_of_a_loss():
     history = History(Clock())
     for loss in (3.0, 5.0, 1.0):
         history.add(4, loss)
@@ -114,7 +114,7 @@ def entry(**changes):
     return BaselineEntry(**(numbers | changes))
 
 
-def test_the_ratio_is_of_the_time_to_the_same_loss():
+def test_the_ratio_is_that_of_the_times_to_the_same_loss():
     ours = entry(
         losses=[3.0, 1.0, 0.5],
         times_s=[2.0, 4.0, 9.0],
@@ -162,7 +162,7 @@ def outcome():
     return pj.tune(case_of(), baselines=Budget(evaluations=150))
 
 
-def test_a_contest_on_one_objective(outcome):
+def test_baselines_use_the_same_objective(outcome):
     found = outcome.baselines
     names = [entry.method for entry in found.entries]
     assert names[:2] == ["Ziegler-Nichols PI", "Ziegler-Nichols PID"]
@@ -180,7 +180,7 @@ def test_a_contest_on_one_objective(outcome):
     assert rule.unit is None
 
 
-def test_a_rule_is_judged_like_the_gains_of_the_box(outcome):
+def test_a_rule_is_evaluated_like_tuned_gains(outcome):
     """Its PI put into the study by hand has the loss and the error of its entry."""
     rule = outcome.baselines.entry("Ziegler-Nichols PI")
     table = {"type": "PID", "dt": 5e-5}

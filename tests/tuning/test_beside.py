@@ -86,7 +86,7 @@ def error_of(loop, data):
     return np.exp(np.mean(logs))
 
 
-def test_the_figures_are_those_of_runs_on_each_plant(perturbed):
+def test_the_figures_equal_those_of_runs_on_each_plant(perturbed):
     case, data, found = perturbed
     assert list(found) == [*BESIDE, "before", "tuned"]
     assert found["before"] == found["tuned"]  # the same gains here
@@ -123,18 +123,18 @@ def test_a_saturated_controller_has_no_error(perturbed):
     assert (*errors, wrong.unstable) == (None, None, None, 3)
 
 
-def test_without_an_ensemble_only_the_nominal_plant_counts(tmp_path):
+def test_without_an_ensemble_the_figures_are_of_the_nominal_plant(tmp_path):
     _, _, found = found_of(written(tmp_path, ensemble=None))
     assert found["PI by rule"].plants == 0
     assert found["PI by rule"].geomean_rms_um is None
     assert found["PI by rule"].sensitivity_peak > 1.0
 
 
-def test_a_study_that_names_none_has_none(tmp_path):
+def test_a_study_without_beside_has_no_figures(tmp_path):
     assert found_of(written(tmp_path, beside={}))[2] == {}
 
 
-def test_a_tuned_study_holds_and_prints_them(tmp_path):
+def test_a_tuned_study_saves_and_prints_the_figures(tmp_path):
     path = written(
         tmp_path,
         ensemble=None,
@@ -155,7 +155,7 @@ def test_a_tuned_study_holds_and_prints_them(tmp_path):
     assert names == list(result.beside)
 
 
-def test_gains_of_an_earlier_run_come_from_their_file(tmp_path):
+def test_gains_of_an_earlier_run_are_read_from_their_file(tmp_path):
     pj.save(p753_survey.feedforward_simc_pi(), tmp_path / "gains.toml")
     beside = {
         "now": {"controller": {"file": "gains.toml"}},

@@ -111,7 +111,7 @@ def test_a_row_for_each_controller_and_rate(compared):
     ]
 
 
-def test_rows_are_the_studies_results(compared):
+def test_rows_equal_the_results_of_the_studies(compared):
     _, out, data = compared
     assert {entry.name for entry in out.iterdir()} == {
         *("comparison.json", "comparison.png"),
@@ -181,7 +181,7 @@ def perturbed_to(result, error, unstable=0, before=(0.4, None, 0.2)):
     return result.model_copy(update={"perturbed": perturbed})
 
 
-def test_the_best_on_held_out_plants_is_stable_on_all_of_them(compared, monkeypatch):
+def test_the_best_on_held_out_plants_is_stable_on_all_plants(compared, monkeypatch):
     _, out, data = compared
     result = load_result(out / data["rows"][0]["study"])
     stable = perturbed_to(result, 0.03, before=(0.4, 0.2, 0.3))
@@ -207,7 +207,7 @@ def test_the_best_on_held_out_plants_is_stable_on_all_of_them(compared, monkeypa
     assert "5 kHz: continuous, 2.00x below the next, PID" in text
 
 
-def test_its_studies_can_be_tuned_alone(compared):
+def test_the_studies_of_a_comparison_can_be_tuned_separately(compared):
     _, out, data = compared
     study = out / data["rows"][0]["study"] / "study.toml"
     (entry,) = read_compared([study])[1]
@@ -261,7 +261,7 @@ def test_bounds_by_factor_and_by_sample():
     assert (bounds.lower, bounds.upper) == (500.0, 25_000.0)
 
 
-def test_a_bound_gives_way_to_the_start():
+def test_bounds_are_widened_to_the_start():
     narrow = {"controller.proportional": {"lower": 1e-6, "upper": 1e-5}}
     (entry, _) = entries(with_controller(bounds=narrow))
     bounds = entry.case.study.parameters["controller.proportional"]

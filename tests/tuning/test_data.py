@@ -50,7 +50,7 @@ def apart(series):
 
 
 @pytest.mark.parametrize("draws", [1, 3])
-def test_no_run_of_the_holdout_repeats_one_of_the_tuning(draws):
+def test_holdout_and_tuning_have_different_draws(draws):
     """As many draws in both, as by default: one stream would give the same."""
     data = make_data(
         case_of(
@@ -87,7 +87,7 @@ def fitted(residual):
     return make_data(dataclasses.replace(case, fit=fit))
 
 
-def test_each_part_of_the_record_disturbs_its_own_runs():
+def test_training_and_validation_parts_disturb_different_runs():
     # The initial loading, the rest of the training part, the validation part.
     residual = np.repeat([9.0, 1.0, -2.0], [1, 199, 200])
     data = fitted(residual)
@@ -111,7 +111,7 @@ def played(residual, reference=REST, moved=SLOW, part="validate"):
     return residual_disturbances(fit, reference, time_s, part)
 
 
-def test_a_short_residual_runs_forth_and_back():
+def test_a_short_residual_is_reflected():
     for found in played(np.arange(400.0)) - 200.0:
         expected = np.mod(found[0] + np.arange(400.0), 398.0)
         expected = np.minimum(expected, 398.0 - expected)
@@ -119,7 +119,7 @@ def test_a_short_residual_runs_forth_and_back():
 
 
 @pytest.mark.parametrize(("part", "first"), [("train", 0), ("validate", 200)])
-def test_the_worst_stretches_are_played(part, first, monkeypatch):
+def test_the_worst_stretches_are_the_disturbances(part, first, monkeypatch):
     """A hump in the middle is the largest, and late it swings fast."""
     monkeypatch.setattr(unexplained, "FAST", 10)
     time = np.arange(200.0)
@@ -156,13 +156,13 @@ def still():
     return case, stages, make_data(case)
 
 
-def test_a_perturbed_plant_starts_at_rest_where_it_is_judged(still):
+def test_a_perturbed_plant_starts_at_rest_in_the_evaluation(still):
     case, stages, data = still
     seen = Evaluator(Clock(), case).limited(case.loop, data.holdout, stages)
     np.testing.assert_allclose(seen.tracking.rms_error, 0.0, atol=1e-12)
 
 
-def test_a_perturbed_plant_starts_at_rest_where_it_is_tuned(still):
+def test_a_perturbed_plant_starts_at_rest_in_the_search(still):
     case, stages, data = still
     objective = objective_of(case, data.tuning, stages=stages)
     figures = objective.figures(case.space.start(case.loop)).tracking

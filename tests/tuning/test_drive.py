@@ -36,13 +36,13 @@ def test_figures_of_a_sine():
 
 
 @pytest.mark.parametrize(("frequency", "inside"), [(900.0, 0.0), (1100.0, 1.0)])
-def test_only_what_lies_above_a_tenth_of_the_rate_is_high(frequency, inside):
+def test_only_frequencies_above_a_tenth_of_the_rate_are_high(frequency, inside):
     run = 40.0 * TIME + 0.3 * np.sin(2.0 * np.pi * frequency * TIME)
     found = drive_of([run], run, DT, 0, None).high_frequency_rms_V
     assert found == pytest.approx(inside * 0.3 / np.sqrt(2.0), abs=1e-4)
 
 
-def test_what_cannot_be_told_is_none():
+def test_unknown_figures_are_none():
     run = np.sin(TIME)
     bare = drive_of([run], run, DT, 0, None)
     assert (bare.current_rms_A, bare.current_peak_A, bare.power_W) == (None,) * 3
@@ -89,7 +89,7 @@ def at_piezo(voltage):
     return signal.lfilter(numerator, denominator, voltage, zi=rest)[0]
 
 
-def test_the_figures_are_those_of_the_hold_out_behind_the_amplifier(outcome):
+def test_the_figures_are_of_the_hold_out_behind_the_amplifier(outcome):
     runs = [at_piezo(log[1].voltage) for log in outcome.logs([0, 1]).values()]
     slews = [np.diff(run)[400:] * 2e4 for run in runs]
     found = outcome.drive[1]["piezo"]
@@ -98,7 +98,7 @@ def test_the_figures_are_those_of_the_hold_out_behind_the_amplifier(outcome):
     assert found.current_rms_A == pytest.approx(3e-6 * expected, rel=1e-9)
 
 
-def test_the_noise_is_that_of_the_closed_form(outcome):
+def test_the_noise_equals_the_closed_form(outcome):
     """Integral control of a static plant: the noise passes a low-pass and the lag."""
     gain = outcome.result.gains["controller.integral"] * 5e-5
     pole = np.exp(-1600.0 * np.pi * 5e-5)
@@ -117,7 +117,7 @@ def test_the_noise_is_that_of_the_closed_form(outcome):
     assert outcome.drive[1]["piezo"].noise_rms_V > 0.0
 
 
-def test_they_are_in_the_file_and_in_the_table(outcome, tmp_path):
+def test_the_figures_are_in_the_file_and_in_the_table(outcome, tmp_path):
     write_numbers(outcome, tmp_path)
     written = load_result(tmp_path)
     assert (written.drive_before, written.drive) == outcome.drive
@@ -131,7 +131,7 @@ def test_they_are_in_the_file_and_in_the_table(outcome, tmp_path):
     assert next(iter(table.columns[2].cells)) == f"{noise:.3g}"
 
 
-def test_figures_without_a_capacitance_are_left_out():
+def test_figures_that_need_a_capacitance_are_omitted_without_one():
     drive = Drive(noise_rms_V=0.1, high_frequency_rms_V=None, slew_rms_V_per_s=2.0)
     table = drive_table(({"x": drive, "y": drive}, {"x": drive, "y": drive}), 1e4)
     assert list(table.columns[0].cells)[::3] == [

@@ -29,7 +29,7 @@ def place(limit, loss, kept=True, unit=0.0):
         ([-4.0, -9.0, -2.0], [True, False, True], [1.3]),
     ],
 )
-def test_a_limit_is_solved_again_from_a_tighter_one_that_is_better(losses, kept, again):
+def test_a_limit_is_solved_again_from_a_better_tighter_one(losses, kept, again):
     found = [
         place(limit, loss, keeps, unit)
         for limit, loss, keeps, unit in zip(

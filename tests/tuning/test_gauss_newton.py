@@ -108,7 +108,7 @@ def test_descents_reach_the_minimum(kind, start):
     assert np.all(np.diff(descent.losses) <= 0.0)
 
 
-def test_a_bent_valley_takes_few_steps():
+def test_a_curved_valley_takes_few_steps():
     """A hundred times steeper across than Rosenbrock's is along; gradients zigzag."""
     (descent,), group = descents_on("valley", [(0.2, 0.56)])
     taken = 0
@@ -118,7 +118,7 @@ def test_a_bent_valley_takes_few_steps():
     assert taken <= 12
 
 
-def test_a_point_without_slopes_ends_its_descent():
+def test_a_point_without_finite_gradients_ends_its_descent():
     good = programs_of("valley")[0](as_array([0.2, 0.5]))
     bad = good._replace(jacobian=good.jacobian * jnp.nan)
     _, group = descents_on("valley", [(0.2, 0.5)], lambda unit: local_model(unit, bad))
@@ -144,7 +144,7 @@ def test_a_rejected_step_keeps_the_model():
     np.testing.assert_array_equal(descent.point, (0.2, 0.3))
 
 
-def test_steps_stop_at_the_sides_of_the_box():
+def test_steps_stay_inside_the_box():
     curvature = np.array([[2.0, 1.9], [1.9, 2.0]])
     unit = np.array([0.2, 0.5])
 
@@ -162,14 +162,14 @@ def test_steps_stop_at_the_sides_of_the_box():
 
 
 @pytest.mark.parametrize(("runs", "counted"), [(1, 10), (4, 600), (10, 10_000)])
-def test_spacing_is_prime_and_leaves_samples(runs, counted):
+def test_spacing_is_prime_and_keeps_enough_samples(runs, counted):
     every = spacing(runs, counted)
     assert all(every % d for d in range(2, every))
     assert counted // every >= 2
     assert runs * counted / every <= 25_000
 
 
-def test_the_better_half_goes_on():
+def test_the_better_half_continues():
     """Of nine descents five, then three; the best ones are never dropped."""
     places = np.random.default_rng(1).uniform(0.1, 0.9, (9, 2))
     seen = []
@@ -229,7 +229,7 @@ def objective_of(case, **options):
     )
 
 
-def test_weighted_errors_have_the_gradient_of_the_objective():
+def test_weighted_errors_give_the_gradient_of_the_objective():
     """From errors of every sample, by a run of its own: sum of w mean(e de)."""
     case = case_of()
     objective = objective_of(case, aggregate="worst")
@@ -309,7 +309,7 @@ def test_a_study_is_tuned(outcome):
     assert len(history) < steps <= 3 * len(history)
 
 
-def test_no_point_around_is_better(outcome, objective, programs):
+def test_no_neighbouring_point_is_better(outcome, objective, programs):
     """Of grids in the box; their loss is the tuner's, less a constant."""
     case = case_of()
     values = jnp.array([outcome.result.gains[path] for path in case.space.paths])

@@ -41,7 +41,7 @@ def tuned(folder, **constraints):
     return pj.tune(path)
 
 
-def test_goals_are_kept_and_active_and_the_steps_are_in_the_result(tmp_path):
+def test_goals_are_kept_and_active_with_steps_in_the_result(tmp_path):
     goals = {"settling_time": 0.008, "gain_margin": 6.0, "bandwidth": 60.0}
     outcome = tuned(tmp_path, **goals)
     found = outcome.result.constraints
@@ -70,7 +70,7 @@ def test_goals_are_kept_and_active_and_the_steps_are_in_the_result(tmp_path):
     assert list(steps_table(outcome.steps).columns[2].cells)[3] == f"{1e3 * worst:.3g}"
 
 
-def test_goals_that_exclude_each_other_end_in_an_alarm_for_each(tmp_path):
+def test_incompatible_goals_have_an_alarm_each(tmp_path):
     result = tuned(tmp_path, settling_time=0.008, phase_margin=70.0).result
     for name, unit in (("settling_time", "s"), ("phase_margin", "deg")):
         assert not result.constraints[name].kept
@@ -104,7 +104,7 @@ def test_a_loop_that_amplifies_its_reference_has_a_note():
         ("settling", 0.01, "settling_time"),
     ],
 )
-def test_limits_that_cannot_be(tmp_path, name, limit, message):
+def test_impossible_limits_are_refused(tmp_path, name, limit, message):
     path = tmp_path / "study.toml"
     path.write_text(tomli_w.dumps(STUDY | {"constraints": {name: limit}}))
     with pytest.raises(ValueError, match=message) as caught:

@@ -89,20 +89,20 @@ def test_the_limit_is_tightened_until_the_exact_one_is_kept(monkeypatch):
     assert stability == 0.0
 
 
-def test_it_ends_after_five_searches_that_each_leave_some_room(monkeypatch):
+def test_the_search_ends_after_five_repetitions(monkeypatch):
     searched, _ = repeated(monkeypatch, [np.inf] * 6)
     aims = 1.0 + 0.3 ** np.arange(1, 6)
     assert [aim for aim, _ in searched] == pytest.approx(aims)
 
 
-def test_plants_that_violate_a_limit_are_searched_until_none_does(monkeypatch):
+def test_the_search_is_repeated_until_no_plant_violates_a_limit(monkeypatch):
     plants = [(0.2, "second"), (1.1e-3, "third"), (9e-4, "fourth")]
     searched, (objective, *_) = repeated(monkeypatch, [0.0] * 4, plants)
     assert searched == [(None, "second"), (None, "third")]
     assert objective.stages == "third"
 
 
-def test_other_plants_and_a_tighter_limit_are_searched_together(monkeypatch):
+def test_plants_and_limits_change_in_the_same_search(monkeypatch):
     searched, _ = repeated(monkeypatch, [3.0, 0.0], [(0.2, "second"), (0.0, None)])
     assert searched == [(1.5, "second")]
 
@@ -115,7 +115,7 @@ def test_other_plants_and_a_tighter_limit_are_searched_together(monkeypatch):
         {"strategy": None},
     ],
 )
-def test_it_does_nothing_where_nothing_is_missed_or_can_be_done(monkeypatch, changes):
+def test_the_search_is_not_repeated_without_need_or_remedy(monkeypatch, changes):
     searched, _ = repeated(monkeypatch, **({"peaks": [3.0]} | changes))
     assert searched == []
 
@@ -130,7 +130,7 @@ def alarming_peak(loop, bound=None, **limits):
     return inspect.unwrap(limited_search._alarming_peak)(case, stability)
 
 
-def test_the_exact_peak_counts_where_it_raises_an_alarm():
+def test_an_exact_peak_with_an_alarm_repeats_the_search():
     loop = integral_loop(4000.0)
     exact = stability_report(loop, OperatingPoint(1.0, dt=DT)).sensitivity_peak
     assert alarming_peak(loop, sensitivity_peak=0.98 * exact) == pytest.approx(exact)
@@ -139,7 +139,7 @@ def test_the_exact_peak_counts_where_it_raises_an_alarm():
     assert alarming_peak(integral_loop(1e5), sensitivity_peak=2.0) == np.inf
 
 
-def test_the_error_bound_of_the_plant_counts():
+def test_the_error_bound_of_the_plant_is_included():
     loop = integral_loop(4000.0)
     exact = stability_report(loop, OperatingPoint(1.0, dt=DT)).sensitivity_peak
     bound = ErrorBound(frequency=(1.0, 5e3), relative=(0.3, 0.3), excited=(True, True))
@@ -147,7 +147,7 @@ def test_the_error_bound_of_the_plant_counts():
     assert found > 1.1 * exact
 
 
-def test_beyond_the_band_of_a_narrow_record_no_gains_are_searched():
+def test_beyond_the_band_of_a_narrow_record_the_search_is_not_repeated():
     """They cannot help there; the alarm remains."""
     loop = integral_loop(4000.0)
     exact = stability_report(loop, OperatingPoint(1.0, dt=DT)).sensitivity_peak

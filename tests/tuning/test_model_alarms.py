@@ -54,7 +54,7 @@ def test_a_small_error_raises_no_alarm(stability):
     assert list(model_alarms(About(), False, 2.0, stability)) == []
 
 
-def test_an_unexcited_band_under_the_loop_is_named(stability):
+def test_an_unexcited_band_within_the_bandwidth_is_named(stability):
     # |T| is 0.16 at 100 Hz: a hidden resonance of 25 times the gain is too much.
     unseen = bound((0.05, 0.05, 25.0, 25.0), (True, True, False, False))
     (alarm,) = model_alarms(About(error_bound=unseen), False, 2.0, stability)
@@ -63,7 +63,7 @@ def test_an_unexcited_band_under_the_loop_is_named(stability):
     assert "record a chirp" in alarm
 
 
-def test_the_worst_peak_is_that_of_sampled_errors(stability):
+def test_the_worst_peak_equals_that_of_sampled_errors(stability):
     (alarm,) = model_alarms(
         About(error_bound=bound((0.6,) * 4, (True,) * 4)), False, 1.05, stability
     )
@@ -72,7 +72,7 @@ def test_the_worst_peak_is_that_of_sampled_errors(stability):
     assert "0.6 times its own gain" in alarm
 
 
-def test_without_a_limit_on_the_peak_instability_still_counts(stability):
+def test_without_a_limit_on_the_peak_instability_is_an_alarm(stability):
     often, always = (bound((share,) * 4, (True,) * 4) for share in (0.6, 1.5))
     assert list(model_alarms(About(error_bound=often), False, np.inf, stability)) == []
     (alarm,) = model_alarms(About(error_bound=always), False, np.inf, stability)
@@ -86,7 +86,7 @@ def test_alarms_of_the_fit_and_a_missing_bound_are_alarms(stability):
     assert "gives no bound on the error" in second
 
 
-def test_a_model_that_was_never_checked_is_noted():
+def test_an_unchecked_model_has_a_note():
     (note,) = unchecked(About(record="bench.csv"))
     assert "fitted to bench.csv and never checked" in note
     assert "plant.check" in note

@@ -68,7 +68,7 @@ def test_tuning_refuses_a_reference_with_stroke_and_remedy():
         ({"offset": -95.0}, r"references.tune: CONST1 spans -45 to -45 um"),
     ],
 )
-def test_every_reference_counts(references, message):
+def test_every_reference_is_checked(references, message):
     with pytest.raises(ValueError, match=message):
         checked(references)
 

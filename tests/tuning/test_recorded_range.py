@@ -50,12 +50,12 @@ def alarms(*ranges, **tables):
     return list(recorded_range_alarms(case, make_data(case)))
 
 
-def test_a_record_of_the_whole_range_raises_none():
+def test_a_record_of_the_whole_range_has_no_alarm():
     assert alarms((-20.0, 120.0)) == []
     assert alarms((-20.0, 30.0)) == []
 
 
-def test_a_plant_that_was_not_fitted_has_none():
+def test_a_plant_without_a_fit_has_no_alarm():
     assert alarms() == []
 
 
@@ -68,7 +68,7 @@ def test_a_plant_that_was_not_fitted_has_none():
         (-9.0, 80.0, True),
     ],
 )
-def test_references_beyond_the_record_raise_one(low, high, raised):
+def test_references_beyond_the_record_raise_an_alarm(low, high, raised):
     found = alarms((low, high))
     assert len(found) == raised
     for alarm in found:
@@ -79,7 +79,7 @@ def test_references_beyond_the_record_raise_one(low, high, raised):
         )
 
 
-def test_a_record_of_a_small_part_of_the_range_raises_one():
+def test_a_record_of_a_small_part_of_the_range_raises_an_alarm():
     """As one does whose input was recorded before an amplifier of ten."""
     small = {"references": STUDY["references"] | {"amplitude": 5.0, "offset": 0.0}}
     width = COVERED * 140.0
@@ -94,14 +94,14 @@ def test_a_record_of_a_small_part_of_the_range_raises_one():
     assert alarms((0.0, 0.99 * width), **small, **limits) == []
 
 
-def test_a_record_far_beyond_the_actuator_raises_one():
+def test_a_record_far_beyond_the_actuator_raises_an_alarm():
     """As one does whose input was recorded behind the amplifier."""
     (alarm,) = alarms((-200.0, 1201.0))
     assert alarm.startswith("the record of the plant covers -200 to 1201 V, the actuat")
     assert alarms((-20.0, 500.0)) == []
 
 
-def test_each_axis_has_its_own():
+def test_each_axis_has_its_own_alarm():
     wide = (-20.0, 120.0)
     assert alarms(wide, wide, **AXES) == []
     (alarm,) = alarms(wide, (-20.0, 20.0), **AXES)

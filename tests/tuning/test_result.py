@@ -25,7 +25,7 @@ def outcome(name, values, limit):
         ([0.5, 0.02], 2.0, True, False, 2, 0.5),
     ],
 )
-def test_a_limit_at_most(values, limit, kept, active, on, worst):
+def test_an_upper_limit(values, limit, kept, active, on, worst):
     found = outcome("sensitivity_peak", values, limit)
     assert (found.kept, found.active, found.on, found.of) == (kept, active, on, 2)
     assert found.value == worst
@@ -42,7 +42,7 @@ def test_a_limit_at_most(values, limit, kept, active, on, worst):
         ([-math.inf, 9.0], False, False, 1, None),
     ],
 )
-def test_a_limit_at_least(values, kept, active, on, worst):
+def test_a_lower_limit(values, kept, active, on, worst):
     found = outcome("delay_margin", values, 2.0)
     assert (found.kept, found.active, found.on, found.of) == (kept, active, on, 2)
     assert found.value == worst
@@ -77,14 +77,14 @@ def test_a_summary_of_plants():
     assert found.geomean_before_rms_um is None
 
 
-def test_plants_lost_before_and_after_are_counted_apart():
+def test_plants_lost_before_and_after_are_counted_separately():
     twice = Perturbed.of(figures(AFTER[:2]), figures(BEFORE[:2]), DRIVEN, {})
     assert (twice.unstable_before, twice.unstable) == (1, 0)
     means = [np.exp(np.mean(np.log([4.0, 9.0]))), 1.0]
     assert twice.geomean_rms_um == pytest.approx(np.median(means))
 
 
-def test_traces_at_rest_join_into_one_mean_a_plant():
+def test_traces_at_rest_give_one_mean_per_plant():
     driven = np.array([True, False, False])
     before = [[[1.0], [4.0], [9.0]], [[1.0], [2.0], [2.0]], [[1.0], [8.0], [2.0]]]
     after = np.ones_like(before)

@@ -138,7 +138,7 @@ def test_multipliers_of_a_known_problem():
     assert multipliers[0] == pytest.approx(4.0, rel=1e-4)
 
 
-def test_what_is_kept_costs_nothing():
+def test_kept_constraints_have_no_cost():
     added = penalty_terms(jnp.array([-0.1, 0.2]), jnp.zeros(2), jnp.asarray(8.0))
     np.testing.assert_allclose(added, [0.0, 2.0 * 0.2])
 
@@ -149,7 +149,7 @@ def test_what_is_kept_costs_nothing():
 @pytest.mark.parametrize(
     "names", [CONSTRAINTS, ["effort"], ["delay_margin", "peak_slew"], []]
 )
-def test_constraints_are_counted_as_they_are_evaluated(names):
+def test_constraint_count_equals_the_number_of_violations(names):
     runs = jnp.ones((3, 2, 1))
     figures = LoopFigures(
         TrackingFigures(*[runs] * len(TrackingFigures._fields)),
@@ -162,7 +162,7 @@ def test_constraints_are_counted_as_they_are_evaluated(names):
     assert constraint_count(limits, 3, 5) == violations(limits, figures).size
 
 
-def test_the_limit_is_kept_active_and_where_the_margin_says(outcome):
+def test_the_limit_is_kept_and_active_at_the_exact_margin(outcome):
     kept = outcome.result.constraints["sensitivity_peak"]
     assert (kept.kept, kept.active, kept.of) == (True, True, 5)
     stages = each(outcome.case.ensemble.stages("margins"))
@@ -174,7 +174,7 @@ def test_the_limit_is_kept_active_and_where_the_margin_says(outcome):
     assert worst == pytest.approx(1.3, rel=5e-3)
 
 
-def test_a_search_that_carries_the_worst_plants_keeps_the_limit_on_all(
+def test_a_search_on_the_worst_plants_keeps_the_limit_on_all(
     outcome, monkeypatch, tmp_path
 ):
     monkeypatch.setattr(evaluator, "CARRIED", 2)
@@ -206,7 +206,7 @@ def test_the_worst_plants_are_those_with_the_largest_exact_peak(outcome, monkeyp
     assert beyond == pytest.approx(np.log(peaks[0] / 1.3), abs=2e-3)
 
 
-def test_no_larger_gain_keeps_the_limit(outcome):
+def test_larger_gains_violate_the_limit(outcome):
     """One gain: the error falls with it, so the limit alone holds it back."""
     (gain,) = outcome.result.gains.values()
     larger = replace(outcome.case.loop, {"controller.integral": 1.03 * gain})
@@ -215,7 +215,7 @@ def test_no_larger_gain_keeps_the_limit(outcome):
     assert outcome.result.after.geomean_rms_um < outcome.result.before.geomean_rms_um
 
 
-def test_held_out_plants_are_judged_one_by_one(outcome):
+def test_held_out_plants_are_evaluated_separately(outcome):
     found = outcome.result.perturbed
     stages = each(outcome.case.ensemble.stages("holdout"))
     peaks = [exact_peak(outcome.after, stage) for stage in stages]
@@ -238,12 +238,12 @@ def test_the_front_trades_error_for_robustness(outcome):
     assert loose.geomean_rms_um < tight.geomean_rms_um
 
 
-def test_the_result_loads_back(outcome, tmp_path):
+def test_the_result_is_saved_and_loaded(outcome, tmp_path):
     (tmp_path / "result.json").write_text(outcome.result.model_dump_json())
     assert pj.load_result(tmp_path) == outcome.result
 
 
-def test_figures_of_runs_are_those_of_their_logs(outcome):
+def test_figures_of_runs_equal_those_of_their_logs(outcome):
     """Voltage, slew, effort and overshoot against NumPy on whole logs."""
     found, case = outcome.result.constraints, outcome.case
     signals = make_data(case).tuning
@@ -288,7 +288,7 @@ def test_figures_of_runs_are_those_of_their_logs(outcome):
 # Ensembles
 
 
-def test_draws_lie_where_the_study_says(tmp_path):
+def test_draws_are_within_the_ranges_of_the_study(tmp_path):
     ensemble = read(written(tmp_path, STUDY)).ensemble
     stages = ensemble.stages("holdout")
     other = read(written(tmp_path, changed(ensemble__holdout=300), "more.toml"))
@@ -309,7 +309,7 @@ def test_draws_lie_where_the_study_says(tmp_path):
     assert not jnp.isin(stages.plant.parts[names.index("gain")].gain, gain[5:]).any()
 
 
-def test_no_plant_of_the_holdout_is_one_of_the_tuning(tmp_path):
+def test_holdout_and_tuning_have_different_plants(tmp_path):
     ensemble = read(written(tmp_path, STUDY)).ensemble
     gain = p753_stage.stage().names.index("gain")
     held, seen = (
@@ -320,7 +320,7 @@ def test_no_plant_of_the_holdout_is_one_of_the_tuning(tmp_path):
     assert not np.isin(held, seen).any()
 
 
-def test_a_stage_without_deviation_is_the_printed_one_and_what_is_added():
+def test_a_stage_without_deviation_is_the_printed_one_with_creep_and_mode():
     stage = p753_stage.stage()
     printed = p753.plant()
     named = dict(zip(stage.names, stage.parts, strict=True))
@@ -345,7 +345,7 @@ def test_poles_and_zeros_move_along_their_rays():
     assert named["gain"].gain == pytest.approx(1.1)
 
 
-def test_every_deviation_of_the_stage_acts_on_its_part():
+def test_every_deviation_changes_its_part_of_the_stage():
     names = p753_stage.stage().names
 
     def part(name, **deviations):
@@ -368,7 +368,7 @@ def test_every_deviation_of_the_stage_acts_on_its_part():
     np.testing.assert_allclose(ringing, 1.0 - np.cos(2.0 * np.pi * turns), atol=1e-6)
 
 
-def test_standard_errors_of_a_fit_are_drawn_from(tmp_path):
+def test_draws_follow_the_standard_errors_of_a_fit(tmp_path):
     fit = {"parameters": {
         "dynamics.moving.0": {"value": 1.0, "standard_error": 1e-3},
         "hysteresis.a": {"value": 1.0, "standard_error": None},
@@ -389,7 +389,7 @@ def test_standard_errors_of_a_fit_are_drawn_from(tmp_path):
 @pytest.mark.parametrize(
     ("over", "tail"), [("mean", 1.0), ("worst", 1.0), ("cvar", 0.4)]
 )
-def test_plants_are_joined_as_named(over, tail, tmp_path):
+def test_plants_are_aggregated_by_the_named_rule(over, tail, tmp_path):
     none = jnp.zeros((5, 2, 1))
     rms = jnp.exp(jnp.arange(10.0).reshape(5, 2, 1) % 7.0)
     figures = TrackingFigures(rms, none, none, none, none, none)
@@ -412,7 +412,7 @@ def test_plants_are_joined_as_named(over, tail, tmp_path):
     assert objective._error(figures) == pytest.approx(expected, abs=1e-6)
 
 
-def test_drift_is_a_random_walk_that_moves_the_stage(tmp_path):
+def test_drift_is_a_random_walk_of_the_stage(tmp_path):
     study = changed(disturbance={"drift_rms": 0.5}, holdout_draws=64)
     signals = make_data(read(written(tmp_path, study))).holdout
     walk = np.asarray(signals.disturbance)
@@ -447,7 +447,7 @@ def test_a_bad_study_is_refused(tables, message, tmp_path):
         read(written(tmp_path, changed(**tables)))
 
 
-def test_every_study_has_limits_unless_it_says_otherwise(tmp_path):
+def test_every_study_has_default_limits(tmp_path):
     def limits(constraints):
         return load(written(tmp_path, STUDY | {"constraints": constraints})).limits
 
@@ -466,6 +466,6 @@ def test_every_study_has_limits_unless_it_says_otherwise(tmp_path):
 
 @pytest.mark.parametrize("name", CONSTRAINTS)
 @pytest.mark.parametrize("limit", [0.0, -1.0, float("inf"), float("nan"), "low", True])
-def test_limits_that_have_no_meaning_are_refused(name, limit):
+def test_meaningless_limits_are_refused(name, limit):
     with pytest.raises(ValueError, match=rf"{name} is .*; it must be a number above"):
         CONSTRAINTS[name].check(name, limit)

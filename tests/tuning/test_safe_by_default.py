@@ -52,7 +52,7 @@ def safe(tmp_path_factory):
     return tuned(tmp_path_factory.mktemp("safe"))
 
 
-def test_the_defaults_hold_where_the_best_gains_would_break_them(free, safe):
+def test_the_defaults_hold_where_unlimited_gains_violate_them(free, safe):
     assert exact(free).sensitivity_peak > 2.1
     assert free.result.constraints == {}
     assert 1.9 < exact(safe).sensitivity_peak < 2.02

@@ -26,7 +26,7 @@ def case():
     return build(study.model_copy(update={"references": references}), "short.toml")
 
 
-def test_it_is_the_mean_over_the_tuning_references_of_the_hold_out(case):
+def test_the_share_is_the_mean_over_the_tuning_references(case):
     data = make_data(case)
     found = sliding_share(case.loop, data, FIRST)
     assert found is not None
@@ -43,13 +43,13 @@ def test_it_is_the_mean_over_the_tuning_references_of_the_hold_out(case):
     np.testing.assert_allclose(list(found.model_dump().values()), expected, rtol=1e-9)
 
 
-def test_another_controller_has_none(case):
+def test_another_controller_has_no_share(case):
     loop = case.loop
     other = Feedback(p753.pid(), loop.plant, loop.actuator, loop.sensor)
     assert sliding_share(other, make_data(case), FIRST) is None
 
 
-def test_the_line_says_both_shares():
+def test_the_line_has_both_shares():
     def parts(share):
         return SlidingShare(
             share=share, sliding_um_per_s=1.0, error_um_per_s=1.0, rest_um_per_s=1.0
@@ -67,7 +67,7 @@ def test_the_line_says_both_shares():
     assert line_of(None, None) is None
 
 
-def test_the_bounded_study_differs_from_that_of_the_thesis_in_its_bounds_alone():
+def test_the_bounded_study_differs_from_that_of_the_thesis_in_bounds_only():
     bounded, free = load(shipped("p753_sliding_mode")), load(shipped("p753_dob"))
     same = set(type(free).model_fields) - {"title", "parameters"}
     for name in same:

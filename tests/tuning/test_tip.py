@@ -43,7 +43,7 @@ def fitted(case, residual):
     return dataclasses.replace(case, fit=fit_of(case.loop.plant, record, moved))
 
 
-def test_what_a_lag_turned_into_its_output_is_found_again():
+def test_the_input_of_a_lag_is_recovered_from_its_output():
     wanted = np.random.default_rng(1).standard_normal(300)
     lag = FirstOrderLag(LAG, DT)
     output = np.asarray(simulate(lag, wanted)[1])
@@ -59,7 +59,7 @@ def test_all_lags_of_a_plant_are_found():
     assert lags_of(ColemanHodgdon(0.1, 0.15, -0.01)) == []
 
 
-def test_the_note_tells_the_error_of_the_input_of_the_lag(case):
+def test_the_note_has_the_error_of_the_input_of_the_lag(case):
     """The tip is what enters the lag: here the voltage, and the residual beside it."""
     case = fitted(case, 0.02 * np.sin(np.arange(800.0)))
     data, start = make_data(case), 400
@@ -81,7 +81,7 @@ def test_the_note_tells_the_error_of_the_input_of_the_lag(case):
     assert of_tip > 2.0 * of_reading
 
 
-def test_no_note_without_a_fit_or_a_lag(case):
+def test_there_is_no_note_without_a_fit_or_a_lag(case):
     assert tip_note(case, case.loop, make_data(case), 400) is None
     still = fitted(case, np.zeros(800))
     faster = dataclasses.replace(

@@ -108,7 +108,7 @@ def run(loop, name="SIN50", seed=9):
     return pj.simulate(loop, pj.loop_inputs(reference, noise), state)[1]
 
 
-def test_gains_that_track_worse_than_the_start_say_so(plain):
+def test_gains_with_a_larger_error_than_the_start_have_a_note(plain):
     before, after = plain.result.before, plain.result.after
     assert not any("than the start" in note for note in plain.result.warnings)
     assert worse_than_the_start(before, after) == []
@@ -122,7 +122,7 @@ def test_gains_that_track_worse_than_the_start_say_so(plain):
 # A run that goes well
 
 
-def test_the_loop_becomes_better_on_noise_it_was_not_tuned_on(outcome):
+def test_tuning_reduces_the_error_on_held_out_noise(outcome):
     result = outcome.result
     assert result.status in ("converged", "step limit")
     assert result.holdout.geomean_rms_um < 0.3 * result.holdout_before.geomean_rms_um
@@ -131,7 +131,7 @@ def test_the_loop_becomes_better_on_noise_it_was_not_tuned_on(outcome):
         assert error < result.holdout_before.per_reference_rms_um[name]
 
 
-def test_only_gains_at_an_edge_are_said_to_be_there(outcome):
+def test_only_gains_at_a_bound_have_a_note(outcome):
     space, gains = outcome.case.space, outcome.result.gains
     places = np.asarray(space.to_unit(jnp.asarray([*gains.values()])))
     expected = [
@@ -166,7 +166,7 @@ def test_the_summary_figures_follow_from_the_references(outcome):
             assert part.peak_error_um[name] >= error
 
 
-def test_scores_are_those_of_a_plain_simulation():
+def test_scores_equal_those_of_a_plain_simulation():
     # No noise: nothing is drawn, so the error can be found again from outside.
     found = pj.tune(case_of({"sensor/noise_rms": 0.0, "optimiser/steps": 1}))
     for loop, part in (
@@ -181,14 +181,14 @@ def test_scores_are_those_of_a_plain_simulation():
             assert part.peak_error_um[name] == pytest.approx(np.abs(settled).max())
 
 
-def test_a_saved_result_loads(outcome, tmp_path):
+def test_a_result_is_saved_and_loaded(outcome, tmp_path):
     (tmp_path / "result.json").write_text(outcome.result.model_dump_json())
     assert load_result(tmp_path) == outcome.result
     assert load_result(tmp_path / "result.json") == outcome.result
     assert isinstance(pj.load_result(tmp_path), Result)
 
 
-def test_results_that_are_none(tmp_path):
+def test_files_without_a_result_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"result.json: No such file or directory"):
         load_result(tmp_path)
     for content in ("", "{", "{}", '{"study": 3}'):
@@ -207,7 +207,7 @@ def test_gains_are_inside_their_bounds_and_in_the_controller(outcome):
     assert outcome.controller is outcome.after.controller
 
 
-def test_nothing_else_is_changed(outcome):
+def test_tuning_changes_the_tuned_parameters_only(outcome):
     before, after = parameters(outcome.before), parameters(outcome.after)
     assert before.keys() == after.keys()
     for path in before.keys() - outcome.result.gains.keys():
@@ -240,7 +240,7 @@ def test_noise_differs_between_references():
         assert 0.5 < one / other < 2.0
 
 
-def test_history_holds_the_lowest_loss_of_each_start(outcome):
+def test_history_contains_the_lowest_loss_of_each_start(outcome):
     history = np.array(outcome.result.history, dtype=float)
     assert history.shape == (6, 2)
     assert np.all(np.diff(history, axis=0) <= 0.0)
@@ -248,7 +248,7 @@ def test_history_holds_the_lowest_loss_of_each_start(outcome):
     assert outcome.result.evaluations == 5 + 2 * len(history)
 
 
-def test_the_best_loss_is_what_the_scores_say(outcome):
+def test_the_best_loss_agrees_with_the_scores(outcome):
     # The history of an optimistix method is one step late, so never better.
     result = outcome.result
     gain = math.log(result.after.geomean_rms_um / result.before.geomean_rms_um)
@@ -257,7 +257,7 @@ def test_the_best_loss_is_what_the_scores_say(outcome):
     assert gain == pytest.approx(best, abs=0.5)
 
 
-def test_progress_is_told(outcome, progress):
+def test_progress_is_reported(outcome, progress):
     texts = [text for text, _ in progress.stages]
     assert texts == [
         "simulating the start",
@@ -271,7 +271,7 @@ def test_progress_is_told(outcome, progress):
     assert progress.bests == sorted(progress.bests, reverse=True)
 
 
-def test_saved_gains_track_the_same(outcome, tmp_path):
+def test_saved_gains_give_the_same_error(outcome, tmp_path):
     path = tmp_path / "gains.toml"
     pj.save(outcome.controller, path)
     loop = p753.loop(pj.load(path))
@@ -306,7 +306,7 @@ def test_another_seed_draws_other_noise(plain):
 # Starts that diverge, and boxes in which everything does
 
 
-def test_a_diverging_start_is_replaced_and_said():
+def test_a_diverging_start_is_replaced_with_a_note():
     changes = {
         "actuator": WIDE,
         f"parameters/{INTEGRAL}/upper": 1e7,
@@ -319,8 +319,7 @@ def test_a_diverging_start_is_replaced_and_said():
     assert result.before.per_reference_rms_um == {"SIN50": None, "SW50": None}
     assert any(
         "the study's own start diverges or stays at a voltage limit; tuning began "
-        "from the best of 4"
-        in text
+        "from the best of 4" in text
         for text in result.warnings
     )
     assert result.holdout.geomean_rms_um < 1.0
@@ -329,7 +328,7 @@ def test_a_diverging_start_is_replaced_and_said():
     json.loads(result.model_dump_json())  # no NaN, no Infinity
 
 
-def test_a_box_in_which_everything_diverges():
+def test_a_box_of_diverging_loops_is_refused():
     changes = {
         "actuator": WIDE,
         f"parameters/{INTEGRAL}": {"lower": 3e6, "upper": 1e7, "start": 5e6},
@@ -340,8 +339,8 @@ def test_a_box_in_which_everything_diverges():
     ) as got:
         pj.tune(case_of(changes))
     assert str(got.value) == (
-        "the loop diverges or stays at a voltage limit at the start and at all 4 points "
-        "tried in the box: "
+        "the loop diverges or stays at a voltage limit at the start and at all 4 "
+        "points tried in the box: "
         "lower the bounds of the gains, raise 'candidates', or check the plant's sign "
         "and sample rate"
     )
@@ -429,7 +428,7 @@ def test_a_weight_on_effort_lowers_the_effort(light):
     assert effort_and_slew(light.after)[0] < 0.5 * effort_and_slew(light.before)[0]
 
 
-def test_gains_at_the_edge_are_said(light):
+def test_gains_at_a_bound_have_a_note(light):
     result = light.result
     assert result.at_bound == [INTEGRAL]
     assert f"at the edge of its bounds: {INTEGRAL}" in result.warnings
@@ -445,7 +444,7 @@ def test_a_weight_on_slew_lowers_the_slew():
     ("method", "aggregate"),
     [("lbfgsb", "worst"), ("levenberg_marquardt", "mean_square")],
 )
-def test_the_other_methods_and_objectives(method, aggregate):
+def test_other_methods_and_objectives_reduce_the_error(method, aggregate):
     changes = {"optimiser/method": method, "objective/aggregate": aggregate}
     result = pj.tune(case_of(changes)).result
     assert method in METHODS
@@ -456,14 +455,14 @@ def test_the_other_methods_and_objectives(method, aggregate):
     assert np.all(np.diff(history, axis=0) <= 0.0)
 
 
-def test_one_start_no_candidates():
+def test_one_start_without_candidates():
     changes = {"method": "bfgs", "starts": 1, "candidates": 0, "steps": 3}
     result = pj.tune(case_of({"optimiser": changes})).result
     assert result.evaluations == 1 + 3
     assert result.after.geomean_rms_um < result.before.geomean_rms_um
 
 
-def test_a_study_that_is_not_there(tmp_path):
+def test_an_unknown_study_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"study .*no.toml: No such file or directory"):
         pj.tune(tmp_path / "no.toml")
 
@@ -487,7 +486,7 @@ def test_a_saturated_start_has_a_warning():
     assert any("start" in text or "before" in text for text in result.warnings)
 
 
-def test_ctrl_c_while_judging_keeps_the_gains():
+def test_ctrl_c_during_the_evaluation_keeps_the_gains():
     recorder = Recorder(stop_stage="judging")
     try:
         found = pj.tune(case_of({}), progress=recorder)
