@@ -1,4 +1,4 @@
-"""What every model of a stage keeps: the protocol of a System, and its recipe.
+"""Tests of every model of a stage: the protocol of a System, and its recipe.
 
 A suite subclasses both classes and names its models; each model runs in one program.
 """
@@ -32,25 +32,25 @@ EXTENT = Extent(
 )
 
 TURNS = np.array([11.3, 43.1, 23.7, 71.9, 51.3, 86.7, 57.1, 66.9, 38.3, 21.1, 47.7])
-PATH = np.repeat(TURNS, 2)  # Every turn is followed by a pause.
+PATH = np.repeat(TURNS, 2)  # a pause after every turning point
 OTHER = 0.5 * PATH + 9.1
 RESTS = (-7.3, 0.0, 30.0, 107.1)
 QUICK = {"xla_backend_optimization_level": 0}
-"""Options of the compiler: a program that runs once need not be a fast one."""
+"""Options of the compiler for programs that run once: compile quickly."""
 
 STEP = 1e-5
-"""Change of a parameter and of a turn for their difference quotients, relative."""
+"""Relative changes of a parameter and of a turning point for difference quotients."""
 
-# Turns that lead through loops within loops, 16 samples a branch
+# turning points of nested loops, 16 samples per branch
 CORNERS = [0.0, 100.0, 5.0, 90.0, 20.0, 75.0, 40.0, 60.0, 50.0]
 INPUT = np.interp(np.arange(129) / 16.0, np.arange(9), CORNERS)
 
 
 class Runs(NamedTuple):
-    """Runs along PATH, along OTHER with changed parameters, at RESTS, for differences.
+    """Runs along PATH, along OTHER with changed parameters, at RESTS, and changed ones.
 
-    ``expected`` are the difference quotients by parameters, then by turns, each by a
-    relative change; ``found`` are the gradients likewise.
+    ``expected`` are the difference quotients by parameters, then by turning points,
+    for relative changes; ``found`` are the gradients in the same order.
     """
 
     size: float
@@ -64,13 +64,13 @@ class Runs(NamedTuple):
 
 
 def shared(channels: int):
-    """Return the factor that turns an input into one for each of the channels."""
+    """Return the factor from a scalar input to an array of the channels."""
     return np.linspace(1.0, 0.5, channels) if channels else 1.0
 
 
 @cache
 def runs_of(model: Callable[[], System], channels: int) -> Runs:
-    """Run a model in one program, with an array as input if it has channels."""
+    """Run a model in one program; with channels its input is an array."""
     flat, unravel = ravel_pytree(model())
     flat = np.asarray(flat)
 
@@ -122,7 +122,7 @@ def runs_of(model: Callable[[], System], channels: int) -> Runs:
 class KeepsTheProtocol:
     """Tests of ``models``: functions by name, each of which makes one.
 
-    ``channels`` is the number of inputs of a model where they are an array,
+    ``channels`` is the number of inputs of a model whose input is an array,
     ``unregistered`` are classes that a user would register.
     """
 
@@ -205,7 +205,7 @@ class HasARecipe:
         recipe = kind.recipe(EXTENT)
         space = space_of(recipe.bounds)
         for changes in recipe.alternatives:
-            space.start(replace(recipe.system, changes))  # raises outside
+            space.start(replace(recipe.system, changes))  # raises if outside
         assert recipe.gain is None or recipe.gain in recipe.bounds
         assert set(recipe.own) <= set(recipe.bounds)
         outputs = np.asarray(response(recipe.system, INPUT))

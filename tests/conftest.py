@@ -2,7 +2,7 @@ import gc
 import os
 from pathlib import Path
 
-# There is a worker for each core: further threads of linear algebra would wait for
+# Each core has a worker: further threads of linear algebra would wait for
 # each other in a busy loop. Read when NumPy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -11,33 +11,33 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
-# The same examples in every run: a red run can be repeated, a green one is no luck.
+# Every run has the same examples, so that failures are reproducible.
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
 
-# Most programs of the tests run once: compiling them well takes longer than running
-# them badly. Commands that tests start inherit this.
+# Most programs of the tests run once: optimised compilation takes longer than running
+# unoptimised code. Commands that tests start inherit this setting.
 jax.config.update("jax_disable_most_optimizations", True)
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
-# Nor does a test look where in the source an operation of a program stands.
+# Tests do not need the source locations of the operations of a program.
 jax.config.update("jax_traceback_in_locations_limit", 0)
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
 
 
 @pytest.fixture
 def optimised():
-    """Compile the programs of a test well, because they run long."""
+    """Compile the programs of a test with optimisation, because they run long."""
     jax.config.update("jax_disable_most_optimizations", False)
     yield
     jax.config.update("jax_disable_most_optimizations", True)
 
 
-# Tracing makes many small objects, of which few are garbage.
+# Tracing creates many small objects; few of them are garbage.
 gc.set_threshold(100_000, 20, 20)
 
 
-# There is a worker for each core: a compiler of several threads gains nothing.
+# Each core has a worker: a compiler with several threads is not faster.
 ONE_THREAD = "--xla_cpu_parallel_codegen_split_count=1"
 os.environ.setdefault("XLA_FLAGS", ONE_THREAD)
 
@@ -62,9 +62,9 @@ install_import_hook([*modules_with_arrays()], "beartype.beartype")
 
 
 def pytest_collection_modifyitems(items):
-    """Begin with the files that take long: the workers then end at the same time.
+    """Start with the slow files, so that the workers end at the same time.
 
-    Those are the files that hold a slow test, and those that compile whole studies.
+    These are the files with a slow test and those that compile whole studies.
     """
     long = {
         item.path
@@ -75,6 +75,6 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_sessionfinish():
-    """Look for leaks once: pytest would five times, in gigabytes of traced programs."""
+    """Collect garbage once: pytest would collect gigabytes of programs five times."""
     gc.collect()
     gc.freeze()

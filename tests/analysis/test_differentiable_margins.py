@@ -1,4 +1,4 @@
-"""Margins from an impulse response, against the exact report, and their slopes."""
+"""Margins from an impulse response against the exact report, and their gradients."""
 
 import math
 
@@ -67,7 +67,7 @@ def test_figures_equal_the_exact_report(name, branch):
     point = OperatingPoint(5.0, branch)
     exact = stability_report(loop, point)
     found = jax.jit(lambda loop: sensitivity(loop, point))(loop)
-    # A peak between two lines is missed by little.
+    # A peak between two frequency lines is underestimated slightly.
     assert peak_of(found) == pytest.approx(exact.sensitivity_peak, rel=5e-3)
     assert disk_margin_of(found) == pytest.approx(exact.disk_margin, rel=5e-3)
     assert delay_margin_of(found) == pytest.approx(exact.delay_margin_samples, rel=5e-3)
@@ -82,7 +82,7 @@ def test_figures_equal_the_exact_report(name, branch):
 
 
 def test_a_lightly_damped_mode_between_two_lines_is_found():
-    """Its peak is 7 Hz wide, in the middle of two lines of the impulse response."""
+    """The peak of the mode is 7 Hz wide, midway between two frequency lines."""
     dt = 1e-4
     loop = pj.Feedback(
         pj.control.PID(0.0, 20.0, dt=dt),
@@ -96,7 +96,7 @@ def test_a_lightly_damped_mode_between_two_lines_is_found():
 
 
 def test_every_branch_equals_the_exact_report():
-    # The branches differ: one of them cannot stand for both.
+    # The branches differ, so one report cannot replace both.
     reports = [stability_report(pid_loop(), OperatingPoint(5.0, b)) for b in BRANCHES]
     exact = [report.sensitivity_peak for report in reports]
     assert max(exact) > 1.02 * min(exact)
@@ -105,7 +105,7 @@ def test_every_branch_equals_the_exact_report():
 
 
 def test_a_crossing_with_phase_lead_limits_the_delay_too():
-    """L = -k / A(z) of a mode turned by a quarter: |L| = 1 with lead on both sides."""
+    """L = -k / A(z) of a mode, rotated by 90 degrees: phase lead at both |L| = 1."""
     radius, angle = 0.99, 0.3
     A = np.array([1.0, -2.0 * radius * np.cos(angle), radius**2])
     k = 1.5 * (1.0 - radius) * 2.0 * np.sin(angle)
@@ -118,7 +118,7 @@ def test_a_crossing_with_phase_lead_limits_the_delay_too():
     whole = next(n for n in range(100) if not stable(n + 1))
     z = np.exp(1j * np.linspace(0.0, np.pi, 20_001))
     loop = -k / np.polyval(A, z)
-    assert np.angle(loop[np.abs(loop) > 1.0]).min() > 0.2  # no lag at all
+    assert np.angle(loop[np.abs(loop) > 1.0]).min() > 0.2  # without lag
     assert whole > 5
     # z^-2 (...) in companion form: the loop as a state space.
     system = LinearLoop(
@@ -135,7 +135,7 @@ def test_a_crossing_with_phase_lead_limits_the_delay_too():
 def test_the_two_sources_of_a_peak_agree_within_the_stated_error(integral):
     loop, duration = pid_loop(integral), 0.05
     exact = stability_report(loop, 5.0)
-    # The quality of the resonance at the peak is that of the pole nearest to it.
+    # The quality factor at the peak is that of the nearest pole.
     poles = np.log(np.array(exact.poles))
     place = 2.0 * np.pi * exact.sensitivity_peak_Hz * p753.DT
     pole = poles[np.argmin(np.abs(poles - 1j * place))]
@@ -161,7 +161,7 @@ def test_a_loop_without_gain_has_the_largest_margins():
 
 def test_a_bandwidth_beyond_nyquist_ends_at_the_nyquist_frequency():
     assert bandwidth_of(jnp.ones(64, complex), 1e-3) == 500.0
-    # A loop that leaves most of the reference at rest has no band to speak of.
+    # A loop that does not follow at frequency zero has no bandwidth.
     assert bandwidth_of(jnp.full(64, 0.5 + 0j), 1e-3) < 0.1
 
 
@@ -205,7 +205,7 @@ ANGLES = np.linspace(0.0, np.pi, 4001)
 
 
 def coupled(gains, coupling=0.4):
-    """S of two integrating axes, L = K [[1, c], [c/2, 1]] z^-3 / (z - 1), by NumPy."""
+    """Return S of two axes, L = K [[1, c], [c/2, 1]] z^-3 / (z - 1), by NumPy."""
     z = np.exp(1j * ANGLES[1:])[:, None, None]
     mixing = jnp.array([[1.0, coupling], [0.5 * coupling, 1.0]])
     L = gains[:, None] * mixing * z**-3 / (z - 1.0)
@@ -229,7 +229,7 @@ def test_a_delay_beyond_the_margin_of_one_axis_makes_two_axes_unstable():
     gains, mixing = np.array([0.12, 0.2]), np.array([[1.0, 0.4], [0.2, 1.0]])
 
     def stable(delay):
-        """Simulate the loop with ``delay`` further samples on the second axis."""
+        """Simulate the loop with ``delay`` additional samples on the second axis."""
         x, past = np.array([1.0, 1.0]), [np.zeros(2)] * 60
         for _ in range(3000):
             acted = np.array([mixing[0] @ past[-4], mixing[1] @ past[-4 - delay]])
@@ -256,7 +256,7 @@ def test_gradients_of_two_axes_equal_finite_differences():
 
 
 def test_equal_singular_values_have_a_gradient():
-    """Two equal axes: the slope along both gains is that of one axis."""
+    """Two equal axes: the gradient along both gains is that of one axis."""
 
     def peak(gain):
         return peak_of(coupled(gain * jnp.ones(2), coupling=0.0))
@@ -271,7 +271,7 @@ def test_equal_singular_values_have_a_gradient():
 
 @pytest.fixture(scope="module")
 def three_axes():
-    """S of a loop of three axes on both branches, and its exact reports."""
+    """Return S of a loop of three axes on both branches, and its exact reports."""
     loop, rest = p558_control.loop(p558_control.pid()), (5.0, 5.0, 5.0)
     exact = [stability_report(loop, OperatingPoint(rest, b)) for b in BRANCHES]
     return jax.jit(lambda loop: sensitivities(loop, rest))(loop), exact
@@ -284,6 +284,6 @@ def test_figures_of_three_axes_equal_the_exact_report(three_axes):
         assert peak_of(S) == pytest.approx(report.sensitivity_peak, rel=5e-3)
         least = min(axis.delay_margin_samples for axis in report.axes)
         assert delay_margin_of(S) == pytest.approx(least, rel=2e-2)
-        # The bound without scaling of the axes is below the structured one.
+        # Without scaling of the axes the bound is smaller than the structured one.
         assert disk_margin_of(S) < report.disk_margin * (1.0 + 5e-3)
         assert disk_margin_of(S) > 0.8 * report.disk_margin

@@ -1,4 +1,4 @@
-"""Margins of linear loops against python-control, and against loops set going."""
+"""Margins of linear loops against python-control and against simulations."""
 
 import json
 import math
@@ -81,7 +81,7 @@ def test_the_transfer_function_equals_the_equations(pair):
 
 
 def test_the_closed_loop_response_equals_that_of_a_run(pair):
-    """These loops are linear: an impulse of the reference tells y/r."""
+    """The loops are linear: the response to an impulse of the reference is y/r."""
     loop, _, report = pair
     samples = 24_000
     impulse = np.full(samples + 1, 3.0)
@@ -123,7 +123,7 @@ def test_poles(pair):
 
 
 def sampled(oracle):
-    """A response that python-control interpolates: any order, and no lost digits."""
+    """Return a sampled response for python-control, accurate for any order."""
     omega = np.geomspace(3.0, 0.99999 * np.pi / DT, 8_000)
     return control.frd(oracle(np.exp(1j * omega * DT)), omega, smooth=True)
 
@@ -157,7 +157,7 @@ def test_sensitivity_peaks_and_disk_margins(pair):
     loop, oracle, report = pair
     distance = control.stability_margins(sampled(oracle))[2]
     assert report.sensitivity_peak == pytest.approx(1.0 / distance, rel=1e-6)
-    # Around the peaks we name, the oracle has that value and none above it.
+    # At our peaks the oracle has the same value, and nowhere a larger one.
     for name, function in (
         ("complementary_peak", lambda L: L / (1.0 + L)),
         ("sensitivity_peak", lambda L: 1.0 / (1.0 + L)),
@@ -166,7 +166,7 @@ def test_sensitivity_peaks_and_disk_margins(pair):
         grid = np.append(np.geomspace(1e-2, np.pi / DT, 8_000), top)
         values = np.abs(function(oracle(np.exp(1j * grid * DT))))
         assert values.max() == pytest.approx(getattr(report, name), rel=1e-7)
-    linear = linear_loop(loop, 3.0)[0]  # compared with the oracle above
+    linear = linear_loop(loop, 3.0)[0]  # compared with the oracle in the test above
     model = control.ss(linear.A, linear.B[:, None], linear.C[None], 0.0, DT)
     grid = np.geomspace(10.0, np.pi / DT, 400)
     worst = grid[np.argmin(disk(model, grid)[0])]
@@ -179,12 +179,12 @@ def test_sensitivity_peaks_and_disk_margins(pair):
 
 
 def disk(model, omega):
-    """python-control's disk margin, gain in dB and phase in degrees at ``omega``."""
+    """Return the disk margin of python-control: gain in dB, phase in degrees."""
     return control.disk_margins(model, omega, skew=0.0, returnall=True)
 
 
 def error_growth(loop, samples=4_000):
-    """How much larger the last tenth of a kicked run is than the tenth before."""
+    """Return the ratio of the last tenth of an impulse response to the tenth before."""
     inputs = LoopInput(
         jnp.zeros(samples), jnp.zeros(samples), jnp.zeros(samples).at[0].set(1e-3)
     )
@@ -242,7 +242,7 @@ def test_an_unstable_loop_has_poles_and_no_margins():
 
 
 def test_a_loop_without_crossover_has_a_gain_margin_only():
-    """L = 0.5 p, a circle of radius 0.5: only the gain can grow too large."""
+    """L = 0.5 p is a circle of radius 0.5: only a larger gain destabilises the loop."""
     one = np.ones(1)
     report = report_of(LinearLoop(np.zeros((1, 1)), one, 0.5 * one, DT))
     assert report.gain_margin == pytest.approx(2.0)  # at the Nyquist frequency

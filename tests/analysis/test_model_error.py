@@ -1,4 +1,4 @@
-"""Worst margins under a model error, against brute force over errors and delays."""
+"""Worst margins for a model error, against an exhaustive grid of errors and delays."""
 
 import jax
 import jax.numpy as jnp
@@ -25,13 +25,13 @@ TURNS = np.exp(2j * np.pi * np.arange(720) / 720)
 def test_worst_sensitivity_is_the_largest_over_errors():
     share = BOUND * np.abs(1.0 - S)
     inside = share < NEAR_ONE
-    assert 10 < inside.sum() < LINES  # both kinds of lines are there
+    assert 10 < inside.sum() < LINES  # the lines include both kinds
     found = np.asarray(worst_sensitivity(jnp.asarray(S), jnp.asarray(BOUND)))
     errors = BOUND[:, None] * TURNS
     sampled = np.max(np.abs(1.0 / (1.0 + L[:, None] * (1.0 + errors))), axis=1)
     ratio = found[inside] / sampled[inside]
     assert np.all(ratio >= 1.0 - 1e-12)
-    # The grid of angles misses the worst one by half a step at most.
+    # The grid of angles misses the worst angle by at most half a step.
     near = share[inside] < 0.9
     np.testing.assert_allclose(ratio[near], 1.0, rtol=2e-3)
     assert np.all(found[~inside] > 1.0 / (1.0 - NEAR_ONE) - 1e-6)
@@ -53,7 +53,7 @@ def test_worst_sensitivity_grows_beyond_instability():
 def closest(line, bound, delays):
     """Return the least |1 + L (1 + D) exp(-j w tau)| over D, by delay."""
     turned = L[line] * np.exp(-1j * ANGLE[line] * delays)
-    # The discs' edges and their inside: radii from 0 to the bound.
+    # The edge and the inside of the discs: radii from 0 to the bound.
     errors = (bound * np.linspace(0.0, 1.0, 41)[:, None] * TURNS).ravel()
     return np.array([np.abs(1.0 + one * (1.0 + errors)).min() for one in turned])
 
@@ -70,7 +70,7 @@ def test_worst_delay_margin_is_the_smallest_delay_that_can_be_unstable(line):
     )
     around = float(2.0 * np.pi / ANGLE[line])
     delays = np.linspace(0.0, around, 241)
-    # The grid of D misses a zero by its step times |L|.
+    # The error of a zero on the grid of D is at most its step times |L|.
     zero = closest(line, bound, delays) < 0.03 * bound * abs(L[line])
     if found == UNLIMITED_DELAY:
         assert not zero.any()
@@ -105,7 +105,7 @@ def test_loops_with_infinite_and_zero_gain(sensitivity, bound, expected):
 
 @pytest.mark.parametrize("loop", [-0.1, -1e-6, 0.1])
 def test_a_small_loop_gain_of_phase_zero_needs_a_delay(loop):
-    # At the Nyquist frequency L is real: a negative one lies towards -1, but far away.
+    # At the Nyquist frequency L is real; a negative L is far from -1 here.
     arguments = (jnp.asarray([1.0 / (1.0 + loop) + 0j]), jnp.asarray([5.0]))
     assert worst_delay_margin(*arguments, jnp.full(1, np.pi))[0] == UNLIMITED_DELAY
 

@@ -1,7 +1,7 @@
-"""Margins of the 3-DOF loops against python-control, and against loops set going.
+"""Margins of the 3-DOF loops against python-control and against simulations.
 
-The oracle's controllers are plain loops; their matrices are found by setting one of
-their numbers at a time to 1.
+The controllers of the oracle are plain loops; their matrices follow from runs with one
+number of their state set to 1.
 """
 
 import json
@@ -45,7 +45,7 @@ STATE = {
 
 
 def place(controller, path):
-    """Where a number of the controller's state is kept: container and key."""
+    """Return the place of a number of the controller's state: container and key."""
     owner, _, key = path.rpartition(".")
     if not owner:
         return vars(controller), key
@@ -54,7 +54,7 @@ def place(controller, path):
 
 
 def controller_matrices(make):
-    """A, B, C, D of a plain controller, from measurements to commands."""
+    """Return A, B, C, D of a plain controller from measurements to commands."""
     paths = STATE[type(make())]
     shapes = [(3, 2) if path == "w" else (3,) for path in paths]
     sizes = [math.prod(shape) for shape in shapes]
@@ -84,7 +84,7 @@ LOOPS = {
 
 @pytest.fixture(scope="module", params=list(LOOPS))
 def both(request):
-    """Our report on a loop, and the oracle's stage and controller."""
+    """Return the report of a loop, and the stage and controller of the oracle."""
     ours, theirs = LOOPS[request.param]
     report = pj.stability_report(p558_control.loop(ours()), REST)
     stage = control.ss(*three_dof.stacked(), np.zeros((3, 3)), T)
@@ -98,7 +98,7 @@ def pair(both):
 
 
 def response(system, hertz):
-    """[lines, q, q] at z on the unit circle; frequencies must ascend."""
+    """Return the response [lines, q, q] on the unit circle at ascending frequencies."""
     omega = 2.0 * np.pi * np.atleast_1d(hertz)
     return np.moveaxis(control.frequency_response(system, omega).frdata, -1, 0)
 
@@ -108,14 +108,14 @@ def largest(matrices):
 
 
 def closed_poles(L, gains):
-    """Poles of python-control's L with gains before it, closed (L.D is zero)."""
+    """Return the closed-loop poles of python-control's L with gains in front."""
     return np.linalg.eigvals(L.A - L.B @ gains @ L.C)
 
 
 def test_poles(pair):
     report, L = pair
     theirs = closed_poles(L, np.eye(3))
-    # Deadbeat states are a multiple pole at 0, which rounding spreads.
+    # Deadbeat states give a multiple pole at 0, which rounding errors separate.
     theirs = theirs[np.abs(theirs) > 0.1]
     ours = np.array(report.poles)
     ours = ours[np.abs(ours) > 0.1]
@@ -164,7 +164,7 @@ def test_one_axis_has_the_same_sensitivity_at_both_cuts():
 
 
 def one_axis(matrices, axis):
-    """L of one axis with the others closed, by elimination."""
+    """Return L of one axis with the other loops closed, by elimination."""
     others = [i for i in range(3) if i != axis]
     rest = np.eye(2) + matrices[:, others][:, :, others]
     back = np.linalg.solve(rest, matrices[:, others, axis][..., None])[..., 0]
@@ -193,12 +193,12 @@ def test_margins_of_each_axis_alone(pair, axis):
         assert found.delay_margin_samples == pytest.approx(delay, rel=1e-6)
     disk = np.abs(0.5 * (1.0 - alone) / (1.0 + alone)).max()
     assert found.disk_margin == pytest.approx(1.0 / disk, rel=1e-5)
-    # All axes may vary at once by no more than one alone.
+    # The margin of all axes at once is at most that of one axis alone.
     assert report.disk_margin <= found.disk_margin
 
 
 def worst_phases(matrix):
-    """The largest spectral radius of M U, U diagonal and unitary, and U."""
+    """Return the largest spectral radius of M U over diagonal unitary U, and that U."""
 
     def radius(phases):
         turned = matrix * np.exp(1j * np.append(phases, 0.0))
@@ -218,13 +218,13 @@ def test_the_smallest_destabilising_change_equals_the_margin_of_all_axes(pair):
     half = np.linalg.inv(np.eye(3) + matrix) - 0.5 * np.eye(3)
     radius, U = worst_phases(half)
     assert report.disk_margin == pytest.approx(1.0 / radius, rel=1e-6)
-    # Perturbations of that size, one an axis, put a pole on the unit circle.
+    # Perturbations of this size, one per axis, move a pole to the unit circle.
     values = np.linalg.eigvals(half * U)
     delta = U / values[np.argmax(np.abs(values))]
     assert np.abs(delta) == pytest.approx(report.disk_margin, rel=1e-6)
     factors = (2.0 + delta) / (2.0 - delta)
     assert np.linalg.svd(np.eye(3) + matrix * factors)[1][-1] < 1e-6
-    # No other frequency needs less, and the scaling only helps.
+    # No other frequency has a smaller one, and scaling reduces the bound.
     others = np.linalg.inv(np.eye(3) + response(L, np.geomspace(0.01, 249.0, 40)))
     for other in others - 0.5 * np.eye(3):
         assert worst_phases(other)[0] <= 1.0 / report.disk_margin * (1.0 + 1e-9)
@@ -245,7 +245,7 @@ def loop():
 
 
 def test_a_free_run_equals_the_prediction_of_the_matrices(loop):
-    # As the reports have it, before its states are balanced.
+    # as in the reports, before its states are balanced
     A, B, C, _, dt, _ = _matrices(loop, OperatingPoint(REST), BrokenLoop)
     model = LinearAxes(A, B, C, dt)
     rest = eqx.filter_jit(broken_loop)(loop, REST)
@@ -263,7 +263,7 @@ def test_a_free_run_equals_the_prediction_of_the_matrices(loop):
     _, log = pj.simulate(loop, LoopInput(quiet, quiet, None), start)
     run = np.stack(log.voltage, axis=-1)
     np.testing.assert_allclose(run, predicted, rtol=0.0, atol=1e-9)
-    # What is left decays with the slowest pole.
+    # The remainder decays with the slowest pole.
     left = np.abs(np.stack(log.displacement, axis=-1)).max(axis=1)
     pole = (left[4_900] / left[4_500]) ** (1.0 / 400.0)
     assert poles.max() == pytest.approx(pole, abs=1e-6)
@@ -274,7 +274,7 @@ def test_a_free_run_equals_the_prediction_of_the_matrices(loop):
     [("dynamic", True, 0.9985), ("step", True, 0.996), ("step", False, 0.990)],
 )
 def test_largest_poles_of_chapter_7(gains, filtered, pole):
-    """The poles that another linearisation of the same readings has."""
+    """Compare the poles with those of an independent linearisation."""
     loop = p558_control.loop(p558_control.multi_axis(gains, filtered))
     linear, *_ = linear_axes(loop, REST)
     largest = np.abs(np.linalg.eigvals(linear.closed())).max()
@@ -312,7 +312,7 @@ def test_a_reference_beyond_the_limits_is_refused(loop):
 
 
 def scalar_loops():
-    """y(k+1) = a y + g u, u = -y: stable, with margins known apart."""
+    """Return stable loops y(k+1) = a y + g u, u = -y, with known margins."""
     one = np.ones(1)
     return [
         LinearLoop(np.array([[a]]), one, gain * one, T)

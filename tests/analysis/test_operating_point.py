@@ -1,4 +1,4 @@
-"""Linearisation: hysteresis at rest, the cut, derivatives, and what is refused."""
+"""Linearisation: hysteresis at rest, the cut, derivatives, and refused input."""
 
 import equinox as eqx
 import jax
@@ -69,7 +69,7 @@ def test_derivatives_of_a_nonlinear_system_equal_finite_differences():
 
 @pytest.mark.parametrize("branch", list(SIDES))
 def test_hysteresis_is_linearised_to_the_slope_of_its_branch(branch):
-    """b + s (a x + c y) on the virgin curve, and no pole of its memory."""
+    """The slope is b + s (a x + c y) on the virgin curve; the memory adds no pole."""
     report = pj.stability_report(p753.loop(pid()), OperatingPoint(5.0, branch))
     x = report.voltage_V
     p = -a / c
@@ -87,7 +87,7 @@ def test_hysteresis_is_linearised_to_the_slope_of_its_branch(branch):
 
 
 def test_an_inverse_hysteresis_has_the_branch_of_the_plant():
-    """With the model equal to the plant both slopes cancel, up, down and anywhere."""
+    """If the model equals the plant, both slopes cancel on either branch."""
     loop = p753.loop(p753.inversion())
     reports = [
         pj.stability_report(loop, OperatingPoint(reference, branch))
@@ -124,7 +124,7 @@ def test_closing_the_cut_loop_gives_the_closed_loop():
     step = jax.jit(lambda state, voltage: broken.step(state, voltage))
     for k in range(samples):
         seen.append(float(state.displacement))
-        # The command of k moves the plant at k: returned from any injected voltage.
+        # The command of sample k moves the plant at k, for any injected voltage.
         voltage = -step(state, 0.0)[1]
         state, _ = step(state, voltage)
         if k == 0:
@@ -133,7 +133,7 @@ def test_closing_the_cut_loop_gives_the_closed_loop():
 
 
 def test_the_injected_voltage_is_hidden_from_the_observer():
-    """The controller remembers its own voltage: only the plant's state is moved."""
+    """The controller stores its own voltage: only the state of the plant is moved."""
     loop = p753.loop(p753.disturbance_observer(), 0.0)
     broken = broken_loop(loop, 4.0)
     still, moved = (broken.step(broken.init(), 30.0 + dv)[0] for dv in (0.0, 1.0))

@@ -1,4 +1,4 @@
-"""How near loops come to their limit, against what is known of them beforehand."""
+"""Distance of loops from their limit, against known answers."""
 
 import json
 
@@ -53,7 +53,7 @@ def disturbance():
 
 @pytest.fixture(scope="module")
 def linear(disturbance):
-    """A slope with one sample of delay, an integral controller, a known disturbance."""
+    """Return the limit of a delayed slope with integral control and a disturbance."""
     found = performance_limit(
         loop_of(pj.core.system.Affine(SLOPE)),
         NAMES,
@@ -78,27 +78,27 @@ def test_the_analysis_of_a_linear_loop_equals_its_definition(linear, disturbance
     for found in linear.references.values():
         whole = disturbance[START:].std()
         assert found.unpredicted == pytest.approx(whole, rel=0.1)
-        # A gain 1 % wrong adds as much of the stage's own motion, all predicted.
+        # An error of the gain of 1 % adds 1 % of the motion, all of it predicted.
         assert found.unpredicted <= found.disturbance < whole + 0.02 * 5.0
 
 
 def test_the_limit_equals_the_scalar_riccati_equation(linear):
     known = np.sqrt(riccati(NOISE**2))
     for found in linear.references.values():
-        # The drawn disturbance is not its model: 45 segments make a spectrum.
+        # The drawn disturbance differs from its model: a spectrum has 45 segments.
         assert found.limit == pytest.approx(known, rel=0.06)
         assert found.limit <= found.one_controller <= 1.03 * known
 
 
 def test_curves_and_bandwidth_equal_the_known_spectra(linear):
-    """The disturbance has DRIVEN^2 / |1 - MEMORY z^-1|^2, the noise is white."""
+    """The disturbance has the spectrum DRIVEN^2 / |1 - MEMORY z^-1|^2."""
     line = np.arccos((1.0 + MEMORY**2 - (DRIVEN / NOISE) ** 2) / (2.0 * MEMORY)) / (
         2.0 * np.pi * DT
     )
     curves = linear.curves
     for i, found in enumerate(linear.references.values()):
         assert found.bandwidth == pytest.approx(line, rel=0.15)
-        # Lines of both signs make the variance.
+        # The lines of positive and negative frequency add up to the variance.
         assert np.sqrt(np.mean(curves.limit[i])) == pytest.approx(found.limit, rel=0.02)
         above = curves.unpredicted[i] > curves.noise
         assert curves.frequency[np.flatnonzero(above)[-1]] == found.bandwidth
@@ -120,7 +120,7 @@ def test_errors_and_shares_equal_those_of_the_loop(linear, disturbance):
         assert shares.unpredicted == pytest.approx(rms(left), rel=0.15)
         parts = shares.noise**2 + shares.unpredicted**2 + shares.predicted**2
         assert np.sqrt(parts) == pytest.approx(found.tuned, rel=0.05)
-        # An integral lags behind a sine by its frequency over the loop's bandwidth.
+        # The lag of integral control is the frequency over the bandwidth of the loop.
         if i == 0:
             lag = 2.0 * np.pi * 10.0 / (8000.0 * SLOPE)
             swing = references[0].std()
@@ -131,7 +131,7 @@ def test_errors_and_shares_equal_those_of_the_loop(linear, disturbance):
 
 
 def test_a_better_controller_is_closer_to_the_limit(linear, disturbance):
-    # Of a constant reference nothing has to be followed: what is left is feedback.
+    # With a constant reference the error is that of the feedback alone.
     references, noise = driving()
     flat = np.full_like(references, 5.0)
     found = {
@@ -152,7 +152,7 @@ def test_a_better_controller_is_closer_to_the_limit(linear, disturbance):
     assert keen.ratio > 2.0
     assert keen.near == 0
     assert {one.largest_excess for one in keen.references.values()} == {"noise"}
-    # The limit is the disturbance's and the noise's, not the loop's.
+    # The limit depends on the disturbance and the noise, not on the loop.
     for name in NAMES:
         limits = [report.references[name].limit for report in (good, keen)]
         assert limits[1] == pytest.approx(limits[0], rel=0.06)
@@ -167,7 +167,7 @@ def test_a_hysteretic_stage(tmp_path):
     )
     for one in found.references.values():
         assert one.limit < one.one_controller < one.tuned
-        # The reference predicts most of what its hysteresis does.
+        # The reference predicts most of the effect of the hysteresis.
         assert 0.0 < one.unpredicted < 0.5 * one.disturbance
         assert one.limit**2 == pytest.approx(
             one.limit_shares.noise**2 + one.limit_shares.unpredicted**2
@@ -185,7 +185,7 @@ def test_a_hysteretic_stage(tmp_path):
 
 def test_memory_and_uncontrollable_states_are_removed():
     class Counting(pj.System):
-        """A slope and a ramp of its own, which no voltage moves."""
+        """A slope, and a ramp that does not depend on the voltage."""
 
         def init(self, input=0.0):
             return jnp.zeros(2)
@@ -201,13 +201,13 @@ def test_memory_and_uncontrollable_states_are_removed():
     )
     model = pj.hysteresis.ColemanHodgdon(0.0077, 0.1167, -0.0487)
     stage = pj.series(hysteresis=model, lag=pj.dynamics.FirstOrderLag(5e-4, DT))
-    # Its own input, a pole at 0, and the lag; not where on its branch it is.
+    # The stored input (a pole at 0) and the lag; not the state of the hysteresis.
     poles = np.linalg.eigvals(linear_plant(loop_of(stage), 5.0, DT).A)
     np.testing.assert_allclose(np.sort(poles), [0.0, np.exp(-0.4)], atol=1e-9)
 
 
 def test_delays_and_zeros_of_a_plant_are_found():
-    """Delays and zeros of plants written as functions of 1/z, and slow creep."""
+    """The plants are written as functions of 1/z; one of them has slow creep."""
     moving, autoregressive = (0.0050811, -0.0036354, 0.010553), (1.6035, -0.61995)
     dynamics = pj.dynamics.ARMA(autoregressive, moving)
     for plant, delay, zeros in (
@@ -248,14 +248,14 @@ def test_only_a_linear_filter_of_the_reference_is_predicted():
     moving = np.stack([references_of.signal(name, jnp.asarray(time)) for name in names])
     known = ReferencePredictor(moving, 5_000, 250)
     assert known.count == 10_000 - 5_000 - 250
-    # Lag, lead and slope: what a controller and a linear stage make of a reference.
+    # Lag, lead and slope: a linear filter of the reference.
     lagging = signal.lfilter([0.05], [1.0, -0.95], moving - moving[:, :1])
     ahead = np.concatenate([moving[:, 20:], moving[:, -20:]], axis=1)
     signals = (lagging + 0.3 * ahead + 4.0)[:, None]
     rest = known.unpredicted(signals)
     whole = known.centred(signals)
     assert np.all(rest.std(axis=2) < 1e-3 * whole.std(axis=2))
-    # Harmonics are no linear filter's work, and neither is anything of one's own.
+    # A linear filter predicts neither harmonics nor an independent signal.
     other = np.stack([np.sin(2.0 * np.pi * 3.0 * 10.0 * time)] * 4)[:, None]
     kept = known.unpredicted(
         signals + np.array([0.0, 1.0, 0.0, 0.0])[:, None, None] * other
@@ -264,7 +264,7 @@ def test_only_a_linear_filter_of_the_reference_is_predicted():
     drawn = np.random.default_rng(4).standard_normal((4, 2, 10_000))
     left = known.unpredicted(drawn)
     np.testing.assert_allclose(left.std(axis=2), 1.0, atol=0.05)
-    # A reference that does not move predicts nothing.
+    # A constant reference predicts nothing.
     still = ReferencePredictor(np.full((4, 10_000), 5.0), 5_000, 250)
     np.testing.assert_array_equal(still.unpredicted(signals), still.centred(signals))
 
@@ -290,7 +290,7 @@ def test_loops_without_a_limit_are_refused():
 
 
 class Scalar(pj.System):
-    """A model of vectors as a plant of numbers."""
+    """A model with vectors as a plant with scalar signals."""
 
     model: pj.dynamics.StateSpace
 

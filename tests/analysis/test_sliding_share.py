@@ -1,4 +1,4 @@
-"""Parts of the sliding variable against a plain alpha-beta filter and NumPy."""
+"""Parts of the sliding variable, against a plain alpha-beta filter in NumPy."""
 
 import dataclasses
 

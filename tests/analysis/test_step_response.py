@@ -17,7 +17,7 @@ ENDS = (3.0, -1.0)
 
 
 def run(share):
-    """Displacement whose step response is ``share``, [samples] from the step on."""
+    """Return the displacement for the step response ``share`` [samples]."""
     moved = ENDS[0] + (ENDS[1] - ENDS[0]) * np.asarray(share)
     return jnp.asarray(np.concatenate([[ENDS[0]], moved]))
 
@@ -32,7 +32,7 @@ def test_a_first_order_lag():
     assert found.rise_time == pytest.approx(TAU * np.log(9.0), rel=1e-4)
     assert found.settling_time == pytest.approx(TAU * np.log(50.0), rel=1e-4)
     assert found.settling_time_fine == pytest.approx(TAU * np.log(1000.0), rel=1e-4)
-    # 40 nm of noise are 1 % of the step.
+    # A noise of 40 nm is 1 % of the step.
     assert found.settling_time_noise == pytest.approx(TAU * np.log(100.0), rel=1e-4)
     assert found.overshoot == 0.0
     assert found.steady_state_error < 1e-7
@@ -57,7 +57,7 @@ def test_an_unsettled_step_has_settling_time_beyond_the_run():
     assert 1_000 * DT < near.settling_time < far.settling_time
     assert far.rise_time > 1_000 * DT
     assert far.steady_state_error == pytest.approx(0.5)
-    # At 89 % the rise is not complete either, and a little longer than the run.
+    # At 89 % the rise is incomplete too; its time slightly exceeds the run.
     short = figures(np.full(1_000, 0.89))
     assert 1_000 * DT < short.rise_time < far.rise_time
 

@@ -1,4 +1,4 @@
-"""Strokes against closed forms, and against a slow drive by NumPy."""
+"""Strokes against closed forms and against a slow motion in NumPy."""
 
 import itertools
 
@@ -23,7 +23,7 @@ def bounds(found):
 
 
 def driven(weights, radii, lag, samples=20_000):
-    """Plays and a lag by NumPy, from rest: to one limit, the other, and back."""
+    """Return the output of plays and a lag from rest to both limits and back."""
     out, plays, y = [], np.zeros(len(radii)), 0.0
     points = (0.0, LOW[0], HIGH[0], LOW[0])
     ramps = [np.linspace(a, b, samples) for a, b in itertools.pairwise(points)]
@@ -35,7 +35,7 @@ def driven(weights, radii, lag, samples=20_000):
 
 
 def test_hysteresis_and_lag_behind_an_actuator():
-    # Over 140 V the slew limit lags far behind a drive of 250 samples.
+    # Over 140 V the slew limit lags far behind a motion of 250 samples.
     actuator = Saturation(-20.0, 120.0) >> SlewLimit(500.0, DT) >> Quantiser(1e-4)
     weights, radii = np.array([0.06, 0.03, 0.01]), np.array([0.0, 5.0, 40.0])
     plays = PrandtlIshlinskii(weights[:1], radii[1:], weights[1:])
@@ -52,7 +52,7 @@ def test_the_limits_of_the_actuator_bound_the_stroke():
 
 
 def test_the_stroke_includes_all_creep():
-    # The drive takes 25 ms, the slowest creep 100 s.
+    # The motion takes 25 ms, the slowest creep 100 s.
     stage = ExponentialCreep((0.1, 0.2), (1.0, 100.0), DT, direct=0.5)
     assert bounds(stroke_of(stage, LOW, HIGH)) == pytest.approx([-16.0, 96.0])
 
@@ -69,7 +69,7 @@ def test_coupled_axes():
 
 
 class Shared(System):
-    """Two axes that share one supply: each gives way when both are driven."""
+    """Two axes that share one supply: each moves less when both are driven."""
 
     def init(self, input=None):
         return ()
@@ -86,7 +86,7 @@ def test_the_stroke_of_an_axis_is_that_of_driving_it_alone():
 
 
 class Walking(System):
-    """A stage of 1 um/V with noise and drift of its own."""
+    """A stage of 1 um/V with noise and drift."""
 
     drift: float
     noise: float

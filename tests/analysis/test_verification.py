@@ -1,4 +1,4 @@
-"""The controller of the limit on stages: what is predicted is what it leaves."""
+"""The controller of the limit on stages: its error equals the prediction."""
 
 import numpy as np
 import pytest
@@ -32,9 +32,9 @@ def test_a_linear_stage_reaches_the_prediction_in_the_first_round():
     report = performance_limit(loop, NAMES, REFERENCES, NOISE, disturbance, start=START)
     shared = [one.one_controller for one in report.references.values()]
     np.testing.assert_allclose(found.predicted, shared, rtol=1e-9)
-    # 0.7 s of noise are one draw of it.
+    # one draw of 0.7 s of noise
     np.testing.assert_allclose(found.simulated, found.predicted, rtol=0.1)
-    # The reference is followed by what was known of it: an integral lags 0.1 um.
+    # Integral control lags the reference by 0.1 um.
     assert report.references["SIN10"].tuned > 10.0 * found.simulated[0]
 
 

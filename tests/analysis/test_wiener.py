@@ -1,4 +1,4 @@
-"""The least error against closed forms, Riccati equations and loops in NumPy."""
+"""Least errors, against closed forms, Riccati equations and loops in NumPy."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def ar1(a, driven=1.0):
 def test_a_factor_is_stable_with_a_stable_inverse():
     wanted = response((1.0, 0.5), (1.0, -0.9))
     np.testing.assert_allclose(outer_factor(np.abs(wanted)), wanted, rtol=1e-10)
-    # A zero outside the circle comes back inside, as large as before.
+    # A zero outside the circle is reflected, with the same gain.
     outside = response((1.0, -2.0), (1.0, -0.9))
     found = outer_factor(np.abs(outside))
     np.testing.assert_allclose(found, response((2.0, -1.0), (1.0, -0.9)), rtol=1e-10)
@@ -54,7 +54,7 @@ def test_the_inner_part_is_the_delay_and_the_zeros_outside():
     plant = response((0.0, 0.0, 1.0, -2.0), (1.0, -0.9))
     found = inner_of((0.0, 0.0, 1.0, -2.0))
     np.testing.assert_allclose(np.abs(found), 1.0, rtol=1e-12)
-    # What is left is stable with a stable inverse: it is its own outer factor.
+    # The remaining factor is stable with a stable inverse: the outer factor.
     rest = plant / found
     np.testing.assert_allclose(rest, -outer_factor(np.abs(plant)), rtol=1e-9)
     angle = np.unwrap(np.angle(found))
@@ -69,7 +69,7 @@ def test_the_inner_part_is_the_delay_and_the_zeros_outside():
 def test_a_white_disturbance_is_unpredictable():
     spectrum = np.full(POINTS, 0.7)
     assert least(spectrum, 0.2, W) == pytest.approx(0.7, rel=1e-12)
-    # Without the delay it can be weighed against the noise.
+    # Without the delay the filter weighs the disturbance against the noise.
     assert least(spectrum, 0.2, np.ones(POINTS)) == pytest.approx(0.7 * 0.2 / 0.9)
 
 
@@ -84,7 +84,7 @@ def test_a_unit_delay_has_the_cost_of_the_scalar_riccati_equation(a, variance):
 
 @pytest.mark.parametrize("zero", [1.2, 3.0, -2.0])
 def test_a_zero_outside_the_circle_raises_the_error_by_the_known_factor(zero):
-    # The part of V outside P_i H2 is spanned by the kernels at w = 0 and w = 1/zero.
+    # The kernels at w = 0 and w = 1/zero span the part of V outside P_i H2.
     a, b = 0.9, 1.0 / zero
     factor = 1.0 + a**2 * (1.0 - b**2) / (1.0 - a * b) ** 2
     delayed = least(ar1(a), 0.0, W)
@@ -94,7 +94,7 @@ def test_a_zero_outside_the_circle_raises_the_error_by_the_known_factor(zero):
 
 
 def lqg(plant, model, driven, variance, effort):
-    """Return E y^2 of the LQG loop; systems (numerator, denominator) in 1/z."""
+    """Return Return E y^2 of the LQG loop; systems (numerator, denominator) in 1/z."""
 
     def states(numerator, denominator):
         # Controllable form of a strictly proper function of 1/z.
@@ -161,7 +161,7 @@ def test_the_error_falls_with_the_noise():
 
 @pytest.fixture(scope="module")
 def drawn():
-    """A disturbance and measurement noise, of ``ar1(0.98)`` and variance 4."""
+    """Return a disturbance of ``ar1(0.98)`` and measurement noise of variance 4."""
     random = np.random.default_rng(5)
     draws, noise = random.standard_normal((2, 60_000))
     return signal.lfilter([1.0], [1.0, -0.98], draws), 2.0 * noise
@@ -178,7 +178,7 @@ def test_the_best_controller_reaches_the_limit_in_a_loop(drawn):
     y, u, seen = (np.zeros(d.size + 400) for _ in range(3))
     moved = np.zeros(d.size + 400)
     for k in range(400, d.size + 400):
-        # The stage answers the voltage; the controller runs the same model beside it.
+        # The controller simulates the same model as the stage.
         moved[k] = np.dot(numerator, u[k - 3 : k + 1][::-1])
         moved[k] -= np.dot(denominator[1:], moved[k - 3 : k][::-1])
         y[k] = moved[k] + d[k - 400]
@@ -204,9 +204,9 @@ def test_no_other_linear_controller_has_a_smaller_error(drawn):
                 [0.0, proportional + integral, -proportional], loop, n
             )
             found.append(np.mean((sensitivity - heard)[1000:] ** 2))
-    assert min(found) > 0.97 * bound  # 3 %: what 60 000 samples tell
+    assert min(found) > 0.97 * bound  # 3 %: the accuracy of 60 000 samples
     assert min(found) < 1.3 * bound
-    # Exactly, in spectra.
+    # the exact comparison, in spectra
     for integral in np.geomspace(0.02, 1.0, 12):
         T = integral * W / (1.0 - W + integral * W)
         assert sum(error_shares(T, ar1(0.98), 4.0)) >= bound
@@ -222,7 +222,7 @@ def test_one_controller_for_several_disturbances():
     shared = errors(common_response(spectra, 0.5, inner, tolerance=1e-9))
     own = [sum(error_shares(best_response(s, 0.5, inner), s, 0.5)) for s in spectra]
     assert np.all(shared >= own)
-    # No mixture of the spectra leads to a lower geometric mean.
+    # No weighted sum of the spectra gives a lower geometric mean.
     random = np.random.default_rng(2)
     for weights in (np.ones(3), 1.0 / np.array(own), *random.exponential(size=(50, 3))):
         mixed = errors(best_response(weights @ spectra / weights.sum(), 0.5, inner))

@@ -1,4 +1,4 @@
-"""Active damping against a loop of NumPy, and the damping that it adds."""
+"""Active damping against a NumPy loop, and the added damping."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -81,7 +81,7 @@ def test_the_loop_equals_the_equations(scheme):
         applied = np.clip(command + damping, -LIMIT, LIMIT)
         railed += abs(applied) == LIMIT
         assert float(log.voltage[k]) == pytest.approx(applied, abs=1e-9)
-        # The stage answers from the next sample on: the loop reads z(k) first.
+        # The voltage acts from the next sample on: the loop reads z(k) first.
         (_,), plant_state = scipy.signal.lfilter(over, under, [applied], zi=plant_state)
         z = plant_state[0]
     assert railed > 0

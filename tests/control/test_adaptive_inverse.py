@@ -17,7 +17,7 @@ from piezojax.core.feedback import LoopInput, Observation
 SAMPLES = 10_000
 NOISE_RMS = 0.012
 DRAWS = np.random.default_rng(5).normal(size=SAMPLES)
-NEVER = 1e15  # s: nothing is forgotten
+NEVER = 1e15  # s: no forgetting
 
 NUMBERS = {
     "weights": (7.0, 8e-3, 8e-7, 0.7, 0.5),
@@ -84,7 +84,7 @@ def test_the_loop_equals_least_squares_over_all_past_samples(name):
         np.testing.assert_allclose(
             getattr(found, column), expected[column], rtol=0.0, atol=1e-8
         )
-    # It is not the controller alone that follows.
+    # The controller alone has a larger error.
     _, alone = run(around(controller), reference(), DRAWS)
     assert np.abs(alone.displacement - found.displacement).max() > 0.05
 
@@ -112,7 +112,7 @@ def test_deviations_of_gain_poles_and_hysteresis_are_learned():
 
 
 def test_stops_follow_the_input_of_the_dynamics():
-    """Behind its slow pole the stage lags the hysteresis by a twentieth of a cycle."""
+    """With a slow pole the stage lags the hysteresis by a twentieth of a cycle."""
     stage = p753_stage.stage(poles=-0.2, hysteresis=0.2)
     wanted = 5.0 - 2.5 * np.cos(2.0 * np.pi * 50.0 * np.arange(SAMPLES + 1) * p753.DT)
     controller = p753.with_adaptive_inverse(p753.pid())
@@ -173,7 +173,7 @@ def test_gradients_equal_finite_differences_and_jit_is_eager():
 
 
 def test_forgetting_restores_the_prior_covariance():
-    """With the row at zero the covariance goes back to its start."""
+    """With a row of zeros the covariance returns to its initial value."""
     learner = RecursiveWeights((1.0, 2.0), (0.5, 0.0), 0.1, 0.01, 1e-3)
     rows = np.random.default_rng(1).normal(size=(100, 2))
     state = learner.init()

@@ -1,4 +1,4 @@
-"""The 3-DOF stage on four actuators in closed loop, one of them locked or not."""
+"""The 3-DOF stage on four actuators in closed loop, with and without a locked one."""
 
 import equinox as eqx
 import jax
@@ -36,7 +36,7 @@ CONTROLLER, PIDS = p558_control.multi_axis(), p558_control.pid()
 
 
 def actuator(gain, play):
-    """Hysteresis of 1 um of play, then the dynamics of (8.40)."""
+    """Return an actuator: a play of 1 um, then the dynamics of (8.40)."""
     a, b = p558_control.ARX[0]
     loop = PrandtlIshlinskii((gain * (1.0 - play),), (1.0,), (gain * play,))
     return series(hysteresis=loop, dynamics=ARMA(a, (*b, 0.0)))
@@ -66,7 +66,7 @@ def rms(log):
 
 @pytest.mark.parametrize("locked", [False, True])
 def test_equal_actuators_give_three_uncoupled_axes(locked):
-    # Geometry and dynamics commute: each axis answers as one actuator does.
+    # Geometry and dynamics commute: each axis has the response of one actuator.
     found = run(p558_actuators.axes_stage(ALIKE, allocation(locked)))
     expected = run(PerAxis(tuple(part.parts[1] for part in ALIKE[:3])))
     for name in ("displacement", "command"):
@@ -81,7 +81,7 @@ def test_four_actuators_and_any_three_follow_the_reference():
         for locked in (False, True)
     ]
     with_all, with_three = map(rms, logs)
-    # No better than chapter 7's controller follows with its own stage; see Table 7-4.
+    # The error is that of the controller of chapter 7 on its own stage; see Table 7-4.
     assert np.all(with_all < [1.0, 4.0, 4.0])
     np.testing.assert_allclose(with_three, with_all, rtol=0.15)
     commands = [

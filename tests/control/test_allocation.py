@@ -1,4 +1,4 @@
-"""Allocation against linear programming, bounded least squares, the plate by hand."""
+"""Allocation against linear programming, bounded least squares and geometry."""
 
 import equinox as eqx
 import jax
@@ -75,7 +75,7 @@ def test_bounded_reaches_every_reachable_pose(bounded, feasible):
 
 
 def test_poses_at_the_edge_of_reach_stay_within_bounds():
-    # Rounding puts such commands a little outside, and the pose a little out of reach.
+    # With rounding such commands may be slightly outside, and the pose out of reach.
     draw = np.random.default_rng(11)
     commands = np.clip(draw.uniform(-25.0, 75.0, (4000, 4)), 0.0, 50.0)
     found = allocate_all(PLATE, commands @ oracle.PLATE.T)
@@ -174,7 +174,7 @@ def test_a_locked_actuator_leaves_the_stated_share(at):
     assert abs(feasible.mean() - LOCKED_SHARES[at]) < 0.02
     errors = np.asarray(found.error)[~feasible]
     for pose, error in zip(POSES[~feasible][:50], errors[:50], strict=True):
-        # Three actuators, three axes: what is left of the pose, bounded.
+        # Three actuators, three axes: the remaining pose within bounds.
         left = pose - at * oracle.PLATE[:, 0]
         q = oracle.least_squares(oracle.PLATE[:, 1:], 0.0, 50.0, left)
         np.testing.assert_allclose(
@@ -183,7 +183,7 @@ def test_a_locked_actuator_leaves_the_stated_share(at):
 
 
 def test_a_locked_actuator_changes_the_twist_of_reachable_poses_only():
-    # A batch over failures: bounds are arrays.
+    # Bounds are arrays, so failures form a batch.
     stuck = np.eye(4, dtype=bool)
     lower, upper = np.where(stuck, 25.0, 0.0), np.where(stuck, 25.0, 50.0)
 
@@ -246,7 +246,7 @@ def test_gradients_equal_finite_differences(place, method, lock):
     by_lower, by_upper = np.eye(11)[3:7], np.eye(11)[7:]
     if lock is not None:
         allocation = allocation.locked(2, lock)
-        # Bounds that are equal move together.
+        # Equal bounds change together.
         by_lower[2] += by_upper[2]
         by_upper[2] = by_lower[2]
     at = (jnp.array(PLACES[place]), allocation.lower, allocation.upper)
@@ -276,7 +276,7 @@ def test_slopes_at_rest_on_the_bounds_are_those_of_the_pseudo_inverse(method):
 numbers = st.floats(-2000.0, 2000.0)
 anywhere = st.tuples(numbers, numbers, numbers).map(np.array)
 TURNED = np.array([3, 0, 1, 2])
-"""The plate turned by 90 degrees: actuator i stands where the one before it stood."""
+"""The plate rotated by 90 degrees: actuator i replaces actuator i - 1."""
 
 
 @settings(max_examples=50)
@@ -323,14 +323,14 @@ def test_a_rotated_plate_has_rotated_commands(pose):
 
 
 def test_commands_are_continuous_in_the_pose():
-    # Twice across all faces of reach, in steps of 0.2 urad and 0.05 um.
+    # A path that crosses all faces of the reachable set twice, in small steps.
     s = np.linspace(0.0, 2.0 * np.pi, 20_001)
     poses = np.stack([25 + 40 * np.sin(s), 500 * np.sin(2 * s), 400 * np.cos(3 * s)], 1)
     for allocation in (PLATE, PLATE.locked(1, 30.0)):
         commands = np.asarray(allocate_all(allocation, poses).commands)
         step = np.linalg.norm(np.diff(poses, axis=0), axis=1)
         jump = np.linalg.norm(np.diff(commands, axis=0), axis=1)
-        # The greatest norm of the inverses on all faces is below 5.
+        # The largest norm of the inverses on all faces is below 5.
         assert np.all(jump < 5.0 * step + 1e-6)
 
 
@@ -346,7 +346,7 @@ def actuator():
 
 
 def motion(height, first, second):
-    """A second of poses: height, tilt about one diagonal and about the other."""
+    """Return poses over a second: height, and tilts about both diagonals."""
     t = p558.DT * np.arange(500)
     one, two = first * np.sin(2 * np.pi * 3 * t), second * np.sin(2 * np.pi * 5 * t)
     return np.stack([height + 2.0 * np.cos(2 * np.pi * t), one + two, two - one], 1)
@@ -374,7 +374,7 @@ def test_equal_actuators_behind_the_allocation_are_uncoupled_axes(poses, lock, m
     model = actuator()
     stage = p558_actuators.stage(model, method)
     if lock is not None:
-        # The loss of an actuator: it no longer moves from where it is.
+        # a failed actuator: it remains at its position
         stuck = stage.parts[0].locked(0, lock)
         stage = eqx.tree_at(lambda stage: stage.parts[0], stage, stuck)
     found = run(stage, poses)

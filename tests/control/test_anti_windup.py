@@ -1,4 +1,4 @@
-"""Anti-windup of the sliding mode family against loops written from the equations."""
+"""Anti-windup of the sliding mode controllers against loops from the equations."""
 
 from functools import cache
 
@@ -32,10 +32,10 @@ RATE = 400.0
 DRAWS = np.random.default_rng(3).normal(size=SAMPLES)
 TIME = DT * np.arange(SAMPLES + 1)
 
-# Half of the way is beyond the 15 um or so that the voltage reaches.
+# Half of the reference is beyond the stroke of about 15 um.
 BEYOND = 12.0 * (1.0 - np.cos(2.0 * np.pi * 20.0 * TIME))
 
-MODEL = ((0.97,), (0.004,))  # V to um, one b coefficient
+MODEL = ((0.97,), (0.004,))  # V to um, with one b coefficient
 CONTINUOUS = {"P": 0.001, "I": 1.0, "D": 1e-7, "m": 18e3, "alpha": 0.1, "beta": 1e-4}
 REFERENCE = {
     **dict(zip("PIDR", (0.1, 2_000.0, 1e-6, 100.0), strict=True)),
@@ -69,7 +69,7 @@ def continuous():
     )
 
 
-CASES = {  # controller; the oracle of a rate
+CASES = {  # controller; oracle for a rate
     "nominal": (p753.sliding_mode(), lambda w: AnyOrder("smc", NOMINAL | w, 20e3)),
     "observer": (
         p753.disturbance_observer(),
@@ -190,5 +190,5 @@ def test_three_axes_equal_the_equations(name):
         np.testing.assert_allclose(
             getattr(found, log), expected[column], rtol=0.0, atol=1e-9, err_msg=log
         )
-    # The limits without the rate are another loop.
+    # Without anti-windup the saturated loop differs.
     assert np.max(np.abs(on_three_axes(name, 0.0).command - found.command)) > 1e-3

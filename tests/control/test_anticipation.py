@@ -7,7 +7,7 @@ from piezojax.core.feedback import Observation
 
 
 class Echo(pj.System):
-    """Puts out the references it is shown."""
+    """Controller whose command is the reference."""
 
     def init(self, input):
         return input.reference
@@ -41,7 +41,7 @@ def test_each_axis_has_its_own_lead():
 
 
 def test_a_lead_compensates_the_delay_of_a_loop():
-    """A loop that is two samples late follows a slow sine without error at lead 2."""
+    """A loop with two samples of delay follows a slow sine without error at lead 2."""
 
     class Follower(pj.System):
         def init(self, input):

@@ -30,7 +30,7 @@ KE = 0.1347
 
 
 def behind(poles):
-    """The printed model (5.33) with more poles behind it, of unit gain each."""
+    """Return the printed model (5.33) followed by further poles of unit gain."""
     a = -np.poly([*np.roots([1.0, *(-a for a in MODEL_533_A)]), *poles])[1:]
     return tuple(a.real), tuple(np.prod(1.0 - poles).real * np.array(MODEL_533_B))
 
@@ -49,7 +49,7 @@ def gains_of(order):
     return {
         **dict(zip("PIDQR", (0.01, 30.0, 1e-6, 1.0, 100.0), strict=True)),
         **{"m": 18_000.0, "alpha": 0.1, "beta": 1e-4, "Ke": KE},
-        # Four equal poles at 500 rad/s would cost half of the digits.
+        # With four equal poles at 500 rad/s half of the digits would be lost.
         "cutoff": 500.0 if order < 4 else 1_500.0,
         **{"model_a": a, "model_b": b, "hysteresis": HYSTERESIS},
     }

@@ -1,4 +1,4 @@
-"""The boundary layer by itself, and where it is bang-bang switching."""
+"""The boundary layer alone, and its limit of bang-bang switching."""
 
 import equinox as eqx
 import jax

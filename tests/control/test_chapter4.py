@@ -1,4 +1,4 @@
-"""Chapter 4's controllers against loops written from its equations."""
+"""Controllers of chapter 4 against loops from its equations."""
 
 from functools import cache
 from typing import NamedTuple
@@ -70,7 +70,7 @@ FILTERS = {1_000: (0.3, 0.001)}
 STAGE_A = (1.6531, -0.6758)
 STAGE_B = unit_dc(STAGE_A, (-0.07323, 0.1736, -0.09756))
 STAGE = {"hysteresis": HYSTERESIS, "step": "trapezoid", "p": STAGE_A, "g": STAGE_B}
-# A stage as quick as the slow rates need; ours.
+# ours: a stage that is fast enough for the slow rates
 QUICK_A, QUICK_B = (0.3, 0.05), (0.6, 0.04, 0.01)
 QUICK = {"hysteresis": HYSTERESIS, "step": "trapezoid", "p": QUICK_A, "g": QUICK_B}
 
@@ -99,7 +99,7 @@ def continuous(rate):
 
 
 def gains_of(a, b, m, inversion):
-    """A set of ours for a model of another order, at 20 kHz."""
+    """Return gains (ours) for a model of another order at 20 kHz."""
     return {
         **dict(zip("PIDR", (0.1, 2_000.0, 1e-6, 100.0), strict=True)),
         **{"alpha": 0.3, "beta": 1e-3, "m": m, "Q": 2.0},
@@ -109,7 +109,7 @@ def gains_of(a, b, m, inversion):
 
 
 def controller_of(gains, rate=20_000):
-    """Return the package's model-reference controller with the oracle's gains."""
+    """Return the model-reference controller of the package with the oracle's gains."""
     controller = ModelReferenceSlidingMode(
         SwitchingPID(gains["P"], gains["I"], gains["D"], dt=1 / rate),
         surface=gains["m"],
@@ -182,7 +182,7 @@ CASES = {
 
 
 def references(rate):
-    """A sum of sines that is faded in, a jump, and rest; one second."""
+    """Return a sum of sines with a fade-in, a jump, and a constant; one second."""
     found = signals.ten_references()["SW50"][:: 20_000 // rate]
     found = found * np.minimum(np.arange(found.size) / (0.1 * rate), 1.0)
     samples = rate + 1
@@ -201,7 +201,7 @@ def run(loop, references, draws):
 
 @cache
 def samples_of(name):
-    """Return the references, the draws and what the package makes of them."""
+    """Return the references, the draws, and the outputs of the package."""
     case = CASES[name]
     draws = np.stack([DRAWS[: case.rate]] * 2 + [np.zeros(case.rate)])
     return (
@@ -242,11 +242,11 @@ def test_the_loop_equals_the_published_one(name):
             )
 
 
-# Bang-bang has no rest to stay at: the sign of a rounding error is 1.
+# Bang-bang control does not rest: the sign of a rounding error is 1.
 @pytest.mark.parametrize("name", [name for name in CASES if name != "bang-bang"])
 def test_a_start_at_rest_stays_at_rest(name):
     samples = samples_of(name)[2]
-    start = 200  # before rounding errors grow where printed gains are unstable
+    start = 200  # before rounding errors grow with unstable printed gains
     voltage = samples.voltage[2, 0]
     assert voltage > 20.0
     np.testing.assert_allclose(
@@ -259,10 +259,10 @@ def test_bang_bang_starts_from_the_holding_voltage():
     controller = catalog.bang_bang()
     seen = Observation(*map(jnp.asarray, (5.0, 5.0, 5.0, 31.0)))
     state = controller.init(seen)
-    for _ in range(20):  # at s = 0 exactly the switching is silent
+    for _ in range(20):  # at exactly s = 0 the switching term is 0
         state, voltage = controller.step(state, seen)
     np.testing.assert_allclose(voltage, 31.0, rtol=0.0, atol=1e-9)
-    # Both sides of the surface differ by the weighted 2 K and no more.
+    # The commands on both sides of the surface differ by the weighted 2 K.
     sides = [
         controller.step(
             controller.init(seen), seen._replace(measured=jnp.asarray(5.0 + tiny))
@@ -296,7 +296,7 @@ def test_both_inverses_minimise_their_cost():
     for form in INVERSIONS.values():
         np.testing.assert_allclose(form(b0, error, 0.0 * b0), 50.0, rtol=1e-12)
 
-    # The minimum of a parabola through three of its points, for a wanted 1 um.
+    # the minimum of the parabola through three points, for a reference of 1 um
     def minimum(cost):
         u = np.array([0.0, 1.0, 2.0])
         square, slope, _ = np.polyfit(u, [cost(x) for x in u], 2)

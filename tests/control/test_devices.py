@@ -1,4 +1,4 @@
-"""Loops of vendors against loops of NumPy, and the rounding of their parameters."""
+"""Loops of vendors against NumPy loops, and the rounding of their parameters."""
 
 import json
 
@@ -185,7 +185,7 @@ CASES = {
 
 @jax.jit
 def commands(controller, references, measurements):
-    """Return the commands of a controller that begins at rest."""
+    """Return the commands of a controller that starts at rest."""
 
     def step(state, now):
         seen = pj.Observation(now[0], now[0], now[1], 30.0)
@@ -200,7 +200,7 @@ def test_a_device_equals_the_loop_of_its_equations(case):
     make, oracle, options = CASES[case]
     random = np.random.default_rng(7)
     references = REST + 25.0 * (np.arange(SAMPLES) > 20) * (np.arange(SAMPLES) < 260)
-    # What a slow stage would measure, and noise.
+    # measurements of a slow stage, with noise
     slow = np.convolve(references, np.exp(-np.arange(SAMPLES) / 60.0) / 60.5)[:SAMPLES]
     measurements = slow + REST * np.exp(-np.arange(SAMPLES) / 60.0)
     measurements = measurements + 0.05 * random.normal(size=SAMPLES)
@@ -233,14 +233,14 @@ def test_pyrpl_rounds_to_its_registers():
     typed = pyrpl(p=-0.12345, i=-20.0, filters=1, filter_1=1500.0).typed()
     assert float(typed.p) * 2**12 == round(-0.12345 * 2**12)
     assert float(typed.i) == pytest.approx(-20.0, abs=2.4e-3)
-    # 125 MHz / 2 pi over 2^14; the gradient is that of what was given.
+    # 125 MHz / 2 pi over 2^14; the gradient is that of the unrounded value.
     assert float(typed.filter_1) == pytest.approx(1214.3, abs=0.1)
     slope = jax.grad(lambda f: pyrpl(p=0.0, i=1.0, filter_1=f).typed().filter_1)
     assert slope(1500.0) == 1.0
 
 
 def test_a_stabilizer_ignores_small_errors():
-    """At 8 V the steps of single precision are 2^-9 codes: less error moves nothing."""
+    """At 8 V the steps of single precision are 2^-9 codes: smaller errors vanish."""
     slow = stabilizer(p=-1e-6, i=1.0)
     measured = np.full(400, REST)
     rest = pj.Observation(REST, REST, REST, 55.0 + 15.0 * 8.0)

@@ -1,6 +1,6 @@
-"""Every controller of the catalogue keeps the protocol.
+"""Every controller of the catalogue satisfies the protocol.
 
-A controller that the catalogue names is checked without a line here. EXTRA adds others.
+Controllers of the catalogue are checked without an entry here; OTHERS adds others.
 """
 
 import dataclasses
@@ -33,19 +33,19 @@ from piezojax.dynamics import FirstOrderLag, SecondOrderLowPass, observability_f
 
 SAMPLES = 8
 STEP = 1e-6
-"""Change of a parameter for its difference quotient, relative."""
+"""Relative change of a parameter for its difference quotient."""
 
 MOST = 24
-"""Parameters of a controller that are changed for differences, at most."""
+"""Largest number of parameters of a controller that are changed."""
 
 QUICK = {"xla_backend_optimization_level": 0}
-"""Options of the compiler: a program that runs once need not be a fast one."""
+"""Options of the compiler for programs that run once: compile quickly."""
 
 DT = p753.DT
 
 
 class Leaking(System):
-    """A controller from outside: an integral of the error that leaks, plus a share."""
+    """A controller from outside the package: a leaky integral and a share."""
 
     gain: jax.Array = parameter("V/um", "gain", least=0.0)
     leak: jax.Array = parameter("1", "share that is left", least=0.0, below=1.0)
@@ -71,7 +71,7 @@ EXTRA = {
         p753.sliding_mode(), FirstOrderLag(4 * DT, DT), 0.2, 3
     ),
 }
-"""Controllers beside those of the catalogue, such as with other options."""
+"""Controllers that the catalogue lacks, such as those with other options."""
 
 STARTS = CONTROLLERS | EXTRA
 
@@ -84,7 +84,7 @@ COSTLY = (
     "p558_anticipating_state_sliding_mode",
     "mirror_state_sliding_mode",
 )
-"""Controllers whose program takes a minute to compile; they have tests of their own."""
+"""Controllers whose program takes a minute to compile; they have separate tests."""
 
 RUN = [name for name in STARTS if name not in COSTLY]
 
@@ -94,7 +94,7 @@ def made(name):
     return STARTS[name]()
 
 
-# Voltages that hold a stage, by what the controller takes for the stage.
+# Holding voltages of a stage, from the model of the stage in the controller.
 
 POSE = (5.0, 10.0, -20.0)
 
@@ -111,7 +111,7 @@ def by_model():
 
 @cache
 def rest_of(name):
-    """Return reference and voltage under which the controller's stage rests."""
+    """Return reference and voltage at which the stage of the controller rests."""
     if not name.startswith("p558"):
         return 5.0, 40.0
     if name.endswith(("nominal", "disturbance_observer")):
@@ -120,9 +120,9 @@ def rest_of(name):
 
 
 def observations(name, moving, seed=7):
-    """Return signals that a controller sees from a rest on, an array or one an axis.
+    """Return the inputs of a controller from rest on, an array or one array per axis.
 
-    With ``moving`` 0 it stays at rest.
+    With ``moving`` 0 the signals are constant.
     """
     random = np.random.default_rng(seed)
 
@@ -149,7 +149,7 @@ def stacked(commands):
 
 
 class Runs(NamedTuple):
-    """Commands of a controller while it moves, with changed gains, and at rest.
+    """Commands of a controller in motion, with changed gains, and at rest.
 
     ``found`` is the gradient by relative changes, ``expected`` its differences.
     """
@@ -164,7 +164,7 @@ class Runs(NamedTuple):
 
 @cache
 def runs(name):
-    """Return what one program gives for all lanes, called twice."""
+    """Return the results of one program for all lanes, called twice."""
     arrays, static = eqx.partition(made(name), eqx.is_array)
     flat, unravel = ravel_pytree(arrays)
     flat, traces = np.asarray(flat), []
@@ -218,7 +218,7 @@ def test_compiled_lanes_equal_eager_steps(name):
         np.testing.assert_allclose(
             found.commands[1][..., k], stacked(command), rtol=1e-8, atol=1e-9
         )
-    assert found.traces == 1  # New gains run in the same program.
+    assert found.traces == 1  # New gains do not compile another program.
 
 
 @pytest.mark.parametrize("name", RUN)
@@ -238,7 +238,7 @@ def test_a_controller_is_saved_and_loaded(name, monkeypatch):
     assert eqx.tree_equal(from_data(json.loads(text)), made(name))
 
 
-# Refusals
+# Refused values
 
 OTHERS = (
     control.InverseGain(Affine(2.0)),

@@ -1,4 +1,4 @@
-"""Inverse feedforward: exact on its own model, bumpless, and harmless to feedback."""
+"""Inverse feedforward: exact on its own model, bumpless, independent of feedback."""
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +72,7 @@ def test_a_wrong_model_starts_without_a_bump(feedback):
 
 
 def test_the_feedback_receives_its_share_of_the_applied_voltage():
-    # A drive that clips: the anti-windup is to see the shortfall and no more.
+    # A saturated drive: the anti-windup must receive exactly the shortfall.
     controller = FeedforwardFeedback(Affine(9.0), p753.pid())
     start = Observation(*map(jnp.asarray, (1.0, 1.0, 1.0, 12.0)))
     state = controller.init(start)
@@ -80,7 +80,7 @@ def test_the_feedback_receives_its_share_of_the_applied_voltage():
     np.testing.assert_allclose(command, 12.0)
     clipped = start._replace(applied=command - 2.0)
     state, command = controller.step(state, clipped)
-    # 2 V short for one sample, at 100 1/s.
+    # a shortfall of 2 V for one sample, at 100 1/s
     np.testing.assert_allclose(command, 12.0 - 2.0 * 100.0 * p753.DT, rtol=1e-12)
 
 

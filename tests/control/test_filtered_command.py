@@ -1,4 +1,4 @@
-"""A filtered command against a plain loop of the PID and SciPy's notch."""
+"""A filtered command against a plain PID loop with the notch of SciPy."""
 
 import jax
 import numpy as np

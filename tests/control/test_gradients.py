@@ -48,7 +48,7 @@ RUNS = {
 class Compiled(NamedTuple):
     names: list[str]
     values: np.ndarray
-    scale: np.ndarray  # relative steps, but absolute for what is zero
+    scale: np.ndarray  # relative steps; absolute for a value of zero
     reverse: jax.stages.Wrapped
     forward: jax.stages.Wrapped
     batch: jax.stages.Wrapped
@@ -56,7 +56,7 @@ class Compiled(NamedTuple):
 
 @pytest.fixture(scope="module", params=LOOPS)
 def loop(request):
-    """One compilation each of everything, for all parameters and runs at once."""
+    """Compile each function once for all parameters and runs."""
     loop = LOOPS[request.param]
     arrays, static = eqx.partition(loop, eqx.is_array)
     flat, unravel = ravel_pytree(arrays)
@@ -84,7 +84,7 @@ def loop(request):
 
 
 STEPS = (1e-6, 4e-6)
-"""Relative. The slope of hysteresis and limits jumps where a voltage turns or reaches
+"""Relative tolerance. The slope of hysteresis and limits jumps where a voltage turns or
 its limit, which lies between two points of the larger step for the parameters that move
 the loop most; rounding spoils the smaller one for those that hardly move it."""
 
@@ -118,11 +118,11 @@ def test_gradient_equals_finite_differences(loop, name):
     loss, gradient = loop.reverse(loop.values, RUNS[name])
     gradient = np.asarray(gradient) * loop.scale
     each = np.stack([differences(loop, RUNS[name], step) for step in STEPS])
-    # A wrong derivative is near neither.
+    # A wrong derivative agrees with neither.
     nearest = np.abs(each - gradient).argmin(axis=0)
     expected = np.take_along_axis(each, nearest[None], axis=0)[0]
     assert np.count_nonzero(expected) > len(loop.names) / 2
-    floor = 3e-9 * loss  # a few units in the last place of the loss, over the step
+    floor = 3e-9 * loss  # some units in the last place of the loss over the step
     assert_close(gradient, expected, loop.names, rtol=1e-4, atol=floor)
 
 

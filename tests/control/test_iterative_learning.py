@@ -1,4 +1,4 @@
-"""Learning from trial to trial, against matrices on a linear stage."""
+"""Iterative learning between trials, against matrices on a linear stage."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ LAWS = {
 
 
 def response_matrix():
-    """G from u(0), u(1), ... to y, all at rest under u(0) before."""
+    """Return G from u(0), u(1), ... to y, at rest under u(0) before."""
     y = np.zeros((SAMPLES + 500, SAMPLES))
     u = np.eye(SAMPLES)
     u = np.concatenate([np.repeat(u[:1], 500, axis=0), u])
@@ -41,7 +41,7 @@ def response_matrix():
 
 
 def law_matrices(law):
-    """L and Q, both with the ends repeated."""
+    """Return L and Q, both with repeated ends."""
     rows = np.arange(SAMPLES)
     ends = lambda i: np.clip(i, 0, SAMPLES - 1)  # noqa: E731
     lead = np.zeros((SAMPLES, SAMPLES))
@@ -80,9 +80,9 @@ def test_trials_equal_the_matrices_and_contract(name):
     )
 
     if name == "with lead":
-        return  # the first errors are never used: no single fixed point
+        return  # the first errors are never used: the fixed point is not unique
 
-    # The closed form: a fixed point, and powers of one matrix towards it.
+    # closed form: a fixed point, and powers of a matrix that converge to it
     step = smooth @ (np.eye(SAMPLES) - lead @ stage)
     fixed = np.linalg.solve(np.eye(SAMPLES) - step, smooth @ lead @ REFERENCE)
     closed = fixed + np.linalg.matrix_power(step, TRIALS) @ (start - fixed)

@@ -1,4 +1,4 @@
-"""Kalman filters against their closed forms and a plain matrix recursion."""
+"""Kalman filters against closed forms and a plain matrix recursion."""
 
 import equinox as eqx
 import jax
@@ -50,7 +50,7 @@ def observed(observer, measured, applied):
 
 
 def alpha_beta_of(index):
-    """Kalata's gains for the tracking index acceleration dt^2 / noise."""
+    """Return Kalata's gains for the tracking index acceleration dt^2 / noise."""
     r = (4.0 + index - np.sqrt(8.0 * index + index**2)) / 4.0
     alpha = 1.0 - r**2
     return alpha, 2.0 * (2.0 - alpha) - 4.0 * np.sqrt(1.0 - alpha)
@@ -63,7 +63,7 @@ def test_the_kinematic_filter_equals_the_alpha_beta_filter_of_kalata(index):
     np.testing.assert_allclose(kalman.gain, (alpha, alpha - beta, 0.0), rtol=1e-8)
 
     measured = jnp.asarray(0.012 * DRAWS[0] + np.cumsum(1e-3 * DRAWS[1]))
-    found = observed(kalman, measured, jnp.asarray(DRAWS[2]))  # deaf to the voltage
+    found = observed(kalman, measured, jnp.asarray(DRAWS[2]))  # no voltage
     same = eqx.tree_at(lambda k: k.gain[:2], kalman, (alpha, alpha - beta))
     expected = observed(AlphaBeta(alpha, beta, DT), measured, jnp.zeros(SAMPLES))
     np.testing.assert_allclose(found.position, expected.position, rtol=0.0, atol=1e-6)
@@ -75,7 +75,7 @@ def test_the_kinematic_filter_equals_the_alpha_beta_filter_of_kalata(index):
 
 
 def covariances(a, n, noise, process, drift, samples):
-    """Riccati recursion from a wide prior: gain and covariance after the update."""
+    """Return gain and covariance by the Riccati recursion from a wide prior."""
     A = np.zeros((n + 1, n + 1))
     A[0, : len(a)] = a
     A[0, n] = A[n, n] = 1.0
@@ -119,7 +119,7 @@ def test_the_estimate_equals_that_of_the_matrix_filter(name):
 
 def test_the_error_equals_the_prediction_and_is_below_the_kinematic_filter():
     noise, process, drift = 0.012, 1e-3, 1e-4
-    voltage = 20.0 * np.sin(np.arange(SAMPLES) * 0.3)  # fast: only the model knows
+    voltage = 20.0 * np.sin(np.arange(SAMPLES) * 0.3)  # fast: needs the model
     y, d, truth = [0.0, 0.0], 0.0, []
     u = np.concatenate([[0.0, 0.0], voltage])
     for k in range(SAMPLES):

@@ -1,4 +1,4 @@
-"""Iterative learning inside a run against trials in plain NumPy."""
+"""Iterative learning within a run, against trials in NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ def run(loop):
 
 
 def trials():
-    """y and u of the loop, the corrections computed between the trials."""
+    """Return y and u of the loop with corrections computed between the trials."""
     ends = lambda i: min(max(i, 0), PERIOD - 1)  # noqa: E731
     correction, y, total, outputs, commands = np.zeros(PERIOD), 0.0, 0.0, [], []
     for trial in range(TRIALS):

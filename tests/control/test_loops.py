@@ -55,7 +55,7 @@ def weighted_pid(proportional, derivative):
     )
 
 
-# Name: the package's controller; the oracle's kind and gains.
+# name: controller of the package; kind and gains of the oracle
 CONTROLLERS = {
     "pid": (pid(), "pid", PID_GAINS),
     "weighted pid": (weighted_pid(3.0, -2.5), "pid", PID_GAINS | {"b": 3.0, "c": -2.5}),
@@ -88,14 +88,14 @@ def published_references():
 
 
 def gentle_references():
-    # All within reach, and from rest: SW starts at 12 um and is faded in.
+    # All are within the stroke and start at rest: SW starts at 12 um with a fade-in.
     references = published_references()
     references[1] *= np.minimum(np.arange(SAMPLES + 1) / 2000, 1.0)
     return references
 
 
 def hard_references():
-    # SW jumps to its start; 20 um are out of reach, so the voltage saturates.
+    # SW jumps to its start; 20 um are beyond the stroke, so the voltage saturates.
     references = published_references()
     references[1, :2] = 0.0
     return np.stack([*references, signals.sine(7, 10.0, 1.0 + 1.0 / p753.RATE)])
@@ -105,10 +105,10 @@ REFERENCES = {
     "pid": hard_references,
     "weighted pid": hard_references,
     "sliding mode": hard_references,
-    # Where the inverse clips, the oracle goes on from what was asked for, the package
-    # from what was applied: see the test below.
+    # After clipping, the oracle continues from the requested output and the package
+    # from the applied voltage: see the test below.
     "inversion": gentle_references,
-    # Out of reach, the observer winds up and rounding errors grow on the way back.
+    # Beyond the stroke the observer winds up, and rounding errors grow on the return.
     "observer": lambda: hard_references()[:3],
     "printed observer": lambda: hard_references()[:3],
 }
@@ -171,12 +171,12 @@ def test_the_model_of_the_inverse_equals_the_stage_after_clipping():
     clipped = samples.command != samples.voltage
     assert 0.1 < np.mean(clipped) < 0.9
     state = jax.tree.map(lambda x: x[0], state)
-    # The controller has yet to see the last voltage.
+    # The controller has not received the last voltage yet.
     model = loop.controller.inverse.model
     ahead = model.step(state.controller.hysteresis, state.voltage)[0]
     stage = state.plant[0]
     np.testing.assert_allclose(ahead[:2], stage[:2], rtol=0.0, atol=1e-12)
-    # Back within reach it follows again.
+    # Within the stroke it follows again.
     error = samples.displacement - samples.reference
     assert np.abs(error[0, -200:]).max() < 0.5
 
@@ -193,7 +193,7 @@ def test_anti_windup_returns_the_stage_sooner():
 
 def test_unit_weights_give_the_pid_of_the_error():
     def plain(state, seen):
-        """What the PID was before it had weights, from its equations."""
+        """The PID without weights, from its equations."""
         integral, rate, last, command = state
         error = seen.reference - seen.measured
         gains = PID_GAINS
@@ -226,7 +226,7 @@ def test_unit_weights_give_the_pid_of_the_error():
 
 
 def test_weights_do_not_change_the_response_to_noise():
-    """At a reference of zero there is nothing to weigh."""
+    """At a reference of zero the weights have no effect."""
     references = np.zeros((1, SAMPLES + 1))
     loops = [around(c, p753.plant()) for c in (pid(), weighted_pid(50.0, -20.0))]
     one, other = (run(loop, references)[1].displacement for loop in loops)
@@ -269,7 +269,7 @@ def test_q_filter_equals_the_published_one():
 def test_corrected_q_filter_has_its_double_pole_at_the_cut_off():
     controller = p753.disturbance_observer()
     wt = 500.0 * p753.DT
-    mapped = (2.0 - wt) / (2.0 + wt)  # bilinear image of -cutoff
+    mapped = (2.0 - wt) / (2.0 + wt)  # bilinear transform of -cutoff
     c = np.array(controller.denominator())
     np.testing.assert_allclose(c[1:] / c[0], [-2.0 * mapped, mapped**2], rtol=1e-9)
     np.testing.assert_allclose(c.sum(), sum(controller.model.moving), rtol=1e-9)

@@ -1,4 +1,4 @@
-"""H-infinity designs: norms from NumPy, a closed form of gamma, a plain loop."""
+"""H-infinity designs against norms from NumPy, a closed form of gamma, a plain loop."""
 
 from functools import cache
 
@@ -60,7 +60,7 @@ def grid():
 
 
 def response(model, w):
-    """The model with its sample of delay, at w rad a sample."""
+    """Return the response of the model with a sample of delay at w rad/sample."""
     a, b = model
     back = np.exp(-1j * w)
     numerator = sum(x * back ** (i + 1) for i, x in enumerate(b))
@@ -76,7 +76,7 @@ def law_response(law, w):
 
 
 def weight_response(low, crossover, high, w):
-    """(high s + low p) / (s + p), bilinear, prewarped to be 1 at the crossover."""
+    """Return (high s + low p) / (s + p), bilinear, prewarped to 1 at the crossover."""
     scale = crossover / np.tan(0.5 * crossover * DT)
     s = 1j * scale * np.tan(0.5 * np.minimum(w, np.pi - 1e-9))
     p = crossover * np.sqrt((1.0 - high**2) / (low**2 - 1.0))
@@ -121,8 +121,8 @@ def test_the_loop_is_stable(name):
 
 
 def test_gamma_equals_the_bound_from_the_zeros():
-    # With hardly any weight on effort only the zeros of G outside the circle, -1.3 and
-    # infinity (the delay), bound W1 S, which is W1 there: Nevanlinna and Pick.
+    # With almost no effort weight only the zeros of G outside the circle, -1.3 and
+    # infinity (the delay), bound W1 S, which equals W1 there: Nevanlinna and Pick.
     weight = first_order_weight(100.0, 3_000.0, 0.3, DT)
     A, B, C, D = (float(x[0, 0]) for x in (weight.A, weight.B, weight.C, weight.D))
     values = np.array([C * B / (-1.3 - A) + D, D])

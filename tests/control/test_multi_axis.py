@@ -1,4 +1,4 @@
-"""The 3-DOF loops of chapters 7 and 8 against loops written from their equations."""
+"""The 3-DOF loops of chapters 7 and 8 against loops from their equations."""
 
 from functools import cache, partial
 from typing import NamedTuple
@@ -47,7 +47,7 @@ TIME = three_dof.T * np.arange(SAMPLES + 1)
 DRAWS = np.random.default_rng(7).standard_normal((SAMPLES, 3))
 HELD = np.array([5.0, 10.0, -20.0])
 
-# All three move at once; they start at zero, as the plain loops do.
+# All three axes move at once; they start at zero like the plain loops.
 MOVING = np.stack(
     [
         8.0 * np.sin(2 * np.pi * 3.0 * TIME),
@@ -65,29 +65,29 @@ class Published(NamedTuple):
 
 
 DERIVATIVE = {"multi-axis": [4e-4, 6e-4, 8e-4], "nominal": [1e-4, 2e-4, 3e-4]}
-"""D, s: every printed one is zero, which would hide its sign."""
+"""D in s: the printed ones are zero, which would hide a wrong sign."""
 
 
 def derived(controller, kind):
-    """Return a controller with DERIVATIVE on its axes."""
+    """Return a controller with the D of DERIVATIVE on its axes."""
     names = [n for n in paths.parameters(controller) if "derivative" in n]
     diagonal = [n for n in names if kind == "nominal" or n[-1] == n[-3]]
     return paths.replace(controller, dict(zip(diagonal, DERIVATIVE[kind], strict=True)))
 
 
 def with_derivative(gains, kind):
-    """Return the plain loop's table of gains with DERIVATIVE."""
+    """Return the gains of the plain loop with DERIVATIVE."""
     return {**gains, "D": DERIVATIVE[kind]}
 
 
 def passing(controller):
-    """Return a filtered controller whose filters pass everything unchanged."""
+    """Return a filtered controller whose filters do not change the signal."""
     names = [n for n in paths.parameters(controller) if "filter." in n]
     values = {name: float(name.endswith("alpha")) for name in names}
     return paths.replace(controller, values)
 
 
-# Without a filter and with one that passes everything: one program serves both.
+# One program serves a controller without a filter: its filter changes nothing.
 CASES = {
     "PID": Published(catalog.pid(), "pid", {}),
     "multi-axis, dynamic, filtered": Published(catalog.multi_axis(), "pid_smc", {}),
@@ -134,7 +134,7 @@ def run(loop, references, draws):
 
 @cache
 def samples_of(name):
-    """Return what the package makes of MOVING with noise, and of HELD without."""
+    """Return the outputs of the package for MOVING with noise, and HELD without."""
     references = np.stack([MOVING, np.broadcast_to(HELD, MOVING.shape)])
     draws = np.stack([DRAWS, np.zeros_like(DRAWS)])
     return run(catalog.loop(CASES[name].controller), references, draws)
@@ -168,16 +168,18 @@ def test_a_start_at_a_reference_is_without_a_bump(name):
     samples = samples_of(name)
     A, B, C = three_dof.stacked()
     holding = np.linalg.solve(C @ np.linalg.solve(np.eye(9) - A, B), HELD)
-    # Chapter 8's nominal model is not quite the stage: its integral starts to move.
+    # The nominal model of chapter 8 is not exactly the stage: its integral moves.
     np.testing.assert_allclose(samples.command[1, 0], holding, rtol=0.0, atol=5e-5)
     np.testing.assert_allclose(samples.displacement[1, 0], HELD, rtol=0.0, atol=1e-8)
 
 
 def test_in_steady_state_u1_decouples_the_axes():
-    # T1(1) = I: the dc gain from the desired outputs to those of the model.
+    # T1(1) = I is the DC gain from desired outputs to those of the model.
     A, B, C = three_dof.stacked()
     dc_gain = C @ np.linalg.solve(np.eye(9) - A, B)
-    assert np.abs(dc_gain - np.diag(np.diag(dc_gain))).max() > 1e-3  # it does couple
+    assert (
+        np.abs(dc_gain - np.diag(np.diag(dc_gain))).max() > 1e-3
+    )  # the model is coupled
     controller = catalog.multi_axis(filtered=False)
     none = (jnp.zeros(()),) * 3
     for axis in range(3):
@@ -262,7 +264,7 @@ def test_a_loop_is_saved_and_loaded(name, tmp_path):
     assert eqx.tree_equal(load(tmp_path / "loop.json"), loop)
 
 
-# The parts
+# Parts of the controllers
 
 
 def test_observability_form_has_the_response_of_the_state_space():
@@ -291,7 +293,7 @@ def test_the_inverse_of_rows(size):
     )
 
 
-# What is refused
+# Refused input
 
 EYE = np.eye(3)
 MODEL = observability_form(p558.model("7"))

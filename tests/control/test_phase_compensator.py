@@ -1,4 +1,4 @@
-"""The nonlinear phaser against its describing function and a plain loop."""
+"""The nonlinear phase compensator against its describing function and a plain loop."""
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +62,7 @@ def test_the_first_harmonic_equals_the_describing_function(amplitude):
 
 
 class Phased:
-    """The PID of the oracles and a stop operator on its command."""
+    """The PID of the oracles with a stop operator on its command."""
 
     def __init__(self):
         self.pid = PID(GAINS, 20e3)

@@ -19,7 +19,7 @@ POLES = {"apart": (0.9, 0.3, -0.2), "at zero": (0.0, 0.0, 0.0), "slow": (0.99, 0
 
 
 def solved(poles, drive, dt):
-    """P, I, D of (4.18) with its right-hand side corrected."""
+    """Return P, I, D of (4.18) with the corrected right-hand side."""
     g2, g1, g0 = np.poly(poles)[1:]
     H = np.array([[1, dt, 1 / dt], [1, 0, 2 / dt], [0, 0, 1 / dt]]) * drive
     return np.linalg.solve(H, [1.0 + g2, -g1, g0])

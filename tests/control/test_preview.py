@@ -1,4 +1,4 @@
-"""Previewed inverses of models with zeros outside the unit circle."""
+"""Preview inverses of models with zeros outside the unit circle."""
 
 import jax
 import jax.numpy as jnp
@@ -47,18 +47,18 @@ def inverse(name, kind, **options):
 
 
 def response(name, input):
-    """What the model does at k = 0, 1, ..., at rest at zero before."""
+    """Return the output of the model from k = 0 on, at rest at zero before."""
     a, b = MODELS[name]
     return lfilter([0.0, *b], [1.0, *(-x for x in a)], input)
 
 
 def smooth(samples=SAMPLES):
-    """A bump of 5 um in the middle, at rest on both sides."""
+    """Return a bump of 5 um in the middle, at rest on both sides."""
     return 5.0 * np.exp(-(((np.arange(samples) - samples / 2) / (samples / 40)) ** 2))
 
 
 def transfer(name, kind, **options):
-    """Response of inverse and model together, and its frequencies, rad a sample."""
+    """Return the response of inverse and model, and its frequencies in rad/sample."""
     impulse = np.zeros(SAMPLES)
     impulse[SAMPLES // 2] = 1.0
     output = response(name, inverse(name, kind, **options)(jnp.asarray(impulse)))
@@ -81,7 +81,7 @@ def test_the_zero_phase_inverse_has_zero_phase(name):
 
 
 def test_zeros_near_the_unit_circle_are_not_cancelled():
-    model = ARMA((0.5,), (1.0, 0.95))  # a zero that would ring, if cancelled
+    model = ARMA((0.5,), (1.0, 0.95))  # cancelling this zero would cause ringing
     reference = jnp.asarray(np.eye(1, 400, 200)[0])
     ringing = INVERSES["zero_phase"](model)(reference)
     calm = INVERSES["zero_phase"](model, margin=0.9)(reference)
@@ -177,11 +177,11 @@ def test_models_without_an_inverse_are_refused(kind, model, options, message):
 
 
 class Feedforward:
-    """The zero-phase inverse of (5.33) at unit gain, then the inverse hysteresis."""
+    """Zero-phase inverse of (5.33) at unit gain, then the inverse hysteresis."""
 
     def __init__(self):
         b = np.array(unit_dc(MODEL_533_A, MODEL_533_B))
-        # Both zeros are outside: all of B(z), forwards in time, over B(1)^2.
+        # Both zeros lie outside: B(z) forward in time, divided by B(1)^2.
         self.ahead = (b / b.sum() ** 2).tolist()
         self.w, self.f, self.u = None, 0.0, 0.0
 
@@ -198,7 +198,7 @@ class Feedforward:
         return self.u
 
     def applied(self, u):
-        """There is no feedback."""
+        """Do nothing, because there is no feedback."""
 
 
 def test_inside_a_loop_the_reference_is_extrapolated():

@@ -1,4 +1,4 @@
-"""Repetitive control: what a period of error does to the next, on a linear loop."""
+"""Repetitive control: the error from period to period on a linear loop."""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ def loop_of(controller):
 @jax.jit
 def errors_of(loop):
     time = jnp.arange(PERIODS * PERIOD)
-    # One harmonic each that the loop follows well, badly, and hardly at all.
+    # harmonics that the loop follows well, poorly, and hardly at all
     angle = 2.0 * jnp.pi * time[:, None] / PERIOD * jnp.asarray([1.0, 3.0, 9.0])
     reference = (1.0 - jnp.cos(angle)).sum(axis=1)
     samples = simulate(loop, loop_inputs(reference), loop.init(0.0))[1]
@@ -48,16 +48,16 @@ def harmonics(errors):
 
 
 def inner_loop(harmonic):
-    """T, from r to z, at a harmonic of the period."""
+    """Return T, from r to z, at a harmonic of the period."""
     z = np.exp(2j * np.pi * harmonic / PERIOD)
     controller = 0.2 + 200.0 * DT / (1.0 - 1.0 / z)
-    # The sensor sees what the stage was given one sample before.
+    # The reading lags the voltage by one sample.
     stage = 0.5 / z / (1.0 - 0.5 / z)
     return controller * stage / (1.0 + controller * stage)
 
 
 def factor(harmonic, gain, lead):
-    """Q (1 - gain z^lead T) of the quarter, half, quarter filter."""
+    """Return Q (1 - gain z^lead T) with the filter of weights 1/4, 1/2, 1/4."""
     angle = 2.0 * np.pi * harmonic / PERIOD
     through = 0.5 + 0.5 * np.cos(angle)
     return through * (1.0 - gain * np.exp(1j * angle * lead) * inner_loop(harmonic))
@@ -83,7 +83,7 @@ def test_errors_contract_to_the_residual_of_the_filter(gain, lead):
     limit = -0.5 * PERIOD * left
     distance = np.linalg.norm(found - limit, axis=1)
     assert distance[-1] < 0.02
-    # From period 1 on, no slower than the condition promises.
+    # from period 1 on, at least as fast as the bound of the condition
     assert np.all(
         distance[5:] < 2.0 * distance[1] * slowest ** np.arange(4, PERIODS - 1)
     )
@@ -125,7 +125,7 @@ def test_bad_parameters_are_refused(options, message):
 @pytest.mark.parametrize("name", ["period", "lead", "advance"])
 def test_counts_must_be_whole(name):
     counts = {"gain": 0.5, "period": 50, name: 7.5}
-    # The type checker of the tests may speak first.
+    # The type checker of the tests may raise first.
     message = rf"{name} in samples is 7\.5; it must be whole|parameter '{name}'"
     with pytest.raises((ValueError, TypeError), match=message):
         RepetitiveControl(INNER, Affine(), **counts)

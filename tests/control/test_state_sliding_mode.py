@@ -1,4 +1,4 @@
-"""State-tracking sliding mode control against a plain loop with SciPy's Riccati."""
+"""State-tracking sliding mode control against a loop with SciPy's Riccati solver."""
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +43,7 @@ def controller(**changes):
 
 
 class Plain:
-    """The controller from its equations, at rest at zero before."""
+    """The controller from its equations; it starts at rest at zero."""
 
     def __init__(self):
         self.A, self.B, self.C = A, B, C = three_dof.stacked()
@@ -70,7 +70,7 @@ class Plain:
         self.w = self.w @ self.Am.T + r[:, None] * self.Bm
         after = self.w @ self.Cm
         s = self.S @ (x - self.N @ yd)
-        # S (A x + B (u + d) - N y_d(k+1)) = PHI s, but for the law.
+        # S (A x + B (u + d) - N y_d(k+1)) = PHI s, without the law
         moved = self.S @ (self.A @ x - self.N @ after)
         u = np.linalg.solve(self.S @ self.B, PHI @ s - moved) - d
         self.total = self.total + s

@@ -1,4 +1,4 @@
-"""The super-twisting law by itself, and on the equation it was made for."""
+"""The super-twisting law alone, and on the equation that it is designed for."""
 
 import math
 

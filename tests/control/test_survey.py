@@ -1,4 +1,4 @@
-"""The surveyed control schemes on the P-753, against loops from their equations."""
+"""Surveyed control schemes on the P-753, against loops from their equations."""
 
 import math
 from functools import cache
@@ -143,7 +143,7 @@ def test_a_start_at_rest_stays_at_rest(name):
     np.testing.assert_allclose(samples.command[2], voltage, rtol=0.0, atol=1e-6)
 
 
-# Our start values, measured and rounded up: um rms over the second half of SIN10.
+# Errors with our start values, rounded up: um rms over the second half of SIN10.
 LEVELS = {
     "boundary layer": 0.75,
     "super-twisting": 0.03,

@@ -1,4 +1,4 @@
-"""Tunable H-infinity control against the design by SciPy's Riccati solver."""
+"""Tunable H-infinity control against the design with SciPy's Riccati solver."""
 
 from types import SimpleNamespace
 
