@@ -1,4 +1,4 @@
-"""Low-pass of analogue electronics against scipy, and against the held input."""
+"""Low-pass of analogue electronics against SciPy and a held input."""
 
 import jax
 import numpy as np
@@ -35,7 +35,7 @@ def stepped(matrices, inputs, start):
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_a_low_pass_is_exact_for_an_input_that_is_linear_between_samples(order):
-    """Also for a cut-off far below the rate, and for one above Nyquist's."""
+    """One cut-off is far below the rate, one above the Nyquist frequency."""
     for bandwidth in (3.0, 900.0, 4e4):
         expected = stepped(discrete(order, bandwidth, "foh"), INPUT, 0.7)
         found = response(AnalogLowPass(bandwidth, DT, order), INPUT, 0.7)
@@ -51,7 +51,7 @@ def test_a_held_input_gives_the_mean_over_the_sample():
     ends = np.append(inside[1:], inside[-1])
     mean = 0.5 * (inside + ends).reshape(-1, fine).mean(axis=1)
     found = response(AnalogLowPass(2e4 / (2.0 * np.pi), DT, 2), INPUT, 0.0)
-    # The sample before the first is at rest.
+    # The sample before the first one is at rest.
     np.testing.assert_allclose(found[:-1], mean[:-1], atol=2e-5)
 
 
@@ -64,7 +64,7 @@ def test_gain_and_poles(order):
     np.testing.assert_allclose(gain, [1.0, np.sqrt(0.5)], rtol=1e-4)
     poles = np.linalg.eigvals(np.asarray(model.A))
     expected = np.linalg.eigvals(discrete(order, bandwidth, "foh")[0])
-    moved = np.abs(poles) > 1e-9  # the last input is a state too, with its pole at 0
+    moved = np.abs(poles) > 1e-9  # the stored last input is a state with a pole at 0
     assert moved.sum() == order
     for pole in expected:
         assert np.abs(poles[moved] - pole).min() < 1e-6

@@ -41,7 +41,7 @@ def test_a_step_creeps_with_the_logarithm_of_time(decades):
     system = LogarithmicCreep(0.02, shortest, longest, DT)
     y = np.asarray(response(system, np.ones(samples), 0.0))
     inside = time > shortest
-    # A straight line over log10(t), with the slope that was asked for.
+    # a straight line over log10(t) with the given slope
     slope, offset = np.polyfit(np.log10(time[inside]), y[inside], 1)
     assert slope == pytest.approx(0.02, rel=0.03)
     ripple = y[inside] - slope * np.log10(time[inside]) - offset
@@ -53,7 +53,7 @@ def test_damped_springs_are_exact_for_a_held_force():
     levels = np.array([0.0, 30.0, -10.0, 55.0])
     u = np.repeat(levels, 250)
     y, total = np.zeros(2), []
-    for volts in u:  # each element's own equation, solved over one held sample
+    for volts in u:  # the equation of each element, solved over one held sample
         for i, (k, c) in enumerate(zip(stiffness, damping, strict=True)):
             end = force * volts / k
             y[i] = end - (end - y[i]) * np.exp(-k / c * DT)
@@ -90,7 +90,7 @@ PARALLEL = {
 
 @pytest.mark.parametrize("name", PARALLEL)
 def test_hysteresis_plus_creep_in_front_of_dynamics(name):
-    # The creep of the voltage itself: what a creep in series gives beyond its input.
+    # The creep of the voltage: the output of a creep in series minus its input.
     only, whole = PARALLEL[name]
     hysteresis = ColemanHodgdon(0.0077, 0.1167, -0.0487)
     lag = FirstOrderLag(0.05, DT)

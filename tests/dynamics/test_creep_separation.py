@@ -1,4 +1,4 @@
-"""Hysteresis and logarithmic creep, told apart in records made without the package."""
+"""Hysteresis and logarithmic creep, separated in records made without the package."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,23 +18,23 @@ PER_DECADE, FASTEST = 0.02, 0.1
 NOISE = 2e-3
 MODEL = "coleman_hodgdon+logarithmic_creep"
 TRAIN, SAMPLES = 800, 1200
-HELD = slice(830, 1200)  # the last hold, which no fit sees
+HELD = slice(830, 1200)  # the last hold, which no fit uses
 
 
 def made(u, seed):
-    """Return clean output, its hysteresis alone, and the record; rest at 0 V before."""
+    """Return noise-free output, its hysteresis, and the record, from rest at 0 V."""
     h = oracle.exact(u, *HYSTERESIS)
     steps = np.diff(h, prepend=0.0)
     time = DT * np.arange(1, u.size + 1)
-    # What h did at sample j has crept since then: a sum over all steps, the law itself.
+    # Each step of h at sample j creeps from then on: the law as a sum over all steps.
     creep = np.convolve(steps, PER_DECADE * np.log10(1.0 + time / FASTEST))[: u.size]
-    y = np.concatenate([[0.0], (h + creep)[:-1]])  # u(k) shows in y(k+1)
+    y = np.concatenate([[0.0], (h + creep)[:-1]])  # u(k) acts on y(k+1)
     noise = NOISE * np.random.default_rng(seed).standard_normal(u.size)
     return y, h, Record(u, y + noise, DT, source=f"made {seed}")
 
 
 def reached(targets):
-    """Voltages from 0 V that go for each target in turn by at most 3 V a sample."""
+    """Return voltages from 0 V to each target in turn, at most 3 V per sample."""
     u = [0.0]
     for target in targets[1:]:
         u.append(u[-1] + np.clip(target - u[-1], -3.0, 3.0))
@@ -69,7 +69,7 @@ def test_the_hysteresis_is_recovered(fit):
     hysteresis = fit.system.parts[0]
     found = free_run(hysteresis, jnp.asarray(INPUTS["walk"]), 0.0)[1:]
     h = TRUTH["walk"][1][:-1]
-    # The two laws share out a step differently in its first second: a scale is free.
+    # The laws divide a step differently in its first second, so the scale is free.
     scale = np.polyfit(found, h, 1)[0]
     assert scale == pytest.approx(1.0, abs=0.03)
     assert np.std(scale * np.asarray(found) - h) < 0.003 * np.ptp(h)

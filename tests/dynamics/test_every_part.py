@@ -1,7 +1,7 @@
-"""Every registered part but a hysteresis keeps the protocol and has a recipe.
+"""Every registered part except hysteresis satisfies the protocol and has a recipe.
 
-A registered part is checked with the numbers that its recipe starts from, without a
-line here. MODELS adds models without a recipe, and other shapes.
+A registered part is checked with the first guess of its recipe, without an entry
+here. MODELS adds models without a recipe, and other shapes.
 """
 
 from functools import partial
@@ -111,7 +111,7 @@ MODELS |= {
 CHANNELS = dict.fromkeys(
     ("linear map", "state_space", "scheduled", "neural_state_space"), 2
 )
-"""Models whose input is an array, and its length."""
+"""Models whose input is an array, with its length."""
 
 
 class TestProtocol(KeepsTheProtocol):

@@ -1,4 +1,4 @@
-"""Filters against SciPy's discretisations, with slopes up to Nyquist's frequency."""
+"""Filters against the discretisations of SciPy, with gradients up to Nyquist."""
 
 import itertools
 from typing import Any
@@ -23,7 +23,7 @@ from piezojax.dynamics.filters import KINDS, METHODS
 DT = 5e-5
 NYQUIST = 0.5 / DT
 SHARES = (1e-6, 1e-3, 0.2, 0.5, 0.9, 0.999)
-"""Frequencies as shares of Nyquist's."""
+"""Frequencies as shares of the Nyquist frequency."""
 
 
 def filters(frequency, method="bilinear", orders=(1, 2, 3, 4)):
@@ -222,7 +222,7 @@ def test_gradients_equal_finite_differences_up_to_nyquist(method):
     def values_and_slopes(share):
         return jax.jvp(last, (share,), (1.0,))
 
-    # One program for the values, their differences and the slopes.
+    # One program gives the values, their differences and the gradients.
     step = 1e-6 * shares[1:6]
     lanes = np.concatenate([shares, shares[1:6] + step, shares[1:6] - step])
     values, slopes = values_and_slopes(lanes)

@@ -67,7 +67,7 @@ def test_a_held_force_gives_the_solution_of_the_differential_equations(changed):
 
 
 def test_without_hysteresis_it_equals_the_linear_oscillator():
-    # The element is then a spring beside the other.
+    # The element is then a spring in parallel.
     stiffness = TRUE["stiffness"] + TRUE["alpha"]
     continuous = (
         np.array([[0.0, 1.0], [-stiffness / 2.0, -TRUE["damping"] / 2.0]]),

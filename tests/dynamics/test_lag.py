@@ -23,7 +23,7 @@ def response(system, inputs, start):
 
 @pytest.mark.parametrize("tau", [1e-6, DT, 1e-3, 10.0])
 def test_step_response_equals_the_closed_form(tau):
-    time = DT * np.arange(1, 1001)  # output k is that at the end of sample k
+    time = DT * np.arange(1, 1001)  # output k is the value at the end of sample k
     outputs = response(FirstOrderLag(tau, DT), np.full(1000, 7.0), 2.0)
     expected = 7.0 - 5.0 * np.exp(-time / tau)
     np.testing.assert_allclose(outputs, expected, rtol=0.0, atol=1e-11)
@@ -33,7 +33,7 @@ def test_ramp_is_followed_with_the_lag_of_a_held_input():
     tau, samples = 1e-3, 2000
     outputs = response(FirstOrderLag(tau, DT), np.arange(samples) * DT, 0.0)
     pole = np.exp(-DT / tau)
-    behind = DT * pole / (1.0 - pole)  # of a ramp held between samples, settled
+    behind = DT * pole / (1.0 - pole)  # settled, for a held ramp
     np.testing.assert_allclose(
         np.arange(samples)[-100:] * DT - outputs[-100:], behind, rtol=1e-9
     )

@@ -1,4 +1,4 @@
-"""The resonance: response, rest, gradients, and the values that a fit starts from."""
+"""The resonance: response, rest, gradients, and starting values of a fit."""
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ def response(system, inputs, start=0.0):
 
 
 def by_matrix_exponential(frequency, damping, inputs, rest):
-    """The state at the end of each sample under a held input, by scipy's expm."""
+    """Return the state after each sample under a held input, by SciPy's expm."""
     w = 2.0 * np.pi * frequency
     matrix = np.zeros((3, 3))
     matrix[:2] = [[0.0, 1.0, 0.0], [-(w**2), -2.0 * damping * w, w**2]]
@@ -112,7 +112,7 @@ def test_a_chain_contains_a_mode_a_lag_and_a_delay():
 
 
 def by_three_states(frequency, damping, time_constant, inputs, rest):
-    """A resonance and a sensor in one exact discretisation, by scipy's expm."""
+    """Return a resonance and a sensor in one exact discretisation, by SciPy's expm."""
     w = 2.0 * np.pi * frequency
     matrix = np.zeros((4, 4))
     matrix[0, 1] = 1.0

@@ -1,4 +1,4 @@
-"""Models of fewer states, and models whose n is not a multiple of q."""
+"""Reduced models, and models whose order n is not a multiple of q."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +21,7 @@ WHOLE = p558.model("6")  # 15 states, 3 axes
 
 
 def impulse_response(model, samples):
-    """C A^s B [samples, q, q], by plain multiplication."""
+    """Return C A^s B [samples, q, q], by plain multiplication."""
     A, state, C = (np.asarray(matrix) for matrix in (model.A, model.B, model.C))
     found = []
     for _ in range(samples):
@@ -31,7 +31,7 @@ def impulse_response(model, samples):
 
 
 def run(system, samples):
-    """The same of a system that runs on tuples, an impulse in each input in turn."""
+    """Return the impulse response of a system with tuples, for each input in turn."""
     columns = []
     for axis in range(3):
         inputs = tuple(
@@ -43,7 +43,7 @@ def run(system, samples):
 
 
 def companion(form):
-    """The block companion matrix of a MatrixARMA."""
+    """Return the block companion matrix of a MatrixARMA."""
     A = [np.array(matrix) for matrix in form.autoregressive]
     q, p = len(A[0]), len(A)
     matrix = np.eye(p * q, k=-q)
@@ -77,7 +77,7 @@ def test_the_difference_is_within_its_bounds(reduced):
     worst = np.linalg.norm(whole - less, 2, axis=(1, 2)).max()
     left_out = reduced.hankel_singular_values[order:]
     assert reduced.error_bound == pytest.approx(2.0 * left_out.sum(), rel=1e-12)
-    # No model of this order can do better than the largest value left out.
+    # No model of this order has a smaller error than the largest omitted value.
     assert left_out[0] < worst < reduced.error_bound
 
 
@@ -95,7 +95,7 @@ def test_any_number_of_states_in_observability_form(reduced, more):
     form = observability_form(model, 3 + more)
     np.testing.assert_allclose(run(form, 300), impulse_response(model, 300), atol=1e-9)
     np.testing.assert_allclose(form.dc_gain(), model.dc_gain(), atol=1e-9)
-    # The model's own poles, and added ones that decay.
+    # the poles of the model, and additional stable ones
     poles = np.linalg.eigvals(companion(form))
     for pole in model.poles():
         nearest = np.argmin(np.abs(poles - pole))
@@ -131,7 +131,7 @@ def test_a_controller_on_such_a_model_stabilises_it(order):
         model=model,
         reference_model=PerAxis((SecondOrderLag(200.0, 0.9, p558.DT),) * 3),
     )
-    # Of 7 states it holds the whole stage of 15, of 8 its model only.
+    # With 7 states the controller stabilises the stage of 15, with 8 only its model.
     plant = p558_control.stage("6") if order == 7 else model
     loop = p558_control.loop(controller, plant=plant)
     linear, *_ = linear_axes(loop, (0.0, 0.0, 0.0))
@@ -163,7 +163,7 @@ def response(model, angle):
 
 
 def single(poles, residues, through):
-    """sum_i residues[i] / (z - poles[i]) + through, in mixed coordinates."""
+    """Return sum_i residues[i] / (z - poles[i]) + through, in mixed coordinates."""
     change = np.random.default_rng(3).normal(size=(len(poles),) * 2)
     return StateSpace(
         change @ np.diag(poles) @ np.linalg.inv(change),
@@ -175,7 +175,7 @@ def single(poles, residues, through):
 
 
 def test_creep_and_memory_are_not_in_the_fast_part():
-    # A lag of 3 samples, creep by 10 % in 1000 and 5 % in 5000 samples, a memory.
+    # a lag of 3 samples, creep of 10 % in 1000 and 5 % in 5000 samples, a memory
     lag, creep, slower = np.exp([-1 / 3, -1 / 1000, -1 / 5000])
     whole = single(
         [lag, creep, slower, 1.0],
@@ -189,7 +189,7 @@ def test_creep_and_memory_are_not_in_the_fast_part():
 
 
 def test_a_slow_plant_keeps_its_dynamics():
-    # The lag is slow, but it is what the plant does at the angle; its creep is not.
+    # The lag is slow, but it determines the response at the angle; creep does not.
     lag, creep = np.exp([-1 / 300, -1 / 30_000])
     whole = single([lag, creep], [1 - lag, 0.1 * (1 - creep)], 0.0)
     np.testing.assert_allclose(fast_part(whole, 0.1).poles(), [lag], rtol=1e-9)

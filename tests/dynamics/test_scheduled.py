@@ -1,4 +1,4 @@
-"""AmplitudeScheduled against a plain loop and its own limits."""
+"""AmplitudeScheduled against a plain loop and its limiting cases."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ TIME_CONSTANT = 0.02
 
 
 def matrices(seed):
-    """Two damped rotations that change a little with the seed, two inputs."""
+    """Return two damped rotations that vary slightly with the seed, with two inputs."""
     draw = np.random.default_rng(seed).standard_normal
     A = np.zeros((4, 4))
     for k, (size, angle) in enumerate([(0.97, 0.5), (0.9, 1.4)]):
@@ -47,7 +47,7 @@ def drive(samples=400):
 
 
 def plain(u):
-    """The same dynamics written sample by sample."""
+    """Return the response of the same dynamics, sample by sample."""
     x, square, outputs = np.zeros(4), 0.0, []
     for sample in u:
         level = np.sqrt(square)
@@ -87,7 +87,7 @@ def test_equal_models_give_one_linear_model():
 
 
 def test_the_state_decays_for_any_level(system):
-    # Interpolated rotations are contractions: the state shrinks at every single step.
+    # Interpolated rotations are contractions: the state decreases in every step.
     state = np.random.default_rng(3).standard_normal(4)
     for level in np.random.default_rng(5).uniform(0.0, 4.0, 50):
         after = np.asarray(system.at(jnp.asarray(level)).A) @ state

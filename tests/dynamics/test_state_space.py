@@ -73,7 +73,7 @@ def test_frequency_response_equals_that_of_scipy(both):
         numerators, denominator = signal.ss2tf(A, B, C, D, channel)
         for row, numerator in enumerate(numerators):
             _, expected = signal.freqz(numerator, denominator, frequency, fs=1 / DT)
-            # A transfer function of order 12 has lost some digits by itself.
+            # A transfer function of order 12 loses some digits.
             np.testing.assert_allclose(
                 found[:, row, channel], expected, rtol=1e-5, atol=1e-8
             )
@@ -137,7 +137,7 @@ def test_stabilised_reflects_poles_outside_the_circle(seed, order, largest):
     assert np.abs(after.poles()).max() < 1.0
     expected = np.where(outside, 1.0 / np.conj(before), before)
     for pole in after.poles():
-        # Random matrices are non-normal: poles carry rounding errors.
+        # Random matrices are non-normal: their poles have rounding errors.
         assert np.abs(expected - pole).min() < 1e-5
     if not moved:
         np.testing.assert_array_equal(after.A, model.A)
@@ -207,7 +207,7 @@ def test_inconsistent_channels_are_refused():
         stacked([])
 
 
-# The printed stage
+# Printed stage
 
 
 @pytest.mark.parametrize(

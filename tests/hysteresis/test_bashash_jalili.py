@@ -27,7 +27,7 @@ def padded(system, path):
 
 
 def response(system, path):
-    """One program for every path that is short enough."""
+    """Return the response; one program serves every path that is short enough."""
     samples = SAMPLES * -(-path.size // SAMPLES)
     longer = np.pad(path, (0, samples - path.size), "edge")
     return np.asarray(padded(system, longer))[: path.size]
@@ -51,14 +51,14 @@ def test_any_path_equals_the_list_of_branches(path):
 
 @pytest.mark.parametrize("depth", [1, 2, 4])
 def test_loops_nested_deeper_than_the_memory(depth):
-    # Ever smaller loops, three times as many as fit, and out again past all of them.
+    # Three times as many nested loops as the memory has, then out of all of them.
     turns = 50.0 + 45.0 * (-0.8) ** np.arange(SAMPLES // 2)
     path = np.concatenate([turns, turns[::-1]])
     found = response(model(depth), path)
     np.testing.assert_allclose(found, expected(path, depth), atol=1e-9)
     deep = np.array(expected(path, SAMPLES))
-    assert np.max(np.abs(found - deep)) > 1e-3  # what was forgotten is missed
-    # Out of the nest, at the outermost turns, nothing of it is left.
+    assert np.max(np.abs(found - deep)) > 1e-3  # forgotten extrema cause an error
+    # At the outermost extrema the nested loops have no effect.
     np.testing.assert_allclose(found[-2:], deep[-2:], atol=1e-9)
 
 
@@ -70,7 +70,7 @@ def test_a_loop_beyond_the_memory_has_neither_width_nor_jump():
     found = np.asarray(response(system, fine))
     step = np.max(np.abs(np.diff(fine)))
     assert np.max(np.abs(np.diff(found))) < 0.25 * step  # the steepest slope is 0.23
-    # 80 to 40 is stored; 40 to 60 and back to 40 is run on the branch from 80.
+    # The branch from 80 to 40 is stored; 40 to 60 and back to 40 follows it.
     np.testing.assert_allclose(found[300:351], found[200:301:2][::-1], atol=1e-9)
 
 

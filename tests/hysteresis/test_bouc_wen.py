@@ -31,7 +31,7 @@ def force(system, displacement):
 
 
 def walk(samples, seed=0):
-    """Displacements of some mm with pauses, m."""
+    """Return displacements (m) of some mm with pauses."""
     draw = np.random.default_rng(seed)
     return np.repeat(np.cumsum(draw.normal(0.0, 3e-4, samples)), 2)
 
@@ -46,7 +46,7 @@ def test_force_solves_the_differential_equation(shape):
         expected.append(before)
         at = target
     found = force(model(shape, substeps=32), path)
-    # In the step in which the force changes its sign the rule is of lower order.
+    # The rule has a lower order in the step in which the force changes its sign.
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=2e-4 * np.ptp(expected))
 
 
@@ -89,7 +89,7 @@ def test_the_force_is_independent_of_the_speed(shape):
     np.testing.assert_array_equal(
         force(model(shape), slow)[4::5], force(model(shape), path)
     )
-    # The same path in twice as many samples: the substeps fall on the same points.
+    # The same path with twice as many samples has the same substeps.
     halfway = 0.5 * (path + np.concatenate([[0.0], path[:-1]]))
     finer = np.stack([halfway, path], axis=1).ravel()
     np.testing.assert_allclose(

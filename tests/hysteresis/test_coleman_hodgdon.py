@@ -33,12 +33,12 @@ def response(system, inputs):
 
 
 def draws(samples):
-    # Voros' explicit form diverges where steps exceed 2/|c| = 41 V.
+    # The explicit form of Voros diverges for steps above 2/|c| = 41 V.
     return np.random.default_rng(1).uniform(-10.0, 30.0, samples)
 
 
 def sine(samples, periods=1):
-    # Divisible by twice the periods: the extrema fall on samples.
+    # Divisible by twice the periods, so that the extrema are samples.
     return 35.0 * (1.0 - np.cos(2.0 * np.pi * periods * np.arange(samples) / samples))
 
 
@@ -98,7 +98,7 @@ def test_exact_scheme_needs_no_fine_steps():
 
 
 def test_quadratic_takes_trapezoid_steps_where_the_direction_turns():
-    # Every sample is a turning point, so no parabola fits.
+    # Every sample is a turning point, so there is no parabola.
     zigzag = draws(101) + 60.0 * (np.arange(101) % 2)
     zigzag[0] = 0.0
     np.testing.assert_allclose(
@@ -172,7 +172,7 @@ shares = st.floats(-1.0, 1.0).map(lambda share: round(share, 6))
 def invertible(draw):
     b = draw(st.floats(0.05, 0.2))
     c = draw(st.floats(-0.1, -0.02))
-    # Above a = 2 b |c| the way back starts in the wrong direction: no inverse.
+    # Above a = 2 b |c| the falling branch starts upwards: no inverse.
     axis = draw(st.just(0.0) | st.floats(0.0, 1.6)) * b
     wanted = draw(st.lists(shares, min_size=16, max_size=16))
     # With a = 0 the output saturates at b/|c|.
@@ -217,7 +217,7 @@ def test_inverse_rests_where_it_starts(wanted):
 
 @pytest.mark.parametrize("change", [0.0, 2.0, -2.0, 1e3, -1e3])
 def test_gradient_of_the_inverse_is_finite(change):
-    # At rest, up and down; with a < 0 no voltage reaches far.
+    # At rest, up and down; with a < 0 the stroke is small.
     def voltage(stage, by):
         state = stage.init(30.0)
         return InverseColemanHodgdon(stage).solve(state, state.output + by)

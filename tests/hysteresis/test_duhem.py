@@ -35,7 +35,7 @@ def bouc_wen(nu=1, **options):
 
 
 def curved(**options):
-    """Nothing special: all four surfaces, output of both."""
+    """Return a general model: all four surfaces, an output of both variables."""
     return Duhem(
         reversible=((0.1, 1e-3), (-0.002,)),
         irreversible=((0.01, 2e-3), (-0.02, -1e-4)),
@@ -54,7 +54,7 @@ def padded(system, path, start):
 
 
 def response(system, path, start):
-    """One program for every path of up to 256 samples."""
+    """Return the response; one program serves all paths of up to 256 samples."""
     longer = np.pad(path, (0, 256 - path.size), "edge")
     return np.asarray(padded(system, longer, start))[: path.size]
 
@@ -69,7 +69,7 @@ def walk(samples, span):
 
 
 def shares(x, u):
-    """The two slopes of `curved`, written out."""
+    """Return the two slopes of `curved` from the equations."""
     f = 0.1 + 1e-3 * u - 0.002 * x - 0.003 * abs(x)
     g = 0.01 + 2e-3 * u + (-0.02 - 1e-4 * u) * x + abs(x) * (1e-5 * u - 0.001 * x)
     return f, g
@@ -119,7 +119,7 @@ def test_linear_surfaces_give_coleman_hodgdon():
 
 
 def test_surfaces_of_the_input_give_shaped_coleman_hodgdon():
-    path = np.linspace(40.0, 70.0, 128)  # its step is of second order only
+    path = np.linspace(40.0, 70.0, 128)  # second order, as its step
     path = np.concatenate([path, path[::-1]])
     shaped = ShapedColemanHodgdon(PULL, SLOPE, C, 4.0, 1.0)
     duhem = Duhem((SLOPE,), (PULL, (C,)), rest_input=4.0, rest_memory=1.0)

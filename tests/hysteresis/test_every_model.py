@@ -1,7 +1,7 @@
-"""Every registered hysteresis model keeps the protocol, has a recipe and an inverse.
+"""Every registered hysteresis model: the protocol, a recipe and an inverse.
 
-A registered model is checked with the numbers that its recipe starts from, without a
-line here. STARTS adds models without a recipe, and other schemes and shapes.
+A registered model is checked with the first guess of its recipe, without an entry
+here. STARTS adds models without a recipe, and other schemes and shapes.
 """
 
 from functools import partial
@@ -46,7 +46,7 @@ KINDS = {
 
 
 class Bowed(Hysteresis, Fittable):
-    """A model from outside: y = slope (x + m), m moves towards x - m as |dx| passes."""
+    """A model from outside: y = slope (x + m), m tends to x - m along the path |dx|."""
 
     part: ClassVar[Part] = Part("bowed", "hysteresis", "A model of this test")
 
@@ -163,7 +163,7 @@ class TestRecipe(HasARecipe):
 
 @partial(jax.jit, compiler_options=QUICK)
 def missed(inverse, inputs):
-    """Return how far the inverse misses outputs that the model has reached."""
+    """Return the errors of the inverse for outputs that the model has reached."""
 
     def sample(state, x):
         wanted = inverse.model.step(state, x)[1]

@@ -56,7 +56,7 @@ def test_the_output_at_the_rest_input_is_the_offset():
 
 
 def test_one_hysteresis_and_its_dynamics_are_recovered():
-    moving = (0.1, -0.2, 0.12)  # DC gain 1 behind these poles
+    moving = (0.1, -0.2, 0.12)  # DC gain 1 with these poles
     one = series(
         hysteresis=ColemanHodgdon(0.0077, 0.1167, -0.05),
         dynamics=ARMA(POLES, moving),

@@ -42,7 +42,7 @@ A, B, C = HYSTERESIS
 
 MODELS = {
     "trapezoid": ColemanHodgdon(A, B, C),
-    "force": BoucWen(0.12, 8e-4, 4e-4),  # its state has no field `input`
+    "force": BoucWen(0.12, 8e-4, 4e-4),  # its state lacks the field `input`
     "shaped": ShapedColemanHodgdon(
         (0.02, 0.006, -2e-5, 1e-7), (0.11, -3e-4, 2e-6), -0.05
     ),
@@ -71,7 +71,7 @@ def voltages_and_outputs(inverse, wanted):
 
 @settings(max_examples=12)
 @given(st.lists(st.floats(0.5, 8.0), min_size=24, max_size=24))
-# The last Newton step goes back by one rounding, to the end of the bracket.
+# The last Newton step returns by one rounding error to the end of the bracket.
 @example([1.0] * 22 + [6.0, 0.6254148300550961])
 def test_inverse_then_model_is_the_identity(inverse, wanted):
     voltages, found = voltages_and_outputs(inverse, jnp.array(wanted))
@@ -80,7 +80,7 @@ def test_inverse_then_model_is_the_identity(inverse, wanted):
 
 
 def test_steps_of_a_nanometre(inverse):
-    # As in a loop: the kink at the last input is close to every answer.
+    # As in a loop: the kink at the last input is close to every solution.
     wanted = 4.0 + 1e-3 * np.cumsum(np.random.default_rng(0).normal(size=24))
     _, found = voltages_and_outputs(inverse, jnp.asarray(wanted))
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-9)
@@ -173,7 +173,7 @@ def test_the_inverse_at_rest_stays_at_rest():
     [
         NormalisedBoucWen(0.05, -1.0, 0.05, 0.6),  # 0.05 - 2 sigma rho < 0
         ColemanHodgdon(0.02, 0.12, -0.05),  # a > 2 b |c|
-        PrandtlIshlinskii((), (5.0,), (0.1,)),  # still after a turn
+        PrandtlIshlinskii((), (5.0,), (0.1,)),  # constant after a turning point
         Duhem(((-0.1,),), ((0.0,),)),
     ],
 )

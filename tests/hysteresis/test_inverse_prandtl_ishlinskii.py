@@ -23,7 +23,7 @@ from piezojax.hysteresis import (
 
 DT = 1e-3
 THRESHOLDS = (2.0, 7.0, 15.0)
-WEIGHTS = (0.02, -0.015, 0.03)  # one plays the other way: the slope stays positive
+WEIGHTS = (0.02, -0.015, 0.03)  # one negative weight; the slope stays positive
 REST = 5.0
 POLYNOMIALS = {"linear": (0.1,), "cubic": (0.1, 2e-4, 1e-6)}
 INVERSES = {
@@ -68,14 +68,14 @@ unit = st.floats(-1.0, 1.0)
 
 @st.composite
 def cases(draw):
-    """Models that rise with any input, or, a fifth of them, within 150 V."""
+    """Return models that rise for any input; a fifth of them only within 150 V."""
     slope = draw(st.floats(0.02, 0.5))
     gaps = draw(st.lists(st.floats(0.1, 20.0), min_size=4, max_size=4))
     weights, total, least = [], slope, slope
     for share in draw(st.lists(st.floats(-0.4, 1.0), min_size=4, max_size=4)):
         weights.append(share * total)
         total += weights[-1]
-        least = min(least, total)  # the flattest, of any plays moving
+        least = min(least, total)  # the smallest slope of any moving plays
     bend = draw(unit)
     if draw(st.integers(0, 4)):
         cubic = draw(st.floats(1e-9, 1e-5))
@@ -130,7 +130,7 @@ def test_inverse_equals_the_operator_of_krejci_and_kuhnen():
 
 
 def test_the_inverse_is_exact_after_a_clipped_voltage(model):
-    # The state is the model's: whatever was applied, the next step is right.
+    # The state is that of the model, so the step after any applied voltage is right.
     inverse = inverse_of(model)
     state = inverse.init(3.0)
     for applied, wanted in ((80.0, 2.0), (-15.0, 6.0), (90.0, 11.0)):
@@ -187,7 +187,7 @@ def test_gradients_of_the_parameters_equal_central_differences():
 
 
 def test_out_of_reach_the_voltage_and_its_gradient_are_finite():
-    # P falls beyond 58 V: no voltage moves the model far up.
+    # P falls beyond 58 V, so large outputs are unreachable.
     model = PrandtlIshlinskii((0.1, 0.0, -1e-5), THRESHOLDS, WEIGHTS, REST)
     state = model.init(20.0)
     for wanted in (-1e3, 1e3):

@@ -92,7 +92,7 @@ def voltage_and_slope(inverse, state, wanted):
 
 @jax.jit
 def stepped(system, input):
-    """The state at rest, and what two steps under the same input make of it."""
+    """Return the state at rest, and after two steps under the same input."""
     before = system.init(input)
     after, output = system.step(before, input)
     last, again = system.step(after, input)
@@ -121,7 +121,7 @@ def test_the_inverse_at_rest_stays_at_rest(density, wanted):
 
 
 def test_the_inverse_reaches_outputs_across_a_flat_section():
-    # Nothing without hysteresis: the output is flat after each turn.
+    # Without a reversible part the output is flat after each turning point.
     model = stage(np.tril(weights(5), -1))
     share = np.array([0.1, 0.6, 0.6, 0.3, 0.8, 0.35, 0.35])
     wanted = LOWEST + share * float(model.weights.sum())
@@ -169,7 +169,7 @@ def test_gradient_at_rest_equals_the_reciprocal_slope():
 
 
 def test_sliding_mode_with_the_inverse_equals_the_oracle():
-    # The inverse of another material than the stage's: Coleman and Hodgdon's.
+    # The inverse has another hysteresis than the stage: Coleman-Hodgdon.
     samples, noise_rms = 20_000, 0.012
     density = np.tril(np.full((4, 4), 0.8)) + 3.0 * np.eye(4)
     model = Preisach(density, LOW, HIGH, LOWEST, 0.0)

@@ -1,9 +1,9 @@
-"""Laws of hysteresis that the models keep, and those that they break.
+"""Laws of hysteresis: those that hold for a model, and those that do not.
 
-A law is a function from a model and an example to a defect, 0 where it is kept. Laws in
-a row's `keeps` hold within the tolerance there on every drawn example; laws in `breaks`
-fail by at least the number there on the stated example, and the model's docstring says
-so. A registered model needs no row: it is held to the laws that it declares.
+A law is a function from a model and an example to a defect, 0 if it holds. Laws in
+`keeps` of a row hold within its tolerance on every drawn example; laws in `breaks`
+have at least the stated defect on the stated example, and the docstring of the model
+documents it. A registered model needs no row: it is tested with its declared laws.
 """
 
 import inspect
@@ -38,8 +38,8 @@ from piezojax.hysteresis import (
 )
 
 SPAN = (0.0, 100.0)  # V
-SHARES = 6  # numbers in 0 .. 1 that make an example
-SEGMENTS, PARTS = 12, 16  # of every path, and samples a segment
+SHARES = 6  # numbers in 0 .. 1 that define an example
+SEGMENTS, PARTS = 12, 16  # of every path, and samples per segment
 LENGTH = SEGMENTS * PARTS + 1
 
 
@@ -49,20 +49,20 @@ def _outputs(system, paths):
 
 
 def outputs(system, *paths):
-    """One program a model: two paths of one length, whatever the law."""
+    """Return the outputs along two paths; one program per model serves all laws."""
     stacked = np.stack([np.pad(p, (0, LENGTH - p.size), "edge") for p in paths])
     return np.asarray(_outputs(system, stacked))
 
 
 def through(shares, parts=PARTS):
-    """Inputs (V) along straight segments between corners given in 0 .. 1."""
+    """Return inputs (V) along straight segments between corners in 0 .. 1."""
     corners = SPAN[0] + (SPAN[1] - SPAN[0]) * np.asarray(shares)
     at = np.arange((corners.size - 1) * parts + 1) / parts
     return np.interp(at, np.arange(corners.size), corners)
 
 
 def return_point_memory(system, example):
-    """A minor loop closes where it was left: um that it misses by."""
+    """Return the distance (um) between start and end of a minor loop."""
     low, q, p, high = sorted(example[:4])
     start = example[4]
     up = [start, high, low, p, q, p]
@@ -72,7 +72,7 @@ def return_point_memory(system, example):
 
 
 def wiping_out(system, example):
-    """What lies between two larger extrema is forgotten: um that are left of it."""
+    """Return the remaining effect (um) of extrema between two larger ones."""
     low, high = min(example), max(example)
     start, *inner, end = example
     plain = [start] * (len(inner) + 1) + [low, high, end]
@@ -82,21 +82,21 @@ def wiping_out(system, example):
 
 
 def congruency(system, example):
-    """Minor loops between the same two inputs are one shape: um that they differ by."""
+    """Return the difference (um) of minor loops between the same two inputs."""
     low, q, p, high = sorted(example[:4])
     start = example[4]
     y = outputs(system, through([start, low, p, q]), through([start, high, q, p, q]))
-    # Both fall from p to q, one from the main branch and one inside a loop.
+    # Both fall from p to q, one from the main branch, one inside a loop.
     first = y[0, 2 * PARTS : 3 * PARTS + 1]
     second = y[1, 3 * PARTS : 4 * PARTS + 1]
     return np.max(np.abs((first - first[0]) - (second - second[0])))
 
 
 def rate_independence(system, example):
-    """Only the path matters, not its speed: um at the corners between two speeds."""
+    """Return the difference (um) at the corners between two speeds."""
     even = through(example)
     corners = even[::PARTS]
-    # Slow out of every corner, fast into the next one.
+    # Slow at the start of every segment, fast at its end.
     shares = (np.arange(PARTS) / PARTS) ** 2
     uneven = [a + (b - a) * shares for a, b in itertools.pairwise(corners)]
     y = outputs(system, even, np.append(np.concatenate(uneven), corners[-1]))
@@ -105,17 +105,17 @@ def rate_independence(system, example):
 
 
 def pauses(system, example):
-    """A pause changes nothing: um at the corners."""
+    """Return the difference (um) at the corners due to pauses."""
     path = through(example)
     y = outputs(system, path, np.repeat(path, 2))
     return np.max(np.abs(y[0, : path.size] - y[1, 1 : 2 * path.size : 2]))
 
 
 def thermodynamic_sign(system, example):
-    """A closed cycle dissipates, counter-clockwise in (V, um): V um that it gives.
+    """Return the energy (V um) released in a closed counter-clockwise cycle.
 
-    The third round of a cycle of four corners: what fades has nearly faded, and in the
-    sum over the samples a kink between two of them costs some 0.1 V um.
+    In the third round of a cycle of four corners fading memory has almost vanished. A
+    kink between two samples adds an error of about 0.1 V um to the sum.
     """
     path = through([*example[:4]] * 3 + [example[0]])
     last = slice(-4 * PARTS - 1, None)
@@ -133,12 +133,12 @@ LAWS = {
 }
 EXACT = 1e-9
 LOOP = (0.05, 0.35, 0.6, 0.95, 0.5, 0.2)
-SHORT = (0.4, 0.55, 0.4, 0.55, 0.42, 0.5)  # so short that little of it fades
+SHORT = (0.4, 0.55, 0.4, 0.55, 0.42, 0.5)  # so short that little memory fades
 CYCLE = (0.0, 1.0, 0.2, 0.8, 0.0, 1.0)
 
 
 class Row(NamedTuple):
-    """A model, the um (or V um) that laws hold to, and what breaks laws how far."""
+    """A model, the tolerance (um or V um) of its laws, and defects of broken laws."""
 
     system: System
     keeps: dict
@@ -146,9 +146,9 @@ class Row(NamedTuple):
 
 
 def fading(system, rate, **breaks):
-    """A differential model: what it remembers fades, and is not wiped out.
+    """Return the row of a differential model: its memory fades and is not wiped out.
 
-    `rate`: at 16 samples a branch; the order of each scheme is tested in its own file.
+    `rate`: at 16 samples per branch; other files test the order of each scheme.
     """
     memory = {
         "return-point memory": (LOOP, 0.02),
@@ -160,7 +160,7 @@ def fading(system, rate, **breaks):
 
 
 def remembering(system, **breaks):
-    """A model of extrema: everything holds to rounding."""
+    """Return the row of a model of extrema: all laws hold to rounding."""
     return row(system, dict.fromkeys(LAWS, EXACT) | {"counter-clockwise": 0.5}, breaks)
 
 
@@ -256,6 +256,6 @@ CLAIMED = [
 def test_a_registered_model_keeps_the_laws_it_claims(kind, law):
     extent = Extent(*SPAN, (0.0, 0.0), 0.12, 0.0, 12.0, 1e-3, 2.0)
     system = kind.recipe(extent).system
-    # A loop gives V um, everything else um.
+    # A loop has the unit V um, every other law um.
     size = 12.0 * (100.0 if law == "counter-clockwise" else 1.0)
     assert LAWS[law](system, LOOP) <= kind.laws[law] * size

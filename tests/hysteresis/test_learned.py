@@ -1,4 +1,4 @@
-"""The learned operator: what it computes, and a loop that nothing else here makes."""
+"""The learned operator: its equation, and a loop that no other model represents."""
 
 import jax
 import numpy as np
@@ -38,7 +38,7 @@ def drive(samples):
 
 
 def driven(x):
-    """What the equations in the docstring add to the output."""
+    """Return the part of the output from the equations in the docstring."""
     v, rest = (x - CENTRE) / SCALE, (REST - CENTRE) / SCALE
     plays = [oracle.play(v, r, rest) for r in THRESHOLDS]
     s = np.stack([v, *plays, np.diff(x, prepend=x[0]) / PACE])
@@ -61,10 +61,10 @@ def test_the_operator_contains_its_dynamics():
 
 
 def strange_loop(u):
-    """A stage whose slope depends on where its backlash stands: no superposition.
+    """Return the output of a stage whose slope depends on the state of its play.
 
     The product of a play and a saturated play, then a lag that is slower on the way
-    down. None of the models with a closed form has such a loop.
+    down. No other model represents such a loop.
     """
     inner, outer = oracle.play(u, 6.0, 0.0), oracle.play(u, 15.0, 0.0)
     force = 0.08 * inner + 1.5 * np.tanh(outer / 30.0) * (1.0 + 0.01 * inner)
@@ -88,7 +88,7 @@ def record():
 
 
 def linear_error(record, train, validate, taps=25):
-    """Held-out error of the best impulse response with an offset, um."""
+    """Return the held-out error (um) of the best impulse response with an offset."""
     past = np.stack(
         [
             np.concatenate([np.full(i, record.input[0]), record.input])[

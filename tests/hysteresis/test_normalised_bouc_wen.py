@@ -31,13 +31,13 @@ def padded(system, path):
 
 
 def response(system, path):
-    """One program for every path of up to 256 samples."""
+    """Return the response; one program serves all paths of up to 256 samples."""
     longer = np.pad(path, (0, 256 - path.size), "edge")
     return np.asarray(padded(system, longer))[: path.size]
 
 
 def memory(system, path):
-    """w from the output."""
+    """Return w from the output."""
     return (response(system, path) - K_X * path) / K_W
 
 
@@ -59,7 +59,7 @@ def test_the_runge_kutta_scheme_converges_to_the_exact_scheme(shape):
     path = walk(20)
     expected = oracle.bounded(path, RHO, *SHAPES[shape])
     found = memory(model(shape, substeps=16), path)
-    # In the part in which w changes its sign the rule is of lower order.
+    # The rule has a lower order in the part in which w changes its sign.
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=5e-3)
 
 

@@ -62,7 +62,7 @@ def expected(x, skewed):
 @pytest.mark.parametrize("name", MODELS)
 def test_the_response_equals_plays_in_a_plain_loop(name):
     x = drive()
-    x[0] = 12.0  # the only step from the virgin state that init takes
+    x[0] = 12.0  # the single step of init from the virgin state
     found = response(MODELS[name](), x, x[0])
     np.testing.assert_allclose(found, expected(x, name == "asymmetric"), atol=1e-12)
 

@@ -17,7 +17,7 @@ from piezojax.hysteresis import (
 
 CELLS, LOW, HIGH, LOWEST = 10, 0.0, 100.0, -1.5
 SIZE = (HIGH - LOW) / CELLS
-LENGTH = 256  # of every input, so that one program runs them all
+LENGTH = 256  # the length of every input, so that one program serves all
 
 
 def draws(seed=0, cells=CELLS):
@@ -39,14 +39,14 @@ def _run(system, inputs):
 
 
 def response(system, inputs):
-    """Outputs along ``inputs``, the first of which it starts at."""
+    """Return the outputs along ``inputs``, from rest at the first one."""
     inputs = np.asarray(inputs, dtype=float)
     padded = np.pad(inputs, (0, LENGTH - inputs.size), "edge")
     return np.asarray(_run(system, padded))[: inputs.size]
 
 
 def sampled(corners, step=5.0):
-    """Straight lines between ``corners``, all multiples of ``step``, at every step."""
+    """Return lines between ``corners``, multiples of ``step``, sampled every step."""
     path = [corners[0]]
     for corner in corners[1:]:
         count = round(abs(corner - path[-1]) / step)
@@ -60,7 +60,7 @@ on_grid = st.integers(-2, 22).map(lambda step: 5.0 * step)
 
 @pytest.mark.parametrize("start", ["virgin", "saturated"])
 def test_the_output_equals_the_sum_of_relays(start):
-    # Between relays that lie 5 V apart along each diagonal: no rounding to agree on.
+    # Inputs between relays that are 5 V apart: rounding does not matter.
     x = 5.0 * np.random.default_rng(1).integers(-2, 23, LENGTH)
     rest = 30.0 if start == "virgin" else None
     expected = LOWEST + oracle.along(WEIGHTS, LOW, HIGH, 2, x, rest)
@@ -73,19 +73,19 @@ def test_the_output_is_the_limit_of_many_relays():
     found = response(model(), x) - LOWEST
     for parts in (10, 100):
         error = np.abs(oracle.along(WEIGHTS, LOW, HIGH, parts, x, 30.0) - found).max()
-        # One relay of each line may stand on either side.
+        # One relay of each line may be on either side.
         assert error <= sum(np.diag(WEIGHTS, -k).max() for k in range(CELLS)) / parts
 
 
-# Figure 2.2: the input at its points 1 to 10 and at its end, V, by the order in which
-# the text has them pass each other.
+# Figure 2.2: the input (V) at its points 1 to 10 and at its end, in the order of size
+# that follows from the text.
 FIGURE = (0.0, 95.0, 10.0, 65.0, 20.0, 55.0, 30.0, 70.0, 25.0, 75.0)
 POINTS = dict(enumerate(FIGURE, 1))
 END = 0.0
 
 
 def last(count, *points):
-    """The last outputs on the way through points of the figure, or inputs (floats)."""
+    """Return the last outputs on the path through points of the figure, or inputs."""
     corners = [POINTS[p] if isinstance(p, int) else p for p in points]
     return response(model("saturated"), sampled(corners))[-count:]
 
@@ -93,20 +93,20 @@ def last(count, *points):
 @pytest.mark.parametrize(
     ("whole", "wiped", "count"),
     [
-        # Beyond 6 the loop of 6 and 7 is forgotten: the path is that from 5 on.
+        # Beyond 6 the loop of 6 and 7 is forgotten: the path continues from 5.
         ((1, 2, 3, 4, 5, 6, 7, 65.0), (1, 2, 3, 4, 5, 65.0), 3),
-        # Beyond 4 that of 4 and 5 is, too.
+        # Beyond 4 the loop of 4 and 5 is forgotten too.
         ((1, 2, 3, 4, 5, 6, 7, 8), (1, 2, 3, 8), 2),
-        # From 8 to 9, back to 8 and on to 10, as if 9 had never been.
+        # From 8 to 9, back to 8 and on to 10: as without 9.
         ((1, 2, 3, 4, 5, 6, 7, 8, 9, 10), (1, 2, 3, 10), 2),
-        # Down through 3: the curve from 2 to 3 goes on to the end.
+        # Down through 3: the curve from 2 to 3 continues to the end.
         ((1, 2, 3, 4, 5, 6, 7, 8, 9, 10, END), (1, 2, END), 3),
     ],
 )
 def test_wiping_out_on_the_input_of_figure_2_2(whole, wiped, count):
     expected = last(count, *wiped)
     np.testing.assert_allclose(last(count, *whole), expected, rtol=0, atol=1e-13)
-    # One sample sooner the smaller loop still counts.
+    # One sample earlier the smaller loop still has an effect.
     sooner = last(count + 1, *whole)[0] - last(count + 1, *wiped)[0]
     assert abs(sooner) > 1e-3
 
@@ -152,7 +152,7 @@ def test_loops_between_the_same_inputs_are_congruent(before, x, y):
 @settings(max_examples=50)
 @given(st.lists(inputs, max_size=5), inputs, inputs, inputs)
 def test_minor_loops_return_to_their_turning_point(before, x, y, z):
-    # An excursion from the middle down to above the last turn, and back.
+    # A path from the middle down to above the last extremum, and back.
     turn, excursion, point = sorted((x, y, z))
     found = response(model(), [*before, turn, point, excursion, point])
     np.testing.assert_allclose(found[-1], found[-3], rtol=0, atol=1e-12)
@@ -161,7 +161,7 @@ def test_minor_loops_return_to_their_turning_point(before, x, y, z):
 @settings(max_examples=50)
 @given(st.lists(on_grid, min_size=3, max_size=4))
 def test_a_closed_cycle_dissipates_energy(corners):
-    # Corners and samples lie where the output may bend: the trapezoid rule is exact.
+    # All kinks of the output are at samples, so the trapezoid rule is exact.
     cycle = sampled([*corners, corners[0]])
     path = np.concatenate([cycle, cycle[1:]])
     x, y = path[-cycle.size :], response(model(), path)[-cycle.size :]
@@ -201,7 +201,7 @@ def test_gradients_at_rest_and_on_edges_are_one_sided():
     for input in (LOW, LOW + SIZE, HIGH):
         found = gradients(model(rest=input), jnp.full(PATH.size, input))
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
-    # Where nothing but what has no width moves: the weight of the cell above the edge.
+    # Only relays without width move: the slope is the weight of the cell above.
     found = gradients(model(rest=LOW + SIZE), jnp.full(PATH.size, LOW + SIZE))[1]
     slope = WEIGHTS[1, 1] / SIZE * np.cos(np.arange(PATH.size))
     np.testing.assert_allclose(found[1:], slope[1:], rtol=1e-12)

@@ -33,7 +33,7 @@ def sine(hertz):
 
 
 def area(hertz):
-    """Area of the last whole loop, V um."""
+    """Return the area (V um) of the last whole loop."""
     x = sine(hertz)[-round(1.0 / (hertz * DT)) :]
     y = np.asarray(response(MODEL, sine(hertz)))[-x.size :]
     return abs(np.sum(0.5 * (y + np.roll(y, -1)) * (np.roll(x, -1) - x)))

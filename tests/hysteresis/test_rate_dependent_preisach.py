@@ -29,7 +29,7 @@ def response(system, inputs):
 
 
 def test_the_output_equals_relays_with_rate_dependent_weights():
-    # Multiples of 5 V, between which the relays lie.
+    # multiples of 5 V; the thresholds of the relays lie between them
     x = 5.0 * np.random.default_rng(1).integers(-2, 19, 100)
     rate = np.diff(x, prepend=x[0]) / DT / RATE
     share = rate**2 / (1.0 + rate**2)

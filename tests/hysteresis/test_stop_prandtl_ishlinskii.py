@@ -32,7 +32,7 @@ X = drive()
 
 
 def test_play_and_stop_add_up_to_the_input():
-    # Of two oracles that know nothing of each other, then of the package.
+    # first of two independent oracles, then of the package
     for r in THRESHOLDS:
         both = oracle.play(X, r, REST) + oracle.stop(X, r, REST)
         np.testing.assert_allclose(both, X, atol=1e-11)
