@@ -1,4 +1,4 @@
-"""Stand-ins for what takes long to compute."""
+"""Replacements for results that take long to compute."""
 
 import numpy as np
 
@@ -6,9 +6,9 @@ from piezojax.identification.fit import Fit, FitError, FitReport
 
 
 def fit_of(system, record, run):
-    """Return a fit of the first half of ``record`` by a model that gives ``run``.
+    """Return a fit to the first half of ``record`` by a model with the output ``run``.
 
-    ``system`` stands for the fitted plant; the second half is the validation part.
+    ``system`` is the fitted plant; the second half is the validation part.
     """
     error = FitError(rmse=1.0, rmse_percent_of_span=1.0, unit="um")
     report = FitReport(

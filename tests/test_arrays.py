@@ -1,4 +1,4 @@
-"""Largest and smallest elements, as objectives and constraints need them."""
+"""Largest and smallest elements, and their derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from piezojax.core.arrays import largest, smallest
 
-# XLA takes subnormal numbers as 0.
+# XLA flushes subnormal numbers to 0.
 numbers = st.floats(-1e6, 1e6, allow_subnormal=False)
 rows = st.lists(st.lists(numbers, min_size=4, max_size=4), min_size=1, max_size=3)
 

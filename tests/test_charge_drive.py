@@ -1,4 +1,4 @@
-"""The charge amplifier against (2.12), and on a hysteretic load."""
+"""The charge amplifier against (2.12), and with a hysteretic load."""
 
 from functools import cache
 
@@ -34,7 +34,7 @@ def response(system, inputs):
 
 @cache
 def rest():
-    """The hysteretic drive at rest at 0 V, whatever its gain and times."""
+    """Return the hysteretic drive at rest at 0 V, for any gain and time constants."""
     return jax.jit(lambda drive: drive.init(0.0))(p753_survey.charge_drive())
 
 
@@ -51,7 +51,7 @@ def test_a_linear_load_has_the_printed_transfer_function(frequency):
     samples = period * max(1, round(10e3 / period))
     turns = jnp.exp(-1j * w * 1e-3 * jnp.arange(samples))
     tone = jnp.asarray(jnp.conj(turns).real)
-    # The transients die with exp(-t / 0.5 s): the second run has none.
+    # Transients decay with exp(-t / 0.5 s): the second run has none.
     found = response(drive, jnp.concatenate([tone, tone]))[samples:]
     found = 2.0 * (found * turns).mean()
     # C_s (s + 1 / C_s R_s) / (s + 1 / C_L R_L), over C_L.
@@ -84,7 +84,7 @@ def test_a_hysteretic_load_equals_the_equations():
 
 
 def loop_width(corner_time):
-    """Widest gap between the branches of the loop at 10 Hz, in % of its stroke."""
+    """Return the width of the loop at 10 Hz, in % of its stroke."""
     drive = ChargeDrive(LOAD, 1.0, corner_time, corner_time, DT)
     command = signals.sine(signals.time_grid(0.3, p753.RATE), 10.0, 30.0)
     y = response(p753.hysteresis(), after(rest(), drive, command))[-2_000:]
@@ -152,7 +152,7 @@ def test_bad_parameters_are_refused(arguments, message):
 
 
 def test_the_catalogued_stage_follows_the_charge():
-    # The hysteresis of the stage undoes that of the load: what moves is the charge.
+    # The hysteresis of the stage cancels that of the load: the charge moves the stage.
     stage = p753_survey.charge_driven_stage()
     time = DT * np.arange(4_000)
     inputs = 30.0 * (1.0 - np.cos(2.0 * np.pi * 20.0 * time))

@@ -1,4 +1,4 @@
-"""The commands, as they are typed."""
+"""The commands with their arguments."""
 
 import csv
 import dataclasses
@@ -64,7 +64,7 @@ def succeeded(result):
 
 
 def failed(result, message, code=1):
-    """Check that there is one line of error and nothing that looks like a crash."""
+    """Check that there is one line of error and no traceback."""
     assert result.exit_code == code
     assert isinstance(result.exception, SystemExit)
     assert result.stderr.startswith("Error: ")
@@ -102,7 +102,7 @@ def record(tmp_path):
 
 
 def write_record(folder, late=0):
-    """A stage with lag and no hysteresis, 300 samples; two amplitudes.
+    """Write a record of a lag without hysteresis: 300 samples, two amplitudes.
 
     The output follows the input ``late`` samples later.
     """
@@ -120,7 +120,7 @@ def write_record(folder, late=0):
 
 
 def write_model(folder, gain=0.06):
-    """The stage of that record, one sample later and without the zero of its sensor."""
+    """Write the model of that record, a sample later, without the sensor's zero."""
     system = pj.series(
         dynamics=pj.dynamics.ARMA([0.5], [gain]), calibration=pj.Affine(1.0, 0.0)
     )
@@ -132,7 +132,7 @@ def write_model(folder, gain=0.06):
 COLUMNS = ("--time", "time_s", "--input", "drive_V", "--output", "sensor_um")
 
 
-# What they all do
+# All commands
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -151,7 +151,7 @@ def test_help_names_the_choices():
 
 
 def test_defaults_are_those_of_the_functions():
-    """Written out in the commands, so that --help need not import them."""
+    """The commands repeat them, so that --help does not import the functions."""
     defaults = {option.name: option.default for option in COMMANDS["identify"].params}
     assert defaults["model"] == DEFAULT
     for field in dataclasses.fields(Options):
@@ -161,7 +161,7 @@ def test_defaults_are_those_of_the_functions():
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_python_m_returns_status_and_one_line(command):
-    # As typed, and what the user's shell sees: status, one line, no traceback.
+    # as in a shell: exit status, one line, no traceback
     argument = {
         "reproduce": ["--table", "9-9"],
         "validate": ["nowhere.json", "nowhere.csv"],
@@ -200,7 +200,7 @@ def test_a_used_folder_is_refused(command, request, tmp_path):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_folder_that_cannot_be_written_is_refused(command, request, tmp_path):
-    # Under a file no folder can be made, not even by root.
+    # Not even root can create a folder under a file.
     (tmp_path / "file").write_text("mine")
     out = tmp_path / "file" / "sub"
     result = call(command, *arguments_for(command, request), "--out", out)
@@ -327,7 +327,7 @@ def test_tune_reports_progress_and_ends_with_a_table(tuned):
     for part in ("SIN50", "SW50", "geometric mean", "integral"):
         assert part in text
     assert "results in" in text
-    assert "\x1b" not in text  # no colours where there is no terminal
+    assert "\x1b" not in text  # no colours without a terminal
     assert " ".join(text.split()).endswith(str(out))
 
 
@@ -381,7 +381,7 @@ def assert_interrupted(out):
     result = pj.load_result(out)
     assert result.status == "interrupted"
     assert result.holdout.stable
-    # So early the search may not have met the limits; result.alarms would say so.
+    # So early the search may violate the limits; result.alarms would list them.
     controller = pj.load(out / "gains.toml", accept_unsafe=True)
     assert float(controller.integral) == result.gains["controller.integral"]
     assert_pictures(out, "tracking.png", "hysteresis.png")
@@ -407,7 +407,7 @@ def test_ctrl_c_waits_for_the_next_progress_report():
         signal.raise_signal(signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
             bar.advance(1.0)
-        bar.stage("judging")  # the press is spent: what was found can be judged
+        bar.stage("judging")  # Ctrl-C acted once, so the gains can be evaluated
 
 
 def test_ctrl_c_during_the_evaluation_loses_nothing(study, tmp_path, monkeypatch):
@@ -538,7 +538,7 @@ def test_ctrl_c_while_drawing_keeps_the_result(study, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_real_ctrl_c(tmp_path):
-    # Long steps, and more of them than it could take before the signal arrives.
+    # Long steps, more than the command can take before the signal arrives.
     study = write_study(
         tmp_path,
         references={
@@ -665,7 +665,7 @@ def test_identify_bad_input(record, tmp_path):
 
 @pytest.fixture
 def made_up(monkeypatch):
-    """Tables without their simulation, which tests/reproduce has."""
+    """Replace the simulation of the tables, which tests/reproduction covers."""
     asked = []
 
     def reproduce(table):

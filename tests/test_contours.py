@@ -1,4 +1,4 @@
-"""Contours and how far off them a run is, against NumPy and closed forms."""
+"""Contours and contour errors, against NumPy and closed forms."""
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +48,7 @@ def test_a_circle_is_exact_from_its_first_sample():
     on = ((x - 5.0) / 4.0) ** 2 + ((y - 1.0) / 3.0) ** 2
     np.testing.assert_allclose(on, 1.0, rtol=1e-12)
     np.testing.assert_allclose(path[0], [1.0, 1.0], atol=1e-12)
-    # Half a turn less than without the rise of 0.2 s, at the same speed from there on.
+    # Half a turn less than without the rise of 0.2 s, then at equal speed.
     late = contours.circle(TIME, 5.0, (4.0, 3.0), (1.0, -2.0))
     np.testing.assert_allclose(path[600:], late[400:-200], atol=1e-9)
 
@@ -70,7 +70,7 @@ def test_a_lissajous_closes_after_a_period_without_retracing(cycles):
         spectrum = np.abs(np.fft.rfft(column[:-1] - 5.0)) / 1000.0
         np.testing.assert_allclose(spectrum[count], 5.0, rtol=1e-12)
         assert np.delete(spectrum, count).max() < 1e-12
-    # A figure that runs back comes by its ends with no speed on both axes at once.
+    # A retraced figure has zero speed on both axes at its ends.
     speed = np.linalg.norm(np.diff(path, axis=0), axis=1)
     assert speed.min() > 0.02 * speed.max()
 
@@ -255,7 +255,7 @@ def test_at_rest_and_at_reversals_the_whole_distance_counts():
 
 
 def circles(reference, displacement):
-    """Distances from the circle through each three points, centre by linear solve."""
+    """Return distances from circles through three points, by a linear solve."""
     found = []
     for k in range(1, len(reference) - 1):
         a, b, c = reference[k - 1 : k + 2]
@@ -286,7 +286,7 @@ def test_figures_equal_those_of_an_oracle(start):
 
 def test_the_error_is_close_to_the_distance_from_the_path():
     reference, _ = wavy()
-    found = reference[:-3] + [0.02, -0.03]  # 3 samples late, and off
+    found = reference[:-3] + [0.02, -0.03]  # 3 samples late, with an error
     exact = distance_to(found[100:], reference)
     result = figures(ContourError(start=100), sample_of(reference[3:], found))
     np.testing.assert_allclose(result.rms, np.sqrt(np.mean(exact**2)), rtol=0.05)

@@ -1,4 +1,4 @@
-"""The coupling of axes from figures, and its picture and that of contours."""
+"""Coupling of axes, and the pictures of coupling and contours."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -158,7 +158,7 @@ def test_coupling_picture_has_shares_and_values_with_units():
 
 def test_contour_picture_magnifies_the_distance_not_the_lag():
     study = study_of()
-    # Z and Rx differ in unit: there is no distance between them.
+    # Z and Rx have different units: there is no distance.
     (contour,) = contours_in(study)
     assert contour.run == 5
     assert contour.axes == (1, 2)
@@ -166,7 +166,7 @@ def test_contour_picture_magnifies_the_distance_not_the_lag():
     middle = np.array([40.0, 20.0])  # of the contour, an ellipse of Rx and Ry
 
     def log(shrunk, lag):
-        # A step inwards along the ellipse's normal, whatever the lag.
+        # an offset inwards along the normal of the ellipse, for any lag
         turned = angles - lag
         on = np.stack([-40.0 * np.cos(turned), 20.0 * np.sin(turned)])
         inwards = -np.stack([on[0] / 1600.0, on[1] / 400.0])
@@ -189,7 +189,7 @@ def test_contour_picture_magnifies_the_distance_not_the_lag():
     np.testing.assert_allclose(right.lines[1].get_ydata(), 100.0, rtol=0.005)
 
     lost = log(1e8, 0.0)
-    lost.displacement[1][60:] = np.nan  # as a run beyond all bounds is drawn
+    lost.displacement[1][60:] = np.nan  # as a diverging run is drawn
     with plot_style():
         found = contour_errors(study, {5: (lost, log(0.1, 0.0))})
         picture = contour_figure(study, "t", found)
@@ -209,7 +209,7 @@ def test_results_of_several_axes_have_both_pictures(tmp_path):
     result = result_of(case.study)
     outcome = Outcome(result, case.loop, case.loop, case, holdout)
     tuning.write_results(outcome, tmp_path)
-    # No axis is driven alone, and no step was taken: those two are not there.
+    # No axis is driven alone and there is no step, so these two are missing.
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
         *("result.json", "gains.toml"),

@@ -1,4 +1,4 @@
-"""Results are written whole or not at all, and never over older ones."""
+"""Results are written completely or not at all, and never overwrite older ones."""
 
 import os
 import stat
@@ -154,7 +154,7 @@ with claimed(folder), temporary(folder / "result.json") as file:
 
 @pytest.fixture(scope="module")
 def litter_names(tmp_path_factory):
-    """Kill a process that has claimed a folder and writes; return what it leaves."""
+    """Kill a process that writes in a claimed folder; return the remaining files."""
     folder = tmp_path_factory.mktemp("out")
     subprocess.run([sys.executable, "-c", LEAVE, folder], check=False)
     found = names(folder)
@@ -197,7 +197,7 @@ def test_results_of_a_killed_run_are_kept_and_its_temporary_files_are_not(
 
 def test_files_in_use_are_kept(tmp_path):
     with temporary(tmp_path / "result.json") as own:
-        # The parent of this process runs for as long as this one.
+        # The parent of this process runs at least as long as this one.
         process, parent = f".{os.getpid()}.", f".{os.getppid()}."
         other = tmp_path / own.name.replace(process, parent)
         other.touch()

@@ -55,7 +55,7 @@ def test_slew_limit_bounds_the_rate():
     np.testing.assert_allclose(outputs, expected, rtol=0.0, atol=1e-11)
     steps = np.abs(np.diff(outputs, prepend=0.0))
     np.testing.assert_allclose(steps.max(), rate * DT, rtol=1e-12)
-    assert np.any(np.abs(outputs - inputs) < 1e-12)  # where it keeps up
+    assert np.any(np.abs(outputs - inputs) < 1e-12)  # where the input is slower
 
 
 def test_slew_limit_starts_at_the_given_value():

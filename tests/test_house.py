@@ -1,4 +1,4 @@
-"""Subpackages: imports go down only, and a module's name has one place."""
+"""Subpackages: imports point downwards only, and module names are unique."""
 
 import ast
 from collections import defaultdict
@@ -13,15 +13,15 @@ SUBPACKAGES = (
     *("solve", "identification", "catalog", "study", "tuning", "sweeping"),
     *("reproduction", "report", "cli"),
 )
-"""Subpackages from the ground up: each may import those before it, so that ``cli``
+"""Subpackages from the lowest up: each may import those before it, so that ``cli``
 alone imports ``report``."""
 
 ENTRIES = ("__init__", "tune", "identify", "validate", "sweep", "reproduce")
-"""Modules at the top, which may import any subpackage and no subpackage may import."""
+"""Modules at the top: they may import any subpackage; no subpackage imports them."""
 
 
 def modules(package):
-    """Return the dotted names below ``package``, packages without ``__init__``."""
+    """Return the dotted names of the modules below ``package``."""
     found = {}
     for path in sorted(package.rglob("*.py")):
         parts = path.relative_to(package).with_suffix("").parts
@@ -33,7 +33,7 @@ def modules(package):
 def imported(package, parts, path, is_package):
     """Yield line number and dotted parts of each import of the package itself.
 
-    Imports inside functions and under TYPE_CHECKING are among them.
+    They include imports inside functions and under TYPE_CHECKING.
     """
     here = parts if is_package else parts[:-1]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -56,7 +56,7 @@ def imported(package, parts, path, is_package):
 
 
 def violations(package):
-    """Return what breaks the order of subpackages in the package, a line each."""
+    """Return the violations of the order of subpackages, one line each."""
     found, arrows, places = [], defaultdict(set), defaultdict(set)
     for parts, (path, is_package) in modules(package).items():
         subpackage, where = parts[0], ".".join(parts)
@@ -98,7 +98,7 @@ def test_every_subpackage_is_listed():
 
 
 def test_reports_do_not_compute():
-    """A report draws numbers that it is given: nothing there simulates or solves."""
+    """A report draws given numbers; it neither simulates nor solves."""
     for path in (Path(piezojax.__file__).parent / "report").glob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         names = {

@@ -1,4 +1,4 @@
-"""Every model that identify fits, as the plant of a study with every design."""
+"""Every model of identify, as the plant of a study with every design."""
 
 from functools import cache
 
@@ -49,12 +49,12 @@ SLOW_TO_COMPILE = (
     "stop_prandtl_ishlinskii",
     "rate_dependent_prandtl_ishlinskii",
 )
-"""Models of whose inverse in a loop only the start is checked, step by step."""
+"""Models whose inverse in a loop is checked at the start only."""
 
 
 @cache
 def record():
-    """A stage of hysteresis and a lag of 3 samples, in two sweeps."""
+    """Return a record of hysteresis and a lag of 3 samples, in two sweeps."""
     time = DT * np.arange(400)
     swing = np.where(time < 0.2, 1.0, 0.6)
     u = 50.0 - 40.0 * swing * np.cos(2 * np.pi * 10 * time)
@@ -91,12 +91,12 @@ WHOLE_MODELS = {
     ),
     "neural_state_space": lambda: neural_start(record(), 2, 4),
 }
-"""Models that are not chains of parts, of sizes that a fit gives them."""
+"""Models that are not chains of parts, with the sizes of a fit."""
 
 
 @cache
 def plant(model):
-    """A model as a fit begins with it."""
+    """Return the first guess of a model in a fit."""
     if model in WHOLE_MODELS:
         return WHOLE_MODELS[model]()
     shape = structure(model, record())
@@ -114,7 +114,7 @@ def loop_around(controller, system):
 
 
 def started(loop):
-    """The loop at rest in the middle of the limits, and the reference there."""
+    """Return the loop at rest in the middle of the limits, and its reference."""
     reference = rest_output(loop.plant, 50.0)
     return loop.init(reference, jnp.asarray(50.0)), reference
 
@@ -137,7 +137,7 @@ def test_every_model_has_every_design_or_a_reason(model, design):
             state, sample = loop.step(state, inputs)
             assert abs(float(sample.voltage) - 50.0) < 1e-6
         return
-    # Rest, then a step of a tenth of what 10 V move.
+    # rest, then a step of a tenth of the motion for 10 V
     references = reference + jnp.where(jnp.arange(400) < 50, 0.0, 0.1 * span)
     _, samples = pj.simulate(loop, pj.loop_inputs(references), state)
     error = np.abs(np.asarray(samples.reference - samples.displacement)) / span
@@ -160,7 +160,7 @@ REFERENCES = {
 
 
 def study(folder, design, stage):
-    """A study file of a few samples and 10 steps."""
+    """Write a study of few samples and 10 steps."""
     path = folder / f"{design}.toml"
     content = {
         "title": "identify meets tune",
@@ -169,7 +169,7 @@ def study(folder, design, stage):
         "plant": stage,
         "actuator": dict(zip(("lower", "upper"), LIMITS, strict=True)),
         "sensor": {"noise_rms": 0.001},
-        # Margins take long to compile; here any loop that gets better will do.
+        # Margins take long to compile; here a smaller error suffices.
         "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
         "controller": {"design": design},
         "references": REFERENCES,
@@ -182,7 +182,7 @@ def study(folder, design, stage):
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
-    """The folder of a fitted default model, and the study of its record, built."""
+    """Return the folder of a fitted default model, and the Case of its record."""
     folder = tmp_path_factory.mktemp("stage")
     rows = [f"{k * DT:.6f},{u:.12g},{y:.12g}" for k, (u, y) in enumerate(samples())]
     (folder / "record.csv").write_text("\n".join(["time_s,input_V,output_um", *rows]))

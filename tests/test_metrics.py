@@ -10,7 +10,7 @@ SAMPLES = 300
 
 
 def record(seed=10):
-    """A made-up run: no loop is needed to check its figures."""
+    """Return a synthetic run, which needs no loop."""
     draw = np.random.default_rng(seed).normal
     reference, voltage = 5.0 + draw(size=SAMPLES), 20.0 * draw(size=SAMPLES)
     displacement = reference + 0.1 * draw(size=SAMPLES)
@@ -37,7 +37,7 @@ def test_figures_count_the_window(start):
     error = np.asarray(run.displacement - run.reference)[start:]
     whole = np.asarray(run.voltage)
     voltage = whole[start:]
-    # A change counts if both of its samples are inside.
+    # A change counts if both of its samples are in the window.
     changes = np.diff(voltage)
     expected = {
         "rms_error": np.sqrt(np.mean(error**2)),

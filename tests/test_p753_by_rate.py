@@ -1,4 +1,4 @@
-"""The P-753's controllers by rate: printed where printed, one rule elsewhere."""
+"""Controllers of the P-753 by rate: printed gains, and one rule at other rates."""
 
 import control
 import jax
@@ -41,7 +41,7 @@ SAME = {
 
 
 OURS = {"bang-bang": {"control_weight"}}
-"""What is not printed and another in each of the two catalogs."""
+"""Values that are not printed and differ between the two catalogue modules."""
 
 
 @pytest.mark.parametrize("name", SAME)
@@ -65,13 +65,13 @@ def test_scaled_gains_give_the_same_loop_in_samples():
             float(get(near, path)) * 4.0**exponent, rel=1e-12
         )
     assert far.feedback.filter.dt == pytest.approx(2e-4)
-    # The 5 kHz set, printed but out of line, is not what 2 kHz is scaled from.
+    # The gains at 2 kHz are not scaled from the printed, suspect set of 5 kHz.
     slow = p753_by_rate.continuous(2_000)
     assert float(slow.law.integral) == printed.CONTINUOUS_GAINS[10_000]["integral"]
 
 
 def held_response(rate):
-    """Impulse response of the linear stage at ``rate``, from its coefficients."""
+    """Return the impulse response of the linear stage at ``rate``."""
     dynamics = printed.plant().parts[1]
     a = [float(x) for x in dynamics.autoregressive]
     b = [float(x) for x in dynamics.moving]
@@ -84,7 +84,7 @@ def held_response(rate):
 
 @pytest.mark.parametrize("rate", RATES)
 def test_ultimate_gain_and_period(rate):
-    """The slowest pole of a loop with a sample of delay meets the unit circle there."""
+    """At the ultimate gain the slowest pole of the loop is on the unit circle."""
     response = held_response(rate)
     kept = response[: np.flatnonzero(np.abs(response) > 1e-9)[-1] + 1]
     gain, period = p753_by_rate.ULTIMATE[rate]

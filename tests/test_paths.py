@@ -1,4 +1,4 @@
-"""Parameters by name."""
+"""Parameters by path."""
 
 from typing import Any, ClassVar
 
@@ -146,7 +146,7 @@ def test_static_fields_are_found_at_any_depth():
 
 
 class Bank(System):
-    """Filters with gains of their own, and a corner."""
+    """Filters with separate gains and a common corner frequency."""
 
     gains: tuple[Any, ...] = parameter("V/um", "gains", converter=as_scalars)
     corner: Any = parameter("rad/s", "corner frequency", below_nyquist=True)
@@ -200,7 +200,7 @@ def test_units_are_substituted_and_cancelled(unit, units, expected):
 
 
 class Gain(System):
-    """A gain between two units that the System around it knows."""
+    """A gain between two units that the outer System declares."""
 
     gain: Any = parameter("[v]/[s]", "gain")
 
@@ -212,7 +212,7 @@ class Gain(System):
 
 
 class Outer(System):
-    """A part whose input is a speed and whose output is that of the whole."""
+    """A System that declares the units of its part: from a speed to its own output."""
 
     part_units: ClassVar[PartUnits] = {"inner": {"s": "um/s", "v": "[u]"}}
 
@@ -231,7 +231,7 @@ def test_units_come_from_the_outer_systems():
     assert declared(Outer(alone), "inner.gain").unit == "[u] s/um"
     loop = Feedback(Outer(alone), alone, Affine(), Affine())
     assert declared(loop, "controller.inner.gain").unit == "V s/um"
-    # The plant is not within the controller.
+    # The plant is not part of the controller.
     assert declared(loop, "plant.gain").unit == "[v]/[s]"
     # The disturbance observer commands its controller in um.
     observed = p753.disturbance_observer()

@@ -13,7 +13,7 @@ SCALES = np.array([1.0, 1.0, 1e-3, 10.0])
 
 
 def relation(count, seed=1):
-    """Rows of which two elements rest in every other stretch of 500, and targets."""
+    """Return rows with two elements constant in every second 500, and targets."""
     rng = np.random.default_rng(seed)
     rows = rng.standard_normal((count, 4)) * SCALES
     rows[np.arange(count) // 500 % 2 == 1, :2] = 0.0
@@ -21,7 +21,7 @@ def relation(count, seed=1):
 
 
 def posterior(rows, targets, noise_variance, prior):
-    """Return mean and covariance: least squares with a row for each prior weight."""
+    """Return mean and covariance of least squares with a row for each prior weight."""
     size = rows.shape[1]
     stacked = np.vstack([rows / np.sqrt(noise_variance), np.eye(size) / np.sqrt(prior)])
     aims = np.concatenate([targets / np.sqrt(noise_variance), np.zeros(size)])
@@ -60,7 +60,7 @@ def test_several_targets_equal_separate_relations():
 
 
 def test_the_root_update_is_accurate_over_a_long_run_with_forgetting():
-    """The covariance itself turns indefinite here."""
+    """The update of the covariance becomes indefinite here."""
     forgetting, prior, count = 0.99, 1e10, 100_000
     rows, targets = relation(count)
 
@@ -71,7 +71,7 @@ def test_the_root_update_is_accurate_over_a_long_run_with_forgetting():
     start = jnp.zeros(4), jnp.sqrt(prior) * jnp.eye(4)
     samples = jnp.asarray(rows), jnp.asarray(targets)
     (weights, root), _ = jax.jit(lambda: jax.lax.scan(step, start, samples))()
-    # The last 5000 rows carry all but 1e-21 of the weight.
+    # All rows before the last 5000 have a weight of 1e-21.
     share = np.sqrt(forgetting ** np.arange(4999, -1, -1.0))
     mean, covariance = posterior(
         rows[-5000:] * share[:, None], targets[-5000:] * share, 1.0, 1e30

@@ -17,7 +17,7 @@ from piezojax.identification.chain import structure
 
 
 def line(name="straight", place="hysteresis", base=pj.hysteresis.Hysteresis):
-    """Return a new class: y = slope x, which remembers nothing."""
+    """Return a new class without memory: y = slope x."""
 
     class Straight(base, Fittable):
         part: ClassVar[Part] = Part(name, place, "A straight line")
@@ -48,7 +48,7 @@ def line(name="straight", place="hysteresis", base=pj.hysteresis.Hysteresis):
 
 @pytest.fixture
 def fresh(monkeypatch):
-    """The registry as it is, restored afterwards."""
+    """Restore the registry after the test."""
     registry.kinds()
     monkeypatch.setattr(registry, "_registered", dict(registry._registered))
 

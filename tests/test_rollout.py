@@ -24,7 +24,7 @@ from piezojax.hysteresis import (
 )
 from piezojax.signals import waveforms as signals
 
-SAMPLES = 1050  # no multiple of the 100 samples of a segment
+SAMPLES = 1050  # not a multiple of the 100 samples of a segment
 PLANT = p753.plant()
 VOLTAGES = jnp.array(np.random.default_rng(13).uniform(-20.0, 120.0, SAMPLES))
 REFERENCE = jnp.array(signals.sine(signals.time_grid(SAMPLES / 2e4, 2e4), 50.0))
@@ -32,7 +32,7 @@ NOISE = jnp.array(np.random.default_rng(14).normal(size=SAMPLES))
 
 
 class WeightedSum(Metric):
-    """Depends on every output and on its place."""
+    """Metric that depends on every output and its index."""
 
     def init(self):
         return jnp.zeros(())
@@ -182,7 +182,7 @@ def test_blocks_equal_single_lanes(lanes):
     alone = [one_lane(*jax.tree.map(lambda x, i=i: x[i], batch)) for i in range(lanes)]
     expected = jax.tree.map(lambda *x: jnp.stack(x), *alone)
     assert_same(jax.jit(lambda *b: in_blocks(lane, *b))(*batch), expected)
-    if lanes > 64:  # fewer are one block, which is vmap
+    if lanes > 64:  # fewer lanes are one block, as in vmap
         assert_same(jax.jit(jax.vmap(lane))(*batch), expected)
 
 
@@ -229,7 +229,7 @@ def test_new_gains_do_not_compile_again(loop):
 
 
 def growth(function):
-    """Bytes of scratch memory that each further sample takes."""
+    """Return the bytes of temporary memory per additional sample."""
     sizes = []
     for samples in (1000, 8000):
         voltages = jax.ShapeDtypeStruct((samples,), jnp.float64)
@@ -245,7 +245,7 @@ def test_memory_of_the_gradient_does_not_grow_with_time():
     def stacked(plant, voltages):
         return jnp.mean(simulate(plant, voltages)[1] ** 2)
 
-    # A stored state each 100 samples, against one each sample.
+    # one stored state per 100 samples, against one per sample
     assert growth(accumulated) < 8.0
     assert growth(stacked) > 40.0
 

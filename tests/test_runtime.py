@@ -28,7 +28,7 @@ OURS = (
 
 
 def python(code, **variables):
-    """Run ``code`` in a fresh interpreter that knows nothing of this one's flags."""
+    """Run ``code`` in a new interpreter without the flags of this one."""
     environment = {
         name: value for name, value in os.environ.items() if name not in OURS
     }
@@ -164,7 +164,7 @@ def test_threads_simulate_simultaneously_if_asked_before_the_backend_starts():
     assert late.stdout.split() == ["False"], late.stderr
 
 
-# What is imported, and when
+# Imported packages
 
 LATER = (
     *("scipy.signal", "scipy.stats", "matplotlib", "rich", "click"),

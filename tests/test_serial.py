@@ -1,4 +1,4 @@
-"""Systems as files: what was saved comes back, and nothing else gets in."""
+"""Systems as files: saved Systems are loaded, and other content is refused."""
 
 import inspect
 import json
@@ -463,8 +463,8 @@ def test_a_damaged_origin_is_refused(tmp_path, about, message):
         assert "\n" not in str(caught.value)
 
 
-# The tests run with every type checked; a user's run is not. What a file of wrong types
-# leads to is therefore seen in a process of its own.
+# The tests check every type; a run of a user does not. Files with wrong types are
+# therefore tested in a separate process.
 ALPHA_BETA = {"type": "AlphaBeta", "alpha": 0.1, "beta": 0.1, "dt": 1e-4}
 SLIDING_MODE = {
     "type": "SlidingMode",

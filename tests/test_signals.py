@@ -25,7 +25,7 @@ def test_time_grid_counts_from_zero(second):
 
 @pytest.mark.parametrize("kind", signals.SIGNALS)
 def test_all_signals_have_one_type(kind, second):
-    # With weak types among them, a compiled loop would be compiled twice.
+    # With a weak type a loop would be compiled twice.
     assert not signals.SIGNALS[kind](second).weak_type
 
 
@@ -62,7 +62,7 @@ def test_superposed_sine_scales_about_the_offset(second):
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11)
 
 
-# Periods of the frequency after which the signal repeats.
+# number of periods after which the signal repeats
 REPEATS = {
     **{"SIN": 1, "COS": 1, "SCAN": 1, "TRI": 1, "SQUARE": 1},
     **{"PWSW": 4, "SW": 20, "MULTISINE": 20},
@@ -77,7 +77,7 @@ def test_period(kind, repeat, second):
     np.testing.assert_allclose(
         values[samples : 3 * samples], values[: 2 * samples], rtol=0.0, atol=1e-9
     )
-    # And after no shorter time.
+    # It does not repeat after a shorter time.
     moved = np.abs(values[samples // 2 :][:samples] - values[:samples])
     assert moved.max() > 0.1
 

@@ -1,4 +1,4 @@
-"""The box of tuned parameters: never left, and seen alike from both sides."""
+"""The box of tuned parameters: maps to and from it, and its bounds."""
 
 import re
 
@@ -31,13 +31,13 @@ examples = settings(max_examples=60, deadline=None)
 def bounds(draw):
     scale = draw(st.sampled_from(sorted(SCALES)))
     low, high = sorted((draw(SIDES[scale]), draw(SIDES[scale])))
-    # Sides that differ by rounding only leave nothing to invert.
+    # Bounds that differ by rounding only have no inverse map.
     assume(high - low > 1e-3 * max(abs(low), abs(high)) + 1e-9)
     return low, high, scale
 
 
-# Plain numbers are drawn and the box is built in the test: checking its types draws
-# random numbers, which a strategy must not.
+# The strategy draws numbers and the test builds the box: checking its types draws
+# random numbers, which is not allowed in a strategy.
 BOXES = st.lists(bounds(), min_size=1, max_size=4)
 POINTS = st.lists(UNIT, min_size=4, max_size=4).map(np.array)
 
@@ -199,7 +199,7 @@ def test_the_start_is_that_of_the_system():
 @pytest.mark.parametrize("gain", [0.99, 10.01, -3.0, float("nan")])
 def test_start_outside_the_bounds(gain):
     message = f"gain starts at {gain:g}; its bounds 1 to 10 must include the start"
-    # Put in afterwards: a system is checked when it is made, not when it is tuned.
+    # Replaced afterwards: a system is checked at construction, not in tuning.
     system = replace(Affine(), {"gain": gain})
     with pytest.raises(ValueError, match=re.escape(message)):
         GAIN.start(system)
@@ -210,7 +210,7 @@ def test_start_on_a_bound_is_moved_inside(gain, place):
     unit = GAIN.start(Affine(gain=gain))
     assert unit[0] == pytest.approx(place, abs=1e-15)
     assert unit[1] == 0.5
-    # As far as anyone can tell it is still the same gain.
+    # The gain is practically unchanged.
     assert float(GAIN.from_unit(unit)[0]) == pytest.approx(gain, rel=1e-5)
     assert np.isfinite(unsquash(unit)).all()
 

@@ -1,4 +1,4 @@
-"""Study files: what is right is built, what is wrong is named in one line."""
+"""Study files: valid ones are built, errors are named in one line."""
 
 import copy
 import json
@@ -60,7 +60,7 @@ UNSAFE = About(unsafe=["Ms 3 is above 2"])
 
 
 def changed(changes):
-    """BASE with ``{"table/key": value}`` put in, or taken out where GONE."""
+    """Return BASE with ``{"table/key": value}`` replaced, or removed if GONE."""
     data = copy.deepcopy(BASE)
     for place, value in changes.items():
         *tables, key = place.split("/")
@@ -96,7 +96,7 @@ def refusal(study):
     return message
 
 
-# What is right
+# Valid studies
 
 
 def test_the_package_contains_studies():
@@ -189,14 +189,14 @@ def test_start_replaces_the_value_of_the_controller(study):
     np.testing.assert_allclose(start, [p753.pid().proportional, 777.0])
 
 
-# What is left to the declarations
+# Values from the declarations
 
 
 PROPORTIONAL, INTEGRAL = "controller.proportional", "controller.integral"
 
 
 def declared_range(path):
-    """The range that PID declares for a path of it."""
+    """Return the range that PID declares for a path."""
     declared = dict(declarations(PID))[path.removeprefix("controller.")]
     return Range(*declared.typical, declared.scale)
 
@@ -220,7 +220,7 @@ def test_a_pattern_adds_every_matching_parameter(study):
     starts = {"anti_windup": 10.0, "derivative_filter": 1e-4}
     tables |= {f"controller.{name}": {"start": s} for name, s in starts.items()}
     case = read(study({"parameters": tables, "tune": ["controller.*"]}))
-    # Those of the table first; then the others, in the order of the fields.
+    # those of the table first, then the others in the order of the fields
     names = [name for name, known in declarations(PID) if known.typical]
     assert set(case.space.paths) == {f"controller.{name}" for name in names}
     rest = [f"controller.{name}" for name in names]
@@ -275,7 +275,7 @@ def test_patterns_and_paths_name_a_parameter_once(study):
 
 
 def observed(dt):
-    """A PID with a disturbance observer, as a table."""
+    """Return a PID with a disturbance observer, as a table."""
     return {
         "type": "DisturbanceObserverControl",
         "feedback": {"type": "PID", "proportional": 1.0, "integral": 9.0, "dt": dt},
@@ -430,7 +430,7 @@ def test_a_cut_off_below_nyquist_is_accepted(study):
     assert read(study(changes)).space.upper[0] == 62_831.8
 
 
-# What is wrong
+# Errors
 
 
 @pytest.mark.parametrize(
@@ -974,8 +974,8 @@ def test_unknown_studies_are_refused(tmp_path):
     assert str(got.value).endswith(", ".join(SHIPPED))
 
 
-# What should be said and is not, or not clearly. Seen in a process of its own, because
-# the types that these tests have checked everywhere are not checked in a user's run.
+# Messages of a run without type checks, in a separate process, because these tests
+# check all types and a run of a user does not.
 
 
 DOB = {"controller": {"catalog": "p753_disturbance_observer"}}

@@ -1,4 +1,4 @@
-"""Electronics of a study: each entry in the loop, against a loop in NumPy."""
+"""Electronics of a study: each entry, against a loop in NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -155,13 +155,13 @@ def test_margins_include_the_electronics():
     margin = (lag - np.pi) / place
     assert report.delay_margin_samples == pytest.approx(margin, rel=1e-6)
     assert float(sensitivity_peak(loop, 3.0)) == pytest.approx(S.max(), rel=2e-3)
-    # Without the electronics the loop is another one.
+    # Without the electronics the margins differ.
     bare = stability_report(case_of().loop, 3.0)
     assert bare.sensitivity_peak < 0.9 * report.sensitivity_peak
 
 
 def test_converters_do_not_change_the_margins():
-    """No voltage of the DAC holds the reference exactly: 3.14159 lies between two."""
+    """The DAC cannot hold the reference exactly: 3.14159 is between two steps."""
     coarse = {"actuator": {"bits": 8}, "sensor": {"resolution": 0.01}}
     smooth, rounded = (
         stability_report(case_of(LINEAR, *changes).loop, 3.14159)

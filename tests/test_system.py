@@ -145,7 +145,7 @@ def test_an_integer_too_large_for_a_float_is_refused():
 
 
 def test_fractional_delay_is_refused():
-    # While the tests run, the check of the annotations comes first.
+    # In the tests the check of the annotations raises first.
     message = r"samples is 1\.5; it must be whole|parameter 'samples'"
     with pytest.raises((ValueError, TypeError), match=message):
         Delay(1.5)
@@ -182,7 +182,7 @@ ELEMENTS = {
 
 @jax.jit
 def drift(system, level):
-    """Largest change of the state and of the output over two steps at rest."""
+    """Return the largest change of state and output over two steps at rest."""
     state = system.init(level)
     first, output = system.step(state, level)
     second, again = system.step(first, level)
@@ -315,7 +315,7 @@ def test_a_disturbance_moves_the_next_displacement():
     inputs = loop_inputs(jnp.zeros(4), disturbance=pulse)
     samples = simulate(loop, inputs, loop.init(0.0))[1]
     np.testing.assert_array_equal(samples.displacement[:3], [0.0, 0.0, 0.5])
-    # The stage itself stayed: only the controller's answer moves it.
+    # The stage does not move: only the response of the controller moves it.
     assert samples.voltage[1] == 0.0 > samples.voltage[2]
     assert samples.displacement[3] < 0.0
 

@@ -1,4 +1,4 @@
-"""The plain loops of chapters 7 and 8 against figures found apart from them."""
+"""The plain loops of chapters 7 and 8 against independent figures."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from oracles.three_dof import T
 from piezojax.catalog import p558
 
 HYSTERESIS = {"weight": 0.02, "radius": 4.0}
-"""The stand-in for the stage's hysteresis, about 1 % of 10 um or urad."""
+"""The assumed hysteresis of the stage, about 1 % of 10 um or urad."""
 
 # RMS of the driven axis, 10 um or urad at 1, 5 and 10 Hz in Z, Rx and Ry, from another
 # simulation of the same readings on a stage with 1 % of hysteresis and sensor noise.
@@ -44,7 +44,7 @@ def test_driven_axes(case):
     plant = {"delay": delay, **HYSTERESIS}
     y = three_dof.simulate(name, references, noise, plant, **options)["y"]
     rms = np.einsum("aca->ac", three_dof.tracking_rms(y, references))
-    # At 1 Hz without an observer it is the stand-in for hysteresis that counts.
+    # At 1 Hz without an observer the error is due to the assumed hysteresis.
     atol = 0.01 if case == "nominal" else 0.004
     np.testing.assert_allclose(rms.ravel(), ELSEWHERE[case], rtol=0.02, atol=atol)
 
@@ -83,7 +83,7 @@ def test_steps():
 
 
 def test_the_dead_beat_state_satisfies_the_sliding_dynamics():
-    # From a plant away from rest, nothing else acting: s(k+1) = PHI s(k) + SB usw(k).
+    # From an initial displacement without other inputs: s(k+1) = PHI s(k) + SB usw(k).
     plant, controller = three_dof.Plant(()), three_dof.PIDSMC("dynamic", False)
     plant.x = np.linspace(-1.0, 1.0, 9)
     zero, rows = np.zeros(3), []
@@ -98,7 +98,7 @@ def test_the_dead_beat_state_satisfies_the_sliding_dynamics():
     SB = 0.49 * Bd[0] - 1.4 * Bd[1] + Bd[2]
     switching = -(s * gains["P"] + T * np.cumsum(s, 0) * gains["I"])
     expected = s[:-1] * gains["PHI"] + switching[:-1] @ SB.T
-    # The first samples lack the past that the state is worked out from.
+    # The state needs past values that the first samples lack.
     np.testing.assert_allclose(s[3:], expected[2:], rtol=0, atol=1e-11)
     assert np.abs(s[3]).max() > 1e-3
 

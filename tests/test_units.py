@@ -1,4 +1,4 @@
-"""Units and sampling rates travel with the files, and studies check them."""
+"""Units and sampling rates are saved in the files, and studies check them."""
 
 import json
 import tomllib

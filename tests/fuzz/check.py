@@ -1,4 +1,4 @@
-"""Check of one case: it works, or it is refused in one line and in time."""
+"""Check of one case: it works, or is refused in one line within the time limit."""
 
 import contextlib
 import signal
@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
 
 
 class FittedError(Exception):
-    """Raised in place of a fit, which takes longer than a case may."""
+    """Raised instead of a fit, which would exceed the time of a case."""
 
 
 def _no_fit(*arguments: object, **options: object) -> None:

@@ -1,8 +1,8 @@
 """Seeded corpus of mutated studies, models and records.
 
-Case n of a seed is always the same. Each starts from a file that is right (a shipped
+Case n of a seed is reproducible. Each starts from a valid file (a shipped
 study, a controller or plant of the catalogue, a record in one of the formats) and has
-one to four mutations: of its keys, values, types, units, nesting, lines or bytes.
+one to four mutations of its keys, values, types, units, nesting, lines or bytes.
 """
 
 import copy
@@ -57,7 +57,7 @@ OTHERS = (
 
 @dataclass
 class Case:
-    """A file of one ``kind`` and, for a record, the options it is read with."""
+    """A file of one ``kind`` and, for a record, the options for reading it."""
 
     kind: str
     name: str
@@ -87,7 +87,7 @@ def _study_trees() -> dict[str, dict[str, Any]]:
         for path in sorted(folder.rglob("*.toml"))
     }
     for tree in trees.values():
-        if "controllers" in tree:  # one case of the comparison instead of all
+        if "controllers" in tree:  # one study of the comparison instead of all
             tree["rates"] = tree["rates"][:1]
             name, table = next(iter(tree["controllers"].items()))
             tree["controllers"] = {name: table}
@@ -232,7 +232,7 @@ def _saved(save: Callable[[Any], None]) -> bytes:
 
 def _mat(arrays: dict[str, Any]) -> bytes:
     content = _saved(lambda file: savemat(file, arrays))
-    return b"MATLAB 5.0 MAT-file".ljust(124) + content[124:]  # without today's date
+    return b"MATLAB 5.0 MAT-file".ljust(124) + content[124:]  # without the date
 
 
 def _hdf5(buffer: Any) -> None:
@@ -363,7 +363,7 @@ CELLS = (
 
 
 def _cells(content: bytes, random: np.random.Generator) -> bytes:
-    """Change cells of a text table."""
+    """Return a text table with changed cells."""
     lines = content.decode("utf-8", "replace").split("\n")
     separator = next((s for s in ";\t, " if s in lines[-2]), ",") if lines[1:] else ","
     near = random.random() < 0.4  # the header

@@ -11,7 +11,7 @@ from typing import Any
 
 HERE = Path(__file__).resolve()
 SILENT = 60.0
-"""Time (s) without an answer after which a process counts as hung."""
+"""Time (s) without output after which a process counts as hung."""
 
 
 def work(seed: int, first: int, last: int) -> None:

@@ -1,4 +1,4 @@
-"""A few hundred mutated files; run.py reads as many as wanted."""
+"""Reading of a few hundred mutated files; run.py reads any number."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ MODEL = corpus.Case("model", "a.json", b'{"type": "Affine"}')
 
 
 def test_mutated_files_work_or_give_one_line_errors():
-    # In a process of its own: here the annotations are checked before the values.
+    # In a separate process, because this one checks annotations before values.
     command = [sys.executable, str(RUN), "--cases", "300", "--seed", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -1,4 +1,4 @@
-"""Which models a record can support."""
+"""Choice of the models that a record supports."""
 
 import numpy as np
 import pytest

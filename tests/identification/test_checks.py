@@ -1,4 +1,4 @@
-"""What is said of a record: nothing of a good one, the reason of a bad one."""
+"""Warnings about records: none for a good one, the reason for a bad one."""
 
 import numpy as np
 import pytest
@@ -17,12 +17,12 @@ TRAIN, VALIDATE = slice(0, 2000), slice(2000, SAMPLES)
 
 
 def triangle(phase):
-    """A unit triangle wave from 0 up, ``phase`` in periods."""
+    """Return a unit triangle wave from 0 upwards, ``phase`` in periods."""
     return 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * phase))
 
 
 def stage(input, lag=0.2, start=0.0):
-    """A play operator and a first-order lag: a stage, sample by sample."""
+    """Return the output of a stage: a play operator and a first-order lag."""
     play, output, outputs = 0.0, start, []
     for drive in input:
         play = max(drive - 0.8, min(drive + 0.8, play))
@@ -42,7 +42,7 @@ def warnings(record, **options):
 
 
 def multisine():
-    """Odd harmonics of 0.5 Hz up to 40 Hz in random phase, after 50 ms of rest."""
+    """Return odd harmonics of 0.5 Hz to 40 Hz, random phases, after 50 ms of rest."""
     phases = np.random.default_rng(5).uniform(0.0, 2.0 * np.pi, 40)
     lines = 0.5 * np.arange(1, 80, 2)
     drive = np.sum(np.cos(2.0 * np.pi * np.outer(TIME, lines) + phases), axis=1)
@@ -50,7 +50,7 @@ def multisine():
 
 
 def smooth_steps():
-    """Moves of least jerk between 0 and 1, and rests, of 0.1 s each."""
+    """Return minimum-jerk motions between 0 and 1, and rests, of 0.1 s each."""
     share = np.clip((TIME[:400] % 0.2) / 0.1 - 1.0, 0.0, 1.0)
     move = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     return np.tile(np.where(TIME[:400] < 0.2, move, 1.0 - move), 10)
@@ -105,7 +105,7 @@ def test_a_clipped_output(side, noise):
     text = "; ".join(warnings(record_of(SINE, output, noise=0.0)))
     assert f"output seems to be clipped: it runs into exactly {side:g} um and" in text
     assert "input seems" not in text
-    # A sine of 20 periods passes the limit as often.
+    # A sine of 20 periods exceeds the limit as often.
     assert "(20 times in all)" in text
     start = int(text.split("from sample ")[1].split()[0])
     count = int(text.split("stays there for ")[1].split()[0])
@@ -230,7 +230,7 @@ def test_each_frequency_determines_two_parameters(lines):
     found = [t for t in warnings(record, order=2 * lines + 1) if "exciting" in t]
     assert len(found) == 1
     assert f"determine {2 * lines} parameters" in found[0]
-    # The autocorrelation matrix of order 2n + 1 of n sines is singular, that of 2n not.
+    # The autocorrelation matrix of n sines is singular at order 2n + 1, not at 2n.
     lagged = np.lib.stride_tricks.sliding_window_view(drive, 40 * lines + 1)[:, ::20]
     values = np.linalg.svd(lagged - drive.mean(), compute_uv=False)
     assert values[2 * lines - 1] > 1e-3 * values[0]
@@ -269,7 +269,7 @@ def test_a_record_cut_from_a_longer_one():
     text = "; ".join(warnings(Record(drive, output, DT)))
     assert f"input moves from sample 0 on, at {drive[0]:g}, well inside its" in text
     assert "begin the record at rest" in text
-    # The periods of a steady state may begin anywhere.
+    # The periods of a steady state may start anywhere.
     assert "moves" not in "; ".join(warnings(Record(drive, output, DT, period=200)))
 
 

@@ -1,4 +1,4 @@
-"""The model that made a record is the one that is chosen, its parameters recovered."""
+"""The model of a simulated record is chosen, and its parameters are recovered."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ TRUTH = {"a": 0.0077, "b": 0.1167, "c": -0.0487}
 
 
 def made_by_coleman_hodgdon():
-    """A record of a Coleman-Hodgdon model and a lag, the plant, its clean output."""
+    """Return a record of a Coleman-Hodgdon model and a lag, the plant, exact output."""
     shape = structure("coleman_hodgdon+lag", Record(ONE_TONE, 0.12 * ONE_TONE, DT))
     truth = {f"hysteresis.{path}": value for path, value in TRUTH.items()}
     truth |= {"lag.time_constant": 2.5e-3, "calibration.offset": -3.0}
@@ -43,7 +43,7 @@ def made_by_coleman_hodgdon():
 
 
 def check_recovered(found, plant, clean):
-    """Every parameter within 4 standard errors, as a plant within the noise."""
+    """Check parameters within 4 standard errors, and the output within the noise."""
     for path, parameter in found.report.parameters.items():
         if parameter.standard_error is None or "rest_" in path:
             continue
@@ -54,7 +54,7 @@ def check_recovered(found, plant, clean):
 
 
 def test_the_model_of_the_simulated_record_is_chosen():
-    # Among a linear one and one that holds it and has four parameters more.
+    # The others are a linear model and one that contains it with four more parameters.
     record, plant, clean = made_by_coleman_hodgdon()
     among = ["coleman_hodgdon", "shaped_coleman_hodgdon"]
     found = identify_all(
@@ -72,9 +72,9 @@ PLAYS = {
 
 
 def made_by_plays(name, **more):
-    """A record of 10 Hz at several amplitudes, the plant, its clean output.
+    """Return a record of 10 Hz at several amplitudes, the plant, its exact output.
 
-    One amplitude alone would leave the weights of the plays to its one loop.
+    One amplitude alone would determine the weights of the plays from a single loop.
     """
     level = np.select(
         [np.arange(SAMPLES) < stop for stop in (300, 400, 500, 600, 700, 800)],
@@ -113,7 +113,7 @@ def test_stops_are_chosen_as_equivalent_plays():
 @pytest.mark.slow
 @pytest.mark.usefixtures("optimised")
 def test_the_models_of_the_micromanipulator():
-    # Its sensor's noise is 0.067 um, cycles differ by as much.
+    # The sensor noise is 0.067 um, and cycles differ by as much.
     if MICROMANIPULATOR.is_file():
         columns = np.loadtxt(MICROMANIPULATOR)
         record = Record(columns[:, 0], columns[:, 4], 1.0 / 200.0, source="whole")

@@ -1,4 +1,4 @@
-"""What a comparison does with fits and failures, and what it writes."""
+"""Comparison of models: fits, failures, and the written files."""
 
 import json
 
@@ -37,15 +37,15 @@ def test_an_unknown_hysteresis_is_refused():
         identify_all(RICH, hysteresis=["lag"])
 
 
-# The course of it, with fits that are made up
+# The search, with synthetic fits
 
 NOISE = np.random.default_rng(0).standard_normal((2000, 1))
 BIAS = {"coleman_hodgdon": 1e-4}
-"""What simulations are off by, beside the noise; others are further off."""
+"""Errors of the simulations in addition to the noise; other models have larger ones."""
 
 
 def made_up(records, model, *, train, validate, progress, method, options):
-    """A fit with the noise for its errors, and the model's own share."""
+    """Return a fit whose errors are the noise plus a part of the model."""
     progress.stage("fitting", 1)
     head = model.split("+")[0]
     own = BIAS.get(head, 0.5) * np.sin(np.arange(2000))[:, None]
@@ -63,7 +63,7 @@ def made_up(records, model, *, train, validate, progress, method, options):
 
 @pytest.fixture
 def made(monkeypatch):
-    """Put ``made_up`` in place of the fits, with chosen models going wrong."""
+    """Replace the fits by ``made_up``; chosen models fail."""
 
     def install(wrong=()):
         def fit(records, model, **more):
@@ -90,7 +90,7 @@ def test_the_first_of_two_equivalent_models_is_chosen(made, monkeypatch):
     assert found.report.best.split("+")[0] == "prandtl_ishlinskii"
     assert stop.note == f"equivalent to {plays}"
     assert f"{stop.model} is {stop.note}" in ranking_notes(found.report)
-    # Another model has its place in the further rounds.
+    # Another model replaces it in further rounds.
     assert not any(
         "stop_" in model and "exponential" not in model for model in found.fits
     )
@@ -206,7 +206,7 @@ def test_progress_counts_the_models(made):
     assert told.stages[-1].startswith(f"{len(fits)} of about ")
 
 
-# A part that the choice does not see
+# A test part that the choice does not use
 
 
 def test_fits_and_choice_do_not_use_the_test_part(made):
@@ -244,7 +244,7 @@ def test_bad_test_parts(parts, message):
         identify_all(RICH, **parts)
 
 
-# What is written
+# Written files
 
 
 def test_the_files_of_a_comparison(made, tmp_path):

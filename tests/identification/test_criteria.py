@@ -1,4 +1,4 @@
-"""Effective samples, AIC, BIC and the order they give, against closed forms."""
+"""Effective samples, AIC, BIC and their ranking, against closed forms."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from piezojax.identification.criteria import (
 
 
 def autoregressive(pole, size, seed=0):
-    """A first-order autoregressive process; its correlation is pole^lag."""
+    """Return a first-order autoregressive process with the correlation pole^lag."""
     draws = np.random.default_rng(seed).standard_normal(size)
     found = np.empty(size)
     last = 0.0
@@ -31,7 +31,7 @@ def test_the_correlation_time_of_an_autoregressive_process(pole):
 
 
 def test_the_correlation_time_predicts_the_variance_of_a_mean():
-    # What an effective number of samples is for, on independent draws.
+    # the purpose of an effective number of samples, on independent draws
     rows = np.stack([autoregressive(0.9, 2000, seed) for seed in range(300)])
     worth = np.mean([row.size / correlation_time(row) for row in rows])
     assert np.var(rows.mean(axis=1)) == pytest.approx(np.var(rows) / worth, rel=0.25)
@@ -76,7 +76,7 @@ def test_common_noise_does_not_hide_a_worse_model():
     rng = np.random.default_rng(2)
     noise = rng.standard_normal((4000, 1))
     worse = [noise + 0.2 * rng.standard_normal((4000, 1))]
-    # 4 % in mean square, within twice the scatter of either taken by itself.
+    # 4 % in mean square, within twice the standard error of either error alone
     assert np.std(noise**2) * np.sqrt(2.0 / 4000) * 2.0 > 0.04
     assert not validates_as_well(worse, [noise])
     assert validates_as_well([noise], worse)
@@ -87,7 +87,7 @@ def test_a_correlated_difference_counts_as_few_samples():
     drift = autoregressive(0.99, 2000)
     drift = (drift - np.mean(drift)) / np.std(drift) + 0.3
     best = 2.0 * np.ones((2000, 1))
-    # 0.3 deviations are 13 standard errors of white noise, and one of this.
+    # 0.3 deviations are 13 standard errors of white noise and one of this noise.
     assert validates_as_well([np.sqrt(best**2 + 0.5 * drift[:, None])], [best])
     shuffled = np.random.default_rng(5).permutation(drift)
     assert not validates_as_well([np.sqrt(best**2 + 0.5 * shuffled[:, None])], [best])
@@ -103,7 +103,7 @@ def test_more_parameters_alone_do_not_win():
         for square, count in zip(training, (5, 25, 5), strict=True)
     ]
     order, well = ranking(bics, [errors[0], errors[0], errors[2]])
-    # The third fits the training part best and simulates worst: never chosen.
+    # The third model fits best and simulates worst: it is never chosen.
     assert int(np.argmin(bics)) == 2
     assert order == [0, 1, 2]
     assert well == [True, True, False]
@@ -117,12 +117,12 @@ def test_equivalent_models_count_as_one():
     errors = [[noise], [near], [other], [near], [near], [noise[:200], near[200:]]]
     bics = [-10.0, -10.9, -10.0, -10.0, -12.1, -10.0]
     counts = [5, 5, 5, 6, 5, 5]
-    # Beside the second, one has another run, one another count, one another BIC.
+    # Besides the second, one has another run, one another count, one another BIC.
     assert first_equivalent(bics, counts, errors) == [0, 0, 2, 3, 4, 0]
 
 
 def test_equivalence_is_relative_to_the_first_model():
-    # Each comes close to the one before, but the last not to the first.
+    # Each model is close to the one before, but the last is not close to the first.
     noise = np.random.default_rng(8).standard_normal((500, 1))
     errors = [[noise * (1.0 + share)] for share in (0.0, 0.08, 0.16)]
     assert first_equivalent([0.0, 0.0, 0.0], [5, 5, 5], errors) == [0, 0, 2]

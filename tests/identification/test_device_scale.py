@@ -1,4 +1,4 @@
-"""The scale of a device's gains from a record of its own loop, read back in text."""
+"""The scale of the gains of a device, from a text record of its own loop."""
 
 import json
 
@@ -17,7 +17,7 @@ SCALE = 1.7
 
 
 def recorded(loop, digits, lag=0, noise=0.0):
-    """Return error and voltage, in text of three decimals, around a stage of 500 Hz."""
+    """Return error and voltage as text of three decimals, in a loop of 500 Hz."""
     random = np.random.default_rng(0)
     w = 2.0 * np.pi * 500.0 * DT
     keep, y, u = np.exp(-w), 40.0, 60.0
@@ -60,7 +60,7 @@ def test_the_scale_of_an_nv200_from_three_decimals(integration, lag):
 
 
 def test_gains_without_a_scale_are_within_their_tolerances():
-    """kp and kd to 1 %, ki to 1e-4, also where the numbers typed in are wrong."""
+    """kp and kd are within 1 %, ki within 1e-4, even with wrong given gains."""
     record = recorded(nv200(kp=0.06, kd=1e-5), 3)
     found = device_scale("nv200", record, {"kp": 0.06, "ki": 70.0, "kd": 0.0})
     assert found.integral.value == pytest.approx(SCALE * 70.0, rel=1e-4)

@@ -23,9 +23,9 @@ DYNAMICS = ARMA((1.2, -0.35), (0.1, 0.08))
 
 
 def drive(samples=20):
-    """Swings that shrink, from rest: corners in every cell of the triangle.
+    """Return a decaying oscillation with corners in every cell of the triangle.
 
-    ``samples`` from corner to corner.
+    There are ``samples`` from corner to corner.
     """
     tops = 40.0 + np.linspace(60.0, 0.0, 25)
     bottoms = 40.0 - np.linspace(60.0, 0.0, 25) * 0.98
@@ -91,7 +91,7 @@ def test_the_fit_uses_the_given_part_of_the_record():
 
 
 def test_with_noise_weights_are_non_negative_and_the_output_fits():
-    # More cells than the material has, and much noise: plain least squares goes below.
+    # More cells than the material and large noise: least squares would go negative.
     noisy = record(noise=0.1)
     found = fit_preisach(noisy, 2 * CELLS, limits=(LOW, HIGH))
     assert np.all(found.weights >= 0.0)

@@ -1,4 +1,4 @@
-"""Every kind of file, written by somebody else's writer, and broken in every way."""
+"""Every format of files, written by other libraries, and damaged in every way."""
 
 import csv
 import io
@@ -29,7 +29,7 @@ PAIR = np.stack([DRIVE, SENSOR], axis=1)
 
 
 def table_text(separator, decimal, header=None, units=None):
-    """A table as a lab's programme would print it; exact to the last bit."""
+    """Return a table as the program of a lab would print it, exact to the last bit."""
     rows = [
         [repr(float(x)).replace(".", decimal) for x in row]
         for row in zip(TIME, DRIVE, SENSOR, strict=True)
@@ -46,7 +46,7 @@ def assert_columns(columns, expected):
     assert list(columns) == list(expected)
     for name, values in expected.items():
         assert columns[name].fault is None
-        # To the last bit but one: Excel's files hold 16 digits.
+        # Excel files have 16 digits: the last bit may differ.
         np.testing.assert_allclose(columns[name].values, values, rtol=4e-16, atol=0)
 
 
@@ -114,7 +114,7 @@ def test_a_column_of_text_does_not_affect_the_others():
 
 def test_empty_cells_are_missing_numbers_and_empty_names_are_counted():
     columns = parsed("t;;y;\n0,5;;1,5;\n1,5;2;;\n")
-    assert list(columns) == ["t", "1", "y"]  # the last one holds nothing
+    assert list(columns) == ["t", "1", "y"]  # the last one is empty
     np.testing.assert_array_equal(columns["1"].values, [np.nan, 2.0])
     np.testing.assert_array_equal(columns["y"].values, [1.5, np.nan])
 
@@ -174,7 +174,7 @@ def write_hdf5(path):
 
 
 def write_mat73(path):
-    """What MATLAB writes with -v7.3: columns first, text as codes, a header before."""
+    """Write a file like MATLAB with -v7.3: columns first, text as codes, a header."""
     with h5py.File(path, "w", userblock_size=512, track_order=True) as file:
         file["t"] = TIME[None, :]
         file["stage/both"] = PAIR.T
@@ -219,7 +219,7 @@ def write_xlsx(path):
 
 
 def lvm_text(x_columns="One", decimal=".", separator="\t"):
-    """A segment as LabVIEW writes it, by NI's specification 4139."""
+    """Return a segment as LabVIEW writes it (NI specification 4139)."""
     times = [repr(float(x)) for x in TIME]
     channels = [[repr(float(x)) for x in column] for column in (DRIVE, SENSOR)]
     step, units = ["1.0E-3"] * 2, ["Volts", "um"]
@@ -277,7 +277,7 @@ def test_round_trip(tmp_path, name):
     path = tmp_path / name
     expected = WRITERS[name](path)
     columns = read_columns(path)
-    # HDF5 gives its members by name, MATLAB by the order they were saved in.
+    # HDF5 lists its members by name, MATLAB in the order of saving.
     assert_columns({name: columns[name] for name in expected}, expected)
     assert set(columns) == set(expected)
 
@@ -290,7 +290,7 @@ def test_a_file_cut_short_is_one_clear_error(tmp_path, name, share):
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     if path.suffix == ".lvm" and share > 0.5:
-        # Whole lines are missing, or the last of them ends early: still a table.
+        # Whole lines are missing, or the last line ends early: still a table.
         assert 20 < read_columns(path)["drive"].values.size < SAMPLES
     else:
         refused(path, path.name)
@@ -366,7 +366,7 @@ def test_a_pickle_is_not_opened(tmp_path):
     path = tmp_path / "record.npz"
     np.savez(path, u=np.array([Trap()] * 60, dtype=object))
     refused(path, "cannot be read: it is not an NPZ archive of plain arrays")
-    # A cached pickle beside an LVM file is what its library would trust.
+    # The library of LVM files would load a cached pickle beside the file.
     lvm = tmp_path / "record.lvm"
     expected = write_lvm(lvm)
     Path(f"{lvm}.pkl").write_bytes(b"garbage")
@@ -387,7 +387,7 @@ def test_labview_text(tmp_path, x_columns, decimal, separator):
     expected |= {"drive": DRIVE, "sensor": SENSOR}
     assert_columns({name: columns[name] for name in expected}, expected)
     assert set(columns) == set(expected)
-    # The file says the sample time of its channels; neither column nor rate is needed.
+    # The file has the sample time of its channels; neither column nor rate is needed.
     record = read_record(path, input="drive", output="sensor")
     assert record.dt == pytest.approx(1e-3, rel=1e-12)
     assert (record.input_unit, record.output_unit) == ("V", "um")

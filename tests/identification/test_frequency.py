@@ -1,4 +1,4 @@
-"""Periodic records: transfer matrix, noise, and the model fitted to them."""
+"""Periodic records: transfer matrix, noise, and the fitted model."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ LINES = np.arange(1, 100)
 
 
 def truth(inputs=2, outputs=3):
-    """Two resonances and a real pole, stable, with feedthrough."""
+    """Return a stable system: two resonances and a real pole, with feedthrough."""
     poles = [0.97 * np.exp(0.6j), 0.95 * np.exp(1.5j)]
     blocks = [[[p.real, -p.imag], [p.imag, p.real]] for p in poles]
     A = np.zeros((5, 5))
@@ -29,7 +29,7 @@ def truth(inputs=2, outputs=3):
 
 
 def multisine(seed):
-    """Random phases on LINES, two channels."""
+    """Return two channels with random phases on LINES."""
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (LINES.size, 2))
     spectrum = np.zeros((PERIOD // 2 + 1, 2), complex)
     spectrum[LINES] = np.exp(1j * phases)
@@ -82,7 +82,7 @@ def test_the_variance_equals_that_over_noise_draws():
         ]
         quotients.append(empirical_response(records, [1.0, 2.0, 0.5]))
     scatter = np.var([q.response for q in quotients], axis=0, ddof=1)
-    # Each record has its own noise already: half of the variance is the added one's.
+    # Each record already has noise, so half of the variance is that of the added noise.
     predicted = np.mean([q.variance for q in quotients], axis=0) / 2.0
     assert np.median(scatter / predicted) == pytest.approx(1.0, abs=0.1)
     assert np.mean(scatter) == pytest.approx(np.mean(predicted), rel=0.1)
@@ -104,7 +104,7 @@ def test_input_power_converts_a_response_error_to_an_output_error():
     predicted = 2.0 * np.einsum(
         "lij,ljk,lik->", change, found.power, change.conj()
     ).real  # fmt: skip
-    # An error of 30 % of the response leaves 30 % of the outputs, record by record.
+    # An error of 30 % of the response is 30 % of the output in each record.
     left = sum(np.sum(np.mean((0.3 * r.outputs) ** 2, axis=0)) for r in records)
     assert predicted == pytest.approx(left, rel=1e-6)
 
@@ -128,9 +128,9 @@ def test_a_known_model_is_found(fit):
 
 def test_the_descent_lowers_the_cost_to_the_noise(fit):
     assert np.all(np.diff(fit.costs) < 0.0)
-    # 4 periods averaged; of 256 noise lines 2 x 99 lie where the fit is.
+    # averages of 4 periods; 2 x 99 of 256 noise lines are in the band of the fit
     left = 4 * 3 * NOISE**2 / 4 * (2 * LINES.size / PERIOD)
-    # 4 records over 2 inputs: half of their noise is inside the response already.
+    # 4 records of 2 inputs: half of their noise is already in the response.
     assert fit.costs[-1] == pytest.approx(left / 2, rel=0.15)
 
 
@@ -160,7 +160,7 @@ def test_any_order_gives_a_stable_model_of_that_order(order):
     assert np.abs(fit.model.poles()).max() < 1.0
 
 
-# What is refused
+# Refused input
 
 
 def record(**changes):

@@ -1,4 +1,4 @@
-"""Fitting a known plant, and the record that comes with piezojax."""
+"""Fits of a known plant, and of the record that comes with piezojax."""
 
 import json
 import re
@@ -38,12 +38,12 @@ TRUTH = {
     "lag.time_constant": 2.5e-3,
     "calibration.offset": -3.0,
 }
-REST = 2.0  # V before the record; it begins with a step to 10 V
+REST = 2.0  # V before the record, which begins with a step to 10 V
 DRAWS = 6
 
 
 def excitation():
-    """Six amplitudes, two frequencies, from 10 V up."""
+    """Return voltages of six amplitudes and two frequencies, from 10 V upwards."""
     time = np.arange(SAMPLES) * DT
     span = np.array([60.0, 40.0, 20.0, 50.0, 30.0, 10.0])[(time / 0.2).astype(int)]
     frequency = np.where(time < 0.6, 10.0, 25.0)
@@ -122,7 +122,7 @@ def test_the_errors_are_those_of_the_returned_simulation(fits):
 
 
 def test_a_rich_record_gives_no_warning(fits):
-    # Only the rest point, which a record may leave open, and its narrow band.
+    # The only warnings are the undetermined rest point and the narrow band.
     for fit in fits:
         for text in fit.report.warnings:
             assert "rest_" in text or "excites nothing above" in text
@@ -237,7 +237,7 @@ def test_every_hysteresis_has_a_warning_for_one_frequency(model):
     assert any("one frequency: only the shape" in w for w in fit.report.warnings)
 
 
-# What is refused
+# Refused input
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ def test_valid_files_pass(packed):
     check_elements(written()[:128])  # no variable at all
 
 
-# The first variable: tag at 128, flags at 136, shape at 152, name at 168, data at 176.
+# first variable: tag at 128, flags at 136, shape at 152, name at 168, data at 176
 @pytest.mark.parametrize(
     ("place", "byte"),
     [(128, 99), (129, 1), (136, 200), (152, 19), (176, 8), (177, 77), (131, 5)],

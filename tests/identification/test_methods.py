@@ -1,4 +1,4 @@
-"""The methods behind ``identify``: by name, on records of one and several channels."""
+"""The methods of ``identify`` by name, on records of one and several channels."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,7 +38,7 @@ def multisine(seed, periods=6):
 
 
 def answered(u, gain=1.0, seed=0):
-    """u(k) moves y(k+1): the difference equation by SciPy, from rest, with noise."""
+    """Return the noisy output of a difference equation in which u(k) moves y(k+1)."""
     taps = [0.0, *B], [1.0, *(-a for a in A)]
     rest = signal.lfilter_zi(*taps) * u[0]
     y = signal.lfilter(*taps, u, zi=rest)[0]
@@ -73,7 +73,7 @@ def test_a_linear_plant_is_identified_and_used_in_a_loop(method):
     assert fit.report.validation.rmse < 3.0 * NOISE
     u = fit.record.input
     again = free_run(fit.system, jnp.asarray(u), u[0])
-    # A periodic record begins in steady state, a plant in a loop at rest.
+    # A periodic record starts in steady state, a plant in a loop at rest.
     np.testing.assert_allclose(again[PERIOD:], fit.simulated[PERIOD:], atol=5 * NOISE)
 
 
@@ -92,7 +92,7 @@ def test_every_output_has_an_error():
 
 def test_records_that_drive_one_channel_in_turn_are_stacked():
     u = multisine(1), multisine(2)
-    gains = np.array([[1.0, 0.2], [-0.3, 2.0]])  # of output i to input j
+    gains = np.array([[1.0, 0.2], [-0.3, 2.0]])  # from input j to output i
     records = [
         Record(
             u[j],

@@ -1,10 +1,10 @@
 """The measured fine-steering mirror: one model for three drive levels.
 
 Floren et al., ISMA-USD 2024, publish a linear model for all levels and a nonlinear one
-that adds a neural network to 28 states. One realisation per level is held out; the fits
-never see it. Realisations differ: held out in turn, all six, the linear model of order
-36 has mean errors of 0.247, 0.146 and 0.647 um at 100, 200 and 300 mV and the scheduled
-one 0.078, 0.116 and 0.167; the last realisation alone, the hardest, has 0.252, 0.160,
+that adds a neural network to 28 states. One realisation per level is held out, which no
+fit uses. Realisations differ: with all six held out in turn, the linear model of order
+36 has mean errors of 0.247, 0.146 and 0.647 um at 100, 200 and 300 mV, the scheduled
+one 0.078, 0.116 and 0.167; the last realisation, the worst one, has 0.252, 0.160,
 0.696 and 0.068, 0.123, 0.177.
 """
 
@@ -27,16 +27,16 @@ pytestmark = pytest.mark.slow
 
 FOLDER = Path(__file__).parents[2].parent / "shared" / "data" / "fsm_mirror"
 LEVELS = {100: 2.2, 200: 1.0, 300: 0.23}
-"""Level in mV: its weight. 100 and 300 mV pull the resonance apart; these weights bring
-all three errors near the published ones. They were chosen with held-out errors, too, in
-sight, so the linear figures are mildly flattered."""
+"""Weight by level in mV. The resonance differs at 100 and 300 mV; with these weights
+all three errors are near the published ones. They were chosen with the held-out errors
+known, so the linear figures are slightly optimistic."""
 
 LINEAR = {100: 0.252, 200: 0.179, 300: 0.658}
 """Published test errors of one linear model in um; a network reaches 0.0866, 0.1309 and
 0.1686."""
 
 HELD_OUT = 5
-"""The last realisation: of the six the one that is predicted worst."""
+"""The last realisation, which has the largest errors of the six."""
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Modes, lag and delay from noisy frequency responses of stages made in NumPy."""
+"""Modes, lag and delay from noisy frequency responses of simulated stages."""
 
 import json
 from functools import cache
@@ -72,7 +72,7 @@ def test_a_lag_is_distinguished_from_a_mode():
 
 
 def test_the_system_has_the_response_of_the_stage():
-    """Measured by an analyser; the loop holds its input for a sample."""
+    """An analyser measures the response; the loop holds its input for a sample."""
     stage, found = measured(1001)[0], model_of(1001)
     assert isinstance(found.system.parts[1], pj.dynamics.Modes)
     low = LINES[LINES < 1500.0]
@@ -82,7 +82,7 @@ def test_the_system_has_the_response_of_the_stage():
     ours = np.array(
         [(C @ np.linalg.solve(x * np.eye(len(A)) - A, B) + D)[0, 0] for x in z]
     )
-    # The output of a step is that at its end: one sample earlier than a measurement.
+    # The output of a step is that at its end, one sample before a measurement.
     turn = np.pi * low / RATE
     hold = np.sinc(turn / np.pi) * np.exp(-1j * turn)
     exact = modal_responses.response(stage, low) * hold * z

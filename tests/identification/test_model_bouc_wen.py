@@ -1,4 +1,4 @@
-"""The Bouc-Wen oscillator from a record: one made here, and the shared benchmark."""
+"""The Bouc-Wen oscillator from a simulated record and from the shared benchmark."""
 
 from pathlib import Path
 
@@ -25,12 +25,12 @@ SHARED = Path(__file__).parents[2].parent / "shared/data/bouc_wen/train.h5"
 
 
 def record_of(force, displacement):
-    """One steady period in N and m."""
+    """Return a record of one steady period in N and m."""
     return Record(force, displacement, 1.0 / RATE, "N", "m", "made", len(force))
 
 
 def predicted(system, record, factor):
-    """Settled output at the samples of `record`, computed `factor` times finer."""
+    """Return the settled output of `record`, with `factor` times the samples."""
     fine = resample(record, factor)
     outputs = steady_response(system, jnp.asarray(fine.input), fine.samples)
     return np.asarray(outputs)[::factor]
@@ -50,7 +50,7 @@ TRUTH = {
     "delta": -0.3,
     "nu": 1.5,
 }
-LINES = np.arange(4, 103)  # of 512 samples at 750 Hz: 6 to 149 Hz
+LINES = np.arange(4, 103)  # lines of 512 samples at 750 Hz: 6 to 149 Hz
 
 
 def made(seed, truth=TRUTH):
@@ -60,7 +60,7 @@ def made(seed, truth=TRUTH):
 
 
 def of_two_starts(record):
-    """The structure with fewer of its starts: what two find, all of them find."""
+    """Return the structure with two of its starts, which suffice here."""
     structure = bouc_wen(record)
     return structure._replace(starts=structure.starts[:2])
 
@@ -118,7 +118,7 @@ PERIOD = 8192
 
 @pytest.fixture(scope="module")
 def benchmark():
-    """The shared training record, and a fresh noiseless period of the same spectrum."""
+    """Return the shared training record and a new noiseless period of its spectrum."""
     h5py = pytest.importorskip("h5py")
     if not SHARED.exists():
         pytest.skip(f"the shared record {SHARED} is absent")
@@ -137,7 +137,7 @@ def benchmark():
 def test_the_true_model_reproduces_the_shared_record(benchmark):
     mean, _ = benchmark
     made = oracle.steady_displacement(mean.input, 1.0 / RATE, oracle.BENCHMARK)
-    # Noise of 7.4e-6 m, averaged over four periods.
+    # noise of 7.4e-6 m, averaged over four periods
     assert rms(made - mean.output) < 4e-6
 
 

@@ -1,4 +1,4 @@
-"""A Preisach model behind a lag from a record, and records that support none."""
+"""Fits of a Preisach model with a lag, and records that do not support one."""
 
 import itertools
 import sys
@@ -36,7 +36,7 @@ CORNERS = (
 
 
 def drive(volts=2):
-    """From corner to corner in steps of ``volts``."""
+    """Return voltages from corner to corner in steps of ``volts``."""
     ways = [
         np.linspace(a, b, abs(b - a) // volts + 2)[1:]
         for a, b in itertools.pairwise(CORNERS)
@@ -45,7 +45,7 @@ def drive(volts=2):
 
 
 def record_of(input, weights=WEIGHTS, fast=None):
-    """Relays one by one, u(k) moving y(k+1); the lag; the noise."""
+    """Return a record of single relays, where u(k) moves y(k+1), a lag, and noise."""
     moved = oracle.along(weights, 0.0, 100.0, 50, input, rest=0.0)
     if fast is not None:
         square = (np.diff(input, prepend=input[0]) / DT / RATE) ** 2
@@ -80,7 +80,7 @@ def test_weights_and_lag_are_recovered(fit):
     far = [(found[n].value - v) / found[n].standard_error for n, v in truth.items()]
     assert np.max(np.abs(far)) < 4.0
     assert 0.7 < np.std(far) < 1.4
-    # The relays of the record switch one by one, by up to 6 nm.
+    # The relays of the record switch separately, by up to 6 nm.
     assert fit.report.validation.rmse < 2.0 * NOISE
 
 
@@ -125,7 +125,7 @@ def test_the_saved_model_is_the_plant(fit, tmp_path):
 
 
 def test_the_turning_points_determine_the_number_of_cells():
-    # Of one loop, of one loop in another, and of all of them.
+    # one loop, a loop in another, and all loops
     once = 50.0 - 50.0 * np.cos(np.linspace(0.0, 6.0 * np.pi, 600))
     twice = np.concatenate([once, np.interp(once, [0.0, 100.0], [0.0, 55.0])])
     found = [
@@ -137,7 +137,7 @@ def test_the_turning_points_determine_the_number_of_cells():
 
 
 def test_the_initial_loading_does_not_add_cells(monkeypatch):
-    # One amplitude: a virgin material passes more cells on the way to the first corner.
+    # One amplitude: the initial loading passes more cells before the first corner.
     record = read_record(
         shipped().parent / "data" / "micromanipulator.csv",
         time="time_s",

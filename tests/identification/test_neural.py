@@ -20,7 +20,7 @@ def noise(columns, seed=0):
 
 
 def settled(step, inputs, order):
-    """Last of five periods of y(k + 1) = step(state, u(k)), from state zero."""
+    """Return the last of five periods of y(k + 1) = step(state, u(k)), from zero."""
     state, outputs = np.zeros(order), []
     for u in np.tile(inputs, (5, 1)):
         state, output = step(state, u)
@@ -45,7 +45,7 @@ def linear(state, u):
 
 
 def share(system, record):
-    """Root mean square error of the settled response, over the output's deviation."""
+    """Return the rms error of the settled response over the deviation of the output."""
     columns = record.inputs if record.inputs.shape[1] > 1 else record.input
     found = steady_response(system, jnp.asarray(columns), record.samples)
     error = np.asarray(found).reshape(record.outputs.shape) - record.outputs
@@ -71,14 +71,14 @@ def test_start_is_stable_for_a_record_of_noise():
 
 
 def bent(state, u):
-    """A state that saturates: no linear system comes close."""
+    """Return a record of a saturating state, which no linear system represents."""
     state = 0.7 * state + np.tanh(2.0 * u[:1]) - 0.3 * np.tanh(3.0 * state)
     return state, 5.0 + 2.0 * state
 
 
 def test_training_fits_a_loop_that_no_linear_model_fits():
     made = record(bent, 1, 1)
-    # Of three draws of four neurons, the first ends in a poor minimum.
+    # The first of three draws of four neurons ends in a poor minimum.
     fitted = fit_neural_state_space(made, 1, 4, starts=3, steps=60)
     fresh = record(bent, 1, 1, seed=1)
     assert np.max(share(neural_start(made, 1, 4), fresh)) > 0.1

@@ -28,7 +28,7 @@ def number_rows(*columns, end=""):
     return "".join(f"{i},{line}" for i, line in enumerate(lines))
 
 
-# A line a setting, one value for each channel; a comma ends most lines.
+# One line per setting, one value per channel; most lines end with a comma.
 TEKTRONIX_MSO = """Model,MSO4034
 Firmware Version,2.48
 

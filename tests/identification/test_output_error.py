@@ -1,4 +1,4 @@
-"""Free-run fits against known truth."""
+"""Free-run fits against known parameters."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ MODEL = "coleman_hodgdon+arma"
 
 
 def p753_record(samples, seed):
-    """Large slow strokes with tones up to 2.9 kHz on them, and 12 nm sensor noise."""
+    """Return a record of large slow motions, tones up to 2.9 kHz and 12 nm noise."""
     time = np.arange(samples) * p753.DT
     u = 45.0 + 25.0 * np.linspace(1.0, 0.3, samples) * np.sin(2 * np.pi * 7.0 * time)
     for hertz, volts in ((43, 15), (310, 6), (700, 4), (1500, 4), (2900, 4)):
@@ -48,7 +48,7 @@ def test_noise_does_not_bias_the_fit_of_the_p753():
 
 
 def several_records():
-    """Return the fit of a short and a long record, the point, and its records."""
+    """Return the fit of a short and a long record, its point, and the records."""
     records = [p753_record(100, 1), p753_record(160, 2)]
     whole = structure(MODEL, records[1])
     shape = whole.without(whole.own)
@@ -68,7 +68,7 @@ def test_residuals_of_records_of_different_length_exclude_the_padding():
         start = jax.tree.map(lambda leaf, row=row: leaf[row], problem.starts)
         columns = np.asarray(start_columns(system, u, start))[:, 20:, 0].T
         error = (record.output - np.asarray(run_after(system, u, start.levels)))[20:]
-        # The zero is free; the states cost what their prior says.
+        # The zero has no penalty; the states have that of their prior.
         count = columns.shape[1] - 1
         cost = np.eye(count, 1 + count, 1) * np.sqrt(start.variance)
         rows = np.concatenate([columns, cost])
@@ -81,7 +81,7 @@ def test_residuals_of_records_of_different_length_exclude_the_padding():
 
 
 def test_the_gradient_of_the_squares_is_right_at_the_most_likely_starts():
-    # The Jacobian holds the responses to the starts; the gradient must not tell.
+    # The Jacobian contains the responses to the starts; the gradient must not.
     problem, unit, _ = several_records()
 
     def squares(u):
@@ -95,7 +95,7 @@ def test_the_gradient_of_the_squares_is_right_at_the_most_likely_starts():
 
 
 def test_an_undetermined_parameter_has_no_standard_error():
-    # Without motion below 30 V the rest point is out of sight.
+    # Without motion below 30 V the rest point is undetermined.
     time = np.arange(600) * p753.DT
     u = 50.0 + 15.0 * np.sin(2 * np.pi * 100.0 * time)
     u[:2] = 30.0, 40.0
@@ -108,8 +108,8 @@ def test_an_undetermined_parameter_has_no_standard_error():
 
 @pytest.mark.slow
 def test_hysteresis_creep_lag_and_delay_are_recovered():
-    # Three frequencies a decade apart: a lag and a delay turn with frequency, a loop
-    # of hysteresis does not, creep fades with it.
+    # Three frequencies, a decade apart: the phase of a lag and a delay depends on
+    # frequency, that of hysteresis does not, and creep decreases with frequency.
     model, dt = "coleman_hodgdon+logarithmic_creep+lag+delay", 2e-3
     time = np.arange(3000) * dt
     level = np.select([time < 2.5, time < 4.5], [1.0, 0.7], 0.5)

@@ -1,4 +1,4 @@
-"""What a chain of parts computes, against a loop over samples."""
+"""Output of a chain of parts, against a loop over samples."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +16,7 @@ SAMPLES = 1000
 
 
 def excitation():
-    """Six tones a decade and a half apart, then 4 s of rest."""
+    """Return six tones over a decade and a half, then 4 s of rest."""
     time = DT * np.arange(SAMPLES)
     level = np.select([time < 5.0, time < 10.0], [1.0, 0.6], 0.8)
     u = 50.0 - 50.0 * level * np.cos(2.0 * np.pi * (0.2 + 0.06 * time) * time)
@@ -29,7 +29,7 @@ INPUT = excitation()
 
 
 def test_the_chain_equals_the_equations_of_its_parts():
-    # Plays on the thresholds of the fit, widened by the rate; one damped spring.
+    # plays with the thresholds of the fit, increased by the rate; one damped spring
     weights, growth, stiffness, time_constant = np.full(10, 0.004), 0.04, 12.0, 2.0
     shape = structure(
         "rate_dependent_prandtl_ishlinskii+spring_damper_creep",

@@ -1,4 +1,4 @@
-"""What the pictures of state-space identification show."""
+"""Content of the pictures of state-space identification."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Reading a lab's record, and what is said about a bad one."""
+"""Reading of the records of a lab, and the messages about bad ones."""
 
 import re
 
@@ -150,7 +150,7 @@ def test_small_jitter_of_the_clock_is_accepted(write):
         [repr(float(t)), *row[1:]] for t, row in zip(TIME + jitter, ROWS, strict=True)
     ]
     record = read_record(write(text_of(rows)), **COLUMNS)
-    # The mean step, so that the jitter of one sample does not count.
+    # The sample time is the mean step, so the jitter of a sample has no effect.
     assert record.dt == pytest.approx(1e-3, rel=1e-4)
 
 
@@ -359,13 +359,13 @@ def test_missing_numbers_have_the_column_name_of_the_file(write):
 
 
 def test_repeated_column_names(write):
-    # Numbers count the columns that are left: input=1 is then the sensor.
+    # Numbers count the remaining columns: input=1 is then the sensor.
     path = write(text_of(ROWS, ["t", "t", "sensor_um"]))
     refused(path, "'t'", rate=1000.0, input=1, output=2)
 
 
 def test_one_column_for_two_signals_is_refused(write):
-    # The default input is column 0, which is the time in most files.
+    # The default input is column 0, which is time in most files.
     refused(write(text_of(ROWS)), "time_s", time="time_s", output=2)
 
 
@@ -530,7 +530,7 @@ def test_time_in_an_unknown_unit(write, name):
 
 
 def uneven():
-    """A straight line and a kinked one over time steps of 1 and 3 ms."""
+    """Return a straight and a kinked line with time steps of 1 and 3 ms."""
     time = np.cumsum(np.tile([1e-3, 3e-3, 1e-3], 70))
     return [
         [repr(float(x)) for x in row]
@@ -554,7 +554,7 @@ def test_uneven_time_is_resampled_if_asked(write, rate):
     grid = time[0] + np.arange(record.samples) / rate
     assert grid[-1] <= time[-1] + 1e-12 < grid[-1] + 1.0 / rate
     assert record.dt == pytest.approx(1.0 / rate, rel=1e-15)
-    # Straight lines are kept, and a kink at a sample rounded off by one step at most.
+    # Straight lines are kept; a kink at a sample is smoothed by at most one step.
     np.testing.assert_allclose(record.input, 5.0 * grid, rtol=1e-12)
     np.testing.assert_allclose(record.output, np.abs(grid - time[100]), atol=1.5e-3)
 

@@ -1,4 +1,4 @@
-"""Chapter 3's estimators on a simulated P-753 whose parameters are known."""
+"""Estimators of chapter 3 on a simulated P-753 with known parameters."""
 
 import re
 
@@ -35,7 +35,7 @@ DRAWS = 4
 
 
 def decaying_triangles(duration=1.0):
-    """Triangles from 0 to 70 V that shrink to a fifth, at five frequencies in turn."""
+    """Return decaying triangles from 0 to 70 V, at five frequencies in turn."""
     parts = []
     shares = {10: 0.3, 50: 0.2, 200: 0.15, 800: 0.15, 2000: 0.2}
     for frequency, share in shares.items():
@@ -46,7 +46,7 @@ def decaying_triangles(duration=1.0):
 
 
 def record_of(scheme="trapezoid", seed=None, duration=1.0, offset=0.0):
-    """The P-753 at 20 kHz over ``decaying_triangles``; 12 nm of noise with a seed."""
+    """Return a record of the P-753 at 20 kHz, with 12 nm of noise if seeded."""
     voltage = decaying_triangles(duration)
     output = free_run(p753.plant(scheme), jnp.asarray(voltage), 0.0) + offset
     noise = np.zeros(voltage.size)
@@ -152,7 +152,7 @@ def noisy():
 
 @pytest.fixture(scope="module")
 def refined(noisy):
-    # One search; the other draws keep to bounds too narrow for a long one.
+    # One full search; for the other draws the bounds are narrow.
     first = instrumental_variables(noisy[0], c=BOUNDS)
     near = (1.02 * float(first.model.c), 0.98 * float(first.model.c))
     return [
@@ -168,7 +168,7 @@ def plain(noisy):
 
 def test_least_squares_is_biased(plain):
     found = poles(plain.model)
-    assert abs(found[0] / POLES[0] - 1.0) > 0.5  # far beyond 1 %: it turns negative
+    assert abs(found[0] / POLES[0] - 1.0) > 0.5  # far beyond 1 %: it is negative
     assert found[0] < 0.0
     for i, name in enumerate(truth().autoregressive):
         away = abs(float(plain.model.autoregressive[i]) - float(name))
@@ -190,7 +190,7 @@ def test_the_residual_of_instrumental_variables_is_the_noise(refined, plain):
     for found in refined:
         assert found.simulation_rms == pytest.approx(p753.NOISE_RMS, rel=0.02)
     assert plain.simulation_rms > 3.0 * p753.NOISE_RMS
-    assert plain.one_step_rms < refined[0].one_step_rms  # what it does minimise
+    assert plain.one_step_rms < refined[0].one_step_rms  # the minimised error
 
 
 def test_standard_errors_cover_the_true_values(refined):
@@ -199,7 +199,7 @@ def test_standard_errors_cover_the_true_values(refined):
             (numbers(fit.model) - numbers(truth())) / numbers(fit.standard_errors)
             for fit in refined
         ]
-    )[:, :-1]  # all but the rest point, which is not fitted
+    )[:, :-1]  # all except the rest point, which is not fitted
     assert np.all(np.isfinite(away))
     assert 0.5 < np.sqrt(np.mean(away**2)) < 2.0
     assert np.max(np.abs(away)) < 5.0
@@ -273,7 +273,7 @@ def test_one_step_equals_one_step_of_the_run(short):
     np.testing.assert_allclose(numbers(model), numbers(third), rtol=1e-9, atol=1e-12)
 
 
-# What is refused
+# Refused input
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ def signal(time, sign=1.0):
 
 
 def mean_ahead(time, step):
-    """The mean of `signal` from `time` to `time + step`, in closed form."""
+    """Return the mean of `signal` from `time` to `time + step`, in closed form."""
     return 0.2 + sum(
         a
         * (np.sin(angle(k) * (time + step) + p) - np.sin(angle(k) * time + p))

@@ -1,4 +1,4 @@
-"""Residual analysis on stages made with NumPy and SciPy: alarms, bound, statistics."""
+"""Residual analysis on stages simulated in NumPy: alarms, bound, statistics."""
 
 from typing import Any
 
@@ -57,7 +57,7 @@ STAGE = product(lag(1e-3), mode(780.0, 0.02))
 
 
 def excitation(seed=0, top=4000.0, samples=SAMPLES):
-    """Noise up to ``top`` Hz on two slow sines."""
+    """Return two slow sines plus noise up to ``top`` Hz."""
     draw = np.random.default_rng(seed).standard_normal(samples)
     if top < 0.5 * RATE:
         band = scipy.signal.cheby2(12, 80.0, 1.15 * top, fs=RATE, output="sos")
@@ -108,7 +108,7 @@ def test_a_missing_mode_is_named_by_frequency_and_size(seed):
     report, warnings = analysed(input, output, answer(SLOW, input))
     (peak,) = report.peaks
     assert peak.frequency_Hz == pytest.approx(780.0, rel=0.02)
-    # |1 / (2 zeta j) - 1| = 25, less what a line of 10 Hz misses of a 30 Hz peak.
+    # |1 / (2 zeta j) - 1| = 25, reduced because lines of 10 Hz miss a peak of 30 Hz.
     assert 15.0 < peak.times_gain < 27.0
     assert report.whiteness[0].significant
     assert report.input_correlation[0].significant
@@ -197,10 +197,10 @@ def test_the_bound_contains_the_true_error(seed):
     clear = (found.frequency < 3500.0) & (found.margin < 1.0)
     ratio = (found.upper / true_error(STAGE, model, found.frequency))[clear]
     assert clear.sum() > 400
-    # A light peak between two lines is missed by a few percent.
+    # A narrow peak between two lines is underestimated by a few percent.
     assert np.mean(ratio > 0.97) > 0.97
     assert np.median(ratio) < 1.5
-    # The bound's bands lower no line.
+    # The bands of the bound do not lower any line.
     bound = error_bound([record], [run], WHOLE).at(found.frequency)
     assert np.all((bound >= 0.999 * found.upper)[clear])
 
@@ -218,18 +218,18 @@ def test_the_bound_of_unexcited_lines_follows_from_their_neighbours():
     weak = found.frequency[found.margin > 1.0]
     for i in range(top + 2, frequency.size, 20):
         if np.min(np.abs(weak - frequency[i])) < 0.02 * frequency[i]:
-            continue  # it limits the bound too
+            continue  # it also limits the bound
         seen = (frequency[i] / frequency[: top + 1]) ** 2 - 1.0
         share = min(1.0, np.min(np.maximum(relative[: top + 1], ABSORBED) * seen))
         expected = max(relative[top], UNSEEN * share)
-        # A band holds its largest value.
+        # A band has its largest value.
         assert expected * 0.9 < relative[i] < expected * 1.25
     assert relative.max() == UNSEEN
     assert frequency[-1] == pytest.approx(0.5 * RATE)
 
 
 def test_a_hidden_mode_of_the_allowed_share_stays_below_the_bound():
-    """The rule beyond the band, against modes placed there."""
+    """Test the rule beyond the band with modes there."""
     input = excitation(top=400.0)
     record = Record(input, noisy(answer(STAGE, input)), DT)
     bound = error_bound([record], [answer(STAGE, input)], WHOLE)
@@ -237,7 +237,7 @@ def test_a_hidden_mode_of_the_allowed_share_stays_below_the_bound():
     known = np.array(bound.frequency)[excited]
     upper, top = np.array(bound.relative)[excited], known.max()
     for hidden in (1.3 * top, 2.0 * top, 3.0 * top):
-        # Its largest share k that shows no error above the bound at any line.
+        # the largest share k with errors below the bound at every line
         share = np.min(np.maximum(upper, ABSORBED) * ((hidden / known) ** 2 - 1.0))
         lines = np.linspace(1.05 * top, 0.49 * RATE, 400)
         b, a = mode(hidden, 0.02)
@@ -299,7 +299,7 @@ def test_cross_correlation_uses_earlier_inputs():
 
 
 def test_the_bound_of_the_correlation_includes_both_spectra():
-    """Independent coloured signals seldom exceed it; the bound for white ones often."""
+    """Independent coloured signals seldom exceed it, but often the white bound."""
     random = np.random.default_rng(4)
     exceeded = naive = 0
     for _ in range(400):

@@ -1,4 +1,4 @@
-"""Resonances behind slow sensors are found, and fits of dynamics start there."""
+"""Resonances behind slow sensors are found, and fits start from them."""
 
 import numpy as np
 import pytest
@@ -109,7 +109,7 @@ def test_white_and_coloured_noise_leave_it_unbiased():
     output = clean + 0.2 * white[0] + 0.05 * slow
     found = refined_instrumental_variables(DRIVE, output, 3, 2)
     np.testing.assert_allclose(found.denominator, A, atol=0.02)
-    # Least squares, from which it starts, is far off.
+    # The initial least-squares estimate has a large error.
     rows = np.stack([-output[2:-1], -output[1:-2], -output[:-3]], axis=1)
     rows = np.column_stack([rows, DRIVE[2:-1], DRIVE[1:-2], DRIVE[:-3]])
     biased = np.linalg.lstsq(rows, output[3:], rcond=None)[0][:3]

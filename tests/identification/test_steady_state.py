@@ -21,7 +21,7 @@ INPUT = np.random.default_rng(0).standard_normal(SAMPLES)
 
 
 def settled(pole, gain=1.0):
-    """Settled response of y(k + 1) = pole y(k) + gain (1 - pole) u(k), by Fourier."""
+    """Return the settled y(k + 1) = pole y(k) + gain (1 - pole) u(k), by Fourier."""
     z = np.exp(2j * np.pi * np.arange(SAMPLES // 2 + 1) / SAMPLES)
     transfer = gain * (1.0 - pole) / (z - pole)
     return np.fft.irfft(transfer * np.fft.rfft(INPUT), SAMPLES)
@@ -51,7 +51,7 @@ def put(numbers):
     return ARMA((numbers[0],), (numbers[1],))
 
 
-STARTS = jnp.array([[0.2, 1.0], [50.0, 1.0], [0.95, 0.1]])  # the second diverges
+STARTS = jnp.array([[0.2, 1.0], [50.0, 1.0], [0.95, 0.1]])  # the second start diverges
 
 
 def test_fit_finds_the_lag_and_survives_a_start_that_diverges():

@@ -22,7 +22,7 @@ def matrices(model):
 
 
 def chirp(channel):
-    """1 to 100 Hz in 10 s: 20 um around 20 um, or 200 urad (section 6.5.4.2)."""
+    """Return a chirp of 1 to 100 Hz in 10 s: 20 um around 20 um, or 200 urad."""
     time = np.arange(SAMPLES) * DT
     wave = np.sin(2.0 * np.pi * (time + 99.0 / 20.0 * time**2))
     return 20.0 + 20.0 * wave if channel == 0 else 200.0 * wave
@@ -231,7 +231,7 @@ def test_p_and_order_are_chosen_on_another_record():
     np.testing.assert_array_equal(np.isinf(choice.errors[0]), [False] * 4 + [True])
 
 
-# What is refused
+# Refused input
 
 
 @pytest.mark.parametrize(

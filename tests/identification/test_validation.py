@@ -1,4 +1,4 @@
-"""A saved model judged on other records, against stages simulated in NumPy."""
+"""Validation of a saved model on other records of stages simulated in NumPy."""
 
 import re
 
@@ -39,9 +39,9 @@ def excitation(samples=6000, low=10.0, high=90.0, seed=1):
 
 
 def moved(u, before=(0.0,), gain=1.0, mode=None, seed=5):
-    """Return the readings of the stage under ``u`` after it stood at ``before``.
+    """Return the readings of the stage under ``u``, at rest at ``before`` first.
 
-    Plays from all thresholds in series with a lag; a ``mode`` (Hz) of 2 % follows.
+    The stage has plays and a lag; a ``mode`` (Hz) with 2 % damping follows.
     """
     way = np.concatenate(
         [np.linspace(a, b, 3000) for a, b in zip(before, (*before[1:], u[0]), strict=1)]
@@ -245,7 +245,7 @@ def test_several_channels():
     for value in u:
         y.append([0.1 * x[0] + 0.02 * x[1], 0.3 * x[1]])
         x = np.array([0.9, 0.8]) * x + value
-    # A step of a plant returns the next sample.
+    # The step of a plant returns the next sample.
     y = np.array([y[0], *y[:-1]]) + [1.0, -2.0]
     found = validate(system, About(), Record(u, y, DT, source="two.csv"))
     (check,) = found.report.records

@@ -1,4 +1,4 @@
-"""The empirical frequency response of two signals, against transfer functions."""
+"""Empirical frequency responses of two signals, against transfer functions."""
 
 import numpy as np
 import pytest

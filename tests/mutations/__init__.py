@@ -1,1 +1,1 @@
-"""Changes of the package that its tests must notice."""
+"""Changes of the package that its tests must detect."""

@@ -1,4 +1,4 @@
-"""The modules that sampled mutants are drawn from, and the fast tests of each."""
+"""The modules with sampled mutants, and the fast tests of each."""
 
 _MARGINS = ("tests/analysis/test_margins.py",)
 _LIMIT = (

@@ -1,8 +1,8 @@
-"""Apply each mutation to a copy of the tree and see whether its tests fail.
+"""Apply each mutation to a copy of the tree and check that its tests fail.
 
 ``python tests/mutations/run.py [--only NAME ...] [--json FILE]``: a mutation is caught
-where the tests named beside it fail, and survives where they pass. Exits with 1 if one
-survives or cannot be tried.
+if the tests named with it fail, and survives if they pass. Exits with 1 if a mutation
+survives or is not tested.
 """
 
 import argparse
@@ -20,11 +20,11 @@ from table import MUTATIONS, Mutation
 ROOT = Path(__file__).parents[2]
 COPIED = ("piezojax", "tests", "tuning", "pyproject.toml")
 FAILED = 1
-"""Exit status of pytest where a test failed; others say that it did not run."""
+"""Exit status of pytest if a test failed; other values mean that it did not run."""
 
 
 def tree(folder: Path) -> Path:
-    """Copy to ``folder`` what the tests need, the shared records as a link."""
+    """Copy the files that the tests need to ``folder``; link the shared records."""
     copy = folder / "main"
     copy.mkdir()
     for name in COPIED:
@@ -41,7 +41,7 @@ def tree(folder: Path) -> Path:
 
 
 def outcome(copy: Path, mutation: Mutation) -> tuple[str, float]:
-    """Return "caught", "survived" or why it was not tried, and the seconds it took."""
+    """Return "caught", "survived" or the reason for no test, and the seconds."""
     place = copy / "piezojax" / mutation.file
     if not place.is_file():
         return f"not tried: no {mutation.file}", 0.0

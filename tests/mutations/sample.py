@@ -1,14 +1,14 @@
-"""Try a seeded sample of the mutants of a module and see which ones its tests catch.
+"""Test a seeded sample of the mutants of a module and list those that survive.
 
 ``python tests/mutations/sample.py [--modules FILE ...] [--count N] [--json FILE]``
 draws N mutants of each module of modules.py. Cosmic Ray makes them (``pip install
 '.[mutation]'``): other operators and comparisons, other numbers, negated conditions,
-loops without a pass, and the like. Each is tried in a copy of the tree; it is caught if
+loops without a pass, and others. Each is tested in a copy of the tree; it is caught if
 a test fails or takes too long. Survivors are shown as a difference. Exits with 1 if the
 share caught is below the bar.
 
-Mutants of annotations are left out, and operators of another group than the replaced
-one, which only raise.
+Mutants of annotations are omitted, and so are operators of another group, which only
+raise errors.
 """
 
 import argparse
@@ -35,7 +35,7 @@ from run import ROOT, tree
 
 BAR = 0.85
 PATIENCE = 4.0
-"""Times the tests of the whole module may take before a mutant counts as caught."""
+"""Factor on the time of the unchanged tests above which a mutant counts as caught."""
 
 IMPORTED = ("jax", "equinox", "optimistix", "scipy.signal", "pytest", "control")
 """Imported once, before the processes of the mutants are forked."""
@@ -106,7 +106,7 @@ def tested(copy: Path, tests: tuple[str, ...], caught) -> None:
     sys.path[:0] = [str(copy), str(copy / "tests")]
     os.environ["PYTHONPATH"] = str(copy)
     sys.dont_write_bytecode = True
-    # Checks of annotations would catch mutants for the tests.
+    # Otherwise the checks of annotations would catch mutants.
     jaxtyping.config.update("jaxtyping_disable", True)
     options = ["-q", "-x", "-o", "addopts=", "-p", "no:cacheprovider"]
     # Plugins are among the modules that were imported before.
@@ -116,7 +116,7 @@ def tested(copy: Path, tests: tuple[str, ...], caught) -> None:
 
 
 def outcome(context, copy, tests, limit) -> tuple[str, float]:
-    """Return "caught", "survived" or "late", and the seconds it took."""
+    """Return "caught", "survived" or "late", and the seconds."""
     status, begun = context.Value("i", -1), time.perf_counter()
     process = context.Process(target=tested, args=(copy, tests, status))
     process.start()
@@ -140,7 +140,7 @@ def difference(source: str, mutated: str) -> str:
 
 
 def tried(context, copy, file, chosen) -> dict:
-    """Try the mutants ``chosen`` of a module; print and return what became of them."""
+    """Test the mutants ``chosen`` of a module; print and return the outcomes."""
     place, tests = copy / "piezojax" / file, MODULES[file]
     source, rows = place.read_text(encoding="utf-8"), []
     found, seconds = outcome(context, copy, tests, None)

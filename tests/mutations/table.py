@@ -1,4 +1,4 @@
-"""The mutations: one wrong line each, and the tests that must fail with it."""
+"""Table of the mutations: a wrong line, and the tests that must fail with it."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 class Mutation(NamedTuple):
     """``old`` becomes ``new`` in ``file`` (of the package); ``tests`` must then fail.
 
-    ``old`` stands in the file exactly once. ``tests`` are arguments of pytest.
+    ``old`` occurs in the file exactly once. ``tests`` are arguments of pytest.
     """
 
     name: str
@@ -310,4 +310,4 @@ MUTATIONS = (
         (_ROBUST, "-k", "deviation"),
     ),
 )
-"""Every mutation that once survived or might; see ``run.py``."""
+"""All mutations; see ``run.py``."""

@@ -1,4 +1,4 @@
-"""The tables of mutations stay applicable: run.py and sample.py take minutes."""
+"""The tables of mutations apply to the code; run.py and sample.py take minutes."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A stage fitted through the loops: known answers, the split, the Jacobian."""
+"""A stage fitted through closed loops: known stages, the halves, the Jacobian."""
 
 import dataclasses
 
@@ -25,12 +25,12 @@ from piezojax.reproduction.summary import geomean, ratio_of
 from piezojax.reproduction.suspect_numbers import CANDIDATES, REFERENCE, candidates_of
 
 ROWS = ("SIN50", "PWSW50")
-"""Short references whose errors the loop's speed sets."""
+"""Short references whose errors depend on the speed of the loop."""
 
 
 @pytest.fixture(scope="module")
 def problem():
-    """A few fast cells, over a quarter of a second instead of one."""
+    """Return a problem of few fast cells, over a quarter of a second instead of one."""
     short = pytest.MonkeyPatch()
     short.setattr(lanes, "WARM_UP", 0.05)
     short.setattr(lanes, "SHORT", 0.08)
@@ -191,7 +191,7 @@ def test_the_number_of_candidates():
     ],
 )
 def test_only_the_suspect_number_is_replaced(doubt, column, expected):
-    """``expected``: the leaves that change, in the lane of one table or in both."""
+    """``expected`` are the changed leaves, in the lane of one table or of both."""
     cells = [printed("ch5", t)["SIN50", column] for t in ("5-3", "5-5")]
     made = lanes.lanes_of(cells, short=True)[0]
     factors = dict.fromkeys(CANDIDATES, 1.0) | {doubt: 0.1}
@@ -306,7 +306,7 @@ def test_the_held_out_ratio_covers_all_cells_of_a_half():
     }
     halves = held_out_ratios(found)
     assert halves["even"]["held_out"]["cells"] == 4
-    # Cells count alike, not experiments.
+    # Each cell has equal weight, not each experiment.
     assert halves["even"]["held_out"]["geomean_ratio"] == pytest.approx(1.5**0.75)
     assert not halves["even"]["met"]
     assert halves["odd"]["held_out"]["geomean_ratio"] == pytest.approx(2.0**0.5)

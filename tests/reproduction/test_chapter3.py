@@ -1,4 +1,4 @@
-"""Tables 3-6 and 3-7: their print, their truth, and what a simulation can say."""
+"""Tables 3-6 and 3-7: the printed cells, the simulated stage, and its errors."""
 
 import csv
 from dataclasses import replace
@@ -105,7 +105,7 @@ def test_the_printed_errors_are_not_reproduced(cells):
     for table, columns in chapter3.TABLES.items():
         assert set(summary[table].columns) == set(columns)
         assert summary[table].cells == 22
-        assert summary[table].geomean_ratio > 5.0  # the hardware did more than this
+        assert summary[table].geomean_ratio > 5.0  # the hardware has further effects
 
 
 def test_the_inputs_stay_in_the_drive_s_range():

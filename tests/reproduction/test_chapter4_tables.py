@@ -1,4 +1,4 @@
-"""Tables 4-5 and 4-6 and the steps: their print, their bars, what cannot agree."""
+"""Tables 4-5 and 4-6 and the steps: printed cells, figures, and bars."""
 
 import csv
 from pathlib import Path
@@ -47,7 +47,7 @@ def test_a_few_printed_numbers(table, row, column, paper):
     assert printed("ch4", table)[row, column].paper == paper
 
 
-# What is measured
+# Figures
 
 
 def test_figures_of_a_step_equal_the_closed_form():

@@ -58,7 +58,7 @@ def test_the_data_equal_the_printed_tables(tables):
 def test_the_prior_predicts_the_driven_axis_better(driven, row):
     with_prior, without = driven["6-7"][row], driven["6-8"][row]
     assert with_prior.sim < without.sim
-    if row != "1Hz_ch3":  # the one place where print has it the other way round
+    if row != "1Hz_ch3":  # the only cell with the opposite order in print
         assert with_prior.paper < without.paper
 
 

@@ -1,4 +1,4 @@
-"""Table 7-4 and Figure 7.4, against print and against a loop from the equations."""
+"""Table 7-4 and Figure 7.4, against print and a loop from the equations."""
 
 import csv
 import io
@@ -78,7 +78,7 @@ def test_the_sliding_mode_control_is_better_in_nine_cells_of_nine(cell):
         assert smc.sim < pid.sim
 
 
-# Against the plain loop
+# Against a plain loop
 
 
 @pytest.mark.parametrize("controller", OPTIONS)
@@ -95,7 +95,7 @@ def test_cells_equal_a_loop_from_the_equations(cell, controller):
     for run, errors in zip(chosen, expected, strict=True):
         name, hertz = run.split("_")[1:]
         for axis, error in zip(p558.OUTPUTS, errors, strict=True):
-            # Off the diagonal print has rows and columns exchanged.
+            # Off the diagonal the printed rows and columns are exchanged.
             found = cell[f"drive_{axis}_{hertz}", f"{controller}:{name}"]
             assert found.sim == pytest.approx(error, rel=0.0, abs=1e-9)
 

@@ -1,4 +1,4 @@
-"""Tables 8-2, 8-3 and their experiments, against print and a loop of its own."""
+"""Tables 8-2, 8-3 and their experiments, against print and a plain loop."""
 
 import csv
 import math
@@ -61,7 +61,7 @@ def test_the_observer_reduces_the_error_in_nine_cells_of_nine(cell):
 
 
 def test_the_levels_are_lower_than_print(tables):
-    # No bar was met or set here: this is what comes out, to be seen when it moves.
+    # There is no bar: the figures are recorded, so that a change is noticed.
     bounds = {"8-2": (2.2, 2.6), "8-3": (2.4, 2.9)}
     for table, (low, high) in bounds.items():
         groups = summarise(tables[table])[table].model_dump()["groups"]
@@ -90,7 +90,7 @@ def test_cells_equal_a_loop_from_the_equations(cell, controller):
 def test_the_combined_experiments():
     first = {(c.row, c.column): c for c in chapter8.cells("figure-8-4")}
     second = {(c.row, c.column): c for c in chapter8.cells("figure-8-5")}
-    # The text gives one of each pair, and by how much the other is higher.
+    # The text gives one of each pair, and the increase of the other.
     for pair, difference in (
         ([first["Ry", name] for name in chapter8.COLUMNS], 0.0118),
         ([second["Z", name] for name in chapter8.COLUMNS], 0.3361),

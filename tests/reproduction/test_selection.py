@@ -1,4 +1,4 @@
-"""Which prints are doubted: made-up cells with a known wrong print, or with none."""
+"""Selection of suspect numbers: synthetic cells with a known misprint or none."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,7 @@ STAGE, PRINTS, CELLS = 2, 6, 30
 
 
 def powers():
-    """How the error of each cell answers: to the stage, and by column to a print."""
+    """Return the exponents of each cell for the stage and for the printed numbers."""
     random = np.random.default_rng(3)
     stage = random.uniform(0.3, 1.5, (CELLS, STAGE))
     prints = np.zeros((CELLS, PRINTS))
@@ -24,7 +24,7 @@ def powers():
 
 
 def errors(self, values):
-    """Errors that grow with the stage, and with a print from a floor on."""
+    """Return errors: powers of the stage and of printed numbers above a floor."""
     stage, prints = powers()
     log = jnp.log(jnp.stack([values[name] for name in self.space.paths]))
     held = jnp.log((0.05 + jnp.exp(log[STAGE:])) / 1.05)

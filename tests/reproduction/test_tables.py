@@ -1,4 +1,4 @@
-"""Tables 5-3 and 5-5, against print and against a loop written from the equations."""
+"""Tables 5-3 and 5-5, against print and a loop from the equations."""
 
 import csv
 import io
@@ -20,7 +20,7 @@ from piezojax.signals.waveforms import THESIS
 COMPARED = ("5-3", "5-5")
 
 COLUMNS = {"pid_smc": "smc", "inversion": "inversion", "dob": "dob"}
-"""Columns of the tables: the kind of controller the oracle knows."""
+"""Kind of controller of the oracle by column of the tables."""
 
 PRINTED = Path(__file__).parents[3] / "shared" / "tables" / "thesis_results.csv"
 
@@ -81,7 +81,7 @@ def test_a_few_printed_numbers(cell, place, paper):
 
 
 def oracle_reference(name, samples):
-    """``samples`` samples and one more, a repeat: what the loop assumes beyond."""
+    """Return ``samples`` samples and a repeat of the last one, as the loop assumes."""
     kind, frequency = re.fullmatch(r"([A-Z]+)(\d+)", name).groups()
     make = {
         "SIN": signals.sine,
@@ -92,7 +92,7 @@ def oracle_reference(name, samples):
     return np.append(values, values[-1])
 
 
-# Each column twice, each kind of reference, both tables; the shorter runs.
+# each column twice, each kind of reference, both tables; the shorter runs
 @pytest.mark.parametrize(
     "place",
     [
@@ -164,7 +164,7 @@ def test_slow_cells_of_5_3_are_within_a_quarter(cell, row, column):
     assert found.sim == pytest.approx(found.paper, rel=0.25)
 
 
-# What is written
+# Written files
 
 
 def cell_of(table, column, paper, sim):

@@ -1,4 +1,4 @@
-"""Optimisers on problems whose answer is known, many starts at once."""
+"""Optimisers on problems with known minima, from many starts at once."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ TOLERANCE = 1e-8
 
 
 class Problem(NamedTuple):
-    """Residuals over the unit cube and where their squares are least."""
+    """Residuals over the unit cube, and the minimum of their squares."""
 
     residuals: object
     minimum: tuple
@@ -69,7 +69,7 @@ def starts_of(problem):
 
 
 def run(method, problem, units, steps=STEPS, loss=None, tolerance=TOLERANCE):
-    """Every view from the first step on, stacked: [step, lane]."""
+    """Return every view from the first step on, stacked: [step, lane]."""
     optimiser = METHODS[method](loss or problem.loss, problem.residuals, tolerance)
 
     @jax.jit
@@ -157,10 +157,10 @@ def test_the_other_methods_approach_a_minimum_on_a_bound(method):
 
 
 def diverging_beyond(edge, problem):
-    """The loss of an Objective: FAILED_LOSS, with a NaN slope, beyond ``edge``."""
+    """Return a loss that is FAILED_LOSS with a NaN gradient beyond ``edge``."""
 
     def loss(unit):
-        blown_up = jnp.sqrt(edge - unit[0])  # NaN beyond the edge, and so is its slope
+        blown_up = jnp.sqrt(edge - unit[0])  # NaN beyond the edge, with a NaN gradient
         total = problem.loss(unit) + 0.0 * blown_up
         return jnp.where(jnp.isfinite(total), total, FAILED_LOSS)
 
@@ -170,7 +170,7 @@ def diverging_beyond(edge, problem):
 @pytest.mark.parametrize(("method", "forward"), [("bfgs", True), ("lbfgsb", False)])
 def test_a_diverging_start_does_not_stop_the_others(method, forward):
     problem = PROBLEMS["quadratic"]
-    # The minimum lies at 0.3: the first long steps of the others go over the edge too.
+    # The minimum is at 0.3: the first long steps of the others exceed the edge too.
     raw = diverging_beyond(0.32, problem)
     units = starts_of(problem).at[:, 0].set(jnp.array([0.02, 0.1, 0.95, 0.25, 0.31]))
     assert np.isnan(jax.grad(raw)(units[2])[0])
@@ -189,7 +189,7 @@ def test_levenberg_marquardt_survives_a_diverging_start():
     problem = PROBLEMS["quadratic"]
 
     def residuals(unit):
-        # As in Objective.residuals: a finite constant where the run diverged.
+        # As in Objective.residuals: a finite constant if the run diverged.
         every = problem.residuals(unit) + 0.0 * jnp.sqrt(0.9 - unit[0])
         return jnp.where(
             jnp.all(jnp.isfinite(every)), every, jnp.sqrt(FAILED_LOSS / 3.0)
@@ -204,7 +204,7 @@ def test_levenberg_marquardt_survives_a_diverging_start():
     )
 
 
-# The gradient that the optimisers get
+# The gradient for the optimisers
 
 
 def wavy(unit):
@@ -262,7 +262,7 @@ def _views(optimiser, unit, steps):
 
 
 def _fit(residuals, start, steps):
-    """Points and sums of squares of a fit after each step, and whether it is done."""
+    """Return points and sums of squares of a fit after each step, and the end flag."""
     program = jax.jit(lambda points: normal_equations(linearised(residuals), points))
     descent = Descent(np.array(start), TRUST_REGION, tolerance=TOLERANCE)
     descents, found = GaussNewton([descent], trials_with_models(program, 1)), []
@@ -292,7 +292,7 @@ def test_gauss_newton_equals_optimistix(residuals, unit):
 
 
 def test_simultaneous_descents_equal_separate_descents():
-    """Of three starts, two in a program; the second one ends before the others."""
+    """Of three starts, two share a program; the second one ends before the others."""
     starts = np.array([[0.9, 0.1, 0.2], [0.3, 0.7, 0.55], [0.2, 0.2, 0.9]])
     program = jax.jit(lambda points: normal_equations(linearised(_quadratic), points))
     descents = [Descent(s, TRUST_REGION, tolerance=TOLERANCE) for s in starts]
@@ -320,7 +320,7 @@ def test_a_start_without_finite_slopes_is_done():
 
 
 def test_a_linear_problem_without_bounds_takes_one_step():
-    """Linear residuals, almost no damping: one step leads to lstsq's solution."""
+    """With linear residuals and little damping one step reaches the lstsq solution."""
     matrix = np.random.default_rng(2).standard_normal((9, 3))
     target = 50.0 * np.random.default_rng(3).standard_normal(9)
     residuals = lambda point: 1e6 * (matrix @ point - target)  # noqa: E731

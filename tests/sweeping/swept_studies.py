@@ -1,4 +1,4 @@
-"""A study that is quick to compile and to run, and a grid to sweep it on."""
+"""A study that compiles and runs quickly, and a grid of its parameters."""
 
 PARAMETERS = {
     "controller.proportional": {"lower": 0.1, "upper": 5.0, "scale": "log"},
@@ -19,7 +19,7 @@ GRID = {
 
 
 def study_of(sweep, **changes):
-    """A PID on a lag: quick to compile, and a millisecond a run."""
+    """Return a study of a PID on a lag, which compiles quickly and runs in 1 ms."""
     study = {
         "title": "a PID on a lag",
         "rate": 20_000.0,

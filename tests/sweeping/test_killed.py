@@ -1,4 +1,4 @@
-"""Processes that are killed in the midst of a sweep."""
+"""Processes that are killed during a sweep."""
 
 import os
 import random
@@ -40,7 +40,7 @@ def test_a_repeatedly_killed_sweep_loses_nothing(write, tmp_path):
     draw, before = random.Random(1), 0
     for _ in range(2):
         process = start(path, out)
-        # Killed while it simulates and writes, after a few new chunks.
+        # Kill it while it simulates and writes, after a few new chunks.
         wanted = before + draw.randint(1, 12)
         while chunks(out) < wanted and process.poll() is None:
             time.sleep(0.002)
@@ -66,7 +66,7 @@ def test_workers_of_a_cluster_give_the_same_result_when_killed(write, tmp_path):
         assert len(set(victims)) == 2
 
         class Killing:
-            """Kills one worker when a few chunks are there."""
+            """Progress that kills a worker after a few chunks."""
 
             done = 0
 

@@ -1,4 +1,4 @@
-"""Points of a sweep, and what is said about those that cannot be."""
+"""Points of a sweep, and the messages about bad ones."""
 
 import copy
 
@@ -17,7 +17,7 @@ BOX = {path: dict(table) for path, table in PARAMETERS.items()}
 
 
 def changed(path, value):
-    """GRID with the entry at ``path`` replaced, or taken out for None."""
+    """Return GRID with the entry at ``path`` replaced, or removed for None."""
     table = copy.deepcopy(GRID)
     inner = table
     for key in path[:-1]:
@@ -36,7 +36,7 @@ def test_grid_is_every_combination_in_c_order(case_of):
     wanted = [[p, t] for p in (0.1, 0.5, 1.0, 2.0, 4.0) for t in steps]
     np.testing.assert_allclose(plan.values(0, 15), wanted, rtol=1e-12)
     np.testing.assert_array_equal(plan.values(4, 9), plan.values(0, 15)[4:9])
-    # The ends are the bounds themselves, not their logarithm's exponential.
+    # The ends are exactly the bounds, not exponentials of their logarithms.
     assert plan.values(0, 3)[[0, 2], 1].tolist() == [5e-4, 2e-3]
 
 
@@ -47,7 +47,7 @@ def test_samples_are_spread_on_the_scale_of_each_parameter(case_of, method):
     for column, bound in zip(values.T, BOX.values(), strict=True):
         low, high = np.log(bound["lower"]), np.log(bound["upper"])
         share = (np.log(column) - low) / (high - low)
-        # One point in each of 64 strips, in both kinds of design.
+        # one point in each of 64 strips, in both designs
         assert sorted(np.floor(64.0 * share).astype(int)) == list(range(64))
 
 

@@ -160,7 +160,7 @@ def test_sensitivity_equals_that_of_the_stability_report(case_of):
             peak = float(found.sensitivity_peak.sel(values).sel(plant=name))
             assert peak == pytest.approx(max(peaks), rel=2e-3)
     at_five = found.sensitivity_peak.sel({"controller.feedback.law.integral": 5.0})
-    assert np.isfinite(at_five).sum() == 3  # one of them is not stable
+    assert np.isfinite(at_five).sum() == 3  # one loop is unstable
     lost = found.sensitivity_peak.sel({"controller.feedback.law.integral": 1000.0})
     assert np.isinf(lost).all()
 
@@ -194,7 +194,7 @@ def test_several_axes_have_a_dimension(case_of, tmp_path):
     np.testing.assert_array_equal(
         found.followed[0], np.asarray(data.references)[0, ::10].T
     )
-    # A picture has a panel for each axis, each in its own unit.
+    # A picture has a panel for each axis in its unit.
     assert [panel.unit for panel in panels(found, "rms_error")] == ["nm", *["nrad"] * 2]
     with pytest.raises(ValueError, match="needs a stage with one axis"):
         Simulator(case_of(table | {"metrics": ["sensitivity_peak"]}, **AXES))
@@ -229,7 +229,7 @@ def test_damaged_and_missing_chunks_are_simulated_again(case_of, tmp_path):
     again = run_sweep(case, tmp_path / "a")
     assert (again.simulated, again.finished) == (2, True)
     assert_same_bits(whole, opened(tmp_path / "a"))
-    # In the share of another process it is found when all are merged.
+    # In the share of another process the damage is found by the merge.
     content[0] ^= 1
     chunks[2].write_bytes(content)
     (tmp_path / "a" / "sweep.nc").unlink()

@@ -1,4 +1,4 @@
-"""Alarms: every reason not to use tuned gains is named, and reaches user and file."""
+"""Alarms: every reason not to use tuned gains is named in output and files."""
 
 import json
 import math
@@ -22,7 +22,7 @@ LIMITS = {"sensitivity_peak": 2.0, "delay_margin": 1.0}
 
 
 def integrator(gain, delay=2):
-    """L = gain z^-delay / (z - 1), as matrices."""
+    """Return L = gain z^-delay / (z - 1) as matrices."""
     A = np.zeros((delay + 1, delay + 1))
     A[0, 0], A[0, 1] = 1.0, 1.0
     A[range(1, delay), range(2, delay + 1)] = 1.0
@@ -32,7 +32,7 @@ def integrator(gain, delay=2):
 
 
 def peak(gain, delay=2):
-    """max |S| of ``integrator`` on a grid, by NumPy."""
+    """Return max |S| of ``integrator`` on a grid, by NumPy."""
     z = np.exp(1j * np.linspace(1e-3, np.pi, 200_001))
     return np.abs(1.0 / (1.0 + gain * z**-delay / (z - 1.0))).max()
 
@@ -86,7 +86,7 @@ def changed(**changes):
 def test_safe_gains_raise_no_alarm():
     kept = {"sensitivity_peak": outcome("sensitivity_peak", [1.4, 1.9], 2.0)}
     assert alarms(changed(constraints=kept, perturbed=perturbed(**kept))) == []
-    # The noise of the hold-out is another one.
+    # The hold-out has another noise draw.
     near = {"peak_slew": outcome("peak_slew", [1.04], 1.0)}
     assert alarms(changed(holdout_constraints=near)) == []
     # The margins of the search differ from the exact ones by less than 1 %.
@@ -197,7 +197,7 @@ def test_exact_margins_replace_those_of_the_nominal_plant_only():
 
 
 def test_the_cut_at_the_displacements_is_checked_on_several_axes():
-    """Two linear loops stand for the cuts: only the one behind exceeds the limit."""
+    """Two linear loops replace the cuts: only that at the outputs exceeds the limit."""
     A, B, C = np.zeros((1, 1)), np.array([[1.0, 0.0]]), np.array([[0.1], [0.9]])
     before = LinearAxes(A, B, C, 1e-4)
     behind = LinearAxes(A, B, 3.0 * C, 1e-4)

@@ -83,12 +83,12 @@ def test_driven_axes_are_evaluated_separately(outcome):
     assert len(result.coupling.per_reference_rms_um) == 5
     assert result.units["Z:SIN5 Rx:SIN10 (Rx)"] == "urad"
     assert result.holdout.geomean_rms_um < 0.8 * result.holdout_before.geomean_rms_um
-    # An axis that is not tuned and not driven stays at its noise.
+    # An axis that is neither tuned nor driven only has noise.
     assert result.coupling.worst_rms_um < 0.2
 
 
 def test_figures_equal_those_of_a_run(outcome):
-    """The error of a trace against a plain run of the tuned loop."""
+    """Compare the error of a trace with a plain run of the tuned loop."""
     case, signals = outcome.case, outcome.holdout
     loop, reference = outcome.after, signals.references[1]
     inputs = pj.loop_inputs(reference, signals.noise[1, 0])
@@ -102,7 +102,7 @@ def test_figures_equal_those_of_a_run(outcome):
 
 
 def test_perturbed_plants_are_evaluated_separately(outcome):
-    """Median and worst factor against runs of both loops on each plant."""
+    """Compare median and worst factor with runs of both loops on each plant."""
     found = outcome.result.perturbed
     assert (found.plants, found.unstable_before, found.unstable) == (5, 0, 0)
     plants = outcome.case.ensemble.stages("holdout").plant

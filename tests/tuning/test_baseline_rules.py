@@ -1,4 +1,4 @@
-"""Ultimate gain, relay and the rules, on stages whose answers are closed forms."""
+"""Ultimate gain, relay and rules, on stages with closed-form answers."""
 
 from typing import NamedTuple
 
@@ -70,14 +70,14 @@ def loop_of(plant, noise=0.0):
 
 
 def integrating():
-    """z^L (z - 1) = -K k dt on the unit circle: angles pi/(2 L + 1)."""
+    """Return gain and period: z^L (z - 1) = -K k dt at the angle pi/(2 L + 1)."""
     angle = np.pi / (2 * LATE + 1)
     gain = 2.0 * np.sin(0.5 * angle) / (RISE * DT)
     return loop_of(Integrator(RISE, DT)), gain, 2.0 * np.pi / angle * DT
 
 
 def lagging():
-    """z^L (z - p) = -K g (1 - p): the angle where its phase is pi, by bisection."""
+    """Return gain and period: z^L (z - p) = -K g (1 - p) at phase pi, by bisection."""
     pole, static = 0.9, 0.4
     low, high = 1e-6, np.pi / LATE
     for _ in range(200):
@@ -107,13 +107,13 @@ def test_the_relay_gives_nearly_the_same(name):
     found = ultimate_by_relay(
         loop, height=5.0, hysteresis=0.0, dt=DT, noise=np.zeros(4000), clock=Clock()
     )
-    # The describing function leaves the harmonics out; the period is whole samples.
+    # The describing function omits harmonics; the period has whole samples.
     assert found.gain == pytest.approx(gain, rel=0.15)
     assert found.period == pytest.approx(period, rel=0.15)
 
 
 def switching(noise, hysteresis, height=5.0):
-    """The relay's cycle behind delay and integrator, in a loop of its own."""
+    """Return the limit cycle of a relay with delay and integrator, in a plain loop."""
     line, level, side, sides, seen = [0.0] * LATE, 0.0, 1.0, [], []
     for draw in noise:
         measured = level + draw

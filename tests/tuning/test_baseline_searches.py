@@ -1,4 +1,4 @@
-"""Baselines that search, on a known minimum, and a comparison on a small study."""
+"""Search baselines on a known minimum, and a comparison on a small study."""
 
 import copy
 import dataclasses
@@ -32,7 +32,7 @@ METHODS = {
 
 
 class Bowl(eqx.Module):
-    """An objective with its minimum where it is put."""
+    """An objective with a given minimum."""
 
     minimum: jnp.ndarray
 
@@ -81,7 +81,7 @@ def test_the_budget_ends_a_search(name):
 
 
 def test_nelder_mead_searches_from_every_start():
-    """Two bowls: the one at the second start is the deeper."""
+    """Of two bowls, the one at the second start is deeper."""
 
     class Two(eqx.Module):
         def loss(self, unit):
@@ -174,14 +174,14 @@ def test_baselines_use_the_same_objective(outcome):
     )
     for entry in found.entries[-3:]:
         assert entry.loss == pytest.approx(found.ours.loss, abs=0.05)
-    # A PI by a rule lies in the box of this study: the searches can only be better.
+    # The box of this study contains a PI by rule, so the searches are better.
     rule = found.entry("Ziegler-Nichols PI")
     assert rule.loss > found.ours.loss
     assert rule.unit is None
 
 
 def test_a_rule_is_evaluated_like_tuned_gains(outcome):
-    """Its PI put into the study by hand has the loss and the error of its entry."""
+    """The PI of the rule in the study has the loss and the error of the entry."""
     rule = outcome.baselines.entry("Ziegler-Nichols PI")
     table = {"type": "PID", "dt": 5e-5}
     table |= {path.split(".")[1]: value for path, value in rule.gains.items()}
@@ -189,7 +189,7 @@ def test_a_rule_is_evaluated_like_tuned_gains(outcome):
     data, start = make_data(case), round(0.02 * 20_000)
     error = holdout_geomean(case.loop, data, start)
     assert error == pytest.approx(rule.holdout_geomean_um, rel=1e-9)
-    # With the noise that tunes in the hold-out's place: what the loss is made of.
+    # The loss is computed from the tuning noise instead of the held-out noise.
     again = dataclasses.replace(data, holdout=data.tuning)
     tuned = holdout_geomean(case.loop, again, start)
     before = outcome.result.before.geomean_rms_um

@@ -1,4 +1,4 @@
-"""Figures of controllers beside the tuned one, against runs of their own."""
+"""Figures of controllers beside the tuned one, against plain runs."""
 
 import json
 
@@ -73,7 +73,7 @@ def perturbed(tmp_path_factory):
 
 
 def error_of(loop, data):
-    """Return the geometric mean of the RMS errors of the hold-out, um, from samples."""
+    """Return the geometric mean of the held-out RMS errors (um), from samples."""
     logs, holdout = [], data.holdout
     run = eqx.filter_jit(
         lambda r, n, d: pj.simulate(loop, loop_inputs(r, n, d), loop.init(r[0]))[1]
@@ -89,7 +89,7 @@ def error_of(loop, data):
 def test_the_figures_equal_those_of_runs_on_each_plant(perturbed):
     case, data, found = perturbed
     assert list(found) == [*BESIDE, "before", "tuned"]
-    assert found["before"] == found["tuned"]  # the same gains here
+    assert found["before"] == found["tuned"]  # equal gains
     stages = case.ensemble.stages("holdout")
     plants = [jax.tree.map(lambda x, i=i: x[i], stages).plant for i in range(3)]
     nominal = case.loop.plant

@@ -1,4 +1,4 @@
-"""Several studies in one go: what is compared, what is written, what is refused."""
+"""Comparison of several studies: rows, files and refused input."""
 
 import json
 import tomllib
@@ -29,7 +29,7 @@ from piezojax.tuning import compare, load_result
 from piezojax.tuning import comparison as comparing
 from piezojax.tuning.comparison import ComparisonResult
 
-# The lag is given no sample time of its own (an ARMA has none), so any rate fits it.
+# An ARMA has no sample time, so any rate is allowed.
 LAG = {"type": "ARMA", "autoregressive": [0.5], "moving": [0.0, 0.067]}
 FILE = {
     "title": "two controllers",
@@ -140,7 +140,7 @@ def with_errors(result, before, after):
 
 
 def tuned_to(monkeypatch, result, errors):
-    """Let tuning find the given errors (um), before and after, one after another."""
+    """Replace tuning: it returns the given errors (um) before and after, in turn."""
     results = iter([with_errors(result, *pair) for pair in errors])
     monkeypatch.setattr(
         comparing,

@@ -1,4 +1,4 @@
-"""Signals that a study is tuned and judged on, and the plants they act on."""
+"""Signals and plants for tuning and evaluation."""
 
 import dataclasses
 
@@ -40,7 +40,7 @@ def case_of(**tables):
 
 
 def apart(series):
-    """Tell whether no two of the series (last dimension: time) are related."""
+    """Return whether all series (last dimension: time) are uncorrelated."""
     rows = np.asarray(series).reshape(-1, np.shape(series)[-1])
     related = np.corrcoef(rows) - np.eye(len(rows))
     return np.abs(related).max() < 5.0 / np.sqrt(rows.shape[1])
@@ -51,7 +51,7 @@ def apart(series):
 
 @pytest.mark.parametrize("draws", [1, 3])
 def test_holdout_and_tuning_have_different_draws(draws):
-    """As many draws in both, as by default: one stream would give the same."""
+    """Both have as many draws as by default: one stream would repeat them."""
     data = make_data(
         case_of(
             objective={"noise_draws": draws},
@@ -75,7 +75,7 @@ def test_noise_is_of_unit_variance():
     assert np.mean(noise) == pytest.approx(0.0, abs=0.02)
 
 
-# What a fitted plant leaves unexplained
+# Residual of a fitted plant
 
 
 def fitted(residual):
@@ -88,7 +88,7 @@ def fitted(residual):
 
 
 def test_training_and_validation_parts_disturb_different_runs():
-    # The initial loading, the rest of the training part, the validation part.
+    # the initial loading, the rest of the training part, the validation part
     residual = np.repeat([9.0, 1.0, -2.0], [1, 199, 200])
     data = fitted(residual)
     np.testing.assert_allclose(data.tuning.disturbance, np.full((2, 2, 400), 1.0))
@@ -96,11 +96,11 @@ def test_training_and_validation_parts_disturb_different_runs():
 
 
 REST, SLOW = np.zeros(400), 1e-9 * np.arange(400.0)
-"""A reference that travels nowhere, and a stage that hardly moves."""
+"""A constant reference, and a stage that hardly moves."""
 
 
 def played(residual, reference=REST, moved=SLOW, part="validate"):
-    """Return the disturbances of a fit that leaves ``residual`` of its record.
+    """Return the disturbances of a fit with the residual ``residual``.
 
     The first has the largest deviation, the second the largest fast changes.
     """
@@ -120,7 +120,7 @@ def test_a_short_residual_is_reflected():
 
 @pytest.mark.parametrize(("part", "first"), [("train", 0), ("validate", 200)])
 def test_the_worst_stretches_are_the_disturbances(part, first, monkeypatch):
-    """A hump in the middle is the largest, and late it swings fast."""
+    """The largest deviation is in the middle, the fastest changes are at the end."""
     monkeypatch.setattr(unexplained, "FAST", 10)
     time = np.arange(200.0)
     swing = np.where(time > 150.0, np.sin(2.0 * np.pi * time / 10.0), 0.0)
@@ -149,7 +149,7 @@ STILL = {"tune": ["CONST2"], "duration": 0.02, "settle": 0.0}
 
 @pytest.fixture(scope="module")
 def still():
-    """References that rest at 2 um, stages whose gains differ, no noise."""
+    """Return constant references of 2 um, stages of different gain, and no noise."""
     case = case_of(references=STILL, sensor={"noise_rms": 0.0}, ensemble=ENSEMBLE)
     stages = case.ensemble.stages("holdout")
     assert np.ptp(np.asarray(stages.plant.gain)) > 0.02
@@ -183,7 +183,7 @@ def objective_of(case, signals, **options):
     ("heights", "lost"), [((1.0, 2.0), False), ((1.0, 500.0), True)]
 )
 def test_one_saturated_run_gives_an_infinite_error(heights, lost):
-    """120 V hold 18 um: at 500 um the actuator stays at its limit, at 2 um never."""
+    """120 V reach 18 um: the actuator stays at its limit at 500 um, not at 2 um."""
     case = case_of()
     references = jnp.asarray(heights)[:, None] * jnp.ones(400)
     signals = Signals(references, jnp.zeros((2, 1, 400)))

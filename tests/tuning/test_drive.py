@@ -19,7 +19,7 @@ CAPACITANCE = 2e-6
 
 
 def test_figures_of_a_sine():
-    """An amplitude a at the angular frequency w, and noise on the held voltage."""
+    """The sine has the amplitude a and angular frequency w; the constant has noise."""
     a, w = 30.0, 2.0 * np.pi * 40.0
     held = 50.0 + 0.02 * np.random.default_rng(0).standard_normal(TIME.size)
     slow = 0.5 * a * np.sin(w * TIME)
@@ -80,7 +80,7 @@ def outcome():
 
 
 def at_piezo(voltage):
-    """Return the voltage behind the low-pass of 800 Hz, by scipy."""
+    """Return the voltage behind the low-pass of 800 Hz, by SciPy."""
     low_pass = signal.cont2discrete(
         signal.butter(1, 1600.0 * np.pi, analog=True), 5e-5, "foh"
     )
@@ -99,7 +99,7 @@ def test_the_figures_are_of_the_hold_out_behind_the_amplifier(outcome):
 
 
 def test_the_noise_equals_the_closed_form(outcome):
-    """Integral control of a static plant: the noise passes a low-pass and the lag."""
+    """Integral control of a static plant: noise passes the loop and the low-pass."""
     gain = outcome.result.gains["controller.integral"] * 5e-5
     pole = np.exp(-1600.0 * np.pi * 5e-5)
     # u = -I/(1 - z^-1) (F u 0.5 z^-1 + n), F the low-pass of the first order
@@ -112,7 +112,7 @@ def test_the_noise_equals_the_closed_form(outcome):
     )
     held = signal.lfilter(gain * b, denominator, np.eye(1, 4000)[0])
     expected = 0.02 * np.sqrt(np.sum(held**2))
-    # 1600 samples of one draw
+    # one draw of 1600 samples
     assert outcome.drive[1]["piezo"].noise_rms_V == pytest.approx(expected, rel=0.2)
     assert outcome.drive[1]["piezo"].noise_rms_V > 0.0
 

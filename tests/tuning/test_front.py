@@ -1,4 +1,4 @@
-"""The order in which a Pareto front is solved; test_robust has one of a loop."""
+"""The order in which a Pareto front is solved; test_robust has that of a loop."""
 
 from itertools import pairwise
 
@@ -20,11 +20,11 @@ def place(limit, loss, kept=True, unit=0.0):
     ("losses", "kept", "again"),
     [
         ([-4.0, -3.0, -2.0], [True, True, True], []),
-        # Worse than a tighter one, and then better: the next is as it was.
+        # The second is worse than the third and is solved again; the first is kept.
         ([-4.0, -1.0, -2.0], [True, True, True], [1.3]),
-        # The first is worse than the second one solved again.
+        # The first is worse than the second once that is solved again.
         ([-2.4, -1.0, -2.0], [True, True, True], [1.3, 1.4]),
-        # What misses its limit says nothing about others.
+        # A point that violates its limit does not affect others.
         ([-4.0, -3.0, -9.0], [True, True, False], []),
         ([-4.0, -9.0, -2.0], [True, False, True], [1.3]),
     ],

@@ -1,4 +1,4 @@
-"""Gauss-Newton on the errors: derivatives, steps within the box, known minima."""
+"""Gauss-Newton on errors: derivatives, steps within the box, known minima."""
 
 import copy
 from functools import cache
@@ -35,7 +35,7 @@ from piezojax.tuning.search import make_strategy
 
 
 class Problem(eqx.Module):
-    """Residuals as one run's errors; the loss is half their mean square."""
+    """Residuals as the errors of a run; the loss is half their mean square."""
 
     kind: str = eqx.field(static=True)
 
@@ -109,7 +109,7 @@ def test_descents_reach_the_minimum(kind, start):
 
 
 def test_a_curved_valley_takes_few_steps():
-    """A hundred times steeper across than Rosenbrock's is along; gradients zigzag."""
+    """The valley is a hundred times steeper than that of Rosenbrock."""
     (descent,), group = descents_on("valley", [(0.2, 0.56)])
     taken = 0
     while descent.loss > 1e-8:
@@ -129,7 +129,7 @@ def test_a_point_without_finite_gradients_ends_its_descent():
 
 
 def test_a_rejected_step_keeps_the_model():
-    """Only a new point is linearised; the damping grows until a step is shorter."""
+    """Only a new point is linearised; the damping grows until a step is accepted."""
     asked, zeros, ones = [], np.zeros((2, 2)), np.ones(2)
 
     def wrong(unit):
@@ -156,7 +156,7 @@ def test_steps_stay_inside_the_box():
     np.testing.assert_allclose(unit + step, [0.0, 0.9 - 0.5 * 0.95], atol=1e-12)
     step = model([0.3, 0.6]).step(0.0, UNIT_BOX)
     np.testing.assert_allclose(unit + step, [0.3, 0.6])
-    # On the side, pushed outwards, it stays there.
+    # At the side of the box a step outwards has no effect.
     edge = LocalModel(np.array([0.0, 0.5]), np.array([3.0, 0.0]), curvature)
     assert edge.step(0.1, UNIT_BOX)[0] == 0.0
 
@@ -170,7 +170,7 @@ def test_spacing_is_prime_and_keeps_enough_samples(runs, counted):
 
 
 def test_the_better_half_continues():
-    """Of nine descents five, then three; the best ones are never dropped."""
+    """Of nine descents five continue, then three; the best ones are never dropped."""
     places = np.random.default_rng(1).uniform(0.1, 0.9, (9, 2))
     seen = []
     standing, ended = descend(
@@ -230,7 +230,7 @@ def objective_of(case, **options):
 
 
 def test_weighted_errors_give_the_gradient_of_the_objective():
-    """From errors of every sample, by a run of its own: sum of w mean(e de)."""
+    """The oracle is a plain run with the errors of all samples: sum of w mean(e de)."""
     case = case_of()
     objective = objective_of(case, aggregate="worst")
     unit = jnp.array([0.4, 0.6])
@@ -252,13 +252,13 @@ def test_weighted_errors_give_the_gradient_of_the_objective():
     loss, sample, weights = whole.loss, whole.errors, whole.weights
     both = jax.jacfwd(lambda u: (errors(u),) * 2, has_aux=True)
     slopes, dense = jax.jit(both)(unit)
-    # The gradient of the objective goes the other way: through its figures.
+    # The gradient of the objective is computed through its figures.
     here = jax.jit(lambda u: derivatives_at(objective, u, every))(unit)
     found = jnp.einsum("r,rt,rti->i", weights, dense, slopes) / dense.shape[1]
     np.testing.assert_allclose(found, here.gradient, rtol=1e-8)
     np.testing.assert_allclose(loss, here.loss, rtol=1e-12)
     np.testing.assert_allclose(weights, here.weights, rtol=1e-12)
-    # Every seventh sample of the run, of those that count.
+    # every seventh counted sample of the run
     at = np.arange(6, 1000, 7)
     at = at[400 // 7 :] - 400
     np.testing.assert_allclose(sample, dense[:, at], atol=1e-12)
@@ -303,14 +303,14 @@ def test_a_study_is_tuned(outcome):
     assert history.shape[1] == 3
     assert np.all(np.diff(history, axis=0) <= 0.0)
     assert len(result.times_s) == len(history)
-    # Each step of each descent: its derivatives, unless the last step was rejected, and
-    # three times as many points as dampings.
+    # Each step of each descent needs derivatives, unless the last step was rejected,
+    # and three times as many points as dampings.
     steps = (result.evaluations - 9 - 3) / (1 + 3 * POINTS)
     assert len(history) < steps <= 3 * len(history)
 
 
 def test_no_neighbouring_point_is_better(outcome, objective, programs):
-    """Of grids in the box; their loss is the tuner's, less a constant."""
+    """Points of grids in the box; the loss is that of the tuner minus a constant."""
     case = case_of()
     values = jnp.array([outcome.result.gains[path] for path in case.space.paths])
     unit = np.asarray(case.space.to_unit(values))

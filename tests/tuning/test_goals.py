@@ -1,4 +1,4 @@
-"""Goals of the trade in a study: kept where they bind, and judged exactly."""
+"""Limits on usual specifications in a study: kept if active, with exact figures."""
 
 import json
 
@@ -50,7 +50,7 @@ def test_goals_are_kept_and_active_with_steps_in_the_result(tmp_path):
     assert found["settling_time"].active
     assert found["settling_time"].of == 1
     before, after = outcome.steps
-    # Noise alone would be slower: the limit costs error, and is that of the worst step.
+    # Without the limit the step is slower; the limit applies to the worst step.
     assert max(s.settling_time_s for s in before.values()) > 0.01
     worst = max(step.settling_time_s for step in after.values())
     assert worst == pytest.approx(found["settling_time"].value, rel=1e-6)
@@ -81,7 +81,7 @@ def test_incompatible_goals_have_an_alarm_each(tmp_path):
 
 
 def test_a_loop_that_amplifies_its_reference_has_a_note():
-    """The observer's loop passes steps on to the light mode of the stage."""
+    """The loop with observer excites the lightly damped mode by steps."""
     observer = p753.disturbance_observer()
     actuator, sensor = p753.actuator(), pj.Sensor(0.0)
     amplifying = pj.Feedback(observer, p753_stage.stage(), actuator, sensor)

@@ -1,4 +1,4 @@
-"""Repeated searches below a limit that the exact margins miss."""
+"""Repeated searches if the exact margins violate a limit."""
 
 import inspect
 from types import SimpleNamespace
@@ -36,7 +36,7 @@ def integral_loop(integral):
 
 
 class Limited:
-    """Objective that remembers its limits and the plants of its margins."""
+    """Objective that records its limits and the plants of its margins."""
 
     def __init__(self, limits, stages="first"):
         self.limits, self.stages = limits, stages
@@ -49,9 +49,9 @@ class Limited:
 
 
 def repeated(monkeypatch, peaks, plants=(), status="converged", strategy="a strategy"):
-    """Return the limits and plants that are searched, and what is returned.
+    """Return the limits and plants of each search, and the result.
 
-    ``peaks`` are the exact Ms, ``plants`` the excess on the worst plants and these.
+    ``peaks`` are the exact Ms, ``plants`` the largest excess with the worst plants.
     """
     values, found, searched = iter(peaks), iter(plants), []
 
@@ -74,7 +74,7 @@ def repeated(monkeypatch, peaks, plants=(), status="converged", strategy="a stra
         worst_plants=lambda loop, before: Carried(*next(found, (0.0, None)), before)
     )
     search = SearchState(np.array([0.5]), status=status, evaluations=5)
-    repeat = inspect.unwrap(limited_search._repeated)  # its arguments are stand-ins
+    repeat = inspect.unwrap(limited_search._repeated)  # with replaced arguments
     return searched, repeat(
         Limited({}), case, evaluator, None, search, strategy, Silent()
     )
@@ -82,7 +82,7 @@ def repeated(monkeypatch, peaks, plants=(), status="converged", strategy="a stra
 
 def test_the_limit_is_tightened_until_the_exact_one_is_kept(monkeypatch):
     searched, found = repeated(monkeypatch, [3.0, 2.2, 0.0])
-    # Half of the room above 1, and five sixths of that.
+    # half of the difference to 1, then five sixths of that
     assert [aim for aim, _ in searched] == pytest.approx([1.5, 1.0 + 0.5 / 1.2])
     _, search, _, stability = found
     assert search.evaluations == 25
@@ -121,7 +121,7 @@ def test_the_search_is_not_repeated_without_need_or_remedy(monkeypatch, changes)
 
 
 def alarming_peak(loop, bound=None, **limits):
-    """Return the Ms that asks for other gains in a study with one ``loop``."""
+    """Return the Ms that repeats the search of a study with one ``loop``."""
     case = SimpleNamespace(
         study=SimpleNamespace(limits=limits),
         plant_about=SimpleNamespace(error_bound=bound),
@@ -148,7 +148,7 @@ def test_the_error_bound_of_the_plant_is_included():
 
 
 def test_beyond_the_band_of_a_narrow_record_the_search_is_not_repeated():
-    """They cannot help there; the alarm remains."""
+    """Other gains cannot help there; the alarm remains."""
     loop = integral_loop(4000.0)
     exact = stability_report(loop, OperatingPoint(1.0, dt=DT)).sensitivity_peak
     narrow = ErrorBound(

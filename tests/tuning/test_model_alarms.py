@@ -1,4 +1,4 @@
-"""Alarms of a model: its error under the closed loop, and those of its fit."""
+"""Alarms of a model: its error in the closed loop, and those of its fit."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ RATE, GAIN = 1000.0, 0.1
 
 @pytest.fixture(scope="module")
 def stability():
-    """L = GAIN / (z - 1): integral action on a stage of gain 1 and one sample."""
+    """Return the report of L = GAIN / (z - 1): integral control of a unit delay."""
     controller = pj.control.PID(
         proportional=0.0, integral=GAIN * RATE, derivative=0.0, dt=1.0 / RATE
     )
@@ -55,7 +55,7 @@ def test_a_small_error_raises_no_alarm(stability):
 
 
 def test_an_unexcited_band_within_the_bandwidth_is_named(stability):
-    # |T| is 0.16 at 100 Hz: a hidden resonance of 25 times the gain is too much.
+    # |T| is 0.16 at 100 Hz: a hidden resonance of 25 times the gain is too large.
     unseen = bound((0.05, 0.05, 25.0, 25.0), (True, True, False, False))
     (alarm,) = model_alarms(About(error_bound=unseen), False, 2.0, stability)
     assert "the record excites nothing at 10" in alarm

@@ -1,4 +1,4 @@
-"""References beyond the stroke of the stage are refused before anything is tuned."""
+"""References beyond the stroke of the stage are refused before tuning."""
 
 import copy
 
@@ -76,7 +76,7 @@ def test_every_reference_is_checked(references, message):
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_small_excess_is_allowed(way):
     limit, allowed = (120.0 if way > 0.0 else -20.0), SLACK * 140.0
-    # CONST holds offset plus amplitude.
+    # CONST is offset plus amplitude.
     alone = {"tune": ["CONST1"], "unseen": [], "amplitude": 1.0}
     checked(alone | {"offset": limit - 1.0 + way * 0.9 * allowed})
     with pytest.raises(ValueError, match="CONST1 spans"):

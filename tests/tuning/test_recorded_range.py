@@ -1,4 +1,4 @@
-"""A model used far outside of the record it was fitted to raises an alarm."""
+"""A model that is used far outside its record raises an alarm."""
 
 import copy
 import dataclasses
@@ -80,7 +80,7 @@ def test_references_beyond_the_record_raise_an_alarm(low, high, raised):
 
 
 def test_a_record_of_a_small_part_of_the_range_raises_an_alarm():
-    """As one does whose input was recorded before an amplifier of ten."""
+    """An example is an input recorded before an amplifier of gain ten."""
     small = {"references": STUDY["references"] | {"amplitude": 5.0, "offset": 0.0}}
     width = COVERED * 140.0
     assert alarms((0.0, 1.01 * width), **small) == []
@@ -95,7 +95,7 @@ def test_a_record_of_a_small_part_of_the_range_raises_an_alarm():
 
 
 def test_a_record_far_beyond_the_actuator_raises_an_alarm():
-    """As one does whose input was recorded behind the amplifier."""
+    """An example is an input recorded behind the amplifier."""
     (alarm,) = alarms((-200.0, 1201.0))
     assert alarm.startswith("the record of the plant covers -200 to 1201 V, the actuat")
     assert alarms((-20.0, 500.0)) == []
@@ -106,7 +106,7 @@ def test_each_axis_has_its_own_alarm():
     assert alarms(wide, wide, **AXES) == []
     (alarm,) = alarms(wide, (-20.0, 20.0), **AXES)
     assert alarm.startswith("the references of axis Rx need -20 to 30 V")
-    # Which input belongs to which axis is not known.
+    # The order of the inputs is not known.
     assert alarms((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), **AXES) == []
 
 

@@ -1,4 +1,4 @@
-"""Outcomes of constraints and summaries of plants, from numbers written by hand."""
+"""Outcomes of constraints and summaries of plants, from given numbers."""
 
 import math
 
@@ -49,7 +49,7 @@ def test_a_lower_limit(values, kept, active, on, worst):
 
 
 def figures(rms, saturated=0.0):
-    """Figures [plants, traces, draws] of the given RMS errors."""
+    """Return figures [plants, traces, draws] with the given RMS errors."""
     rms = np.array(rms, dtype=float)
     nothing = np.zeros_like(rms)
     names = [name for name in TrackingFigures._fields if name != "rms_error"]
@@ -66,7 +66,7 @@ AFTER = [[[1.0], [4.0], [1.0]], [[math.inf], [1.0], [1.0]], [[2.0], [8.0], [1.0]
 def test_a_summary_of_plants():
     found = Perturbed.of(figures(BEFORE), figures(AFTER), DRIVEN, {})
     assert (found.plants, found.unstable_before, found.unstable) == (3, 1, 1)
-    # Plants 0 and 2 are stable after, plant 0 alone before and after.
+    # Plants 0 and 2 are stable after tuning, only plant 0 before and after.
     assert found.geomean_rms_um == pytest.approx(np.median([2.0, 4.0]))
     assert found.worst_rms_um == pytest.approx(4.0)
     assert found.median_better == pytest.approx(3.0)

@@ -118,7 +118,7 @@ def each(stages):
 
 
 def test_multipliers_of_a_known_problem():
-    """Minimise (x-3)^2 with ln x <= ln 2: x = 2, multiplier -df/dx / dg/dx = 4."""
+    """Minimise (x-3)^2 with ln x <= ln 2: x = 2, multiplier -(df/dx) / (dg/dx) = 4."""
 
     def total(x, multipliers, penalty):
         added = penalty_terms(jnp.log(x / 2.0)[None], multipliers, penalty)
@@ -199,7 +199,7 @@ def test_the_worst_plants_are_those_with_the_largest_exact_peak(outcome, monkeyp
     peaks = sorted((exact_peak(outcome.after, stage) for stage in stages), reverse=True)
     carried = [exact_peak(outcome.after, stage) for stage in each(worst)]
     assert carried == pytest.approx(peaks[:2], rel=1e-9)
-    # Half of them were carried before.
+    # Half of them were in the search before.
     for old in set(range(5)) - set(places.tolist()):
         again = found.worst_plants(outcome.after, Carried(0.0, None, np.array([old])))
         assert again.places.tolist() == [places[0], old]
@@ -207,7 +207,7 @@ def test_the_worst_plants_are_those_with_the_largest_exact_peak(outcome, monkeyp
 
 
 def test_larger_gains_violate_the_limit(outcome):
-    """One gain: the error falls with it, so the limit alone holds it back."""
+    """The error falls with the single gain, so only the limit bounds it."""
     (gain,) = outcome.result.gains.values()
     larger = replace(outcome.case.loop, {"controller.integral": 1.03 * gain})
     stages = each(outcome.case.ensemble.stages("margins"))
@@ -244,7 +244,7 @@ def test_the_result_is_saved_and_loaded(outcome, tmp_path):
 
 
 def test_figures_of_runs_equal_those_of_their_logs(outcome):
-    """Voltage, slew, effort and overshoot against NumPy on whole logs."""
+    """Compare voltage, slew, effort and overshoot with NumPy on complete logs."""
     found, case = outcome.result.constraints, outcome.case
     signals = make_data(case).tuning
     own = Stage(case.loop.plant, case.loop.sensor)
@@ -351,7 +351,7 @@ def test_every_deviation_changes_its_part_of_the_stage():
     def part(name, **deviations):
         return p753_stage.stage(**deviations).parts[names.index(name)]
 
-    # At rest all of it has crept: 1 % of a step in each of three decades.
+    # At rest the creep is complete: 1 % of a step in each of three decades.
     assert rest_output(part("creep"), 1.0) == pytest.approx(1.03, rel=1e-12)
     less = part("creep", creep=-0.5)
     assert rest_output(less, 1.0) == pytest.approx(1.015, rel=1e-12)
@@ -362,7 +362,7 @@ def test_every_deviation_changes_its_part_of_the_stage():
     np.testing.assert_allclose(2.0 * found, twice, rtol=0.0, atol=1e-12)
     ramp = pj.simulate(part("delay", delay=0.4), np.arange(4.0))[1]
     np.testing.assert_allclose(ramp[1:], np.arange(1.0, 4.0) - 0.4, atol=1e-12)
-    # 4 kHz at 20 kHz: nearly undamped, a fifth of a turn each sample.
+    # 4 kHz at 20 kHz: nearly undamped, a fifth of a period per sample.
     ringing = pj.simulate(part("mode", mode_damping=1e-9), np.ones(10))[1]
     turns = np.arange(1, 11) / 5.0
     np.testing.assert_allclose(ringing, 1.0 - np.cos(2.0 * np.pi * turns), atol=1e-6)
@@ -416,14 +416,14 @@ def test_drift_is_a_random_walk_of_the_stage(tmp_path):
     study = changed(disturbance={"drift_rms": 0.5}, holdout_draws=64)
     signals = make_data(read(written(tmp_path, study))).holdout
     walk = np.asarray(signals.disturbance)
-    # 0.5 um after a second: 0.5 sqrt(0.05) after this run.
+    # 0.5 um after a second, so 0.5 sqrt(0.05) after this run
     assert np.std(walk[..., -1]) == pytest.approx(0.5 * np.sqrt(0.05), rel=0.15)
     assert np.std(np.diff(walk, axis=-1)) == pytest.approx(
         0.5 * np.sqrt(5e-5), rel=0.02
     )
 
 
-# What is wrong
+# Errors
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Default limits: kept where they bind, free where they do not, off where written."""
+"""Default limits: kept if active, without effect if not, off on request."""
 
 import pytest
 import tomli_w

@@ -1,4 +1,4 @@
-"""Share of the error in the sliding variable: its means, its line, its study."""
+"""Share of the error in the sliding variable: means, printed line, and study."""
 
 from typing import Any
 

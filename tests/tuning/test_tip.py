@@ -1,4 +1,4 @@
-"""Error of the tip of a stage whose sensor may lag behind it."""
+"""Error of the tip of a stage whose sensor may lag the tip."""
 
 import dataclasses
 import re
@@ -37,7 +37,7 @@ def case():
 
 
 def fitted(case, residual):
-    """Return ``case`` as if its plant were fitted and left ``residual`` (um)."""
+    """Return ``case`` as if its plant were fitted with this ``residual`` (um)."""
     moved = 10.0 * np.sin(np.arange(800.0) / 20.0)
     record = Record(moved, moved + residual, DT)
     return dataclasses.replace(case, fit=fit_of(case.loop.plant, record, moved))
@@ -48,7 +48,7 @@ def test_the_input_of_a_lag_is_recovered_from_its_output():
     lag = FirstOrderLag(LAG, DT)
     output = np.asarray(simulate(lag, wanted)[1])
     found = before_lag(output, LAG, DT)
-    # The first output is that of the rest before the record.
+    # The first output is that at rest before the record.
     np.testing.assert_allclose(found, wanted[1:], rtol=0.0, atol=1e-10)
 
 
@@ -60,7 +60,7 @@ def test_all_lags_of_a_plant_are_found():
 
 
 def test_the_note_has_the_error_of_the_input_of_the_lag(case):
-    """The tip is what enters the lag: here the voltage, and the residual beside it."""
+    """The tip is the input of the lag: here the voltage plus the residual."""
     case = fitted(case, 0.02 * np.sin(np.arange(800.0)))
     data, start = make_data(case), 400
     note = tip_note(case, case.loop, data, start)

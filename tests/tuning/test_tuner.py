@@ -1,4 +1,4 @@
-"""Tuning a small study, and what becomes of it when things go wrong."""
+"""Tuning of a small study, also with diverging loops and interrupts."""
 
 import copy
 import json
@@ -17,7 +17,7 @@ from piezojax.study import Study, build
 from piezojax.tuning.make_result import worse_than_the_start
 from piezojax.tuning.result import Result, load_result
 
-# A PID on a lag is compiled in a few seconds; what is tested is the same for any loop.
+# A PID on a lag compiles in a few seconds, and the tests do not depend on the loop.
 LAG = {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5}
 WIDE = {"lower": -1e300, "upper": 1e300}
 PROPORTIONAL, INTEGRAL = "controller.proportional", "controller.integral"
@@ -61,7 +61,7 @@ def case_of(changes, seed=None):
 
 
 class Recorder:
-    """Progress that remembers; it may press Ctrl-C on the way."""
+    """Progress that records its calls and may raise KeyboardInterrupt."""
 
     def __init__(self, stop_after=None, stop_stage=None):
         self.stages, self.bests = [], []
@@ -85,7 +85,7 @@ def progress():
 
 @pytest.fixture(scope="module")
 def outcome(progress):
-    """The P-753 with its hysteresis, a reference kept unseen."""
+    """Return the outcome of the P-753 with hysteresis and an unseen reference."""
     changes = {
         "plant": {"catalog": "p753"},
         "references/unseen": ["TRI50"],
@@ -100,7 +100,7 @@ def plain():
 
 
 def run(loop, name="SIN50", seed=9):
-    """A run with noise of its own; 50 ms."""
+    """Return a run of 50 ms with its own noise."""
     time = signals.time_grid(0.05, 20_000.0)
     noise = jnp.asarray(np.random.default_rng(seed).standard_normal(time.size))
     reference = signals.signal(name, time)
@@ -116,10 +116,10 @@ def test_gains_with_a_larger_error_than_the_start_have_a_note(plain):
     was, found = 1e3 * after.geomean_rms_um, 1e3 * before.geomean_rms_um
     assert f"{found:.4g} nm against {was:.4g} nm" in note
     lost = before.model_copy(update={"geomean_rms_um": None})
-    assert worse_than_the_start(after, lost) == []  # an alarm says more
+    assert worse_than_the_start(after, lost) == []  # the alarm is more specific
 
 
-# A run that goes well
+# A successful run
 
 
 def test_tuning_reduces_the_error_on_held_out_noise(outcome):
@@ -167,7 +167,7 @@ def test_the_summary_figures_follow_from_the_references(outcome):
 
 
 def test_scores_equal_those_of_a_plain_simulation():
-    # No noise: nothing is drawn, so the error can be found again from outside.
+    # Without noise nothing is drawn, so a plain run has the same error.
     found = pj.tune(case_of({"sensor/noise_rms": 0.0, "optimiser/steps": 1}))
     for loop, part in (
         (found.before, found.result.before),
@@ -249,7 +249,7 @@ def test_history_contains_the_lowest_loss_of_each_start(outcome):
 
 
 def test_the_best_loss_agrees_with_the_scores(outcome):
-    # The history of an optimistix method is one step late, so never better.
+    # The history of an optimistix method lags one step, so it is never better.
     result = outcome.result
     gain = math.log(result.after.geomean_rms_um / result.before.geomean_rms_um)
     best = min(loss for row in result.history for loss in row)
@@ -303,7 +303,7 @@ def test_another_seed_draws_other_noise(plain):
             assert error == pytest.approx(old.per_reference_rms_um[name], rel=0.2)
 
 
-# Starts that diverge, and boxes in which everything does
+# Diverging starts, and boxes of diverging loops
 
 
 def test_a_diverging_start_is_replaced_with_a_note():
@@ -386,7 +386,7 @@ def test_saturation_is_reported():
     changes = {
         "plant": {"catalog": "p753"},
         "references/unseen": ["TRI50"],
-        # The references ask for 10 kV/s and more.
+        # The references require 10 kV/s and more.
         "actuator/slew_rate": 2e3,
     }
     result = pj.tune(case_of(changes)).result
@@ -406,7 +406,7 @@ def test_no_saturation_is_not_reported(plain):
 # Objectives and optimisers
 
 
-# Here effort and slew grow with the integral gain, all the way.
+# Here effort and slew grow monotonically with the integral gain.
 WEIGHTED = {
     "references/tune": ["SIN50"],
     "parameters": {INTEGRAL: {"lower": 1.0, "upper": 2e4, "scale": "log"}},
