@@ -1,24 +1,24 @@
-"""Is the hysteresis that made a record the one that is chosen, its parameters found?
+"""Test of the choice of a model on simulated records, and of its parameters.
 
     python tests/benchmarks/choice.py --json choice.json [--draws N] [--models NAME,...]
 
-Each hysteresis that can be fitted makes a record behind a lag, with white sensor noise
-and parameters inside what a laboratory sees; ``identify_all`` fits every model to it
-and chooses, as ``python -m piezojax.identify RECORD --model all`` does. All have one
-input: a major loop, loops nested in loops at several places, all at two paces; for two
-densities, blended by the pace, there are more fast ones. It lasts less than creep needs
-to show. A line for each model that made a record:
+A record is simulated with each hysteresis that can be fitted, followed by a lag, with
+white sensor noise and parameters of usual size. ``identify_all`` fits every model to it
+and chooses one, as ``python -m piezojax.identify RECORD --model all`` does. All records
+have one input: a major loop and nested loops at several places, at two rates. The
+record of two densities, interpolated by the rate, has more fast loops. The records are
+too short for creep. The table has a line for each simulated model:
 
-- the model that was chosen, its error on the validation part;
-- the largest distance of a parameter from the truth, in its standard errors (the state
-  before the record left out), and how many of the parameters the record determines;
+- the chosen model and its error on the validation part;
+- the largest error of a parameter in its standard errors (without the state before the
+  record), and the number of parameters that the record determines;
 - the error against the output without noise over the validation part, in noise rms.
 
-Recovered: all parameters are determined and within 4 standard errors, and the last is
-below a half. StopPrandtlIshlinskii is a way to write PrandtlIshlinskii, so that is what
-it is to be chosen as, with the parameters of ``as_plays``; the neurons of a learned
-operator may change places and signs. ``--tone`` makes records with one sine instead,
-900 samples at 10 Hz, which shows what such a record cannot tell.
+Recovered means that all parameters are determined and within 4 standard errors, and
+that the last figure is below a half. StopPrandtlIshlinskii is equivalent to
+PrandtlIshlinskii, so the latter is to be chosen, with the parameters of ``as_plays``.
+The neurons of a learned operator may be permuted and change signs. ``--tone`` simulates
+records with one sine instead, 900 samples at 10 Hz, which do not determine all models.
 """
 
 import argparse
@@ -42,7 +42,7 @@ from piezojax.identification import (
 
 
 def as_numbered(values, found):
-    """The truth of a learned operator with the neurons in the order of the fit.
+    """Return the true parameters of a learned operator in the order of the fit.
 
     Neurons may change places, and their signs: tanh is odd.
     """

@@ -1,4 +1,4 @@
-"""The reference engines of the throughput benchmark, and the first loop they run.
+"""The reference engines of the throughput benchmark, and its first loop.
 
 The loop "dob_pid_smc" is the disturbance-observer-based PID sliding-mode
 controller (thesis, chapter 5) on a hysteretic second-order plant, 20 kHz, float64.
@@ -25,14 +25,14 @@ unit DC gain; past f are unclipped, past u clipped; everything starts at zero, r
 
 The result of a lane is the RMS of y(k) - r(k), k = steps//2 ... steps-1, in um.
 
-An engine is used as `engine.prepare(gains, reference, noise)`, then `engine.run()`
-as often as wanted, with gains [B, 8], reference [B, steps+1], noise [B, steps];
-`run` returns rms [B]. Only `run` is timed: compiling, packing and copying belong
-into `prepare`. `engine(gains, reference, noise)` does both.
+An engine is used as `engine.prepare(gains, reference, noise)`, then `engine.run()` any
+number of times, with gains [B, 8], reference [B, steps+1], noise [B, steps]; `run`
+returns rms [B]. Only `run` is timed: `prepare` compiles, packs and copies.
+`engine(gains, reference, noise)` does both.
 
-`loop_three_dof.py` has another loop; `CEngine(loop)` and `NumpyEngine(loop)` run it.
-Its reference [B, steps+1, 3], noise [B, steps, 3] and rms [B, 3] have axes, its gains
-are [B, 9].
+`loop_three_dof.py` has another loop; `CEngine(loop)` and `NumpyEngine(loop)` run it,
+with the shapes reference [B, steps+1, 3], noise [B, steps, 3], rms [B, 3] and
+gains [B, 9].
 """
 
 import ctypes
@@ -62,11 +62,11 @@ GCC_FLAGS = "-O3 -march=native"
 
 
 class UnavailableError(RuntimeError):
-    """What this engine needs is not on this machine."""
+    """The engine needs software that is not on this machine."""
 
 
 def problem(lanes, steps, seed=0):
-    """Gains, reference and noise: every lane has its own.
+    """Return gains, reference and noise, different in every lane.
 
     Gains within 10 % of the nominal ones, 10 um sines of 1 to 50 Hz, 12 nm noise.
     """
@@ -83,9 +83,9 @@ def problem(lanes, steps, seed=0):
 
 @dataclass(frozen=True)
 class Loop:
-    """What the engines run."""
+    """A loop for the engines."""
 
-    name: str  # of the C function, too
+    name: str  # also of the C function
     source: str  # beside this file
     problem: Callable  # (lanes, steps, seed) -> gains, reference, noise
     simulate: Callable  # (gains, reference, noise) -> rms, lanes second, time first
@@ -96,10 +96,10 @@ class Loop:
 
 
 class Engine:
-    """What the engines share: being called."""
+    """Base of the engines: ``engine(...)`` prepares and runs."""
 
-    compile_s = None  # seconds of the last compilation, where there was one
-    slow = False  # timed over fewer steps, and scaled
+    compile_s = None  # seconds of the last compilation, if any
+    slow = False  # timed over fewer steps, then scaled
 
     def __call__(self, gains, reference, noise):
         self.prepare(gains, reference, noise)
@@ -107,11 +107,11 @@ class Engine:
 
 
 def simulate(gains, reference, noise):
-    """RMS error of one lane (gains [8], reference [T+1]) or, in NumPy, of many.
+    """Return the RMS error of one lane (gains [8], reference [T+1]) or, in NumPy, many.
 
-    Indexed by time first, so the same source runs a lane in numba (numbers) and
+    Time is the first index, so that the same source runs a lane in numba (numbers) and
     all lanes at once in NumPy (gains [8, B], reference [T+1, B], noise [T, B]).
-    What comes last from the measurement enters each sum last: a shorter chain.
+    The measurement enters each sum last, for a shorter chain of operations.
     """
     unit_dc = (1.0 - A1 - A2) / (B0 + B1 + B2)
     g0, g1, g2 = unit_dc * B0, unit_dc * B1, unit_dc * B2
@@ -183,7 +183,7 @@ DOB_PID_SMC = Loop("dob_pid_smc", "loop.c", problem, simulate, one_lane=True)
 
 
 class NumpyEngine(Engine):
-    """All lanes at once in NumPy, a Python loop over time."""
+    """Engine in NumPy: all lanes at once, a Python loop over time."""
 
     name = "numpy"
     slow = True

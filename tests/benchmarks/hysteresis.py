@@ -1,15 +1,15 @@
-"""Hysteresis models beside C: one run, and one gradient by all parameters.
+"""Speed of hysteresis models relative to C: a run, and a gradient by all parameters.
 
     python tests/benchmarks/hysteresis.py --json hysteresis.json
 
-Every lane has its own parameters and input, 64 of them over 20 000 samples, on one
-core; both engines are timed in turn. What is found is the mean square of the output of
-each lane. The gradient is exact here (in reverse, or in forward mode where that is
-faster: `mode` in the rows), in C that of one-sided differences, a run for each
-parameter and one more. A bar is the most that `ratio_to_c` may be.
+There are 64 lanes of 20 000 samples on one core, each with its own parameters and
+input; both engines are timed in turn. The result is the mean square of the output of
+each lane. The gradient is exact in piezojax (in reverse mode, or in forward mode if
+that is faster: `mode` in the rows). In C it is by one-sided differences, a run for each
+parameter and one more. A bar is the largest allowed `ratio_to_c`.
 
-A model takes part by its name in `--model help`, or OTHERS here, and a C function of
-that name in hysteresis.c; without one it is listed as having no yardstick.
+A model is measured if it is in `--model help`, or in OTHERS here, and if hysteresis.c
+has a C function of its name; without one it is listed as having no reference in C.
 """
 
 import argparse

@@ -1,12 +1,12 @@
-"""Fitting ten parameters to 20 000 samples from 16 starts: piezojax beside SciPy.
+"""Fit of ten parameters to 20 000 samples from 16 starts: piezojax and SciPy.
 
     python tests/benchmarks/identification.py --json identification.json
 
-One record of the P-753 with 12 nm rms sensor noise; the model is Coleman-Hodgdon
-hysteresis, second-order dynamics and an offset. piezojax fits it as a user would,
-everything from the first trace on counted; SciPy's least_squares (trf, differences)
-runs on a numba simulation of the same model, from the same 16 starts in the same box,
-one after the other, its compilation apart. Both fit the whole record.
+The record is that of a P-753 with 12 nm rms sensor noise; the model is Coleman-Hodgdon
+hysteresis, second-order dynamics and an offset. The time of piezojax includes tracing
+and compiling. SciPy's least_squares (trf, differences) uses a numba simulation of the
+same model, from the same 16 starts in the same box, one after another; its compile time
+is reported separately. Both fit the whole record.
 """
 
 import argparse

@@ -1,16 +1,16 @@
-"""Sliding mode control of the P-753 with the inverse of two hysteresis models.
+"""Sliding mode control of the P-753 with the inverses of two hysteresis models.
 
     python tests/benchmarks/inverses.py --json inverses.json
 
-On a stage with Coleman and Hodgdon's hysteresis and on one with Preisach's:
+On a stage with Coleman-Hodgdon hysteresis and on one with Preisach hysteresis it
+computes
 
-1. how well both models, fitted to the same record of the stage, follow that record and
-   another;
-2. what their inverses leave of the hysteresis: each drives the hysteresis alone along
-   the ten references, without dynamics or a loop; beside them a constant gain, K_e;
-3. how well the PID-based sliding mode controllers of chapter 5 follow the references,
-   with the printed gains: nominal, behind each inverse, and with a disturbance
-   observer.
+1. the errors of both models, fitted to the same record of the stage, on that record and
+   on another;
+2. the errors of their inverses: each drives the hysteresis alone along the ten
+   references, without dynamics or a loop, and so does a constant gain, K_e;
+3. the tracking errors of the PID-based sliding mode controllers of chapter 5 with the
+   printed gains: nominal, with each inverse, and with a disturbance observer.
 
 RMS errors in nm without noise, from rest at zero, over the second of two windows, as
 ``python -m piezojax.reproduce`` reads Tables 5-3 and 5-5.

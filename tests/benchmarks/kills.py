@@ -1,10 +1,10 @@
-"""Commands killed at random moments: nothing finished is lost, nothing is left over.
+"""Commands killed at random moments: finished results remain, temporary files do not.
 
     python tests/benchmarks/kills.py [--kills N] [--first N] [--seed N]
 
-Each kill starts tune, identify --model all or a sweep, sends SIGTERM or SIGKILL after a
-random time, and looks at what is left: no traceback, the right exit status, every fit
-and chunk that was finished, and after the next run no temporary files and no empty
+Each kill starts tune, identify --model all or a sweep, and sends SIGTERM or SIGKILL
+after a random time. There must be no traceback, the right exit status, and every
+finished fit and chunk; after the next run there must be no temporary files and no empty
 folders. Exits with 1 if a kill shows a fault.
 """
 

@@ -1,18 +1,18 @@
 """The loop "three_dof_pid_smc" of the throughput benchmark, for the engines.
 
-The output tracking PID sliding-mode controller of a stage with three axes (thesis,
-chapter 7, gains for dynamic tracking) with its alpha-beta filter, on the stage (7.53)
-of nine states, 500 Hz, float64. Every lane has its own P, I, D, one of each an axis.
-The equations stand in oracles/three_dof.py, whose controller is run here as the NumPy
-engine. With e = yh - yd, and the controller's state (7.27) X2 = [e; a; b]
+It has the output tracking PID sliding-mode controller of a stage with three axes
+(thesis, chapter 7, gains for dynamic tracking) with its alpha-beta filter, on the stage
+(7.53) of nine states, 500 Hz, float64. Every lane has its own P, I, D for each axis.
+The equations are those of oracles/three_dof.py, whose controller runs here as the NumPy
+engine. With e = yh - yd, and the state (7.27) of the controller, X2 = [e; a; b],
 
     a(k) = q(k) + A2 e(k)             q(k+1) = p(k) + A1 e(k) + B1 u2(k)
     b(k) = p(k) + A1 e(k) + A2 a(k)   p(k+1) = A0 e(k) + B0 u2(k)
 
-it keeps no past e and u2 but p and q, and S X2 and the equivalent control become sums
-of constant matrices times e, q and p: that is how loop_three_dof.c works.
+it stores p and q instead of past e and u2, and S X2 and the equivalent control are sums
+of constant matrices times e, q and p, as in loop_three_dof.c.
 
-The result of a lane is the RMS of y(k) - r(k), k = steps//2 ... steps-1, an axis.
+The result of a lane is the RMS of y(k) - r(k), k = steps//2 ... steps-1, for each axis.
 """
 
 import sys
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from engines import Loop
 
-# The oracles lie beside the benchmarks, of which neither is installed.
+# Neither the oracles nor the benchmarks are installed.
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from oracles import p558, three_dof
 
@@ -32,10 +32,10 @@ NOISE_RMS = 0.0008, 0.013, 0.013  # um, urad, urad
 
 
 def problem(lanes, steps, seed=0):
-    """Gains [B, 9], reference [B, steps+1, 3] and noise [B, steps, 3].
+    """Return gains [B, 9], reference [B, steps+1, 3] and noise [B, steps, 3].
 
     P and I within 10 % of the printed ones, D up to 1e-3; every axis follows a sine of
-    10 um or urad peak to peak, in one lane slower than in the next.
+    10 um or urad peak to peak, whose frequency rises from lane to lane.
     """
     rng = np.random.default_rng(seed)
     gains = NOMINAL_GAINS * rng.uniform(0.9, 1.1, (lanes, 9))
@@ -51,7 +51,7 @@ def problem(lanes, steps, seed=0):
 
 
 def simulate(gains, reference, noise):
-    """RMS [B, 3] of all lanes: gains [9, B], reference [T+1, B, 3], noise [T, B, 3]."""
+    """Return RMS [B, 3]: gains [9, B], reference [T+1, B, 3], noise [T, B, 3]."""
     rows = (np.stack(axes, axis=-1) for axes in np.split(gains, 3))
     drawn = dict(zip("PID", rows, strict=True))
     plant = three_dof.Plant((gains.shape[1],))
@@ -68,7 +68,7 @@ def simulate(gains, reference, noise):
 
 
 def design():
-    """The constants of loop_three_dof.c, in the order of its struct design."""
+    """Return the constants of loop_three_dof.c, in the order of its struct design."""
     controller = three_dof.PIDSMC(NOMINAL)
     Am, Bm, Cm = controller.Am, controller.Bm, controller.Cm
     trace, q0 = np.trace(Am), Cm @ Bm

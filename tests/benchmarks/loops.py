@@ -1,10 +1,10 @@
-"""The loop of every hysteresis model: one picture.
+"""Picture of the loop of every hysteresis model.
 
     python tests/benchmarks/loops.py --out loops.png
 
-Each, with the parameters of choice_records.py, is driven slowly from 0 to 100 V and
-back, then up with the same small loop four times on the way; those that depend on the
-rate once more, forty times as fast. Without a lag or noise.
+Each model, with the parameters of choice_records.py, is driven slowly from 0 to 100 V
+and back, then up with the same small loop four times; rate-dependent models are driven
+again forty times as fast. There is no lag or noise.
 """
 
 import argparse
@@ -44,7 +44,7 @@ def hysteresis(name):
 
 
 def followed(system, samples_a_volt):
-    """Input and output along the corners."""
+    """Return input and output along the corners."""
     path = choice_records.strokes(CORNERS, samples_a_volt)
     path = np.concatenate([[CORNERS[0]], path])
     run = jax.jit(lambda x: piezojax.simulate(system, x, system.init(x[0]))[1])
@@ -52,7 +52,7 @@ def followed(system, samples_a_volt):
 
 
 def picture():
-    """A panel a model."""
+    """Return the picture with a panel for each model."""
     names = [*choice_records.NAMES, *OTHERS]
     down = -(-len(names) // ACROSS)
     drawn = figure(2.3 * ACROSS, 2.2 * down)

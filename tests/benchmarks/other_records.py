@@ -1,15 +1,16 @@
-"""Is a model fitted to two records right on a third of another kind?
+"""Test of models fitted to two records on a third record of another kind.
 
     python tests/benchmarks/other_records.py [--stages 0:20] [--model NAME]
 
 Twenty of the forty stages of tests/oracles, which share no code with piezojax, are
-recorded three times: sines of 20, 40 or 100 Hz behind a step, steps with holds, or a
-random walk; each record begins at another voltage after another path, and the sensor's
-zero is another. A model is fitted to two of the records and judged on the third by
-``pj.validate``. A line for each stage: the error on the third record in nm and % of its
-span, the noise of the sensor, the error of the fit, and whether the bar holds.
+recorded three times: sines of 20, 40 or 100 Hz after a step, steps with holds, or a
+random walk. Each record has another initial voltage, another path before and another
+zero of the sensor. A model is fitted to two of the records and validated on the third
+by ``pj.validate``. The table has a line for each stage: the error on the third record
+in nm and % of its span, the noise of the sensor, the error of the fit, and whether the
+bar is met.
 
-The bar: at most 1.5 times the noise or 0.3 % of the span on 18 of 20.
+The bar is an error of at most 1.5 times the noise or 0.3 % of the span on 18 of 20.
 """
 
 import argparse

@@ -1,13 +1,13 @@
-"""Speed of the Preisach models beside C.
+"""Speed of the Preisach models relative to C.
 
     python tests/benchmarks/preisach.py --json preisach.json
 
-The plain model and the rate-dependent one, each by itself, float64, one core: 64 lanes,
-each with its own input, over 2000 steps; the mean square of the output, and its
-gradient by all weights (and the rate) in reverse mode. C (preisach.c) is the faster of
-two ways to write it, and its gradient in closed form: the output is linear in the
-weights. Runs take turns, so that a busy machine disturbs all alike; medians. ratio_to_c
-is over C for the same figures.
+The plain and the rate-dependent model run alone in float64 on one core: 64 lanes, each
+with its own input, over 2000 steps. The result is the mean square of the output, and
+its gradient by all weights (and the rate) in reverse mode. C (preisach.c) is the faster
+of two programs; its gradient is in closed form, because the output is linear in the
+weights. Runs alternate, so that other load affects all equally; times are medians.
+ratio_to_c is the time divided by that of C for the same result.
 """
 
 import argparse

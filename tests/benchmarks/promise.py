@@ -1,23 +1,24 @@
-"""Do promised errors hold on stages that piezojax has never seen?
+"""Test of promised errors on stages that share no code with piezojax.
 
     python tests/benchmarks/promise.py [--stages 0:40] [--poor] [--json FILE]
 
-Each of the forty stages of tests/oracles, which share no code with piezojax, goes the
-way of the README: a record as CSV, a study that names it, ``pj.tune``. The tuned
-controller then runs on the stage itself, sample by sample, with new noise. A line for
-each stage:
+Each of the forty stages of tests/oracles follows the procedure of the README: a record
+as CSV, a study that names it, ``pj.tune``. The tuned controller then runs on the stage,
+sample by sample, with new noise. The table has a line for each stage:
 
-- promised and obtained error, nm rms: geometric means over the references of the
-  study, the unseen ones included; promised by the hold-out, obtained on the sensed
-  displacement without noise. ``tip`` is that of the tip, ahead of the sensor's lag;
-- their ratio, and the largest ratio of one reference;
+- promised and obtained error, nm rms: geometric means over the references of the study,
+  including the unseen ones. The promised error is that of the hold-out, the obtained
+  one that of the sensed displacement without noise, and ``tip`` that of the tip, before
+  the lag of the sensor;
+- their ratio, and the largest ratio for one reference;
 - Ms as printed, and whether a run stays at a voltage limit or is lost.
 
-Alarms and notes stand above the table, with each stage when it ends.
+Alarms and notes of each stage are printed above the table.
 
-The bar: no loop lost without an alarm before; without one obtained within 1.3 of
-promised on 36 of 40 and never above 2; at most 2 false alarms. ``--poor`` takes records
-and models that are too poor (promise_cases.py); each must be warned of or refused.
+The bar: no lost loop without an alarm; without an alarm the obtained error is at most
+1.3 times the promised one on 36 of 40 stages and never above 2 times; at most 2 false
+alarms. ``--poor`` takes records and models that are too poor (promise_cases.py); each
+must have a warning or be refused.
 """
 
 import argparse

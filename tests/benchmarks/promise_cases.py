@@ -1,6 +1,6 @@
 """Records and models that are too poor for a promise, or of another stage.
 
-Each case makes a Setup of promise.py by ``make(stage, kind=...)`` and spoils it.
+Each case makes a Setup of promise.py by ``make(stage, kind=...)`` and degrades it.
 """
 
 import numpy as np

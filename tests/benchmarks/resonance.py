@@ -1,4 +1,4 @@
-"""Resonances found in 60 simulated records: frequency and damping beside the truth.
+"""Resonances in 60 simulated records: estimated and true frequency and damping.
 
     python tests/benchmarks/resonance.py [--all] [--start] [--records 0:60] [--json F]
 

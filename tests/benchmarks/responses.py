@@ -1,12 +1,12 @@
-"""Are the modes of noisy frequency responses found?
+"""Test of the modes that are found in noisy frequency responses.
 
     python tests/benchmarks/responses.py [--stages 0:60] [--seed 1000]
 
-Each stage of tests/oracles/modal_responses.py has 1 to 4 modes with 0.5 to 10 %
-damping and a delay; its response has 800 lines from 10 Hz to 5 kHz. A line for each
-stage whose modes are not all found within 0.2 % in frequency and 10 % in damping; then
-how many are, and how often a frequency or a damping lies within two standard errors.
-The bar is 57 of 60, and 95 % of the intervals.
+Each stage of tests/oracles/modal_responses.py has 1 to 4 modes with 0.5 to 10 % damping
+and a delay; its response has 800 lines from 10 Hz to 5 kHz. The command prints a line
+for each stage with a mode that is not found within 0.2 % in frequency and 10 % in
+damping, then the number of stages with all modes found, and the share of frequencies
+and dampings within two standard errors. The bar is 57 of 60, and 95 % of the intervals.
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""How long a user waits before anything happens, against importing JAX alone.
+"""Start-up time of imports and commands, relative to an import of JAX alone.
 
     python tests/benchmarks/startup.py [--runs N] [--json FILE]
 
-Fresh interpreters, taking turns: the yardstick ``import jax, equinox, optimistix``,
-``import piezojax``, the same with its verbs used, and ``--help`` of every command. A
-line for each: median seconds, and the median of the ratios to the yardstick of the same
-turn. Exits with 1 where a ratio is above its bar.
+New interpreters run in turn: the reference ``import jax, equinox, optimistix``,
+``import piezojax``, the same with its functions used, and ``--help`` of every command.
+The table has a line for each: median seconds, and the median ratio to the reference of
+the same turn. Exits with 1 if a ratio is above its bar.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""Throughput, memory and cost of a sweep, beside what one core predicts.
+"""Throughput, memory and cost of a sweep, against a prediction from one core.
 
     python tests/benchmarks/sweep.py --json sweep.json [--samples 10000] [--kills 20]
 
 The sweep is 10 000 gain sets of the DOB-based PID-SMC on the P-753 x the ten references
-of the thesis x 1 s at 20 kHz: 2e9 samples. It runs in a process of its own, as the
-command does. Figures of the JSON file:
+of the thesis x 1 s at 20 kHz: 2e9 samples. It runs in a separate process, like the
+command. Figures of the JSON file:
 
     lane_steps             simulated samples
     block_s                median time of blocks of 64 lanes of tests/benchmarks/
@@ -12,17 +12,17 @@ command does. Figures of the JSON file:
                            after the sweep, half of them each
     predicted_s            lane_steps at that speed, divided by the cores
     simulating_s, ratio    time from the first chunk to the last, over predicted_s
-    cpu_ratio              processor time of a sample, over that of such a block: on a
-                           machine with other work the fairer of the two (Linux)
+    cpu_ratio              processor time of a sample over that of such a block, which
+                           depends less on other load (Linux)
     wall_s, wall_ratio     the whole command, Python's start and compiling included
     lane_steps_per_s       lane_steps / simulating_s, all cores together
-    rss_mb                 resident memory over time, [s since the first chunk was
-                           there, MB (10^6)], while chunks are simulated; rss_growth is
+    rss_mb                 resident memory over time, [s since the first chunk,
+                           MB (10^6)], while chunks are simulated; rss_growth is
                            the largest in its last half over the largest in its first
     rss_peak_mb            largest of the whole command, pictures included
     cost                   core-hours of 10^9 simulations at the measured chunk times
     kills                  with --kills N: a smaller sweep killed N times at random
-                           moments, and whether it then equals the unbroken one
+                           moments, and whether it then equals the uninterrupted one
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The engines of the benchmark compute the same thing."""
+"""The engines of the benchmark give the same results."""
 
 import importlib
 import sys

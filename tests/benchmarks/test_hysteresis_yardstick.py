@@ -1,4 +1,4 @@
-"""The hysteresis models that hysteresis.c has compute the same there and in piezojax.
+"""The hysteresis models of hysteresis.c give the same results in C and in piezojax.
 
 A model without a function in C is not a failure.
 """
@@ -44,7 +44,7 @@ def test_each_model_equals_c(name):
     np.testing.assert_allclose(run, c, rtol=1e-9)
 
 
-# One macro of C makes all gradients of the functions that the test before compares.
+# One C macro makes all gradients of the functions in the previous test.
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["coleman_hodgdon", "bashash_jalili", "duhem"])
 def test_gradients_equal_c(name):
@@ -52,7 +52,7 @@ def test_gradients_equal_c(name):
     differences = c_engine(problem, "gradient").run()
     mode = hysteresis.modes("gradient", len(problem.sizes))[0]
     gradient = hysteresis.PiezojaxEngine(problem, mode).run()
-    # By the usual change of a parameter: one-sided differences are that good.
+    # relative to the usual change of a parameter, for one-sided differences
     scale = np.max(np.abs(gradient * problem.sizes), axis=1, keepdims=True)
     np.testing.assert_allclose(
         gradient * problem.sizes / scale, differences * problem.sizes / scale, atol=1e-4

@@ -1,19 +1,19 @@
-"""Throughput of piezojax beside C, numba and NumPy on closed loops.
+"""Throughput of piezojax, C, numba and NumPy on closed loops.
 
     python tests/benchmarks/throughput.py --json throughput.json
 
-Each engine runs on one core, in turn with the others (A, B, A, B, ...), so that a
-busy machine disturbs all alike. Rows of the JSON file:
+Each engine runs on one core, in turn with the others (A, B, A, B, ...), so that other
+load affects all equally. Rows of the JSON file:
 
-    seconds_median    median time of --steps steps of all lanes. Engines too slow for
-                      that are timed over fewer steps, given as `steps`, and scaled.
+    seconds_median    median time of --steps steps of all lanes. Slow engines are timed
+                      over fewer steps, given as `steps`, and the time is scaled.
     lane_steps_per_s  lanes * --steps / seconds_median
     ratio_to_c        seconds_median over that of one forward run in C of the same
                       lanes, for gradients too; null where gcc is missing
     extra_memory_mb   growth of resident memory during a run (10^6 bytes), inputs and
                       compiled code not counted; null where the system is not Linux
 
-Compile times stand apart, in `compile_s`, and are in no row. C is always timed.
+Compile times are separate, in `compile_s`. C is always timed.
 Every lane has its own reference and noise: 4096 lanes need about 6 GB of memory.
 """
 
@@ -114,7 +114,7 @@ def make_engine(name, what, loop):
 
 
 def part(data, what, steps):
-    """What an engine is given: the first steps, and for gradients shared gains."""
+    """Return the inputs of an engine: first steps, and shared gains for gradients."""
     gains, reference, noise = data
     gains = gains[0] if what == "gradient" else gains
     return gains, reference[:, : steps + 1], noise[:, :steps]
@@ -175,11 +175,11 @@ def memory_bytes(field):
 
 
 def extra_memory_mb(loop_name, what, name, lanes, steps):
-    """Peak growth of resident memory in one run; for a fresh process.
+    """Return the peak growth of resident memory in one run of a new process.
 
-    Not ru_maxrss: a child inherits its parent's high-water mark, and compiling
-    raises it above what the run needs. The kernel's mark is reset instead, after a
-    warm-up run and after freed memory, which a run would reuse unseen, is returned.
+    ru_maxrss does not serve: a child inherits the peak of its parent, and compiling
+    raises it above that of the run. Instead the peak of the kernel is reset after a
+    warm-up run, when freed memory, which a run would reuse, has been returned.
     """
     loop = LOOPS[loop_name]
     engine = make_engine(name, what, loop)

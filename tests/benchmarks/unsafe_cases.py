@@ -1,6 +1,6 @@
-"""Random studies that invite unsafe gains, and their loops in NumPy.
+"""Random studies that favour unsafe gains, and their loops in NumPy.
 
-A stage is plays, a resonance and a delay, on one axis or three that push each other;
+A stage has plays, a resonance and a delay, on one axis or three coupled axes;
 its controllers are PIDs or sliding modes. ``draw(number)`` returns a Case with the
 study's tables. ``Loop`` steps the same equations sample by sample, sharing no code with
 piezojax: with the limits and the plays, or linear about a slope of the plays.

@@ -1,11 +1,11 @@
-"""Do unsafe gains leave the command without an alarm?
+"""Search for unsafe gains that leave the command without an alarm.
 
     python tests/benchmarks/unsafe_gains.py [--studies 0:200] [--json FILE]
 
-Each random study of unsafe_cases.py (light resonances, tight, wide and hopeless bounds
-and limits, one axis and three) is tuned in a few steps by the command. Where it ends
-with exit status 0, the gains in its folder are put into a loop in NumPy that shares no
-code with piezojax, and this must hold:
+Each random study of unsafe_cases.py (lightly damped resonances; tight, wide and
+infeasible bounds and limits; one axis and three) is tuned in a few steps by the
+command. If it ends with exit status 0, the gains in its folder run in a NumPy loop that
+shares no code with piezojax, with these requirements:
 
 - every eigenvalue inside the unit circle, on the branches of the plays at the highest
   point of the references;
