@@ -64,7 +64,7 @@ def as_numbered(values, found):
 
 
 def judged(fit, values, clean):
-    """How far a fit is from the truth."""
+    """Return the errors of a fit relative to the true parameters."""
     found = fit.report.parameters
     if "hysteresis.mixing.0.0" in found:
         values = as_numbered(values, found)
@@ -87,7 +87,7 @@ def judged(fit, values, clean):
 
 
 def recovered(one):
-    """Whether the parameters and the output are those of the truth."""
+    """Return whether the parameters and the output are recovered."""
     return (
         not one["undetermined"]
         and one["worst_in_standard_errors"] < 4.0
@@ -96,7 +96,7 @@ def recovered(one):
 
 
 class Lines:
-    """Progress on standard error: a line a fit."""
+    """Progress on standard error: one line per fit."""
 
     def __init__(self, name):
         self._name, self._last, self._began = name, "", time.perf_counter()
@@ -114,7 +114,7 @@ class Lines:
 
 
 def study(name, drive, seed=1, among=None):
-    """One record, all models, and what was chosen."""
+    """Return the choice among all models for one record."""
     record, clean = choice_records.made(name, drive, seed)
     model, values = choice_records.expected(name, drive)
     began = time.perf_counter()
@@ -144,7 +144,7 @@ def study(name, drive, seed=1, among=None):
 
 
 def table(rows):
-    """What was found, a line a truth: the worst of all draws of the noise."""
+    """Return the table: a line per simulated model, the worst of all noise draws."""
     shown = Table(title=f"records with {1e3 * NOISE:g} nm of noise")
     for column in ("made by", "chosen", "furthest parameter, s.e."):
         shown.add_column(column)
@@ -180,7 +180,7 @@ def table(rows):
 
 
 def main():
-    """Make the records, fit them, print the table."""
+    """Simulate the records, fit them and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--models", help="only records of these, by commas")
@@ -201,7 +201,7 @@ def main():
         if options.tone:
             drive = choice_records.TONE
         rows.append(study(name, drive, seed, among))
-        if options.json:  # as far as it got
+        if options.json:  # the results so far
             options.json.write_text(
                 json.dumps({"rows": rows}, indent=2) + "\n", encoding="utf-8"
             )

@@ -1,4 +1,4 @@
-"""Records that each hysteresis makes, with its parameters: what choice.py fits."""
+"""Simulated records of each hysteresis, with its parameters, for choice.py."""
 
 import itertools
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from piezojax.identification.chain import structure
 NOISE = 0.01  # um
 LAG = 1.1e-3  # s
 OFFSET = -2.0  # um
-SLOW, FAST = 0.7, 0.15  # samples a volt
+SLOW, FAST = 0.7, 0.15  # samples per volt
 SHORTEST = 5  # samples of a stroke
 
 FIRST = (
@@ -35,25 +35,25 @@ FIRST = (
 
 
 def walk(height, step=10):
-    """Up to 100 V and back to 0 in loops of ``height``, a step further each time."""
+    """Return corners up to 100 V and back to 0 in loops of ``height``, step by step."""
     ways = range(0, 100 - height, step)
     up = [corner for k in ways for corner in (k + height, k + step)]
     return (*up, 100, *(100 - corner for corner in up), 0)
 
 
 AGAIN = (0, 100, 20, 80, 35, 65, 45, 90, 10, 50, 0, 75, 40, 95, 60, 85, 5, 100, 0)
-"""Turning points of the training part, V: slow ones, then fast ones."""
+"""Turning points (V) of the training part: slow ones, then fast ones."""
 
 MORE = (*walk(30), *walk(50), *np.random.default_rng(0).integers(0, 101, 40), 0)
-"""Fast ones after these, for what has a memory of its own at that pace."""
+"""Further fast turning points, for models with a separate memory at that rate."""
 
 LAST = (0, 97, 15, 62, 28, 89, 51, 73, 3, 41, 9, 100, 37, 81, 22, 0)
 LAST_AGAIN = (0, 93, 33, 68, 12, 87, 47, 99, 58, 77, 0, 52, 16)
-"""Those of the validation part."""
+"""Turning points of the validation part."""
 
 
 def strokes(corners, samples_a_volt):
-    """The way from corner to corner, at rest in each; without the first sample."""
+    """Return the input between corners, at rest in each, without the first sample."""
     pieces = []
     for start, stop in itertools.pairwise(corners):
         samples = max(SHORTEST, round(samples_a_volt * abs(stop - start)))
@@ -63,7 +63,7 @@ def strokes(corners, samples_a_volt):
 
 
 class Drive(NamedTuple):
-    """An input from rest at 0 V, its sample time, how many samples are to be fitted."""
+    """An input from rest at 0 V, its sample time, and the number of samples to fit."""
 
     input: np.ndarray
     dt: float
@@ -71,14 +71,14 @@ class Drive(NamedTuple):
 
     @property
     def seen(self):
-        """What the fit sees, as a record of a stage without hysteresis."""
+        """Return the fitted part as a record of a stage without hysteresis."""
         return Record(
             self.input[: self.trained], 0.12 * self.input[: self.trained], self.dt
         )
 
 
 def loops(again):
-    """The corners of FIRST and LAST slowly, ``again`` and LAST_AGAIN fast."""
+    """Return a Drive: FIRST and LAST slowly, ``again`` and LAST_AGAIN fast."""
     seen = np.concatenate([[0.0], strokes(FIRST, SLOW), strokes(again, FAST)])
     judged = [strokes(LAST, SLOW), strokes(LAST_AGAIN, FAST)]
     return Drive(np.concatenate([seen, *judged]), 4e-4, seen.size)
@@ -96,7 +96,7 @@ PLAYS = {
 
 
 def learned():
-    """Weights of a learned operator: drawn, but not as the fit's starts are."""
+    """Return random weights of a learned operator, drawn unlike the starts of a fit."""
     draw = np.random.default_rng(2026).uniform
     signs = np.array([[1, -1], [-1, 1]])
     return {
@@ -156,14 +156,14 @@ TRUTHS = {
     },
     "learned_operator": learned(),
 }
-"""Parameters of each hysteresis by their paths in it; V, um, s."""
+"""Parameters of each hysteresis by path; V, um, s."""
 
 CELLS = 10
 HALF_WAY = 7e3  # V/s
 
 
 def density(alpha=6.2, beta=3.4, along=0.03):
-    """Weights of a Preisach model on which its lines differ from place to place."""
+    """Return weights of a Preisach model that vary over the triangle."""
     i, j = np.mgrid[0:CELLS, 0:CELLS]
     hump = 0.25 * np.exp(-((i - alpha) ** 2 + (j - beta) ** 2) / 8.0)
     weights = 0.03 + hump + np.where(i == j, 0.45 + along * j, 0.0)
@@ -171,28 +171,28 @@ def density(alpha=6.2, beta=3.4, along=0.03):
 
 
 def preisach(drive):
-    """One density."""
+    """Return a model with one density."""
     del drive
     return Preisach(density(), 0.0, 100.0, OFFSET, REST)
 
 
 def rate_dependent_preisach(drive):
-    """Two of them, the fast one with its hump elsewhere."""
+    """Return a model with two densities; the fast one has its maximum elsewhere."""
     fast = density(alpha=4.1, beta=2.2, along=0.01)
     return RateDependentPreisach(preisach(drive), fast, HALF_WAY, drive.dt)
 
 
 DRIVES = {"rate_dependent_preisach": loops((*AGAIN, *MORE))}
-"""Inputs of those for which LOOPS does not do."""
+"""Inputs of models for which LOOPS does not suffice."""
 
 WHOLE = {"preisach": preisach, "rate_dependent_preisach": rate_dependent_preisach}
-"""Models that are not part of a chain."""
+"""Models that are not parts of a chain."""
 
 NAMES = (*TRUTHS, *WHOLE)
 
 
 def truth(name, drive=LOOPS):
-    """The plant that makes the record, and its parameters by their names in a fit."""
+    """Return the plant of the record, and its parameters by their names in a fit."""
     if name in WHOLE:
         hysteresis = WHOLE[name](drive)
         plant = series(hysteresis=hysteresis, lag=FirstOrderLag(LAG, drive.dt))
@@ -219,7 +219,7 @@ def truth(name, drive=LOOPS):
 
 
 def expected(name, drive=LOOPS):
-    """What is to be chosen for a record of ``name``, and its parameters."""
+    """Return the model to be chosen for a record of ``name``, and its parameters."""
     plant, values = truth(name, drive)
     if name == "stop_prandtl_ishlinskii":
         plays = parameters(plant.parts[0].as_plays(), "hysteresis.")
@@ -229,7 +229,7 @@ def expected(name, drive=LOOPS):
 
 
 def made(name, drive=LOOPS, seed=1):
-    """The record, and the output without noise."""
+    """Return the record, and the output without noise."""
     plant, _ = truth(name, drive)
     clean = np.asarray(free_run(plant, jnp.asarray(drive.input), REST))
     noise = NOISE * np.random.default_rng(seed).standard_normal(clean.size)

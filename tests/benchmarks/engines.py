@@ -89,9 +89,9 @@ class Loop:
     source: str  # beside this file
     problem: Callable  # (lanes, steps, seed) -> gains, reference, noise
     simulate: Callable  # (gains, reference, noise) -> rms, lanes second, time first
-    one_lane: bool  # simulate takes one lane as well, and numba can compile it
-    axes: tuple[int, ...] = ()  # of signals and result
-    design: Callable | None = None  # () -> what else the C function is given
+    one_lane: bool  # simulate also takes one lane, and numba can compile it
+    axes: tuple[int, ...] = ()  # number of axes of signals and result
+    design: Callable | None = None  # () -> further arguments of the C function
     few_lanes: tuple[str, ...] = ()  # gcc flags for 4 lanes or fewer
 
 
@@ -130,7 +130,7 @@ def simulate(gains, reference, noise):
     inv_t, inv_b0, inv_ke = 1.0 / T, 1.0 / B0, 1.0 / KE
     r_b1, r_b2 = B1 / B0, B2 / B0
 
-    # Zeros shaped like a lane or a row of lanes: numba wants one type throughout.
+    # Zeros with the shape of a lane or a row of lanes: numba needs one type.
     zero = 0.0 * slope
     y = y1 = h = h1 = yh = vh = s_sum = s1 = f1 = f2 = zero
     z1 = z2 = qy1 = qy2 = qu1 = qu2 = u1 = u2 = u3 = total = zero
@@ -201,7 +201,7 @@ class NumpyEngine(Engine):
 
 @functools.cache
 def _numba_lanes():
-    """The lane-by-lane loop compiled by numba, and the seconds that took."""
+    """Return the loop over lanes compiled by numba, and the seconds of compiling."""
     try:
         import numba
     except ImportError as error:
@@ -221,7 +221,7 @@ def _numba_lanes():
 
 
 class NumbaEngine(Engine):
-    """Lane after lane in serial numba, without fastmath; of the first loop only."""
+    """Engine in serial numba, lane by lane, without fastmath; first loop only."""
 
     name = "numba"
     slow = True
@@ -243,10 +243,10 @@ class NumbaEngine(Engine):
 
 @functools.cache
 def c_library(name, *flags):
-    """A C source beside this file as a library, and the seconds to compile it."""
+    """Return a C source beside this file as a library, and the seconds of compiling."""
     gcc = shutil.which("gcc")
     if gcc is None:
-        raise UnavailableError("gcc is not on the PATH: no C yardstick")
+        raise UnavailableError("gcc is not on the PATH: no C reference")
     source = Path(__file__).with_name(name)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         target = Path(folder, "loop.so")
@@ -264,19 +264,19 @@ def c_library(name, *flags):
 
 
 def c_flags():
-    """The gcc flags in use."""
+    """Return the gcc flags."""
     return GCC_FLAGS
 
 
 def aligned(*shape):
-    """An empty array that starts on a cache line."""
+    """Return an empty array that starts on a cache line."""
     memory = np.empty(int(np.prod(shape)) + 8)
     skip = -memory.ctypes.data % 64 // 8
     return memory[skip : skip + memory.size - 8].reshape(shape)
 
 
 def blocks(rows, width):
-    """[lanes, ...] as [block, ..., width]; the last lane fills up the last block."""
+    """Return [lanes, ...] as [block, ..., width], padded with the last lane."""
     count = -(-len(rows) // width)
     found = aligned(count, *rows.shape[1:], width)
     for index, block in enumerate(found):
@@ -286,7 +286,7 @@ def blocks(rows, width):
 
 
 class CEngine(Engine):
-    """The loop in C, compiled by gcc for this machine: SIMD over blocks of lanes."""
+    """Engine in C, compiled by gcc for this machine: SIMD over blocks of lanes."""
 
     name = "c"
 

@@ -20,7 +20,7 @@ import statistics
 import time
 from pathlib import Path
 
-import throughput  # first: it keeps libraries from starting threads  # isort: skip
+import throughput  # first: it prevents threads of libraries  # isort: skip
 import engines
 import equinox as eqx
 import jax
@@ -36,7 +36,7 @@ from piezojax.core.registry import parts
 
 BAR = 2.0
 BARS = {"preisach": 5.0}
-"""What a model's ratio to C may be, where it is not BAR."""
+"""Largest ratio to C of models with another bar than BAR."""
 
 EXTENT = Extent(
     low=0.0,
@@ -54,10 +54,10 @@ DIFFERENCE = 1e-6
 """Step of the differences in C, as a share of a parameter's usual size."""
 
 FEW = 12
-"""Up to so many parameters forward mode may be the faster one: both are timed."""
+"""Largest number of parameters for which both modes are timed."""
 
 OTHERS = {
-    # A force over a displacement: the numbers are those of volts and um all the same.
+    # A force over a displacement, with the numbers of volts and um.
     "bouc_wen": lambda: piezojax.hysteresis.BoucWen(
         alpha=0.12, beta_gamma=0.012, beta_delta=-0.008, nu=1.3
     ),
@@ -79,21 +79,21 @@ OTHERS = {
         falling_tau=0.03,
     ),
 }
-"""Models timed with other numbers than those a fit starts from, if one does: no term is
+"""Models timed with other numbers than the first guess of a fit: no term is
 zero."""
 
 MODELS = [name for name, kind in parts().items() if kind.part.place == "hysteresis"]
 MODELS += [name for name in OTHERS if name not in MODELS]
 
 
-def has_yardstick(name):
+def has_c_reference(name):
     """Return whether hysteresis.c has the model, with or without a compiler here."""
     source = Path(__file__).with_name("hysteresis.c").read_text(encoding="utf-8")
     return f"MODEL({name}," in source
 
 
 class MeanSquare(piezojax.Metric):
-    """Mean of the squares of the output."""
+    """Metric: mean square of the output."""
 
     samples: int = eqx.field(static=True)
 
@@ -108,9 +108,9 @@ class MeanSquare(piezojax.Metric):
 
 
 class Problem:
-    """A model, parameters [lanes, n] of its usual sizes [n], inputs [lanes, steps].
+    """A model, parameters [lanes, n] of usual size [n], inputs [lanes, steps].
 
-    A size of 0 stands for a number that is no parameter: it has no gradient.
+    A number with size 0 is not a parameter and has no gradient.
     """
 
     def __init__(self, name, lanes, steps, seed=0):
@@ -134,7 +134,7 @@ class Problem:
         self.inputs = 50.0 * (1.0 - fade * np.cos(2 * np.pi * hertz * time_s))
 
     def lane(self, values, input, segment):
-        """Mean square of the output of one lane."""
+        """Return the mean square of the output of one lane."""
         ends = np.cumsum([math.prod(shape) for shape in self.shapes.values()])
         pieces = jnp.split(values, ends[:-1])
         system = replace(
@@ -154,7 +154,7 @@ class Problem:
 
 
 def _size(bounds, leaf):
-    """Usual size of each number in a leaf; by its bounds, where it starts at 0."""
+    """Return the usual size of each number in a leaf; if it is 0, from its bounds."""
     if leaf.ndim:
         return np.abs(leaf).ravel()
     reach = 1.0 if bounds is None else bounds.upper - bounds.lower
@@ -162,14 +162,14 @@ def _size(bounds, leaf):
 
 
 def modes(what, count):
-    """How piezojax may find it, quickest first."""
+    """Return the modes of piezojax for a task, the usually fastest first."""
     if what == "forward":
         return ["run"]
     return ["forward", "reverse"] if count <= FEW else ["reverse"]
 
 
 class PiezojaxEngine:
-    """All lanes in one program."""
+    """Engine in piezojax: all lanes in one program."""
 
     name = "piezojax"
 
@@ -178,7 +178,7 @@ class PiezojaxEngine:
         segment = steps if mode != "reverse" else piezojax.core.rollout.SEGMENT
         lane = lambda values, input: problem.lane(values, input, segment)  # noqa: E731
         function = {"run": lane, "forward": jax.jacfwd(lane), "reverse": jax.grad(lane)}
-        # A plain loop reads inputs that lie time first, segments whole lanes.
+        # A plain loop reads inputs with time first, segments read whole lanes.
         axis = 1 if segment == steps else 0
         inputs = problem.inputs.T if axis else problem.inputs
         self._arguments = jnp.array(problem.parameters), jnp.array(inputs)
@@ -192,7 +192,7 @@ class PiezojaxEngine:
 
 
 def _library():
-    """The C functions, with vectors as wide as XLA's where gcc knows of them."""
+    """Return the C functions, with the vector width of XLA if gcc supports it."""
     try:
         return engines.c_library("hysteresis.c", "-mprefer-vector-width=512")
     except engines.UnavailableError:
@@ -200,7 +200,7 @@ def _library():
 
 
 class CEngine:
-    """The model's functions in hysteresis.c; UnavailableError without gcc or them."""
+    """Engine in C, hysteresis.c; UnavailableError without gcc or the functions."""
 
     name = "c"
 
@@ -235,7 +235,7 @@ class CEngine:
 
 
 def measure(problem, what, repeats):
-    """Rows of C and piezojax, timed in turn."""
+    """Return the rows of C and piezojax, timed in turn."""
     found = [("run" if what == "forward" else "differences", CEngine(problem, what))]
     found += [
         (mode, PiezojaxEngine(problem, mode))
@@ -269,7 +269,7 @@ def measure(problem, what, repeats):
 
 
 def within(rows):
-    """Whether the best mode of each model and task keeps its bar."""
+    """Return whether the best mode of each model and task meets its bar."""
     best = {}
     for row in rows:
         if row["engine"] == "piezojax":
@@ -322,8 +322,8 @@ def main(arguments=None):
     throughput.pin_to_one_core()
     console, rows = Console(), []
     for name in options.models:
-        if not has_yardstick(name):
-            console.print(f"{name}: no yardstick")
+        if not has_c_reference(name):
+            console.print(f"{name}: no reference in C")
             continue
         problem = Problem(name, options.lanes, options.steps)
         for what in ("forward", "gradient"):

@@ -34,7 +34,7 @@ MODEL = "coleman_hodgdon+arma"
 
 
 def p753_record(samples=SAMPLES, noise=p753.NOISE_RMS, seed=1):
-    """A swept triangle-like drive with tones up to 3 kHz, and the noisy output."""
+    """Return a swept triangular input with tones up to 3 kHz, and the noisy output."""
     time_s = np.arange(samples) * p753.DT
     fade = np.linspace(1.0, 0.3, samples)
     voltage = 45.0 + 25.0 * fade * np.sin(2 * np.pi * 7.0 * time_s)
@@ -47,7 +47,7 @@ def p753_record(samples=SAMPLES, noise=p753.NOISE_RMS, seed=1):
 
 @numba.njit(cache=False)
 def simulated(x, a, b, c, rest_input, rest_output, a1, a2, b0, b1, b2, offset):
-    """Trapezoid Coleman-Hodgdon from its virgin curve, then (3.30), then the offset."""
+    """Return the trapezoid Coleman-Hodgdon output, then (3.30), then the offset."""
     gain = (b0 + b1 + b2) / (1.0 - a1 - a2)
     u, h = rest_input, rest_output
     h1 = h2 = h
@@ -82,7 +82,7 @@ ORDER = (
 
 
 def by_scipy(record):
-    """Return the best mean square root, seconds, and seconds of compiling."""
+    """Return the best RMS error, the seconds, and the seconds of compiling."""
     shape = structure(MODEL, record)
     slope = float(shape.system.parts[0].b)
     low, high = np.asarray(shape.space.lower), np.asarray(shape.space.upper)
@@ -109,7 +109,7 @@ def by_scipy(record):
 
 
 def by_piezojax(record):
-    """Return the mean square root and seconds, from the first trace on."""
+    """Return the RMS error and the seconds, tracing included."""
     begin = time.perf_counter()
     whole = slice(0, record.samples)
     fit = identify(record, MODEL, train=whole, validate=whole)

@@ -47,7 +47,7 @@ NAMES = ("nominal", "Coleman-Hodgdon inverse", "Preisach inverse", "observer")
 
 
 class Window(Metric):
-    """Mean square error of the displacement, um^2, from ``start`` up to ``stop``."""
+    """Metric: mean square error (um^2) of the displacement, ``start`` to ``stop``."""
 
     start: jax.Array
     stop: jax.Array
@@ -66,7 +66,7 @@ class Window(Metric):
 
 @eqx.filter_jit
 def mean_squares(controller, plant, references, starts, stops):
-    """Of each reference, a row each, um^2."""
+    """Return the mean square error (um^2) of each reference."""
     loop = Feedback(controller, plant, p753.actuator(), Sensor(0.0))
     state = loop.init(0.0, holding=0.0)
 
@@ -80,7 +80,7 @@ def mean_squares(controller, plant, references, starts, stops):
 
 
 def references():
-    """The ten references, um, a row each, and the windows that count, in samples."""
+    """Return the ten references (um), one per row, and their windows in samples."""
     lengths = np.array([round(window(name) * p753.RATE) for name in signals.THESIS])
     time = jnp.arange(2 * lengths.max()) / p753.RATE
     rows = [signals.signal(name, time) for name in signals.THESIS]
@@ -88,7 +88,7 @@ def references():
 
 
 def other_input():
-    """An input that the models are not fitted to, V: two sines, from rest at 0 V."""
+    """Return another input (V) than the fitted one: two sines, from rest at 0 V."""
     time = np.arange(2 * round(p753.RATE)) * p753.DT
     wave = 18.0 * np.sin(2 * np.pi * 10.0 * time) + 20.0 * np.sin(
         2 * np.pi * 3.3 * time
@@ -97,7 +97,7 @@ def other_input():
 
 
 def record_errors(plant, record, models):
-    """RMS error of the models without noise, nm: on the fitted record, on another."""
+    """Return the RMS errors (nm) of the models on the fitted and on another record."""
     found = {}
     for name, input in (
         ("fitted record", record.input),
@@ -112,7 +112,7 @@ def record_errors(plant, record, models):
 
 
 def study(truth, progress):
-    """Everything about the stage whose hysteresis is ``truth``."""
+    """Return all figures of the stage with the hysteresis ``truth``."""
     plant = p753_inverses.PLANTS[truth]()
     record = p753_inverses.record_of(plant)
     inverses = {
@@ -148,7 +148,7 @@ def study(truth, progress):
 
 @eqx.filter_jit
 def left_over(inverse, hysteresis, references, starts, stops):
-    """Mean square of what the hysteresis makes of the references, less these, um^2."""
+    """Return the mean square (um^2) of the output of inverse and hysteresis minus r."""
 
     def one(reference, start, stop):
         system = piezojax.core.system.Series((inverse, hysteresis))
@@ -161,17 +161,17 @@ def left_over(inverse, hysteresis, references, starts, stops):
 
 
 def by_reference(squares):
-    """RMS errors, nm, by the name of the reference."""
+    """Return RMS errors (nm) by the name of the reference."""
     return dict(zip(signals.THESIS, 1e3 * np.sqrt(np.asarray(squares)), strict=True))
 
 
 def mean(errors):
-    """Geometric mean over the references."""
+    """Return the geometric mean over the references."""
     return float(np.exp(np.mean([np.log(errors[name]) for name in signals.THESIS])))
 
 
 def shown(errors):
-    """Geometric mean and worst, or the one number there is."""
+    """Return geometric mean and worst as text, or a single number."""
     if not isinstance(errors, dict):
         return f"{errors:.1f}"
     return f"{mean(errors):.1f}, {max(errors.values()):.1f}"

@@ -73,7 +73,7 @@ def command(name: str, arguments: list[str]) -> list[str]:
 
 
 def one_kill(number: int, seed: int) -> tuple[str, list[str]]:
-    """Return what was killed, and the faults seen."""
+    """Return the killed command and its faults."""
     draw = random.Random(1000 * seed + number)
     name = ("tune", "identify", "sweep")[number % 3]
     stop = draw.choice((signal.SIGTERM, signal.SIGKILL))
@@ -127,7 +127,7 @@ def lost(
     code: int,
     before: dict[str, int],
 ) -> list[str]:
-    """Return what was finished and is missing or damaged."""
+    """Return finished results that are missing or damaged."""
     out = folder / "results" / {"tune": "small", "identify": "bench"}.get(name, "swept")
     faults = []
     if name == "tune":
@@ -178,7 +178,7 @@ def left_over(name: str, folder: Path, arguments: list[str]) -> list[str]:
 
 
 def main() -> int:
-    """Kill as often as asked; return 1 if a kill shows a fault."""
+    """Kill the given number of times; return 1 if a kill shows a fault."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--first", type=int, default=0)

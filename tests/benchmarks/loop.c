@@ -1,4 +1,4 @@
-/* The loop "dob_pid_smc" in plain C: the yardstick of throughput.py.
+/* The loop "dob_pid_smc" in plain C: the reference of throughput.py.
 
    Equations, units and readings: engines.py. This is the same step, written for
    speed: float64, one thread, no allocation, no branch in a step, no division in a

@@ -1,4 +1,4 @@
-/* The loop "three_dof_pid_smc" in plain C: the yardstick of the 3-DOF stage.
+/* The loop "three_dof_pid_smc" in plain C: the reference for the 3-DOF stage.
 
    Equations, units and readings: loop_three_dof.py, which also works out the
    matrices. This is the same step, written for speed: float64, one thread, no

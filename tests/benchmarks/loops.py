@@ -18,7 +18,7 @@ import piezojax
 from piezojax.report.figures import AFTER, BEFORE, add_title, figure, plot_style, write
 
 CORNERS = (0, 100, 0, *4 * (65, 35), 100, 0)
-SLOW, FAST = 4.0, 0.1  # samples a volt
+SLOW, FAST = 4.0, 0.1  # samples per volt
 ACROSS = 5
 
 OTHERS = {
@@ -26,7 +26,7 @@ OTHERS = {
         alpha=0.14, beta_gamma=0.012, beta_delta=-0.004, nu=1.3
     ),
 }
-"""Models that make no record for choice.py."""
+"""Models without a record in choice.py."""
 
 RATED = (
     "rate_dependent_prandtl_ishlinskii",

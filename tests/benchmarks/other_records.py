@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from oracles import forty_stages
 
 NOISE, SPAN, KEPT = 1.5, 0.3, 18
-"""The bar: factor over the noise, % of the span, stages."""
+"""Bar: factor on the noise, % of the span, number of stages."""
 
 SCENARIOS = (
     ("20 Hz", "100 Hz", "40 Hz"),
@@ -41,7 +41,7 @@ SCENARIOS = (
     ("walk", "100 Hz", "steps"),
     ("steps", "walk", "20 Hz"),
 )
-"""Two records to fit and one to judge on, for stages in turn."""
+"""Two records to fit and one for validation, in turn over the stages."""
 
 SECONDS = {"20 Hz": 0.6, "40 Hz": 0.5, "100 Hz": 0.4, "steps": 1.2, "walk": 1.0}
 
@@ -78,7 +78,7 @@ def walk(p, random, seconds):
 
 
 def voltages(p, kind, random):
-    """Return the voltages of a record of a ``kind``, before its start a path to it."""
+    """Return the voltages of a record of a ``kind``, with the path before its start."""
     seconds = SECONDS[kind]
     if kind == "steps":
         share = steps(p, random, seconds)
@@ -90,7 +90,7 @@ def voltages(p, kind, random):
 
 
 def record_of(stage, kind, seed):
-    """Return a Record of a ``kind``; its start, path before and zero are drawn."""
+    """Return a Record of a ``kind`` with random start, previous path and zero."""
     p = stage.parameters
     random = np.random.default_rng([2026, seed])
     u = voltages(p, kind, random)

@@ -19,7 +19,7 @@ BLOCK = 64  # lanes simulated at a time
 
 
 def loop(gains):
-    """The loop with these gains [8]; its noise is given in um."""
+    """Return the loop with these gains [8]; its noise is in um."""
     controller = eqx.tree_at(
         lambda c: (
             c.feedback.law.proportional,
@@ -38,7 +38,7 @@ def loop(gains):
 
 
 def three_dof(gains, base, stage):
-    """The loop of loop_three_dof.py: P, I, D of each axis in gains [9]."""
+    """Return the loop of loop_three_dof.py with P, I, D of each axis in gains [9]."""
     diagonals = [gains[:3], gains[3:6], gains[6:]]
     controller = eqx.tree_at(
         lambda c: [
@@ -57,17 +57,17 @@ def three_dof(gains, base, stage):
 
 
 def three_dof_loops():
-    """What makes a loop of gains [9], its parts made once and outside of jit."""
+    """Return the function from gains [9] to a loop, its parts made outside jit."""
     base, stage = p558_control.multi_axis("dynamic"), p558_control.stage()
     return lambda gains: three_dof(gains, base, stage)
 
 
 LOOPS = {DOB_PID_SMC.name: lambda: loop, THREE_DOF_PID_SMC.name: three_dof_loops}
-"""What makes loop_of(gains), by the loop's name."""
+"""Functions that make loop_of(gains), by the name of the loop."""
 
 
 def rms(loop_of, gains, inputs, **options):
-    """RMS error of one lane over the second half of the run, of each axis."""
+    """Return the RMS errors of one lane over the second half of the run, by axis."""
     system = loop_of(gains)
     samples = jax.tree.leaves(inputs)[0].shape[0]
     metric = piezojax.core.metrics.Tracking(start=samples // 2)
@@ -82,9 +82,9 @@ def rms(loop_of, gains, inputs, **options):
 
 
 def block_of_rms(loop_of, gains, inputs):
-    """RMS errors of a block: gains [width, n], inputs [steps, width].
+    """Return the RMS errors of a block: gains [width, n], inputs [steps, width].
 
-    One plain loop over signals that lie time first, as it reads them.
+    One plain loop, which reads signals with time first.
     """
     steps = jax.tree.leaves(inputs)[0].shape[0]
     return jax.vmap(lambda g, u: rms(loop_of, g, u, segment=steps), in_axes=(0, 1))(
@@ -93,9 +93,9 @@ def block_of_rms(loop_of, gains, inputs):
 
 
 def mean_square(loop_of, gains, inputs):
-    """The loss: gains [n] shared by all lanes, inputs [lanes, steps]."""
+    """Return the loss for gains [n] of all lanes and inputs [lanes, steps]."""
     lanes = jax.tree.leaves(inputs)[0].shape[0]
-    # A copy for each lane: their gradients are then summed once, not in each step.
+    # One copy per lane: gradients are then summed once, not in each step.
     each = jnp.broadcast_to(gains, (lanes, len(gains)))
     blocks = piezojax.core.rollout.in_blocks(
         lambda g, u: rms(loop_of, g, u), each, inputs
@@ -104,7 +104,7 @@ def mean_square(loop_of, gains, inputs):
 
 
 def signals(reference, noise):
-    """LoopInput of [lanes, steps+1] and [lanes, steps]; of each axis, if there are."""
+    """Return the LoopInput of [lanes, steps+1] and [lanes, steps], by axis if any."""
     if noise.ndim == 2:
         return LoopInput(reference[:, 1:], noise)
     axes = range(noise.shape[2])
@@ -115,7 +115,7 @@ def signals(reference, noise):
 
 
 class PiezojaxEngine(Engine):
-    """A loop of the benchmark as a user of piezojax would run it.
+    """Engine in piezojax: a loop of the benchmark as a user would run it.
 
     `what` is "forward" or "gradient".
 
@@ -137,7 +137,7 @@ class PiezojaxEngine(Engine):
     def prepare(self, gains, reference, noise):
         """Build the loop, put the data on the device and compile for their shapes.
 
-        Everything that is not simulation: conversion, layout, tracing, compiling
+        This is everything except simulation: conversion, layout, tracing, compiling
         (ahead of time, so that nothing is left for the first run). Sets
         `self.compile_s` to the seconds of tracing and compiling. Called anew for other
         shapes and for other data.
@@ -159,7 +159,7 @@ class PiezojaxEngine(Engine):
         self.compile_s = time.perf_counter() - begin
 
     def _block(self, gains, inputs, lanes):
-        """These lanes; the last one fills up the last block."""
+        """Return these lanes; the last one fills the last block."""
         lanes = np.minimum(lanes, self._lanes - 1)
         signals = jax.tree.map(lambda x: jnp.array(x[lanes].T), inputs)
         return jnp.array(gains[lanes]), signals

@@ -1,4 +1,4 @@
-/* Preisach's model in plain C, and the rate-dependent one: the yardsticks of preisach.py.
+/* Preisach's model in plain C, and the rate-dependent one: the references of preisach.py.
 
    Relays lie on lines of one width; line k has a weight for each of its cells, and is
    up as far as a play operator stands, counted in cells. A rate-dependent model blends

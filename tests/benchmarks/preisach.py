@@ -35,7 +35,7 @@ DT, PACE = 1e-4, 4e3  # s; V/s: half of the samples are faster
 
 
 class MeanSquare(Metric):
-    """Of the output, um^2."""
+    """Metric: mean square of the output, um^2."""
 
     def init(self):
         return jnp.zeros(()), jnp.zeros(())
@@ -48,7 +48,7 @@ class MeanSquare(Metric):
 
 
 def problem(model, cells, lanes, steps, seed=0):
-    """The model, and inputs [lanes, steps], V: sines that grow."""
+    """Return the model, and inputs (V) [lanes, steps]: growing sines."""
     rng = np.random.default_rng(seed)
     weights = [np.tril(rng.uniform(0.0, 0.2, (cells, cells))) for _ in range(2)]
     time = np.arange(steps) / steps
@@ -64,9 +64,9 @@ def problem(model, cells, lanes, steps, seed=0):
 
 
 def by_c(name, model, inputs):
-    """What runs the C function ``name`` and returns the mean squares.
+    """Return the function that runs the C function ``name`` for the mean squares.
 
-    Of a gradient: their sum, and its gradient by the parameters, by their paths.
+    For a gradient it returns their sum and the gradient of it by path.
     """
     source = Path(__file__).with_name("preisach.c")
     with tempfile.TemporaryDirectory() as folder:
@@ -111,7 +111,7 @@ def by_c(name, model, inputs):
 
 
 def by_piezojax(model, inputs, *, gradient):
-    """What runs the model, and the seconds of compiling."""
+    """Return the function that runs the model, and the seconds of compiling."""
     signals = jnp.asarray(inputs)
     known = parameters(model)
     values = {
@@ -131,7 +131,7 @@ def by_piezojax(model, inputs, *, gradient):
 
         if not gradient:
             return jax.vmap(lane, (None, 1))(with_values, signals.T)
-        # A copy for each lane: their gradients are then summed once, not in each step.
+        # One copy per lane: gradients are then summed once, not in each step.
         many = jax.tree.map(
             lambda x: jnp.broadcast_to(x, (len(signals), *x.shape)), with_values
         )
@@ -145,7 +145,7 @@ def by_piezojax(model, inputs, *, gradient):
 
 
 def timed(name, options):
-    """Rows of one model, and the seconds of compiling."""
+    """Return the rows of one model, and the seconds of compiling."""
     model, inputs = problem(name, options.cells, options.lanes, options.steps)
     forward, forward_s = by_piezojax(model, inputs, gradient=False)
     gradient, gradient_s = by_piezojax(model, inputs, gradient=True)
@@ -185,7 +185,7 @@ def timed(name, options):
 
 
 def main():
-    """Check that all agree, time them in turns, print one table."""
+    """Check that all agree, time them in turn, and print one table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, required=True, metavar="FILE")
     parser.add_argument("--cells", type=int, default=20)

@@ -45,10 +45,10 @@ import promise_cases
 from oracles import excitation, forty_stages
 
 CLOSE, FAR, KEPT, FALSE = 1.3, 2.0, 36, 2
-"""The bar: ratios, stages within the first, false alarms."""
+"""Bar: two ratios, stages within the first one, false alarms."""
 
 LOST = 0.2
-"""Error of a lost loop, as a share of the deviation of its reference, if it is also
+"""Error above which a loop is lost, relative to the deviation of its reference, if also
 above FAR times the promise."""
 
 RAILED = 0.02
@@ -59,7 +59,7 @@ ROUTINE = (
     "never checked on a second record",
     "at the edge of its bounds",
 )
-"""Parts of notes that every run has and that warn of nothing."""
+"""Parts of notes that every run has and that are no warnings."""
 
 MODEL = inspect.signature(pj.identify).parameters["model"].default
 
@@ -68,7 +68,7 @@ MODEL = inspect.signature(pj.identify).parameters["model"].default
 class Setup:
     """A stage with its record as columns by name, and the study of it.
 
-    ``check`` is a second record of the stage, if the study names one.
+    ``check`` is the second record that the study names, if any.
     """
 
     stage: object
@@ -78,7 +78,7 @@ class Setup:
 
 
 def setup(stage, design, kind="careful"):
-    """Return the Setup of a stage: record and study as the README has them."""
+    """Return the Setup of a stage: record and study as in the README."""
     p = stage.parameters
     voltages, readings = excitation.record(stage, kind)
     columns = {
@@ -252,7 +252,7 @@ def warned(line):
 
 
 def broken(line):
-    """Return how a promise without an alarm is broken, "" if it is kept."""
+    """Return the reason why a promise without an alarm is broken, or ""."""
     if warned(line):
         return ""
     if line["lost"] or line["railed"]:
@@ -261,7 +261,7 @@ def broken(line):
 
 
 def healthy(line):
-    """Return whether the stage does what was promised."""
+    """Return whether the promise of the stage holds."""
     gone = line["refused"] or line["lost"] or line["railed"]
     return not gone and line["ratio"] <= CLOSE
 
@@ -285,7 +285,7 @@ def table_of(lines):
 
 
 def summary(lines):
-    """Return the bar and what was reached, one sentence a line."""
+    """Return the bar and the result, one sentence per line."""
     silent = [line for line in lines if not warned(line)]
     lost = [line["name"] for line in silent if line["lost"] or line["railed"]]
     kept = [line for line in silent if healthy(line)]
@@ -359,7 +359,7 @@ def main():
                 console.print(f"    {key[:-1]}: {text}", soft_wrap=True)
         if chosen.json:
             chosen.json.write_text(json.dumps(lines, indent=1), encoding="utf-8")
-        # The programs of twenty stages are more than a process may map into memory.
+        # The programs of twenty stages exceed the memory maps of a process.
         jax.clear_caches()
     console.print(table_of(lines))
     for sentence in (poor_summary if chosen.poor else summary)(lines):

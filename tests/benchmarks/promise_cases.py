@@ -8,7 +8,7 @@ from oracles import excitation, forty_stages
 
 LIGHT = {"audited": forty_stages.audited}
 LIGHT |= {f"stage {n}": lambda n=n: forty_stages.stage(n) for n in (5, 19, 23)}
-"""Stages with a light mode below 800 Hz."""
+"""Stages with a lightly damped mode below 800 Hz."""
 
 NO_MODE = (
     "coleman_hodgdon+lag",
@@ -18,19 +18,19 @@ NO_MODE = (
 
 
 def with_model(make, stage, model):
-    """A model without dynamics, on a stage with a light mode."""
+    """Return a case with a model without dynamics, on a stage with a mode."""
     one = make(stage())
     one.study["plant"]["model"] = model
     return one
 
 
 def of_kind(make, number, kind):
-    """A record that shows too little."""
+    """Return a case with a record that is too poor."""
     return make(forty_stages.stage(number), kind=kind)
 
 
 def scaled(make, number, column, factor, name=None):
-    """A column in another unit, or with the other sign, under ``name``."""
+    """Return a case with a column in another unit or sign, under ``name``."""
     one = make(forty_stages.stage(number))
     name = name or column
     one.columns = {
@@ -44,19 +44,19 @@ def scaled(make, number, column, factor, name=None):
 
 
 def named(make, number, **columns):
-    """Columns taken for each other."""
+    """Return a case with exchanged columns."""
     one = make(forty_stages.stage(number))
     one.study["plant"] |= columns
     return one
 
 
 def rated(make, number, factor):
-    """A time column whose numbers are ``factor`` times those in s."""
+    """Return a case whose time column is ``factor`` times the time in s."""
     return scaled(make, number, "time_s", factor)
 
 
 def of_another(make, number, other):
-    """The record of another stage at the rate of this one, checked on one of this."""
+    """Return a case with the record of another stage, checked on one of this stage."""
     one = make(forty_stages.stage(number))
     own = one.stage
     voltages, readings = excitation.record(own, seed=1)

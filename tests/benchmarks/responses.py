@@ -28,7 +28,7 @@ FREQUENCY, DAMPING, KEPT = 2e-3, 0.1, 57
 
 
 def judged(stage, fit):
-    """Return the worst errors of frequency and damping, and all in deviations."""
+    """Return the worst errors of frequency and damping, and all in standard errors."""
     worst, deviations = np.zeros(2), []
     for frequency, damping in zip(stage.frequency, stage.damping, strict=True):
         distances = [abs(one.value - frequency) for one in fit.frequency]

@@ -29,7 +29,7 @@ CASES = {
         for name in COMMANDS
     },
 }
-"""Arguments of Python, and the most that the ratio may be."""
+"""Arguments of Python, and the largest allowed ratio."""
 
 
 def seconds(arguments):
@@ -50,7 +50,7 @@ def main():
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
     for arguments, _ in CASES.values():
-        seconds(arguments)  # bytecode and disk cache
+        seconds(arguments)  # fill the bytecode and disk caches
     turns = [
         {name: seconds(arguments) for name, (arguments, _) in CASES.items()}
         for _ in range(options.runs)

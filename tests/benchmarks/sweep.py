@@ -66,9 +66,9 @@ def cores():
 
 
 def write_study(path, samples, **sweep):
-    """The shipped study of this controller, with its eight gains drawn by Sobol.
+    """Write the shipped study of this controller with eight gains drawn by Sobol.
 
-    On the stage of throughput.py, which has neither creep nor a mode.
+    The stage is that of throughput.py, without creep and mode.
     """
     study = load(shipped("p753_dob")).model_dump(mode="json", exclude_none=True)
     study["plant"], study["disturbance"] = {"catalog": "p753"}, {}
@@ -79,7 +79,7 @@ def write_study(path, samples, **sweep):
 
 
 def block_seconds(repeats):
-    """Times of blocks of the throughput benchmark on one core: wall, processor."""
+    """Return wall and processor times of blocks of the throughput benchmark."""
     from piezojax_engine import PiezojaxEngine
 
     engine = PiezojaxEngine()
@@ -94,7 +94,7 @@ def block_seconds(repeats):
 
 
 def state_of(process):
-    """Resident memory in MB and processor time in s, so far, of a process."""
+    """Return the resident memory (MB) and the processor time (s) of a process."""
     folder = Path(f"/proc/{process.pid}")
     try:
         pages = int((folder / "statm").read_text().split()[1])
@@ -106,7 +106,7 @@ def state_of(process):
 
 
 def run_command(study, out, every_s=0.05):
-    """Run the sweep and watch it; returns seconds, and [time, MB, s of processor]."""
+    """Run and observe the sweep; return seconds, and [time, MB, s of processor]."""
     begin = time.perf_counter()
     process = subprocess.Popen([*COMMAND, study, "--out", out, "--quiet"])
     watched = []
@@ -121,7 +121,7 @@ def run_command(study, out, every_s=0.05):
 
 
 def chunks_of(out):
-    """When each chunk was there (s), and what it took of a core (s), in that order."""
+    """Return the time of each chunk (s) and its core time (s), in order of time."""
     found = []
     for path in (out / "chunks").glob("*.chunk"):
         with open(path, "rb") as file:
@@ -132,7 +132,7 @@ def chunks_of(out):
 
 
 def simulating_seconds(chunks, workers):
-    """From the start of the first chunk to the end of the last."""
+    """Return the time from the start of the first chunk to the end of the last."""
     first = min(end - seconds for end, seconds in chunks[: 2 * workers])
     return chunks[-1][0] - first
 
@@ -157,7 +157,7 @@ def main_sweep(folder, samples):
     first, last = chunks[0][0], chunks[-1][0]
     during = [row for row in watched if first <= row[0] <= last]
     memory, half = [row[1] for row in during], len(during) // 2
-    # What the processor did between the first watched moment and the last.
+    # processor time between the first and the last observation
     share = (during[-1][0] - during[0][0]) / simulating
     cpu_each = (during[-1][2] - during[0][2]) / (share * steps)
     core_s = sum(seconds for _, seconds in chunks)
@@ -191,11 +191,11 @@ def main_sweep(folder, samples):
 
 
 def killed_sweep(folder, kills, seed):
-    """Kill a sweep again and again; compare it with one that was left alone."""
+    """Kill a sweep repeatedly; compare it with an uninterrupted one."""
     import xarray as xr
 
     draw = random.Random(seed)
-    # Of small chunks, several for each kill.
+    # with small chunks, several per kill
     samples = BLOCK * max(40, 6 * kills)
     study = write_study(
         folder / "small.toml", samples, chunk=BLOCK, references=["SW30"]
@@ -206,7 +206,7 @@ def killed_sweep(folder, kills, seed):
     for _ in range(kills):
         process = subprocess.Popen([*COMMAND, study, "--out", out, "--quiet"])
         wanted = len(before) + draw.randint(1, 6)
-        # Some die before their first chunk, most in the midst of one.
+        # Some end before their first chunk, most during a chunk.
         early = draw.random() < 0.2
         give_up = time.monotonic() + draw.uniform(0.5, 4.0)
         while process.poll() is None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-# The benchmark is a script beside its modules, not a package.
+# The benchmark is a script with modules beside it, not a package.
 sys.path.insert(0, str(Path(__file__).parent))
 engines = importlib.import_module("engines")
 loop_three_dof = importlib.import_module("loop_three_dof")
@@ -23,7 +23,7 @@ def rms_of(engine, *problem):
         pytest.skip(str(reason))
 
 
-# One lane, a half-filled block, more than one block.
+# one lane, a half-filled block, more than one block
 @pytest.mark.parametrize("lanes", [1, 5, 20])
 def test_c_and_numba_agree(lanes):
     problem = engines.problem(lanes, STEPS)
@@ -39,7 +39,7 @@ def test_c_and_numpy_agree():
     np.testing.assert_allclose(engines.numpy_engine(*problem), c, rtol=0, atol=1e-9)
 
 
-# One lane, and more than one block, the last half filled.
+# one lane, and several blocks with the last one half filled
 @pytest.mark.parametrize("lanes", [1, 20])
 def test_c_and_numpy_agree_on_three_axes(lanes):
     loop = loop_three_dof.THREE_DOF_PID_SMC
@@ -82,7 +82,7 @@ def test_gradient_agrees_with_central_differences():
         for d in np.diag(step)
     ]
     np.testing.assert_allclose(loss, mean_square(nominal), rtol=1e-9)
-    # Compared as slopes per relative change, so that each gain counts alike.
+    # Gradients by relative changes, so that each gain has equal weight.
     np.testing.assert_allclose(
         gradient * nominal,
         np.array(differences) * nominal,

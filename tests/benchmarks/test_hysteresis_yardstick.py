@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-# The benchmark is a script beside its modules, not a package.
+# The benchmark is a script with modules beside it, not a package.
 sys.path.insert(0, str(Path(__file__).parent))
 engines = importlib.import_module("engines")
 hysteresis = importlib.import_module("hysteresis")
@@ -28,14 +28,14 @@ def c_engine(problem, what):
         raise
 
 
-YARDSTICKS = [name for name in hysteresis.MODELS if hysteresis.has_yardstick(name)]
+IN_C = [name for name in hysteresis.MODELS if hysteresis.has_c_reference(name)]
 
 
 def test_the_first_models_have_a_reference_in_c():
-    assert {"coleman_hodgdon", *hysteresis.OTHERS} <= set(YARDSTICKS)
+    assert {"coleman_hodgdon", *hysteresis.OTHERS} <= set(IN_C)
 
 
-@pytest.mark.parametrize("name", YARDSTICKS)
+@pytest.mark.parametrize("name", IN_C)
 def test_each_model_equals_c(name):
     problem = hysteresis.Problem(name, LANES, STEPS)
     c = c_engine(problem, "forward").run()
@@ -68,7 +68,7 @@ def test_the_command_writes_rows(tmp_path, monkeypatch):
     rows = json.loads(file.read_text())["rows"]
     found = [(row["what"], row["engine"], row["mode"]) for row in rows]
     if ("forward", "c", "run") not in found:
-        pytest.skip("no C yardstick here")
+        pytest.skip("no C reference here")
     assert ("forward", "piezojax", "run") in found
     assert ("gradient", "piezojax", "reverse") in found
     assert ("gradient", "c", "differences") in found
@@ -85,7 +85,7 @@ def test_models_without_a_function_in_c_are_listed(monkeypatch):
 
 def test_a_model_without_a_reference_in_c_is_listed(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(hysteresis.throughput, "pin_to_one_core", lambda: 1)
-    monkeypatch.setattr(hysteresis, "has_yardstick", lambda name: False)
+    monkeypatch.setattr(hysteresis, "has_c_reference", lambda name: False)
     arguments = ["--json", str(tmp_path / "out.json"), "--models", "duhem"]
-    assert hysteresis.main(arguments) == 1  # nothing else was asked for
-    assert "duhem: no yardstick" in capsys.readouterr().out
+    assert hysteresis.main(arguments) == 1  # the only model in this run
+    assert "duhem: no reference in C" in capsys.readouterr().out

@@ -33,7 +33,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-# Before any library starts its threads.
+# before any library starts its threads
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -44,7 +44,7 @@ from rich.table import Table  # noqa: E402
 
 LOOPS = {loop.name: loop for loop in (engines.DOB_PID_SMC, THREE_DOF_PID_SMC)}
 ENGINES = ("piezojax", "c", "numba", "numpy")
-SHORTEST_SAMPLE_S = 0.02  # shorter runs are repeated within one sample
+SHORTEST_SAMPLE_S = 0.02  # shorter runs are repeated within one measurement
 SLOW_BUDGET_S = 1.0  # about the longest run of an engine marked slow
 TRIAL_STEPS = 200
 
@@ -94,7 +94,7 @@ def parse(arguments=None):
 
 
 def pin_to_one_core():
-    """One core for this process, its later threads and its children."""
+    """Restrict this process, its later threads and its children to one core."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
         return 1
@@ -128,7 +128,7 @@ def seconds_of(run, calls=1):
 
 
 def prepare(engine, data, what, steps):
-    """Prepare for at most `steps` steps; returns how many it will run."""
+    """Prepare for at most `steps` steps; return the number of steps."""
     if engine.slow:
         engine.prepare(*part(data, what, TRIAL_STEPS))
         each = seconds_of(engine.run) / TRIAL_STEPS
@@ -138,7 +138,7 @@ def prepare(engine, data, what, steps):
 
 
 def measure(loop, lanes, wanted, options, skip):
-    """Time the wanted (what, engine) pairs on one number of lanes, in turn."""
+    """Time the given (what, engine) pairs for one number of lanes, in turn."""
     entries, data = [], loop.problem(lanes, options.steps)
     for what, name in wanted:
         try:
@@ -197,7 +197,7 @@ def extra_memory_mb(loop_name, what, name, lanes, steps):
 
 
 def in_fresh_process(function, *arguments):
-    # Spawned: a fork would start with this process's memory.
+    # Spawned, because a fork would start with the memory of this process.
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(max_workers=1, mp_context=spawn) as pool:
         return pool.submit(function, *arguments).result()
@@ -243,7 +243,7 @@ def table(rows):
 
 
 def compile_key(row):
-    """C and numba compile once, piezojax once a shape."""
+    """Return the key of a compilation: C and numba compile once, piezojax per shape."""
     if row["engine"] == "piezojax":
         return f"piezojax {row['loop']} {row['what']} {row['lanes']}"
     return f"{row['engine']} {row['loop']}"

@@ -21,7 +21,7 @@ AMPLITUDE = 4.0
 AXES = ("X", "Y", "Z")
 DELAY = 2
 THREE_OF = 5
-"""One study in so many has three axes."""
+"""One study in this number has three axes."""
 
 
 @dataclasses.dataclass
@@ -40,13 +40,13 @@ class Stage:
 
     @property
     def transition(self):
-        """Of position and velocity / w in one sample under a held input."""
+        """Return the transition of position and velocity / w under a held input."""
         w = 2.0 * math.pi * self.frequency
         return expm(np.array([[0.0, w], [-w, -2.0 * self.damping * w]]) * DT)
 
     @property
     def arma(self):
-        """a and b of y(k+1) = a1 y(k) + a2 y(k-1) + b0 x(k) + b1 x(k-1), by z."""
+        """Return a, b of y(k+1) = a1 y(k) + a2 y(k-1) + b0 x(k) + b1 x(k-1)."""
         A = self.transition
         b = np.eye(2)[:, :1] - A[:, :1]
         a1, a2 = np.trace(A), -np.linalg.det(A)
@@ -139,7 +139,7 @@ def drawn_stage(random):
 
 
 def drawn_limits(random, three):
-    """Return limits, from ones that cannot be met to ones that never bind."""
+    """Return limits, from infeasible ones to ones that are never active."""
     which = random.integers(3 if three else 4)
     if which == 0:
         return {}
@@ -208,7 +208,7 @@ def pid(random, stage):
 
 
 def sliding_mode(random, stage):
-    """Return the table of a sliding mode on a model that is off, and its box."""
+    """Return the table of a sliding mode with a wrong model, and its box."""
     off = dataclasses.replace(
         stage, frequency=stage.frequency * random.uniform(0.8, 1.2)
     )
@@ -295,7 +295,7 @@ class SlidingModeLaw:
         e1, e2 = yh - r, vh - (r - r_last) / DT
         s = self.m * e1 + e2
         forward = (r_next - a1 * r - a2 * r_last) / b0
-        # The error state one sample on, without control.
+        # The error state one sample later, without control.
         e1_next = (a1 + a2) * e1 - a2 * DT * e2
         e2_next = (a1 + a2 - 1.0) / DT * e1 - a2 * e2
         equivalent = -(self.m * e1_next + e2_next) / (b0 * (self.m + 1.0 / DT))
@@ -311,8 +311,8 @@ LAWS = {"PID": PIDLaw, "SlidingMode": SlidingModeLaw}
 class Loop:
     """The loop of a case with the controllers of ``tables``, one for each axis.
 
-    A state holds, axis by axis, the controller's, the applied voltage, position and
-    speed of the resonance, and the delayed positions, the oldest last.
+    A state contains for each axis that of the controller, the applied voltage, position
+    and speed of the resonance, and the delayed positions, the oldest last.
     """
 
     def __init__(self, case, tables):
@@ -326,8 +326,8 @@ class Loop:
     def step(self, x, r, r_next, noise, moved):
         """Return the next state, displacements and voltages.
 
-        ``moved(axis, voltage)`` returns what the plays of an axis make of a voltage,
-        and the voltage within the limits.
+        ``moved(axis, voltage)`` returns the output of the plays of an axis for a
+        voltage, and the voltage within the limits.
         """
         following, y, voltages = x.copy(), self.displacement(x), []
         pushed, ways = [], list(zip(self.starts, self.ends, strict=True))

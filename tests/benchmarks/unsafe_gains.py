@@ -41,7 +41,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from unsafe_cases import AXES, DT, LOWER, RATE, UPPER, Loop, draw, margins
 
 CLOSE = 0.02
-"""Relative error of a margin by which it may miss its limit."""
+"""Relative amount by which a margin may violate its limit."""
 
 RAILED = 0.02
 """Share of samples at a voltage limit above which a run counts as saturated."""
@@ -84,7 +84,7 @@ def references_of(case):
 
 
 def faults(case, tables, result):
-    """Return what is wrong with the controllers of a result, and their margins."""
+    """Return the faults of the controllers of a result, and their margins."""
     loop, found = Loop(case, tables), []
     references = references_of(case)
     highest = np.max([r.max(axis=0) for r in references.values()], axis=0)
@@ -119,7 +119,7 @@ def promises(result):
 
 
 def run_faults(case, loop, references, promised):
-    """Yield what is wrong with the runs of a loop."""
+    """Yield the faults of the runs of a loop."""
     start = round(case.study["references"]["settle"] * RATE)
     random = np.random.default_rng([19, case.number])
     for name, reference in references.items():
@@ -147,7 +147,7 @@ def run_faults(case, loop, references, promised):
 
 
 def line_of(number):
-    """Return the line of a study: how it ended, and the faults of its gains."""
+    """Return the line of a study: its exit status and the faults of its gains."""
     case, began = draw(number), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         code, last, tables, result = ended(case, Path(folder))
@@ -170,7 +170,7 @@ def line_of(number):
 
 
 def summary(lines):
-    """Return the bar and what was reached, one sentence a line."""
+    """Return the bar and the result, one sentence per line."""
     by = Counter(line["code"] for line in lines)
     silent = [line for line in lines if line["code"] == 0 and line["faults"]]
     alarmed = [line for line in lines if line["code"] == 3]
@@ -213,7 +213,7 @@ def main():
     parser.add_argument("--studies", default=f"0:{COUNT}", metavar="FIRST:STOP")
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
-    # The studies share their programs, however short they take to compile.
+    # The studies share compiled programs of any compile time.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_disable_most_optimizations", True)
     console = Console(width=None if sys.stdout.isatty() else 120)

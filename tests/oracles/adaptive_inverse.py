@@ -1,13 +1,13 @@
-"""The learned inverse as a plain loop: least squares over everything seen so far."""
+"""The learned inverse as a plain loop: least squares over all past samples."""
 
 import numpy as np
 
 
 class AdaptiveInverse:
-    """Beside ``feedback``, a controller of ``control``; forgets nothing.
+    """Learned inverse without forgetting, with a ``feedback`` of ``control``.
 
-    Every sample the weights are found anew, from all rows so far and the prior as one
-    more row for each weight: no recursion is shared with what is tested.
+    In every sample the weights are computed from all past rows and the prior as one
+    further row for each weight: no recursion is shared with the tested code.
     """
 
     def __init__(self, feedback, weights, deviations, thresholds, **numbers):

@@ -1,11 +1,11 @@
-"""Control allocation by general solvers, and by the geometry of the P-558 by hand."""
+"""Control allocation by general solvers and by the geometry of the P-558."""
 
 import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog, lsq_linear
 
 PLATE = np.array([[0.25, 0.25, 0.25, 0.25], [5, 5, -5, -5], [-5, 5, 5, -5]])
-"""Z in um, Rx and Ry in urad of elongations in um of actuators at (+-50, +-50) mm."""
+"""From elongations (um) of actuators at (+-50, +-50) mm to Z (um), Rx, Ry (urad)."""
 
 ELONGATIONS = np.array(
     [(1, 0.05, -0.05), (1, 0.05, 0.05), (1, -0.05, 0.05), (1, -0.05, -0.05)]
@@ -16,7 +16,7 @@ TWIST = np.array([1, -1, 1, -1]) / 2
 def out_of_reach(geometry, lower, upper, poses):
     """Return the least sum of abs(pose - geometry q) for q in bounds, by pose.
 
-    One linear programme for all, with what is lacking and what is too much as slacks.
+    One linear program for all poses; deficit and excess are its slack variables.
     """
     axes, actuators = geometry.shape
     count = len(poses)
@@ -42,7 +42,7 @@ def least_squares(geometry, lower, upper, pose, axis_weights=1.0):
 
 
 def least_effort(geometry, lower, upper, pose, weights, axis_weights, cost=1e-4):
-    """Return the same, of several the one with nearly the least weighted sum q^2.
+    """Return such q with nearly the least weighted sum q^2.
 
     The sum is added at a small cost, so that q is off by about its square.
     """
@@ -55,7 +55,7 @@ def least_effort(geometry, lower, upper, pose, weights, axis_weights, cost=1e-4)
 def shifted(poses, lower=0.0, upper=50.0):
     """Return elongations of the P-558, shifted along the twist as little as possible.
 
-    Also whether the bounds can be kept at all, by pose.
+    Also return whether the bounds can be kept, by pose.
     """
     least = poses @ ELONGATIONS.T
     ends = np.stack([(lower - least) / TWIST, (upper - least) / TWIST])

@@ -1,4 +1,4 @@
-"""PID-based sliding mode control on a model of any order, with the matrices of ch. 5.
+"""PID-based sliding mode control on a model of any order, by the matrices of ch. 5.
 
 The state (5.3) is [y, Dy, D2y, ...], D the difference over a sample, so that every
 matrix has numbers near 1; s is divided by the sample time at the end.
@@ -52,7 +52,7 @@ class AnyOrder:
             self.z, self.u, self.w = np.zeros((3, size))
 
     def sliding_mode(self, z, r_next):
-        """v(k): v1 of (5.13), v_eq of (5.17), PID of (5.18)."""
+        """Return v(k): v1 of (5.13), v_eq of (5.17), PID of (5.18)."""
         gains, T = self.gains, self.period
         n = len(self.B)
         yh, vh = self.observer.step(z)
@@ -76,7 +76,7 @@ class AnyOrder:
         return v1 + veq + self.wound - dv
 
     def optimal_inverse(self, v):
-        """f(k) of (5.23), b0 belonging to B."""
+        """Return f(k) of (5.23), where b0 belongs to B."""
         b = np.array(self.gains["model_b"])
         weight = self.gains["Q"] / (self.gains["Q"] + self.gains["R"])
         f = weight * (v - b[1:] / b[0] @ self.f[: b.size - 1])
@@ -84,14 +84,14 @@ class AnyOrder:
         return f
 
     def observer_term(self, z):
-        """w(k) of (5.1): C(1/z) w = A(1/z) z / Ke - B(1/z) u(k-1), u as applied."""
+        """Return w(k) of (5.1): C(1/z) w = A(1/z) z / Ke - B(1/z) u(k-1), applied u."""
         self.z = np.array([z / self.gains["Ke"], *self.z[:-1]])
         self.w = np.array([0.0, *self.w[:-1]])
         self.w[0] = (self.a @ self.z - self.b @ self.u - self.c @ self.w) / self.c[0]
         return self.w[0]
 
     def step(self, z, r_next, r, r_prev):
-        """The command u(k), not yet clipped. The reference rested before k = 0."""
+        """Return u(k) before clipping; the reference is constant before k = 0."""
         gains = self.gains
         if self.r is None:
             self.r = np.full(len(self.B), r_prev)

@@ -26,7 +26,7 @@ BENCHMARK = {
 
 
 def force_after(displacement, force, target, alpha, beta_gamma, beta_delta, nu):
-    """Force at `target`, reached monotonically: dz/dy by an adaptive solver."""
+    """Return the force at `target` on a monotone path, by an adaptive solver."""
     direction = 1.0 if target >= displacement else -1.0
 
     def slope(_, z):
@@ -41,7 +41,7 @@ def force_after(displacement, force, target, alpha, beta_gamma, beta_delta, nu):
 
 
 def branch_of_unit_nu(change, force, alpha, beta_gamma, beta_delta):
-    """Force after `change`, nu = 1, on a branch where it keeps its sign.
+    """Return the force after `change`, nu = 1, on a branch of constant sign of z.
 
     dz/dy = alpha - k z with k = beta_gamma s + beta_delta sign(z), s that of dy.
     """
@@ -76,10 +76,10 @@ def _heun(u, dt, mass, damping, stiffness, alpha, beta, gamma, delta, nu):
 
 
 def steady_displacement(force, dt, parameters, finer=256, periods=2):
-    """Steady displacement at the samples of one period of a band-limited `force`.
+    """Return the steady displacement over one period of a band-limited `force`.
 
-    `force` is filled up to `finer` samples a sample by its Fourier series; Heun's rule
-    on that grid, started at rest; the last of `periods` periods.
+    `force` is interpolated to `finer` samples per sample by its Fourier series; Heun's
+    rule on that grid starts at rest; the last of `periods` periods counts.
     """
     samples = force.size
     spectrum = np.zeros(finer * samples // 2 + 1, complex)
@@ -91,7 +91,7 @@ def steady_displacement(force, dt, parameters, finer=256, periods=2):
 
 
 def multisine(samples, lines, deviation, seed):
-    """Random-phase multisine: equal amplitudes at the given lines of its period."""
+    """Return a random-phase multisine with equal amplitudes at the given lines."""
     phases = 2.0 * np.pi * np.random.default_rng(seed).random(len(lines))
     spectrum = np.zeros(samples // 2 + 1, complex)
     spectrum[lines] = np.exp(1j * phases)

@@ -13,7 +13,7 @@ from .hysteresis import inverse_trapezoid_step
 
 
 def q_filter(b, cutoff, rate, corrected=True):
-    """Denominator (c0, c1, c2) of the Q filter (5.28), cutoff in rad/s.
+    """Return the denominator (c0, c1, c2) of the Q filter (5.28), cutoff in rad/s.
 
     Q(z) = (b0 + b1 z^-1 + b2 z^-2) / (c0 + c1 z^-1 + c2 z^-2) with unit DC
     gain (5.29). corrected=True: the bilinear transform puts both poles at
@@ -53,7 +53,7 @@ class AlphaBeta:
         return self.yh, self.vh
 
     def applied(self, u):
-        """It does not see the voltage."""
+        """Do nothing: the filter does not use the voltage."""
 
 
 class Kalman:
@@ -88,14 +88,14 @@ class Kalman:
 
 
 def make_observer(gains, period):
-    """The Kalman filter if the gains have one (its gain as "kalman")."""
+    """Return the Kalman filter if the gains contain "kalman", else an AlphaBeta."""
     if "kalman" in gains:
         return Kalman(gains["model_a"], gains["model_b"], gains["kalman"], period)
     return AlphaBeta(gains["alpha"], gains["beta"], period)
 
 
 class PID:
-    """Our baseline, not of the thesis: filtered D, back-calculation.
+    """Our baseline, not in the thesis: filtered D, back-calculation.
 
     gains: P, I, D, derivative_filter Tf [s], anti_windup K_aw [1/s]; b and c weigh
     the reference in the proportional and the derivative part, 1 if left out.
@@ -111,7 +111,7 @@ class PID:
         self.command = 0.0
 
     def step(self, z, r_next, r, r_prev):
-        """u(k) = P (b r - z) + q + D d; the arguments as in the module docstring."""
+        """Return u(k) = P (b r - z) + q + D d; arguments as in the module docstring."""
         period = self.period
         b, c = self.gains.get("b", 1.0), self.gains.get("c", 1.0)
         e = r - z
@@ -165,7 +165,7 @@ class PIDSMC:
             )
 
     def sliding_mode(self, z, r_next, r, r_prev):
-        """v(k): v1 of (5.13), veq of (5.17), PID of (5.18).
+        """Return v(k): v1 of (5.13), veq of (5.17), PID of (5.18).
 
         State [y, (y(k) - y(k-1)) / T]; F of (5.10) is not needed.
         """
@@ -197,13 +197,13 @@ class PIDSMC:
         return v1 + veq + dv
 
     def optimal_inverse(self, v):
-        """f(k) of (5.23), b0 belonging to B."""
+        """Return f(k) of (5.23), where b0 belongs to B."""
         b0, b1, b2 = self.gains["model_b"]
         weight = self.gains["Q"] / (self.gains["Q"] + self.gains["R"])
         return weight * (v - b1 / b0 * self.f1 - b2 / b0 * self.f2)
 
     def observer_term(self, z):
-        """w(k) of (5.1): Q/(Ke G) z(k) - Q u(k-1), u as applied."""
+        """Return w(k) of (5.1): Q/(Ke G) z(k) - Q u(k-1), applied u."""
         a1, a2 = self.gains["model_a"]
         b0, b1, b2 = self.gains["model_b"]
         c0, c1, c2 = self.c
@@ -274,7 +274,7 @@ class ModelReference:
         self.command = self.wound = 0.0
 
     def step(self, z, r_next, r, r_prev):
-        """The command u(k), not yet clipped; r(k-1) is not used."""
+        """Return the command u(k) before clipping; r(k-1) is not used."""
         gains, period = self.gains, self.period
         lead = gains.get("lead", 0.0)
         r = (1.0 - lead) * r + lead * r_next
@@ -361,13 +361,13 @@ class Continuous:
 
 
 def back_calculated(controller, u):
-    """The change of the integral by the shortfall of u; gains: anti_windup, 1/s."""
+    """Return the change of the integral by the clipping of u; anti_windup in 1/s."""
     rate = controller.gains.get("anti_windup", 0.0)
     return controller.period * rate * (u - controller.command)
 
 
 def make_controller(kind, gains, rate):
-    """kind: a key of the table below, or a variant of PIDSMC."""
+    """Return the controller ``kind``: a key of the table below or a PIDSMC variant."""
     kinds = {"pid": PID, "model reference": ModelReference, "continuous": Continuous}
     if kind in kinds:
         return kinds[kind](gains, rate)

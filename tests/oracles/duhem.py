@@ -8,10 +8,10 @@ from scipy.integrate import solve_ivp
 
 
 def along(corners, x0, rising, falling):
-    """x at every corner: dx/du on each branch by an adaptive solver.
+    """Return x at every corner: dx/du on each branch by an adaptive solver.
 
-    `rising(x, u)` and `falling(x, u)` are dx/du. The sign of x splits no branch: the
-    tolerance takes care of it.
+    `rising(x, u)` and `falling(x, u)` are dx/du. Branches are not split at x = 0: the
+    tolerance suffices.
     """
     x = [x0]
     for start, stop in itertools.pairwise(corners):
@@ -32,7 +32,7 @@ def along(corners, x0, rising, falling):
 
 
 def kutta(path, x0, reversible, irreversible):
-    """The classical fourth-order rule, one step a sample, from (path[0], x0)."""
+    """Return x by the classical fourth-order rule, one step per sample, from x0."""
     out, x = [], x0
     for u0, u1 in itertools.pairwise([path[0], *path]):
         du = u1 - u0
@@ -50,7 +50,7 @@ def kutta(path, x0, reversible, irreversible):
 
 
 def bounded(corners, rho, sigma, n, w0=0.0):
-    """w of the normalised Bouc-Wen model, (2.5), at every corner."""
+    """Return w of the normalised Bouc-Wen model, (2.5), at every corner."""
 
     def slope(direction):
         def of(w, _):

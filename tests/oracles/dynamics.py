@@ -4,7 +4,7 @@ import numpy as np
 
 
 def arma(x, a, b, x_init=0.0, y_init=0.0):
-    """Equation (3.30), no extra delay: x(k) acts on y(k) through b[0].
+    """Return the output of (3.30) without delay: x(k) acts on y(k) through b[0].
 
     y(k) = a[0] y(k-1) + a[1] y(k-2) + ... + b[0] x(k) + b[1] x(k-1) + ...
     Every x before sample 0 is x_init, every y before sample 0 is y_init.

@@ -1,15 +1,15 @@
-"""Records of a stage: those of a careful user, and those that say too little."""
+"""Records of a stage: careful ones, and ones that are too poor."""
 
 import numpy as np
 
 CHIRP, MULTISINE, RAMP = 0.4, 0.35, 0.02
-"""Durations, s; a ramp leads from one place to the next."""
+"""Durations, s; a ramp connects two levels."""
 
 SMALL = 0.02
-"""Amplitude of chirp and multisine, in spans, unless the amplifier is too slow."""
+"""Amplitude of chirp and multisine in spans, if the amplifier is fast enough."""
 
 CYCLES = ((6.0, 0.96, 2), (15.0, 0.5, 3), (40.0, 0.15, 4))
-"""Frequency in Hz, height in spans and number of the large cycles of a half."""
+"""Frequency (Hz), height (spans) and number of the large cycles of each half."""
 
 
 def _time(duration, dt):
@@ -22,13 +22,13 @@ def _ramp(start, stop, dt, duration=RAMP):
 
 
 def _fade(count):
-    """Window that rises and falls over a twentieth of the samples at either end."""
+    """Return a window with edges of a twentieth of the samples at each end."""
     edge = np.minimum(np.arange(count), np.arange(count)[::-1]) / (0.05 * count)
     return 0.5 * (1.0 - np.cos(np.pi * np.minimum(edge, 1.0)))
 
 
 def large_cycles(p, random):
-    """Return cycles of three heights and frequencies, the first over all the span."""
+    """Return cycles of three heights and frequencies, the first over the whole span."""
     dt, place, parts = 1.0 / p.rate, 0.0, []
     for frequency, height, count in CYCLES:
         frequency *= random.uniform(0.85, 1.2)
@@ -117,8 +117,8 @@ KINDS = {
 def record(stage, kind="careful", seed=0):
     """Return the voltages and the readings of ``stage`` [samples] under ``kind``.
 
-    Reading k is taken as voltage k begins to act. The stage rests at the first voltage
-    before; ``seed`` is that of its noise and of the excitation.
+    Reading k is taken when voltage k starts to act. The stage rests at the first
+    voltage before; ``seed`` is that of its noise and of the excitation.
     """
     voltages = KINDS[kind](stage.parameters, np.random.default_rng([40, seed]))
     first = stage.reset(voltages[0], seed)

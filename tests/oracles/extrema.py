@@ -1,15 +1,15 @@
-"""Hysteresis as a list of branches that were interrupted: (2.8) and (2.9).
+"""Hysteresis as a list of interrupted branches: (2.8) and (2.9).
 
-A branch is (start, target, upwards), two points (v, x) and its direction. The last of
-the list is followed; each of the others was left at the start of the one after it,
-which heads back for its own start. Arrived there, both are over.
+A branch is (start, target, upwards): two points (v, x) and its direction. The last of
+the list is active; each of the others was left at the start of the next one, which
+returns to the start of the former. When it arrives there, both end.
 """
 
 import math
 
 
 def on(branch, v, shapes):
-    """x at v on a branch; shapes holds (alpha, tau) rising and falling."""
+    """Return x at v on a branch; shapes are (alpha, tau) rising and falling."""
     (v1, x1), (v2, x2), upwards = branch
     alpha, tau = shapes[0] if upwards else shapes[1]
     whole = (v2 - v1) * (1.0 + alpha * math.exp(-tau * abs(v2 - v1)))
@@ -22,7 +22,7 @@ def passed(v, point, upwards):
 
 
 def follow(path, lower, upper, shapes, depth):
-    """x along the path, from rest at path[0]; `depth` branches inside the first."""
+    """Return x along the path from rest at path[0], with `depth` nested branches."""
     rising, falling = (lower, upper, True), (upper, lower, False)
     branches = [rising if path[0] >= lower[0] else falling]
     last = path[0]

@@ -18,7 +18,7 @@ def _parted(random, count, total):
 
 
 def irregular_plays(random):
-    """12 to 40 plays: a loop of about 8 to 20 % of the stroke."""
+    """Return 12 to 40 plays: a loop of about 8 to 20 % of the stroke."""
     count = random.integers(12, 41)
     share = random.uniform(0.2, 0.5)
     thresholds = 0.45 * np.sort(random.uniform(size=count)) ** random.uniform(0.7, 1.5)
@@ -29,14 +29,14 @@ def irregular_plays(random):
 
 
 def drifting_plays(random):
-    """Plays that creep towards the input: minor loops drift and do not close."""
+    """Return plays that creep towards the input: minor loops drift and do not close."""
     table = irregular_plays(random)
     table[1:, 2] = random.uniform(0.02, 0.3)
     return table
 
 
 def slipping_elements(random):
-    """8 to 20 elasto-slide elements."""
+    """Return 8 to 20 elasto-slide elements."""
     count = random.integers(8, 21)
     stiffness = _parted(random, count, random.uniform(0.25, 0.7))
     room = random.uniform(0.005, 0.45, count)
@@ -44,7 +44,7 @@ def slipping_elements(random):
 
 
 def relay_grid(random):
-    """Random weights on a triangle of 12 to 30 cells a side, more near its diagonal."""
+    """Return random weights on a triangle of 12 to 30 cells, more at its diagonal."""
     cells = random.integers(12, 31)
     middle = (np.arange(cells) + 0.5) / cells
     apart = np.abs(middle[:, None] - middle)
@@ -59,7 +59,7 @@ def relay_grid(random):
 
 
 def rate_dependent_loop(random):
-    """Bouc-Wen with loops that widen by 2 to 10 % a factor e of the rate."""
+    """Return Bouc-Wen with loops that widen by 2 to 10 % per factor e of the rate."""
     rise, height = random.uniform(0.3, 0.6), random.uniform(0.05, 0.13)
     both, tilt = rise / height, random.uniform(-0.3, 0.3)
     row = [rise, both * (1.0 - tilt), both * tilt]
@@ -67,7 +67,7 @@ def rate_dependent_loop(random):
 
 
 def frictions(random):
-    """One to three Dahl frictions of different exponents."""
+    """Return one to three Dahl frictions of different exponents."""
     count = random.integers(1, 4)
     rise = _parted(random, count, random.uniform(0.3, 0.6))
     height = _parted(random, count, random.uniform(0.06, 0.14))
@@ -85,7 +85,7 @@ KINDS = {
 
 
 def logarithmic_creep(per_decade):
-    """Return rows (time, share): two exponentials a decade from 10 ms to 300 s."""
+    """Return rows (time, share): two exponentials per decade from 10 ms to 300 s."""
     times = 10.0 ** np.arange(-2.0, 2.51, 0.5)
     return np.column_stack([times, np.full(len(times), 0.5 * per_decade)])
 

@@ -12,7 +12,7 @@ import numpy as np
 
 
 def trapezoid_step(x0, y0, x1, a, b, c):
-    """One step of (3.8) rising, (3.14)-(3.16) falling; from k to k + 1."""
+    """Return y(k + 1) by (3.8) rising, (3.14)-(3.16) falling."""
     s = 1.0 if x1 >= x0 else -1.0
     dx = x1 - x0
     square = x1 * x1 - x0 * x0
@@ -22,7 +22,7 @@ def trapezoid_step(x0, y0, x1, a, b, c):
 
 
 def exact_step(x0, y0, x1, a, b, c):
-    """Solution of (3.5) on the monotone branch from x0 to x1 (c not zero).
+    """Return the solution of (3.5) on the monotone branch from x0 to x1 (c not zero).
 
     On a branch dy/dx = s (a x + c y) + b, whose particular solution is
     y = p x + q, p = -a/c, q = (p - b) / (s c); the rest decays as
@@ -35,11 +35,11 @@ def exact_step(x0, y0, x1, a, b, c):
 
 
 def quadratic_step(x_prev, y_prev, x0, y0, x1, a, b, c):
-    """(3.21)-(3.24): from k-1 and k to k+1, both increments of one sign.
+    """Return y(k+1) by (3.21)-(3.24), for two increments of one sign.
 
     q1, q2, q3 are c times the weights of y(k-1), y(k), y(k+1) in the integral
     over [x(k), x(k+1)] of the parabola through the three points: (3.18) and
-    (3.19) with the matrix inverse written out. (3.20) as printed is wrong;
+    (3.19) with the explicit matrix inverse. (3.20) as printed is wrong;
     the form used here is (1 - s q3) y(k+1) = ... + (1 + s q2) y(k).
     """
     s = 1.0 if x1 >= x0 else -1.0
@@ -55,7 +55,7 @@ def quadratic_step(x_prev, y_prev, x0, y0, x1, a, b, c):
 
 
 def voros_step(x0, y0, x1, a, b, c):
-    """One step of (2.11), explicit: f, g and y are taken at sample k.
+    """Return y(k+1) by the explicit (2.11): f, g and y are those of sample k.
 
     y(k+1) = y(k) + (a x(k) + c y(k)) |x(k+1) - x(k)| + b (x(k+1) - x(k)),
     which is (2.11) with alpha f[x] = a x, g[x] = b and alpha = -c.
@@ -65,7 +65,7 @@ def voros_step(x0, y0, x1, a, b, c):
 
 
 def inverse_trapezoid_step(f0, u0, f1, a, b, c):
-    """u(k+1) for which the trapezoid step from (u0, f0) gives f1; no limits.
+    """Return u(k+1) for which the trapezoid step from (u0, f0) gives f1; no limits.
 
     (5.24) for f1 > f0, (5.25) for f1 < f0, both with the corrected
     2 [f(k+1) - f(k)] in zeta; u0 again if f1 = f0. a must be positive.
@@ -82,7 +82,7 @@ def inverse_trapezoid_step(f0, u0, f1, a, b, c):
 
 
 def clip(value, lower, upper):
-    """value limited to [lower, upper]."""
+    """Return the value limited to [lower, upper]."""
     return max(lower, min(upper, value))
 
 
@@ -99,17 +99,17 @@ def _run(step, x, a, b, c, x_init, y_init):
 
 
 def trapezoid(x, a, b, c, x_init=0.0, y_init=0.0):
-    """Trapezoid rule (3.8), (3.14)-(3.16)."""
+    """Return y by the trapezoid rule (3.8), (3.14)-(3.16)."""
     return _run(trapezoid_step, x, a, b, c, x_init, y_init)
 
 
 def exact(x, a, b, c, x_init=0.0, y_init=0.0):
-    """Exact solution of (3.5) for x monotone between samples."""
+    """Return the exact solution of (3.5) for x monotone between samples."""
     return _run(exact_step, x, a, b, c, x_init, y_init)
 
 
 def voros(x, a, b, c, x_init=0.0, y_init=0.0):
-    """Voros' explicit model (2.11).
+    """Return y by the explicit model of Voros (2.11).
 
     Output k is y[k] = y[k-1] + (a x[k-1] + c y[k-1]) |x[k] - x[k-1]|
     + b (x[k] - x[k-1]), with x[-1] = x_init and y[-1] = y_init.
@@ -118,7 +118,7 @@ def voros(x, a, b, c, x_init=0.0, y_init=0.0):
 
 
 def quadratic(x, a, b, c, x_init=0.0, y_init=0.0):
-    """Quadratic rule (3.21)-(3.24), trapezoid (3.26)-(3.29) where it fails.
+    """Return y by the rule (3.21)-(3.24), or the trapezoid (3.26)-(3.29).
 
     A step is quadratic only if it and the step before it are both nonzero
     and of one sign. The first step (x_init to x[0]) is a trapezoid step.
@@ -141,10 +141,10 @@ def quadratic(x, a, b, c, x_init=0.0, y_init=0.0):
 
 
 def inverse_trapezoid(f, a, b, c, f_init, u_init, lower=-20.0, upper=120.0):
-    """Corrected (5.24), (5.25) along f[0 .. N-1], each u clipped.
+    """Return u by the corrected (5.24), (5.25) along f[0 .. N-1], each u clipped.
 
-    The next step starts from the clipped u(k) and from the commanded f(k),
-    also where clipping kept f(k) from being reached.
+    The next step starts from the clipped u(k) and the commanded f(k), even
+    if f(k) was not reached because of clipping.
     """
     f0 = float(f_init)
     u0 = float(u_init)
@@ -157,7 +157,7 @@ def inverse_trapezoid(f, a, b, c, f_init, u_init, lower=-20.0, upper=120.0):
 
 
 def play(x, threshold, start):
-    """A backlash of half-width `threshold`, pushed and pulled by x, from `start`."""
+    """Return the output of a play of half-width `threshold` for x, from `start`."""
     w, out = start, []
     for value in x:
         if value - w > threshold:
@@ -169,7 +169,7 @@ def play(x, threshold, start):
 
 
 def shaped_trapezoid(x, pull, slope, c, y_init):
-    """y' = |x'| (p(x) + c y) + g(x) x' along x from (x[0], y_init).
+    """Return y of y' = |x'| (p(x) + c y) + g(x) x' along x from (x[0], y_init).
 
     Polynomials with the lowest power first; their integrals are exact, that of y is the
     trapezoid rule: (1 - s c dx/2) y1 = (1 + s c dx/2) y0 + s [P] + [G].
@@ -186,7 +186,7 @@ def shaped_trapezoid(x, pull, slope, c, y_init):
 
 
 def stop(x, threshold, start):
-    """A spring with a slider that yields at +-`threshold`, unloaded at `start`."""
+    """Return the force of a spring and slider, +-`threshold`, unloaded at `start`."""
     held, before, out = 0.0, start, []
     for value in x:
         held += value - before
@@ -198,7 +198,7 @@ def stop(x, threshold, start):
 
 
 def inverse_prandtl_ishlinskii(f, slope, thresholds, weights, rest):
-    """Inverse of slope x + sum w play(x) as Krejci and Kuhnen (2001) write it.
+    """Return the inverse of slope x + sum w play(x) by Krejci and Kuhnen (2001).
 
     Plays of f with the thresholds sum_{j<=i} w_j (r_i - r_j), where r_0 = 0 and w_0 is
     the slope, and the weights 1/w_0 and -w_i / (W_i W_{i-1}), W_i = sum_{j<=i} w_j.
@@ -213,7 +213,7 @@ def inverse_prandtl_ishlinskii(f, slope, thresholds, weights, rest):
 
 
 def rate_dependent_plays(x, thresholds, growth, dt, start):
-    """Backlashes whose half-width grows with the rate of the sample before."""
+    """Return plays whose half-width grows with the rate of the previous sample."""
     columns = [[start] * len(thresholds)]
     rate, before = 0.0, x[0]
     for value in x:

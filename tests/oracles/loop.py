@@ -17,7 +17,7 @@ def closed_loop(
     limits=(-20.0, 120.0),
     rate=20000.0,
 ):
-    """Run N steps, reference having N + 1 samples; all at rest at zero before.
+    """Run N steps for a reference of N + 1 samples, from rest at zero.
 
     plant: hysteresis = (a, b, c), step = "exact" (default) or "trapezoid",
     p = (p1, p2), g = (g0, g1, g2), delay = extra samples (default 0).
@@ -72,7 +72,7 @@ def closed_loop(
 
 
 def tracking_rms(displacement, reference):
-    """RMS (um) of y(k) - r(k) over the second half of the run."""
+    """Return the RMS (um) of y(k) - r(k) over the second half of the run."""
     n = len(displacement)
     total = 0.0
     for k in range(n // 2, n):

@@ -80,9 +80,9 @@ ARX = {
         "b": [[-0.004917, 0.04512], [-0.001969, 0.03962], [-0.001185, 0.02997]],
     }
 }
-"""(8.40)-(8.42): y(k) + a1 y(k-1) + a2 y(k-2) = b1 u(k-1) + b2 u(k-2) per axis."""
+"""(8.40)-(8.42): y(k) + a1 y(k-1) + a2 y(k-2) = b1 u(k-1) + b2 u(k-2) by axis."""
 for _name, _factors in (
-    # As printed Rx and Ry have DC gains of 2.32 and 1.92, in (7.53) 0.938 and 0.943.
+    # The printed Rx and Ry have DC gains of 2.32 and 1.92; in (7.53) 0.938 and 0.943.
     ("repaired", (1.0, 0.404, 0.491)),
     # Z too has the DC gain of (7.53): 1.038 instead of 0.995.
     ("matched", (1.043, 0.404, 0.491)),

@@ -1,4 +1,4 @@
-"""Preisach's model: relay by relay, and line by line of one width.
+"""The Preisach model, by relays and by lines of relays of one width.
 
 The triangle of the weights: alpha in cell i and beta in cell j of n equal cells
 between low and high, j <= i. The weight of a cell lies evenly on its diagonal, from
@@ -14,10 +14,10 @@ from .control import PIDSMC
 
 
 class Relays:
-    """Relays that are stepped one by one: `parts` of them in each cell.
+    """Relays that are stepped separately: `parts` of them in each cell.
 
-    Without `rest` all are down at first; else those are up whose alpha and beta have
-    their mean below rest.
+    Without `rest` all are down initially; else those are up whose mean of alpha and
+    beta is below rest.
     """
 
     def __init__(self, weights, low, high, parts, rest=None):
@@ -39,7 +39,7 @@ class Relays:
             ]
 
     def output(self, input):
-        """Switch what the input switches; the weights of what is up."""
+        """Switch the relays by the input; return the weights of those that are up."""
         total = 0.0
         for r in range(len(self.up)):
             if input < self.beta[r]:
@@ -52,16 +52,16 @@ class Relays:
 
 
 def along(weights, low, high, parts, inputs, rest=None):
-    """Output of the relays along the inputs, without the output of all down."""
+    """Return the output of the relays along the inputs minus that of all down."""
     relays = Relays(weights, low, high, parts, rest)
     return np.array([relays.output(u) for u in inputs])
 
 
 class Lines:
-    """The same relays, infinitely many, by plays: what they put out, and an inverse.
+    """Infinitely many such relays, by plays: their output and its inverse.
 
-    A line of relays with half-width r = (alpha - beta)/2 is up as far as a backlash of
-    that half-width stands; its weight below w is linear between the cells' corners.
+    A line of relays with half-width r = (alpha - beta)/2 is up as far as a play of
+    that half-width; its weight below w is linear between the corners of the cells.
     """
 
     def __init__(self, weights, low, high, rest):
@@ -81,26 +81,26 @@ class Lines:
         return enumerate(self.r)
 
     def moved(self, input):
-        """Where the backlashes stand after `input`."""
+        """Return the outputs of the plays after `input`."""
         return [
             min(max(w, input - r), input + r)
             for w, r in zip(self.w, self.r, strict=True)
         ]
 
     def output(self, input):
-        """Output after `input`, which is not remembered."""
+        """Return the output after `input` without storing it."""
         parts = zip(self.moved(input), self.knots, self.below, strict=True)
         return sum(float(np.interp(w, x, y)) for w, x, y in parts)
 
     def inverse(self, wanted):
-        """The input whose output is `wanted`."""
+        """Return the input whose output is `wanted`."""
         return brentq(
             lambda u: self.output(u) - wanted, self.low, self.high, xtol=1e-13
         )
 
 
 class PreisachInversion(PIDSMC):
-    """PID-SMC that asks for a hysteresis output, with Preisach's model inverted."""
+    """PID-SMC that commands a hysteresis output, with an inverse Preisach model."""
 
     def __init__(self, gains, rate, lines, lowest):
         super().__init__("inversion", gains, rate)

@@ -30,7 +30,7 @@ GAINS_5_4 = {
 
 
 def unit_dc(a, b):
-    """Numerator b scaled so that sum(b) = 1 - sum(a): unit DC gain."""
+    """Return the numerator b scaled so that sum(b) = 1 - sum(a): unit DC gain."""
     scale = (1.0 - sum(a)) / sum(b)
     return tuple(scale * value for value in b)
 
@@ -41,7 +41,7 @@ T2_G = unit_dc(MODEL_533_A, MODEL_533_B)
 
 
 def plant_t2(step="exact", delay=0):
-    """Plant dictionary of T2 for `loop.closed_loop`."""
+    """Return the plant dictionary of T2 for `loop.closed_loop`."""
     return {
         "hysteresis": HYSTERESIS,
         "step": step,
@@ -52,7 +52,7 @@ def plant_t2(step="exact", delay=0):
 
 
 def smc_gains(kind, table):
-    """Gains for kind "smc", "inversion", "dob"; table "5-3" or "5-5".
+    """Return the gains of kind "smc", "inversion", "dob" for table "5-3" or "5-5".
 
     Table 5-3 was run with the gains of Table 5-2, Table 5-5 with those of
     Table 5-4. The nominal controller is built on (5.34), the others on (5.33).
@@ -69,8 +69,8 @@ def smc_gains(kind, table):
 
 
 def table_duration(name):
-    """Length (s) of the run behind a cell: half of it holds whole periods of SIN, SW.
+    """Return the length (s) of the run of a cell; half has whole periods of SIN, SW.
 
-    Not in the thesis. SW10 repeats itself after 2 s, SW30 after 0.67 s.
+    It is not in the thesis. SW10 repeats after 2 s, SW30 after 0.67 s.
     """
     return 4.0 if name == "SW10" else 2.0

@@ -1,4 +1,4 @@
-"""Chapter 3's model (3.32) and the rows of its regression (3.33), in plain loops."""
+"""Model (3.32) of chapter 3 and the rows of its regression (3.33), in plain loops."""
 
 import numpy as np
 
@@ -6,12 +6,12 @@ from . import hysteresis
 
 
 def _past(values, k):
-    """values[k], the first one for what lies before the record."""
+    """Return values[k], or the first value before the record."""
     return values[max(k, 0)]
 
 
 def operators(x, c, scheme, x_init=0.0):
-    """y_1 (a = 1, b = 0) and y_2 (a = 0, b = 1) of the voltages x."""
+    """Return y_1 (a = 1, b = 0) and y_2 (a = 0, b = 1) of the voltages x."""
     run = {
         "trapezoid": hysteresis.trapezoid,
         "quadratic": hysteresis.quadratic,
@@ -21,9 +21,9 @@ def operators(x, c, scheme, x_init=0.0):
 
 
 def rows(x, z, c, scheme):
-    """Rows [z(k-1), z(k-2), y_1(k-1 .. k-3), y_2(k-1 .. k-3), 1], k = 0 .. N-1.
+    """Return rows [z(k-1), z(k-2), y_1(k-1 .. k-3), y_2(k-1 .. k-3), 1], k < N.
 
-    The last entries of each row follow (3.33) with its last row put right, and with one
+    The last entries of each row follow (3.33) with its last row corrected, and with one
     sample between voltage and displacement.
     """
     first, second = operators(x, c, scheme)
@@ -37,7 +37,7 @@ def rows(x, z, c, scheme):
 
 
 def model(x, c, a, b1, b2, scheme, offset=0.0, x_init=0.0):
-    """z of (3.32) plus an offset, b[0] at the same sample; at rest at zero before."""
+    """Return z of (3.32) plus an offset, b[0] at the same sample, from rest at zero."""
     first, second = operators(x, c, scheme, x_init)
     outputs = []
     for k in range(len(x)):

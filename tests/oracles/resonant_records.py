@@ -1,4 +1,4 @@
-"""Records of a stage with a resonance behind a slow sensor, in NumPy and SciPy alone.
+"""Records of a stage with a resonance behind a slow sensor, in NumPy and SciPy only.
 
 Hysteresis (24 plays or Coleman-Hodgdon), creep of 1 % a decade, a resonance and a
 first-order sensor in one exact discretisation (matrix exponential, held input), white
@@ -42,7 +42,7 @@ NAMED = Case()
 
 
 def grid(count=60):
-    """Return ``count`` cases: excitations and lags in turn, the rest drawn."""
+    """Return ``count`` cases: excitations and lags in turn, other values random."""
     draw = np.random.default_rng(18)
     excitations, hystereses = tuple(EXCITATIONS), tuple(HYSTERESES)
     return [
@@ -76,7 +76,7 @@ def measured(case):
 
 
 def sweep(samples, draw):
-    """Two linear chirps to 0.45 of the rate, the second smaller."""
+    """Return two linear chirps to 0.45 of the rate, the second one smaller."""
     del draw
     half = samples // 2
     time = np.arange(half) / RATE
@@ -86,7 +86,7 @@ def sweep(samples, draw):
 
 
 def multisine(samples, draw):
-    """Random phases at all lines of half a second to 0.45 of the rate."""
+    """Return random phases at all lines of half a second to 0.45 of the rate."""
     period = int(RATE / 2)
     lines = np.arange(1, int(0.45 * period))
     spectrum = np.zeros(period // 2 + 1, complex)
@@ -96,20 +96,20 @@ def multisine(samples, draw):
 
 
 def binary(samples, draw):
-    """A pseudo-random binary sequence with a clock of three samples."""
+    """Return a pseudo-random binary sequence with a clock of three samples."""
     bits = draw.integers(2, size=samples // 3 + 1)
     return 35.0 + 30.0 * np.repeat(bits, 3)[:samples]
 
 
 def steps(samples, draw):
-    """Random levels, each held for 10 to 60 ms."""
+    """Return random levels, each held for 10 to 60 ms."""
     lengths = draw.integers(100, 600, size=samples // 100)
     levels = draw.uniform(10.0, 90.0, size=lengths.size)
     return np.repeat(levels, lengths)[:samples]
 
 
 def mixed(samples, draw):
-    """Large slow loops with small steps and a small multisine on them."""
+    """Return large slow loops with superposed small steps and a small multisine."""
     time = np.arange(samples) / RATE
     swing = 1.0 - 0.5 * np.floor(4.0 * time / time[-1]) / 4.0
     slow = 45.0 - 30.0 * swing * np.cos(2 * np.pi * 8.0 * time)
@@ -130,7 +130,7 @@ EXCITATIONS = {
 
 
 def plays(input):
-    """24 plays and a straight line, from rest at 0 V."""
+    """Return the output of 24 plays and a straight line, from rest at 0 V."""
     thresholds = 2.0 * np.arange(24)
     weights = 0.02 * np.exp(-thresholds / 12.0)
     weights[0] = SLOPE - weights[1:].sum()
@@ -142,7 +142,7 @@ def plays(input):
 
 
 def coleman_hodgdon(input):
-    """y' = alpha |x'| (f x - y) + g x' in steps of one sample, from rest at 0 V."""
+    """Return y of y' = alpha |x'| (f x - y) + g x', one step per sample, from rest."""
     alpha, f, g = 0.04, SLOPE * 1.1, SLOPE * 0.85
     last = y = 0.0
     output = np.empty(input.size)
@@ -161,7 +161,7 @@ HYSTERESES = {"plays": plays, "Coleman-Hodgdon": coleman_hodgdon}
 
 
 def crept(signal, share=0.01):
-    """Creep by ``share`` of a step in each decade of time from 1 ms to 100 s."""
+    """Return creep by ``share`` of a step in each decade of time from 1 ms to 100 s."""
     total = np.zeros_like(signal)
     for time_constant in 10.0 ** np.arange(-2.0, 2.5, 0.5):
         pole = np.exp(-1.0 / (RATE * time_constant))
@@ -171,7 +171,7 @@ def crept(signal, share=0.01):
 
 
 def dynamic(signal, case):
-    """The resonance and the sensor, together exact for a held input."""
+    """Return the output of resonance and sensor, exact for a held input."""
     w = 2.0 * np.pi * (case.frequency or 0.0)
     blocks, size = [], 0
     matrix, source = np.zeros((4, 4)), None

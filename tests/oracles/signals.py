@@ -8,12 +8,12 @@ PATTERN = (1.0, 1.0, 0.5, 0.15)
 
 
 def _count(duration, rate):
-    """Number of samples N, taken at t = k / rate, k = 0 .. N-1."""
+    """Return the number of samples N at t = k / rate, k = 0 .. N-1."""
     return round(duration * rate)
 
 
 def sine(frequency, amplitude=5.0, duration=1.0, rate=20000.0):
-    """SIN: A (1 - cos(2 pi f t)), so 0 .. 2 A um, starting at rest."""
+    """Return SIN: A (1 - cos(2 pi f t)), 0 .. 2 A um, from rest."""
     values = []
     for k in range(_count(duration, rate)):
         turns = frequency * k / rate
@@ -22,10 +22,10 @@ def sine(frequency, amplitude=5.0, duration=1.0, rate=20000.0):
 
 
 def piecewise_sine(frequency, amplitude=5.0, duration=1.0, rate=20000.0):
-    """PWSW: as `sine`, the amplitude times 1, 1, 0.5, 0.15 period by period.
+    """Return PWSW: `sine` with the amplitude times 1, 1, 0.5, 0.15 by period.
 
     The pattern repeats every four periods. Sample k belongs to period
-    floor(f k / rate); on a boundary the value is zero for either factor.
+    floor(f k / rate); at a boundary the value is zero for either factor.
     """
     values = []
     for k in range(_count(duration, rate)):
@@ -36,7 +36,7 @@ def piecewise_sine(frequency, amplitude=5.0, duration=1.0, rate=20000.0):
 
 
 def superposed_sine(f_max, amplitude=5.0, duration=1.0, rate=20000.0):
-    """SW: equation (4.48), all of it (the offset too) times amplitude / 5."""
+    """Return SW: equation (4.48), with its offset, times amplitude / 5."""
     values = []
     for k in range(_count(duration, rate)):
         t = k / rate - 0.1
@@ -50,7 +50,7 @@ def superposed_sine(f_max, amplitude=5.0, duration=1.0, rate=20000.0):
 
 
 def ten_references(n_extra=1, duration=1.0, rate=20000.0):
-    """The ten inputs of Table 5-1 by name, each with N + n_extra samples.
+    """Return the ten inputs of Table 5-1 by name, each with N + n_extra samples.
 
     N = duration * rate. The extra samples continue the signal, so that
     r(k + 1) exists at the last step.

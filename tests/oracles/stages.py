@@ -1,12 +1,12 @@
-"""Forty piezo stages with memories, modes and converters of the literature, in NumPy.
+"""Forty piezo stages in NumPy: memories of the literature, modes and converters.
 
     voltage -> converter, delay -> slew limit -> memory -> creep -> modes -> tip
     tip -> lag of the sensor -> noise, converter -> reading
 
 The memory is one of MEMORIES, none of them the one that ``identify`` fits by default.
-Between two samples a stage takes SUBSTEPS steps, in which the voltage slews; the modes
-and the sensor are stepped exactly (matrix exponential) under a held input. All states
-live in arrays that a compiled step changes in place.
+Between two samples a stage has SUBSTEPS steps, in which the voltage slews; the modes
+and the sensor have exact steps (matrix exponential) for a held input. All states
+are in arrays that a compiled step changes in place.
 
 Lengths in um, voltages in V, times in s. ``stage(number)`` draws one of the forty.
 """
@@ -28,10 +28,10 @@ POOL = 1 << 17
 
 @numba.njit(cache=True)
 def plays(x, dx, dt, state, table):
-    """Sum of plays: rows (threshold, weight, accommodation), Kuhnen 2003.
+    """Return the sum of plays: rows (threshold, weight, accommodation), Kuhnen 2003.
 
-    With an accommodation a play's position creeps along the path towards the input, so
-    that minor loops drift and do not close.
+    With an accommodation the position of a play creeps along the path towards the
+    input, so that minor loops drift and do not close.
     """
     total = 0.0
     for i in range(len(table)):
@@ -44,10 +44,10 @@ def plays(x, dx, dt, state, table):
 
 @numba.njit(cache=True)
 def maxwell_slip(x, dx, dt, state, table):
-    """Charge q of x = a q + sum of elasto-slide forces, Goldfarb and Celanovic 1997.
+    """Return q of x = a q + sum of elasto-slide forces, Goldfarb and Celanovic 1997.
 
-    Row 0 holds a; the others (stiffness, breakaway force). The forces are piecewise
-    linear in q: the step goes from one breakaway to the next.
+    Row 0 has a; the others (stiffness, breakaway force). The forces are piecewise
+    linear in q: the step is computed from one breakaway to the next.
     """
     left = dx
     while left != 0.0:
@@ -76,7 +76,7 @@ def maxwell_slip(x, dx, dt, state, table):
 
 @numba.njit(cache=True)
 def _corner(table, a, b):
-    """Integral of the symmetric density from the lowest corner to (a, b)."""
+    """Return the integral of the symmetric density from the lowest corner to (a, b)."""
     cells = len(table) - 2
     a, b = min(max(a, 0.0), 1.0) * cells, min(max(b, 0.0), 1.0) * cells
     i, j = min(int(a), cells - 1), min(int(b), cells - 1)
@@ -91,16 +91,16 @@ def _corner(table, a, b):
 
 @numba.njit(cache=True)
 def _triangle(table, high, low):
-    """Weight of the relays that switch up by ``high`` and down from ``low`` on."""
+    """Return the weight of relays that switch up by ``high`` and down from ``low``."""
     square = _corner(table, high, high) + _corner(table, low, low)
     return 0.5 * square - _corner(table, high, low)
 
 
 @numba.njit(cache=True)
 def preisach(x, dx, dt, state, table):
-    """Preisach operator with constant density in each cell, by its stored extrema.
+    """Return the Preisach output with constant density in each cell, by stored extrema.
 
-    Row 0 holds the lowest input and the weight of x itself; the other rows the
+    Row 0 has the lowest input and the weight of x; the other rows have the
     integral of the density, extended symmetrically, at the corners of the cells.
     ``state[0]`` is the number of extrema in ``state[1:]``, a minimum first and the
     input itself last: Mayergoyz 1991, with their wiping-out.
@@ -111,7 +111,7 @@ def preisach(x, dx, dt, state, table):
         count, state[1], state[2] = 2, 0.0, 0.0
     rising = count % 2 == 0  # the last entry is a maximum
     if (place < state[count]) if rising else (place > state[count]):
-        count += 1 if count < len(state) - 2 else -1  # or forget the smallest loop
+        count += 1 if count < len(state) - 2 else -1  # or forget the smallest
         rising = not rising
     state[count] = place
     while count > 2:
@@ -131,9 +131,9 @@ def preisach(x, dx, dt, state, table):
 
 @numba.njit(cache=True)
 def bouc_wen(x, dx, dt, state, table):
-    """x less h, h' = A x' - b |x'| h - c x' |h|, Low and Guo 1995.
+    """Return x - h with h' = A x' - b |x'| h - c x' |h|, Low and Guo 1995.
 
-    Row 0: A, b, c. Row 1: a share and a rate in spans per s; b falls by about the
+    Row 0: A, b, c. Row 1: a share and a rate in spans per s; b decreases by about the
     share for each factor e above that rate, so that fast loops are wider.
     """
     rate = abs(dx) / dt
@@ -151,7 +151,7 @@ def _bouc_wen_slope(h, dx, a, b, c):
 
 @numba.njit(cache=True)
 def dahl(x, dx, dt, state, table):
-    """x less the sum of friction forces F, dF/dx = k |1 - F/F_c|^n, Dahl 1976.
+    """Return x minus the friction forces F, dF/dx = k |1 - F/F_c|^n, Dahl 1976.
 
     F/F_c has the sign of the motion. Rows: k, F_c, n.
     """
@@ -189,7 +189,7 @@ def remember(kind, x, dx, dt, state, table):
 
 @dataclasses.dataclass(frozen=True)
 class Parameters:
-    """Numbers of a stage; ``memory`` is the place of its operator in MEMORIES.
+    """Numbers of a stage; ``memory`` is the index of its operator in MEMORIES.
 
     ``modes`` are rows (frequency in Hz, damping ratio, residue) with residues of sum 1,
     ``creep`` rows (time in s, share). ``bend`` is the relative rise of the gain over
@@ -222,7 +222,7 @@ class Parameters:
         return self.upper - self.lower
 
 
-# Places in the arrays of numbers, and of states that are single numbers.
+# Indices in the arrays of numbers, and of states that are single numbers.
 LOWER, SPAN, GAIN, BEND, SLEW, NOISE, LSB, RAMP, WALK, DAC, DT, ZERO = range(12)
 VOLTAGE, PLACE, DRAW, DRIFT, TIP, SENSED = range(6)
 
@@ -251,7 +251,7 @@ def advance(
         old, most = single[VOLTAGE], numbers[SLEW] * dt
         now = old + min(max(line[place] - old, -most), most)
         single[VOLTAGE] = now
-        # A held voltage changes in one substep: its rate is that over the sample.
+        # A held voltage changes in one substep; its rate is that over the sample.
         h = remember(kind, now / span, (now - old) / span, SUBSTEPS * dt, memory, table)
         h = shaped(numbers, h)
         pushed = h
@@ -343,7 +343,7 @@ class Stage:
         self.reset(0.0, seed)
 
     def _scale(self):
-        """Set the numbers; a slow loop over the span measures the stroke."""
+        """Set the numbers; the stroke follows from a slow loop over the span."""
         p, numbers = self.parameters, self._numbers
         numbers[GAIN], numbers[SPAN] = 1.0, p.span
         corners = np.array([0.0, p.upper, p.lower, p.upper])
@@ -372,9 +372,9 @@ class Stage:
         return found
 
     def reset(self, voltage=0.0, seed=None):
-        """Rest at ``voltage``, reached slowly from the virgin state; return a reading.
+        """Move slowly from the virgin state to rest at ``voltage``; return a reading.
 
-        With a ``seed`` noise and drift are drawn anew, else they go on.
+        With a ``seed`` noise and drift are drawn again, else they continue.
         """
         if seed is not None:
             entropy = np.random.SeedSequence([18, seed])
@@ -393,7 +393,7 @@ class Stage:
         return advance(*self._parts, voltage)
 
     def respond(self, voltages):
-        """Return readings, tips and sensed tips [samples] of ``step`` by voltage."""
+        """Return readings, tips and sensed tips [samples] for the voltages."""
         voltages = np.ascontiguousarray(voltages, dtype=float)
         found = np.zeros((3, len(voltages)))
         advance_all(self._parts, voltages, *found)

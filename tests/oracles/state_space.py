@@ -18,7 +18,7 @@ def markov(A, B, C, count):
 
 
 def random_stable(seed, states, inputs, outputs):
-    """Return A, B, C, D drawn at random, the largest pole at modulus 0.9."""
+    """Return random A, B, C, D whose largest pole has modulus 0.9."""
     draw = np.random.default_rng(seed).standard_normal
     A = draw((states, states))
     A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()

@@ -1,4 +1,4 @@
-"""Surveyed control schemes, plain loops; at rest at zero before the first step.
+"""Surveyed control schemes as plain loops, at rest at zero before the first step.
 
 Each has step(z, r_next, r, r_prev) and applied(u), as in `control`.
 """
@@ -22,7 +22,7 @@ class BoundaryLayer:
 
 
 class SuperTwisting:
-    """w - k1 s / (s^2 + d^2)^(1/4), w falling by T k2 s / (s^2 + d^2)^(1/2)."""
+    """w - k1 s / (s^2 + d^2)^(1/4); w decreases by T k2 s / (s^2 + d^2)^(1/2)."""
 
     def __init__(self, root, sign, layer, period):
         self.root, self.sign, self.layer = root, sign, layer
@@ -61,11 +61,11 @@ class Switched:
         return f
 
     def applied(self, u):
-        """Nothing here depends on the limits."""
+        """Do nothing: the controller does not depend on the limits."""
 
 
 class Feedforward:
-    """Inverse trapezoid hysteresis of r(k+1), and a PID beside it unless None."""
+    """Inverse trapezoid hysteresis of r(k+1), plus a PID unless None."""
 
     def __init__(self, hysteresis, pid_gains, rate):
         self.hysteresis = hysteresis
@@ -85,7 +85,7 @@ class Feedforward:
 
 
 class Repetitive:
-    """Any controller with r + w; whole histories kept, nothing wraps around.
+    """Any controller with the reference r + w, with complete histories.
 
     w(k+1) = p w(k) + (1 - p) x(k+1-N+advance), x(k) = w(k) + gain e(k + lead), with
     x zero before the errors that make it.

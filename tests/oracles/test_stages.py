@@ -1,4 +1,4 @@
-"""The stages themselves: each operator against a slow loop or a closed form."""
+"""The forty stages: each operator against a slow loop or a closed form."""
 
 import itertools
 import math
@@ -19,7 +19,7 @@ STIFF = np.array([[1500.0, 1.0, 1.0]])
 
 
 def wandering(seed=1, corners=12):
-    """A path over 0 to 1 with turning points at random, 150 samples a stroke."""
+    """Return a path over 0 to 1 with random turning points, 150 samples per stroke."""
     ends = np.random.default_rng(seed).uniform(size=corners)
     ends = np.concatenate([[0.0, 1.0], ends])
     strokes = [np.linspace(*pair, 150) for pair in itertools.pairwise(ends)]
@@ -35,7 +35,7 @@ def memorised(kind, path, table, dt=1e9):
 
 
 def plain(**changes):
-    """A stage of 50 um over 100 V at 10 kHz; without changes, a line and a mode."""
+    """Return a stage of 50 um over 100 V at 10 kHz; by default a line and a mode."""
     numbers = {
         "name": "plain",
         "rate": 10e3,
@@ -111,7 +111,7 @@ def test_the_preisach_operator_equals_its_relays():
         expected.append(table[0, 1] * x + weight[on].sum())
     found = memorised("preisach", path, table)
     assert np.abs(found - expected).max() < 1.5 / (cells * each)
-    assert found[149] == pytest.approx(1.0)  # the weights are shares
+    assert found[149] == pytest.approx(1.0)  # the weights have the sum 1
 
 
 def test_a_slow_bouc_wen_loop_solves_its_equation():
@@ -153,7 +153,7 @@ def test_friction_of_exponent_one_is_an_exponential():
 LOOPS = np.concatenate(
     [np.linspace(*ends, 2000) for ends in ((0, 1), (1, 0.2), (0.2, 0.7), (0.7, 0.2))]
 )
-"""Up, then a large stroke down, a smaller one up and back to where it began."""
+"""Up, a large stroke down, then a smaller one up and back to its start."""
 
 
 @pytest.mark.parametrize("kind", forty_stages.KINDS)
@@ -180,7 +180,7 @@ def test_minor_loops_between_the_same_inputs_are_congruent(kind):
         return memorised(kind, path, table)[-600:]
 
     rising, falling = after(0.35), after(1.0)
-    if kind != "maxwell_slip":  # congruent in its force: the charge is what is solved
+    if kind != "maxwell_slip":  # congruent in the force; the output is the charge
         np.testing.assert_allclose(np.ptp(falling - rising), 0.0, atol=1e-12)
     assert np.abs(falling - rising).min() > 1e-3
 
@@ -209,7 +209,7 @@ def test_modes_of_either_sign_have_their_transfer_function():
     u = 50.0 + 10.0 * np.sin(2.0 * np.pi * frequency * time)
     _, tip, sensed = stage.respond(u)
     s = 2j * np.pi * frequency
-    held = -np.expm1(-s * 1e-4) / (s * 1e-4)  # the converter holds
+    held = -np.expm1(-s * 1e-4) / (s * 1e-4)  # the converter holds the voltage
     expected = sum(
         residue * w**2 / (s**2 + 2.0 * zeta * w * s + w**2)
         for w, zeta, residue in modes * [2.0 * np.pi, 1.0, 1.0]
@@ -219,7 +219,7 @@ def test_modes_of_either_sign_have_their_transfer_function():
         wave = np.exp(-s * (time[1000:] + 1e-4))
         return np.mean(y[1000:] * wave) / np.mean(u[1000:] * np.exp(-s * time[1000:]))
 
-    # 50 um on 100 V; the hold's images are the rest.
+    # 50 um over 100 V; the difference is due to the images of the hold.
     assert response(tip) / 0.5 == pytest.approx(held * expected, rel=1e-3)
     lagged = held * expected / (1.0 + 2e-4 * s)
     assert response(sensed) / 0.5 == pytest.approx(lagged, rel=1e-3)
@@ -256,7 +256,7 @@ def test_the_delay_shifts_the_response(delay):
 def test_the_amplifier_limits_the_slew_rate():
     stage = plain(slew=1e4)
     tips = stage.respond(np.full(400, 50.0))[1]
-    # The ramp ends after 5 ms, and a mode follows a ramp with a lag of 2 zeta / w.
+    # The ramp ends after 5 ms; a mode lags a ramp by 2 zeta / w.
     lag = 2.0 / (2.0 * np.pi * 1500.0)
     assert tips[39] == pytest.approx(0.5 * 1e4 * (40e-4 - lag), rel=0.01)
 
@@ -286,7 +286,7 @@ def test_voltages_are_limited():
     assert stage.respond(np.full(500, 1e9))[1][-1] == pytest.approx(50.0)
 
 
-# The forty, and their records
+# The forty stages, and their records
 
 
 def test_the_forty_stages_have_their_strokes_and_loops():

@@ -1,7 +1,7 @@
 """The 3-DOF stage P-558.TCD and its controllers (thesis, chapters 7, 8), plain loops.
 
 Axes Z in um, Rx and Ry in urad, a sample every 2 ms. Signals have time first and the
-three axes last; whatever lies between is simulated at once, run beside run. At time k
+three axes last; dimensions between them are simulated at once. At time k
 a controller gets the measurement z(k) and the references r(k+1), r(k), and returns the
 command u(k), which acts on y(k+1). Everything starts at zero, the references too.
 """
@@ -24,7 +24,7 @@ from .p558 import (
 
 
 def stacked():
-    """A [9, 9], B [9, 3], C [3, 9] of (7.52)."""
+    """Return A [9, 9], B [9, 3], C [3, 9] of (7.52)."""
     a, b, c = zip(*PLANT, strict=True)
     columns = [np.reshape(column, (3, 1)) for column in b]
     return block_diag(*a), block_diag(*columns), np.hstack(c)
@@ -34,7 +34,7 @@ class Plant:
     """x(k+1) = A x(k) + B h(k-delay), y(k) = C x(k).
 
     h = (1 - weight) u + weight p, where p is the play operator of u with that radius:
-    a stand-in for the hysteresis of the stage, of which no model is printed.
+    an assumption for the hysteresis of the stage, of which no model is printed.
     """
 
     def __init__(self, shape, delay=0, weight=0.0, radius=0.0):
@@ -101,11 +101,11 @@ class PID:
         return -self.law.step(r - z), {}
 
     def applied(self, u):
-        """There is no anti-windup."""
+        """Do nothing, because there is no anti-windup."""
 
 
 def autoregression():
-    """A0, A1, A2 and B0, B1, B2 of (7.26), each [3, 3].
+    """Return A0, A1, A2 and B0, B1, B2 of (7.26), each [3, 3].
 
     y(k+3) = A0 y(k) + A1 y(k+1) + A2 y(k+2) + B0 u(k) + B1 u(k+1) + B2 u(k+2), from the
     observability form of the stacked model and its first three Markov parameters.
@@ -119,7 +119,7 @@ def autoregression():
 
 
 def reference_model(frequency, damping):
-    """Am [2, 2], Bm [2], Cm [2] of one axis of (7.54), inputs held over a sample."""
+    """Return Am [2, 2], Bm [2], Cm [2] of one axis of (7.54) for a held input."""
     square = frequency * frequency
     both = np.zeros((3, 3))
     both[0, 1] = 1.0
@@ -131,7 +131,7 @@ def reference_model(frequency, damping):
 class PIDSMC:
     """Chapter 7: output tracking PID-SMC, static decoupling, model reference.
 
-    Readings: the state of (7.27) is dead-beat, worked out from past e and u2; +PHI in
+    Readings: the state of (7.27) is computed from past e and u2 (dead-beat); +PHI in
     (7.30); u1 causal, two samples behind (7.16).
     """
 
@@ -214,8 +214,8 @@ class Observer:
 class NominalSMC:
     """Chapter 8: a PID-SMC per axis, with or without the disturbance observer.
 
-    Readings: the equivalent control (8.33) acts on the nominal model's own state, one
-    step ahead, the switching part on the measured error; u(k) of the predictors is
+    Readings: the equivalent control (8.33) uses the state of the nominal model, one
+    step ahead, and the switching part the measured error; u(k) of the predictors is
     un(k-1); b0 = 0, so (8.39) inverts the numerator by its sum; r(k+2) is extrapolated.
     """
 
@@ -273,7 +273,7 @@ class NominalSMC:
 
 
 def make_controller(name, **options):
-    """One of pid, pid_smc, dob_smc, nominal_smc; options as in its class."""
+    """Return pid, pid_smc, dob_smc or nominal_smc, with the options of its class."""
     if name == "pid":
         return PID(**options)
     if name == "pid_smc":
@@ -288,7 +288,7 @@ def simulate(name, references, noise=None, plant=None, limits=None, **options):
     references [N+1, ..., 3] for N samples, noise [N, ..., 3] adds to the measurement,
     limits (lower, upper) of the commands.
     Returns arrays [N, ..., 3]: y (the plant's output), z (measured), u, and what the
-    controller logs, the sliding variable s among it.
+    controller logs, such as the sliding variable s.
     """
     references = np.asarray(references, dtype=float)
     steps, shape = len(references) - 1, references.shape[1:-1]
@@ -308,13 +308,13 @@ def simulate(name, references, noise=None, plant=None, limits=None, **options):
 
 
 def tracking_rms(y, references):
-    """RMS of y(k) - r(k) over the second half, [..., 3]."""
+    """Return the RMS of y(k) - r(k) over the second half, [..., 3]."""
     miss = (y - references[: len(y)])[len(y) // 2 :]
     return np.sqrt(np.mean(miss * miss, axis=0))
 
 
 def table_sines(seconds=4.0):
-    """[N+1, 3, 3, 3]: time, driven axis, 1 / 5 / 10 Hz, axis; 10 um or urad."""
+    """Return sines of 10 um or urad [N+1, driven axis, 1 / 5 / 10 Hz, axis]."""
     steps = round(seconds / T)
     time = T * np.arange(steps + 1)
     references = np.zeros((steps + 1, 3, 3, 3))

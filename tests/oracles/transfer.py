@@ -1,4 +1,4 @@
-"""Loop transfer functions written from the equations.
+"""Loop transfer functions from the equations.
 
 Polynomials in p = z^-1, lowest power first; the critical point is -1.
 """
@@ -29,14 +29,14 @@ def transfer(numerator, denominator, period):
 
 
 def plant(a, b, gain=1.0, delay=1):
-    """gain p^delay (b0 + b1 p + ..) / (1 - a1 p - ..): y(k + delay) from u(k)."""
+    """Return gain p^delay (b0 + b1 p + ..) / (1 - a1 p - ..) from u to y."""
     return gain * np.concatenate([np.zeros(delay), b]), np.array(
         [1.0, *(-x for x in a)]
     )
 
 
 def pid_loop(proportional, integral, derivative, filter_time, period, num, den):
-    """L for u = P e + I T sum e + D d, d the slope of e behind a first-order filter."""
+    """Return L for u = P e + I T sum e + D d, where d is the filtered slope of e."""
     smooth = period / (period + filter_time)
     ends, lag = np.array([1.0, -1.0]), np.array([1.0, -(1.0 - smooth)])
     top = plus(
@@ -48,9 +48,9 @@ def pid_loop(proportional, integral, derivative, filter_time, period, num, den):
 
 
 def disturbance_observer_loop(gains, period, num, den):
-    """L(z) for u = f / Ke - w, the sliding mode f of (5.17), (5.18), (5.23).
+    """Return L(z) for u = f / Ke - w, with f of (5.17), (5.18), (5.23).
 
-    A function of z: multiplied out, the many factors near z = 1 would lose digits.
+    It is a function of z: expanded, the many factors near z = 1 would lose digits.
     """
     alpha, beta, m = gains["alpha"], gains["beta"], gains["m"]
     a1, a2 = gains["model_a"]

@@ -141,7 +141,7 @@ class Command:
     """Hold the integral (V), the output filters, the limits and the anti-windup."""
 
     def __init__(self, applied, direct, filters, lower, upper, anti_windup):
-        """Begin at rest: ``direct`` plus the integral equals ``applied``."""
+        """Start at rest: ``direct`` plus the integral equals ``applied``."""
         if anti_windup not in ("none", "hold"):
             raise ValueError(f"unknown anti-windup {anti_windup!r}")
         self.integral = applied - direct
@@ -194,7 +194,7 @@ class NV200:
         depth=0.0,
         anti_windup="none",
     ):
-        """Begin at rest; ``stroke`` is needed where ``sr`` is below 2000."""
+        """Start at rest; ``stroke`` is needed if ``sr`` is below 2000."""
         if integration not in ("rectangular", "trapezoidal", "half"):
             raise ValueError(f"unknown integration {integration!r}")
         dt = self.dt
@@ -263,7 +263,7 @@ class E727:
         upper=math.inf,
         anti_windup="none",
     ):
-        """Begin at rest; a rejection of 1 switches a notch off."""
+        """Start at rest; a rejection of 1 switches a notch off."""
         if structure not in ("series", "parallel"):
             raise ValueError(f"unknown structure {structure!r}")
         if method not in (0, 1) or law != 1 or filter_type not in (0, 1):
@@ -329,7 +329,7 @@ class GenericServo:
         upper=math.inf,
         anti_windup="none",
     ):
-        """Begin at rest; ``ti`` of None, 0 or infinity switches the integral off."""
+        """Start at rest; ``ti`` of None, 0 or infinity switches the integral off."""
         if form not in ("parallel", "standard") or low_pass_order not in (1, 2):
             raise ValueError(f"unknown form {form!r} or low-pass order")
         if form == "standard":
@@ -363,7 +363,7 @@ class Stabilizer:
     """Simulate one channel of a Stabilizer: a biquad in single precision.
 
     The gains are those of its PID representation of order I, the signals in V at the
-    converters; ``volts`` of the piezo belong to 1 V of the output.
+    converters; 1 V of the output gives ``volts`` at the piezo.
     """
 
     CODES = np.float32(3200.0)
