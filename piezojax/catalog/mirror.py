@@ -103,8 +103,8 @@ def multi_axis() -> MultiAxisSlidingMode:
 
     The gains hold for that model alone. On the model of 24 states the loop is unstable
     (largest pole 1.25), because the prediction of chapter 7 needs a model of every
-    resonance; ``state_sliding_mode`` is stable on both. The real mirror will need other
-    gains or a better model.
+    resonance; ``state_sliding_mode`` is stable on both. The real mirror will probably
+    need other gains or a better model.
     """
     plant = stage(order=12)
     scale = _surface_scale(plant)

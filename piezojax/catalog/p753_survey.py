@@ -46,7 +46,7 @@ BOUNDARY_LAYER = {"gain": 1e4, "width": 4e4}
 """K in V and the layer in um/s. K is large because the inverse passes 1 % of v."""
 
 SUPER_TWISTING = {"root_gain": 10.0, "sign_gain": 1e6, "layer": 1e4}
-"""Gains in V/(um/s)^(1/2) and V/s, layer in um/s."""
+"""Gains in V/(um/s)^(1/2) and V/s; layer in um/s."""
 
 NOTCH = 0.5, 0.1
 """Damping and depth of a notch at the nominal mode of the stage."""

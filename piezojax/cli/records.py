@@ -53,7 +53,7 @@ def record_columns(function: Callable) -> Callable:
 
 
 def print_columns(console: Console, records: Iterable["Record"]) -> None:
-    """Print what was read: columns with their units and ranges, samples and rate."""
+    """Print the columns with their units and ranges, the samples and the rate."""
     for record in records:
         sides = "; ".join(
             f"{role} {', '.join(columns)}"

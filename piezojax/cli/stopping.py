@@ -37,7 +37,7 @@ def handled(handlers: dict[signal.Signals, Handler]) -> Iterator[None]:
 def terminable() -> Iterator[None]:
     """End the process at once on SIGTERM, with the exit status of a shell.
 
-    There is nothing to keep while a command imports, reads its files or prints; while
+    No results are lost while a command imports, reads its files or prints; while
     it computes, ``Bar`` handles the signal.
     """
     _first.clear()

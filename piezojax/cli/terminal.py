@@ -105,5 +105,5 @@ class Bar:
 
 def console(quiet: bool) -> Console:
     """Return the console on which a command prints: standard output, or none."""
-    # Titles and paths may hold brackets: nothing printed is markup.
+    # Titles and paths may contain brackets, so nothing printed is markup.
     return Console(quiet=quiet, file=sys.stdout, highlight=False, markup=False)

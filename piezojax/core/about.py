@@ -13,11 +13,11 @@ class About(BaseModel):
     ``piezojax`` is the version that wrote the file. ``study`` is the name of the study
     with its ``seed``, ``record`` the origin of the record of a fit, and ``rate_Hz`` the
     sampling rate. ``units`` maps the channels of the System to their units, and
-    ``parameter_units`` its parameters, by path; "" is a unit that is not known.
+    ``parameter_units`` its parameters, by path; "" is an unknown unit.
     ``input_ranges`` are the least and greatest value of each input in the record.
     ``error_bound`` bounds the error of a fitted model, ``residual_rms`` is the rms
     error of each output on the validation part of its record, in the unit of the
-    output, and ``checked`` are the other records that it was validated on;
+    output, and ``checked`` lists the other records of its validation;
     ``standard_errors`` are those of its parameters, by path. ``unsafe`` lists the
     alarms raised when the System was made; ``load`` refuses a file with any. Keys of
     later versions are ignored.

@@ -22,8 +22,8 @@ class ErrorBound(BaseModel):
     """Upper bound of the relative error of a model, by frequency.
 
     ``relative`` bounds ``|G_true / G_model - 1|`` at ``frequency`` (Hz, increasing up
-    to the Nyquist frequency). ``excited`` tells for each line whether the record holds
-    enough power there; where it does not, ``relative`` is an assumption (``UNSEEN``).
+    to the Nyquist frequency). ``excited`` is true for each line at which the record has
+    enough power; at the others ``relative`` is an assumption (``UNSEEN``).
     Raises ValueError for lists of different length, and for frequencies that are
     negative or do not increase.
     """
@@ -69,19 +69,19 @@ class ErrorBound(BaseModel):
         return self.highest < NARROW * self.frequency[-1]
 
     def respected(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the bound ``at`` each ``frequency`` (Hz) that gains can respect.
+        """Return the bound ``at`` each ``frequency`` (Hz), 0 above a narrow record.
 
-        Above the band of a narrow record it is 0: there the record supports no gains,
-        and the remedy is another record, not other gains.
+        Above the band of a narrow record no gains are supported, and the remedy is
+        another record, not other gains.
         """
         beyond = self.narrow & (frequency > self.highest)
         return np.where(beyond, 0.0, self.at(frequency))
 
     def supported(self, frequency: np.ndarray) -> np.ndarray:
-        """Return the bound that a search respects, on a grid of equal steps (Hz).
+        """Return the bound for a search, on a grid of equal steps (Hz).
 
-        It is the largest bound within half a step of each ``frequency``, with the
-        exception of ``respected``.
+        It is the largest bound within half a step of each ``frequency``, and 0 above a
+        narrow record as in ``respected``.
         """
         half = 0.5 * (frequency[1] - frequency[0])
         lines, relative = np.asarray(self.frequency), np.asarray(self.relative)

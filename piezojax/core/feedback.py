@@ -172,7 +172,7 @@ def holding_input(plant: System, output: Signal) -> Signal:
 
     Newton's method is applied to the loading curve from the rest point of the plant. If
     no input reaches ``output``, the last iterate is returned and the loop starts with
-    an error. Limits belong in the actuator of the loop, not in the plant, because the
+    an error. Limits belong to the actuator of the loop, not to the plant, because the
     curve is flat beyond them. The iteration starts at 0. With several axes it starts at
     ``output``, because commands have its unit and the pose 0 may be outside, or on the
     edge of, the range of a stage with an allocation.

@@ -10,7 +10,7 @@ from .system import System
 
 ENTRY_POINTS = "piezojax.extensions"
 """Group of entry points. Each names a System, a module that exports Systems, or a
-module that adds to a table of piezojax, such as its constraints. piezojax registers its
+module that extends a table of piezojax, such as its constraints. piezojax registers its
 own models and controllers through it."""
 
 S = TypeVar("S", bound=System)

@@ -22,7 +22,7 @@ _CPU_FLAGS = {
         "--xla_cpu_copy_insertion_use_region_analysis=true",
         (0, 9, 2),
     ),
-    # The newer code generator compiles up to twice as long, and loops run no faster.
+    # The newer code generator takes up to twice the compile time; loops are not faster.
     "xla_cpu_use_fusion_emitters": ("--xla_cpu_use_fusion_emitters=false", (0, 10)),
 }
 _BEFORE = (0, 13)
@@ -32,7 +32,7 @@ CACHE_VARIABLE = "PIEZOJAX_COMPILATION_CACHE"
 
 def _set(option: str, value: Any) -> None:
     # Importing JAX takes a second, and `--help` should not wait for it. JAX reads
-    # options from the environment when it is imported.
+    # options from the environment at its import.
     if jax := sys.modules.get("jax"):
         jax.config.update(option, value)
     else:

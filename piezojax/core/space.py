@@ -63,7 +63,7 @@ class Range:
         """Return the Range with its bounds moved inside, to multiples of the step."""
         if self.step is None:
             return self
-        slack = 1e-9  # a bound on the grid stays, whatever its rounding error
+        slack = 1e-9  # a bound on the grid stays, despite rounding errors
         lower = self.step * math.ceil(self.lower / self.step - slack)
         upper = self.step * math.floor(self.upper / self.step + slack)
         return dataclasses.replace(self, lower=lower, upper=upper)

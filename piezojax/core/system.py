@@ -103,7 +103,7 @@ def rest_output(system: System, input: Any) -> Any:
 
 
 def accepts(system: System, example: Any) -> bool:
-    """Return whether ``system`` takes ``example`` as its input; nothing is computed."""
+    """Return whether ``system`` accepts ``example`` as its input, without computing."""
     try:
         eqx.filter_eval_shape(rest_output, system, example)
     except (AttributeError, TypeError, ValueError, IndexError):

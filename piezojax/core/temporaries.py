@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 FOREIGN = 86_400.0
-"""Age (s) from which the file of a process on another machine counts as left over."""
+"""Age (s) above which the file of a process on another machine counts as left over."""
 
 _HOST = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:32] or "host"
 _NAME = re.compile(
@@ -41,7 +41,7 @@ def temporary(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[bool]:
-    """Mark ``folder`` as in use; yield whether it holds nothing else.
+    """Mark ``folder`` as in use; yield whether it is otherwise empty.
 
     Of several processes that claim an empty folder at the same time, at most one
     receives True. Raises OSError if the folder cannot be written.
@@ -82,7 +82,7 @@ def _age(path: Path) -> float:
 def _is_running(process: int) -> bool:
     """Return whether another ``process`` of this machine is running.
 
-    Process numbers start anew in a container: a file that bears the number of this
+    Process numbers restart in a container: a file that has the number of this
     process, but is not its own, belongs to an earlier process.
     """
     if process == os.getpid():

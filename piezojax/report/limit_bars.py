@@ -44,7 +44,7 @@ NO_LIMIT = 1e4
 
 
 def limit_text(report: LimitReport | str) -> str:
-    """Return lines on the distance from the limit, with the causes of a large one."""
+    """Return lines on the ratio to the limit, with the causes of a large ratio."""
     if isinstance(report, str):
         return f"note: no limit of linear control: {report}"
     if report.ratio > NO_LIMIT:

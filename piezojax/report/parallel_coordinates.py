@@ -15,7 +15,7 @@ from .sweep_scale import COLOUR_MAP, LOST, Parameter, colour_bar, scale_of
 MOST_LINES = 1500
 """Largest number of lines.
 
-A third are the best points; the rest are chosen at regular steps of rank."""
+A third are the best points; the others are chosen at equal steps of rank."""
 
 
 def parallel_coordinates(

@@ -1,6 +1,6 @@
 """Candidates for suspect numbers: every printed number of the loops, by one rule.
 
-A candidate is one number that is printed in one place, whatever the number of columns
+A candidate is one number that is printed in one place, for any number of columns
 that use it. The candidates are:
 
 - each gain, weight and filter constant of each parameter table and section,

@@ -98,9 +98,9 @@ def cosine(
     amplitude: ScalarLike = 5.0,
     offset: ScalarLike = 0.0,
 ) -> Time:
-    """COS: the sine a quarter of a period on, from mid-range at full speed.
+    """COS: the sine a quarter of a period later; it starts mid-range at full speed.
 
-    With SIN on another axis it makes a circle about the middle of both.
+    With SIN on another axis it gives a circle around the middle of both ranges.
     """
     return offset + amplitude * (1.0 + jnp.sin(2.0 * jnp.pi * frequency * time))
 
@@ -122,7 +122,7 @@ def scan(
     check("turnaround", turnaround, least=0.0, most=0.5)
     half = 0.5 * turnaround
     below = 0.5 - jnp.abs(jnp.mod(time * frequency, 1.0) - 0.5)  # 0.5 at the top
-    near = jnp.minimum(below, 0.5 - below)  # from the turn that is nearer
+    near = jnp.minimum(below, 0.5 - below)  # from the nearer turn
     speed = amplitude / (0.25 - 0.5 * half)
     turning = near**2 / (2.0 * half) if half > 0.0 else near
     gone = speed * jnp.where(near < half, turning, near - 0.5 * half)

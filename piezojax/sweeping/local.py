@@ -37,7 +37,7 @@ def local_chunks(
 ) -> Iterator[Iterator[FinishedChunk]]:
     """Yield an iterator over the finished ``chunks``, in any order.
 
-    An early exit waits for the running blocks only.
+    An early exit waits only for the running blocks.
     """
     stop, idle = threading.Event(), list(devices)
 

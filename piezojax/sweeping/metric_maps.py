@@ -10,7 +10,7 @@ from ..study.sweep_table import METRICS
 if TYPE_CHECKING:
     from xarray import Dataset
 
-_BEYOND = 1e3  # times the median: larger values are those of lost points
+_BEYOND = 1e3  # factor on the median; points with larger values count as lost
 
 
 class MetricMap(NamedTuple):

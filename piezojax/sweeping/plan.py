@@ -21,8 +21,8 @@ from ..tuning.unexplained import STRETCHES
 CHUNK_LANE_STEPS = 5e7
 """Simulated samples of a chunk, all plants and references together.
 
-A chunk takes almost a second: an interrupt loses little, and writing costs less than
-simulating.
+A chunk takes almost a second: an interrupt loses little work, and writing takes less
+time simulating.
 """
 
 CHUNK_BYTES = 64e6
