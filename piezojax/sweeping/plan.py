@@ -22,7 +22,7 @@ CHUNK_LANE_STEPS = 5e7
 """Simulated samples of a chunk, all plants and references together.
 
 A chunk takes almost a second: an interrupt loses little work, and writing takes less
-time simulating.
+time than simulating.
 """
 
 CHUNK_BYTES = 64e6
