@@ -144,7 +144,7 @@ class KeepsTheProtocol:
         for kind in self.unregistered:
             registry.register(kind)
 
-    def test_at_rest_it_stays_at_rest(self, runs):
+    def test_a_model_at_rest_stays_at_rest(self, runs):
         rests = slice(2, 2 + len(RESTS))
         for last, first in zip(
             jax.tree.leaves(runs.last), jax.tree.leaves(runs.first), strict=True
@@ -158,7 +158,7 @@ class KeepsTheProtocol:
         )
         assert all(np.all(np.isfinite(slope[rests])) for slope in runs.slopes)
 
-    def test_compiled_and_batched_it_computes_the_same(self, runs, name):
+    def test_compiled_and_batched_runs_equal_single_runs(self, runs, name):
         system, share = runs.other, shared(self.channels.get(name, 0))
         inputs = [jnp.asarray(x * share) for x in OTHER[:6]]
         state, stepping = system.init(inputs[0]), resolve(system)
@@ -170,7 +170,7 @@ class KeepsTheProtocol:
         assert runs.outputs.dtype == jnp.float64
         assert np.max(np.abs(np.diff(runs.outputs[1, :6], axis=0))) > 0.0
 
-    def test_its_gradient_equals_finite_differences(self, runs):
+    def test_the_gradient_equals_finite_differences(self, runs):
         assert np.all(np.isfinite(runs.found))
         np.testing.assert_allclose(
             runs.found, runs.expected, rtol=1e-5, atol=1e-8 * runs.size
@@ -178,7 +178,7 @@ class KeepsTheProtocol:
         assert np.count_nonzero(runs.expected) > 0.5 * runs.expected.size
 
     @pytest.mark.usefixtures("known")
-    def test_saved_it_comes_back(self, name, tmp_path):
+    def test_a_model_is_saved_and_loaded(self, name, tmp_path):
         model = self.models[name]()
         save(model, tmp_path / "model.json")
         back = load(tmp_path / "model.json")
@@ -200,7 +200,7 @@ class HasARecipe:
     def pytest_generate_tests(self, metafunc):
         metafunc.parametrize("name", self.kinds)
 
-    def test_its_recipe_starts_inside_its_bounds_and_moves(self, name):
+    def test_the_recipe_starts_inside_its_bounds_and_moves(self, name):
         kind = self.kinds[name]
         recipe = kind.recipe(EXTENT)
         space = space_of(recipe.bounds)

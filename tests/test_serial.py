@@ -578,7 +578,7 @@ def test_an_integer_of_more_than_64_bits_is_a_number(tmp_path):
     assert float(load(tmp_path / "a.json").gain) == 1e30
 
 
-def test_saving_into_a_folder_that_is_not_there(tmp_path):
+def test_saving_into_a_missing_folder_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"nowhere.a.json: No such file"):
         save(pj.core.system.Affine(), tmp_path / "nowhere" / "a.json")
 

@@ -220,7 +220,7 @@ def test_start_names_an_unknown_parameter():
         space_of({"gian": Range(0.0, 1.0)}).start(Affine())
 
 
-def test_put_changes_its_parameters_and_no_other():
+def test_put_changes_its_parameters_only():
     pid = PID(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, dt=1e-4)
     ranges = {"integral": Range(0.5, 8.0, "log"), "proportional": Range(0.0, 4.0)}
     space = space_of(ranges)

@@ -132,7 +132,7 @@ BOUNDS = ErrorBound(
 )
 
 
-def test_a_bound_between_two_lines_is_the_larger_one():
+def test_a_bound_between_two_lines_is_the_larger_of_both():
     asked = [-1.0, 0.0, 5.0, 10.0, 15.0, 20.0, 21.0, 60.0]
     expected = [0.1, 0.1, 0.3, 0.3, 0.3, 0.2, 25.0, 25.0]
     np.testing.assert_array_equal(BOUNDS.at(asked), expected)

@@ -259,7 +259,7 @@ def test_gradients_equal_finite_differences(place, method, lock):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_slopes_at_rest_on_the_bounds_are_those_of_the_pseudo_inverse(method):
+def test_gradients_at_rest_on_the_bounds_equal_the_pseudo_inverse(method):
     def commands(allocation, pose):
         return allocation.step((), pose)[1]
 

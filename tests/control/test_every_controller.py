@@ -222,7 +222,7 @@ def test_compiled_lanes_equal_eager_steps(name):
 
 
 @pytest.mark.parametrize("name", RUN)
-def test_its_gradient_equals_finite_differences(name):
+def test_the_gradient_equals_finite_differences(name):
     found = runs(name)
     assert np.all(np.isfinite(found.gradients))
     floor = 1e-7 * np.sum(np.abs(found.commands[0]))

@@ -146,7 +146,7 @@ def test_modes_are_in_parallel():
     np.testing.assert_allclose(found, 1.1 * single[0] - 0.1 * single[1], atol=1e-9)
 
 
-def test_the_gradient_of_modes_is_that_of_differences():
+def test_the_gradient_of_modes_equals_finite_differences():
     @jax.jit
     def last(point):
         stage = Modes(point[:2], point[2:4], DT, point[4:5], point[5:])

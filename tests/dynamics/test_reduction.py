@@ -120,7 +120,7 @@ def test_as_many_states_as_rows_give_the_printed_form(chapter, lags):
 
 
 @pytest.mark.parametrize("order", [7, 8])
-def test_a_controller_on_such_a_model_stabilises_it(order):
+def test_a_controller_on_a_reduced_model_stabilises_the_stage(order):
     model = observability_form(balanced_reduction(WHOLE, order).model)
     unit = np.eye(3)
     controller = pj.control.MultiAxisSlidingMode(

@@ -205,7 +205,7 @@ def test_inverse_equals_the_corrected_equation():
 
 
 @pytest.mark.parametrize("wanted", [-2.0, 0.0, 4.0, 13.0])
-def test_inverse_rests_where_it_starts(wanted):
+def test_the_inverse_at_rest_stays_at_rest(wanted):
     stage = model()
     inverse = InverseColemanHodgdon(stage)
     state = inverse.init(wanted)

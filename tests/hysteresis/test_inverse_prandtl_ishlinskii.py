@@ -195,7 +195,7 @@ def test_out_of_reach_the_voltage_and_its_gradient_are_finite():
         assert np.all(np.isfinite(found))
 
 
-def test_it_drives_a_stage_open_loop():
+def test_the_inverse_drives_a_stage_in_open_loop():
     model = MODELS["plain cubic"]
     control = InverseFeedforward(inverse_of(model))
     at = Observation(2.0, 2.0, 2.0, inverse_of(model).step(model.init(REST), 2.0)[1])

@@ -253,7 +253,7 @@ CLAIMED = [
 
 
 @pytest.mark.parametrize(("kind", "law"), CLAIMED)
-def test_a_registered_model_keeps_the_laws_it_claims(kind, law):
+def test_a_registered_model_satisfies_its_declared_laws(kind, law):
     extent = Extent(*SPAN, (0.0, 0.0), 0.12, 0.0, 12.0, 1e-3, 2.0)
     system = kind.recipe(extent).system
     # A loop has the unit V um, every other law um.

@@ -159,7 +159,7 @@ def test_amplitudes_of_the_validation_part_alone_are_named():
     assert any("beyond that of the training part" in text for text in warnings)
 
 
-def test_a_narrow_record_is_named_and_its_band_given():
+def test_a_narrow_record_has_an_alarm_with_its_band():
     input = excitation(top=100.0)
     report, warnings = analysed(
         input, noisy(answer(STAGE, input)), answer(STAGE, input)

@@ -122,7 +122,7 @@ def test_the_reported_loss_is_that_of_the_reported_point(solved):
     np.testing.assert_allclose(views.loss[:30], expected, rtol=1e-6, atol=1e-12)
 
 
-def test_a_finished_start_stays_where_it_is(solved):
+def test_a_finished_start_does_not_move(solved):
     _, _, views = solved
     assert np.all(views.done[-1])
     for lane in range(views.done.shape[1]):
