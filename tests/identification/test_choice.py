@@ -1,7 +1,5 @@
 """The model of a simulated record is chosen, and its parameters are recovered."""
 
-from pathlib import Path
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -24,9 +22,6 @@ DT = 1e-3
 SAMPLES = 900
 TRAIN = slice(0, 600)
 NOISE = 0.01
-MICROMANIPULATOR = (
-    Path(__file__).parents[2].parent / "shared/data/micromanipulator/Model_Vi_Do.dat"
-)
 ONE_TONE = 30.0 - 30.0 * np.cos(2.0 * np.pi * 10.0 * DT * np.arange(SAMPLES))
 TRUTH = {"a": 0.0077, "b": 0.1167, "c": -0.0487}
 
@@ -111,19 +106,14 @@ def test_stops_are_chosen_as_equivalent_plays():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("optimised")
 def test_the_models_of_the_micromanipulator():
     # The sensor noise is 0.067 um, and cycles differ by as much.
-    if MICROMANIPULATOR.is_file():
-        columns = np.loadtxt(MICROMANIPULATOR)
-        record = Record(columns[:, 0], columns[:, 4], 1.0 / 200.0, source="whole")
-    else:
-        record = read_record(
-            shipped().parent / "data" / "micromanipulator.csv",
-            time="time_s",
-            input="input_V",
-            output="displacement_um",
-        )
+    record = read_record(
+        shipped().parent / "data" / "micromanipulator.csv",
+        time="time_s",
+        input="input_V",
+        output="displacement_um",
+    )
     report = identify_all(record, hysteresis=["shaped_coleman_hodgdon"]).report
     assert report.rows[0].validation_rmse <= 0.15
     assert not [row for row in report.rows if row.status == "failed"]
