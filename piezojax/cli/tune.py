@@ -86,6 +86,7 @@ def _tune(
     from ..report.limit_bars import limit_text, write_limit
     from ..report.robustness import constraints_table, front_table
     from ..report.step_pictures import steps_table
+    from ..report.structure_pictures import structures_table
     from ..report.summary_tables import (
         beside_table,
         following_table,
@@ -117,6 +118,8 @@ def _tune(
     result = outcome.result
     print_alarms(console, result.alarms)
     console.print(tuning_table(result))
+    if result.structures:
+        console.print(structures_table(result.structures))
     if result.beside:
         console.print(beside_table(result))
     console.print(gains_table(result))

@@ -110,6 +110,27 @@ def get(system: eqx.Module, path: str) -> Any:
     return node
 
 
+def get_part(system: Any, path: str) -> Any:
+    """Return the part of ``system`` at ``path``: a System, a tuple or a leaf.
+
+    Raises ValueError, with the parts that there are, if there is none.
+    """
+    node, known = system, ""
+    for name in path.split("."):
+        children = _children(node)
+        if name not in children:
+            raise ValueError(
+                f"no part {path!r}; {known or 'the whole'} has {', '.join(children)}"
+            )
+        node, known = children[name], f"{known}.{name}".lstrip(".")
+    return node
+
+
+def replace_part(system: S, path: str, part: Any) -> S:
+    """Return ``system`` with its part at ``path`` replaced by ``part``."""
+    return eqx.tree_at(lambda tree: _walk(tree, path), system, part)
+
+
 def replace(system: S, values: Mapping[str, Any]) -> S:
     """Return ``system`` with the leaves at the given paths replaced."""
     if not values:

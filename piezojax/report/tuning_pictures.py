@@ -29,6 +29,7 @@ from .figures import (
 )
 from .robustness import front_figure, perturbed_figure
 from .step_pictures import steps_figure
+from .structure_pictures import structures_figure
 
 _MOST_TRACES = 3  # in the tracking picture
 _PERIODS = 4.0  # of the reference, drawn from the end of the run
@@ -58,6 +59,7 @@ def write_results(outcome: Outcome, folder: Path) -> None:
             "steps": steps_figure(outcome.step_runs, outcome.steps, result.heading)
             if outcome.steps[1]
             else None,
+            "structures": structures_figure(result.structures, result.heading),
             "robustness": perturbed_figure(result.perturbed, result.heading),
             "pareto": front_figure(
                 result.front,

@@ -13,6 +13,7 @@ from ..signals import waveforms as signals
 from ..solve.optimisers import GAUSS_NEWTON, METHODS
 from .ensemble_table import EnsembleTable
 from .stage_tables import Actuator, DisturbanceTable, SensorTable
+from .structure_table import StructuresTable
 from .sweep_table import SweepTable, require_quoted_paths
 from .tables import (
     ByAxis,
@@ -166,7 +167,8 @@ class Study(Table):
     ``rate`` is the sampling rate, Hz. ``tune`` names parameters to tune: paths in the
     loop, or patterns such as ``controller.feedback.*``. ``parameters`` names further
     ones. It also overrides the declared bounds, scales and starts. ``beside`` names
-    controllers to which the tuned one is compared.
+    controllers to which the tuned one is compared. ``structures`` are numbers of
+    notches, of which the result has as many as are worth their parameters.
     """
 
     title: str
@@ -189,6 +191,7 @@ class Study(Table):
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
     beside: dict[str, BesideTable] = Field(default_factory=dict)
     sweep: SweepTable | None = None
+    structures: StructuresTable | None = None
 
     @field_validator("parameters", mode="before")
     @classmethod
@@ -291,6 +294,19 @@ class Study(Table):
                     f"sweep.references: {name} is not one of the study's references, "
                     f"{', '.join(known)}"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _structured(self) -> "Study":
+        if self.structures and self.axes:
+            raise ValueError(
+                f"structures are for one axis; this stage has {len(self.axes.names)}"
+            )
+        if self.structures and self.pareto:
+            raise ValueError(
+                "structures and pareto are both given; choose the structure first, "
+                "then trace the front of its gains"
+            )
         return self
 
     @model_validator(mode="after")

@@ -32,8 +32,11 @@ def search_within_limits(
     evaluator: Evaluator,
     clock: Clock,
     progress: Progress,
+    also: np.ndarray | None = None,
 ) -> Found:
     """Return the objective with its limits, the search, its strategy and the stability.
+
+    ``also`` are further points [points, n] from which the search may start.
 
     The defaults among the limits are rarely active, and margins in every loss cost time
     to compile. Unless the study limits a margin itself, the box is searched without
@@ -48,10 +51,10 @@ def search_within_limits(
     if uses(own, "margins") or study.pareto or own == study.limits:
         carried = evaluator.worst_plants(case.loop)
         every = every.on_margin_stages(carried.stages)
-        search, strategy = search_box(every, case, clock, progress)
+        search, strategy = search_box(every, case, clock, progress, also)
         return _repeated(every, case, evaluator, carried, search, strategy, progress)
     objective = objective.with_limits(own)
-    search, strategy = search_box(objective, case, clock, progress)
+    search, strategy = search_box(objective, case, clock, progress, also)
     try:
         stability = exact_stability(case, search)
         after = case.space.put(case.loop, as_array(search.unit))

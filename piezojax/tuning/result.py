@@ -16,6 +16,7 @@ from .drive import Drive
 from .objective import RAILED
 from .sliding import SlidingShare
 from .step_tests import StepResult
+from .structure_choice import StructureSearch
 
 RESULT_FILE = "result.json"
 GAINS_FILE = "gains.toml"
@@ -247,6 +248,8 @@ class Result(BaseModel):
     """The same steps with the tuned gains."""
     sliding_before: SlidingShare | None = None
     sliding: SlidingShare | None = None
+    structures: StructureSearch | None = None
+    """Structures of the controller that were tuned; these gains are of the chosen."""
     units: dict[str, str] = {}
     gain_units: dict[str, str] = {}
     """Declared units of ``gains``; "" without a declaration."""

@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
 from ..analysis.stability import StabilityReports
 from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
@@ -24,6 +26,7 @@ from .outcome import Outcome
 from .reach import require_reach
 from .recorded_range import recorded_range_alarms
 from .sliding import sliding_share
+from .structure_search import search_structures
 from .tip import tip_note
 
 
@@ -37,14 +40,29 @@ def tune(
 
     ``study`` is a Case, the path of a study file, or None for the default study. With a
     budget as ``baselines``, the baselines are run on the same objective afterwards.
+    Each of the ``structures`` of a study is tuned; the Outcome is that of the chosen.
     ``Ctrl-C`` ends the search and keeps the best gains found so far. A start that
     diverges or stays at a voltage limit is replaced by the best of the candidates.
     Raises ValueError if a reference is beyond the stroke of the stage, or if neither
     the start nor any candidate gives a stable loop.
     """
     progress = progress or Silent()
-    clock = Clock()
     case = study if isinstance(study, Case) else read(study or shipped())
+    if case.study.structures is None:
+        return _tune(case, None, progress, baselines)
+    if baselines is not None:
+        raise ValueError("baselines are for one structure; leave out [structures]")
+    return search_structures(case, _tune, progress)
+
+
+def _tune(
+    case: Case,
+    also: np.ndarray | None,
+    progress: Progress,
+    baselines: Budget | None = None,
+) -> Outcome:
+    """Tune one structure; ``also`` are further points [points, n] to start from."""
+    clock = Clock()
     table, space = case.study, case.space
     data = make_data(case)
     require_reach(case, data)
@@ -54,7 +72,7 @@ def tune(
     before = evaluator.figures(case.loop, data.tuning)
     objective = make_objective(case, data, evaluator, before)
     objective, search, strategy, stability = search_within_limits(
-        objective, case, evaluator, clock, progress
+        objective, case, evaluator, clock, progress, also
     )
 
     after = space.put(case.loop, as_array(search.unit))

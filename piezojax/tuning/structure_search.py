@@ -1,0 +1,392 @@
+"""Search over structures: notches are added where a mode limits the tuned loop."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..analysis.plant_modes import PlantMode, plant_modes
+from ..analysis.stability import stability_reports
+from ..core.feedback import Feedback
+from ..core.paths import get, replace
+from ..core.progress import Progress
+from ..core.recipe import Resonance
+from ..study import Case
+from ..study.references import highest_reference
+from ..study.with_notches import NOTCH, OFF, moved, place_of, with_notches
+from .alarms import EXACT, HELD_OUT, PEAK, exact_figures
+from .outcome import Outcome
+from .result import Result, number
+from .structure_choice import (
+    LIMITING,
+    ModeInLoop,
+    Structure,
+    StructureSearch,
+    choose,
+    criterion_text,
+    explain,
+)
+
+AROUND = np.linspace(-4.0, 4.0, 33)
+"""Lines around a mode, as distances from it in half-widths of its peak."""
+
+WIDTHS = 0.2, 0.6
+"""Damping ratios of the poles of a notch from which a search starts."""
+
+SHALLOWEST = 0.05
+"""Least depth of a notch from which a search starts."""
+
+Tune = Callable[[Case, np.ndarray | None, Progress], Outcome]
+"""Function ``tune(case, also, progress)`` that tunes one structure.
+
+``also`` are further points [points, n] of the unit box that may become starts."""
+
+Modes = tuple[PlantMode, ...]
+
+
+class _Tuned(NamedTuple):
+    """A tuned structure: the modes at its notches, its outcome and its row."""
+
+    at: Modes
+    outcome: Outcome
+    row: Structure
+
+
+def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
+    """Tune each structure of the study and return the Outcome of the chosen one.
+
+    The first notch is placed at the mode around which |S| of the loop tuned without
+    notches is largest, each further one where that of the loop tuned with the notches
+    so far is. A mode that makes less than ``LIMITING`` of |L| limits no loop and gets
+    no notch. At last the notches of the chosen structure are
+    tried one by one: if the loop keeps its limit on Ms with a notch switched off, it is
+    tuned without that notch too. ``Ctrl-C`` ends the search with the structures so far.
+    Raises ValueError if no structure could be tuned, and as ``with_notches``.
+    """
+    table = case.study.structures
+    assert table is not None
+    place_of(case)
+    modes, notes = _shown_modes(case)
+    found: list[_Tuned] = []
+    rows: list[Structure] = []
+
+    def run(at: Modes, previous: _Tuned | None) -> bool:
+        """Tune the structure with notches ``at`` these modes; return whether to go on.
+
+        The search starts from the gains of the structure ``previous`` too.
+        """
+        shown = " and ".join(f"{mode.frequency:.4g}" for mode in at)
+        progress.stage(f"{len(at)} notches" + (f" at {shown} Hz" if at else ""))
+        variant = with_notches(case, [_resonance(mode) for mode in at])
+        also = _starts(case, variant, at, previous)
+        try:
+            outcome = tune(variant, also, progress)
+        except ValueError as error:
+            rows.append(_untuned(len(at), at, str(error)))
+            return True
+        rows.append(_row_of(case, at, modes, outcome))
+        found.append(_Tuned(at, outcome, rows[-1]))
+        return outcome.result.status != "interrupted"
+
+    going = True
+    for count in table.notches:
+        previous = found[-1] if found else None
+        at = previous.at if previous else ()
+        others = _limiting(modes, previous)
+        at = (*at, *others[: count - len(at)])
+        if len(at) < count:
+            reason = (
+                f"not tuned: of {len(modes)} modes of the plant, no other makes "
+                f"{LIMITING:g} of the loop gain"
+            )
+            rows.append(_untuned(count, at, reason))
+            continue
+        going = going and run(at, previous)
+        if not going:
+            break
+    while going:
+        best = _best(found, table.worth)
+        fewer = [
+            at
+            for at in (_without_needless(case, best) if best else ())
+            if len(at) in table.notches and all(set(one.at) != set(at) for one in found)
+        ]
+        if not fewer or not run(fewer[0], best):
+            break
+    best = _best(found, table.worth)
+    if best is None:
+        reasons = dict.fromkeys(row.reason for row in rows)
+        raise ValueError("; ".join(reasons))
+    explain(rows, rows.index(best.row))
+    result, every = best.outcome.result, [one.outcome.result for one in found]
+    result.structures = StructureSearch(
+        criterion=criterion_text(table.worth), structures=rows
+    )
+    result.warnings = [*notes, *result.warnings]
+    result.evaluations = sum(one.evaluations for one in every)
+    result.compile_s = sum(one.compile_s for one in every)
+    result.wall_s = sum(one.wall_s for one in every)
+    if any(one.status == "interrupted" for one in every):
+        result.status = "interrupted"
+    return best.outcome
+
+
+def _best(found: Sequence[_Tuned], worth: float) -> _Tuned | None:
+    chosen = choose([one.row for one in found], worth)
+    return None if chosen is None else found[chosen]
+
+
+def _shown_modes(case: Case) -> tuple[list[PlantMode], list[str]]:
+    """Return the modes of the plant, and a note on those that its record denies.
+
+    A fitted model has an error bound; a mode that makes a smaller part of the response
+    may be a fit to noise.
+    """
+    study = case.study
+    modes = plant_modes(case.loop.plant, highest_reference(study), study.dt)
+    bound = case.plant_about.error_bound
+    if bound is None:
+        return modes, []
+    shown = [mode for mode in modes if mode.share > float(bound.at(mode.frequency))]
+    dropped = [f"{mode.frequency:.4g}" for mode in modes if mode not in shown]
+    if not dropped:
+        return modes, []
+    return shown, [
+        f"structures: no notch is tried at {', '.join(dropped)} Hz, because the error "
+        "bound of the model is larger than its mode there; a record with a chirp up to "
+        "half the sampling rate tells more"
+    ]
+
+
+def _limiting(modes: Sequence[PlantMode], tuned: _Tuned | None) -> list[PlantMode]:
+    """Return the modes without a notch that limit the ``tuned`` loop, worst first.
+
+    The worst is the one around which |S| is largest. Without a tuned loop all modes are
+    returned, in the order of their gain in an integral control, which falls with
+    frequency.
+    """
+    seen = _in_loop(modes, tuned.outcome) if tuned else None
+    had = tuned.at if tuned else ()
+    if seen is None:
+        free = [mode for mode in modes if mode not in had]
+        return sorted(free, key=lambda mode: -mode.gain / mode.angle)
+    free = [
+        (sensitivity, mode)
+        for (part, sensitivity), mode in zip(seen, modes, strict=True)
+        if mode not in had and part >= LIMITING
+    ]
+    return [mode for _, mode in sorted(free, reverse=True)]
+
+
+def _in_loop(
+    modes: Sequence[PlantMode], outcome: Outcome
+) -> list[tuple[float, float]] | None:
+    """Return the part of |L| that each mode makes, and the largest |S| around it.
+
+    The larger of both branches counts. None if the tuned loop could not be linearised.
+    """
+    loops = outcome.stability.loops.get("after", {}).values()
+    if not loops:
+        return None
+    found = []
+    for mode in modes:
+        lines = np.minimum(mode.angle * (1.0 + mode.damping * AROUND), math.pi)
+        L = np.array([loop.response(lines) for loop in loops])
+        part = float(np.max(np.abs(L[:, len(AROUND) // 2])) * mode.share)
+        found.append((part, float(np.max(1.0 / np.abs(1.0 + L)))))
+    return found
+
+
+def _without_needless(case: Case, tuned: _Tuned) -> list[Modes]:
+    """Return the modes of ``tuned`` without each notch that its loop does not need.
+
+    The notch that was added last is left out: the structure without it is known.
+    """
+    limit = case.study.limits.get(PEAK, math.inf)
+    found = []
+    for i, mode in enumerate(tuned.at[:-1], 1):
+        path = f"{place_of(case)}.filter.{NOTCH.format(i)}.depth"
+        without = replace(tuned.outcome.after, {path: OFF})
+        peak = _peak(case, without)
+        if math.isfinite(peak) and peak <= limit * (1.0 + EXACT):
+            found.append(tuple(other for other in tuned.at if other != mode))
+    return found
+
+
+def _peak(case: Case, loop: Feedback) -> float:
+    """Return the exact Ms of ``loop``, infinite if it is not stable or not known."""
+    study = case.study
+    reports = stability_reports({"after": loop}, highest_reference(study), study.dt)
+    figures = exact_figures(reports).values()
+    peaks = [found[PEAK] if found else None for found in figures]
+    return max((math.inf if p is None else p for p in peaks), default=math.inf)
+
+
+def _starts(
+    case: Case, variant: Case, at: Modes, previous: _Tuned | None
+) -> np.ndarray | None:
+    """Return points of the box of ``variant`` from which its search may start.
+
+    They are the gains of the study with the notches on, and those of ``previous`` with
+    the further notches on, and with all of them at their modes again. A notch that is
+    off has no derivative by its frequency.
+    """
+    if not at:
+        return None
+    place = place_of(case)
+    paths = variant.space.paths
+    own = {path: float(get(variant.loop, path)) for path in paths}
+
+    def notch(number: int, mode: PlantMode, width: float) -> dict[str, float]:
+        where = f"{place}.filter.{NOTCH.format(number)}"
+        depth = min(max(mode.damping / width, SHALLOWEST), OFF)
+        return {
+            f"{where}.frequency": mode.frequency,
+            f"{where}.damping": width,
+            f"{where}.depth": depth,
+        }
+
+    def switched_on(values: Mapping[str, float], had: Modes) -> list[dict[str, float]]:
+        found = []
+        for width in WIDTHS:
+            further = [notch(i, m, width) for i, m in enumerate(at, 1) if m not in had]
+            found.append({k: v for part in (values, *further) for k, v in part.items()})
+        return found
+
+    points = switched_on(own, ())
+    if previous is not None:
+        tuned = own | _carried(previous, at, place)
+        points += switched_on(tuned, previous.at) + switched_on(tuned, ())
+    return np.stack([_unit(variant, values) for values in points])
+
+
+def _carried(previous: _Tuned, at: Modes, place: str) -> dict[str, float]:
+    """Return the gains of ``previous`` by their path in the structure ``at``."""
+    gains = previous.outcome.result.gains
+    if not previous.at:
+        return {moved(path, place): value for path, value in gains.items()}
+    found = {}
+    for path, value in gains.items():
+        head, dot, tail = path.removeprefix(f"{place}.filter.").partition(".")
+        if not path.startswith(f"{place}.filter."):
+            found[path] = value
+            continue
+        names = {NOTCH.format(i): mode for i, mode in enumerate(previous.at, 1)}
+        if names[head] in at:
+            number = 1 + at.index(names[head])
+            found[f"{place}.filter.{NOTCH.format(number)}{dot}{tail}"] = value
+    return found
+
+
+def _unit(case: Case, values: Mapping[str, float]) -> np.ndarray:
+    """Return ``values`` by path, moved into their bounds, as a point of the box."""
+    ranges = case.space.ranges()
+    inside = {
+        path: min(max(values[path], bounds.lower), bounds.upper)
+        for path, bounds in ranges.items()
+    }
+    return np.asarray(case.space.start(replace(case.loop, inside)))
+
+
+def _resonance(mode: PlantMode) -> Resonance:
+    return Resonance(mode.frequency, mode.damping)
+
+
+def _untuned(count: int, at: Modes, reason: str) -> Structure:
+    return Structure(
+        notches=count, at_Hz=[mode.frequency for mode in at], reason=reason
+    )
+
+
+def _row_of(
+    case: Case, at: Modes, modes: Sequence[PlantMode], outcome: Outcome
+) -> Structure:
+    """Return the figures of a tuned structure."""
+    result, place = outcome.result, place_of(case)
+    notches = [
+        tuple(
+            result.gains[f"{place}.filter.{NOTCH.format(i)}.{name}"]
+            for name in ("frequency", "damping", "depth")
+        )
+        for i in range(1, len(at) + 1)
+    ]
+    dt = case.study.dt
+    seen = _in_loop(modes, outcome) or [(math.nan, math.nan)] * len(modes)
+    errors = _errors(result)
+    known = [error for error in errors if error is not None]
+    stable = bool(known) and len(known) == len(errors)
+    return Structure(
+        notches=len(at),
+        at_Hz=[mode.frequency for mode in at],
+        notches_Hz=[frequency for frequency, *_ in notches],
+        parameters=len(result.gains),
+        error_um=float(np.median(known)) if stable else None,
+        worst_um=max(known) if stable else None,
+        sensitivity_peak=_largest_peak(outcome),
+        alarms=len(result.alarms) - _slight(result),
+        log_errors=[None if error is None else math.log(error) for error in errors],
+        modes=[
+            ModeInLoop(
+                frequency_Hz=mode.frequency,
+                damping=mode.damping,
+                part_of_loop_gain=number(part),
+                sensitivity=number(sensitivity),
+                notch=math.prod(_notch_gain(*n, mode.angle, dt) for n in notches),
+            )
+            for mode, (part, sensitivity) in zip(modes, seen, strict=True)
+        ],
+        gains=result.gains,
+        wall_s=result.wall_s,
+    )
+
+
+def _slight(result: Result) -> int:
+    """Return the number of limits that held-out plants miss by less than HELD_OUT.
+
+    These plants were not tuned on, and some of any structure may be a little worse than
+    those that were.
+    """
+    outcomes = result.perturbed.constraints.values() if result.perturbed else ()
+    count = 0
+    for one in outcomes:
+        if one.kept or one.value is None:
+            continue
+        above = one.value / one.limit
+        by = above if one.sense == "at most" else 1.0 / above
+        count += by < 1.0 + HELD_OUT
+    return count
+
+
+def _errors(result: Result) -> list[float | None]:
+    """Return the errors (um) by held-out plant, or by reference of the hold-out."""
+    if result.perturbed is not None:
+        return list(result.perturbed.geomeans_um)
+    parts = [part for part in (result.holdout, result.unseen) if part is not None]
+    return [error for part in parts for error in part.per_reference_rms_um.values()]
+
+
+def _largest_peak(outcome: Outcome) -> float | None:
+    """Return the largest Ms on the plants of the hold-out, or that of the nominal one.
+
+    None if it is not finite.
+    """
+    perturbed = outcome.result.perturbed
+    if perturbed is not None and PEAK in perturbed.constraints:
+        return perturbed.constraints[PEAK].value
+    figures = exact_figures(outcome.stability).values()
+    peaks = [found[PEAK] if found else None for found in figures]
+    known = [peak for peak in peaks if peak is not None]
+    return max(known) if known and len(known) == len(peaks) else None
+
+
+def _notch_gain(
+    frequency: float, damping: float, depth: float, angle: float, dt: float
+) -> float:
+    """Return the gain of a ``Notch`` at ``angle`` (rad/sample).
+
+    By the bilinear transform, prewarped at its ``frequency`` (Hz).
+    """
+    ratio = math.tan(0.5 * angle) / math.tan(math.pi * frequency * dt)
+    rest, damped = 1.0 - ratio**2, 2.0j * damping * ratio
+    return abs((rest + depth * damped) / (rest + damped))
