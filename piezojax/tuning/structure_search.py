@@ -59,10 +59,10 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
     The first notch is placed at the mode around which |S| of the loop tuned without
     notches is largest, each further one where that of the loop tuned with the notches
     so far is. A mode that makes less than ``LIMITING`` of |L| limits no loop and gets
-    no notch. At last the notches of the chosen structure are
-    tried one by one: if the loop keeps its limit on Ms with a notch switched off, it is
-    tuned without that notch too. ``Ctrl-C`` ends the search with the structures so far.
-    Raises ValueError if no structure could be tuned, and as ``with_notches``.
+    no notch. At last the notches of the chosen structure are tried one by one: if the
+    loop keeps its limit on Ms with a notch switched off, it is tuned without that notch
+    too. ``Ctrl-C`` ends the search with the structures so far. Raises ValueError if no
+    structure could be tuned, and as ``with_notches``.
     """
     table = case.study.structures
     assert table is not None
@@ -70,12 +70,14 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
     modes, notes = _shown_modes(case)
     found: list[_Tuned] = []
     rows: list[Structure] = []
+    tried: list[set[PlantMode]] = []
 
     def run(at: Modes, previous: _Tuned | None) -> bool:
         """Tune the structure with notches ``at`` these modes; return whether to go on.
 
         The search starts from the gains of the structure ``previous`` too.
         """
+        tried.append(set(at))
         shown = " and ".join(f"{mode.frequency:.4g}" for mode in at)
         progress.stage(f"{len(at)} notches" + (f" at {shown} Hz" if at else ""))
         variant = with_notches(case, [_resonance(mode) for mode in at])
@@ -110,7 +112,7 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
         fewer = [
             at
             for at in (_without_needless(case, best) if best else ())
-            if len(at) in table.notches and all(set(one.at) != set(at) for one in found)
+            if len(at) in table.notches and set(at) not in tried
         ]
         if not fewer or not run(fewer[0], best):
             break
@@ -124,6 +126,11 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
         criterion=criterion_text(table.worth), structures=rows
     )
     result.warnings = [*notes, *result.warnings]
+    if len(found) > 1:
+        result.warnings.append(
+            f"structures: the hold-out chose among {len(found)} structures, so its "
+            "error is that of the best of these and slightly too small"
+        )
     result.evaluations = sum(one.evaluations for one in every)
     result.compile_s = sum(one.compile_s for one in every)
     result.wall_s = sum(one.wall_s for one in every)

@@ -1,6 +1,7 @@
 """Structures of a study: the criterion, the modes, the notches and the search."""
 
 import copy
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ from scipy import signal
 import piezojax as pj
 from piezojax.analysis.plant_modes import plant_modes
 from piezojax.control import FilteredCommand
+from piezojax.core.error_bound import ErrorBound
 from piezojax.core.paths import get, get_part
 from piezojax.core.progress import Silent
 from piezojax.core.recipe import Resonance
@@ -405,6 +407,8 @@ def test_each_notch_goes_where_the_tuned_loop_is_limited(monkeypatch):
     assert rows[3].reason.startswith("not tuned: of 3 modes of the plant, no other")
     assert rows[0].reason == "10 times the error of the chosen one"
     assert (result.evaluations, result.compile_s, result.wall_s) == (30, 3.0, 6.0)
+    (note,) = result.warnings
+    assert note.startswith("structures: the hold-out chose among 3 structures")
     assert "10 %" in result.structures.criterion
     table = structures_table(result.structures)
     assert table.row_count == 4
@@ -427,6 +431,11 @@ def test_a_notch_that_the_loop_does_not_need_is_dropped(monkeypatch):
     rows = searched(tuning, monkeypatch, needed=False).structures.structures
     assert tuning.calls == [(), (400,), (400, 900), (900,)]
     assert [r.at_Hz for r in rows if r.chosen] == [pytest.approx([900.0])]
+    # If the smaller structure cannot be tuned, the larger one stays.
+    tuning = Pretended(errors | {(900,): None}, ALL)
+    rows = searched(tuning, monkeypatch, needed=False).structures.structures
+    assert [r.chosen for r in rows] == [False, False, True, False, False]
+    assert len(tuning.calls) == 4
     # With its notch needed, the other structure is not even tried.
     tuning = Pretended(errors, ALL)
     assert searched(tuning, monkeypatch).structures.structures[2].chosen
@@ -445,6 +454,24 @@ def test_the_search_goes_on_from_the_gains_before(monkeypatch):
     np.testing.assert_allclose(second, [0.05, 0.05] * 3, rtol=1e-6)
     np.testing.assert_allclose(first[2:4], DEPTH, rtol=1e-6)
     assert np.all(first[[0, 1, 4, 5]] < DEPTH)
+
+
+def test_a_mode_below_the_error_bound_of_the_model_may_be_noise():
+    """The third mode makes 0.05 % of the response, the bound is 1 %, then 200 %."""
+    case = case_of()
+    modes, notes = searching._shown_modes(case)
+    assert (len(modes), notes) == (3, [])
+
+    def bounded(relative):
+        bound = ErrorBound(
+            frequency=(0.0, 5000.0), relative=(relative,) * 2, excited=(True,) * 2
+        )
+        return dataclasses.replace(case, plant_about=pj.About(error_bound=bound))
+
+    shown, (note,) = searching._shown_modes(bounded(0.01))
+    assert [mode.frequency for mode in shown] == pytest.approx([400.0, 900.0])
+    assert "no notch is tried at 1600 Hz" in note
+    assert searching._shown_modes(bounded(2.0))[0] == []
 
 
 def test_structures_that_cannot_be_tuned_are_rows(monkeypatch):
