@@ -30,12 +30,15 @@ class LoopInput(NamedTuple):
     """Input of a loop at sample k.
 
     ``next_reference`` is r(k+1) in um, ``noise`` a unit-variance draw that the sensor
-    scales, ``disturbance`` an optional addition in um to the displacement at k+1.
+    scales, ``disturbance`` an optional addition in um to the displacement at k+1, and
+    ``input_disturbance`` one in V to the voltage at the plant, which the controller
+    does not know.
     """
 
     next_reference: Signal
     noise: Signal
     disturbance: Signal | None = None
+    input_disturbance: Signal | None = None
 
 
 class LoopSample(NamedTuple):
@@ -116,7 +119,10 @@ class Feedback(System):
         )
         controller, command = self.controller.step(state.controller, observation)
         actuator, voltage = self.actuator.step(state.actuator, command)
-        plant, displacement = self.plant.step(state.plant, voltage)
+        at_plant = voltage
+        if input.input_disturbance is not None:
+            at_plant = jax.tree.map(jnp.add, voltage, input.input_disturbance)
+        plant, displacement = self.plant.step(state.plant, at_plant)
         if input.disturbance is not None:
             displacement = jax.tree.map(jnp.add, displacement, input.disturbance)
         sample = LoopSample(
@@ -138,13 +144,16 @@ def loop_inputs(
     reference: Float[Array, " samples"] | Float[Array, "samples axes"],
     noise: Float[Array, " samples"] | Float[Array, "samples axes"] | None = None,
     disturbance: Float[Array, " samples"] | Float[Array, "samples axes"] | None = None,
+    input_disturbance: Float[Array, " samples"]
+    | Float[Array, "samples axes"]
+    | None = None,
 ) -> LoopInput:
     """Return the inputs of a loop that follows ``reference`` (um).
 
     ``noise`` holds unit-variance draws, zero if left out; ``disturbance`` (um) is added
-    to the output of the plant. The last reference is also the next reference of the
-    last sample, where it acts only after the end of the record. Several axes are
-    columns, each in the unit of its axis.
+    to the output of the plant, ``input_disturbance`` (V) to its input. The last
+    reference is also the next reference of the last sample, where it acts only after
+    the end of the record. Several axes are columns, each in the unit of its axis.
     """
     reference = as_array(reference)
     following = _following(reference)
@@ -153,6 +162,7 @@ def loop_inputs(
         _columns(following),
         _columns(noise),
         None if disturbance is None else _columns(disturbance),
+        None if input_disturbance is None else _columns(input_disturbance),
     )
 
 

@@ -22,9 +22,9 @@ from ..core.rollout import Metric, simulate
 from ..core.system import System
 from ..signals.waveforms import time_grid
 from ..study import Case, Stage
-from ..study.references import highest_reference
 from ..study.sweep_table import SENSITIVITY
 from ..tuning.data import make_data
+from ..tuning.runs import RunNoise
 from .plan import TRAJECTORIES, Plan, plants_of, references_of, sweep_table
 
 # Poles of the hysteresis lie at 1, up to rounding, and must count as stable.
@@ -71,11 +71,8 @@ class Simulator:
         # One row for each run: each reference repeats for every draw of noise.
         self.draws = data.noise.shape[1]
         self.reference = data.references[np.repeat(chosen, self.draws)]
-        self.noise = data.noise[chosen].reshape(self.reference.shape)
-        self.disturbance = (
-            None
-            if data.disturbance is None
-            else data.disturbance[chosen].reshape(self.reference.shape)
+        self.run_noise = jax.tree.map(
+            lambda x: x[chosen].reshape(self.reference.shape), data.run_noise
         )
         self.start = round(study.references.settle * study.rate)
         self.samples = self.reference.shape[1]
@@ -108,8 +105,7 @@ class Simulator:
         loop: Feedback,
         values: Float[Array, "width parameters"],
         reference: Float[Array, "runs samples *axes"],
-        noise: Float[Array, "runs samples *axes"],
-        disturbance: Float[Array, "runs samples *axes"] | None,
+        run_noise: RunNoise,
     ) -> dict[str, Any]:
         """Return the results of a block as arrays [runs, width, ...].
 
@@ -122,8 +118,8 @@ class Simulator:
             return replace(loop, dict(zip(paths, values, strict=True)))
 
         def run(drives):
-            reference, noise, disturbance = drives
-            inputs = loop_inputs(reference, noise, disturbance)
+            reference, run_noise = drives
+            inputs = loop_inputs(reference, *run_noise)
 
             def simulate_point(values):
                 system, first = loop_at(values), reference[0]
@@ -144,7 +140,7 @@ class Simulator:
             figures, log = jax.vmap(simulate_point)(values)
             return figures._asdict() | log
 
-        results = jax.lax.map(run, (reference, noise, disturbance))
+        results = jax.lax.map(run, (reference, run_noise))
         if SENSITIVITY in self.metrics:
             results[SENSITIVITY] = jax.vmap(lambda v: self._peaks(loop_at(v)))(values)
         names = (*self.metrics, *(TRAJECTORIES if self.every else ()))
@@ -152,9 +148,7 @@ class Simulator:
 
     def _peaks(self, loop: Feedback) -> tuple[Array, Array]:
         """Return Ms and the state matrix of the closed loop, both for every branch."""
-        point = OperatingPoint(
-            highest_reference(self.case.study), dt=self.case.study.dt
-        )
+        point = OperatingPoint(self.case.highest_reference, dt=self.case.study.dt)
         models = [
             open_loop(loop, dataclasses.replace(point, branch=name))
             for name in BRANCHES
@@ -170,7 +164,7 @@ class Simulator:
         with self._lock:
             if device not in self._inputs:
                 self._inputs[device] = jax.device_put(
-                    (self.reference, self.noise, self.disturbance), device
+                    (self.reference, self.run_noise), device
                 )
             key = device, plant
             if key not in self._programs:

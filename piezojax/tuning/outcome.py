@@ -25,7 +25,7 @@ from .baselines import Baselines
 from .coupling import Coupling, coupling_matrix
 from .drive import Drive, drive_of
 from .result import Result
-from .runs import Signals
+from .runs import RunNoise, Signals
 from .step_tests import StepResult, StepRun
 
 _BEYOND = 1e9  # um or V
@@ -85,6 +85,11 @@ class Outcome:
         study = self.case.study
         if study.axes is not None:
             return "the limit is known for one axis only"
+        if (
+            study.sensor.measured_noise is not None
+            or study.disturbance.input is not None
+        ):
+            return "the limit is known for white noise of the sensor and no other input"
         names, signals = study.references.tune, self.holdout
         count, disturbance = len(names), signals.disturbance
         try:
@@ -136,8 +141,7 @@ class Outcome:
         count = len(signals.references)
         logs = [self._log(loop, index) for index in range(count)]
         level = jnp.broadcast_to(signals.references[0, 0], signals.references[0].shape)
-        undisturbed = None if signals.disturbance is None else jnp.zeros_like(level)
-        held = _log(loop, level, signals.noise[0, 0], undisturbed)
+        held = _log(loop, level, signals.run_noise.of(0, 0).undisturbed())
         voltages = [
             _at_piezo(self.case.amplifier, log.voltage) for log in (*logs, held)
         ]
@@ -167,13 +171,12 @@ class Outcome:
             return {}, {}
         signals, dt = self.holdout, self.case.study.dt
         samples = signals.references.shape[1]
-        quiet = jnp.zeros_like(signals.noise[0, 0])
-        undisturbed = None if signals.disturbance is None else quiet
+        quiet = jax.tree.map(jnp.zeros_like, signals.run_noise.of(0, 0))
         ends = step_ends(np.asarray(signals.references))
 
         def run(loop: Feedback, pair: np.ndarray) -> StepRun:
             reference = step_reference(as_array(pair), samples)
-            log = _log(loop, reference, quiet, undisturbed)
+            log = _log(loop, reference, quiet)
             time = dt * np.arange(-1, samples - 1)
             low, high = map(float, pair)
             return StepRun((low, high), time, _finite(log.displacement))
@@ -220,13 +223,12 @@ class Outcome:
 
     def _log(self, loop: Feedback, index: int) -> LoopSample:
         signals = self.holdout
-        moved = None if signals.disturbance is None else signals.disturbance[index, 0]
-        return _log(loop, signals.references[index], signals.noise[index, 0], moved)
+        return _log(loop, signals.references[index], signals.run_noise.of(index, 0))
 
 
 @jax.jit
-def _log(loop: Feedback, reference: Any, noise: Any, disturbance: Any) -> LoopSample:
-    inputs = loop_inputs(reference, noise, disturbance)
+def _log(loop: Feedback, reference: Any, run_noise: RunNoise) -> LoopSample:
+    inputs = loop_inputs(reference, *run_noise)
     return simulate(loop, inputs, loop.init(reference[0]))[1]
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,8 +17,29 @@ from ..core.system import resolve
 from ..study import Stage
 
 
+class RunNoise(NamedTuple):
+    """Noise and disturbances of runs; each run has its own.
+
+    ``noise`` holds draws of unit variance, ``disturbance`` is added to the displacement
+    (um), ``input_disturbance`` to the voltage (V), each [*runs, samples, *axes].
+    """
+
+    noise: Float[Array, "..."]
+    disturbance: Float[Array, "..."] | None
+    input_disturbance: Float[Array, "..."] | None
+
+    def of(self, *run: int | slice) -> "RunNoise":
+        """Return those of one run, or of a slice of runs."""
+        return jax.tree.map(lambda x: x[run], self)
+
+    def undisturbed(self) -> "RunNoise":
+        """Return the same noise with disturbances of 0."""
+        quiet = jax.tree.map(jnp.zeros_like, self)
+        return quiet._replace(noise=self.noise)
+
+
 class Signals(eqx.Module):
-    """References (um), unit-variance noise draws and disturbances (um) for a loop.
+    """References (um), unit-variance noise draws and disturbances for a loop.
 
     With several axes, each array has a last dimension for them, in the unit of each
     axis, and ``traces`` are the evaluated pairs of a reference and an axis.
@@ -29,8 +50,14 @@ class Signals(eqx.Module):
     references: Float[Array, "references samples *axes"]
     noise: Float[Array, "references draws samples *axes"]
     disturbance: Float[Array, "references draws samples *axes"] | None = None
+    input_disturbance: Float[Array, "references draws samples *axes"] | None = None
     traces: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
     holding: Float[Array, "*begins"] | None = None
+
+    @property
+    def run_noise(self) -> RunNoise:
+        """Noise and disturbances by reference and draw."""
+        return RunNoise(self.noise, self.disturbance, self.input_disturbance)
 
     @property
     def begins(self) -> Array:
@@ -79,9 +106,9 @@ def sampled(
     if signals.references.ndim > 2:
         metric = PerAxisMetric(metric, signals.references.shape[2])
 
-    def one(parameters, reference, noise, disturbance, holding):
+    def one(parameters, reference, run_noise, holding):
         loop = resolve(loop_of(parameters))  # once for the start and the run
-        inputs = loop_inputs(reference, noise, disturbance)
+        inputs = loop_inputs(reference, *run_noise)
         state = loop.init(reference[0], holding)
         found = simulate(loop, inputs, state, metric=metric, every=every)[1]
         if every == 1:
@@ -97,12 +124,11 @@ def sampled(
     copies = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*runs, *jnp.shape(x))), parameters
     )
-    draws = jax.vmap(one, in_axes=(0, None, 0, 0, None))
+    draws = jax.vmap(one, in_axes=(0, None, 0, None))
     found = jax.vmap(draws)(
         copies,
         signals.references,
-        signals.noise,
-        signals.disturbance,
+        signals.run_noise,
         signals.holding,
     )
     if not signals.traces:

@@ -54,12 +54,10 @@ def _mean(values: Any) -> float | None:
 def _parts(loop: Feedback, signals: Signals, first: int) -> tuple[Array, ...]:
     """Return the share and the SlidingParts [references] of ``loop``."""
 
-    def one(reference, noise, disturbance):
-        inputs = loop_inputs(reference, noise, disturbance)
+    def one(reference, run_noise):
+        inputs = loop_inputs(reference, *run_noise)
         parts = sliding_parts(loop, inputs, reference[0], first)
         return (parts.share, *parts)
 
-    moved = signals.disturbance
-    return jax.vmap(one)(
-        signals.references, signals.noise[:, 0], None if moved is None else moved[:, 0]
-    )
+    first_draw = signals.run_noise.of(slice(None), 0)
+    return jax.vmap(one)(signals.references, first_draw)

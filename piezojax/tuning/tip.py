@@ -59,9 +59,9 @@ def _geometric_mean(errors: Float[np.ndarray, "references draws samples"]) -> fl
 def _displacements(
     loop: Feedback, signals: Signals
 ) -> Float[Array, "references draws samples"]:
-    def one(reference, noise, disturbance):
-        inputs = loop_inputs(reference, noise, disturbance)
+    def one(reference, run_noise):
+        inputs = loop_inputs(reference, *run_noise)
         return simulate(loop, inputs, loop.init(reference[0]))[1].displacement
 
-    draws = jax.vmap(one, in_axes=(None, 0, 0))
-    return jax.vmap(draws)(signals.references, signals.noise, signals.disturbance)
+    draws = jax.vmap(one, in_axes=(None, 0))
+    return jax.vmap(draws)(signals.references, signals.run_noise)
