@@ -449,14 +449,14 @@ def test_a_cut_off_below_nyquist_is_accepted(study):
             "sensor/noise",
             0.1,
             "sensor.noise is unknown; allowed are resolution, bits, range, bandwidth, "
-            "order, delay, noise_rms, anti_aliasing, anti_aliasing_order; "
-            "did you mean 'noise_rms'?",
+            "order, delay, noise_rms, measured_noise, anti_aliasing, "
+            "anti_aliasing_order; did you mean 'noise_rms'?",
         ),
         (
             "references/setle",
             0.1,
             "references.setle is unknown; allowed are tune, unseen, amplitude, offset, "
-            "duration, settle; did you mean 'settle'?",
+            "duration, settle, files; did you mean 'settle'?",
         ),
         (
             "parameters/controller.integral/max",

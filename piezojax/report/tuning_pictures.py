@@ -105,7 +105,9 @@ def _drawn_traces(outcome: Outcome) -> list[Trace]:
     for trace in traces_of(study):
         if trace.name not in errors:
             continue
-        place = trace.axis, parse(_signal_of(study, trace))[0]
+        signal = _signal_of(study, trace)
+        in_file = signal in study.references.files
+        place = trace.axis, signal if in_file else parse(signal)[0]
         current = by_kind.get(place)
         error = errors[trace.name] or np.inf
         if current is None or error > (errors[current.name] or np.inf):
@@ -125,8 +127,10 @@ def _signal_of(study: Study, trace: Trace) -> str:
 
 def _drawn_from(study: Study, trace: Trace) -> float:
     """Return the time (s) from which a trace is drawn."""
-    table = study.references
-    frequency = parse(_signal_of(study, trace))[1] or 1.0
+    table, signal = study.references, _signal_of(study, trace)
+    if signal in table.files:
+        return table.settle
+    frequency = parse(signal)[1] or 1.0
     return max(table.settle, table.duration - _PERIODS / frequency)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ..catalog import CONTROLLERS, PLANTS, at_rate
 from ..control.design import DESIGNS
@@ -22,17 +23,22 @@ from ..core.system import System, accepts
 from ..identification import Fit, Record, identify, read_record, validate
 from .ensemble import Ensemble, Stage, ensemble_of
 from .make_hardware import driven, make_actuator, make_amplifier, make_sensor, per_axis
+from .measured_noise import MeasuredNoise, read_noise
 from .origin import check_origin, check_rate, in_study_units
 from .parameters import check_value, search_space
+from .references import reference_signals
 from .schema import Study, load
 from .stage_tables import RecordPlant
 from .tables import one_of, validated
+from .trajectories import read_trajectories
 
 
 @dataclass(frozen=True)
 class Case:
     """A study with its loop and its search space.
 
+    ``references`` are those of tuning before the unseen ones, in um or in the units of
+    the axes.
     ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
     names to the plants of a sweep, which replace the plant of the loop. ``notes`` are
     sentences: on starts that differ from the controller of the study, and on a design
@@ -40,13 +46,15 @@ class Case:
     a record or a file, with the bound on its error. ``amplifier`` maps the voltage of
     the actuator to that of the piezo, both in V; it is part of the plant, and None if
     the study has none. ``beside`` maps names to the controllers that the tuned one is
-    compared with.
+    compared with. ``sensor_noise``, ``output_disturbance`` and ``input_disturbance``
+    are those of files; the study of a case with the first has its rms value.
     """
 
     study: Study
     name: str
     loop: Feedback
     space: Space
+    references: Float[np.ndarray, "references samples *axes"]
     fit: Fit | None = None
     ensemble: Ensemble | None = None
     plants: Mapping[str, System] = field(default_factory=dict)
@@ -54,6 +62,18 @@ class Case:
     plant_about: About = field(default_factory=About)
     amplifier: System | None = None
     beside: Mapping[str, System] = field(default_factory=dict)
+    sensor_noise: MeasuredNoise | None = None
+    output_disturbance: MeasuredNoise | None = None
+    input_disturbance: MeasuredNoise | None = None
+
+    @property
+    def highest_reference(self) -> float | tuple[float, ...]:
+        """Highest value of all references, um; a tuple on a stage with axes.
+
+        It is the operating point of the margins of a study.
+        """
+        peaks = np.max(self.references, axis=(0, 1))
+        return tuple(peaks.tolist()) if self.study.axes else float(peaks)
 
     def unit(self, path: str) -> str:
         """Return the declared unit of the parameter at ``path`` in the loop.
@@ -77,6 +97,8 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
     path = Path(path)
     if seed is not None:
         study = study.model_copy(update={"seed": seed})
+    trajectories = read_trajectories(study, path.parent)
+    study, measured = _with_measured_noise(study, path.parent)
     plant, fit, about, notes_of_plant = _plant(study, path.parent)
     zero = per_axis(study, lambda axis: as_array(0.0))
     _check_role(plant, zero, "plant", "a voltage to a displacement")
@@ -110,10 +132,17 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         path.stem,
         loop,
         space,
+        reference_signals(study, trajectories),
         fit,
         ensemble,
         plants,
-        (*notes_of_plant, *design_notes, *notes),
+        (
+            *(trajectory.note for trajectory in trajectories.values()),
+            *(noise.note for noise in measured.values()),
+            *notes_of_plant,
+            *design_notes,
+            *notes,
+        ),
         about,
         amplifier,
         {
@@ -125,6 +154,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
             )
             for name, table in study.beside.items()
         },
+        **measured,
     )
 
 
@@ -134,6 +164,33 @@ def read(path: str | Path, seed: int | None = None) -> Case:
     Raises ValueError as ``build`` does.
     """
     return build(load(path), path, seed)
+
+
+def _with_measured_noise(
+    study: Study, folder: Path
+) -> tuple[Study, dict[str, MeasuredNoise]]:
+    """Return ``study`` with the rms noise of its sensor, and the noise of its files."""
+    units = study.axes.units if study.axes else ("um",)
+    volts = ("V",) * study.axis_count
+    tables = {
+        "sensor_noise": (study.sensor.measured_noise, "sensor.measured_noise", units),
+        "output_disturbance": (study.disturbance.output, "disturbance.output", units),
+        "input_disturbance": (study.disturbance.input, "disturbance.input", volts),
+    }
+    found = {
+        name: read_noise(
+            table, study, folder, where, each, sensor=name == "sensor_noise"
+        )
+        for name, (table, where, each) in tables.items()
+        if table is not None
+    }
+    if "sensor_noise" in found:
+        rms = tuple(found["sensor_noise"].rms.tolist())
+        sensor = study.sensor.model_copy(
+            update={"noise_rms": rms if study.axes else rms[0]}
+        )
+        study = study.model_copy(update={"sensor": sensor})
+    return study, found
 
 
 def _plant(

@@ -1,23 +1,33 @@
 """References of a study as signals."""
 
-import jax
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core.arrays import as_array
 from ..signals import motions, waveforms
 from .schema import Study
+from .trajectories import Trajectory
 
 
-def reference_signals(study: Study) -> Float[Array, "references samples *axes"]:
+def reference_signals(
+    study: Study, trajectories: Mapping[str, Trajectory]
+) -> Float[np.ndarray, "references samples *axes"]:
     """Return the references of ``study``, the tuning ones before the unseen ones.
 
-    They are in um, or in the units of the axes.
+    They are in um, or in the units of the axes. ``trajectories`` are those of its
+    files, by name.
     """
     table = study.references
     time_s = waveforms.time_grid(table.duration, study.rate)
-    names = (*table.tune, *table.unseen)
-    return as_array(np.stack([_signal(study, name, time_s) for name in names]))
+
+    def signal(name: str) -> np.ndarray:
+        if name not in trajectories:
+            return np.asarray(_signal(study, name, time_s))
+        values = trajectories[name].values
+        return values if study.axes else values[:, 0]
+
+    return np.stack([signal(name) for name in (*table.tune, *table.unseen)])
 
 
 def _signal(study: Study, name: str, time_s: Array) -> Array:
@@ -26,14 +36,3 @@ def _signal(study: Study, name: str, time_s: Array) -> Array:
     if study.axes is None:
         return waveforms.signal(name, time_s, amplitudes[0], offsets[0])
     return motions.motion(name, time_s, study.axes.names, amplitudes, offsets)
-
-
-def highest_reference(study: Study) -> float | tuple[float, ...]:
-    """Return the highest value of all references, um; a tuple on a stage with axes.
-
-    It is the operating point of the margins of a study.
-    """
-    # JAX may be tracing the caller; the references are constants all the same.
-    with jax.ensure_compile_time_eval():
-        peaks = np.max(np.asarray(reference_signals(study)), axis=(0, 1))
-    return tuple(peaks.tolist()) if study.axes else float(peaks)

@@ -12,6 +12,7 @@ from ..signals import motions
 from ..signals import waveforms as signals
 from ..solve.optimisers import GAUSS_NEWTON, METHODS
 from .ensemble_table import EnsembleTable
+from .file_tables import NoiseFile, TrajectoryTable, check_trajectory_name
 from .stage_tables import Actuator, DisturbanceTable, SensorTable
 from .structure_table import StructuresTable
 from .sweep_table import SweepTable, require_quoted_paths
@@ -26,6 +27,9 @@ from .tables import (
     unknown_key,
     validated,
 )
+
+_OWN_LISTS = ("tune", "unseen", "files")
+"""Keys whose lists are not values by axis."""
 
 MEMORY_GB = 16.0
 """Largest memory of the signals of a study, GB."""
@@ -57,12 +61,13 @@ class AxesTable(Table):
 
 
 class References(Table):
-    """References of the runs, by the names of their signals.
+    """References of the runs, by the names of their signals or trajectories.
 
     ``tune`` are the references of the objective; ``unseen`` are used only to evaluate
     the tuned gains. ``amplitude`` and ``offset`` are in the unit of the axis (um on a
     stage with one axis), ``duration`` and ``settle`` in s. Errors count after
-    ``settle``.
+    ``settle``. ``files`` are trajectories in files, by name; they have an offset of
+    their own and no amplitude.
     """
 
     tune: tuple[str, ...] = Field(min_length=1)
@@ -71,6 +76,7 @@ class References(Table):
     offset: ByAxis[Finite] = 0.0
     duration: Positive = 1.0
     settle: NotNegative = 0.5
+    files: dict[str, TrajectoryTable] = Field(default_factory=dict)
 
     @field_validator("tune", "unseen")
     @classmethod
@@ -90,6 +96,10 @@ class References(Table):
         for name in self.unseen:
             if name in self.tune:
                 raise ValueError(f"{name} is in both tune and unseen")
+        for name in self.files:
+            check_trajectory_name(name)
+            if name not in (*self.tune, *self.unseen):
+                raise ValueError(f"files.{name} is in neither tune nor unseen")
         return self
 
 
@@ -222,6 +232,8 @@ class Study(Table):
             except ValueError as error:
                 part = "tune" if name in table.tune else "unseen"
                 raise ValueError(f"references.{part}: {error}") from None
+            if name in table.files:
+                continue
             for kind in driven.values():
                 frequency = signals.parse(kind)[1] or 0.0
                 if frequency >= 0.5 * self.rate:
@@ -321,7 +333,10 @@ class Study(Table):
             f"{name}.{key}": value
             for name, table in tables.items()
             for key, value in table
-            if key not in ("tune", "unseen")
+            if not isinstance(value, NoiseFile) and key not in _OWN_LISTS
+        } | {
+            f"references.files.{name}.offset": trajectory.offset
+            for name, trajectory in self.references.files.items()
         }
         for key, value in lists.items():
             if isinstance(value, tuple) and len(value) != self.axis_count:
@@ -353,9 +368,12 @@ class Study(Table):
     def driven(self, reference: str) -> dict[str, str]:
         """Return the signals of a reference by the name of the driven axis.
 
-        The name is "" on a stage with one axis. Raises ValueError for an unknown
-        reference.
+        The name is "" on a stage with one axis. That of a trajectory is the signal of
+        each of its axes. Raises ValueError for an unknown reference.
         """
+        if reference in self.references.files:
+            axes = self.references.files[reference].axes if self.axes else ("",)
+            return dict.fromkeys(axes, reference)
         if self.axes:
             return motions.parse(reference, self.axes.names)
         signals.parse(reference)

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from ..identification import DEFAULT, chain
+from .file_tables import NoiseFile
 from .tables import ByAxis, Finite, NotNegative, Positive, Table
 
 Bandwidth = Annotated[float, Field(ge=1e-3, le=1e9, allow_inf_nan=False, strict=True)]
@@ -117,11 +118,13 @@ class SensorTable(ElectronicsTable):
     """Noise of the sensor, um, and the properties of its electronics.
 
     ``noise_rms`` is white up to half the rate and is added behind the bandwidth and the
-    delay. ``anti_aliasing`` (Hz), of order ``anti_aliasing_order``, filters the
-    displacement and the noise before the converter.
+    delay; ``measured_noise`` is that of a file instead. ``anti_aliasing`` (Hz), of
+    order ``anti_aliasing_order``, filters the displacement and the noise before the
+    converter.
     """
 
     noise_rms: ByAxis[NotNegative] = 0.0
+    measured_noise: NoiseFile | None = None
     anti_aliasing: ByAxis[Bandwidth] | None = None
     anti_aliasing_order: Order | None = None
 
@@ -130,13 +133,21 @@ class SensorTable(ElectronicsTable):
         if self.bits is not None and self.range is None:
             raise ValueError("bits is given without range, the travel that it divides")
         _needs(self, "anti_aliasing_order", "anti_aliasing")
+        if self.measured_noise is not None and np.any(np.greater(self.noise_rms, 0.0)):
+            raise ValueError(
+                "noise_rms and measured_noise are both given; give one of them"
+            )
         return self
 
 
 class DisturbanceTable(Table):
-    """Disturbance of the displacement.
+    """Disturbances of the stage.
 
-    ``drift_rms`` is the rms value of a random walk after one second, um.
+    ``drift_rms`` is the rms value of a random walk after one second, um. ``output`` is
+    a measured vibration that is added to the displacement, in the unit of each axis;
+    ``input`` is measured noise that is added to the voltage of the actuator, V.
     """
 
     drift_rms: ByAxis[NotNegative] = 0.0
+    output: NoiseFile | None = None
+    input: NoiseFile | None = None

@@ -69,10 +69,19 @@ def contours_in(study: Study) -> list[Contour]:
         return []
     found = []
     for run, name in enumerate((*study.references.tune, *study.references.unseen)):
-        axes = motions.contour_axes(name, study.axes.names)
+        axes = _axes_of(study, name)
         if axes and len({study.axes.units[axis] for axis in axes}) == 1:
             found.append(Contour(run, axes))
     return found[:_MOST]
+
+
+def _axes_of(study: Study, name: str) -> tuple[int, int] | None:
+    """Return the axes of the contour of a reference: a trajectory drives two."""
+    assert study.axes is not None
+    if name not in study.references.files:
+        return motions.contour_axes(name, study.axes.names)
+    driven = [study.axes.names.index(axis) for axis in study.driven(name)]
+    return (driven[0], driven[1]) if len(driven) == 2 else None
 
 
 def contour_errors(study: Study, runs: dict[int, Logs]) -> list[ContourErrors]:
@@ -84,7 +93,7 @@ def contour_errors(study: Study, runs: dict[int, Logs]) -> list[ContourErrors]:
     for contour in contours_in(study):
         logs = runs[contour.run]
         samples = len(logs[0].reference[contour.axes[0]])
-        path = _path(study, contour, samples)
+        path = _path(study, contour, logs[0])
         first = round(study.references.settle * study.rate)
         shown = slice(first, None, max(1, (samples - first) // _POINTS))
         time = np.arange(samples)[shown] * study.dt
@@ -102,14 +111,18 @@ def _error(
     return ContourError(nearest, points - nearest)
 
 
-def _path(study: Study, contour: Contour, samples: int) -> np.ndarray:
+def _path(study: Study, contour: Contour, log: LoopSample) -> np.ndarray:
     """Return the path [points, 2] of a contour, with points between the samples.
 
-    The chord between two samples may lie further from the curve than the stage does.
+    The chord between two samples may lie further from the curve than the stage does. A
+    trajectory of a file is linear between its samples.
     """
     assert study.axes is not None
     table = study.references
     name = (*table.tune, *table.unseen)[contour.run]
+    samples = len(log.reference[contour.axes[0]])
+    if name in table.files:
+        return np.stack([log.reference[axis] for axis in contour.axes], axis=1)
     finer = max(1, min(_FINER, _SEGMENTS // samples))
     time = np.arange((samples - 1) * finer + 1) * study.dt / finer
     amplitudes, offsets = study.by_axis(table.amplitude), study.by_axis(table.offset)

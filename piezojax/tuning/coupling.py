@@ -39,7 +39,8 @@ def coupling_matrix(study: Study, errors: Mapping[str, float | None]) -> Couplin
 
     Examples of ``errors`` are those of ``Result.holdout`` and ``Result.coupling``
     together. References that drive several axes are left out, because they do not show
-    coupling. Over several references that drive the same axis the mean square is taken.
+    coupling, and so are trajectories of files, whose amplitude is another. Over several
+    references that drive the same axis the mean square is taken.
     The diagonal holds the tracking errors. Raises ValueError for a study of one axis.
     """
     if study.axes is None:
@@ -49,8 +50,9 @@ def coupling_matrix(study: Study, errors: Mapping[str, float | None]) -> Couplin
     counts = np.zeros_like(squares)
     runs = (*study.references.tune, *study.references.unseen)
     for trace in traces_of(study):
-        driven = list(study.driven(runs[trace.run]))
-        if len(driven) > 1 or trace.name not in errors:
+        run = runs[trace.run]
+        driven = list(study.driven(run))
+        if len(driven) > 1 or run in study.references.files or trace.name not in errors:
             continue
         place = names.index(driven[0]), trace.axis
         error = errors[trace.name]

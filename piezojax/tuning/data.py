@@ -14,10 +14,13 @@ from ..core.feedback import Feedback, holding_input
 from ..core.system import System
 from ..signals import waveforms
 from ..study import Case, Stage
-from ..study.references import reference_signals
+from ..study.measured_noise import MeasuredNoise
 from .runs import Signals
 from .traces import Trace, traces_of
 from .unexplained import STRETCHES, residual_disturbances
+
+Part = Literal["train", "validate"]
+"""Part of a record: that of tuning, or that of the hold-out."""
 
 
 @dataclass
@@ -44,7 +47,7 @@ def make_data(case: Case) -> Data:
     study = case.study
     table = study.references
     time_s = waveforms.time_grid(table.duration, study.rate)
-    references = np.asarray(reference_signals(study))
+    references = case.references
     # Two streams of one seed: the hold-out draws are new for every reference.
     streams = np.random.SeedSequence(study.seed).spawn(2)
     counts = study.objective.noise_draws, study.holdout_draws
@@ -83,13 +86,13 @@ def _signals(
     time_s: jax.Array,
     random: np.random.Generator,
     draws: int,
-    part: Literal["train", "validate"],
+    part: Part,
 ) -> Signals:
     count, samples, *axes = references.shape
     if case.fit is not None:
         draws *= STRETCHES
     shape = (count, draws, samples, *axes)
-    noise = as_array(random.standard_normal(shape))
+    noise = _noise(case, random, shape, part)
     disturbance = None
     if case.fit is not None:
         played = [
@@ -103,7 +106,39 @@ def _signals(
         # One axis has no dimension for axes.
         walk = as_array(np.cumsum(steps, axis=2) * (drift if axes else drift[0]))
         disturbance = walk if disturbance is None else disturbance + walk
-    return Signals(as_array(references), noise, disturbance, (), holding)
+    moved, pushed = (
+        None
+        if measured is None
+        else _measured(measured, random, shape, part, len(axes))
+        for measured in (case.output_disturbance, case.input_disturbance)
+    )
+    if moved is not None:
+        disturbance = moved if disturbance is None else disturbance + moved
+    return Signals(as_array(references), noise, disturbance, pushed, (), holding)
+
+
+def _noise(
+    case: Case, random: np.random.Generator, shape: tuple[int, ...], part: Part
+) -> jax.Array:
+    """Return draws of unit variance, white or those of the study's file."""
+    measured = case.sensor_noise
+    if measured is None:
+        return as_array(random.standard_normal(shape))
+    rms = measured.rms if len(shape) > 3 else measured.rms[0]
+    drawn = _measured(measured, random, shape, part, len(shape) - 3)
+    return drawn / np.where(rms > 0.0, rms, 1.0)
+
+
+def _measured(
+    measured: MeasuredNoise,
+    random: np.random.Generator,
+    shape: tuple[int, ...],
+    part: Part,
+    axes: int,
+) -> jax.Array:
+    """Return noise of a file, [references, draws, samples, *axes]."""
+    drawn = measured.draws(random, shape[:2], shape[2], part)
+    return as_array(drawn if axes else drawn[..., 0])
 
 
 def own_stage(loop: Feedback) -> Stage:

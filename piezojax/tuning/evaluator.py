@@ -25,7 +25,6 @@ from ..solve.clock import Clock
 from ..solve.multi_start import in_batches
 from ..study import Case, Stage
 from ..study.ensemble import Part
-from ..study.references import highest_reference, reference_signals
 from .data import held, own_stage
 from .objective import MARGIN_BLOCK, StepTest, margins_on
 from .runs import Signals, evaluate
@@ -191,7 +190,7 @@ class Evaluator:
         if not uses(self.limits, "margins"):
             return None
         study = self._case.study
-        point = OperatingPoint(highest_reference(study), dt=study.dt)
+        point = OperatingPoint(self._case.highest_reference, dt=study.dt)
 
         def margins(loop, stages, _):
             return margins_on(
@@ -230,7 +229,7 @@ def step_test_of(case: Case) -> StepTest | None:
     study = case.study
     if study.axes is not None:
         return None
-    references = np.asarray(reference_signals(study))
+    references = case.references
     return StepTest(
         as_array(step_ends(references)),
         as_array(study.sensor.noise_rms),

@@ -11,7 +11,6 @@ from ..solve.multi_start import Strategy, minimise
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import SearchState
 from ..study import Case
-from ..study.references import highest_reference
 from .alarms import EXACT, PEAK, exact_figures
 from .evaluator import Carried, Evaluator
 from .make_result import constraint_outcomes
@@ -87,7 +86,7 @@ def exact_stability(case: Case, search: SearchState) -> StabilityReports:
     after = case.space.put(case.loop, as_array(search.unit))
     return stability_reports(
         {"before": case.loop, "after": after},
-        highest_reference(study),
+        case.highest_reference,
         study.dt,
         study.axes.names if study.axes else (),
     )

@@ -6,7 +6,6 @@ import numpy as np
 from ..core.arrays import as_array
 from ..core.metrics import TrackingFigures
 from ..study import Case
-from ..study.references import highest_reference
 from .data import Data, held
 from .evaluator import Evaluator, drawn_stages
 from .objective import RAILED, Objective
@@ -50,7 +49,7 @@ def make_objective(
         model_error=evaluator.model_error,
         over=table.ensemble.aggregate if table.ensemble else "mean",
         tail=table.ensemble.tail if table.ensemble else 1.0,
-        highest=as_array(highest_reference(table)),
+        highest=as_array(case.highest_reference),
         step_test=evaluator.step_test,
         dt=table.dt,
     )

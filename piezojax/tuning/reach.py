@@ -35,10 +35,16 @@ def require_reach(case: Case, data: Data) -> None:
         run = beyond[0]
         part = "tune" if run < len(table.tune) else "unseen"
         where = f"axis {name}" if name else "the stage"
+        signal = (*table.tune, *table.unseen)[run]
+        remedy = (
+            f"change scale or offset under references.files.{signal}"
+            if signal in table.files
+            else f"reduce references.amplitude, now {amplitudes[axis]:g}, or "
+            f"change references.offset, now {offsets[axis]:g}"
+        )
         raise ValueError(
-            f"references.{part}: {(*table.tune, *table.unseen)[run]} spans "
+            f"references.{part}: {signal} spans "
             f"{bottoms[run]:.4g} to {tops[run]:.4g} {unit}, beyond the stroke of "
             f"{where}, {lowest:.4g} to {highest:.4g} {unit} between the limits of the "
-            f"actuator: reduce references.amplitude, now {amplitudes[axis]:g}, or "
-            f"change references.offset, now {offsets[axis]:g}"
+            f"actuator: {remedy}"
         )

@@ -5,7 +5,6 @@ import tomli_w
 
 import piezojax as pj
 from piezojax.analysis.stability import OperatingPoint, stability_report
-from piezojax.study.references import highest_reference
 
 STUDY = {
     "title": "integral action on a stage with a light mode",
@@ -35,9 +34,7 @@ def tuned(folder, **tables):
 
 def exact(outcome):
     loop, dt = outcome.after, outcome.case.study.dt
-    return stability_report(
-        loop, OperatingPoint(highest_reference(outcome.case.study), dt=dt)
-    )
+    return stability_report(loop, OperatingPoint(outcome.case.highest_reference, dt=dt))
 
 
 @pytest.fixture(scope="module")

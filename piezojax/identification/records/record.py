@@ -1,7 +1,6 @@
 """Measured records: input and output columns, read from a file and checked."""
 
 import dataclasses
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,30 +9,13 @@ from typing import Any
 import numpy as np
 
 from ...core.conversion import factor
-from .columns import Column, Columns, ContentError
-from .formats import read_columns
-from .units import seconds_of, unit_of
-
-Key = str | int
-"""Name of a column, or its number from zero."""
+from .sampled import Key, read_sampled
 
 SHORTEST = 50
 """Least number of samples in a record."""
 
-IS_TIME = re.compile(r"time\b|time_|x[-_ ](axis|value)\b", re.IGNORECASE)
-"""Pattern of the names of time columns."""
-
-COUNTED = ("s", "ms", "us", "ns", "sequence")
-"""Units, in lower case, of columns that count time or samples."""
-
-LONGEST = 100_000_000
-"""Most samples of a resampled record."""
-
 LARGEST = 1e100
 """Largest value of a signal; the squares of much larger ones are not finite."""
-
-UNIFORM = 1e-3
-"""Largest relative difference of time steps that count as one sample time."""
 
 
 @dataclass(frozen=True)
@@ -230,154 +212,20 @@ def read_record(
     contradicting sample times, or a record that is too short.
     """
     path = Path(path)
-    columns = read_columns(path)
-    try:
-        clock = _column_names(columns, [] if time is None else [time], "time")
-        inputs = _column_names(columns, input, "input")
-        outputs = _column_names(columns, output, "output")
-        for role, names in (("input", inputs), ("output", outputs)):
-            _check_signals(columns, names, role)
-        values = _numbers(columns, {"time": clock, "input": inputs, "output": outputs})
-        steps = {f"column {n!r}": columns[n].dt for n in inputs + outputs}
-        if rate is not None:
-            steps = {"the rate": 1.0 / _above_zero(rate, "rate")} | steps
-        instants = None
-        for name in clock:
-            instants = values[name] * seconds_of(name, columns[name])
-            step = _time_step(instants, even=resample is None)
-            steps = {f"column {name!r}": step} | steps
-        dt = _common_step(steps)
-        if resample is not None:
-            if instants is None:
-                instants = dt * np.arange(values[inputs[0]].size)
-            values, dt = _resampled(values, instants, resample)
-    except ContentError as error:
-        raise ValueError(f"{path.name}: {error}") from None
+    roles = {"input": input, "output": output}
+    even = resample is None
+    read = read_sampled(path, roles, time=time, rate=rate, even=even, least=SHORTEST)
+    if resample is not None:
+        read = read.resampled(resample, path)
+    inputs, outputs = read.names["input"], read.names["output"]
     return Record(
-        np.stack([values[name] for name in inputs], axis=1),
-        np.stack([values[name] for name in outputs], axis=1),
-        dt,
-        input_units=tuple(unit_of(n, columns[n]) or "V" for n in inputs),
-        output_units=tuple(unit_of(n, columns[n]) or "um" for n in outputs),
+        read.matrix("input"),
+        read.matrix("output"),
+        read.dt,
+        input_units=tuple(read.units[n] or "V" for n in inputs),
+        output_units=tuple(read.units[n] or "um" for n in outputs),
         source=path.name,
         period=period,
         input_names=tuple(inputs),
         output_names=tuple(outputs),
     )
-
-
-def _check_signals(columns: Columns, names: list[str], role: str) -> None:
-    for name in names:
-        unit = (unit_of(name, columns[name]) or "").lower()
-        if IS_TIME.match(name) or unit in COUNTED:
-            raise ContentError(
-                f"the {role} column is {name!r}; name the columns of input and output: "
-                f"there are {', '.join(columns)}"
-            )
-
-
-def _column_names(
-    columns: Columns, wanted: Key | Sequence[Key], role: str
-) -> list[str]:
-    """Return the names of the columns ``wanted``, given by name or number."""
-    if isinstance(wanted, str) and wanted not in columns and "," in wanted:
-        wanted = [key.strip() for key in wanted.split(",")]
-    names = list(columns)
-    found = []
-    for key in [wanted] if isinstance(wanted, Key) else wanted:
-        number = isinstance(key, int) or (key not in columns and key.isdecimal())
-        name = dict(enumerate(names)).get(int(key)) if number else key
-        if name not in columns:
-            raise ContentError(
-                f"{role} column {key!r} is missing; there are {', '.join(names)}"
-            )
-        found.append(name)
-    if role != "time" and not found:
-        raise ContentError(f"no {role} column is named")
-    return found
-
-
-def _numbers(columns: Columns, roles: dict[str, list[str]]) -> dict[str, np.ndarray]:
-    """Return the columns of all ``roles`` as finite floats of one length."""
-    values, role_of = {}, {}
-    for role, name in ((role, name) for role, names in roles.items() for name in names):
-        if name in role_of:
-            raise ContentError(
-                f"column {name!r} is named twice: as {role_of[name]} and as {role}"
-            )
-        role_of[name] = role
-        values[name] = _finite(columns[name], f"{role} column {name!r}")
-    if len({column.size for column in values.values()}) > 1:
-        lengths = ", ".join(f"{name} {column.size}" for name, column in values.items())
-        raise ContentError(f"columns differ in length: {lengths}")
-    return values
-
-
-def _finite(column: Column, name: str) -> np.ndarray:
-    if column.fault:
-        raise ContentError(f"{name}, {column.fault}")
-    if column.values.dtype.kind not in "fiub":
-        raise ContentError(f"{name} is {column.values.dtype}, not real numbers")
-    values = column.values.astype(float)
-    bad = np.flatnonzero(~np.isfinite(values))
-    if bad.size:
-        raise ContentError(
-            f"{name} is missing or not finite at sample {bad[0]} ({bad.size} in all)"
-        )
-    return values
-
-
-def _above_zero(value: float, name: str) -> float:
-    if not (np.isfinite(value) and value > 0):
-        raise ContentError(f"{name} is {value:g} Hz; it must be above 0")
-    return value
-
-
-def _time_step(time: np.ndarray, even: bool) -> float:
-    """Return the mean step in s of an increasing time axis; check it for ``even``."""
-    if time.size < 2:
-        raise ContentError(f"{time.size} samples; at least {SHORTEST} are needed")
-    steps = np.diff(time)
-    if np.any(steps <= 0):
-        sample = int(np.flatnonzero(steps <= 0)[0]) + 1
-        raise ContentError(f"time does not increase at sample {sample}")
-    dt = float(np.median(steps))
-    uneven = np.flatnonzero(np.abs(steps - dt) > UNIFORM * dt)
-    if even and uneven.size:
-        sample = int(uneven[0]) + 1
-        raise ContentError(
-            f"time is not uniform: step {steps[sample - 1]:g} s at sample {sample}, "
-            f"{dt:g} s elsewhere; resample=HZ puts it on a uniform grid"
-        )
-    return float((time[-1] - time[0]) / (time.size - 1))
-
-
-def _common_step(steps: dict[str, float | None]) -> float:
-    """Return the sample time in s; check that all known values agree."""
-    known = [(source, step) for source, step in steps.items() if step is not None]
-    if not known:
-        raise ContentError("name the time column, or give its rate in Hz")
-    first, dt = known[0]
-    for other, step in known:
-        if abs(step - dt) > UNIFORM * dt:
-            raise ContentError(
-                f"the sample rate is {1.0 / dt:.6g} Hz by {first} and {1.0 / step:.6g} "
-                f"Hz by {other}; they must agree within {100.0 * UNIFORM:g} %"
-            )
-    return dt
-
-
-def _resampled(
-    values: dict[str, np.ndarray], instants: np.ndarray, rate: float
-) -> tuple[dict[str, np.ndarray], float]:
-    """Return ``values`` on a uniform grid of ``rate`` (Hz), and the step in s."""
-    dt = 1.0 / _above_zero(rate, "resample")
-    # The factor keeps the last sample despite rounding.
-    steps = (instants[-1] - instants[0]) / dt * (1.0 + 1e-12)
-    if not steps < LONGEST:
-        raise ContentError(
-            f"resample is {rate:g} Hz: {instants[-1] - instants[0]:g} s would be "
-            f"{steps:.3g} samples; at most {LONGEST:g} are allowed"
-        )
-    grid = instants[0] + dt * np.arange(int(steps) + 1)
-    return {name: np.interp(grid, instants, v) for name, v in values.items()}, dt
