@@ -585,7 +585,7 @@ def identified(tmp_path_factory):
 
 def test_identify_writes_its_results(identified):
     _, out = identified
-    assert names(out) == ["fit.json", "fit.png", "model.json"]
+    assert names(out) == ["fit.json", "fit.png", "model.json", "model.residual.npz"]
     assert_pictures(out, "fit.png")
 
 

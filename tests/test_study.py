@@ -484,8 +484,9 @@ def test_a_cut_off_below_nyquist_is_accepted(study):
         (
             "plant",
             {"record": "r.csv", "model": "coleman_hodgdon", "trian": [0, 9]},
-            "plant.trian is unknown; allowed are record, model, time, input, output, "
-            "record_rate, train, check; did you mean 'train'?",
+            "plant.trian is unknown; allowed are record, model, method, among, time, "
+            "input, output, record_rate, resample, period, train, validate, test, "
+            "order, window, oversample, steps, check; did you mean 'train'?",
         ),
         (
             "controller",
@@ -540,8 +541,8 @@ def test_unknown_keys(refusal, place, value, message):
         ),
         (
             "plant",
-            {"record": "r.csv", "model": "preisach"},
-            "plant.model is 'preisach': a model has no part 'preisach'; there are co",
+            {"record": "r.csv", "model": "preisac"},
+            "plant.model is 'preisac': a model has no part 'preisac'; there are co",
         ),
         (
             "plant",
@@ -922,8 +923,8 @@ def study_of_a_bent_plant(study, monkeypatch):
         return path
 
     monkeypatch.setattr(
-        "piezojax.study.case.identify",
-        lambda record, *_, **__: fit_of(bent, record, record.output),
+        "piezojax.study.fitted_plant.identify",
+        lambda records, *_, **__: fit_of(bent, records[0], records[0].output),
     )
     return written
 

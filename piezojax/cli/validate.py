@@ -37,6 +37,7 @@ def main(model, records, estimate, out, seed, quiet, **columns):
     def body(console):
         from ..core.serial import load, read_about
         from ..identification import read_record, validate
+        from ..identification.residual_record import load_residual
         from ..report.model_validation import (
             input_lines,
             validation_table,
@@ -44,13 +45,14 @@ def main(model, records, estimate, out, seed, quiet, **columns):
         )
 
         system, about = load(model, accept_unsafe=True), read_about(model)
+        residual = load_residual(model, about)
         loaded = [read_record(record, **columns) for record in records]
         print_columns(console, loaded)
         with Bar(console) as bar, results_folder(out, model.stem) as folder:
             bar.stage("judging the model")
             found = validate(system, about, loaded, estimate=estimate)
             bar.stage("drawing")
-            write_validation(found, folder)
+            write_validation(found, folder, residual)
         report = found.report
         print_alarms(console, report.alarms)
         console.print(validation_table(report))

@@ -10,6 +10,7 @@ from ..core.serial import save
 from ..identification.estimators.estimate import LinearDetail
 from ..identification.fit import Fit
 from ..identification.records.record import Record
+from ..identification.residual_record import ResidualRecord, save_residual
 from .figures import (
     AFTER,
     BEFORE,
@@ -40,8 +41,9 @@ def write_fit(fit: Fit, folder: Path) -> None:
 
 
 def write_model(fit: Fit, folder: Path) -> None:
-    """Write model.json and fit.json into ``folder``."""
+    """Write model.json, its residual and fit.json into ``folder``."""
     save(fit.system, folder / MODEL_FILE, fit.about)
+    save_residual(ResidualRecord.of(fit), folder / MODEL_FILE)
     text = fit.report.model_dump_json(indent=2)
     write_text(folder / FIT_FILE, text + "\n")
 

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from ..core.files import write_text
 from ..core.serial import save
+from ..identification.residual_record import ResidualRecord, save_residual
 from ..identification.validation import RecordCheck, Validation, ValidationReport
 from .figures import (
     AFTER,
@@ -29,9 +30,16 @@ DRAWN = 6
 WORDS = {"amplitude": "input range in a stretch", "rate": "input slope"}
 
 
-def write_validation(found: Validation, folder: Path) -> None:
-    """Write model.json with the verdict, validation.json and the picture."""
+def write_validation(
+    found: Validation, folder: Path, residual: ResidualRecord | None = None
+) -> None:
+    """Write model.json with the verdict, validation.json and the picture.
+
+    ``residual`` is that of the model over its own record.
+    """
     save(found.system, folder / MODEL_FILE, found.about)
+    if residual is not None:
+        save_residual(residual, folder / MODEL_FILE)
     text = found.report.model_dump_json(indent=2)
     write_text(folder / VALIDATION_FILE, text + "\n")
     with plot_style():

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +21,17 @@ from ..core.serial import from_data, read_about
 from ..core.serial import load as load_system
 from ..core.space import Space
 from ..core.system import System, accepts
-from ..identification import Fit, Record, identify, read_record, validate
+from ..identification import Fit
+from ..identification.residual_record import ResidualRecord, load_residual
 from .ensemble import Ensemble, Stage, ensemble_of
+from .fitted_plant import fitted_plant
 from .make_hardware import driven, make_actuator, make_amplifier, make_sensor, per_axis
 from .measured_noise import MeasuredNoise, read_noise
-from .origin import check_origin, check_rate, in_study_units
+from .origin import check_origin
 from .parameters import check_value, search_space
 from .references import reference_signals
 from .schema import Study, load
-from .stage_tables import RecordPlant
-from .tables import one_of, validated
+from .tables import one_of
 from .trajectories import read_trajectories
 
 
@@ -48,6 +50,7 @@ class Case:
     the study has none. ``beside`` maps names to the controllers that the tuned one is
     compared with. ``sensor_noise``, ``output_disturbance`` and ``input_disturbance``
     are those of files; the study of a case with the first has its rms value.
+    ``saved_residual`` is that of a plant from a file.
     """
 
     study: Study
@@ -65,6 +68,12 @@ class Case:
     sensor_noise: MeasuredNoise | None = None
     output_disturbance: MeasuredNoise | None = None
     input_disturbance: MeasuredNoise | None = None
+    saved_residual: ResidualRecord | None = None
+
+    @cached_property
+    def residual(self) -> ResidualRecord | None:
+        """Residual of the fitted plant, of this study or of a file; None without."""
+        return self.saved_residual if self.fit is None else ResidualRecord.of(self.fit)
 
     @property
     def highest_reference(self) -> float | tuple[float, ...]:
@@ -155,6 +164,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
             for name, table in study.beside.items()
         },
         **measured,
+        saved_residual=_saved_residual(study, path.parent, about),
     )
 
 
@@ -198,34 +208,25 @@ def _plant(
 ) -> tuple[System, Fit | None, About, Sequence[str]]:
     """Return the plant, its fit if it has one, its origin, and notes of its check."""
     table = study.plant
-    if "record" not in table:
+    if not {"record", "records"} & set(table):
         plant = _from_source(table, "plant", folder, PLANTS, study.rate)
         about = _about_file(table, folder)
         check_origin(about, study, "plant.file")
         return plant, None, about, ()
     if set(table) & {"catalog", "file", "type"}:
         raise _source_error(table, "plant", ("catalog", "file", "type", "record"))
-    description = validated(RecordPlant, table, "plant")
+    fit, about, notes = fitted_plant(table, study, folder)
+    return fit.system, fit, about, notes
 
-    def read_as(path: Path, where: str) -> Record:
-        record = read_record(
-            folder / path,
-            time=description.time,
-            input=description.input,
-            output=description.output,
-            rate=description.record_rate,
-        )
-        check_rate(1.0 / record.dt, study, where)
-        return in_study_units(record, where)
 
-    record = read_as(description.record, "plant.record")
-    others = [read_as(path, "plant.check") for path in description.check]
-    train = slice(*description.train) if description.train else None
-    fit = identify(record, description.model, train=train)
-    if not others:
-        return fit.system, fit, fit.about, ()
-    found = validate(fit.system, fit.about, others)
-    return fit.system, fit, found.about, found.report.notes
+def _saved_residual(study: Study, folder: Path, about: About) -> ResidualRecord | None:
+    """Return the residual beside the file of the plant, if there is one."""
+    if "file" not in study.plant:
+        return None
+    try:
+        return load_residual(folder / str(study.plant["file"]), about)
+    except ValueError as error:
+        raise ValueError(f"plant.file: {error}") from None
 
 
 def _about_file(table: Mapping[str, Any], folder: Path) -> About:

@@ -9,13 +9,14 @@ from ..identification import Record
 from .schema import Study
 
 
-def in_study_units(record: Record, where: str) -> Record:
-    """Return ``record``, named at the key ``where``, with input in V and output in um.
+def in_study_units(record: Record, study: Study, where: str) -> Record:
+    """Return ``record``, named at the key ``where``, in V and the units of the axes.
 
     Raises ValueError for a unit that cannot be converted.
     """
+    units = study.axes.units if study.axes else ("um",)
     try:
-        return record.in_units(("V",), ("um",))
+        return record.in_units(("V",) * len(units), units)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 

@@ -1,48 +1,15 @@
 """Tables of a study that describe the stage: plant, drive, sensor, disturbance."""
 
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from ..identification import DEFAULT, chain
 from .file_tables import NoiseFile
 from .tables import ByAxis, Finite, NotNegative, Positive, Table
 
 Bandwidth = Annotated[float, Field(ge=1e-3, le=1e9, allow_inf_nan=False, strict=True)]
 Order = Annotated[int, Field(strict=True, ge=1, le=4)]
-
-
-class RecordPlant(Table):
-    """A plant fitted to a record.
-
-    ``time``, ``input`` and ``output`` are columns, by name or number; ``train`` is the
-    first sample of the fitted part and the sample after its last. ``record_rate`` is
-    the sampling rate of the records, Hz. ``check`` are other records of the stage, with
-    the same columns, that the fitted plant is validated on.
-    """
-
-    record: Path
-    model: str = DEFAULT
-    time: str | int | None = None
-    input: str | int = 0
-    output: str | int = 1
-    record_rate: Positive | None = None
-    train: tuple[int, int] | None = None
-    check: tuple[Path, ...] = ()
-
-    @field_validator("check", mode="before")
-    @classmethod
-    def _listed(cls, given: Any) -> Any:
-        return (given,) if isinstance(given, str) else given
-
-    @field_validator("model")
-    @classmethod
-    def _known(cls, name: str) -> str:
-        if name != DEFAULT:
-            chain(name)
-        return name
 
 
 class ElectronicsTable(Table):

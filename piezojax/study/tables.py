@@ -108,7 +108,8 @@ def _message(error: ValidationError, kind: type[BaseModel], where: str) -> str:
         for part in first["loc"][:-1]:
             field = getattr(table, "model_fields", {}).get(part)
             table = _table_in(field.annotation if field else table)
-        return unknown_key(key, str(first["loc"][-1]), table.model_fields)
+        known = [field.alias or n for n, field in table.model_fields.items()]
+        return unknown_key(key, str(first["loc"][-1]), known)
     if first["type"] == "missing":
         return f"{key} is missing"
     message = first["msg"].removeprefix("Value error, ")

@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,15 +12,13 @@ import numpy as np
 from ..core.arrays import as_array, as_signal
 from ..core.feedback import Feedback, holding_input
 from ..core.system import System
+from ..identification.residual_record import Part
 from ..signals import waveforms
 from ..study import Case, Stage
 from ..study.measured_noise import MeasuredNoise
 from .runs import Signals
 from .traces import Trace, traces_of
 from .unexplained import STRETCHES, residual_disturbances
-
-Part = Literal["train", "validate"]
-"""Part of a record: that of tuning, or that of the hold-out."""
 
 
 @dataclass
@@ -89,14 +87,14 @@ def _signals(
     part: Part,
 ) -> Signals:
     count, samples, *axes = references.shape
-    if case.fit is not None:
+    if case.residual is not None:
         draws *= STRETCHES
     shape = (count, draws, samples, *axes)
     noise = _noise(case, random, shape, part)
     disturbance = None
-    if case.fit is not None:
+    if case.residual is not None:
         played = [
-            residual_disturbances(case.fit, reference, np.asarray(time_s), part)
+            residual_disturbances(case.residual, reference, np.asarray(time_s), part)
             for reference in references
         ]
         disturbance = as_array(np.repeat(played, draws // STRETCHES, axis=1))

@@ -10,6 +10,7 @@ from ..analysis.constraints import LoopFigures, worst_by_plant
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import TrackingFigures
+from ..identification.residual_record import SUFFIX
 from ..solve.clock import Clock
 from ..solve.search_state import SearchState
 from ..study import Case
@@ -170,13 +171,8 @@ def _warnings(
     case: Case, at_bound: list[str], after: Scores, holdout: Scores
 ) -> list[str]:
     found = []
+    found += _residual_notes(case)
     if case.fit is not None:
-        part = case.fit.report.validation
-        found.append(
-            f"the fitted plant leaves {part.rmse:.3g} {part.unit} rms of its record "
-            "unexplained; this residual is a disturbance of the loop, that of the "
-            "training part while tuning, that of the validation part in the hold-out"
-        )
         report = case.fit.report
         found += [
             f"fitted plant: {text}"
@@ -193,6 +189,35 @@ def _warnings(
                 f"the actuator saturates on {where} runs of {', '.join(railed)}"
             )
     return found
+
+
+def _residual_notes(case: Case) -> list[str]:
+    """Return a note on the residual of a fitted plant: its size, or its absence."""
+    about = case.plant_about
+    if case.fit is not None:
+        part = case.fit.report.validation
+        size = f"{part.rmse:.3g} {part.unit}"
+    elif about.residual_rms:
+        axes = case.study.axes
+        units = axes.units if axes else ("um",)
+        size = ", ".join(
+            f"{rms:.3g} {unit}"
+            for rms, unit in zip(about.residual_rms, units, strict=False)
+        )
+    else:
+        return []
+    if case.residual is None:
+        return [
+            f"the fitted plant leaves {size} rms of its record unexplained, and the "
+            "file of that residual is not beside the model: the runs are without it, "
+            "and their errors are too small by what it would add; copy it there "
+            f"(*{SUFFIX}), or fit the model again"
+        ]
+    return [
+        f"the fitted plant leaves {size} rms of its record unexplained; this residual "
+        "is a disturbance of the loop, that of the training part while tuning, that of "
+        "the validation part in the hold-out"
+    ]
 
 
 def worse_than_the_start(before: Scores, after: Scores) -> list[str]:

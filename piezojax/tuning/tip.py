@@ -25,7 +25,7 @@ def tip_note(case: Case, loop: Feedback, data: Data, start: int) -> str | None:
     """
     dt = case.study.dt
     lags = [lag for lag in lags_of(case.loop.plant) if lag > dt]
-    if case.fit is None or not lags:
+    if case.residual is None or not lags:
         return None
     signals = data.holdout
     reading = np.asarray(_displacements(loop, signals))

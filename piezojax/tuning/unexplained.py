@@ -1,11 +1,11 @@
 """Residual of a fitted plant as disturbances of the loop."""
 
-from typing import Literal
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
 
-from ..identification import Fit
+from ..identification.residual_record import Part, ResidualRecord, Stretch
 
 STRETCHES = 2
 """Number of stretches of the residual that disturb each reference."""
@@ -22,43 +22,71 @@ Samples = Float[np.ndarray, " samples"]
 
 
 def residual_disturbances(
-    fit: Fit, reference: Samples, time_s: Samples, part: Literal["train", "validate"]
-) -> Float[np.ndarray, "stretches samples"]:
-    """Return the worst stretches of the residual of ``fit`` under ``reference``, um.
+    residual: ResidualRecord,
+    reference: Float[np.ndarray, "samples ..."],
+    time_s: Samples,
+    part: Part,
+) -> Float[np.ndarray, "stretches samples ..."]:
+    """Return the worst stretches of ``residual`` under ``reference``, in its unit.
 
     Without them, a controller that contains the fitted model would be tuned and
     evaluated as if the stage were that model. The errors of a hysteresis follow the
     path of the stage: the residual is played as far as the reference (um) has
     travelled, or as time has passed, whichever is farther; forwards and backwards until
     the reference ends. ``time_s`` are the times of the reference's samples, ``part``
-    names the part of the record. Of many beginnings, evenly spaced over that part, two
-    are chosen: one with the largest deviation, for loops that follow slowly, and one
-    with the largest fast changes.
+    names the part of the records. Of many beginnings, evenly spaced over that part of
+    each record, two are chosen: one with the largest deviation, for loops that follow
+    slowly, and one with the largest fast changes. Several axes travel and deviate
+    together, each in units of its own residual.
     """
-    where = getattr(fit, part)
-    simulated = fit.simulated[where]
+    path = reference.reshape(len(reference), -1)
+    whole = np.concatenate([one.residual for one in residual.parts[part]])
+    sizes = np.maximum(whole.std(axis=0), np.finfo(float).tiny)
+    stretches = [
+        played
+        for one in residual.parts[part]
+        for played in _played(one, path, time_s / residual.dt, part)
+    ]
+
+    def slow(stretch: np.ndarray) -> float:
+        return float(np.linalg.norm(np.std(stretch, axis=0) / sizes))
+
+    def fast(stretch: np.ndarray) -> float:
+        each = [_fast_rms(column) for column in stretch.T]
+        return float(np.linalg.norm(each / sizes))
+
+    worst = np.stack([max(stretches, key=slow), max(stretches, key=fast)])
+    return worst.reshape(STRETCHES, *reference.shape)
+
+
+def _played(
+    record: Stretch,
+    reference: Float[np.ndarray, "samples axes"],
+    passed: Samples,
+    part: Part,
+) -> Iterator[Float[np.ndarray, "samples axes"]]:
+    """Yield the residual of ``record`` from each beginning; ``passed`` in samples."""
     # Initial loading is a single event.
-    first = 0 if part == "validate" else _end_of_loading(simulated)
-    residual = (fit.record.output[where] - simulated)[first:]
-    moved = np.abs(np.diff(simulated[first:]))
+    first = 0 if part == "validate" else _end_of_loading(record.simulated)
+    residual = record.residual[first:]
+    moved = np.linalg.norm(np.diff(record.simulated[first:], axis=0), axis=1)
     moved = np.maximum(moved, 1e-9 * moved.max())  # a stage at rest
     travelled = np.concatenate([[0.0], np.cumsum(moved)])
-    distance = np.cumsum(np.abs(np.diff(reference, prepend=reference[0])))
-    places, passed = np.arange(float(residual.size)), time_s / fit.record.dt
-    count = int(np.clip(OVERLAP * residual.size / passed[-1], LEAST, MOST))
-    stretches = []
+    steps = np.diff(reference, axis=0, prepend=reference[:1])
+    distance = np.cumsum(np.linalg.norm(steps, axis=1))
+    places = np.arange(float(len(residual)))
+    count = int(np.clip(OVERLAP * len(residual) / passed[-1], LEAST, MOST))
     for begin in np.linspace(0.0, places[-1], count, endpoint=False):
         start = np.interp(begin, places, travelled)
         by_distance = _place(start + distance, travelled)
-        place = np.maximum(begin + passed, by_distance)
-        stretches.append(np.interp(_folded(place, places[-1]), places, residual))
-    return np.stack([max(stretches, key=np.std), max(stretches, key=_fast_rms)])
+        place = _folded(np.maximum(begin + passed, by_distance), places[-1])
+        yield np.stack([np.interp(place, places, axis) for axis in residual.T], axis=1)
 
 
-def _end_of_loading(simulated: Samples) -> int:
+def _end_of_loading(simulated: Float[np.ndarray, "samples axes"]) -> int:
     """Return the sample of the first half that is farthest from the first sample."""
-    half = simulated[: simulated.size // 2]
-    return int(np.argmax(np.abs(half - half[0])))
+    half = simulated[: max(1, len(simulated) // 2)]
+    return int(np.argmax(np.linalg.norm(half - half[0], axis=1)))
 
 
 def _place(distance: Samples, travelled: Float[np.ndarray, " places"]) -> Samples:

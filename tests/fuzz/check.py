@@ -14,7 +14,7 @@ from piezojax import study as studies
 from piezojax.core.serial import load as load_system
 from piezojax.identification.records.checks import record_warnings
 from piezojax.identification.records.record import read_record
-from piezojax.study import case as study_case
+from piezojax.study import fitted_plant
 
 from .corpus import Case
 
@@ -83,7 +83,7 @@ def _read(case: Case, path: Path, building: bool) -> None:
     else:
         study = studies.load(path)
         if building:
-            with mock.patch.object(study_case, "identify", _no_fit):
+            with mock.patch.object(fitted_plant, "identify", _no_fit):
                 studies.build(study, path)
 
 

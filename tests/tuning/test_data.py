@@ -8,6 +8,7 @@ import pytest
 from stand_ins import fit_of
 
 from piezojax.identification.records.record import Record
+from piezojax.identification.residual_record import ResidualRecord
 from piezojax.solve.clock import Clock
 from piezojax.study import Study, build
 from piezojax.tuning import unexplained
@@ -108,7 +109,8 @@ def played(residual, reference=REST, moved=SLOW, part="validate"):
     record = Record(np.arange(400.0), moved + residual, case.study.dt)
     fit = fit_of(case.loop.plant, record, moved)
     time_s = case.study.dt * np.arange(float(len(reference)))
-    return residual_disturbances(fit, reference, time_s, part)
+    residual = ResidualRecord.of(fit)
+    return residual_disturbances(residual, np.asarray(reference), time_s, part)
 
 
 def test_a_short_residual_is_reflected():

@@ -1,0 +1,65 @@
+"""Plant of a study, fitted to the records that the study names."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..core.about import About
+from ..identification import (
+    Fit,
+    Record,
+    identify,
+    identify_all,
+    read_record,
+    validate,
+)
+from .origin import check_rate, in_study_units
+from .plant_tables import ALL, RecordPlant
+from .schema import Study
+from .tables import validated
+
+
+def fitted_plant(
+    table: Mapping[str, Any], study: Study, folder: Path
+) -> tuple[Fit, About, Sequence[str]]:
+    """Return the fit of the plant ``table``, its origin, and the notes of its check.
+
+    The records lie in ``folder``. Raises ValueError, naming the key, for a record that
+    cannot be read, has another rate or unit than the study, or cannot be fitted.
+    """
+    description = validated(RecordPlant, table, "plant")
+
+    def read_as(path: Path, where: str) -> Record:
+        record = read_record(folder / path, **description.columns)
+        check_rate(1.0 / record.dt, study, where)
+        return in_study_units(record, study, where)
+
+    records = [read_as(path, "plant.record") for path in description.record]
+    others = [read_as(path, "plant.check") for path in description.check]
+    train, validate_on, test = (
+        None if span is None else slice(*span)
+        for span in (description.train, description.validate_on, description.test)
+    )
+    if description.model == ALL:
+        ranking = identify_all(
+            records,
+            hysteresis=description.among,
+            train=train,
+            validate=validate_on,
+            test=test,
+            options=description.options,
+        )
+        fit = ranking.best
+    else:
+        fit = identify(
+            records,
+            description.model,
+            method=description.method,
+            train=train,
+            validate=validate_on,
+            options=description.options,
+        )
+    if not others:
+        return fit, fit.about, ()
+    found = validate(fit.system, fit.about, others)
+    return fit, found.about, found.report.notes

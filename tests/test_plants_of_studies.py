@@ -1,0 +1,195 @@
+"""Plants that a study fits or loads: several records, options, residuals."""
+
+import copy
+import dataclasses
+
+import numpy as np
+import pytest
+
+import piezojax as pj
+from piezojax.core.serial import read_about
+from piezojax.identification import read_record
+from piezojax.identification.estimators.estimate import Options
+from piezojax.identification.residual_record import (
+    ResidualRecord,
+    Stretch,
+    load_residual,
+    residual_path,
+)
+from piezojax.report.fit_pictures import write_model
+from piezojax.study import Study, build
+from piezojax.tuning.data import make_data
+from piezojax.tuning.make_result import _residual_notes
+from piezojax.tuning.unexplained import residual_disturbances
+
+RATE, PERIOD = 1000.0, 200
+TABLE = {
+    "record": ["a.csv", "b.csv"],
+    "model": "state_space",
+    "method": "frequency_response",
+    "time": "time_s",
+    "input": "drive_V",
+    "output": "moved_um",
+    "resample": RATE,
+    "period": PERIOD,
+    "order": 1,
+}
+STUDY = {
+    "title": "a lag from two records",
+    "rate": RATE,
+    "plant": TABLE,
+    "actuator": {"lower": -20.0, "upper": 120.0},
+    "controller": {"type": "PID", "proportional": 0.1, "integral": 1.0, "dt": 1e-3},
+    "references": {"tune": ["SIN5"], "duration": 0.4, "settle": 0.1},
+    "tune": ["controller.integral"],
+}
+
+
+def study_of(**tables):
+    return Study.model_validate(copy.deepcopy(STUDY) | tables)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Records of a lag at 2 kHz, which are resampled to the rate of the study."""
+    folder = tmp_path_factory.mktemp("records")
+    for name, seed, length in (("a", 0, 6), ("b", 1, 4)):
+        random = np.random.default_rng(seed)
+        lines = random.standard_normal(31) + 1j * random.standard_normal(31)
+        lines[0] = 0.0
+        drive = np.tile(100.0 * np.fft.irfft(lines, 2 * PERIOD), length)
+        moved = np.zeros(drive.size)
+        for k in range(1, drive.size):
+            moved[k] = 0.95 * moved[k - 1] + 0.02 * drive[k - 1]
+        moved += 0.01 * random.standard_normal(drive.size)
+        time = np.arange(drive.size) / (2.0 * RATE)
+        np.savetxt(
+            folder / f"{name}.csv",
+            np.c_[time, drive, moved],
+            delimiter=",",
+            header="time_s,drive_V,moved_um",
+            comments="",
+        )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def case(folder):
+    return build(study_of(), folder / "study.toml")
+
+
+def test_a_study_fits_what_identify_fits(folder, case):
+    columns = {"time": "time_s", "input": "drive_V", "output": "moved_um"}
+    records = [
+        read_record(folder / f"{n}.csv", **columns, resample=RATE, period=PERIOD)
+        for n in "ab"
+    ]
+    direct = pj.identify(
+        records, "state_space", method="frequency_response", options=Options(order=1)
+    )
+    assert len(case.fit.records) == 2
+    assert case.fit.records[0].period == PERIOD
+    for path in ("dynamics.A1.0", "calibration.offset"):
+        if path in pj.core.paths.parameters(direct.system):
+            assert pj.core.paths.get(case.loop.plant, path) == pytest.approx(
+                pj.core.paths.get(direct.system, path)
+            )
+    assert case.fit.report.validation.rmse == direct.report.validation.rmse
+    assert case.fit.report.validation.rmse < 0.1
+
+
+def test_the_residual_is_that_of_every_record(case):
+    found = ResidualRecord.of(case.fit)
+    assert [len(one.residual) for one in found.parts["train"]] == [600, 600]
+    # The shorter record has fewer samples to validate on.
+    assert [len(one.residual) for one in found.parts["validate"]] == [600, 200]
+    record, run = case.fit.records[1], case.fit.simulations[1]
+    np.testing.assert_array_equal(
+        found.parts["validate"][1].residual, (record.outputs - run)[600:]
+    )
+
+
+def test_a_saved_plant_keeps_its_residual(folder, case, tmp_path):
+    write_model(case.fit, tmp_path)
+    model = tmp_path / "model.json"
+    assert residual_path(model).name == "model.residual.npz"
+    study = study_of(plant={"file": "model.json"})
+    loaded = build(study, tmp_path / "study.toml")
+    # The disturbances are those of the plant fitted in a study.
+    fitted, saved = make_data(case), make_data(loaded)
+    assert np.abs(fitted.tuning.disturbance).max() > 0.005
+    for part in ("tuning", "holdout"):
+        np.testing.assert_allclose(
+            getattr(saved, part).disturbance, getattr(fitted, part).disturbance
+        )
+    (note,) = _residual_notes(loaded)
+    assert "this residual is a disturbance of the loop" in note
+    residual_path(model).unlink()
+    without = build(study, tmp_path / "study.toml")
+    assert make_data(without).tuning.disturbance is None
+    (note,) = _residual_notes(without)
+    assert "the file of that residual is not beside the model" in note
+    assert "\n" not in note
+
+
+def test_a_residual_of_another_model_is_refused(case, tmp_path):
+    write_model(case.fit, tmp_path)
+    model = tmp_path / "model.json"
+    about = read_about(model)
+    other = about.model_copy(update={"residual_rms": [2.0 * about.residual_rms[0]]})
+    with pytest.raises(ValueError, match=r"model.residual.npz is the residual of ano"):
+        load_residual(model, other)
+    for content in (b"", b"no archive"):
+        residual_path(model).write_bytes(content)
+        with pytest.raises(ValueError, match="is not the residual of a model") as found:
+            load_residual(model, about)
+        assert "\n" not in str(found.value)
+    np.savez(residual_path(model), dt=1e-3, train_0_residual=np.zeros((5, 1)))
+    with pytest.raises(ValueError, match="is not the residual of a model"):
+        load_residual(model, about)
+    with pytest.raises(ValueError, match=r"^plant.file: .*is not the residual"):
+        build(study_of(plant={"file": "model.json"}), tmp_path / "study.toml")
+
+
+def test_several_axes_play_their_residuals_together():
+    """Both axes come from the same samples, wherever the stretch begins."""
+    time = np.arange(1000.0)
+    moved = np.stack([1e-9 * time, 1e-9 * time], axis=1)
+    residual = np.stack([time, -2.0 * time], axis=1)
+    both = (Stretch(residual, moved),)
+    record = ResidualRecord(1e-3, {"train": both, "validate": both})
+    found = residual_disturbances(
+        record, np.zeros((400, 2)), 1e-3 * np.arange(400.0), "validate"
+    )
+    assert found.shape == (2, 400, 2)
+    np.testing.assert_allclose(found[..., 1], -2.0 * found[..., 0], atol=1e-9)
+    alone = dataclasses.replace(
+        record, parts={"validate": (Stretch(residual[:, :1], moved[:, :1]),)}
+    )
+    single = residual_disturbances(
+        alone, np.zeros(400), 1e-3 * np.arange(400.0), "validate"
+    )
+    np.testing.assert_allclose(single, found[..., 0])
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"record": []}, "plant.record: Tuple should have at least 1 item"),
+        ({"among": ["duhem"]}, 'plant: among and test need model = "all"'),
+        ({"model": "all"}, "plant: method needs one model; all uses the default of"),
+        (
+            {"period": 1},
+            "plant.period is 1: Input should be greater than or eq",
+        ),
+        ({"order": 0}, "plant.order is 0: Input should be greater"),
+        ({"resample": 500.0}, "rate is 1000 Hz, but plant.record was made for 500 Hz"),
+        ({"record": ["a.csv", "none.csv"]}, "none.csv: No such file"),
+        ({"method": "subspce"}, "method 'subspce' is unknown"),
+        ({"catalog": "p753_dob"}, "plant has the keys"),
+    ],
+)
+def test_a_bad_plant_is_one_line(folder, table, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        build(study_of(plant=TABLE | table), folder / "study.toml")
+    assert "\n" not in str(caught.value)
