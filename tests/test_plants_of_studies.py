@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import piezojax as pj
+from piezojax.analysis.stability import stability_reports
 from piezojax.core.serial import read_about
 from piezojax.identification import read_record
 from piezojax.identification.estimators.estimate import Options
+from piezojax.identification.estimators.modal_fit import ModalFit, ModalValue
 from piezojax.identification.residual_record import (
     ResidualRecord,
     Stretch,
@@ -20,6 +22,7 @@ from piezojax.report.fit_pictures import write_model
 from piezojax.study import Study, build
 from piezojax.tuning.data import make_data
 from piezojax.tuning.make_result import _residual_notes
+from piezojax.tuning.measured_response import margins_on_response
 from piezojax.tuning.unexplained import residual_disturbances
 
 RATE, PERIOD = 1000.0, 200
@@ -192,4 +195,88 @@ def test_several_axes_play_their_residuals_together():
 def test_a_bad_plant_is_one_line(folder, table, message):
     with pytest.raises(ValueError, match=message) as caught:
         build(study_of(plant=TABLE | table), folder / "study.toml")
+    assert "\n" not in str(caught.value)
+
+
+# A plant from a frequency response
+
+
+def response_file(folder):
+    """A mode at 100 Hz with a delay, in nm/V; return the lines and um/V."""
+    frequency = np.geomspace(5.0, 480.0, 120)
+    s, w = 2j * np.pi * frequency, 2.0 * np.pi * 100.0
+    values = 0.1 * w**2 / (s**2 + 0.04 * w * s + w**2) * np.exp(-3e-4 * s)
+    np.savetxt(
+        folder / "bench.csv",
+        np.c_[frequency, 1e3 * np.abs(values), np.degrees(np.angle(values))],
+        delimiter=",",
+        header="frequency_Hz,magnitude,phase_deg",
+        comments="",
+    )
+    return frequency, values
+
+
+def wrong_fit(response, held=None, most=0):
+    """Stand for a fit of the mode, with a gain that is 10 % too large."""
+    assert (held, response.unit) == (None, "um/V")
+    one = (
+        (ModalValue(100.0, 1.0),),
+        (ModalValue(0.02, 1e-3),),
+        (ModalValue(0.11, 1e-3),),
+    )
+    values = response.values
+    return ModalFit(
+        *one, None, ModalValue(3e-4, 1e-6), 1.1 * values, 1e-3 * np.abs(values)
+    )
+
+
+def test_a_plant_from_a_response(tmp_path, monkeypatch):
+    # The fit takes long, and has tests of its own.
+    monkeypatch.setattr("piezojax.identification.response_model.modal_fit", wrong_fit)
+    frequency, values = response_file(tmp_path)
+    study = study_of(plant={"response": "bench.csv", "unit": "nm/V"})
+    case = build(study, tmp_path / "study.toml")
+    assert case.plant_about.error_bound is not None
+    assert case.plant_about.rate_Hz == RATE
+    assert float(case.loop.plant.parts[0].gain) == pytest.approx(0.11)
+    assert any("hysteresis and creep are not in the model" in n for n in case.notes)
+    # C(jw) P_measured(jw), with a PI in closed form and the hold of the converter.
+    reports = stability_reports({"after": case.loop}, 5.0, 1e-3)
+    ratio = case.response.response.values / case.response.fit.fitted
+    loop = next(iter(reports.loops["after"].values()))
+    angle = 2.0 * np.pi * frequency * 1e-3
+    delay = np.exp(-1j * angle)
+    controller = 0.1 + 1e-3 / (1.0 - delay)
+    expected = controller * values * (1.0 - delay) / (1j * angle)
+    low = frequency < 80.0  # the sampling folds what lies above
+    np.testing.assert_allclose(
+        (loop.response(angle) * ratio)[low], expected[low], rtol=0.03
+    )
+    found = margins_on_response(case, reports)
+    assert set(found) == {"after"}
+    assert found["after"].lines == 120
+    peak = np.max(1.0 / np.abs(1.0 + loop.response(angle) * ratio))
+    assert found["after"].sensitivity_peak == pytest.approx(peak)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (
+            {"unit": "V/um"},
+            "plant.response: its unit is 'V/um'; it must be a leng",
+        ),
+        ({"response": "none.csv"}, "plant.response: record .*none.csv: No such file"),
+        (
+            {"hold": True},
+            "plant.hold is unknown; allowed are response, held, unit",
+        ),
+        ({"record": "a.csv"}, "plant has the keys response, record; it must have exac"),
+    ],
+)
+def test_a_bad_response_is_one_line(tmp_path, table, message):
+    response_file(tmp_path)
+    plant = {"response": "bench.csv"} | table
+    with pytest.raises(ValueError, match=message) as caught:
+        build(study_of(plant=plant), tmp_path / "study.toml")
     assert "\n" not in str(caught.value)

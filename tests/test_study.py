@@ -842,7 +842,7 @@ def test_least_squares_needs_a_squared_objective(refusal, method):
     ],
 )
 def test_exactly_one_choice_is_required(refusal, where, table, keys):
-    last = "record" if where == "plant" else "design"
+    last = "record, response" if where == "plant" else "design"
     assert refusal({where: table}) == (
         f"{where} has the keys {keys}; it must have exactly one of "
         f"catalog, file, type, {last}"

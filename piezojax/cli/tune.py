@@ -84,6 +84,7 @@ def _tune(
     from ..report.drive_table import drive_table
     from ..report.fit_pictures import write_fit
     from ..report.limit_bars import limit_text, write_limit
+    from ..report.response_pictures import write_response
     from ..report.robustness import constraints_table, front_table
     from ..report.step_pictures import steps_table
     from ..report.structure_pictures import structures_table
@@ -92,6 +93,7 @@ def _tune(
         following_table,
         gains_table,
         perturbed_text,
+        response_table,
         sliding_text,
         stability_table,
         tuning_table,
@@ -112,6 +114,8 @@ def _tune(
             write_results(outcome, folder)
             if case.fit is not None:
                 write_fit(case.fit, folder)
+            if case.response is not None:
+                write_response(case.response, folder)
             write_stability(outcome.stability, folder, outcome.result.heading)
             bar.stage("computing the limit of linear control")
             write_limit(outcome.limit, folder, outcome.result.heading)
@@ -124,6 +128,8 @@ def _tune(
         console.print(beside_table(result))
     console.print(gains_table(result))
     console.print(stability_table(outcome.stability))
+    if result.on_response:
+        console.print(response_table(result.on_response))
     if outcome.stability.reports:
         console.print(following_table(outcome.stability))
     if outcome.steps[1]:

@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..analysis.stability import StabilityReport, StabilityReports, worst_margins
+from ..analysis.stability.measured_margins import MeasuredMargins
 from ..core.registry import parts
 from ..identification.device_scale import DeviceScale
 from ..identification.estimators.estimate import FittedParameter
@@ -210,6 +211,34 @@ def stability_table(stability: StabilityReports) -> Table:
             )
     for name in stability.problems:
         table.add_row("tuned" if name == "after" else name, "-", "-", "-", "-")
+    return table
+
+
+def response_table(found: Mapping[str, MeasuredMargins]) -> Table:
+    """Return the margins of each loop at the measured lines of a response."""
+    one = next(iter(found.values()))
+    table = Table(
+        title=f"on the {one.lines} measured lines of the response, "
+        f"{one.lowest_Hz:.4g} to {one.highest_Hz:.4g} Hz"
+    )
+    table.add_column("loop")
+    for title in ("Ms", "gain margin", "phase margin", "delay margin"):
+        table.add_column(title, justify="right")
+    for name, margins in found.items():
+        shown = "tuned" if name == "after" else name
+        if not margins.stable:
+            table.add_row(shown, *_UNSTABLE)
+            continue
+        figures = (
+            (margins.gain_margin_dB, "{:.1f} dB"),
+            (margins.phase_margin_deg, "{:.1f}°"),
+            (margins.delay_margin_samples, "{:.2f} samples"),
+        )
+        table.add_row(
+            shown,
+            f"{margins.sensitivity_peak:.2f}",
+            *("-" if value is None else text.format(value) for value, text in figures),
+        )
     return table
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,8 +23,9 @@ from ..core.space import Space
 from ..core.system import System, accepts
 from ..identification import Fit
 from ..identification.residual_record import ResidualRecord, load_residual
+from ..identification.response_model import ResponseModel
 from .ensemble import Ensemble, Stage, ensemble_of
-from .fitted_plant import fitted_plant
+from .fitted_plant import fitted_plant, plant_of_response
 from .make_hardware import driven, make_actuator, make_amplifier, make_sensor, per_axis
 from .measured_noise import MeasuredNoise, read_noise
 from .origin import check_origin
@@ -50,7 +51,8 @@ class Case:
     the study has none. ``beside`` maps names to the controllers that the tuned one is
     compared with. ``sensor_noise``, ``output_disturbance`` and ``input_disturbance``
     are those of files; the study of a case with the first has its rms value.
-    ``saved_residual`` is that of a plant from a file.
+    ``saved_residual`` is that of a plant from a file, ``response`` the model of a plant
+    that is fitted to a frequency response.
     """
 
     study: Study
@@ -69,6 +71,7 @@ class Case:
     output_disturbance: MeasuredNoise | None = None
     input_disturbance: MeasuredNoise | None = None
     saved_residual: ResidualRecord | None = None
+    response: ResponseModel | None = None
 
     @cached_property
     def residual(self) -> ResidualRecord | None:
@@ -108,7 +111,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         study = study.model_copy(update={"seed": seed})
     trajectories = read_trajectories(study, path.parent)
     study, measured = _with_measured_noise(study, path.parent)
-    plant, fit, about, notes_of_plant = _plant(study, path.parent)
+    plant, about, fit, response, notes_of_plant = _plant(study, path.parent)
     zero = per_axis(study, lambda axis: as_array(0.0))
     _check_role(plant, zero, "plant", "a voltage to a displacement")
     amplifier = make_amplifier(study)
@@ -165,6 +168,7 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         },
         **measured,
         saved_residual=_saved_residual(study, path.parent, about),
+        response=response,
     )
 
 
@@ -203,20 +207,38 @@ def _with_measured_noise(
     return study, found
 
 
-def _plant(
-    study: Study, folder: Path
-) -> tuple[System, Fit | None, About, Sequence[str]]:
-    """Return the plant, its fit if it has one, its origin, and notes of its check."""
+class _Plant(NamedTuple):
+    """Plant of a study with its origin and notes, and its fit if it has one."""
+
+    system: System
+    about: About
+    fit: Fit | None = None
+    response: ResponseModel | None = None
+    notes: Sequence[str] = ()
+
+
+_FITTED = "record", "records", "response"
+"""Keys of a plant that is fitted in the study."""
+
+
+def _plant(study: Study, folder: Path) -> _Plant:
+    """Return the plant of ``study``, whose files lie in ``folder``."""
     table = study.plant
-    if not {"record", "records"} & set(table):
+    given = [key for key in _FITTED if key in table]
+    if not given:
         plant = _from_source(table, "plant", folder, PLANTS, study.rate)
         about = _about_file(table, folder)
         check_origin(about, study, "plant.file")
-        return plant, None, about, ()
-    if set(table) & {"catalog", "file", "type"}:
-        raise _source_error(table, "plant", ("catalog", "file", "type", "record"))
+        return _Plant(plant, about)
+    sources = ("catalog", "file", "type")
+    if len(given) > 1 or set(table) & set(sources):
+        raise _source_error(table, "plant", (*sources, "record", "response"))
+    if given == ["response"]:
+        model = plant_of_response(table, study, folder)
+        notes = [f"plant.response: {model.report.found}", *model.report.notes]
+        return _Plant(model.system, model.about, None, model, notes)
     fit, about, notes = fitted_plant(table, study, folder)
-    return fit.system, fit, about, notes
+    return _Plant(fit.system, about, fit, None, notes)
 
 
 def _saved_residual(study: Study, folder: Path, about: About) -> ResidualRecord | None:
@@ -349,7 +371,8 @@ def _from_source(
     known = {*sources, _ACCEPT} if "file" in table else set(sources)
     extra = set() if "type" in table else set(table) - known
     if len(given) != 1 or extra:
-        allowed = (*sources, *(["record"] if where == "plant" else []))
+        fitted = ["record", "response"] if where == "plant" else []
+        allowed = (*sources, *fitted)
         raise _source_error(table, where, allowed)
     try:
         return sources[given[0]]()

@@ -1,4 +1,4 @@
-"""Plant of a study, fitted to the records that the study names."""
+"""Plant of a study, fitted to the records or the response that the study names."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,8 +13,10 @@ from ..identification import (
     read_record,
     validate,
 )
-from .origin import check_rate, in_study_units
-from .plant_tables import ALL, RecordPlant
+from ..identification.records.response_file import read_response
+from ..identification.response_model import ResponseModel, identify_response
+from .origin import check_rate, in_study_units, response_in_study_units
+from .plant_tables import ALL, RecordPlant, ResponsePlant
 from .schema import Study
 from .tables import validated
 
@@ -63,3 +65,25 @@ def fitted_plant(
         return fit, fit.about, ()
     found = validate(fit.system, fit.about, others)
     return fit, found.about, found.report.notes
+
+
+def plant_of_response(
+    table: Mapping[str, Any], study: Study, folder: Path
+) -> ResponseModel:
+    """Return the model of the frequency response of the plant ``table``, in um/V.
+
+    Raises ValueError, starting with ``plant``, for a stage with several axes and a
+    response that cannot be read, converted or fitted.
+    """
+    description = validated(ResponsePlant, table, "plant")
+    if study.axes is not None:
+        raise ValueError(
+            f"plant.response: a response is for one axis; the study has "
+            f"{study.axis_count}"
+        )
+    try:
+        measured = read_response(folder / description.response, unit=description.unit)
+        measured = response_in_study_units(measured)
+        return identify_response(measured, study.rate, held=description.held)
+    except ValueError as error:
+        raise ValueError(f"plant.response: {error}") from None

@@ -1,11 +1,14 @@
 """Units and sampling rate of the records and files that a study names."""
 
+import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
 
 from ..core.about import About
+from ..core.conversion import factor
 from ..identification import Record
+from ..identification.records.response_file import FrequencyResponse
 from .schema import Study
 
 
@@ -19,6 +22,22 @@ def in_study_units(record: Record, study: Study, where: str) -> Record:
         return record.in_units(("V",) * len(units), units)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
+
+
+def response_in_study_units(response: FrequencyResponse) -> FrequencyResponse:
+    """Return ``response`` in um/V.
+
+    Raises ValueError for a unit that is not a length over a voltage.
+    """
+    output, _, input = (part.strip() for part in response.unit.partition("/"))
+    factors = factor(output, "um"), factor(input, "V")
+    if None in factors:
+        raise ValueError(
+            f"its unit is {response.unit!r}; it must be a length over a voltage, as "
+            "um/V or nm/mV"
+        )
+    ratio = (factors[0] or 1.0) / (factors[1] or 1.0)
+    return dataclasses.replace(response, values=ratio * response.values, unit="um/V")
 
 
 def check_origin(about: About, study: Study, where: str) -> None:

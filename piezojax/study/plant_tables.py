@@ -17,6 +17,18 @@ Span = tuple[int, int]
 Count = Annotated[int, Field(strict=True, ge=1)]
 
 
+class ResponsePlant(Table):
+    """A plant fitted to a frequency response, for the rate of the study.
+
+    ``response`` is the file, ``unit`` that of the response, output over input. With
+    ``held`` it was measured through converters at the rate of the study.
+    """
+
+    response: Path
+    held: bool = False
+    unit: str = "um/V"
+
+
 class RecordPlant(Table):
     """A plant fitted to records, with the options of ``identify``.
 

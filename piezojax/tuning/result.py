@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from ..analysis.constraints import CONSTRAINTS, LoopFigures, worst_by_plant
+from ..analysis.stability.measured_margins import MeasuredMargins
 from ..core.files import read_model
 from ..core.metrics import TrackingFigures
 from ..solve.problem import TOLERANCE
@@ -246,6 +247,8 @@ class Result(BaseModel):
     """Step tests before tuning, by step; none on several axes."""
     steps: dict[str, StepResult] = {}
     """The same steps with the tuned gains."""
+    on_response: dict[str, MeasuredMargins] = {}
+    """Margins "before" and "after" on the measured frequency response of the plant."""
     sliding_before: SlidingShare | None = None
     sliding: SlidingShare | None = None
     structures: StructureSearch | None = None

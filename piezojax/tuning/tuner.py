@@ -21,6 +21,7 @@ from .front import trace_front
 from .limited_search import search_within_limits
 from .make_objective import make_objective
 from .make_result import constraint_outcomes, make_result
+from .measured_response import margins_on_response, response_alarms
 from .model_alarms import model_alarms
 from .outcome import Outcome
 from .reach import require_reach
@@ -101,7 +102,9 @@ def _tune(
         result.status = "interrupted"
     result.warnings += peak_notes(stability)
     limits = table.limits
+    result.on_response = margins_on_response(case, stability)
     of_model = [
+        *response_alarms(result.on_response, limits, stability),
         *_model_alarms(case, limits, stability),
         *recorded_range_alarms(case, data),
         *device_alarms(after.controller),
