@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
+
 from ..core.recipe import Extent
 from ..core.registry import parts as known_parts
 from .chain import dynamics_parts, extent_of, is_dynamic, training_record
@@ -19,6 +21,8 @@ from .estimators.model_preisach import (
     TOO_FEW,
     distinguishable_cells,
 )
+from .estimators.scheduled_fit import MODEL as SCHEDULED
+from .estimators.scheduled_fit import SAME_LEVEL
 from .methods import METHODS
 from .records.checks import lines
 from .records.record import Record
@@ -282,6 +286,21 @@ def _objection_to_periods(
     return _several_records(records)
 
 
+def _objection_to_scheduled(
+    records: Sequence[Record], train: slice, options: Options
+) -> str | None:
+    """Return the objection unless there are several channels, periods and levels."""
+    del options
+    if any(record.period is None for record in records):
+        return "it needs periodic records (--period)"
+    if _not_single_channel(records) is None:
+        return "it is for several inputs or outputs"
+    drives = [np.mean(record.inputs[train].std(axis=0)) for record in records]
+    if max(drives) <= min(drives) * (1.0 + SAME_LEVEL):
+        return "it needs records of two or more drive levels"
+    return None
+
+
 def _objection_to_preisach(
     model: str, records: Sequence[Record], train: slice, options: Options
 ) -> str | None:
@@ -305,6 +324,7 @@ _OBJECTIONS = {
     LINEAR: _objection_to_state_space,
     "bouc_wen": lambda *of: _objection_to_periods(*of) or _not_single_channel(of[0]),
     "neural_state_space": _objection_to_periods,
+    SCHEDULED: _objection_to_scheduled,
     PLAIN: partial(_objection_to_preisach, PLAIN),
     RATE_DEPENDENT: partial(_objection_to_preisach, RATE_DEPENDENT),
 }

@@ -1,6 +1,7 @@
 """Methods of identification by name, with a common signature."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace as replace_record
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from ..core.arrays import as_array
 from ..core.paths import get, parameters, replace
 from ..core.progress import Progress
+from ..core.system import Affine, series
 from ..hysteresis.model import hystereses
 from .chain import OFFSET, structure, training_record
 from .estimators.estimate import Estimate, FittedParameter, Options, bound_warning
@@ -22,6 +24,8 @@ from .estimators.output_error import (
     values_and_errors,
 )
 from .estimators.regression import instrumental_variables, least_squares
+from .estimators.scheduled_fit import MODEL as SCHEDULED
+from .estimators.scheduled_fit import by_amplitude
 from .estimators.steady_state import fit_structure, steady_response
 from .estimators.structure import Structure
 from .records.record import Record
@@ -158,15 +162,24 @@ def _by_nonnegative_least_squares(
     del options
     record = _single(records)
     progress.stage(f"searching for the lag behind the {model} model")
-    found = preisach_with_lag(record, train, model)
+    # Weights are not below 0: where the output falls, the chain turns its sign.
+    x, y = record.input[train], record.output[train]
+    sign = float(np.sign(np.cov(x, y)[0, 1])) or 1.0
+    found = preisach_with_lag(
+        replace_record(record, outputs=sign * record.outputs), train, model
+    )
+    system = found.system
+    if sign < 0.0:
+        parts = dict(zip(system.names, system.parts, strict=True))
+        system = series(**parts, calibration=Affine(-1.0))
     named = {
         name: FittedParameter(value=value, standard_error=deviation)
         for (name, value), deviation in zip(
             found.values.items(), found.deviations, strict=True
         )
     }
-    runs, _ = free_runs(found.system, [record], train)
-    return Estimate(found.system, runs, named, found.warnings, 1, True)
+    runs, _ = free_runs(system, [record], train)
+    return Estimate(system, runs, named, found.warnings, 1, True)
 
 
 def _single(records: Records) -> Record:
@@ -211,6 +224,11 @@ METHODS: dict[str, Method] = {
         "least squares on the transfer matrix of periodic records",
         ("state_space",),
         by_frequency_response,
+    ),
+    "scheduled_frequency_response": Method(
+        "least squares on the transfer matrices of periodic records, by drive level",
+        (SCHEDULED,),
+        by_amplitude,
     ),
     "steady_state": Method(
         "Levenberg-Marquardt on the mean of the periods",

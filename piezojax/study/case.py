@@ -25,7 +25,7 @@ from ..identification import Fit
 from ..identification.residual_record import ResidualRecord, load_residual
 from ..identification.response_model import ResponseModel
 from .ensemble import Ensemble, Stage, ensemble_of
-from .fitted_plant import fitted_plant, plant_of_response
+from .fitted_plant import fitted_plant, on_axes, plant_of_response
 from .make_hardware import driven, make_actuator, make_amplifier, make_sensor, per_axis
 from .measured_noise import MeasuredNoise, read_noise
 from .origin import check_origin
@@ -229,7 +229,7 @@ def _plant(study: Study, folder: Path) -> _Plant:
         plant = _from_source(table, "plant", folder, PLANTS, study.rate)
         about = _about_file(table, folder)
         check_origin(about, study, "plant.file")
-        return _Plant(plant, about)
+        return _Plant(on_axes(plant, study), about)
     sources = ("catalog", "file", "type")
     if len(given) > 1 or set(table) & set(sources):
         raise _source_error(table, "plant", (*sources, "record", "response"))
@@ -238,7 +238,7 @@ def _plant(study: Study, folder: Path) -> _Plant:
         notes = [f"plant.response: {model.report.found}", *model.report.notes]
         return _Plant(model.system, model.about, None, model, notes)
     fit, about, notes = fitted_plant(table, study, folder)
-    return _Plant(fit.system, about, fit, None, notes)
+    return _Plant(on_axes(fit.system, study), about, fit, None, notes)
 
 
 def _saved_residual(study: Study, folder: Path, about: About) -> ResidualRecord | None:

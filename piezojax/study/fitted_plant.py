@@ -4,7 +4,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import numpy as np
+
 from ..core.about import About
+from ..core.arrays import as_array
+from ..core.axes import Packed
+from ..core.system import System, accepts, rest_output
 from ..identification import (
     Fit,
     Record,
@@ -65,6 +71,24 @@ def fitted_plant(
         return fit, fit.about, ()
     found = validate(fit.system, fit.about, others)
     return fit, found.about, found.report.notes
+
+
+def on_axes(system: System, study: Study) -> System:
+    """Return ``system`` with a signal for each axis, if it has vectors instead.
+
+    A fit to records of several channels has vectors.
+    """
+    if study.axes is None:
+        return system
+    zero = (as_array(0.0),) * study.axis_count
+    vector = as_array(np.zeros(study.axis_count))
+    if not accepts(system, vector):
+        return system
+    output = eqx.filter_eval_shape(rest_output, system, vector)
+    if getattr(output, "shape", None) != vector.shape:
+        return system
+    wrapped = Packed(system)
+    return wrapped if accepts(wrapped, zero) else system
 
 
 def plant_of_response(

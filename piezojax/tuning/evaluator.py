@@ -26,6 +26,7 @@ from ..solve.multi_start import in_batches
 from ..study import Case, Stage
 from ..study.ensemble import Part
 from .data import held, own_stage
+from .level_stages import level_stages
 from .objective import MARGIN_BLOCK, StepTest, margins_on
 from .runs import Signals, evaluate
 
@@ -246,11 +247,14 @@ def _count(stages: Stage | None) -> int:
 def drawn_stages(case: Case, part: Part) -> Stage | None:
     """Return the nominal stage and the drawn stages of ``part``, stacked.
 
-    None if no stages are drawn.
+    Margins are limited at each level of a scheduled plant too. None if there is no
+    other stage than the nominal one.
     """
-    others = case.ensemble.stages(part) if case.ensemble else None
-    if others is None:
+    drawn = case.ensemble.stages(part) if case.ensemble else None
+    levels = level_stages(case.loop) if part == "margins" else None
+    others = [stages for stages in (drawn, levels) if stages is not None]
+    if not others:
         return None
     return jax.tree.map(
-        lambda *parts: jnp.concatenate(parts), own_stage(case.loop), others
+        lambda *parts: jnp.concatenate(parts), own_stage(case.loop), *others
     )

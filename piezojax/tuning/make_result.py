@@ -16,6 +16,7 @@ from ..solve.search_state import SearchState
 from ..study import Case
 from .data import Data
 from .evaluator import Evaluator
+from .level_stages import levels_of
 from .model_alarms import unchecked
 from .objective import Objective
 from .result import (
@@ -180,6 +181,11 @@ def _warnings(
             if text not in report.alarms
         ]
     found += unchecked(case.plant_about)
+    if levels := levels_of(case.loop.plant):
+        found.append(
+            f"the plant is scheduled by the level of its drive: limits on margins hold "
+            f"at each of its {levels} levels, the printed margins at rest only"
+        )
     if at_bound:
         found.append(f"at the edge of its bounds: {', '.join(at_bound)}")
     for where, figures in (("tuning", after), ("hold-out", holdout)):

@@ -1,7 +1,7 @@
 """Empirical transfer matrix of periodic records, and its noise."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -43,6 +43,11 @@ class EmpiricalResponse:
     def band(self) -> np.ndarray:
         """Return half the 95 % band [lines, p, m] of the magnitude of ``response``."""
         return CONFIDENCE * np.sqrt(0.5 * self.variance)
+
+    def ahead(self) -> "EmpiricalResponse":
+        """Return the response from the inputs to the outputs one sample later."""
+        turn = np.exp(2j * np.pi * self.frequency * self.dt)
+        return replace(self, response=self.response * turn[:, None, None])
 
 
 def empirical_response(

@@ -21,14 +21,14 @@ from .response_fit import fit_response
 from .subspace import identify_channel
 
 
-class _Centre(NamedTuple):
+class Centre(NamedTuple):
     """Means of the inputs [m] and outputs [p], removed before a linear fit."""
 
     input: np.ndarray
     output: np.ndarray
 
     @classmethod
-    def of(cls, record: Record, train: slice) -> "_Centre":
+    def of(cls, record: Record, train: slice) -> "Centre":
         return cls(
             record.inputs[train].mean(axis=0), record.outputs[train].mean(axis=0)
         )
@@ -55,7 +55,7 @@ def by_subspace(
     """
     del model
     progress.stage(f"regression with {options.window} past and future samples")
-    centres = [_Centre.of(record, train) for record in records]
+    centres = [Centre.of(record, train) for record in records]
     fits = [
         identify_channel(
             centre.removed(record).until(train.stop), options.window, options.order
@@ -67,7 +67,7 @@ def by_subspace(
     for channel, record in enumerate(records):
         inputs = np.zeros((record.samples, len(records)))
         inputs[:, channel] = record.input - centres[channel].input
-        run = np.asarray(_run(stage, as_array(inputs), 0))
+        run = np.asarray(steady_run(stage, as_array(inputs), 0))
         runs.append(run + centres[channel].output)
     warnings = [
         f"{record.source}: {note}"
@@ -98,7 +98,7 @@ def by_frequency_response(
     """
     del model
     progress.stage("measuring the transfer matrix")
-    centres = [_Centre.of(record, train) for record in records]
+    centres = [Centre.of(record, train) for record in records]
     measured = empirical_response([whole_periods(record, train) for record in records])
     progress.stage(f"fitting {options.order} states to it")
     fit = fit_response(measured, options.order)
@@ -110,7 +110,9 @@ def by_frequency_response(
     )
     runs = tuple(
         np.asarray(
-            _run(stage, as_array(record.inputs - centre.input), record.period or 0)
+            steady_run(
+                stage, as_array(record.inputs - centre.input), record.period or 0
+            )
         )
         + centre.output
         for record, centre in zip(records, centres, strict=True)
@@ -134,8 +136,8 @@ def _without_feedthrough(
 
 
 @eqx.filter_jit
-def _run(
-    model: StateSpace, inputs: Float[Array, "n m"], settle: int
+def steady_run(
+    model: System, inputs: Float[Array, "n m"], settle: int
 ) -> Float[Array, "n p"]:
     """Return the free run from rest, after the first ``settle`` inputs."""
     state = model.init(inputs[0])
@@ -148,7 +150,7 @@ def _linear(
     detail: LinearDetail,
     runs: tuple[np.ndarray, ...],
     warnings: list[str],
-    centre: "_Centre",
+    centre: "Centre",
 ) -> Estimate:
     """Return the estimate as a plant for a loop, in which u(k) moves y(k+1)."""
     stage = detail.model
