@@ -7,8 +7,6 @@ import click
 from rich.console import Console
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ..identification import Record
 
 
@@ -58,11 +56,8 @@ def print_columns(console: Console, records: Iterable["Record"]) -> None:
         sides = "; ".join(
             f"{role} {', '.join(columns)}"
             for role, columns in (
-                ("input", _of(record.input_names, record.inputs, record.input_units)),
-                (
-                    "output",
-                    _of(record.output_names, record.outputs, record.output_units),
-                ),
+                ("input", _of(record, record.input_names, record.input_units)),
+                ("output", _of(record, record.output_names, record.output_units)),
             )
         )
         console.print(
@@ -73,10 +68,10 @@ def print_columns(console: Console, records: Iterable["Record"]) -> None:
         )
 
 
-def _of(
-    names: Sequence[str], columns: "np.ndarray", units: str | tuple[str, ...]
-) -> list[str]:
+def _of(record: "Record", names: Sequence[str], units: Sequence[str]) -> list[str]:
+    columns = record.inputs if names is record.input_names else record.outputs
     return [
         f"{name!r} from {column.min():.4g} to {column.max():.4g} {unit}"
+        + (" (assumed)" if name in record.assumed else "")
         for name, column, unit in zip(names, columns.T, units, strict=True)
     ]

@@ -42,6 +42,11 @@ class Extent(NamedTuple):
     lags: tuple[float, ...] = ()  # s, time constants
     delay: float | None = None  # s
 
+    def mirrored(self) -> "Extent":
+        """Return the extent of the same record with the sign of its output changed."""
+        first = self.first[0], -self.first[1]
+        return self._replace(slope=-self.slope, centre=-self.centre, first=first)
+
     @property
     def width(self) -> float:
         """Range of the input, V."""
@@ -81,6 +86,9 @@ class Fittable(System):
     """
 
     part: ClassVar[Part]
+    rising: ClassVar[bool] = False
+    """Whether the output can only rise with the input. For a record in which it falls,
+    the recipe is that of the mirrored output, and the chain turns the sign."""
 
     @classmethod
     @abc.abstractmethod

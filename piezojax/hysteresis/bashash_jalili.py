@@ -66,6 +66,7 @@ class BashashJalili(Hysteresis, Fittable):
     extreme is not above the lower one.
     """
 
+    rising: ClassVar[bool] = True
     laws: ClassVar[Laws] = turning_point_laws(without=("congruency",))
     part: ClassVar[Part] = Part(
         "bashash_jalili",

@@ -120,10 +120,14 @@ def structure(name: str, record: Record) -> Structure:
     extent, shown = extent_of(record), dynamics_of(record)
     known = known_parts()
     kinds = [known[part] for part in chain(name)]
-    parts = {kind.part.place: kind.recipe(extent) for kind in kinds}
+    falls = extent.slope < 0.0 and any(kind.rising for kind in kinds)
+    described = extent.mirrored() if falls else extent
+    parts = {kind.part.place: kind.recipe(described) for kind in kinds}
     reach = 2.0 * extent.span
     # Without a hysteresis nothing else turns volts into the output's unit.
-    slope = 1.0 if "hysteresis" in parts else extent.slope
+    slope = extent.slope
+    if "hysteresis" in parts:
+        slope = -1.0 if falls else 1.0
     scaled = "hysteresis" in parts or any(part.gain for part in parts.values())
     parts["calibration"] = Recipe(
         Affine(slope, extent.centre),

@@ -19,7 +19,7 @@ from .chain import DEFAULT, shown_dynamics
 from .estimators.estimate import FittedParameter, LinearDetail, Options
 from .estimators.resonances import LinearDynamics
 from .methods import method_for
-from .plausibility import plausibility_warnings
+from .plausibility import assumed_units, plausibility_warnings
 from .records.checks import record_warnings
 from .records.parts import check_compatible, check_train, train_and_validation
 from .records.record import Record
@@ -246,6 +246,7 @@ def identify(
         residuals=residuals,
         warnings=[
             *alarms,
+            *of_each(assumed_units),
             *of_each(checked),
             *estimate.warnings,
             *_missed(shown, estimate.linear),

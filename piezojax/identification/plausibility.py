@@ -5,10 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from .estimators.welch import spectral_response
-from .records.record import Record
-
-EVEN = 1e-3
-"""Largest scatter of the steps of a time axis, as a share of their mean."""
+from .records.record import EVEN, Record
 
 FOLLOWS = 0.5
 """Least share of the output's power that the input explains."""
@@ -37,6 +34,17 @@ def plausibility_warnings(record: Record) -> list[str]:
     if clocks or record.inputs.shape[1] != 1 or record.outputs.shape[1] != 1:
         return clocks
     return [*_relation(record), *_units(record)]
+
+
+def assumed_units(record: Record) -> list[str]:
+    """Return a note for each column whose unit is not stated anywhere."""
+    units = dict(zip(record.input_names, record.input_units, strict=False))
+    units |= dict(zip(record.output_names, record.output_units, strict=False))
+    return [
+        f"the unit of column {name!r} is not stated; {units[name]} is assumed: name "
+        f"the column with its unit, as {name}_{units[name]}"
+        for name in record.assumed
+    ]
 
 
 def _clocks(record: Record) -> Iterator[str]:

@@ -29,10 +29,20 @@ def train_and_validation(
 ) -> tuple[slice, slice]:
     """Return the parts to fit and to validate on, by default the halves of a record.
 
-    Raises ValueError for a part that is empty or outside of the ``samples``.
+    A part to validate on that is left out is what follows the part to fit, or, if
+    nothing does, what comes before it. Raises ValueError for a part that is empty or
+    outside of the ``samples``, and if the part to fit leaves none to validate on.
     """
     train = _closed(train or slice(0, samples // 2), samples)
-    validate = _closed(validate or slice(min(train.stop, samples), samples), samples)
+    if validate is None:
+        last = train.stop >= samples > train.start > 0
+        validate = slice(0, train.start) if last else slice(train.stop, samples)
+        if train.start == 0 and train.stop == samples:
+            raise ValueError(
+                f"train is 0:{samples}, the whole record: nothing is left to validate "
+                "the model on; fit fewer samples, or name the samples to validate on"
+            )
+    validate = _closed(validate, samples)
     for name, part in (("train", train), ("validate", validate)):
         if not 0 <= part.start < part.stop <= samples:
             raise ValueError(

@@ -1,7 +1,7 @@
 """Measured records: input and output columns, read from a file and checked."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 
 from ...core.conversion import factor
-from .sampled import Key, read_sampled
+from .sampled import Key, Sampled, read_sampled
 
 SHORTEST = 50
 """Least number of samples in a record."""
+
+EVEN = 1e-3
+"""Largest scatter of the steps of a time axis, as a share of their mean."""
 
 LARGEST = 1e100
 """Largest value of a signal; the squares of much larger ones are not finite."""
@@ -26,7 +29,9 @@ class Record:
     ``output_units``, one unit per column. A single column may be given as [samples] and
     its unit as one text. ``dt`` is the sample time in s, ``source`` the origin named in
     messages, ``period`` the number of samples in a period of a periodic input;
-    ``input_names`` and ``output_names`` are those of the columns in a file.
+    ``input_names`` and ``output_names`` are those of the columns in a file, ``assumed``
+    those whose unit neither the file nor their name states: they are taken to be in V
+    and um.
 
     Raises ValueError, naming column and sample, for columns of different length, too
     few samples, missing numbers, a constant column, a sample time that is not positive,
@@ -42,6 +47,7 @@ class Record:
     period: int | None = None
     input_names: tuple[str, ...] = ()
     output_names: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()
 
     def __post_init__(self):
         for side in ("input", "output"):
@@ -209,15 +215,18 @@ def read_record(
 
     Raises ValueError, naming the column and the sample, for a file that cannot be read,
     a missing column, missing numbers, unsorted time, uneven time without ``resample``,
-    contradicting sample times, or a record that is too short.
+    contradicting sample times, a record that is too short, or, without ``time``, a
+    column given by its number that rises in even steps, as a time axis does.
     """
     path = Path(path)
-    roles = {"input": input, "output": output}
+    roles: dict[str, Key | Sequence[Key]] = {"input": input, "output": output}
     even = resample is None
     read = read_sampled(path, roles, time=time, rate=rate, even=even, least=SHORTEST)
     if resample is not None:
         read = read.resampled(resample, path)
     inputs, outputs = read.names["input"], read.names["output"]
+    if time is None:
+        _refuse_time_axes(read, roles, path)
     return Record(
         read.matrix("input"),
         read.matrix("output"),
@@ -228,4 +237,28 @@ def read_record(
         period=period,
         input_names=tuple(inputs),
         output_names=tuple(outputs),
+        assumed=tuple(n for n in (*inputs, *outputs) if read.units[n] is None),
     )
+
+
+def _refuse_time_axes(
+    read: Sampled, roles: Mapping[str, Key | Sequence[Key]], path: Path
+) -> None:
+    """Raise ValueError if a column given by its number seems to be the time.
+
+    A column that is given by its name is meant; ``identify`` warns of it.
+    """
+    for role, given in roles.items():
+        names = read.names[role]
+        keys: Iterable[Any] = [given]
+        if len(names) > 1:
+            keys = given.split(",") if isinstance(given, str) else np.atleast_1d(given)
+        for key, name in zip(keys, names, strict=True):
+            steps = np.diff(read.values[name])
+            even = np.all(steps > 0.0) and np.std(steps) < EVEN * np.mean(steps)
+            if even and str(key).strip().isdecimal():
+                raise ValueError(
+                    f"{path.name}: column {key} ({name!r}), taken as the {role}, rises "
+                    f"in even steps of {np.mean(steps):.4g}, as a time axis does: name "
+                    "the columns of time, input and output"
+                )
