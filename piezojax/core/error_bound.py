@@ -15,6 +15,9 @@ A mode of damping zeta that is not in the model changes the response by the fact
 NARROW = 0.1
 """Excited band, as a share of the Nyquist frequency, below which a record is narrow."""
 
+WIDTH = 0.01
+"""Relative width of the bands of a bound: half the width of a peak of 1 % damping."""
+
 _NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
@@ -106,3 +109,20 @@ class ErrorBound(BaseModel):
         below = np.searchsorted(lines, frequency, side="right") - 1
         above = np.searchsorted(lines, frequency, side="left")
         return np.clip(below, 0, last), np.clip(above, 0, last)
+
+
+def banded(
+    frequency: np.ndarray, relative: np.ndarray, excited: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the lines of a bound [lines] merged in bands of ``WIDTH``.
+
+    A band has the largest ``relative`` of its lines, and is excited if all of them are.
+    The last band ends at the last ``frequency``.
+    """
+    band = np.floor(np.log(frequency / frequency[0]) / np.log1p(WIDTH))
+    first = np.flatnonzero(np.diff(band, prepend=-1.0))
+    last = np.append(first[1:], band.size) - 1
+    middle = np.sqrt(frequency[first] * frequency[last])
+    middle[-1] = frequency[-1]
+    largest = np.maximum.reduceat(relative, first)
+    return middle, largest, np.logical_and.reduceat(excited, first)

@@ -1,7 +1,7 @@
 """Model of a stage from its measured frequency response."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from pydantic import BaseModel
@@ -11,8 +11,10 @@ from ..core.paths import declared
 from ..core.system import Affine, Delay, System, series
 from ..dynamics import FractionalDelay, Modes
 from .estimators.estimate import FittedParameter
-from .estimators.modal_fit import MOST_MODES, ModalFit, error_bound, modal_fit
-from .records.response_file import FrequencyResponse
+from .estimators.modal_fit import MOST_MODES, modal_fit
+from .estimators.modal_model import ModalFit, error_bound
+from .measured_response import Measurement
+from .records.response import FrequencyResponse
 
 SMALL_MOTIONS = (
     "a frequency response shows small motions: hysteresis and creep are not in the "
@@ -24,13 +26,17 @@ LONGEST = 32
 FOLDED = 0.9
 """Share of half the rate above which a measured mode cannot be simulated."""
 
+LARGE = 2.0
+"""Mean square of the residual, relative to the variance, from which a note says so."""
+
 
 class ResponseReport(BaseModel):
     """Report of a model from a frequency response, the content of ``response.json``.
 
     ``error`` is the median of the relative error of the model at the measured lines,
-    ``noise`` that of the noise, as a standard deviation. The standard errors of the
-    gain and of the shares neglect the correlation of the gains of the modes.
+    ``noise`` that of the noise, as a standard deviation. ``excess`` is the mean square
+    of the residual relative to the variance of the lines, None if that is not known.
+    ``measured`` tells how the response was measured, if from records.
     """
 
     source: str
@@ -40,6 +46,8 @@ class ResponseReport(BaseModel):
     parameters: dict[str, FittedParameter]
     error: float
     noise: float
+    excess: float | None = None
+    measured: Measurement | None = None
     notes: list[str]
 
 
@@ -63,14 +71,17 @@ def identify_response(
     *,
     held: bool = False,
     most: int = MOST_MODES,
+    measured: Measurement | None = None,
 ) -> ResponseModel:
     """Return the modes, lag and delay of ``response`` as a System of ``rate`` in Hz.
 
     With ``held`` the response was measured at this rate through converters that hold
-    the input; otherwise by an analogue analyser. At most ``most`` modes are fitted. The
-    saved model carries a bound on its error, so that a study limits the margins for
-    what the response does not show. Raises ValueError for a rate that is not above 0, a
-    mode too near half the rate, and a response that no mode explains.
+    the input, if it does not say so itself; otherwise by an analogue analyser. At most
+    ``most`` modes are fitted, by the variances of the response if it has any.
+    ``measured`` goes into the report. The saved model carries a bound on its error, so
+    that a study limits the margins for what the response does not show. Raises
+    ValueError for a rate that is not above 0, a mode too near half the rate, and a
+    response that no mode explains.
     """
     if not (math.isfinite(rate) and rate > 0.0):
         raise ValueError(f"rate is {rate:g} Hz; it must be above 0")
@@ -95,14 +106,16 @@ def identify_response(
         parameters=parameters,
         error=float(sorted(relative)[relative.size // 2]),
         noise=float(sorted(noise)[noise.size // 2]),
-        notes=[SMALL_MOTIONS],
+        excess=fit.excess,
+        measured=measured,
+        notes=[SMALL_MOTIONS, *_notes(fit, response)],
     )
     about = About(
         record=response.source or None,
         rate_Hz=rate,
         units={"input": input, "output": output},
         parameter_units=_units(system, parameters, response.unit),
-        error_bound=error_bound(fit, response, dt),
+        error_bound=error_bound(fit, response, fit.deviation, dt),
         standard_errors={
             path: one.standard_error
             for path, one in parameters.items()
@@ -112,13 +125,36 @@ def identify_response(
     return ResponseModel(system, report, response, fit, about)
 
 
+def _notes(fit: ModalFit, response: FrequencyResponse) -> Iterator[str]:
+    """Yield what the user should know of the fit."""
+    if fit.searched < response.frequency.size:
+        yield (
+            f"the search merged {response.frequency.size} lines into {fit.searched}; "
+            "the last descent used all"
+        )
+    if fit.excess is not None and fit.excess > LARGE:
+        yield (
+            f"the residual is {math.sqrt(fit.excess):.2g} times as large as the "
+            "variance of the response explains: the stage does more than these modes, "
+            "lag and delay; the standard errors are larger by this factor"
+        )
+    for mode, damping in zip(fit.frequency, fit.damping, strict=True):
+        width = 2.0 * damping.value * mode.value
+        if response.resolution > width:
+            yield (
+                f"a line was estimated from a band of {response.resolution:.3g} Hz, "
+                f"and the resonance at {mode.value:.5g} Hz is {width:.3g} Hz wide: its "
+                "damping is biased; record longer, or a multisine with --period"
+            )
+
+
 def _system_of(fit: ModalFit, dt: float) -> System:
-    gain, delay = fit.static_gain, fit.delay.value
+    gain, delay = fit.static_gain.value, fit.delay.value
     modes = Modes(
         [one.value for one in fit.frequency],
         [one.value for one in fit.damping],
         dt,
-        [one.value / gain for one in fit.gain[1:]],
+        [one.value for one in fit.share],
         [] if fit.lag is None else [fit.lag.value],
     )
     parts: dict[str, System] = {"gain": Affine(gain), "dynamics": modes}
@@ -133,16 +169,14 @@ def _system_of(fit: ModalFit, dt: float) -> System:
 
 def _parameters(fit: ModalFit) -> dict[str, FittedParameter]:
     """Return the parameters of the System, by path, with their standard errors."""
-    gain = fit.static_gain
-    spread = math.sqrt(sum(one.error**2 for one in fit.gain))
-    found = {"gain.gain": (gain, spread)}
+    found = {"gain.gain": fit.static_gain}
     for i, (frequency, damping) in enumerate(
         zip(fit.frequency, fit.damping, strict=True)
     ):
         found[f"dynamics.frequency.{i}"] = frequency
         found[f"dynamics.damping.{i}"] = damping
-    for i, one in enumerate(fit.gain[1:]):
-        found[f"dynamics.share.{i}"] = one.value / gain, one.error / abs(gain)
+    for i, one in enumerate(fit.share):
+        found[f"dynamics.share.{i}"] = one
     if fit.lag is not None:
         found["dynamics.time_constant.0"] = fit.lag
     if fit.delay.value > 0.0:

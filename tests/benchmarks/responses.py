@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from oracles import modal_responses
 
 from piezojax.identification.estimators.modal_fit import modal_fit
-from piezojax.identification.records.response_file import FrequencyResponse
+from piezojax.identification.records.response import FrequencyResponse
 
 LINES = np.linspace(10.0, 5000.0, 800)
 FREQUENCY, DAMPING, KEPT = 2e-3, 0.1, 57

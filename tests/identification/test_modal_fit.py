@@ -6,6 +6,7 @@ from functools import cache
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 from click.testing import CliRunner
 from oracles import modal_responses
 
@@ -13,9 +14,11 @@ import piezojax as pj
 from piezojax.cli.identify import main
 from piezojax.core.serial import read_about
 from piezojax.dynamics import linearise
-from piezojax.identification.estimators.modal_fit import modal_fit, noise_deviation
+from piezojax.identification.estimators import line_noise, modal_model
+from piezojax.identification.estimators.line_noise import noise_deviation
+from piezojax.identification.estimators.modal_fit import modal_fit
+from piezojax.identification.records.response import FrequencyResponse
 from piezojax.identification.records.response_file import (
-    FrequencyResponse,
     read_response,
 )
 from piezojax.identification.response_model import identify_response
@@ -57,7 +60,7 @@ def test_the_noise_is_estimated_without_a_model():
     stage, values = measured(1001)
     exact = np.abs(modal_responses.response(stage, LINES))
     expected = np.hypot(stage.noise[0] * exact, stage.noise[1])
-    ratio = noise_deviation(LINES, values) / expected
+    ratio = noise_deviation(FrequencyResponse(LINES, values)) / expected
     assert 0.8 < np.median(ratio) < 1.25
 
 
@@ -198,7 +201,7 @@ def test_the_command_writes_a_model_that_a_study_reads(tmp_path, monkeypatch):
     assert float(output[-1]) == pytest.approx(sum(stage.gain), rel=0.02)
     refused = CliRunner().invoke(main, ["bench.csv", "--response"])
     assert refused.exit_code == 1
-    assert "--response takes one RECORD, and a --rate" in refused.output
+    assert "a file of --response needs a --rate" in refused.output
 
 
 def test_a_magnitude_in_decibels_needs_its_unit(tmp_path):
@@ -228,3 +231,89 @@ def test_a_dead_channel_and_a_delay_of_many_samples():
     whole, rest = found.system.parts[2:]
     delay = found.fit.delay.value
     assert whole.samples * 1e-6 + float(rest.delay) == pytest.approx(delay, rel=1e-9)
+
+
+def test_the_model_of_a_held_input_is_that_of_the_sampled_stage():
+    """Against SciPy's discretisation; the delay is a whole number of samples."""
+    dt, w, zeta = 1e-4, 2.0 * np.pi * 900.0, 0.03
+    lines = np.linspace(100.0, 4000.0, 60)
+    none = np.zeros(lines.size)
+    point = np.r_[np.log(w), np.log(zeta), 0.7, 2 * dt * 2.0 * np.pi * lines[-1]]
+    found = modal_model.response(
+        point,
+        modal_model.Shape(1, False, True),
+        modal_model.lines_of(lines, none, none, dt),
+    )[0]
+    b, a, _ = scipy.signal.cont2discrete(([0.7 * w**2], [1.0, 2 * zeta * w, w**2]), dt)
+    turn = 2.0 * np.pi * lines * dt
+    exact = scipy.signal.freqz(b.ravel(), a, turn)[1] * np.exp(-2j * turn)
+    np.testing.assert_allclose(found, exact, rtol=2e-3)
+
+
+@pytest.mark.parametrize("held", [None, 1e-4])
+def test_derivatives_of_the_model(held):
+    lines = np.linspace(100.0, 4000.0, 30)
+    none, shape = np.zeros(lines.size), modal_model.Shape(2, True, True)
+    data = modal_model.lines_of(lines, none, none, held)
+    logs = np.log([5e3, 1.2e4, 0.02, 0.1])
+    point = np.r_[logs, 1.0, 0.3, np.log(1e-5), 2.0]
+    slopes = modal_model.response(point, shape, data)[1]
+    for i in range(point.size):
+        step = 1e-6 * np.eye(point.size)[i]
+        ends = [modal_model.response(point + s * step, shape, data)[0] for s in (1, -1)]
+        change = (ends[0] - ends[1]) / 2e-6
+        np.testing.assert_allclose(slopes[:, i], change, rtol=1e-5, atol=1e-7)
+
+
+def test_gain_and_shares_have_the_errors_of_all_parameters():
+    """Monte Carlo of the linear estimate at the truth, for two near modes."""
+    lines = np.linspace(100.0, 1200.0, 80)
+    shape = modal_model.Shape(2, False, True)
+    point = np.r_[np.log(2 * np.pi * np.array([500.0, 560.0])), np.log([0.05, 0.05])]
+    point = np.r_[point, 0.6, 0.5, 1.0]
+    deviation = np.full(lines.size, 0.01)
+    data = modal_model.lines_of(lines, np.zeros(lines.size), deviation, None)
+    fit = modal_model.fit_of(
+        point, shape, data, scale=1.0, excess=None, searched=80, held=None
+    )
+    rows = modal_model.residuals(point, shape, data)[1]
+    noise = np.random.default_rng(2).standard_normal((rows.shape[0], 4000))
+    gains = point[4:6, None] + (np.linalg.pinv(rows) @ noise)[4:6]
+    total = gains.sum(axis=0)
+    assert fit.static_gain.error == pytest.approx(np.std(total), rel=0.05)
+    assert fit.share[0].error == pytest.approx(np.std(gains[1] / total), rel=0.1)
+    apart = np.hypot(*(one.error for one in fit.gain))
+    assert fit.static_gain.error < 0.3 * apart  # neglecting the correlation
+
+
+def test_many_lines_are_merged_without_loss():
+    lines = np.linspace(1.0, 5000.0, 20_000)
+    random, deviation = np.random.default_rng(4), 0.1 + lines / 5e4
+    noise = random.standard_normal((2, lines.size)) * deviation
+    found = line_noise.merged(lines, 1.0 + noise[0] + 1j * noise[1], deviation)
+    frequency, values, spread = found
+    assert frequency.size < 2500
+    assert np.sum(spread**-2.0) == pytest.approx(np.sum(deviation**-2.0))
+    assert np.std((values - 1.0).real / spread) == pytest.approx(1.0, abs=0.05)
+    assert np.all(np.diff(frequency) > 0.0)
+    few = line_noise.merged(lines[:1000], noise[0, :1000], deviation[:1000])
+    np.testing.assert_array_equal(few[0], lines[:1000])
+
+
+def test_known_variances_are_the_weights():
+    stage, values = measured(1000)
+    exact = modal_responses.response(stage, LINES)
+    variance = np.hypot(stage.noise[0] * np.abs(exact), stage.noise[1]) ** 2
+    random = np.random.default_rng(8)
+    for freedom in (2.0, 8.0):
+        drawn = variance * random.chisquare(freedom, LINES.size) / freedom
+        known = FrequencyResponse(LINES, values, variance=drawn, freedom=freedom)
+        ratio = noise_deviation(known) / np.sqrt(variance)
+        assert 0.9 < np.median(ratio) < 1.1
+        assert np.std(ratio) < 0.2
+    wrong = FrequencyResponse(LINES, values, variance=0.04 * variance)
+    found = identify_response(wrong, RATE, most=1)
+    assert found.fit.excess == pytest.approx(25.0, rel=0.25)
+    assert "times as large as the variance of the response" in found.report.notes[1]
+    ratio = found.fit.deviation / np.sqrt(0.5 * variance)
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.15)

@@ -102,12 +102,19 @@ def _periods(columns: np.ndarray, period: int) -> np.ndarray:
     return columns[len(columns) - whole * period :].reshape(whole, period, -1)
 
 
+def period_spectra(columns: np.ndarray, period: int) -> np.ndarray:
+    """Return the spectra [periods, lines, channels] of the whole periods at the end.
+
+    A sinusoid of amplitude a has the modulus a / 2 in its line.
+    """
+    return np.fft.rfft(_periods(columns, period), axis=1) / period
+
+
 def _spectra(record: Record) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mean spectra [lines, channels] and the variance of the output means."""
     period = _period(record)
     inputs, outputs = (
-        np.fft.rfft(_periods(columns, period), axis=1) / period
-        for columns in (record.inputs, record.outputs)
+        period_spectra(columns, period) for columns in (record.inputs, record.outputs)
     )
     noise = np.var(outputs, axis=0, ddof=1) / len(outputs)
     return inputs.mean(axis=0), outputs.mean(axis=0), noise

@@ -24,7 +24,8 @@ class SpectralResponse(NamedTuple):
     ``frequency`` [lines] in Hz; ``response`` [lines], complex, output over input;
     ``variance`` [lines], the expected square of the modulus of its error; ``coherence``
     [lines], the share of the output power that the input explains linearly, 0 to 1;
-    ``power`` [lines], the power of the input in each line, in its unit squared.
+    ``power`` [lines], the power of the input in each line, in its unit squared;
+    ``averages``, the number of independent averages.
     """
 
     frequency: np.ndarray
@@ -32,6 +33,7 @@ class SpectralResponse(NamedTuple):
     variance: np.ndarray
     coherence: np.ndarray
     power: np.ndarray
+    averages: float
 
 
 def spectral_response(
@@ -93,6 +95,7 @@ def _periodic(
         noise[kept] / power[kept],
         np.abs(mean[kept]) ** 2 / np.maximum(total[kept], np.finfo(float).tiny),
         power[kept],
+        whole,
     )
 
 
@@ -105,7 +108,7 @@ def _welch(
 ) -> SpectralResponse:
     import scipy.signal  # takes long to import
 
-    size = segment or max(SHORTEST, 2 ** int(np.log2(max(1, input.size // AVERAGES))))
+    size = segment or segment_length(input.size)
     count = (2 * input.size) // size - 1
     if size < SHORTEST or count < 2:
         raise ValueError(
@@ -130,7 +133,13 @@ def _welch(
         (total - explained).clip(0.0) / power / averages,
         coherence,
         power,
+        averages,
     )
+
+
+def segment_length(samples: int) -> int:
+    """Return the number of samples in a segment by default."""
+    return max(SHORTEST, 2 ** int(np.log2(max(1, samples // AVERAGES))))
 
 
 def _excited(power: np.ndarray, least: float) -> np.ndarray:

@@ -60,18 +60,25 @@ def parsed(text: str) -> Columns:
     """Return the columns of a text table; infer its dialect from its lines.
 
     Cells are separated by ``;``, tabs, commas or blanks. The decimal sign is a point or
-    a comma. A header and a row of units below it are optional. Raises ContentError for
-    an empty file, rows of different length, or two columns with the same name.
+    a comma. A header and a row of units below it are optional; without one, a comment
+    line above the numbers with a name for each column is the header. Raises
+    ContentError for an empty file, rows of different length, or two columns with the
+    same name.
     """
-    lines = [
-        line
-        for line in text.splitlines()
-        if line.strip() and not line.lstrip().startswith(COMMENT)
-    ]
+    every = [line for line in text.splitlines() if line.strip()]
+    lines = [line for line in every if not line.lstrip().startswith(COMMENT)]
     if not lines:
         raise ContentError("the file is empty")
     separator, decimal = _dialect(lines[:: max(1, len(lines) // 100)])
-    return table(_cells(lines, separator), decimal)
+    rows = _cells(lines, separator)
+    above = every[: every.index(lines[0])]
+    if above and all(_numeric(cell, decimal) for cell in rows[0] if cell):
+        names = _cells([above[-1].strip().lstrip("".join(COMMENT))], separator)[0]
+        names = [name.strip() for name in names]
+        text_only = all(name and not _numeric(name, decimal) for name in names)
+        if len(set(names)) == len(names) == len(rows[0]) > 1 and text_only:
+            rows = [names, *rows]
+    return table(rows, decimal)
 
 
 def table(rows: Sequence[Sequence[str]], decimal: str = ".") -> Columns:

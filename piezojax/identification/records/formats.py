@@ -76,8 +76,11 @@ def _mat(file: BinaryIO) -> Columns:
     check_elements(file.read())
     file.seek(0)
     arrays = {n: v for n, v in loadmat(file).items() if not n.startswith("__")}
-    step = stated_step(arrays)
-    return _merged(_spread(name, values, dt=step) for name, values in arrays.items())
+    step, unit = stated_step(arrays), _text(arrays.get("FrequencyUnit"))
+    return _merged(
+        _spread(name, values, unit if name == "Frequency" else None, step)
+        for name, values in arrays.items()
+    )
 
 
 def _hdf5(file: BinaryIO, separator: str = "/") -> Columns:

@@ -1,21 +1,26 @@
 """Frequency responses from files of an analyser: magnitude and phase, or complex."""
 
 import re
-from dataclasses import dataclass
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 
 from .columns import Column, Columns
 from .formats import read_columns
-
-LEAST_LINES = 8
+from .response import FrequencyResponse
+from .saved_response import stated_in
+from .touchstone import SUFFIXES, touchstone
+from .units import unit_of
 
 _HERTZ = {"khz": 1e3, "hz": 1.0, "rad/s": 0.5 / np.pi, "omega": 0.5 / np.pi}
 """Factors to Hz by text in the name or unit; the first that matches, else 1."""
 
 _ROLES = {
     "coherence": r"coh",
+    "noise": r"^noise deviation\b",
+    "other": r"^distortion deviation\b",
+    "variance": r"^deviation\b",
     "real": r"\bre(al)?\b",
     "imaginary": r"\bim(ag|aginary)?\b",
     "phase": r"phase|\barg\b|angle",
@@ -24,110 +29,192 @@ _ROLES = {
 }
 """Text in the name or unit of a column that gives its role, the first that matches."""
 
+_OF_ONE = ("coherence", "noise", "variance")
+"""Roles of columns that are read if the file holds a single response."""
 
-@dataclass(frozen=True)
-class FrequencyResponse:
-    """Measured frequency response of one input and one output.
+UNIT = "um/V"
+"""Unit of a response whose file does not state it."""
 
-    ``frequency`` [lines] in Hz increases; ``values`` [lines] are complex, in ``unit``
-    (output over input). Raises ValueError for fewer than LEAST_LINES lines, columns of
-    different length, numbers that are not finite, and frequencies that are not above 0
-    or do not increase.
+
+def read_response(path: str | Path, *, unit: str | None = None) -> FrequencyResponse:
+    """Read the only frequency response in a file; arguments as ``read_responses``.
+
+    Raises ValueError as ``read_responses``, and for a file with several responses.
     """
-
-    frequency: np.ndarray
-    values: np.ndarray
-    unit: str = "um/V"
-    source: str = ""
-
-    def __post_init__(self):
-        frequency = np.asarray(self.frequency, float)
-        values = np.asarray(self.values, complex)
-        object.__setattr__(self, "frequency", frequency)
-        object.__setattr__(self, "values", values)
-        where = f"{self.source}: " if self.source else ""
-        if frequency.ndim != 1 or frequency.shape != values.shape:
-            raise ValueError(
-                f"{where}frequency has the shape {frequency.shape}, the response "
-                f"{values.shape}; both must be [lines]"
-            )
-        if frequency.size < LEAST_LINES:
-            raise ValueError(
-                f"{where}the response has {frequency.size} lines; at least "
-                f"{LEAST_LINES} are needed"
-            )
-        if not (np.all(np.isfinite(frequency)) and np.all(np.isfinite(values))):
-            line = int(np.argmin(np.isfinite(frequency) & np.isfinite(values)))
-            raise ValueError(f"{where}line {line} is not a finite number")
-        if frequency[0] <= 0.0 or np.any(np.diff(frequency) <= 0.0):
-            raise ValueError(
-                f"{where}the frequencies must be above 0 and increase from line to line"
-            )
+    found = read_responses(path, unit=unit)
+    if len(found) > 1:
+        raise ValueError(f"{path}: there are {len(found)} responses in it; keep one")
+    return found[0]
 
 
-def read_response(path: str | Path, *, unit: str = "um/V") -> FrequencyResponse:
-    """Read a frequency response from a table in one of ``formats.FORMATS``.
+def read_responses(
+    path: str | Path, *, unit: str | None = None
+) -> list[FrequencyResponse]:
+    """Read frequency responses from a table in one of ``formats.FORMATS``.
 
     The names and units of the columns give their roles: a frequency (Hz, kHz or rad/s),
-    and magnitude (a ratio, or dB re 1 ``unit``) with phase (degrees or radians), or
-    real and imaginary part. A frequency without a unit is in Hz, an omega in rad/s.
+    and magnitude (a ratio, or dB re 1 unit of the response) with phase (degrees or
+    radians), or real and imaginary part, or complex numbers, as the variables
+    ``ResponseData``, ``Frequency`` and ``FrequencyUnit`` of a MATLAB file. A frequency
+    without a unit is in Hz, an omega in rad/s. With several columns of one role each
+    pair is a response: columns belong together by the number in their names, or by
+    their order. A column ``deviation`` is the standard deviation of a single response.
     Other columns are ignored. The lines are sorted; one at 0 Hz is left out.
 
-    Raises ValueError, listing the columns, for a file without these columns or with two
-    of one role, for a phase whose unit is not in its name, columns of different length,
-    a magnitude below 0, and as FrequencyResponse.
+    A Touchstone file is read too: S11 of one port, S21 of two. ``unit`` is that of the
+    response, if its columns do not state it; by default UNIT.
+
+    Raises ValueError, listing the columns, for a file without these columns or with
+    columns that do not belong together, for a phase whose unit is not in its name,
+    columns of different length, a magnitude below 0, two units, and as
+    FrequencyResponse.
     """
     path = Path(path)
+    if path.suffix.lower() in SUFFIXES:
+        frequency, values = touchstone(path)
+        return [_sorted(frequency, values, unit or UNIT, str(path))]
     columns = read_columns(path)
-    roles = _roles(columns, path)
-    sizes = {name: columns[name].values.size for name in roles.values()}
+    roles = _roles(columns)
+    sizes = {
+        name: columns[name].values.size for names in roles.values() for name in names
+    }
     if len(set(sizes.values())) > 1:
         shown = ", ".join(f"{name} {size}" for name, size in sizes.items())
         raise ValueError(f"{path}: the columns differ in length: {shown}")
-    listed = ", ".join(columns)
-    if "frequency" not in roles:
-        raise ValueError(
-            f"{path}: no column is a frequency; name one frequency_Hz (there are "
-            f"{listed})"
-        )
-    frequency = _numbers(columns, roles["frequency"], path)
-    text = _label(roles["frequency"], columns[roles["frequency"]])
-    frequency = frequency * next((s for n, s in _HERTZ.items() if n in text), 1.0)
-    if {"real", "imaginary"} <= roles.keys():
-        parts = (_numbers(columns, roles[role], path) for role in ("real", "imaginary"))
-        values = np.array([1.0, 1j]) @ np.array([*parts])
-    elif {"magnitude", "phase"} <= roles.keys():
-        values = _magnitude(columns, roles["magnitude"], path) * np.exp(
-            1j * _phase(columns, roles["phase"], path)
-        )
-    else:
-        raise ValueError(
-            f"{path}: name the columns of the response magnitude_dB or magnitude, and "
-            f"phase_deg or phase_rad, or real and imag (there are {listed})"
-        )
+    frequency = _frequency(columns, roles, path)
+    pairs = _pairs(columns, roles, path)
+    found = []
+    for names in pairs:
+        own = _unit(columns, names, unit, path)
+        values = _values(columns, names, path)
+        source = f"{path}: {names[0]}" if len(pairs) > 1 else str(path)
+        more = {} if len(pairs) > 1 else _more(columns, roles, path)
+        found.append(_sorted(frequency, values, own, source, **more))
+    return found
+
+
+def _sorted(
+    frequency: np.ndarray, values: np.ndarray, unit: str, source: str, **more
+) -> FrequencyResponse:
     order = np.argsort(frequency, kind="stable")
     order = order[frequency[order] != 0.0]
-    return FrequencyResponse(frequency[order], values[order], unit, str(path))
+    lined = {
+        name: part[order] if isinstance(part, np.ndarray) else part
+        for name, part in more.items()
+    }
+    return FrequencyResponse(frequency[order], values[order], unit, source, **lined)
 
 
 def _label(name: str, column: Column) -> str:
     return f"{name} {column.unit or ''}".lower().replace("_", " ").strip()
 
 
-def _roles(columns: Columns, path: Path) -> dict[str, str]:
-    """Return the column of each role."""
-    found: dict[str, str] = {}
+def _roles(columns: Columns) -> dict[str, list[str]]:
+    """Return the columns of each role."""
+    found: dict[str, list[str]] = defaultdict(list)
     for name, column in columns.items():
         label = _label(name, column)
         role = next((r for r, text in _ROLES.items() if re.search(text, label)), None)
-        if role is None or role == "coherence":
-            continue
-        if role in found:
-            raise ValueError(
-                f"{path}: {found[role]!r} and {name!r} are both a {role}; keep one"
-            )
-        found[role] = name
+        if np.iscomplexobj(column.values) and role != "frequency":
+            role = "complex"
+        if role is not None and role != "other":
+            found[role].append(name)
     return found
+
+
+def _frequency(columns: Columns, roles: dict[str, list[str]], path: Path) -> np.ndarray:
+    """Return the frequencies in Hz."""
+    names = roles.get("frequency", [])
+    if len(names) > 1:
+        raise ValueError(
+            f"{path}: {names[0]!r} and {names[1]!r} are both a frequency; keep one"
+        )
+    if not names:
+        raise ValueError(
+            f"{path}: no column is a frequency; name one frequency_Hz (there are "
+            f"{', '.join(columns)}), or give the --method for a record over time"
+        )
+    text = _label(names[0], columns[names[0]])
+    if names[0] == "Frequency" and "ResponseData" in columns and "/" not in text:
+        text = text.replace("frequency", "", 1)
+        if not any(unit in text for unit in _HERTZ):
+            raise ValueError(
+                f"{path}: the unit of Frequency is not known (MATLAB's default is "
+                "rad/s): add a variable FrequencyUnit, 'Hz' or 'rad/s'"
+            )
+    scale = next((s for n, s in _HERTZ.items() if n in text), 1.0)
+    if re.search(r"rad/timeunit|rad/second", text):
+        scale = _HERTZ["rad/s"]
+    return scale * _numbers(columns, names[0], path)
+
+
+def _pairs(
+    columns: Columns, roles: dict[str, list[str]], path: Path
+) -> list[tuple[str, ...]]:
+    """Return the columns of each response."""
+    if "complex" in roles:
+        return [(name,) for name in roles["complex"]]
+    for two in (("real", "imaginary"), ("magnitude", "phase")):
+        if not all(role in roles for role in two):
+            continue
+        first, second = (roles[role] for role in two)
+        if len(first) != len(second):
+            role = two[0] if len(first) > len(second) else two[1]
+            names = roles[role]
+            raise ValueError(
+                f"{path}: {names[0]!r} and {names[1]!r} are both a {role}; keep one, "
+                "or give each its own partner"
+            )
+        numbers = [
+            [re.findall(r"\d+", name)[:1] for name in each] for each in (first, second)
+        ]
+        if all(map(all, numbers)) and sorted(numbers[0]) == sorted(numbers[1]):
+            second = [second[numbers[1].index(number)] for number in numbers[0]]
+        return list(zip(first, second, strict=True))
+    raise ValueError(
+        f"{path}: name the columns of the response magnitude_dB or magnitude, and "
+        f"phase_deg or phase_rad, or real and imag (there are {', '.join(columns)})"
+    )
+
+
+def _unit(
+    columns: Columns, names: tuple[str, ...], unit: str | None, path: Path
+) -> str:
+    """Return the unit of a response, from its columns or as given."""
+    stated = unit_of(names[0], columns[names[0]]) or ""
+    if "/" not in stated:
+        return unit or UNIT
+    if unit not in (None, stated):
+        raise ValueError(
+            f"{path}: column {names[0]!r} is in {stated}, and the unit given is {unit}"
+        )
+    return stated
+
+
+def _values(columns: Columns, names: tuple[str, ...], path: Path) -> np.ndarray:
+    """Return the complex values in the columns ``names``."""
+    if len(names) == 1:
+        return columns[names[0]].values
+    first = _label(names[0], columns[names[0]])
+    if re.search(_ROLES["real"], first):
+        parts = (_numbers(columns, name, path) for name in names)
+        return np.array([1.0, 1j]) @ np.array([*parts])
+    return _magnitude(columns, names[0], path) * np.exp(
+        1j * _phase(columns, names[1], path)
+    )
+
+
+def _more(
+    columns: Columns, roles: dict[str, list[str]], path: Path
+) -> dict[str, object]:
+    """Return the other properties of the only response of a file."""
+    found: dict[str, object] = {}
+    for role in _OF_ONE:
+        names = roles.get(role, [])
+        if len(names) == 1:
+            values = _numbers(columns, names[0], path)
+            found[role] = values if role == "coherence" else values**2
+    return found | stated_in(path)
 
 
 def _numbers(columns: Columns, name: str, path: Path) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.error_bound import UNSEEN, ErrorBound
+from ...core.error_bound import UNSEEN, ErrorBound, banded
 from ..estimators.welch import SHORTEST, SpectralResponse, spectral_response
 from ..records.record import Record
 
@@ -40,9 +40,6 @@ AVERAGES = 8
 ABSORBED = 0.05
 """Least error at an excited line in the limit on a missing mode, because the fitted
 parameters may absorb as much of the smooth error of the mode."""
-
-WIDTH = 0.01
-"""Relative width of the bands of a bound: half the width of a peak of 1 % damping."""
 
 
 class RelativeError(NamedTuple):
@@ -192,14 +189,10 @@ def _share(frequency: float, known: np.ndarray, upper: np.ndarray) -> float:
 def _bound(
     frequency: np.ndarray, relative: np.ndarray, excited: np.ndarray
 ) -> ErrorBound:
-    """Return the ErrorBound on bands of ``WIDTH``, with the largest value of each."""
-    band = np.floor(np.log(frequency / frequency[0]) / np.log1p(WIDTH))
-    first = np.flatnonzero(np.diff(band, prepend=-1.0))
-    last = np.append(first[1:], band.size) - 1
-    middle = np.sqrt(frequency[first] * frequency[last])
-    middle[-1] = frequency[-1]
+    """Return the ErrorBound on narrow bands, with the largest value of each."""
+    lines, largest, all_excited = banded(frequency, relative, excited)
     return ErrorBound(
-        frequency=tuple(float(f"{f:.8g}") for f in middle),
-        relative=tuple(float(f"{x:.4g}") for x in np.maximum.reduceat(relative, first)),
-        excited=tuple(np.logical_and.reduceat(excited, first).tolist()),
+        frequency=tuple(float(f"{f:.8g}") for f in lines),
+        relative=tuple(float(f"{x:.4g}") for x in largest),
+        excited=tuple(all_excited.tolist()),
     )
