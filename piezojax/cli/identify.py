@@ -5,6 +5,12 @@ from pathlib import Path
 import click
 
 from .command import Command, common, print_alarms, results_folder, run
+from .identify_response import (
+    Amplitudes,
+    ResponseOptions,
+    fit_responses,
+    load_dynamics,
+)
 from .records import SampleRange, print_columns, record_columns
 from .stopping import exit_interrupted
 from .terminal import Bar
@@ -49,23 +55,50 @@ class _Gain(click.ParamType):
 @click.option(
     "--response",
     is_flag=True,
-    help="RECORD is a frequency response: fit modes, lag and delay; needs --rate.",
+    help="Fit modes, lag and delay to the frequency response in RECORD, for a "
+    "controller of --rate; with --method, to that of a record over time.",
 )
 @click.option(
-    "--held",
-    is_flag=True,
-    help="With --response: measured through converters that run at --rate.",
+    "--held/--not-held",
+    default=None,
+    help="With --response: measured through converters that hold the input, at the "
+    "rate of the record or --rate (default: held in a record over time).",
+)
+@click.option("--unit", help="With --response: unit of a file of a response  [um/V]")
+@click.option(
+    "--amplitude",
+    "amplitudes",
+    type=Amplitudes(),
+    default=(),
+    help="With --response: rms amplitude of the input of each response.",
 )
 @click.option(
-    "--unit",
-    default="um/V",
-    show_default=True,
-    help="With --response: unit of the response.",
+    "--realisations",
+    type=click.IntRange(min=1),
+    default=1,
+    help="With --response: realisations of a multisine, one after another in a RECORD.",
+)
+@click.option(
+    "--skip",
+    type=click.IntRange(min=0),
+    help="With --response: periods that robust leaves out at the start  [1]",
+)
+@click.option(
+    "--segment",
+    type=click.IntRange(min=1),
+    help="With --response: samples in a segment of welch.",
+)
+@click.option(
+    "--dynamics",
+    type=click.Path(path_type=Path),
+    help="Hold the linear dynamics of this saved model; fit hysteresis and creep.",
 )
 @click.option("--among", help="With 'all': compare only these and linear models.")
 @record_columns
 @click.option(
-    "--method", help="Method of the fit (default: the first that can fit the model)."
+    "--method",
+    help="Method of the fit (default: the first that can fit the model), or, with "
+    "--response, of measuring: welch, local_polynomial or robust.",
 )
 @click.option(
     "--order",
@@ -113,6 +146,11 @@ def main(
     response,
     held,
     unit,
+    amplitudes,
+    realisations,
+    skip,
+    segment,
+    dynamics,
     among,
     method,
     order,
@@ -130,7 +168,7 @@ def main(
     """Fit a plant model to measured RECORDs of one stage.
 
     With --controller, measure how a device scales its gains: the input is its error,
-    the output its voltage.
+    the output its voltage. With --response, fit a frequency response.
 
     Text (.csv, .txt, .dat), .npz, .mat and .h5 files; .tdms, .lvm and .xlsx with
     piezojax[lab].
@@ -150,18 +188,22 @@ def main(
             return
         if not records:
             raise ValueError("give a RECORD to fit a model to")
-        for given, needed in (
-            (gains, controller),
-            (held or unit != "um/V", response),
-            (response and controller, None),
-        ):
-            if given and not needed:
-                raise ValueError(
-                    "--gain needs --controller, --held and --unit need --response, and "
-                    "--response and --controller exclude each other"
-                )
+        responses = ResponseOptions(
+            method, held, unit, amplitudes, realisations, skip, segment
+        )
+        if gains and not controller:
+            raise ValueError("--gain needs --controller")
+        if responses.given() and not response:
+            raise ValueError(f"{', '.join(responses.given())} need --response")
+        if response and controller:
+            raise ValueError("--response and --controller exclude each other")
+        if dynamics and (response or controller or model == ALL):
+            raise ValueError(
+                "--dynamics needs one model: it excludes --response, --controller and "
+                "--model all"
+            )
         if response:
-            fit_response(console)
+            fit_responses(console, records, columns, responses, out)
             return
         if model == ALL and method is not None:
             raise ValueError("--method needs one model; 'all' uses the default of each")
@@ -169,7 +211,7 @@ def main(
             raise ValueError("--among and --test need --model all")
         loaded = [read_record(record, **columns) for record in records]
         print_columns(console, loaded)
-        options = Options(order, window, oversample, steps)
+        options = Options(order, window, oversample, steps, load_dynamics(dynamics))
         if controller is not None:
             measure(console, loaded)
             return
@@ -194,28 +236,6 @@ def main(
         for warning in fit.report.warnings:
             console.print(f"note: {warning}", soft_wrap=True)
         console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
-
-    def fit_response(console):
-        from ..identification.records.response_file import read_response
-        from ..identification.response_model import identify_response
-        from ..report.response_pictures import write_response
-        from ..report.summary_tables import parameter_table
-
-        if len(records) > 1 or columns["rate"] is None:
-            raise ValueError("--response takes one RECORD, and a --rate")
-        with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
-            bar.stage("fitting modes")
-            measured = read_response(records[0], unit=unit)
-            found = identify_response(measured, columns["rate"], held=held)
-            bar.stage("drawing")
-            write_response(found, folder)
-        report = found.report
-        title = f"{report.lines} lines: median error {100.0 * report.error:.2g} %"
-        console.print(parameter_table(report.parameters, title))
-        console.print(f"found: {report.found}", soft_wrap=True)
-        for note in report.notes:
-            console.print(f"note: {note}", soft_wrap=True)
-        console.print(f"results in {folder}", soft_wrap=True)
 
     def measure(console, loaded):
         from ..core.files import write_json

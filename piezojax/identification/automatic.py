@@ -9,6 +9,7 @@ from ..core.progress import Progress, Silent
 from ..hysteresis.model import hystereses
 from .chain import dynamics_of, dynamics_parts, structure
 from .estimators.output_error import from_rest, output_error, starts_of
+from .held_dynamics import HeldDynamics
 from .records.record import Record
 
 HYSTERESES = (
@@ -37,22 +38,34 @@ STEPS = 24
 
 
 def automatic(
-    record: Record, progress: Progress | None = None, beside: Sequence[Record] = ()
+    record: Record,
+    progress: Progress | None = None,
+    beside: Sequence[Record] = (),
+    dynamics: HeldDynamics | None = None,
 ) -> str:
     """Return the default chain for ``record``, the training samples.
 
     The hysteresis is the one with the least error after short fits to ``record`` and
     those ``beside`` it, which are made at a lower sampling rate if that resolves the
-    resonances.
+    resonances. With ``dynamics``, which are held, the chain has no others.
     """
-    hysteresis = hysteresis_for([record, *beside], progress)
-    return f"{hysteresis}+{CREEP}+{dynamics_parts(record)}"
+    hysteresis = hysteresis_for([record, *beside], progress, dynamics)
+    return _chain_of(hysteresis, record, dynamics)
 
 
-def hysteresis_for(records: Sequence[Record], progress: Progress | None = None) -> str:
+def _chain_of(hysteresis: str, record: Record, dynamics: HeldDynamics | None) -> str:
+    behind = dynamics_parts(record) if dynamics is None else ""
+    return "+".join(part for part in (hysteresis, CREEP, behind) if part)
+
+
+def hysteresis_for(
+    records: Sequence[Record],
+    progress: Progress | None = None,
+    dynamics: HeldDynamics | None = None,
+) -> str:
     """Return the name of the hysteresis in ``HYSTERESES`` that describes them best.
 
-    Dynamics and bounds are those of the first record.
+    Dynamics, if they are not held, and bounds are those of the first record.
     """
     first, *others = HYSTERESES
     if records[0].samples < LEAST:
@@ -60,9 +73,9 @@ def hysteresis_for(records: Sequence[Record], progress: Progress | None = None) 
     (progress or Silent()).stage("choosing the hysteresis")
     every = _slowing(records[0])
     slow = [_slowed(record, every) for record in records]
-    least, chosen = CLEARLY * _error(first, slow), first
+    least, chosen = CLEARLY * _error(first, slow, dynamics), first
     for name in others:
-        error = _error(name, slow)
+        error = _error(name, slow, dynamics)
         if error < least:
             least, chosen = error, name
     return chosen
@@ -91,7 +104,9 @@ def _slowed(record: Record, every: int) -> Record:
     return Record(input, output, every * record.dt, source=record.source)
 
 
-def _error(name: str, records: Sequence[Record]) -> float:
+def _error(
+    name: str, records: Sequence[Record], dynamics: HeldDynamics | None
+) -> float:
     """Return the rms error after a short fit; with several records, after one to each.
 
     The error of a fit to one of several is that on the others. It is infinite if there
@@ -99,7 +114,7 @@ def _error(name: str, records: Sequence[Record]) -> float:
     which designs of controllers need.
     """
     first = records[0]
-    shape = structure(f"{name}+{CREEP}+{dynamics_parts(first)}", first)
+    shape = structure(_chain_of(name, first, dynamics), first, dynamics)
     squares = []
     for record in records:
         others = [other for other in records if other is not record]

@@ -14,6 +14,7 @@ from ..core.system import Affine, Series, series
 from ..hysteresis.model import Hysteresis
 from .estimators.resonances import LinearDynamics, linear_dynamics
 from .estimators.structure import Structure
+from .held_dynamics import HeldDynamics
 from .records.record import Record
 
 LINEAR = ("dynamics", "lag", "delay")
@@ -112,17 +113,41 @@ def extent_of(record: Record) -> Extent:
     )
 
 
-def structure(name: str, record: Record) -> Structure:
+def slow_chain(name: str, source: str) -> list[str]:
+    """Return the parts of a model whose dynamics come from ``source``.
+
+    Raises ValueError as for ``chain``, and for a part with dynamics.
+    """
+    known = known_parts()
+    parts = [part.strip() for part in name.split("+")]
+    chain(name)  # its checks
+    for part in parts:
+        if known[part].part.place in LINEAR or is_dynamic(part):
+            raise ValueError(
+                f"the dynamics come from {source}: leave {part} out of the model, as "
+                "in coleman_hodgdon+exponential_creep"
+            )
+    return parts
+
+
+def structure(
+    name: str, record: Record, dynamics: HeldDynamics | None = None
+) -> Structure:
     """Return the chain ``name`` with starts and bounds derived from ``record``.
 
-    An offset of the output is always added. Raises ValueError as for ``chain``.
+    An offset of the output is always added. With ``dynamics``, which are held, the
+    chain has no other dynamics. Raises ValueError as for ``chain`` and ``slow_chain``.
     """
     extent, shown = extent_of(record), dynamics_of(record)
     known = known_parts()
-    kinds = [known[part] for part in chain(name)]
+    names = slow_chain(name, dynamics.source) if dynamics else chain(name)
+    kinds = [known[part] for part in names]
     falls = extent.slope < 0.0 and any(kind.rising for kind in kinds)
     described = extent.mirrored() if falls else extent
     parts = {kind.part.place: kind.recipe(described) for kind in kinds}
+    if dynamics is not None:
+        held = dynamics.at(record.dt)
+        parts |= {place: Recipe(system, {}) for place, system in held.items()}
     reach = 2.0 * extent.span
     # Without a hysteresis nothing else turns volts into the output's unit.
     slope = extent.slope
@@ -155,7 +180,7 @@ def structure(name: str, record: Record) -> Structure:
             OFFSET,
         ),
         tuple(path for path in bounds if path.split(".")[0] in LINEAR),
-        shown.whitening if shown.modes else (),
+        shown.whitening if shown.modes and dynamics is None else (),
     )
 
 

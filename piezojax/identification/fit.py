@@ -18,6 +18,7 @@ from .automatic import automatic
 from .chain import DEFAULT, shown_dynamics
 from .estimators.estimate import FittedParameter, LinearDetail, Options
 from .estimators.resonances import LinearDynamics
+from .held_dynamics import HeldDynamics, combined_bound
 from .methods import method_for
 from .plausibility import assumed_units, plausibility_warnings
 from .records.checks import record_warnings
@@ -80,7 +81,7 @@ class Fit:
     """A fitted plant, its report, the records and the simulated outputs (their unit).
 
     ``system`` holds the input in force before the first record. ``count`` is the number
-    of fitted parameters.
+    of fitted parameters. ``held`` are the dynamics that were not fitted, if any.
     """
 
     system: System
@@ -91,6 +92,12 @@ class Fit:
     validate: slice
     linear: LinearDetail | None = None
     count: int = 0
+    held: HeldDynamics | None = None
+
+    @property
+    def plant(self) -> System:
+        """The fitted System to save, at the rate of the dynamics that were held."""
+        return self.system if self.held is None else self.held.plant(self.system)
 
     def errors(self, part: slice) -> list[np.ndarray]:
         """Return the errors over ``part``, [samples, p] for each record."""
@@ -127,7 +134,7 @@ class Fit:
             for i, unit in enumerate(each)
         }
         residuals = self.report.residuals
-        return About(
+        about = About(
             record=record.source or None,
             rate_Hz=1.0 / record.dt,
             units=units,
@@ -145,6 +152,16 @@ class Fit:
             },
             unsafe=self.report.alarms,
         )
+        if self.held is None:
+            return about
+        held, bound = self.held, about.error_bound
+        changed = {
+            "record": f"{about.record}, dynamics of {held.source}",
+            "rate_Hz": 1.0 / held.dt,
+            "error_bound": combined_bound(bound, held.about.error_bound, held.dt),
+            "standard_errors": about.standard_errors | held.standard_errors(),
+        }
+        return about.model_copy(update=changed)
 
     def _parameter_units(self) -> dict[str, str]:
         """Return the units of the parameters of the System, by path.
@@ -156,8 +173,8 @@ class Fit:
         sides = {"V": set(record.input_units), "um": set(record.output_units)}
         known = {name: "".join(each) for name, each in sides.items() if len(each) == 1}
         found = {}
-        for path in parameters(self.system):
-            declaration = declared(self.system, path)
+        for path in parameters(self.plant):
+            declaration = declared(self.plant, path)
             unit = declaration.unit if declaration else ""
             unclear = any(name in unit and name not in known for name in sides)
             found[path] = "" if unclear else replaced(unit, known)
@@ -202,7 +219,7 @@ def identify(
     Raises ValueError for an unknown model or method, an empty part, records of
     different sample time or units, or if no start leads to a finite fit.
     """
-    began = time.perf_counter()
+    began, options = time.perf_counter(), options or Options()
     records = (records,) if isinstance(records, Record) else tuple(records)
     check_compatible(records)
     records = tuple(sorted(records, key=lambda record: -record.samples))
@@ -211,12 +228,15 @@ def identify(
     if model == DEFAULT:
         parts = [record.until(train.stop) for record in records]
         parts.sort(key=lambda part: -part.span)
-        model = automatic(parts[0], progress, parts[1:])
+        model = automatic(parts[0], progress, parts[1:], options.dynamics)
     shown = shown_dynamics(records, train)
-    chosen = method_for(model, method)
-    estimate = chosen.estimate(
-        model, records, train, options or Options(), progress or Silent()
-    )
+    chosen, held = method_for(model, method), options.dynamics
+    if held is not None and chosen.models:
+        raise ValueError(
+            f"the dynamics come from {held.source}: {model} has its own; name a chain "
+            "such as coleman_hodgdon+exponential_creep"
+        )
+    estimate = chosen.estimate(model, records, train, options, progress or Silent())
 
     def of_each(check: Callable[[Record], Iterable[str]]) -> list[str]:
         return [
@@ -228,6 +248,8 @@ def identify(
     runs = estimate.simulations
     alarms = of_each(plausibility_warnings)
     alarms += _error_warnings(records, runs, validate)
+    gains = ([], []) if held is None else held.gain_notes(records[0])
+    alarms += gains[0]
     checked = partial(
         record_warnings,
         train=train,
@@ -239,7 +261,7 @@ def identify(
     residuals, unexplained = residual_report(records, runs, train, validate)
     report = FitReport(
         model=model,
-        found=str(shown),
+        found=str(shown) if held is None else f"dynamics of {held.source}, held",
         parameters=estimate.parameters,
         train=_fit_error(records, runs, train),
         validation=_fit_error(records, runs, validate),
@@ -249,6 +271,7 @@ def identify(
             *of_each(assumed_units),
             *of_each(checked),
             *estimate.warnings,
+            *gains[1],
             *_missed(shown, estimate.linear),
             *unexplained,
         ],
@@ -264,6 +287,7 @@ def identify(
         validate,
         estimate.linear,
         estimate.parameter_count(),
+        held,
     )
 
 

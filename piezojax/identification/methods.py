@@ -44,7 +44,7 @@ Records = Sequence[Record]
 def _by_output_error(
     model: str, records: Records, train: slice, options: Options, progress: Progress
 ) -> Estimate:
-    shape = structure(model, training_record(records, train))
+    shape = structure(model, training_record(records, train), options.dynamics)
     optimum = output_error(
         shape, records, train, steps=options.steps, progress=progress
     )

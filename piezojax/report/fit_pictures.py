@@ -42,7 +42,7 @@ def write_fit(fit: Fit, folder: Path) -> None:
 
 def write_model(fit: Fit, folder: Path) -> None:
     """Write model.json, its residual and fit.json into ``folder``."""
-    save(fit.system, folder / MODEL_FILE, fit.about)
+    save(fit.plant, folder / MODEL_FILE, fit.about)
     save_residual(ResidualRecord.of(fit), folder / MODEL_FILE)
     text = fit.report.model_dump_json(indent=2)
     write_text(folder / FIT_FILE, text + "\n")

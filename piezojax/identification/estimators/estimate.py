@@ -8,6 +8,7 @@ from pydantic import BaseModel
 
 from ...core.system import System
 from ...dynamics import StateSpace
+from ..held_dynamics import HeldDynamics
 from .frequency import EmpiricalResponse
 
 
@@ -35,13 +36,14 @@ class Options:
     ``order`` is the number of states of a linear model, ``window`` the number p of past
     and future samples in the Hankel-Toeplitz regression, ``oversample`` the number of
     simulated samples per sample of a periodic record, ``steps`` the largest number of
-    steps of a descent.
+    steps of a descent. ``dynamics`` are those that the fit of a chain holds.
     """
 
     order: int = 4
     window: int = 20
     oversample: int = 8
     steps: int = 200
+    dynamics: HeldDynamics | None = None
 
 
 class LinearDetail(NamedTuple):

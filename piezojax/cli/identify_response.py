@@ -1,0 +1,204 @@
+"""``python -m piezojax.identify ... --response``: models from frequency responses."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+from rich.console import Console
+
+from .command import results_folder
+from .records import print_columns
+from .terminal import Bar
+
+if TYPE_CHECKING:
+    from ..identification.held_dynamics import HeldDynamics
+    from ..identification.measured_response import Measurement
+    from ..identification.records.response import FrequencyResponse
+
+
+class Amplitudes(click.ParamType):
+    """Numbers above 0, separated by commas."""
+
+    name = "A,B,..."
+
+    def convert(self, value, param, ctx):
+        """Return the numbers; fail with one line for any other text."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = tuple(float(number) for number in value.split(","))
+        except ValueError:
+            numbers = ()
+        if not numbers or not all(0.0 < number < float("inf") for number in numbers):
+            self.fail(f"{value!r} must be numbers above 0, as in 0.1,0.5", param, ctx)
+        return numbers
+
+
+class ResponseOptions(NamedTuple):
+    """Options of ``--response``.
+
+    None and 1 are the values of options that were not given.
+    """
+
+    method: str | None
+    held: bool | None
+    unit: str | None
+    amplitudes: tuple[float, ...]
+    realisations: int
+    skip: int | None
+    segment: int | None
+
+    def given(self) -> list[str]:
+        """Return the options that only ``--response`` takes, as they were typed."""
+        named = {
+            "--held": self.held is not None,
+            "--unit": self.unit is not None,
+            "--amplitude": bool(self.amplitudes),
+            "--realisations": self.realisations != 1,
+            "--skip": self.skip is not None,
+            "--segment": self.segment is not None,
+        }
+        return [name for name, given in named.items() if given]
+
+
+def fit_responses(
+    console: Console,
+    records: Sequence[Path],
+    columns: Mapping[str, Any],
+    options: ResponseOptions,
+    out: Path | None,
+) -> None:
+    """Read or measure the responses, fit their modes, write and print the results."""
+    from ..identification.response_levels import compare_levels
+    from ..identification.response_model import identify_response
+    from ..report.response_pictures import write_levels, write_measured, write_response
+    from ..report.response_tables import levels_table, measurement_table
+    from ..report.summary_tables import parameter_table
+
+    if options.method is None:
+        found, rate = _read(records, columns, options)
+    else:
+        found, rate = _measured(console, records, columns, options)
+    with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
+        if len(found) == 1 and found[0][1] is not None:
+            write_measured(found[0][0], folder)
+        bar.stage("fitting modes")
+        try:
+            models = [
+                identify_response(
+                    response, rate, held=bool(options.held), measured=measured
+                )
+                for response, measured in found
+            ]
+        except ValueError as error:
+            kept = (
+                ""
+                if not any(folder.iterdir())
+                else (f" (the measured response is in {folder})")
+            )
+            raise ValueError(f"no model: {error}{kept}") from None
+        bar.stage("drawing")
+        levels = compare_levels(models) if len(models) > 1 else None
+        if levels is None:
+            write_response(models[0], folder)
+        else:
+            write_levels(levels, folder)
+    for _, measured in found:
+        if measured is not None:
+            console.print(measurement_table(measured))
+    chosen = models[0]
+    if levels is not None:
+        console.print(levels_table(levels))
+        for note in levels.report.notes:
+            console.print(f"note: {note}", soft_wrap=True)
+        chosen = levels.chosen
+        console.print(
+            f"model.json is the model of response {levels.report.chosen + 1}; its "
+            "error bound holds for all",
+            soft_wrap=True,
+        )
+    report = chosen.report
+    title = f"{report.lines} lines: median error {100.0 * report.error:.2g} %"
+    console.print(parameter_table(report.parameters, title))
+    console.print(f"found: {report.found}", soft_wrap=True)
+    notes = [*(report.measured.notes if report.measured else []), *report.notes]
+    for note in notes:
+        console.print(f"note: {note}", soft_wrap=True)
+    console.print(f"results in {folder}", soft_wrap=True)
+
+
+Found = list[tuple["FrequencyResponse", "Measurement | None"]]
+
+
+def _read(
+    records: Sequence[Path], columns: Mapping[str, Any], options: ResponseOptions
+) -> tuple[Found, float]:
+    """Return the responses in files, and the rate of the model in Hz."""
+    from dataclasses import replace
+
+    from ..identification.records.response_file import read_responses
+
+    if columns["rate"] is None:
+        raise ValueError("a file of --response needs a --rate, that of the controller")
+    if columns["period"] or options.realisations != 1 or options.skip is not None:
+        raise ValueError(
+            "--period, --realisations and --skip need a --method: the RECORD is then "
+            "a record over time"
+        )
+    responses = [
+        response
+        for path in records
+        for response in read_responses(path, unit=options.unit)
+    ]
+    amplitudes = options.amplitudes
+    if amplitudes and len(amplitudes) != len(responses):
+        raise ValueError(
+            f"--amplitude has {len(amplitudes)} values for {len(responses)} responses"
+        )
+    if amplitudes:
+        responses = [
+            replace(response, amplitude=amplitude)
+            for response, amplitude in zip(responses, amplitudes, strict=True)
+        ]
+    return [(response, None) for response in responses], columns["rate"]
+
+
+def _measured(
+    console: Console,
+    records: Sequence[Path],
+    columns: Mapping[str, Any],
+    options: ResponseOptions,
+) -> tuple[Found, float]:
+    """Return the responses of records over time, and their rate in Hz."""
+    from ..identification.measured_response import ResponseSettings, measure_responses
+    from ..identification.records.record import read_record
+
+    if options.unit is not None or options.amplitudes:
+        raise ValueError(
+            "--unit and --amplitude are those of a file of a response; with --method "
+            "they come from the record"
+        )
+    loaded = [read_record(record, **columns) for record in records]
+    print_columns(console, loaded)
+    settings = ResponseSettings(
+        method=options.method or "",
+        realisations=options.realisations,
+        skip=1 if options.skip is None else options.skip,
+        segment=options.segment,
+        held=options.held is not False,
+    )
+    return [*measure_responses(loaded, settings)], 1.0 / loaded[0].dt
+
+
+def load_dynamics(path: Path | None) -> "HeldDynamics | None":
+    """Return the linear dynamics of the saved model at ``path``, if there is a path.
+
+    Raises ValueError as ``load`` and ``held_dynamics`` do.
+    """
+    from ..core.serial import load, read_about
+    from ..identification.held_dynamics import held_dynamics
+
+    if path is None:
+        return None
+    return held_dynamics(load(path), read_about(path), path.name)
