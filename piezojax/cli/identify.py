@@ -233,6 +233,11 @@ def main(
         print_alarms(console, fit.report.alarms)
         console.print(fit_table(fit.report))
         console.print(f"found: {fit.report.found or 'no resonance'}", soft_wrap=True)
+        if fit.held is not None:
+            from ..identification.held_dynamics import bound_text
+
+            text = bound_text(fit.about.error_bound, fit.held.dt)
+            console.print(text, soft_wrap=True)
         for warning in fit.report.warnings:
             console.print(f"note: {warning}", soft_wrap=True)
         console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)

@@ -187,6 +187,19 @@ def _check_linear(tail: System, source: str) -> None:
         )
 
 
+def bound_text(bound: ErrorBound | None, dt: float) -> str:
+    """Return a line on the ``bound`` of a plant of the sample time ``dt`` (s)."""
+    rate = f"the plant runs at {1.0 / dt:.6g} Hz"
+    if bound is None:
+        return f"{rate}; the record does not bound its error"
+    excited = np.asarray(bound.relative)[np.asarray(bound.excited)]
+    return (
+        f"{rate}; with both records its response is known up to {bound.highest:.4g} "
+        f"Hz, within {100.0 * np.median(excited):.2g} % in the median and "
+        f"{100.0 * excited.max():.2g} % at worst"
+    )
+
+
 def combined_bound(
     slow: ErrorBound | None, fast: ErrorBound | None, dt: float
 ) -> ErrorBound | None:

@@ -1,6 +1,6 @@
 """Frequency responses from records over time, by amplitude of the input."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -220,21 +220,13 @@ def _periodic(
     properties: dict,
     notes: list[str],
 ) -> FrequencyResponse:
-    estimate: Callable[[Record, int], LineEstimates]
-    if settings.method == "robust":
-
-        def estimate(record, period):
-            signals = record.input, record.output
-            return steady_response(*signals, record.dt, period, settings.skip)
-
-    else:
-
-        def estimate(record, period):
-            return periodic_local_polynomial(
-                record.input, record.output, record.dt, period
-            )
-
-    each = [estimate(record, record.period or 0) for record in records]
+    each = []
+    for record in records:
+        signals = record.input, record.output, record.dt, record.period or 0
+        if settings.method == "robust":
+            each.append(steady_response(*signals, settings.skip))
+        else:
+            each.append(periodic_local_polynomial(*signals))
     if len(each) == 1:
         notes.append(
             "one realisation: the band holds the noise, and no nonlinear distortion; "

@@ -160,8 +160,13 @@ def levels_figure(found: ResponseLevels) -> Figure:
     """Draw the responses at all amplitudes, and the change of each parameter."""
     report = found.report
     unit = found.chosen.response.unit.replace("um", "µm")
-    picture = figure(9.0, 4.2)
-    left, right = picture.subplots(1, 2)
+    picture = figure(9.0, 4.8)
+    grid = picture.add_gridspec(3, 2)
+    left = picture.add_subplot(grid[:, 0])
+    panels = {
+        kind: picture.add_subplot(grid[i, 1])
+        for i, kind in enumerate(("gain", "frequency", "damping"))
+    }
     labels = level_labels(found)
     count = len(labels)
     for i, (model, label) in enumerate(zip(found.models, labels, strict=True)):
@@ -177,14 +182,17 @@ def levels_figure(found: ResponseLevels) -> Figure:
     left.legend(fontsize=7.5, title="amplitude" if report.amplitudes else None)
     x = report.amplitudes or [*range(1, count + 1)]
     for change in report.changes:
+        kind, _, mode = change.parameter.partition(", ")
         value, error = _relative(change)
-        right.errorbar(x, value, error, marker="o", ms=3.0, label=change.parameter)
+        ax, label = panels[kind], mode or "all modes"
+        ax.errorbar(x, value, error, marker="o", ms=3.0, capsize=2.0, label=label)
+        ax.set(ylabel=f"{kind}, change (%)")
+    for ax in panels.values():
+        ax.legend(fontsize=7.0)
     name = f"rms amplitude of the input ({report.input_unit})"
-    right.set(
-        xlabel=name if report.amplitudes else "number of the response",
-        ylabel="change from the first (%)",
+    panels["damping"].set(
+        xlabel=name if report.amplitudes else "number of the response"
     )
-    right.legend(fontsize=7.0)
     add_title(picture, "Modes by amplitude of the input")
     return picture
 

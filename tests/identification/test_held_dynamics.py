@@ -171,6 +171,7 @@ def test_two_commands_give_the_whole_plant(tmp_path, monkeypatch):
     done = CliRunner().invoke(main, line.split())
     assert done.exit_code == 0, done.output
     assert "dynamics of model.json, held" in done.output
+    assert "the plant runs at 20000 Hz; " in done.output
     plant = pj.load(tmp_path / "found" / "model.json")
     about = read_about(tmp_path / "found" / "model.json")
     hysteresis, modes, *_ = plant.parts

@@ -3,6 +3,7 @@
 import re
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -98,7 +99,7 @@ def _sorted(
 ) -> FrequencyResponse:
     order = np.argsort(frequency, kind="stable")
     order = order[frequency[order] != 0.0]
-    lined = {
+    lined: dict[str, Any] = {
         name: part[order] if isinstance(part, np.ndarray) else part
         for name, part in more.items()
     }

@@ -67,8 +67,8 @@ def _as_table(response: FrequencyResponse) -> str:
     values, unit = response.values, response.unit
     columns = {
         "frequency_Hz": response.frequency,
-        f"real [{unit}]": values.real,
-        f"imag [{unit}]": values.imag,
+        f"real [{unit}]": np.real(values),
+        f"imag [{unit}]": np.imag(values),
         f"magnitude [{unit}]": np.abs(values),
         "phase_deg": np.degrees(np.unwrap(np.angle(values))),
     }
