@@ -68,7 +68,7 @@ def test_the_change_of_each_mode_is_told_with_its_error():
     assert gain.change_percent == pytest.approx(10.0)
     assert frequency.change_percent == pytest.approx(100.0 * (690.0 / 700.0 - 1.0))
     assert frequency.standard_error_percent == pytest.approx(
-        100.0 * np.hypot(1e-4, 1e-4 * 690.0 / 700.0) * 690.0 / 690.0, rel=0.02
+        100.0 * np.hypot(1e-4, 1e-4) * 690.0 / 700.0, rel=1e-6
     )
     assert damping.change_percent == pytest.approx(50.0)
     assert [one.certain for one in found.report.changes] == [True] * 3
@@ -78,7 +78,7 @@ def test_the_change_of_each_mode_is_told_with_its_error():
     peak = float(LINES[at])
     own = found.models[found.report.chosen].response.values[at]
     worst = max(abs(one.response.values[at] / own - 1.0) for one in found.models)
-    assert found.chosen.about.error_bound.at(peak) >= worst
+    assert found.chosen.about.error_bound.at(peak) >= 0.999 * worst
 
 
 def test_changes_below_the_errors_are_not_claimed():
