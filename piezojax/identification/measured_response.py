@@ -16,6 +16,10 @@ from .records.response import FrequencyResponse
 ALIKE = 1.1
 """Ratio of rms amplitudes up to which records count as of one amplitude."""
 
+HIGHEST = 0.8
+"""Share of half the rate below which the response to a held input is kept: above it,
+the images of each frequency are as large as itself."""
+
 CERTAIN = 3.0
 """Standard errors by which the total variance must exceed the noise."""
 
@@ -164,7 +168,20 @@ def _measured(
         )
     else:
         found = _periodic(records, settings, properties, notes)
+    if settings.held:
+        found = _below(found, HIGHEST * 0.5 / first.dt)
     return found, _measurement(found, sources, settings, first.input_unit, notes)
+
+
+def _below(found: FrequencyResponse, highest: float) -> FrequencyResponse:
+    """Return the lines of ``found`` below the frequency ``highest`` (Hz)."""
+    count = int(np.searchsorted(found.frequency, highest))
+    columns = {
+        name: None if part is None else part[:count]
+        for name in ("frequency", "values", "variance", "noise", "coherence")
+        for part in [getattr(found, name)]
+    }
+    return replace(found, **columns)
 
 
 def _by_welch(

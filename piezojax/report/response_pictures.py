@@ -186,9 +186,10 @@ def levels_figure(found: ResponseLevels) -> Figure:
         value, error = _relative(change)
         ax, label = panels[kind], mode or "all modes"
         ax.errorbar(x, value, error, marker="o", ms=3.0, capsize=2.0, label=label)
-        ax.set(ylabel=f"{kind}, change (%)")
+        ax.set(ylabel=f"{kind} (%)")
     for ax in panels.values():
         ax.legend(fontsize=7.0)
+    panels["gain"].set(title="change from the first amplitude")
     name = f"rms amplitude of the input ({report.input_unit})"
     panels["damping"].set(
         xlabel=name if report.amplitudes else "number of the response"

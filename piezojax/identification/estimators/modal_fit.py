@@ -98,7 +98,7 @@ def modal_fit(
     held = response.held or held
     least = KNOWN_VARIANCE if known else LEAST_VARIANCE
     every = response.frequency, response.values, noise_deviation(response)
-    data = lines_of(*merged(*every), held, least, count=1)
+    data = lines_of(*merged(*every), held, least, count=2)
     searched = data.omega.size
     # Half of the numbers at least are left to tell noise from modes.
     most = min(most, max(1, (searched - 2) // 3))
@@ -121,7 +121,13 @@ def modal_fit(
             "resonance, with more lines around it"
         )
     if held is not None or searched < response.frequency.size:
-        chosen, data = _on_all(chosen, data, lines_of(*every, held, least))
+        merged_lines, data = data, lines_of(*every, held, least)
+        fewer = [
+            min(alike, key=lambda one: _criterion(one, found, merged_lines))
+            for modes in range(chosen.shape.modes - 1, 0, -1)
+            if (alike := [one for one in found if one.shape.modes == modes])
+        ]
+        chosen = _on_all([chosen, *fewer], merged_lines, data)
     variance = 2.0 * chosen.cost / _freedom(chosen, data)
     return fit_of(
         chosen.point,
@@ -134,17 +140,25 @@ def modal_fit(
     )
 
 
-def _on_all(found: _Found, data: Lines, every: Lines) -> tuple[_Found, Lines]:
-    """Return the fit of ``found``, from merged ``data``, to ``every`` line, and these.
+def _on_all(found: list[_Found], data: Lines, every: Lines) -> _Found:
+    """Return the best of the fits ``found`` to merged ``data``, on ``every`` line.
 
-    A lag that these do not show is left out.
+    The first was chosen; each of the others has a mode less. A lag or a mode that
+    imitates the error of merged lines is left out: all lines do not show it.
     """
-    point, shape = found.point.copy(), found.shape
-    point[3 * shape.modes + shape.lag :] *= every.highest / data.highest
-    tried = [_refined(point, shape, every)]
-    if shape.lag and shape.delay:
-        tried.append(_without_lag(tried[0], every))
-    return min(tried, key=lambda one: _criterion(one, tried, every)), every
+    tried: list[_Found] = []
+    best = None
+    for one in found:
+        point, shape = one.point.copy(), one.shape
+        point[3 * shape.modes + shape.lag :] *= every.highest / data.highest
+        own = [_refined(point, shape, every)]
+        if shape.lag and shape.delay:
+            own.append(_without_lag(own[0], every))
+        tried += own
+        before, best = best, min(tried, key=lambda one: _criterion(one, tried, every))
+        if before is not None and best.shape.modes == before.shape.modes:
+            break
+    return best or found[0]
 
 
 def _refined(point: np.ndarray, shape: Shape, data: Lines) -> _Found:

@@ -28,7 +28,7 @@ DELAYS = 16
 
 IMAGES = 4
 """Images of a frequency on either side that count: those left out are smaller than the
-first by a factor of about 40. The search makes do with one."""
+first by a factor of about 40. The search makes do with two."""
 
 BLOCK = 4096
 """Lines evaluated at a time."""
