@@ -128,7 +128,7 @@ def _draw_measured(gain: Axes, phase: Axes, response: FrequencyResponse) -> None
     phase.fill_between(hertz, low, high, **shade)
     level = distortion_level(response)
     if response.noise is None:
-        of = "noise" if response.realisations == 1 else "error of the mean"
+        of = "noise and distortion" if response.resolution else "noise"
         label, deviation = of, np.sqrt(response.variance)
     else:
         label, deviation = "noise of the mean", np.sqrt(response.noise)
