@@ -36,6 +36,13 @@ def record_columns(function: Callable) -> Callable:
                 "--output", default="1", show_default=True, help="Output column."
             ),
             click.option(
+                "--reference", help="Reference column of a record of a closed loop."
+            ),
+            click.option(
+                "--dither",
+                help="Column of the voltage added to the command of the controller.",
+            ),
+            click.option(
                 "--rate", type=float, help="Sampling rate, Hz, without a time column."
             ),
             click.option(
@@ -58,6 +65,14 @@ def print_columns(console: Console, records: Iterable["Record"]) -> None:
             for role, columns in (
                 ("input", _of(record, record.input_names, record.input_units)),
                 ("output", _of(record, record.output_names, record.output_units)),
+                *(
+                    (role, [_range(signal, unit)])
+                    for role, signal, unit in (
+                        ("reference", record.reference, record.output_unit),
+                        ("dither", record.dither, record.input_unit),
+                    )
+                    if signal is not None
+                ),
             )
         )
         console.print(
@@ -71,7 +86,11 @@ def print_columns(console: Console, records: Iterable["Record"]) -> None:
 def _of(record: "Record", names: Sequence[str], units: Sequence[str]) -> list[str]:
     columns = record.inputs if names is record.input_names else record.outputs
     return [
-        f"{name!r} from {column.min():.4g} to {column.max():.4g} {unit}"
+        f"{name!r} {_range(column, unit)}"
         + (" (assumed)" if name in record.assumed else "")
         for name, column, unit in zip(names, columns.T, units, strict=True)
     ]
+
+
+def _range(column: "np.ndarray", unit: str) -> str:
+    return f"from {column.min():.4g} to {column.max():.4g} {unit}"

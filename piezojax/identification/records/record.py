@@ -11,6 +11,9 @@ import numpy as np
 from ...core.conversion import factor
 from .sampled import Key, Sampled, read_sampled
 
+EXCITATIONS = ("reference", "dither")
+"""Signals that excite a closed loop, fields of a record."""
+
 SHORTEST = 50
 """Least number of samples in a record."""
 
@@ -33,9 +36,14 @@ class Record:
     those whose unit neither the file nor their name states: they are taken to be in V
     and um.
 
+    A record of a closed loop may hold its excitation: the ``reference`` [samples] in
+    the unit of the output, and the ``dither`` [samples] in that of the input, which is
+    added to the command of the controller and contained in the input.
+
     Raises ValueError, naming column and sample, for columns of different length, too
-    few samples, missing numbers, a constant column, a sample time that is not positive,
-    or a period outside 2..samples.
+    few samples, missing numbers, a constant input or output, a sample time that is not
+    positive, a period outside 2..samples, or a reference or dither beside several
+    inputs or outputs.
     """
 
     inputs: np.ndarray
@@ -48,6 +56,8 @@ class Record:
     input_names: tuple[str, ...] = ()
     output_names: tuple[str, ...] = ()
     assumed: tuple[str, ...] = ()
+    reference: np.ndarray | None = None
+    dither: np.ndarray | None = None
 
     def __post_init__(self):
         for side in ("input", "output"):
@@ -94,6 +104,7 @@ class Record:
                     )
                 if np.ptp(column) == 0:
                     raise ValueError(f"{self.source}: {name} never changes")
+        self._check_excitation()
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise ValueError(
                 f"{self.source}: the sample time is {self.dt:g} s; it must be above 0"
@@ -103,6 +114,42 @@ class Record:
                 f"{self.source}: the period is {self.period} samples; "
                 f"it must lie in 2..{samples}"
             )
+
+    def _check_excitation(self) -> None:
+        """Check reference and dither, and store them as floats."""
+        for name in EXCITATIONS:
+            if getattr(self, name) is None:
+                continue
+            signal = np.asarray(getattr(self, name), dtype=float)
+            object.__setattr__(self, name, signal)
+            if signal.shape != (self.samples,):
+                raise ValueError(
+                    f"{self.source}: {name} has shape {signal.shape}; it must be "
+                    f"[samples], here ({self.samples},)"
+                )
+            if self.inputs.shape[1] != 1 or self.outputs.shape[1] != 1:
+                raise ValueError(
+                    f"{self.source}: a record with a {name} must have one input and "
+                    "one output"
+                )
+            bad = np.flatnonzero(~(np.abs(signal) <= LARGEST))
+            if bad.size:
+                raise ValueError(
+                    f"{self.source}: {name} is missing or not finite at sample "
+                    f"{bad[0]} ({bad.size} in all)"
+                )
+
+    @property
+    def closed_loop(self) -> bool:
+        """Whether the record holds the reference or the dither of a loop."""
+        return self.reference is not None or self.dither is not None
+
+    @property
+    def excitation(self) -> np.ndarray:
+        """Reference and dither [samples, 0 to 2], those that change."""
+        known = [getattr(self, name) for name in EXCITATIONS]
+        moving = [each for each in known if each is not None and np.ptp(each) > 0.0]
+        return np.stack(moving, axis=1) if moving else np.empty((self.samples, 0))
 
     @property
     def samples(self) -> int:
@@ -175,16 +222,28 @@ class Record:
                 factors.append(found)
             changed[f"{side}s"] = getattr(self, f"{side}s") * np.array(factors)
             changed[f"{side}_units"] = tuple(wanted)
+            beside = "dither" if side == "input" else "reference"
+            if getattr(self, beside) is not None:
+                changed[beside] = getattr(self, beside) * factors[0]
         return dataclasses.replace(self, **changed)
 
     def until(self, stop: int) -> "Record":
         """Return the first ``stop`` samples as a record; errors as for Record."""
         return dataclasses.replace(
-            self,
-            inputs=self.inputs[:stop],
-            outputs=self.outputs[:stop],
+            self.during(slice(stop)),
             period=None,
             source=f"{self.source}, first {stop} samples",
+        )
+
+    def during(self, part: slice) -> "Record":
+        """Return the samples ``part`` as a record; errors as for Record."""
+        kept = {
+            name: None if signal is None else signal[part]
+            for name in EXCITATIONS
+            for signal in [getattr(self, name)]
+        }
+        return dataclasses.replace(
+            self, inputs=self.inputs[part], outputs=self.outputs[part], **kept
         )
 
     @property
@@ -199,6 +258,8 @@ def read_record(
     time: Key | None = None,
     input: Key | Sequence[Key] = 0,
     output: Key | Sequence[Key] = 1,
+    reference: Key | None = None,
+    dither: Key | None = None,
     rate: float | None = None,
     period: int | None = None,
     resample: float | None = None,
@@ -206,7 +267,9 @@ def read_record(
     """Read a record from a file in one of ``formats.FORMATS``.
 
     ``time``, ``input`` and ``output`` are column names or zero-based numbers; several
-    inputs or outputs are a sequence of them, or one text with commas. The sample time
+    inputs or outputs are a sequence of them, or one text with commas. ``reference`` and
+    ``dither`` are the columns that excite a closed loop, converted to the units of
+    output and input; a reference or dither without a unit is in these. The sample time
     comes from the column ``time``, from ``rate`` (Hz) or from the channel properties in
     the file; if several of these are known, they must agree within 0.1 %. Units come
     from the file or from column names such as ``displacement_um`` or ``drive [V]``.
@@ -215,11 +278,14 @@ def read_record(
 
     Raises ValueError, naming the column and the sample, for a file that cannot be read,
     a missing column, missing numbers, unsorted time, uneven time without ``resample``,
-    contradicting sample times, a record that is too short, or, without ``time``, a
-    column given by its number that rises in even steps, as a time axis does.
+    contradicting sample times, a reference or dither in a unit that cannot be
+    converted, a record that is too short, or, without ``time``, a column given by its
+    number that rises in even steps, as a time axis does.
     """
     path = Path(path)
     roles: dict[str, Key | Sequence[Key]] = {"input": input, "output": output}
+    exciting = zip(EXCITATIONS, (reference, dither), strict=True)
+    roles |= {role: key for role, key in exciting if key is not None}
     even = resample is None
     read = read_sampled(path, roles, time=time, rate=rate, even=even, least=SHORTEST)
     if resample is not None:
@@ -238,7 +304,28 @@ def read_record(
         input_names=tuple(inputs),
         output_names=tuple(outputs),
         assumed=tuple(n for n in (*inputs, *outputs) if read.units[n] is None),
+        **{
+            role: _converted(read, role, of[0], path)
+            for role, of in (("reference", outputs), ("dither", inputs))
+            if role in roles
+        },
     )
+
+
+def _converted(read: Sampled, role: str, beside: str, path: Path) -> np.ndarray:
+    """Return the only column of ``role``, [samples], in the unit of ``beside``."""
+    (name,) = read.names[role]
+    unit, wanted = read.units[name], read.units[beside]
+    if unit is None or wanted is None:
+        return read.values[name]
+    found = factor(unit, wanted)
+    if found is None:
+        raise ValueError(
+            f"{path.name}: the {role} column {name!r} is in {unit}, and {wanted} is "
+            f"needed, the unit of {beside!r}: scale the column, and name it with its "
+            "unit"
+        )
+    return read.values[name] * found
 
 
 def _refuse_time_axes(

@@ -26,10 +26,16 @@ def average_periods(record: Record, skip: int = 1) -> Record:
     kept = slice(skip * period, count * period)
 
     def mean(columns: np.ndarray) -> np.ndarray:
-        periods = columns[kept].reshape(count - skip, period, -1)
+        periods = columns[kept].reshape(count - skip, period, *columns.shape[1:])
         return periods.mean(axis=0)
 
-    return replace(record, inputs=mean(record.inputs), outputs=mean(record.outputs))
+    return replace(
+        record,
+        inputs=mean(record.inputs),
+        outputs=mean(record.outputs),
+        reference=None if record.reference is None else mean(record.reference),
+        dither=None if record.dither is None else mean(record.dither),
+    )
 
 
 def whole_periods(record: Record, train: slice) -> Record:
@@ -45,8 +51,7 @@ def whole_periods(record: Record, train: slice) -> Record:
             f"{record.source}: {train.stop - train.start} samples to fit on hold no "
             f"whole period of {record.period}"
         )
-    part = slice(train.start, train.start + count * record.period)
-    return replace(record, inputs=record.inputs[part], outputs=record.outputs[part])
+    return record.during(slice(train.start, train.start + count * record.period))
 
 
 def resample(record: Record, factor: int = 1) -> Record:
@@ -56,8 +61,8 @@ def resample(record: Record, factor: int = 1) -> Record:
     the model must hold its input over a sample. Output k is the value at the instant k.
     Input k is the mean over the sample that starts at the instant k. Both are exact for
     a periodic signal without content at or above half the sampling rate. With a
-    ``factor`` of 1 only the inputs change. Raises ValueError if the record is not
-    exactly one period or ``factor`` is below 1.
+    ``factor`` of 1 only the inputs change. A reference and a dither are left out.
+    Raises ValueError if the record is not exactly one period or ``factor`` is below 1.
     """
     if record.period != record.samples:
         raise ValueError(
@@ -76,6 +81,8 @@ def resample(record: Record, factor: int = 1) -> Record:
         outputs=_filtered(np.ones_like(angle), record.outputs, samples),
         dt=record.dt / factor,
         period=samples,
+        reference=None,
+        dither=None,
     )
 
 
