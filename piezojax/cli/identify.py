@@ -93,6 +93,18 @@ class _Gain(click.ParamType):
     type=click.Path(path_type=Path),
     help="Hold the linear dynamics of this saved model; fit hysteresis and creep.",
 )
+@click.option(
+    "--closed-loop",
+    type=click.Choice(["direct", "indirect", "joint"]),
+    help="Approach to a record of a closed loop (default with a --reference or "
+    "--dither: direct; joint where its noise model fails).",
+)
+@click.option(
+    "--loop-controller",
+    metavar="FILE|NAME",
+    help="With --closed-loop indirect: gains.toml or the catalogued controller that "
+    "closed the loop.",
+)
 @click.option("--among", help="With 'all': compare only these and linear models.")
 @record_columns
 @click.option(
@@ -151,6 +163,8 @@ def main(
     skip,
     segment,
     dynamics,
+    closed_loop,
+    loop_controller,
     among,
     method,
     order,
@@ -211,7 +225,13 @@ def main(
             raise ValueError("--among and --test need --model all")
         loaded = [read_record(record, **columns) for record in records]
         print_columns(console, loaded)
-        options = Options(order, window, oversample, steps, load_dynamics(dynamics))
+        inside = None
+        if loop_controller is not None:
+            inside = controller_of(loop_controller, 1.0 / loaded[0].dt)
+        held_dynamics = load_dynamics(dynamics)
+        options = Options(
+            order, window, oversample, steps, held_dynamics, closed_loop, inside
+        )
         if controller is not None:
             measure(console, loaded)
             return
@@ -238,9 +258,25 @@ def main(
 
             text = bound_text(fit.about.error_bound, fit.held.dt)
             console.print(text, soft_wrap=True)
+        if fit.report.closed_loop:
+            console.print(f"closed loop: {fit.report.closed_loop}", soft_wrap=True)
         for warning in fit.report.warnings:
             console.print(f"note: {warning}", soft_wrap=True)
         console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
+
+    def controller_of(source, rate):
+        from ..catalog import CONTROLLERS, at_rate
+        from ..core.serial import load
+
+        if source in CONTROLLERS:
+            return at_rate(CONTROLLERS, source, rate)
+        if not Path(source).is_file():
+            raise ValueError(
+                f"--loop-controller {source!r} is neither a file nor one of the "
+                f"catalogue: {', '.join(CONTROLLERS)}"
+            )
+        # It ran on the stage when the record was made, whatever its alarms.
+        return load(source, accept_unsafe=True)
 
     def measure(console, loaded):
         from ..core.files import write_json

@@ -7,6 +7,8 @@ import click
 from rich.console import Console
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..identification import Record
 
 

@@ -27,7 +27,8 @@ class Extent(NamedTuple):
 
     ``modes``, ``lags`` and ``delay`` are the linear dynamics that the record shows,
     from which a recipe takes its starting values, the strongest resonance first. They
-    are empty, and the delay None, if none were found or no search was made.
+    are empty, and the delay None, if none were found or no search was made. ``reach``
+    is a factor on the distance of bounds from the modes that were found.
     """
 
     low: float  # V
@@ -41,6 +42,7 @@ class Extent(NamedTuple):
     modes: tuple[Resonance, ...] = ()
     lags: tuple[float, ...] = ()  # s, time constants
     delay: float | None = None  # s
+    reach: float = 1.0
 
     def mirrored(self) -> "Extent":
         """Return the extent of the same record with the sign of its output changed."""

@@ -73,10 +73,11 @@ def mode_bounds(extent: Extent, mode: Resonance) -> dict[str, Range]:
     a free run.
     """
     if mode in extent.modes:
-        off = max(NEAR, NEAR_DAMPED * mode.damping)
+        off = extent.reach * max(NEAR, NEAR_DAMPED * mode.damping)
+        faded = extent.reach * FADED
         return {
             "frequency": scaled_range(mode.frequency, 1.0 - off, 1.0 + off),
-            "damping": scaled_range(mode.damping, 1.0 - FADED, 1.0 + FADED),
+            "damping": scaled_range(mode.damping, 1.0 - faded, 1.0 + faded),
         }
     return {
         "frequency": Range(0.5 / extent.duration, 0.499 / extent.dt, "log"),

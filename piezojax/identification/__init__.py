@@ -2,8 +2,10 @@
 
 from .chain import DEFAULT as DEFAULT
 from .chain import chain as chain
+from .closed_loop import APPROACHES as APPROACHES
 from .compare import identify_all as identify_all
 from .estimators.estimate import Options as Options
+from .estimators.loop_response import loop_response as loop_response
 from .estimators.model_bouc_wen import bouc_wen as bouc_wen
 from .estimators.neural import fit_neural_state_space as fit_neural_state_space
 from .estimators.neural import neural_start as neural_start

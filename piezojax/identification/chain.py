@@ -90,8 +90,11 @@ def dynamics_parts(record: Record) -> str:
     return ("mode" if alone else "modes") + ("+delay" if late else "")
 
 
-def extent_of(record: Record) -> Extent:
-    """Return the ranges of a record with one input and one output, and its dynamics."""
+def extent_of(record: Record, reach: float = 1.0) -> Extent:
+    """Return the ranges of a record with one input and one output, and its dynamics.
+
+    ``reach`` is that of Extent.
+    """
     x, y = record.input, record.output
     shown, span = dynamics_of(record), record.span
     slope = span / float(np.ptp(x)) * float(np.sign(np.cov(x, y)[0, 1]) or 1.0)
@@ -110,6 +113,7 @@ def extent_of(record: Record) -> Extent:
         modes=shown.modes,
         lags=shown.lags,
         delay=shown.delay,
+        reach=reach,
     )
 
 
@@ -131,14 +135,19 @@ def slow_chain(name: str, source: str) -> list[str]:
 
 
 def structure(
-    name: str, record: Record, dynamics: HeldDynamics | None = None
+    name: str,
+    record: Record,
+    dynamics: HeldDynamics | None = None,
+    *,
+    reach: float = 1.0,
 ) -> Structure:
     """Return the chain ``name`` with starts and bounds derived from ``record``.
 
     An offset of the output is always added. With ``dynamics``, which are held, the
-    chain has no other dynamics. Raises ValueError as for ``chain`` and ``slow_chain``.
+    chain has no other dynamics. ``reach`` is that of Extent. Raises ValueError as for
+    ``chain`` and ``slow_chain``.
     """
-    extent, shown = extent_of(record), dynamics_of(record)
+    extent, shown = extent_of(record, reach), dynamics_of(record)
     known = known_parts()
     names = slow_chain(name, dynamics.source) if dynamics else chain(name)
     kinds = [known[part] for part in names]

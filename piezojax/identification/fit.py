@@ -16,7 +16,9 @@ from ..core.progress import Progress, Silent
 from ..core.system import System
 from .automatic import automatic
 from .chain import DEFAULT, shown_dynamics
+from .closed_loop import check_approach, feedback_warnings, is_closed
 from .estimators.estimate import FittedParameter, LinearDetail, Options
+from .estimators.projection import excited_columns
 from .estimators.resonances import LinearDynamics
 from .held_dynamics import HeldDynamics, combined_bound
 from .methods import method_for
@@ -51,10 +53,12 @@ class FitReport(BaseModel):
     ``residuals`` is the analysis of the free-run error; None in files of old versions.
     ``alarms`` are those of ``warnings`` that speak against any use of the model:
     columns or units that are probably wrong, and a model that explains little.
+    ``closed_loop`` says how a record of a closed loop was fitted, and with which bias.
     """
 
     model: str
     found: str = ""
+    closed_loop: str = ""
     parameters: dict[str, FittedParameter]
     train: FitError
     validation: FitError
@@ -216,8 +220,11 @@ def identify(
     longest if left out) and validated by its free run on ``validate`` (the rest if left
     out); a record without samples there is only fitted. Each of several records has its
     own zero and its own state before it. The records of the fit are the longest first.
+    A record with a reference or dither, or an approach in ``options.closed_loop``, is
+    fitted as one of a closed loop, which only ``output_error`` does without bias.
     Raises ValueError for an unknown model or method, an empty part, records of
-    different sample time or units, or if no start leads to a finite fit.
+    different sample time or units, an approach that does not suit records or method, or
+    if no start leads to a finite fit.
     """
     began, options = time.perf_counter(), options or Options()
     records = (records,) if isinstance(records, Record) else tuple(records)
@@ -225,6 +232,8 @@ def identify(
     records = tuple(sorted(records, key=lambda record: -record.samples))
     train, validate = train_and_validation(records[0].samples, train, validate)
     check_train(records, train)
+    options = options or Options()
+    check_approach(records, options)
     if model == DEFAULT:
         parts = [record.until(train.stop) for record in records]
         parts.sort(key=lambda part: -part.span)
@@ -236,7 +245,18 @@ def identify(
             f"the dynamics come from {held.source}: {model} has its own; name a chain "
             "such as coleman_hodgdon+exponential_creep"
         )
+    if held is not None and is_closed(records, options):
+        raise ValueError(
+            f"the dynamics come from {held.source}: they are held in records of an "
+            "open loop only; leave out the reference, the dither and the approach"
+        )
+    if options.closed_loop is not None and not chosen.closed_loop:
+        raise ValueError(
+            f"the method for {model!r} is for open loops; output_error fits a chain to "
+            f"a record of a closed loop by {options.closed_loop}"
+        )
     estimate = chosen.estimate(model, records, train, options, progress or Silent())
+    feedback = [] if estimate.closed_loop else feedback_warnings(records, train)
 
     def of_each(check: Callable[[Record], Iterable[str]]) -> list[str]:
         return [
@@ -262,12 +282,14 @@ def identify(
     report = FitReport(
         model=model,
         found=str(shown) if held is None else f"dynamics of {held.source}, held",
+        closed_loop=estimate.closed_loop,
         parameters=estimate.parameters,
         train=_fit_error(records, runs, train),
         validation=_fit_error(records, runs, validate),
         residuals=residuals,
         warnings=[
             *alarms,
+            *feedback,
             *of_each(assumed_units),
             *of_each(checked),
             *estimate.warnings,
@@ -331,8 +353,15 @@ def _fit_error(
 def _error_warnings(
     records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
 ) -> list[str]:
-    outputs = np.concatenate([record.outputs[part] for record in records])
-    share = unexplained_share(_errors(records, runs, part), outputs)
+    # In a closed loop a model explains the response to the excitation, and no noise.
+    errors, outputs = (
+        np.concatenate([excited_columns(record, each)[part] for record, each in pairs])
+        for pairs in (
+            [(r, run - r.outputs) for r, run in zip(records, runs, strict=True)],
+            [(r, r.outputs) for r in records],
+        )
+    )
+    share = unexplained_share(errors, outputs)
     if share <= POOR:
         return []
     return [

@@ -12,6 +12,7 @@ from ..core.progress import Progress
 from ..core.system import Affine, series
 from ..hysteresis.model import hystereses
 from .chain import OFFSET, structure, training_record
+from .closed_loop import LoopFit, is_closed, loop_fit
 from .estimators.estimate import Estimate, FittedParameter, Options, bound_warning
 from .estimators.linear import by_frequency_response, by_subspace
 from .estimators.model_bouc_wen import bouc_wen
@@ -44,17 +45,29 @@ Records = Sequence[Record]
 def _by_output_error(
     model: str, records: Records, train: slice, options: Options, progress: Progress
 ) -> Estimate:
-    shape = structure(model, training_record(records, train), options.dynamics)
-    optimum = output_error(
-        shape, records, train, steps=options.steps, progress=progress
-    )
+    if is_closed(records, options):
+        found = loop_fit(model, records, train, options, progress)
+    else:
+        shape = structure(model, training_record(records, train), options.dynamics)
+        optimum = output_error(
+            shape, records, train, steps=options.steps, progress=progress
+        )
+        found = LoopFit(optimum, optimum.system, shape, "", [])
+    system, optimum, shape = found.system, found.optimum, found.shape
     named = {
-        name: FittedParameter(value=float(value), standard_error=error)
+        name.removeprefix(found.inside): FittedParameter(
+            value=float(value), standard_error=error
+        )
         for name, value, error in zip(
             optimum.problem.space.paths, *values_and_errors(optimum), strict=True
         )
     }
-    system = optimum.system
+    warnings = _optimum_warnings(optimum, named, shape, options.steps)
+    if not found.scatter_known:
+        named = {
+            name: one.model_copy(update={"standard_error": None})
+            for name, one in named.items()
+        }
     runs, zeros = free_runs(system, records, train)
     if len(records) > 1:
         named |= {
@@ -64,13 +77,20 @@ def _by_output_error(
             for i, (record, zero) in enumerate(zip(records, zeros, strict=True))
         }
         system = replace(system, {OFFSET: get(system, OFFSET) + zeros[0]})
+    elif found.inside and OFFSET in named:
+        # An integrator in the loop hides the offset of the stage.
+        zero = float(np.mean((records[0].output - runs[0][:, 0])[train]))
+        value = float(get(system, OFFSET)) + zero
+        system, runs = replace(system, {OFFSET: value}), (runs[0] + zero,)
+        named[OFFSET] = FittedParameter(value=value, standard_error=None)
     return Estimate(
         system,
         runs,
         named,
-        _optimum_warnings(optimum, named, shape, options.steps),
+        [*found.warnings, *warnings],
         shape.order,
         bool(hystereses(shape.system)),
+        closed_loop=found.text,
     )
 
 
@@ -87,7 +107,7 @@ def _optimum_warnings(
         found.append(f"the fit had not converged after its {steps} steps")
     equal = optimum.units[optimum.losses <= optimum.losses[0] * (1.0 + EQUAL_LOSS)]
     spread = np.ptp(equal, axis=0)
-    for i, name in enumerate(optimum.problem.space.paths):
+    for i, name in enumerate(fitted):
         if name not in shown:
             found += bound_warning(name, optimum.units[0, i])
         if fitted[name].standard_error is None:
@@ -189,16 +209,20 @@ def _single(records: Records) -> Record:
 
 
 class Method(NamedTuple):
-    """Summary, names of the ``models`` (none: chains of parts) and fit of a method."""
+    """Summary, names of the ``models`` (none: chains of parts) and fit of a method.
+
+    ``closed_loop`` tells whether it takes the approaches to a closed loop.
+    """
 
     summary: str
     models: tuple[str, ...]
     estimate: Callable[[str, Records, slice, Options, Progress], Estimate]
+    closed_loop: bool = False
 
 
 METHODS: dict[str, Method] = {
     "output_error": Method(
-        "Levenberg-Marquardt on the free-run error", (), _by_output_error
+        "Levenberg-Marquardt on the free-run error", (), _by_output_error, True
     ),
     "instrumental_variables": Method(
         "(3.32) by regression, unbiased under sensor noise",

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from .estimators.loop_response import joint_response
+from .estimators.projection import excited_part
 from .estimators.welch import spectral_response
 from .records.record import EVEN, Record
 
@@ -60,14 +62,16 @@ def _clocks(record: Record) -> Iterator[str]:
 
 
 def _relation(record: Record) -> Iterator[str]:
+    # In a closed loop only the response to its excitation is that of the stage.
+    moved = excited_part(record)
     try:
-        found = spectral_response(record.input, record.output, record.dt)
+        found = spectral_response(moved.input, moved.output, record.dt)
     except ValueError:
         return
     explained = found.power * np.abs(found.response) ** 2
     total = explained / np.maximum(found.coherence, np.finfo(float).tiny)
     share = float(np.sum(explained) / max(np.sum(total), np.finfo(float).tiny))
-    correlation = float(np.corrcoef(record.input, record.output)[0, 1])
+    correlation = float(np.corrcoef(moved.input, moved.output)[0, 1])
     if share < FOLLOWS:
         yield (
             f"the output does not follow the input: it explains {100.0 * share:.0f} % "
@@ -75,6 +79,11 @@ def _relation(record: Record) -> Iterator[str]:
             "wrong? Name them with --input and --output"
         )
         return
+    if record.excitation.size:
+        found = joint_response(
+            record.input, record.output, record.excitation, record.dt
+        )
+        explained = found.power * np.abs(found.response) ** 2
     clear = (found.coherence > CLEAR) & (found.power > 1e-2 * found.power.max())
     if not clear.any():
         return

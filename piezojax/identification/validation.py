@@ -14,6 +14,7 @@ from ..core.about import About
 from ..core.error_bound import ErrorBound
 from ..core.system import System, accepts, rest_output
 from .estimators.approach import start_of
+from .estimators.projection import excited_columns
 from .fit import POOR, unexplained_share
 from .records.record import LARGEST, Record
 from .residuals.bound import joined
@@ -216,7 +217,12 @@ def _judged(
         text = "the model diverges on this record: choose another model"
         return _Judged(check, run, None, [text], [])
     faults = model_faults([record], [run], rest)
-    share = unexplained_share(error, record.outputs[rest])
+    share = unexplained_share(
+        *(
+            excited_columns(record, each)[rest]
+            for each in (run - record.outputs, record.outputs)
+        )
+    )
     alarms = [*_error_alarms(check, about, share), *faults.warnings]
     notes = [*([] if alarms else _worse(check)), *_beyond(about, record)]
     return _Judged(check, run, faults.bound, alarms, notes)

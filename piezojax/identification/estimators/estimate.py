@@ -37,6 +37,9 @@ class Options:
     and future samples in the Hankel-Toeplitz regression, ``oversample`` the number of
     simulated samples per sample of a periodic record, ``steps`` the largest number of
     steps of a descent. ``dynamics`` are those that the fit of a chain holds.
+    ``closed_loop`` is one of ``closed_loop.APPROACHES`` to a record of a closed loop,
+    chosen by the record if left out; ``controller`` is the controller that closed it,
+    for ``indirect``.
     """
 
     order: int = 4
@@ -44,6 +47,8 @@ class Options:
     oversample: int = 8
     steps: int = 200
     dynamics: HeldDynamics | None = None
+    closed_loop: str | None = None
+    controller: System | None = None
 
 
 class LinearDetail(NamedTuple):
@@ -74,6 +79,7 @@ class Estimate(NamedTuple):
     ``order`` is the number of parameters of linear dynamics that the records had to
     excite. ``hysteresis`` is True if the records also had to hold full cycles.
     ``count`` is the number of fitted parameters if ``parameters`` does not name all.
+    ``closed_loop`` says how a record of a closed loop was fitted.
     """
 
     system: System
@@ -84,6 +90,7 @@ class Estimate(NamedTuple):
     hysteresis: bool = False
     linear: LinearDetail | None = None
     count: int | None = None
+    closed_loop: str = ""
 
     def parameter_count(self) -> int:
         """Return the number of fitted parameters."""

@@ -26,6 +26,7 @@ from ...solve.multi_start import Patience, descend
 from ...solve.problem import linearised
 from ..records.record import Record
 from .approach import Start, most_likely, run_after, start_columns, start_of
+from .noise_model import NOISE_ORDER, whitening_filter
 from .structure import Structure
 
 PARALLEL_STARTS = 4
@@ -39,6 +40,12 @@ ROUGH_STEPS = 24
 
 PASSES = 3
 """Number of searches for the starts of several records, each followed by a fit."""
+
+NOISE_PASSES = 4
+"""Largest number of times that a noise model and the parameters are fitted in turn."""
+
+NOISE_SETTLED = 1e-3
+"""Relative change of the mean square of the prediction error that ends these passes."""
 
 TOLERANCE = 1e-10
 """Relative change of loss and point below which a descent ends."""
@@ -77,16 +84,17 @@ class Problem(eqx.Module):
     """Fit of one System to several records, padded to one length with zero weights.
 
     A single record begins at rest. Each of several records has its own start, stacked
-    in ``starts``. The errors behind the filter ``whitening``, if it has coefficients,
-    have the weight ``share``.
+    in ``starts``. The errors have the weight ``plain`` (0 or 1), and those behind the
+    filter ``whitening``, if it has coefficients, the weight ``share``.
     """
 
     system: System
     space: Space
-    inputs: Float[Array, "records samples"]
+    inputs: Float[Array, "records samples *m"]
     outputs: Float[Array, "records samples"]
     weights: Float[Array, "records samples"]
     starts: Start | None
+    plain: Float[Array, ""]
     whitening: Float[Array, " taps"]
     share: Float[Array, ""]
 
@@ -123,7 +131,7 @@ class Problem(eqx.Module):
         """Return the weighted errors; their sum of squares is the mean square."""
         error, unlikely = self._errors_and_starts(unit)
         error = _bounded(error)
-        counted = [self.weights * error, unlikely]
+        counted = [self.plain * self.weights * error, unlikely]
         if self.whitening.size:
             counted.append(self.share * self.weights * self.whitened(error))
         return jnp.concatenate([part.ravel() for part in counted])
@@ -145,6 +153,27 @@ class Problem(eqx.Module):
         white = jnp.linalg.norm(self.weights * self.whitened(error))
         return eqx.tree_at(lambda problem: problem.share, self, plain / white)
 
+    def predicting(self, unit: Float[Array, " n"]) -> "Problem":
+        """Return the problem of the prediction errors, whitened as those at ``unit``.
+
+        The first samples, for which the filter lacks earlier errors, do not count.
+        """
+        errors, weights = map(np.asarray, (self.errors(unit), self.weights))
+        counted = [each[used > 0.0] for each, used in zip(errors, weights, strict=True)]
+        weights = weights.copy()
+        weights[:, :NOISE_ORDER] = 0.0
+        weights /= np.sqrt(np.sum(weights**2))
+        return eqx.tree_at(
+            lambda problem: (
+                problem.whitening,
+                problem.weights,
+                problem.plain,
+                problem.share,
+            ),
+            self,
+            (*map(as_array, (whitening_filter(counted), weights, 0.0, 1.0)),),
+        )
+
 
 def _bounded(error: Array) -> Array:
     """Limit ``error``, so that a start that diverges does not affect its batch."""
@@ -165,23 +194,33 @@ def free_run(
 
 
 def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Return the free run from the rest input of the model, or from the first input."""
-    return free_run(system, input, input_before(system, input[0]))
+    """Return the free run from the rest input of the model, or from the first input.
+
+    A System of several inputs starts from the first of these.
+    """
+    before = input_before(system, input[0]) if input.ndim == 1 else input[0]
+    return free_run(system, input, before)
 
 
 def problem_of(
-    structure: Structure, records: Sequence[Record], train: slice
+    structure: Structure,
+    records: Sequence[Record],
+    train: slice,
+    drives: Sequence[np.ndarray] | None = None,
 ) -> Problem:
     """Return the fit of ``structure`` to ``records``.
 
-    Errors count over the samples ``train`` of each record.
+    Errors count over the samples ``train`` of each record. ``drives`` [samples, m] take
+    the place of the inputs of the records.
     """
+    drives = [record.input for record in records] if drives is None else drives
     count = len(records)
     samples = min(train.stop, max(record.samples for record in records))
-    inputs, outputs, weights = np.zeros((3, count, samples))
-    for row, record in enumerate(records):
+    inputs = np.zeros((count, samples, *drives[0].shape[1:]))
+    outputs, weights = np.zeros((2, count, samples))
+    for row, (record, drive) in enumerate(zip(records, drives, strict=True)):
         size = min(record.samples, samples)
-        inputs[row] = np.pad(record.input[:size], (0, samples - size), mode="edge")
+        inputs[row, :size], inputs[row, size:] = drive[:size], drive[size - 1]
         outputs[row, :size] = record.output[:size]
         weights[row, train.start : size] = 1.0
     weights /= np.sqrt(np.sum(weights))
@@ -192,6 +231,7 @@ def problem_of(
         as_array(outputs),
         as_array(weights),
         None,
+        as_array(1.0),
         as_array(structure.whitening),
         as_array(0.0),
     )
@@ -247,6 +287,8 @@ def output_error(
     *,
     steps: int = 200,
     progress: Progress | None = None,
+    noise_model: bool = False,
+    drives: Sequence[np.ndarray] | None = None,
 ) -> Optimum:
     """Fit ``structure`` to ``records`` by the mean square of the free-run error.
 
@@ -254,16 +296,26 @@ def output_error(
     structure; after a few steps only the best continue, up to ``steps`` steps. The
     error counts over the samples ``train`` of each record; the model sees the input
     alone, from the first sample on. With several records the state before each and the
-    zero of each take the place of the structure's ``own`` parameters. Raises ValueError
-    when no start leads to a finite simulation.
+    zero of each take the place of the structure's ``own`` parameters.
+
+    With a ``noise_model`` the error is that of the prediction by the model and an
+    autoregressive model of its errors, which are fitted in turn (Ljung, System
+    Identification, 2nd ed., 3.2 and 13.4): feedback from the output to the input then
+    leaves the fit unbiased, as long as the noise model whitens the errors. ``drives``
+    are as in ``problem_of``. Raises ValueError when no start leads to a finite
+    simulation.
     """
     progress = progress or Silent()
     several = len(records) > 1
     if several:
         structure = structure.without(structure.own)
-    problem, starts = problem_of(structure, records, train), structure.starts
+    problem = problem_of(structure, records, train, drives)
+    starts, whitened = structure.starts, bool(structure.whitening or noise_model)
+    if noise_model:
+        idle = jnp.zeros(NOISE_ORDER + 1)  # of the final size, to compile once
+        problem = eqx.tree_at(lambda p: p.whitening, problem, idle)
     progress.stage(f"compiling the fit of {starts.shape[1]} parameters")
-    rough = min(steps, ROUGH_STEPS) if structure.whitening or several else steps
+    rough = min(steps, ROUGH_STEPS) if whitened or several else steps
     units, losses, finished = _inside(starts), np.zeros(len(starts)), False
     rounds = PASSES if several else 1
     for left in reversed(range(rounds)):
@@ -271,18 +323,27 @@ def output_error(
             system = problem.space.put(problem.system, as_array(units[0]))
             found, *_ = starts_of(system, records, train)
             problem = at_starts(problem, found)
-        last = not left and not structure.whitening
+        last = not left and not whitened
         units, losses, finished = _descended(
             problem, _inside(units), steps if last else rough, progress
         )
-    if structure.whitening:
-        # Errors of the hysteresis may have hidden a resonance from the first fit.
-        problem = _balanced(problem, as_array(units[0]))
-        dynamics = [problem.space.paths.index(path) for path in structure.dynamics]
-        again = units.copy()
-        again[:, dynamics] = starts[0, dynamics]
-        starts = _inside(np.concatenate([again, units])[: len(units) + 1])
-        units, losses, finished = _descended(problem, starts, steps, progress)
+    before = np.inf
+    for _ in range(NOISE_PASSES if noise_model else int(whitened)):
+        point = as_array(units[0])
+        if noise_model:
+            problem = problem.predicting(point)
+        else:
+            problem = _balanced(problem, point)
+        if np.isinf(before):
+            # Errors of the hysteresis may have hidden a resonance from the first fit.
+            dynamics = [problem.space.paths.index(path) for path in structure.dynamics]
+            again = units.copy()
+            again[:, dynamics] = starts[0, dynamics]
+            units = np.concatenate([again, units])[: len(units) + 1]
+        units, losses, finished = _descended(problem, _inside(units), steps, progress)
+        if abs(before - losses[0]) <= NOISE_SETTLED * losses[0]:
+            break
+        before = losses[0]
     return Optimum(problem, units, losses, finished)
 
 
@@ -354,7 +415,7 @@ def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]
     problem, unit = optimum.problem, as_array(optimum.units[0])
     values, slopes, jacobian = map(np.asarray, _sensitivity(problem, unit))
     jacobian = jacobian / np.where(slopes == 0.0, 1.0, slopes)
-    kinds = 2 if problem.whitening.size else 1
+    kinds = 2 if problem.whitening.size and float(problem.plain) else 1
     counted = kinds * int(np.sum(np.asarray(problem.weights) > 0))
     variance = optimum.losses[0] / max(counted - unit.size, 1)
     return values, standard_errors(jacobian, variance)

@@ -108,13 +108,7 @@ def _welch(
 ) -> SpectralResponse:
     import scipy.signal  # takes long to import
 
-    size = segment or segment_length(input.size)
-    count = (2 * input.size) // size - 1
-    if size < SHORTEST or count < 2:
-        raise ValueError(
-            f"the segment is {size} samples; it must be at least {SHORTEST} and "
-            f"{input.size} samples must hold two that overlap by half"
-        )
+    size, count = segment_size(input.size, segment)
     settings = {"fs": 1.0 / dt, "nperseg": size, "detrend": "linear"}
     settings["scaling"] = "spectrum"
     frequency, power = scipy.signal.welch(input, **settings)
@@ -138,8 +132,27 @@ def _welch(
 
 
 def segment_length(samples: int) -> int:
-    """Return the number of samples in a segment by default."""
+    """Return the number of samples in a segment by default: a power of 2.
+
+    AVERAGES of them fit into ``samples``.
+    """
     return max(SHORTEST, 2 ** int(np.log2(max(1, samples // AVERAGES))))
+
+
+def segment_size(samples: int, segment: int | None) -> tuple[int, int]:
+    """Return the size of half-overlapping segments, and their number in ``samples``.
+
+    Without a ``segment`` it is ``segment_length``. Raises ValueError for a segment that
+    is too short, or of which two do not fit.
+    """
+    size = segment or segment_length(samples)
+    count = (2 * samples) // size - 1
+    if size < SHORTEST or count < 2:
+        raise ValueError(
+            f"the segment is {size} samples; it must be at least {SHORTEST} and "
+            f"{samples} samples must hold two that overlap by half"
+        )
+    return size, count
 
 
 def _excited(power: np.ndarray, least: float) -> np.ndarray:

@@ -229,13 +229,10 @@ class Record:
 
     def until(self, stop: int) -> "Record":
         """Return the first ``stop`` samples as a record; errors as for Record."""
-        return dataclasses.replace(
-            self.during(slice(stop)),
-            period=None,
-            source=f"{self.source}, first {stop} samples",
-        )
+        source = f"{self.source}, first {stop} samples"
+        return dataclasses.replace(self, period=None).during(slice(stop), source)
 
-    def during(self, part: slice) -> "Record":
+    def during(self, part: slice, source: str | None = None) -> "Record":
         """Return the samples ``part`` as a record; errors as for Record."""
         kept = {
             name: None if signal is None else signal[part]
@@ -243,7 +240,11 @@ class Record:
             for signal in [getattr(self, name)]
         }
         return dataclasses.replace(
-            self, inputs=self.inputs[part], outputs=self.outputs[part], **kept
+            self,
+            inputs=self.inputs[part],
+            outputs=self.outputs[part],
+            source=source or self.source,
+            **kept,
         )
 
     @property

@@ -4,7 +4,8 @@ The residual ``e = y - y_model`` and the output of the model respond to the same
 The relative error is the ratio ``|G_eu| / |G_mu|`` of their empirical frequency
 responses, so that the model need not be linearised. The part of the residual that is
 not a linear response (noise, and hysteresis that the model does not follow) widens the
-confidence interval.
+confidence interval. In a closed loop noise reaches the input too, and both are the
+responses to the reference or the dither, if the record holds one.
 """
 
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.error_bound import UNSEEN, ErrorBound, banded
+from ..estimators.loop_response import joint_response
 from ..estimators.welch import SHORTEST, SpectralResponse, spectral_response
 from ..records.record import Record
 
@@ -82,6 +84,8 @@ def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeErro
     if period is not None and samples < 2 * period:
         period = None
     segment = max(SHORTEST, 2 ** int(np.log2(max(1, samples // AVERAGES))))
+    if record.excitation.size and period is None:
+        return _closed_loop_error(record, run, part, segment)
     residual, own = (
         spectral_response(
             record.input[part],
@@ -102,6 +106,28 @@ def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeErro
         (CONFIDENCE * np.sqrt(residual.variance) / size)[kept],
         size[kept],
         resolution,
+    )
+
+
+def _closed_loop_error(
+    record: Record, run: np.ndarray, part: slice, segment: int
+) -> RelativeError:
+    """Return the relative error, from what the excitation of a loop explains."""
+    signals, input, error = (
+        each[part] for each in (record.excitation, record.input, record.output - run)
+    )
+    model = run[part]
+    ratio, own = (
+        joint_response(one, other, signals, record.dt, segment=segment, least=least)
+        for one, other, least in ((model, error, 0.0), (input, model, LEAST))
+    )
+    resolution = 1.0 / (segment * record.dt)
+    kept = np.isin(ratio.frequency, own.frequency[_stands_out(own, resolution)])
+    lines = np.isin(own.frequency, ratio.frequency[kept])
+    size = np.maximum(np.abs(own.response[lines]), np.finfo(float).tiny)
+    margin = CONFIDENCE * np.sqrt(ratio.variance[kept] + own.variance[lines] / size**2)
+    return RelativeError(
+        ratio.frequency[kept], np.abs(ratio.response[kept]), margin, size, resolution
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from ...core.error_bound import ErrorBound
+from ..estimators.projection import excited_columns
 from ..records.record import Record
 from .bound import RelativeError, error_bound, relative_error
 from .correlation import Correlation, autocorrelation, cross_correlation
@@ -25,7 +26,9 @@ class ResidualReport(BaseModel):
     """Analysis of the free-run error over the validation part.
 
     ``whiteness`` holds the autocorrelation of each output's residual,
-    ``input_correlation`` its correlation with each input (outputs vary slowest).
+    ``input_correlation`` its correlation with each input (outputs vary slowest); for
+    records of a closed loop with the reference and the dither, because noise is in the
+    input.
     ``peaks`` are resonances that the model lacks. ``coverage`` is the band and range of
     the whole records, ``unseen`` the part of validation that training does not cover.
     ``error_bound`` bounds the relative error of the model over frequency; it is None,
@@ -39,6 +42,11 @@ class ResidualReport(BaseModel):
     coverage: Coverage
     unseen: Unseen
     error_bound: ErrorBound | None
+
+
+def _independent(record: Record) -> np.ndarray:
+    """Return the signals [samples, k] that are independent of the noise."""
+    return record.excitation if record.excitation.size else record.inputs
 
 
 class Faults(NamedTuple):
@@ -63,7 +71,7 @@ def residual_report(
     errors = np.concatenate(
         [(r.outputs - run)[validate] for r, run in zip(records, runs, strict=True)]
     )
-    inputs = np.concatenate([record.inputs[validate] for record in records])
+    inputs = np.concatenate([_independent(record)[validate] for record in records])
     faults = model_faults(records, runs, validate)
     report = ResidualReport(
         whiteness=[autocorrelation(error) for error in errors.T],
@@ -155,7 +163,12 @@ def _gain_warnings(
 ) -> Iterator[str]:
     for output in range(runs[0].shape[1]):
         measured, modelled = (
-            np.concatenate([signal[validate, output] for signal in signals])
+            np.concatenate(
+                [
+                    excited_columns(record, signal[:, [output]])[validate, 0]
+                    for record, signal in zip(records, signals, strict=True)
+                ]
+            )
             for signals in ([record.outputs for record in records], runs)
         )
         moved = modelled - modelled.mean()

@@ -1,0 +1,68 @@
+"""Feedback from the output to the input of a record, from their predictability.
+
+Without feedback the past output does not help to predict the input from its own past
+(Caines and Chan, IEEE Trans. Automatic Control 20, 1975; Ljung, System Identification,
+2nd ed., 13.4).
+"""
+
+import numpy as np
+import scipy.stats
+
+OWN, LAGS = 80, 3
+"""Number of past samples of the input, and of the output, in a prediction. The input
+has more, because the output of a stage tells of inputs that are long past."""
+
+STRETCH = 1000
+"""Samples that are predicted with one set of coefficients: a chirp changes."""
+
+SHARE = 0.01
+"""Least share of the unpredictable part of the input that past outputs explain, from
+which the input counts as made by feedback."""
+
+PROBABILITY = 1e-4
+"""Largest probability of such a share by chance."""
+
+MOST = 40
+"""Most stretches that are used."""
+
+PREDICTABLE = 1e-10
+"""Power of the prediction error, as a share of the power of the input, below which an
+input counts as predictable from its own past."""
+
+
+def feedback_share(input: np.ndarray, output: np.ndarray) -> float:
+    """Return the share of the input's prediction error that past outputs explain.
+
+    Both [samples]. The share expected by chance is subtracted. It is 0 if the rest may
+    be due to chance, for a record shorter than STRETCH, and for an input that its own
+    past determines.
+    """
+    alone = helped = 0.0
+    more = freedom = 0
+    for start in range(0, min(input.size, MOST * STRETCH) - STRETCH + 1, STRETCH):
+        part = slice(start, start + STRETCH)
+        own, both, rows = _left(input[part], output[part])
+        if own <= PREDICTABLE * np.var(input[part]) * rows:
+            continue
+        alone, helped, more = alone + own, helped + both, more + LAGS
+        freedom += rows - OWN - LAGS - 1
+    if not more:
+        return 0.0
+    ratio = (alone - helped) / more / max(helped / freedom, 1e-300)
+    if scipy.stats.f.sf(ratio, more, freedom) > PROBABILITY:
+        return 0.0
+    return float(1.0 - helped / alone - more / (more + freedom))
+
+
+def _left(input: np.ndarray, output: np.ndarray) -> tuple[float, float, int]:
+    """Return the squares that the own past leaves, those that both leave, and rows.
+
+    y(k) does not count, which an input that acts within its sample moves too.
+    """
+    u, y = input - input.mean(), output - output.mean()
+    windows = np.lib.stride_tricks.sliding_window_view
+    own = windows(u[:-1], OWN)
+    columns = (own, np.ones(len(own)), windows(y[OWN - LAGS : -1], LAGS), u[OWN:])
+    triangle = np.asarray(np.linalg.qr(np.column_stack(columns), mode="r"))
+    rest = triangle[OWN + 1 :, -1]
+    return float(rest @ rest), float(rest[-1] ** 2), len(own)
