@@ -23,7 +23,7 @@ from .terminal import Bar
     "--estimate",
     type=SampleRange(),
     help="Samples from which the state before each record and the zero of its sensor "
-    "are estimated (default: the first fifth).",
+    "are estimated (default: a fifth, or more until the input has covered its range).",
 )
 @common
 def main(model, records, estimate, out, seed, quiet, **columns):

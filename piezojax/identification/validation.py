@@ -23,8 +23,17 @@ from .residuals.report import model_faults
 SHARE = 0.2
 """First share of a record, on which its initial state and zero are estimated."""
 
-MOST = 20_000
-"""Most samples of that part, if it is not given."""
+COVERED = 0.9
+"""Share of each input's range in the record that it has covered by the end of that
+part. Before it has, no model can tell the zero from the memory of earlier motions: only
+larger extrema wipe it out."""
+
+LATEST = 0.5
+"""Largest part of a record that is spent on the estimate."""
+
+MOST = 20_000, 100_000
+"""Most samples of that part, if it is not given: of the first part, and of one that
+goes on until the input has covered its range."""
 
 WINDOWS = 40
 """Number of stretches in which the error is compared with amplitude and rate."""
@@ -58,8 +67,8 @@ class RecordCheck(BaseModel):
 
     ``estimated`` and ``judged`` are samples, first and one past the last: the part from
     which the state before the record and the ``zero`` of each output were estimated,
-    and the part over which the errors count. ``before`` are the two levels of each
-    input between which the stage is assumed to have moved before the record. ``rmse``,
+    and the part over which the errors count. ``before`` are the levels of each input
+    over which the stage is assumed to have moved before the record. ``rmse``,
     ``largest`` and ``zero`` are in ``unit``; ``rmse`` is None if the model diverges.
     ``times_fit`` is the ratio of ``rmse`` to the error on the model's own record, if
     that is known. ``by_input`` are the errors by amplitude and rate.
@@ -69,7 +78,7 @@ class RecordCheck(BaseModel):
     rate_Hz: float  # noqa: N815
     estimated: tuple[int, int]
     judged: tuple[int, int]
-    before: list[tuple[float, float]]
+    before: list[list[float]]
     zero: list[float]
     unit: str
     rmse: float | None
@@ -115,10 +124,11 @@ def validate(
     """Validate ``system`` by its free runs over other ``records`` of its stage.
 
     The state before each record, and the zero of its sensor, are estimated on the
-    samples ``estimate`` (by default the first fifth, at most 20 000 samples); the
-    errors count over what follows. The state is that after a slow motion from rest
-    between two levels of the input, the levels with the least error. No parameter of
-    the model changes.
+    samples ``estimate``; the errors count over what follows. By default these are the
+    first fifth, at most 20 000 samples, or as many more as the input needs to cover
+    90 % of its range in the record, at most half of it and 100 000 samples. The state
+    is that after a slow motion from rest over three levels of the input, the levels
+    with the least error. No parameter of the model changes.
 
     Raises ValueError if there is no record, for units that cannot be converted to those
     of the model, another sampling rate, an ``estimate`` that leaves no samples for the
@@ -204,7 +214,7 @@ def _judged(
         rate_Hz=1.0 / record.dt,
         estimated=(part.start, part.stop),
         judged=(rest.start, rest.stop),
-        before=[(float(a), float(b)) for a, b in np.reshape(start.levels, (2, -1)).T],
+        before=np.asarray(start.levels).reshape(len(start.levels), -1).T.tolist(),
         zero=[0.0 if diverged else float(z) for z in zero],
         unit=record.output_unit,
         rmse=None if diverged else rmse,
@@ -232,7 +242,7 @@ def _part(record: Record, estimate: slice | None) -> slice:
     """Return the samples from which to estimate; ValueError if none are left."""
     samples = record.samples
     if estimate is None:
-        return slice(0, min(MOST, max(1, round(SHARE * samples))))
+        return default_part(record)
     start, stop = estimate.start or 0, estimate.stop
     if stop is None or not 0 <= start < stop < samples:
         raise ValueError(
@@ -240,6 +250,18 @@ def _part(record: Record, estimate: slice | None) -> slice:
             f"of {record.source}, and leave samples for the errors"
         )
     return slice(start, stop)
+
+
+def default_part(record: Record) -> slice:
+    """Return the samples from which state and zero are estimated by default."""
+    first, last = (
+        min(most, max(1, round(share * record.samples)))
+        for most, share in zip(MOST, (SHARE, LATEST), strict=True)
+    )
+    inputs = record.inputs
+    reached = np.maximum.accumulate(inputs) - np.minimum.accumulate(inputs)
+    enough = np.all(reached >= COVERED * np.ptp(inputs, axis=0), axis=1)
+    return slice(0, max(first, min(last, int(np.argmax(enough)) + 1)))
 
 
 def _signals(system: System, record: Record) -> np.ndarray:

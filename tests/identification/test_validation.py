@@ -13,6 +13,8 @@ from piezojax.core.error_bound import ErrorBound
 from piezojax.dynamics import FirstOrderLag, StateSpace
 from piezojax.hysteresis import PrandtlIshlinskii
 from piezojax.identification import Record, free_run, validate
+from piezojax.identification.estimators.approach import start_of
+from piezojax.identification.validation import default_part
 
 DT, NOISE = 1e-4, 2e-3
 THRESHOLDS, WEIGHTS, SLOPE = (5.0, 15.0, 30.0), (0.03, 0.02, 0.02), 0.1
@@ -97,6 +99,33 @@ def test_estimating_the_state_before_the_record_reduces_the_error():
     assert check.rmse < 1.6 * NOISE
     from_rest = np.asarray(free_run(MODEL, jnp.asarray(u), 0.0))
     assert np.std((from_rest - y)[1200:]) > 4.0 * NOISE
+
+
+@pytest.mark.parametrize(("low", "high"), [(35.0, 65.0), (10.0, 90.0)])
+def test_three_turns_beyond_the_range_of_the_record_are_found(low, high):
+    # Pairs of levels within the ranges leave more than twice the noise.
+    u = excitation(3000, low, high)
+    y = moved(u, (0.0, 112.0, 33.0, 58.0))
+    ends = np.array([20.0, 100.0])
+    start, run, zero = start_of(MODEL, u, y, slice(0, 3000), ends)
+    assert np.std(run[:, 0] - y) < 1.1 * NOISE
+    assert start.levels[1:] == pytest.approx([33.0, 58.0], abs=0.3)
+    assert zero == pytest.approx([0.0], abs=NOISE)
+
+
+def test_the_state_is_estimated_until_the_input_has_covered_its_range():
+    time = DT * np.arange(4000)
+    u = 50.0 + np.where(time < 0.15, 5.0, 40.0) * np.sin(2.0 * np.pi * 20.0 * time)
+    part = default_part(Record(u, u, DT))
+    assert part.start == 0
+    # Three quarters of the period after 0.15 s, a little less for 90 % of the range.
+    assert 0.175 < part.stop * DT < 0.1875
+    both = np.stack([u, np.where(time < 0.19, 0.0, 1.0)], axis=1)
+    assert default_part(Record(both, u, DT)).stop == 1901
+    late = np.where(time < 0.3, 0.0, u)
+    assert default_part(Record(late, u, DT)) == slice(0, 2000)
+    steady = np.where(time < 0.01, 40.0, 60.0)
+    assert default_part(Record(steady, u, DT)) == slice(0, 800)
 
 
 def test_the_simulation_is_shifted_by_the_zero():

@@ -1,11 +1,12 @@
-"""State of a stage before a record: that after a slow motion between two levels.
+"""State of a stage before a record: that after a slow motion over three levels.
 
-The last two turning points determine most of the state of a hysteresis. A record tells
-them by its first part: the pair is taken whose free run scatters least about it.
+The last turning points determine most of the state of a hysteresis. A record tells them
+by its first part: the levels are taken whose free run scatters least about it, apart
+from what the states of linear parts explain.
 """
 
+import itertools
 import math
-from itertools import product
 from typing import Any
 
 import equinox as eqx
@@ -19,15 +20,29 @@ from ...core.arrays import State
 from ...core.rollout import simulate
 from ...core.system import Series, System
 from ...hysteresis.model import hystereses
+from ...solve.multi_start import in_batches
 
-SAMPLES = 1000
-"""Samples of the motion."""
+TURNS = 3
+"""Levels of the motion before a record."""
+
+SAMPLES = 500
+"""Samples of the motion from one level to the next."""
 
 LEVELS = 9
-"""Levels of the input tried for each of the two turning points."""
+"""Levels tried for each turning point before the best ones are refined."""
 
-FINER = (-0.5, -0.25, 0.0, 0.25, 0.5)
-"""Levels around the best ones, in steps of the first grid."""
+BEYOND = 0.2
+"""Share of the input's range by which the levels may lie outside of it: a stage that
+was switched on has been at 0 V, and its record need not go there."""
+
+FINEST = 1.0 / 1024.0
+"""Share of the input's range to which the levels are refined."""
+
+ROUNDS = 20
+"""Most rounds of a refinement."""
+
+WIDTH = 3**TURNS
+"""Candidates that are simulated together."""
 
 DEVIATION = 0.3
 """Standard deviation of a linear state before a record, as a share of its difference
@@ -45,25 +60,25 @@ RESOLVED = 1e-12
 
 
 def run_after(
-    system: System, inputs: Float[Array, " samples *m"], levels: Float[Array, " 2 *m"]
+    system: System,
+    inputs: Float[Array, " samples *m"],
+    levels: Float[Array, " turns *m"],
 ) -> Array:
     """Return the outputs [samples, p] under ``inputs`` after a motion over ``levels``.
 
-    The stage rests at the first level, then moves slowly to the second and to the first
-    input. A plant maps u(k) to y(k+1), as in ``free_run``. A plant of scalar signals
-    takes [samples] and [2], and returns [samples].
+    The stage rests at the first level, then moves slowly to each of the others and to
+    the first input. A plant maps u(k) to y(k+1), as in ``free_run``. A plant of scalar
+    signals takes [samples] and [turns], and returns [samples].
     """
     return _run_from(system, inputs, _state_after(system, inputs[0], levels))
 
 
 def _state_after(system: System, first: Array, levels: Array) -> State:
     """Return the state one sample before the record."""
-    way = 0.5 - 0.5 * jnp.cos(jnp.linspace(0.0, jnp.pi, SAMPLES // 2))
+    way = 0.5 - 0.5 * jnp.cos(jnp.linspace(0.0, jnp.pi, SAMPLES))
     way = way.reshape(-1, *[1] * first.ndim)
-    path = [
-        levels[0] + (levels[1] - levels[0]) * way,
-        levels[1] + (first - levels[1]) * way,
-    ]
+    ends = [*levels, first]
+    path = [a + (b - a) * way for a, b in itertools.pairwise(ends)]
     state, _ = simulate(system, jnp.concatenate(path), system.init(levels[0]))
     return state
 
@@ -77,7 +92,7 @@ def _run_from(system: System, inputs: Array, state: State) -> Array:
 def linear_responses(
     system: System,
     inputs: Float[Array, " samples *m"],
-    levels: Float[Array, " 2 *m"],
+    levels: Float[Array, " turns *m"],
     ends: Float[Array, " 2 *m"],
 ) -> Array:
     """Return the free responses [states, samples, p] of the linear parts of ``system``.
@@ -130,10 +145,10 @@ def _with_linear(system: System, state: State, linear: Any) -> State:
 def runs_after(
     system: System,
     inputs: Float[Array, " samples *m"],
-    levels: Float[Array, " candidates 2 *m"],
+    levels: Float[Array, " candidates turns *m"],
 ) -> Array:
     """Return the outputs of ``run_after`` for each candidate of ``levels``."""
-    return jax.vmap(lambda pair: run_after(system, inputs, pair))(levels)
+    return jax.vmap(lambda turns: run_after(system, inputs, turns))(levels)
 
 
 def levels_before(
@@ -143,42 +158,82 @@ def levels_before(
     part: slice,
     ranges: np.ndarray,
 ) -> np.ndarray:
-    """Return the two levels [2, m] of the inputs whose free run fits best.
+    """Return the levels [TURNS, m] of the inputs whose free run fits best.
 
     ``inputs`` [samples, m] or [samples], ``outputs`` [samples, p] or [samples]. Errors
-    count over ``part``, except for their mean: the zero of the sensor is free.
-    ``ranges`` [2, m] or [2] are the ends of the range of the inputs. Of pairs that fit
-    equally well the first is taken, for which the stage rests at the first input.
+    count over ``part``, apart from what the zeros of the sensor and the states of the
+    linear parts explain (``most_likely``). ``ranges`` [2, m] or [2] are the ends of the
+    range of the inputs; the levels lie up to BEYOND of it outside. Two levels are
+    searched on a grid and refined; then a third one is, before, between or after them.
+    Of levels that fit equally well the first are taken, for which the stage rests at
+    the first input.
     """
-    low, high = ranges
+    width = ranges[1] - ranges[0]
+    low, high = ranges[0] - BEYOND * width, ranges[1] + BEYOND * width
     u, y = inputs[: part.stop], outputs[part].reshape(part.stop - part.start, -1)
+    drive = jnp.asarray(u)
+    rest = np.broadcast_to(inputs[0], (TURNS, *np.shape(low))).astype(float)
+    start = Start(jnp.asarray(rest), jnp.asarray(ranges), jnp.zeros(()))
+    columns = np.asarray(_columns(system, drive, start))[:, part].reshape(-1, y.size).T
+    free, own = y.shape[1], columns.shape[1]
 
-    def best(candidates: np.ndarray) -> np.ndarray:
-        runs = np.asarray(runs_after(system, jnp.asarray(u), jnp.asarray(candidates)))
+    def best(candidates: np.ndarray, variance: float) -> tuple[np.ndarray, float]:
+        """Return the candidate that fits best, and its mean square."""
+        runs = in_batches(
+            lambda some: runs_after(system, drive, some), candidates, WIDTH
+        )
         error = y - runs[:, part].reshape(len(candidates), *y.shape)
-        scatter = np.var(
-            np.clip(np.nan_to_num(error, nan=1e30), -1e30, 1e30), axis=1
-        ).sum(-1)
-        return candidates[np.argmin(scatter)]
+        error = np.clip(np.nan_to_num(error, nan=1e15), -1e15, 1e15)
+        prior = np.sqrt(variance) * np.eye(own)[free:]
+        base, _ = np.linalg.qr(np.concatenate([columns, prior]))
+        # The prior's own rows have no error.
+        error = error.reshape(len(candidates), -1)
+        left = np.sum(error**2, axis=1) - np.sum((error @ base[: y.size]) ** 2, axis=1)
+        place = int(np.argmin(left))
+        return candidates[place], max(float(left[place]), 0.0) / y.size
 
-    grid = np.linspace(0.0, 1.0, LEVELS)
+    def refined(levels: np.ndarray, variance: float) -> tuple[np.ndarray, float]:
+        step = 0.5 / (LEVELS - 1)
+        for _ in range(ROUNDS):
+            found, variance = best(
+                np.clip(levels + step * around * (high - low), low, high), variance
+            )
+            if np.array_equal(found, levels):
+                step *= 0.5
+            levels = found
+            if step < FINEST:
+                break
+        return levels, variance
+
     channels = [1] * (ranges.ndim - 1)
-    shares = np.array([*product(grid, grid)]).reshape(-1, 2, *channels)
-    first = np.broadcast_to(inputs[0], (1, *ranges.shape))
-    found = best(np.concatenate([first, low + shares * (high - low)]))
-    finer = np.array([*product(FINER, FINER)]).reshape(-1, 2, *channels) * grid[1]
-    return best(np.clip(found + finer * (high - low), low, high))
+    steps = sorted(
+        itertools.product((-1.0, 0.0, 1.0), repeat=TURNS), key=np.linalg.norm
+    )
+    around = np.array(steps).reshape(-1, TURNS, *channels)
+    grid = np.linspace(0.0, 1.0, LEVELS)
+    pairs = [(a, a, b) for a, b in itertools.product(grid, grid)]
+    shares = np.array(pairs).reshape(-1, TURNS, *channels)
+    candidates = np.concatenate([rest[None], low + shares * (high - low)])
+    levels, variance = best(candidates, float(np.mean(np.var(y, axis=0))))
+    levels, variance = refined(levels, variance)
+    third = low + grid.reshape(-1, *channels) * (high - low)
+    inserted = [
+        np.insert(levels[1:], place, level, axis=0)
+        for place in range(TURNS)
+        for level in third
+    ]
+    return refined(*best(np.stack([levels, *inserted]), variance))[0]
 
 
 class Start(eqx.Module):
-    """What came before a record: a slow motion over two levels of the input, and more.
+    """What came before a record: a slow motion over levels of the input, and more.
 
     ``ends`` are those of the range of the inputs. The zeros of the outputs and the
     linear states before the record are those that are ``most_likely`` if the other
     errors have the ``variance``.
     """
 
-    levels: Float[Array, " 2 *m"]
+    levels: Float[Array, " turns *m"]
     ends: Float[Array, " 2 *m"]
     variance: Float[Array, ""]
 
@@ -197,6 +252,11 @@ def start_columns(
     zeros = jnp.broadcast_to(jnp.eye(outputs)[:, None], (outputs, len(inputs), outputs))
     columns = jnp.concatenate([zeros, DEVIATION * responses])
     return jnp.where(jnp.isfinite(columns), columns, 0.0)
+
+
+@eqx.filter_jit
+def _columns(system: System, inputs: Array, start: Start) -> Array:
+    return start_columns(system, inputs, start)
 
 
 def most_likely(
