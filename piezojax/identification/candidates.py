@@ -95,7 +95,9 @@ def supported_parts(
     dynamics = [shown] if shown not in DYNAMICS else []
     for name in DYNAMICS:
         needed = _parameter_count(name, extent)
-        if 2 * found >= needed or name == DYNAMICS[-1]:
+        # A transient that rings excites dynamics, whatever the frequencies of the rest.
+        excited = 2 * found >= needed or bool(extent.modes)
+        if excited or name == DYNAMICS[-1]:
             dynamics.append(name)
         else:
             untried.append(UntriedModel(name, _too_few(found, needed)))
@@ -213,6 +215,11 @@ def _untried_chains(
 
 def _creep_of(model: str) -> str:
     return next((part for part in model.split("+") if part in parts_at("creep")), "")
+
+
+def single_channel(records: Sequence[Record]) -> bool:
+    """Return whether every record has one input and one output."""
+    return _not_single_channel(records) is None
 
 
 def _not_single_channel(records: Sequence[Record]) -> str | None:

@@ -100,17 +100,21 @@ def validates_as_well(errors: Errors, best: Errors) -> bool:
 
 
 def ranking(
-    bics: Sequence[float], validation: Sequence[Errors]
+    bics: Sequence[float], validation: Sequence[Errors | None]
 ) -> tuple[list[int], list[bool]]:
     """Return the order of the fits, best first, and whether each validates as well.
 
     Fits whose ``validation`` errors are not significantly above the smallest come
-    first. Both groups are sorted by BIC, lowest first.
+    first. Both groups are sorted by BIC, lowest first. Fits without errors come last.
     """
-    squares = [float(np.mean(np.concatenate(errors) ** 2)) for errors in validation]
-    best = validation[int(np.argmin(squares))]
-    well = [validates_as_well(errors, best) for errors in validation]
-    order = sorted(range(len(bics)), key=lambda i: (not well[i], bics[i]))
+    known = [errors for errors in validation if errors is not None]
+    best = min(known, key=lambda errors: float(np.mean(np.concatenate(errors) ** 2)))
+    well = [
+        errors is not None and validates_as_well(errors, best) for errors in validation
+    ]
+    order = sorted(
+        range(len(bics)), key=lambda i: (not well[i], validation[i] is None, bics[i])
+    )
     return order, well
 
 

@@ -17,11 +17,19 @@ RULE = (
 """Rule for the choice of the best model."""
 
 
+RULE_ACROSS = RULE.replace(
+    "validation error", "error on each record left out of the fit in turn"
+)
+"""Rule for several records of one input and one output."""
+
+
 class RankedModel(BaseModel):
     """Errors of a model of the ranking, or the reason why it has none.
 
-    ``parameters`` is the number of fitted parameters, ``validates_as_well`` whether the
-    model validates as well as the best, ``folder`` the place of its model.json and
+    ``parameters`` is the number of fitted parameters, ``across_rmse`` the rms error on
+    each record left out of a fit to the others, None for a single record and for a
+    model that fails on one of them. ``validates_as_well`` tells whether the model
+    validates as well as the best, ``folder`` the place of its model.json and
     fit.json.
     """
 
@@ -32,6 +40,7 @@ class RankedModel(BaseModel):
     train_rmse: float | None = None
     validation_rmse: float | None = None
     validation_rmse_percent_of_span: float | None = None
+    across_rmse: float | None = None
     aic: float | None = None
     bic: float | None = None
     validates_as_well: bool | None = None
@@ -46,7 +55,8 @@ class RankingReport(BaseModel):
     ``rows`` holds the fitted models, best first, then the failed and untried ones.
     ``test`` is the error of the best model on samples used neither by a fit nor by the
     choice, None without such a part. ``effective_samples`` (of ``samples``, for each
-    output) is the number that AIC and BIC count.
+    output) is the number that AIC and BIC count. ``across`` tells whether the models
+    were compared on records left out of their fits.
     """
 
     best: str
@@ -59,8 +69,13 @@ class RankingReport(BaseModel):
     samples: int
     effective_samples: list[float]
     interrupted: bool
+    across: bool = False
     rows: list[RankedModel]
     wall_s: float
+
+    def error_of(self, row: RankedModel) -> float | None:
+        """Return the rms error of ``row`` that the choice compared."""
+        return row.across_rmse if self.across else row.validation_rmse
 
 
 @dataclass(frozen=True)

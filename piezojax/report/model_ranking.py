@@ -107,7 +107,8 @@ def _folded(model: str) -> str:
 
 def ranking_table(report: RankingReport) -> Table:
     """Return the table of the fitted models, best first, and of the failed ones."""
-    table = Table(title=f"free-run rms error on the validation part, {report.unit}")
+    where = "each record left out" if report.across else "the validation part"
+    table = Table(title=f"free-run rms error on {where}, {report.unit}")
     table.add_column("model", no_wrap=True)
     for title in ("error  ", "para-\nmeters", "BIC", "time,\ns", "notes"):
         table.add_column(title, justify="right", no_wrap=True)
@@ -115,12 +116,15 @@ def ranking_table(report: RankingReport) -> Table:
     for row in report.rows:
         if row.status == "not tried":
             continue
-        if row.bic is None or row.validation_rmse is None:
+        if row.bic is None:
             table.add_row(_folded(row.model), "failed", "-", "-", f"{row.wall_s:.1f}")
             continue
+        error = report.error_of(row)
         table.add_row(
             _folded(row.model),
-            f"{row.validation_rmse:.3g} {' ' if row.validates_as_well else '*'}",
+            "fails *"
+            if error is None
+            else f"{error:.3g} {' ' if row.validates_as_well else '*'}",
             str(row.parameters),
             f"+{row.bic - least:.0f}",
             f"{row.wall_s:.1f}",
@@ -150,9 +154,10 @@ def ranking_notes(report: RankingReport) -> list[str]:
         notes.append("interrupted: the best of the models fitted so far")
     notes.append(f"best: {report.best} ({report.rule})")
     if report.test is None:
+        used = "each record left out" if report.across else "the validation part"
         notes.append(
-            "the choice used the validation part, so the error there is not a held-out "
-            "error; --test START:STOP reserves samples for one"
+            f"the choice used {used}, so the error there is not a held-out error; "
+            "--test START:STOP reserves samples for one"
         )
     else:
         notes.append(
@@ -184,9 +189,9 @@ def ranking_figure(ranking: ModelRanking) -> Figure:
 
 
 def _errors_panel(ax: Axes, report: RankingReport) -> None:
-    rows = [row for row in report.rows if row.validation_rmse is not None]
-    rows.sort(key=lambda row: row.validation_rmse or 0.0, reverse=True)
-    errors = np.array([row.validation_rmse for row in rows], dtype=float)
+    rows = [row for row in report.rows if report.error_of(row) is not None]
+    rows.sort(key=lambda row: report.error_of(row) or 0.0, reverse=True)
+    errors = np.array([report.error_of(row) for row in rows], dtype=float)
     for place, row in enumerate(rows):
         chosen = row.model == report.best
         colour = AFTER if chosen else MEASURED
@@ -200,6 +205,7 @@ def _errors_panel(ax: Axes, report: RankingReport) -> None:
             color=colour,
             fontweight="bold" if chosen else "normal",
         )
+    judged = "error on each record left out" if report.across else "validation error"
     ax.set_yticks(range(len(rows)), [_folded(row.model) for row in rows], fontsize=7)
     ax.set_ylim(-0.7, len(rows) - 0.3)
     ax.margins(x=0.12)
@@ -207,7 +213,7 @@ def _errors_panel(ax: Axes, report: RankingReport) -> None:
         ax.set_xscale("log")
         plain_tick_labels(ax.xaxis)
     ax.set(
-        xlabel=f"validation error ({display_unit(report.unit)} rms)",
+        xlabel=f"{judged} ({display_unit(report.unit)} rms)",
         title="Error and number of parameters; chosen in blue",
     )
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.signal
 
 from piezojax import (
     Record,
@@ -86,6 +87,24 @@ def test_one_frequency_excludes_second_order_dynamics():
         model.endswith("+lag") or model.split("+")[0] in OWN_DYNAMICS
         for model in models(found)
     )
+
+
+def test_a_step_that_rings_excites_dynamics():
+    # A mode at 60 Hz behind a step, and one frequency.
+    w, dt = 2.0 * np.pi * 60.0, 1e-3
+    time = np.arange(2000) * dt
+    input = np.sin(2.0 * np.pi * 2.0 * time) + np.where(time > 0.1, 5.0, 0.0)
+    mode = ([w**2], [1.0, 0.04 * w, w**2])
+    b, a, _ = scipy.signal.cont2discrete(mode, dt)
+    output = scipy.signal.lfilter(b[0], a, input)
+    output += 1e-3 * np.random.default_rng(0).standard_normal(2000)
+    behind, untried = supported_parts([Record(input, output, dt)], HALF)
+    assert behind.dynamics == ("mode", "arma", "lag")
+    assert untried == []
+    still = np.where(time > 0.1, input, 0.0) - np.where(time > 0.1, 5.0, 0.0)
+    behind, untried = supported_parts([Record(still, 0.1 * still, dt)], HALF)
+    assert behind.dynamics == ("lag",)
+    assert "arma" in reasons(untried)
 
 
 def test_a_short_record_excludes_creep():

@@ -2,20 +2,25 @@
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import piezojax as pj
 from piezojax import (
     Record,
     load,
 )
 from piezojax.cli.identify import main
 from piezojax.core.system import Affine
+from piezojax.dynamics import FirstOrderLag
 from piezojax.identification import (
-    compare,
+    free_run,
     identify_all,
+    model_search,
 )
+from piezojax.identification.across import errors_across
 from piezojax.identification.candidates import parts_at
 from piezojax.identification.fit import Fit, FitError, FitReport
 from piezojax.identification.ranking import RankingReport
@@ -72,7 +77,7 @@ def made(monkeypatch):
                     raise error
             return made_up(records, model, **more)
 
-        monkeypatch.setattr(compare, "identify", fit)
+        monkeypatch.setattr(model_search, "identify", fit)
 
     return install
 
@@ -129,7 +134,7 @@ def test_a_fit_with_non_finite_values_has_failed(made, monkeypatch):
             found.report.validation.rmse = np.inf
         return found
 
-    monkeypatch.setattr(compare, "identify", fit)
+    monkeypatch.setattr(model_search, "identify", fit)
     rows = identify_all(RICH).report.rows
     (row,) = (row for row in rows if row.model.startswith("shaped"))
     assert (row.status, row.note) == ("failed", "its free run is not finite")
@@ -242,6 +247,97 @@ def test_without_a_test_part_a_note_says_that_there_is_no_held_out_error(made):
 def test_bad_test_parts(parts, message):
     with pytest.raises(ValueError, match=message):
         identify_all(RICH, **parts)
+
+
+# Several records
+
+
+def test_of_several_records_each_is_left_out_in_turn(made, monkeypatch):
+    made()
+    asked = []
+
+    def left_out(records, fit_to):
+        fit = fit_to(records[1:], slice(0, 2000))
+        model = fit.report.model.split("+")[0]
+        asked.append((model, len(records), fit.train, fit.validate))
+        if model == "prandtl_ishlinskii":
+            return None
+        size = {"shaped_coleman_hodgdon": 0.5}.get(model, 1.0)
+        return tuple(size * NOISE + own for own in (0.0, 0.1))
+
+    monkeypatch.setattr(model_search, "errors_across", left_out)
+    seen = []
+    names = ["coleman_hodgdon", "shaped_coleman_hodgdon", "prandtl_ishlinskii"]
+    ranking = identify_all(
+        [RICH, RICH], hysteresis=names, done=lambda one: seen.append(one.report)
+    )
+    report = ranking.report
+    # The validation part prefers coleman_hodgdon.
+    assert report.best.split("+")[0] == "shaped_coleman_hodgdon"
+    assert "left out of the fit" in report.rule
+    assert all(one[1:] == (2, slice(0, 2000), slice(0, 2000)) for one in asked)
+    rows = {row.model.split("+")[0]: row for row in report.rows if row.bic}
+    assert rows["shaped_coleman_hodgdon"].across_rmse == pytest.approx(0.5, rel=0.1)
+    fails = rows["prandtl_ishlinskii"]
+    assert (fails.across_rmse, fails.validates_as_well) == (None, False)
+    assert "it fails there" in " ".join(ranking_notes(report))
+    assert ranking_table(report).row_count == len(ranking.fits)
+    # A fit is kept before it has been judged on other records.
+    assert [row.model for row in seen[0].rows if row.bic] == [asked_first(seen[0])]
+    assert not seen[0].across
+    assert seen[1].across
+
+
+def asked_first(report):
+    """Return the model of the only fit of a report."""
+    (model,) = (row.model for row in report.rows if row.status == "fitted")
+    return model
+
+
+def test_the_choice_across_records_does_not_see_the_test(made, monkeypatch):
+    made()
+    lengths = set()
+
+    def left_out(records, fit_to):
+        lengths.update(record.samples for record in records)
+        return (NOISE, NOISE)
+
+    monkeypatch.setattr(model_search, "errors_across", left_out)
+    identify_all([RICH, RICH], hysteresis=["coleman_hodgdon"], test=slice(1600, None))
+    assert lengths == {1600}
+
+
+def lag_of(gain):
+    """Return a fit of a first-order lag with this gain."""
+    system = pj.series(gain=Affine(gain), lag=FirstOrderLag(5e-3, 1e-3))
+    blank = FitError(rmse=0.0, rmse_percent_of_span=0.0, unit="um")
+    report = FitReport(
+        model="lag", parameters={}, train=blank, validation=blank, warnings=[], wall_s=0
+    )
+    return Fit(system, report, (RICH,), (RICH.outputs,), slice(0, 9), slice(0, 9))
+
+
+def test_errors_across_are_those_on_the_record_left_out():
+    run = np.asarray(free_run(lag_of(0.1).system, jnp.asarray(TONES), TONES[0]))
+    records = [Record(TONES, gain * run + 3.0, 1e-3) for gain in (1.0, 1.5)]
+    asked = []
+
+    def fit_to(others, part):
+        asked.append((others, part))
+        return lag_of(0.15 if others[0] is records[1] else 0.1)
+
+    found = errors_across(records, fit_to)
+    assert asked == [((records[1],), slice(0, 2000)), ((records[0],), slice(0, 2000))]
+    for error, sign in zip(found, (1.0, -1.0), strict=True):
+        assert error.shape[0] <= 1600
+        part = run[-len(error) :]
+        expected = sign * 0.5 * (part - part.mean())
+        np.testing.assert_allclose(error[:, 0] - error.mean(), expected, atol=2e-3)
+
+    def failing(others, part):
+        raise RuntimeError("xla")
+
+    assert errors_across(records, failing) is None
 
 
 # Written files

@@ -52,6 +52,35 @@ def train_and_validation(
     return train, validate
 
 
+def train_validation_and_test(
+    samples: int, train: slice | None, validate: slice | None, test: slice | None
+) -> tuple[slice, slice, slice | None]:
+    """Return the parts to fit, to validate and to test on; there may be no test.
+
+    Left out, train and validate are the halves of the samples before the test. Raises
+    ValueError for a part that is empty or outside of the ``samples``, and for a test
+    that shares samples with the others.
+    """
+    if test is None:
+        return *train_and_validation(samples, train, validate), None
+    test = slice(test.start or 0, samples if test.stop is None else test.stop)
+    if not 0 <= test.start < test.stop <= samples:
+        raise ValueError(
+            f"test is {test.start}:{test.stop}; "
+            f"it must lie in 0:{samples} and hold a sample"
+        )
+    train = train or slice(0, test.start // 2)
+    validate = validate or slice(train.stop, test.start)
+    train, validate = train_and_validation(samples, train, validate)
+    for name, part in (("train", train), ("validate", validate)):
+        if part.start < test.stop and test.start < part.stop:
+            raise ValueError(
+                f"test {test.start}:{test.stop} shares samples with {name} "
+                f"{part.start}:{part.stop}; they must not overlap"
+            )
+    return train, validate, test
+
+
 def check_train(records: tuple[Record, ...], train: slice) -> None:
     """Raise ValueError if a record ends before the part to fit begins."""
     for record in records:
