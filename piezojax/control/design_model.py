@@ -10,7 +10,15 @@ from jaxtyping import Array, Float
 from ..core.arrays import Scalar, ScalarLike, as_array
 from ..core.feedback import Feedback, LoopInput
 from ..core.system import Affine, Series, System, rest_output
-from ..dynamics import ARMA, StateSpace, fast_part, linearise, reduced, scaled_to_dc
+from ..dynamics import (
+    ARMA,
+    AmplifierSlew,
+    StateSpace,
+    fast_part,
+    linearise,
+    reduced,
+    scaled_to_dc,
+)
 from ..hardware import Sensor
 from ..hysteresis import HystereticARMA
 from ..hysteresis.inverse import Inverse
@@ -132,7 +140,9 @@ def _separated(plant: System) -> tuple[Hysteresis | None, tuple[System, ...]]:
             "a design needs one hysteresis in series with linear parts; the plant has "
             f"{', '.join(type(part).__name__ for part in parts)}"
         )
-    others = tuple(part for part in parts if not isinstance(part, Hysteresis))
+    # A slew limit acts on large steps alone, and not behind the hysteresis.
+    apart = (Hysteresis, AmplifierSlew)
+    others = tuple(part for part in parts if not isinstance(part, apart))
     return (hysteretic[0] if hysteretic else None), others
 
 

@@ -7,8 +7,9 @@ from typing import ClassVar, NamedTuple
 from .space import Range
 from .system import System
 
-PLACES = ("hysteresis", "creep", "dynamics", "lag", "delay")
-"""Places of the parts of a chain, in the order in which parts are listed."""
+PLACES = ("hysteresis", "creep", "dynamics", "lag", "delay", "drive")
+"""Places of the parts of a chain, in the order in which parts are listed. A drive is
+listed last and acts first."""
 
 
 class Resonance(NamedTuple):
@@ -26,9 +27,10 @@ class Extent(NamedTuple):
     """Ranges of the signals of a record, from which a recipe computes bounds.
 
     ``modes``, ``lags`` and ``delay`` are the linear dynamics that the record shows,
-    from which a recipe takes its starting values, the strongest resonance first. They
-    are empty, and the delay None, if none were found or no search was made. ``reach``
-    is a factor on the distance of bounds from the modes that were found.
+    from which a recipe takes its starting values, the strongest resonance first.
+    ``slew`` is the slew rate of the amplifier. They are empty, delay and slew None, if
+    none were found or no search was made. ``reach`` is a factor on the distance of
+    bounds from the modes that were found.
     """
 
     low: float  # V
@@ -42,6 +44,7 @@ class Extent(NamedTuple):
     modes: tuple[Resonance, ...] = ()
     lags: tuple[float, ...] = ()  # s, time constants
     delay: float | None = None  # s
+    slew: float | None = None  # V/s
     reach: float = 1.0
 
     def mirrored(self) -> "Extent":

@@ -32,6 +32,7 @@ from .reduction import balanced_reduction as balanced_reduction
 from .reduction import fast_part as fast_part
 from .reduction import reduced as reduced
 from .scheduled import AmplitudeScheduled as AmplitudeScheduled
+from .slew import AmplifierSlew as AmplifierSlew
 from .state_space import StateSpace as StateSpace
 from .state_space import reflected as reflected
 from .state_space import stabilised as stabilised

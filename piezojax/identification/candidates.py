@@ -98,7 +98,7 @@ def supported_parts(
         # A transient that rings excites dynamics, whatever the frequencies of the rest.
         excited = 2 * found >= needed or bool(extent.modes)
         if excited or name == DYNAMICS[-1]:
-            dynamics.append(name)
+            dynamics.append(name if extent.slew is None else f"{name}+slew")
         else:
             untried.append(UntriedModel(name, _too_few(found, needed)))
     return SupportedParts(tuple(creeps), tuple(dynamics)), untried

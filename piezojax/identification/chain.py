@@ -13,6 +13,7 @@ from ..core.space import INSIDE, Range, Space, space_of
 from ..core.system import Affine, Series, series
 from ..hysteresis.model import Hysteresis
 from .estimators.resonances import LinearDynamics, linear_dynamics
+from .estimators.slew_rate import has_steps
 from .estimators.structure import Structure
 from .held_dynamics import HeldDynamics
 from .records.record import Record
@@ -22,6 +23,9 @@ LINEAR = ("dynamics", "lag", "delay")
 
 DEFAULT = "auto"
 """Model that is fitted by default (``automatic``)."""
+
+DRIVE = "drive"
+"""Place of the part that acts first."""
 
 OFFSET = "calibration.offset"
 """Parameter that stands for the zero of the sensor."""
@@ -59,13 +63,23 @@ def is_dynamic(part: str) -> bool:
 
 
 def training_record(records: Sequence[Record], train: slice) -> Record:
-    """Return the training samples of the record with the largest range.
+    """Return the training samples of the record that shows most (``by_evidence``)."""
+    return by_evidence(records, train)[0]
 
-    Models, bounds and starts must not depend on the validation part.
+
+def by_evidence(records: Sequence[Record], train: slice) -> list[Record]:
+    """Return the training samples of the records, the one with the largest range first.
+
+    Those with steps come before the others: they show resonances and the slew rate
+    best. Models, bounds and starts must not depend on the validation part.
     """
-    return max(
-        (record.until(train.stop) for record in records), key=lambda record: record.span
-    )
+
+    def shows(record: Record) -> tuple[bool, float]:
+        single = record.inputs.shape[1] == 1
+        return single and has_steps(record.input), record.span
+
+    parts = [record.until(train.stop) for record in records]
+    return sorted(parts, key=shows, reverse=True)
 
 
 def dynamics_of(record: Record) -> LinearDynamics:
@@ -87,7 +101,8 @@ def dynamics_parts(record: Record) -> str:
         return "lag"
     late = shown.delay is not None and shown.delay > FRACTION * record.dt
     alone = len(shown.modes) == 1 and not shown.lags
-    return ("mode" if alone else "modes") + ("+delay" if late else "")
+    found = ["mode" if alone else "modes"]
+    return "+".join(found + ["delay"] * late + ["slew"] * (shown.slew is not None))
 
 
 def extent_of(record: Record, reach: float = 1.0) -> Extent:
@@ -113,6 +128,7 @@ def extent_of(record: Record, reach: float = 1.0) -> Extent:
         modes=shown.modes,
         lags=shown.lags,
         delay=shown.delay,
+        slew=shown.slew,
         reach=reach,
     )
 
@@ -151,6 +167,7 @@ def structure(
     known = known_parts()
     names = slow_chain(name, dynamics.source) if dynamics else chain(name)
     kinds = [known[part] for part in names]
+    kinds.sort(key=lambda kind: kind.part.place != DRIVE)
     falls = extent.slope < 0.0 and any(kind.rising for kind in kinds)
     described = extent.mirrored() if falls else extent
     parts = {kind.part.place: kind.recipe(described) for kind in kinds}

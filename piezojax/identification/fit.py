@@ -15,7 +15,7 @@ from ..core.paths import declared, parameters
 from ..core.progress import Progress, Silent
 from ..core.system import System
 from .automatic import automatic
-from .chain import DEFAULT, shown_dynamics
+from .chain import DEFAULT, by_evidence, shown_dynamics
 from .closed_loop import check_approach, feedback_warnings, is_closed
 from .estimators.estimate import FittedParameter, LinearDetail, Options
 from .estimators.projection import excited_columns
@@ -235,9 +235,8 @@ def identify(
     options = options or Options()
     check_approach(records, options)
     if model == DEFAULT:
-        parts = [record.until(train.stop) for record in records]
-        parts.sort(key=lambda part: -part.span)
-        model = automatic(parts[0], progress, parts[1:], options.dynamics)
+        first, *beside = by_evidence(records, train)
+        model = automatic(first, progress, beside, options.dynamics)
     shown = shown_dynamics(records, train)
     chosen, held = method_for(model, method), options.dynamics
     if held is not None and chosen.models:

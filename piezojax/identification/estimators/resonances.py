@@ -14,6 +14,7 @@ import numpy as np
 
 from ...core.recipe import Resonance
 from .refined import TransferFunction, refined_instrumental_variables
+from .slew_rate import slew_rate, slewed
 
 SHORTEST = 400
 """Least number of samples in which dynamics are looked for."""
@@ -68,6 +69,7 @@ class LinearDynamics(NamedTuple):
     ``delay`` is beyond the one sample between input and output. ``slope`` is that of
     the output over the full range of the input, below the resonances. Both are None
     where no dynamics could be looked for. ``whitening`` is the filter of the errors.
+    ``slew`` is the slew rate of the input (its unit per s), None if it shows no limit.
     """
 
     modes: tuple[Resonance, ...] = ()
@@ -75,6 +77,7 @@ class LinearDynamics(NamedTuple):
     delay: float | None = None
     slope: float | None = None
     whitening: tuple[float, ...] = ()
+    slew: float | None = None
 
     def __str__(self) -> str:
         texts = [
@@ -83,6 +86,8 @@ class LinearDynamics(NamedTuple):
             for mode in self.modes
         ]
         texts += [f"a lag of {1e3 * lag:.2g} ms" for lag in self.lags]
+        if self.slew is not None:
+            texts.append(f"a slew rate of {self.slew:.3g} V/s")
         return ", ".join(texts)
 
 
@@ -102,14 +107,27 @@ def _found(input: bytes, output: bytes, dt: float) -> LinearDynamics:
     x, y = _liveliest(np.frombuffer(input), np.frombuffer(output))
     if x.size < SHORTEST:
         return LinearDynamics()
+    output = _above_slowest(y)
+
+    def cost(x: np.ndarray) -> float:
+        # A mode and a lag. Steps tell the rate without the plays, which take long.
+        try:
+            model = refined_instrumental_variables(_above_slowest(x), output, 3, 3)
+        except (ValueError, np.linalg.LinAlgError):
+            return np.inf
+        return float(np.sqrt(model.cost))
+
+    rate = slew_rate(x, cost)
+    x = x if rate is None else slewed(x, rate)
     try:
-        model = _chosen(_Signals(_play_outputs(x), _above_slowest(y)))
+        model = _chosen(_Signals(_play_outputs(x), output))
     except (ValueError, np.linalg.LinAlgError):
         return LinearDynamics()
     modes, lags = model.modes(dt), model.lags(dt)
     delay = model.extra_delay(modes, lags, dt)
     whitening = tuple(map(float, model.dynamics.noise))
-    return LinearDynamics(modes, lags, delay, model.slope(), whitening)
+    slew = None if rate is None else rate / dt
+    return LinearDynamics(modes, lags, delay, model.slope(), whitening, slew)
 
 
 def _liveliest(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,48 @@
+"""Slew limit of the amplifier in front of a stage, which can be fitted."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+
+from ..core.arrays import Scalar, ScalarLike, as_array
+from ..core.parameter import parameter, sample_time
+from ..core.recipe import Extent, Fittable, Part, Recipe, scaled_range
+
+OFF = 0.8, 1.25
+"""Bounds of a rate, as multiples of the one estimated from the record."""
+
+SHORTEST = 2.0
+"""Samples in which the voltage crosses the range of a record that shows no limit."""
+
+
+class AmplifierSlew(Fittable):
+    """Mean over each sample of a voltage that follows its input at a limited rate.
+
+    Within a sample the voltage v moves from its last value towards the input u, by at
+    most ``rate`` dt, and stays there; the part behind it takes a voltage held over the
+    sample, which is the mean. Small motions pass unchanged. ``hardware.SlewLimit``
+    has the voltage at the end of each sample instead. Input and output in V. Raises
+    ValueError for a rate that is not positive.
+    """
+
+    part: ClassVar[Part] = Part("slew", "drive", "Slew limit of the amplifier")
+
+    rate: Scalar = parameter(
+        "V/s", "slew rate", above=0.0, scale="log", typical=(1e2, 1e7)
+    )
+    dt: float = sample_time()
+
+    @classmethod
+    def recipe(cls, extent: Extent) -> Recipe:
+        rate = extent.slew or extent.width / (SHORTEST * extent.dt)
+        return Recipe(cls(rate, extent.dt), {"rate": scaled_range(rate, *OFF)})
+
+    def init(self, input: ScalarLike = 0.0) -> Scalar:
+        return as_array(input)
+
+    def step(self, state: Scalar, input: ScalarLike) -> tuple[Scalar, Scalar]:
+        most = self.rate * self.dt
+        change = jnp.clip(as_array(input) - state, -most, most)
+        end = state + change
+        # The ramp takes the share |change| / most of the sample.
+        return end, end - 0.5 * change * jnp.abs(change) / most

@@ -1,0 +1,58 @@
+"""Slew rate of the amplifier in front of a stage that a record with steps shows."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+JUMP, STEPS, RARE = 0.05, 5, 0.02
+"""Change of the input in a sample, as a share of its range, that is a step; fewest
+steps that show a slew rate, and largest share of samples with one."""
+
+SAMPLES = tuple(np.geomspace(0.75, 75.0, 12))
+"""Samples that the largest step may take at the slew rate."""
+
+ROUNDS = 3
+"""Refinements of the slew rate, each by half of the logarithm of the last."""
+
+DROP = 0.95
+"""Factor by which a slew rate must lower the error."""
+
+
+def has_steps(x: np.ndarray) -> bool:
+    """Return whether ``x`` [samples] jumps several times, and rests or moves slowly."""
+    jumps = np.abs(np.diff(x)) > JUMP * np.ptp(x)
+    return int(np.sum(jumps)) >= STEPS and bool(np.mean(jumps) < RARE)
+
+
+def slewed(x: np.ndarray, most: float) -> np.ndarray:
+    """Return the mean over each sample of ``x`` moving by at most ``most`` in one.
+
+    As ``dynamics.AmplifierSlew``, at rest under the first sample.
+    """
+    found, last = np.empty_like(x), float(x[0])
+    for k, value in enumerate(x.tolist()):
+        change = min(max(value - last, -most), most)
+        last += change
+        found[k] = last - 0.5 * change * abs(change) / most
+    return found
+
+
+def slew_rate(x: np.ndarray, cost: Callable[[np.ndarray], float]) -> float | None:
+    """Return the largest change of ``x`` in a sample at the slew rate, or None.
+
+    ``cost`` is the error that an input leaves. The best rate of a geometric grid is
+    refined, and counts if its input leaves clearly less than ``x`` itself and the
+    largest step takes more than a sample: a shorter ramp looks like a delay.
+    """
+    if not has_steps(x):
+        return None
+    largest = float(np.max(np.abs(np.diff(x))))
+    costs = {samples: cost(slewed(x, largest / samples)) for samples in SAMPLES}
+    best, ratio = min(costs, key=lambda key: costs[key]), SAMPLES[1] / SAMPLES[0]
+    for _ in range(ROUNDS):
+        ratio = np.sqrt(ratio)
+        for samples in (best * ratio, best / ratio):
+            costs[samples] = cost(slewed(x, largest / samples))
+        best = min(costs, key=lambda key: costs[key])
+    shown = best > 1.0 and costs[best] < DROP * cost(x)
+    return float(largest / best) if shown else None

@@ -1,0 +1,88 @@
+"""The slew limit of an amplifier: its mean over a sample, and its search."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from piezojax import Record, simulate
+from piezojax.control.design_model import design_model
+from piezojax.core.system import Affine, series
+from piezojax.dynamics import AmplifierSlew, FirstOrderLag
+from piezojax.hysteresis import PrandtlIshlinskii
+from piezojax.identification.chain import dynamics_of, dynamics_parts, structure
+
+DT, RATE = 1e-4, 1e5
+FINE = 1000
+
+
+def mean_voltages(u, rate, dt=DT):
+    """Return the mean over each sample of a voltage stepped in FINE parts of it."""
+    v, found = u[0], []
+    for wanted in u:
+        path = v + np.sign(wanted - v) * rate * dt * (np.arange(FINE) + 0.5) / FINE
+        low, high = sorted((v, wanted))
+        found.append(np.clip(path, low, high).mean())
+        v += np.clip(wanted - v, -rate * dt, rate * dt)
+    return np.array(found)
+
+
+def test_the_mean_voltage_of_each_sample():
+    u = np.array([20.0, 20.0, 26.0, 26.0, 80.0, 75.0, 75.0, 0.0, 9.0, 20.0, 20.0])
+    u = np.repeat(u, 2)
+    part = AmplifierSlew(RATE, DT)
+    _, found = simulate(part, u, part.init(u[0]))
+    np.testing.assert_allclose(found, mean_voltages(u, RATE), atol=0.02)
+    assert np.max(np.abs(np.diff(found))) <= RATE * DT + 1e-9
+
+
+def test_a_rate_below_zero():
+    with pytest.raises(ValueError, match="rate"):
+        AmplifierSlew(-1.0, DT)
+
+
+def stage(u, rate, frequency=600.0, damping=0.02):
+    """Return readings of a mode behind a slew limit, with 2 nm of noise."""
+    v = u if rate is None else mean_voltages(u, rate)
+    w = 2.0 * np.pi * frequency
+    mode = ([0.1 * w**2], [1.0, 2.0 * damping * w, w**2])
+    b, a, _ = scipy.signal.cont2discrete(mode, DT)
+    y = 0.1 * v[0] + scipy.signal.lfilter(b[0], a, v - v[0])
+    return y + 2e-3 * np.random.default_rng(1).standard_normal(u.size)
+
+
+STEPS = np.repeat(np.random.default_rng(0).uniform(10.0, 90.0, 14), 150)
+
+
+def test_a_record_with_steps_shows_slew_rate_and_mode():
+    record = Record(STEPS, stage(STEPS, 4e4), DT)
+    found = dynamics_of(record)
+    assert found.slew == pytest.approx(4e4, rel=0.05)
+    assert found.modes[0].frequency == pytest.approx(600.0, rel=1e-3)
+    assert found.modes[0].damping == pytest.approx(0.02, rel=0.05)
+    assert "a slew rate of" in str(found)
+    assert dynamics_parts(record).endswith("+slew")
+    # The part acts first, wherever the name of the chain has it.
+    shape = structure(f"prandtl_ishlinskii+{dynamics_parts(record)}", record)
+    assert shape.system.names[:2] == ("drive", "hysteresis")
+    assert "drive.rate" in shape.space.paths
+
+
+def test_a_fast_amplifier_shows_no_slew_rate():
+    assert dynamics_of(Record(STEPS, stage(STEPS, None), DT)).slew is None
+
+
+def test_a_design_leaves_the_slew_limit_out():
+    parts = {
+        "hysteresis": PrandtlIshlinskii((0.1,), (5.0,), (0.02,)),
+        "lag": FirstOrderLag(1e-3, DT),
+        "calibration": Affine(1.0, 2.0),
+    }
+    with_slew = series(drive=AmplifierSlew(RATE, DT), **parts)
+    expected = design_model(series(**parts), DT, (0.0, 100.0))
+    found = design_model(with_slew, DT, (0.0, 100.0))
+    assert found.rest == pytest.approx(float(expected.rest))
+    assert found.gain() == pytest.approx(float(expected.gain()))
+    for name in ("autoregressive", "moving"):
+        np.testing.assert_allclose(
+            getattr(found.dynamics, name), getattr(expected.dynamics, name), rtol=1e-9
+        )
