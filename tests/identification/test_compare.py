@@ -307,6 +307,19 @@ def test_the_choice_across_records_does_not_see_the_test(made, monkeypatch):
     assert lengths == {1600}
 
 
+def test_a_stop_while_a_fit_is_judged_keeps_the_fit(made, monkeypatch):
+    made()
+
+    def stopped(records, fit_to):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(model_search, "errors_across", stopped)
+    found = identify_all([RICH, RICH], hysteresis=["coleman_hodgdon"])
+    assert found.report.interrupted
+    assert [row.model for row in found.report.rows if row.bic] == list(found.fits)
+    assert len(found.fits) == 1
+
+
 def lag_of(gain):
     """Return a fit of a first-order lag with this gain."""
     system = pj.series(gain=Affine(gain), lag=FirstOrderLag(5e-3, 1e-3))

@@ -107,12 +107,12 @@ def _found(input: bytes, output: bytes, dt: float) -> LinearDynamics:
     x, y = _liveliest(np.frombuffer(input), np.frombuffer(output))
     if x.size < SHORTEST:
         return LinearDynamics()
-    output = _above_slowest(y)
+    moved = _above_slowest(y)
 
     def cost(x: np.ndarray) -> float:
         # A mode and a lag. Steps tell the rate without the plays, which take long.
         try:
-            model = refined_instrumental_variables(_above_slowest(x), output, 3, 3)
+            model = refined_instrumental_variables(_above_slowest(x), moved, 3, 3)
         except (ValueError, np.linalg.LinAlgError):
             return np.inf
         return float(np.sqrt(model.cost))
@@ -120,7 +120,7 @@ def _found(input: bytes, output: bytes, dt: float) -> LinearDynamics:
     rate = slew_rate(x, cost)
     x = x if rate is None else slewed(x, rate)
     try:
-        model = _chosen(_Signals(_play_outputs(x), output))
+        model = _chosen(_Signals(_play_outputs(x), moved))
     except (ValueError, np.linalg.LinAlgError):
         return LinearDynamics()
     modes, lags = model.modes(dt), model.lags(dt)
