@@ -1,7 +1,7 @@
 """Lightly damped modes of a plant, from its linearisation."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -45,7 +45,8 @@ def plant_modes(plant: System, reference: ScalarLike, dt: float) -> list[PlantMo
     A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
     if not all(np.isfinite(m).all() for m in (A, B, C, D)):
         return []
-    poles, left, right = linalg.eig(A, left=True, right=True)
+    decomposed: Any = linalg.eig(A, left=True, right=True)
+    poles, left, right = decomposed
     found = []
     for i in np.flatnonzero((poles.imag > 1e-9) & (np.abs(poles) < 1.0)):
         rate, angle = np.log(poles[i]), float(np.angle(poles[i]))

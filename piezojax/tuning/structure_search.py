@@ -151,7 +151,9 @@ def _shown_modes(case: Case) -> tuple[list[PlantMode], list[str]]:
     may be a fit to noise.
     """
     study = case.study
-    modes = plant_modes(case.loop.plant, highest_reference(study), study.dt)
+    highest = highest_reference(study)
+    assert isinstance(highest, float)  # structures are for one axis
+    modes = plant_modes(case.loop.plant, highest, study.dt)
     bound = case.plant_about.error_bound
     if bound is None:
         return modes, []
@@ -311,14 +313,15 @@ def _row_of(
 ) -> Structure:
     """Return the figures of a tuned structure."""
     result, place = outcome.result, place_of(case)
-    notches = [
-        tuple(
-            result.gains[f"{place}.filter.{NOTCH.format(i)}.{name}"]
-            for name in ("frequency", "damping", "depth")
+    gains, dt = result.gains, case.study.dt
+
+    def notch_gain(where: str, angle: float) -> float:
+        frequency, damping, depth = (
+            gains[f"{where}.{name}"] for name in ("frequency", "damping", "depth")
         )
-        for i in range(1, len(at) + 1)
-    ]
-    dt = case.study.dt
+        return _notch_gain(frequency, damping, depth, angle, dt)
+
+    wheres = [f"{place}.filter.{NOTCH.format(i)}" for i in range(1, len(at) + 1)]
     seen = _in_loop(modes, outcome) or [(math.nan, math.nan)] * len(modes)
     errors = _errors(result)
     known = [error for error in errors if error is not None]
@@ -326,7 +329,7 @@ def _row_of(
     return Structure(
         notches=len(at),
         at_Hz=[mode.frequency for mode in at],
-        notches_Hz=[frequency for frequency, *_ in notches],
+        notches_Hz=[gains[f"{where}.frequency"] for where in wheres],
         parameters=len(result.gains),
         error_um=float(np.median(known)) if stable else None,
         worst_um=max(known) if stable else None,
@@ -339,7 +342,7 @@ def _row_of(
                 damping=mode.damping,
                 part_of_loop_gain=number(part),
                 sensitivity=number(sensitivity),
-                notch=math.prod(_notch_gain(*n, mode.angle, dt) for n in notches),
+                notch=math.prod(notch_gain(where, mode.angle) for where in wheres),
             )
             for mode, (part, sensitivity) in zip(modes, seen, strict=True)
         ],

@@ -306,10 +306,11 @@ def peak(L):
 def is_stable(angle, L):
     """Return whether a loop with one pole of L at 1 and all others inside is stable.
 
-    (z - 1) (1 + L) turns by half a circle along the upper half of the unit circle.
+    (z - 1) (1 + L) is positive at z = 1 and turns by half a circle along the upper half
+    of the unit circle.
     """
     turn = np.unwrap(np.angle((np.exp(1j * angle) - 1.0) * (1.0 + L)))
-    return bool(abs(turn[-1] - turn[0] - np.pi) < 0.5)
+    return bool(abs(turn[-1] - np.pi) < 0.5)
 
 
 def error(loop_at, references, amplitude, noise, dt):

@@ -282,6 +282,7 @@ def line_of(name, plant, steps):
         "plant": name,
         "light": len(plant.modes) - 1,
         "loops": found,
+        "gains": gains,
         "alarms": alarms,
         "seconds": time.perf_counter() - began,
     }
