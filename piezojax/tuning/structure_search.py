@@ -13,7 +13,6 @@ from ..core.paths import get, replace
 from ..core.progress import Progress
 from ..core.recipe import Resonance
 from ..study import Case
-from ..study.references import highest_reference
 from ..study.with_notches import NOTCH, OFF, moved, place_of, with_notches
 from .alarms import EXACT, HELD_OUT, PEAK, exact_figures
 from .outcome import Outcome
@@ -151,7 +150,7 @@ def _shown_modes(case: Case) -> tuple[list[PlantMode], list[str]]:
     may be a fit to noise.
     """
     study = case.study
-    highest = highest_reference(study)
+    highest = case.highest_reference
     assert isinstance(highest, float)  # structures are for one axis
     modes = plant_modes(case.loop.plant, highest, study.dt)
     bound = case.plant_about.error_bound
@@ -226,7 +225,7 @@ def _without_needless(case: Case, tuned: _Tuned) -> list[Modes]:
 def _peak(case: Case, loop: Feedback) -> float:
     """Return the exact Ms of ``loop``, infinite if it is not stable or not known."""
     study = case.study
-    reports = stability_reports({"after": loop}, highest_reference(study), study.dt)
+    reports = stability_reports({"after": loop}, case.highest_reference, study.dt)
     figures = exact_figures(reports).values()
     peaks = [found[PEAK] if found else None for found in figures]
     return max((math.inf if p is None else p for p in peaks), default=math.inf)

@@ -178,6 +178,7 @@ def _ratio(found: _Spectra, input: np.ndarray, least: float) -> SpectralResponse
         noise.clip(0.0) / power[kept] / found.averages,
         np.clip(explained / np.maximum(found.total[kept], 1e-300), 0.0, 1.0),
         power[kept],
+        found.averages,
     )
 
 
