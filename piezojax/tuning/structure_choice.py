@@ -41,11 +41,11 @@ class Structure(BaseModel):
     modes at which they were placed. ``parameters`` is the number of tuned parameters.
     ``error_um`` and ``worst_um`` are the median and the largest error of the held-out
     plants, or the geometric mean and the largest error of the references if there are
-    no such plants; None if a run diverges or rails. ``log_errors`` are the logarithms
-    of these errors (um), None where a run is lost. ``sensitivity_peak`` is the largest
-    on the plants of the hold-out, or the exact one of the nominal plant. ``alarms``
-    counts the reasons not to use the gains, ``gains`` holds them by path, and
-    ``reason`` tells why the structure was chosen or not.
+    no such plants; None if a run diverges or stays at a voltage limit. ``log_errors``
+    are the logarithms of these errors (um), None where a run is lost.
+    ``sensitivity_peak`` is the largest on the plants of the hold-out, or the exact one
+    of the nominal plant. ``alarms`` counts the reasons not to use the gains, ``gains``
+    holds them by path, and ``reason`` tells why the structure was chosen or not.
     """
 
     notches: int
@@ -158,7 +158,7 @@ def explain(structures: Sequence[Structure], chosen: int) -> None:
 
 def _reason(one: Structure, best: Structure) -> str:
     if one.error_um is None:
-        return "a run diverges or rails"
+        return "a run diverges or stays at a voltage limit"
     if one.alarms > best.alarms:
         return f"{one.alarms} alarms, those of the chosen one are {best.alarms}"
     if one.idle:
