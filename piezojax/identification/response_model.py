@@ -21,7 +21,8 @@ SMALL_MOTIONS = (
     "model; identify them from a slow record of the whole range"
 )
 LONGEST = 32
-"""Longest delay, in samples, that is interpolated; the rest of a delay is whole."""
+"""Longest delay, in samples, that is interpolated; the rest of a longer one is a whole
+number of samples."""
 
 FOLDED = 0.9
 """Share of half the rate above which a measured mode cannot be simulated."""
@@ -79,7 +80,7 @@ def identify_response(
     the input, if it does not say so itself; otherwise by an analogue analyser. At most
     ``most`` modes are fitted, by the variances of the response if it has any.
     ``measured`` goes into the report. The saved model carries a bound on its error, so
-    that a study limits the margins for what the response does not show. Raises
+    that a study limits the margins under errors that the response does not show. Raises
     ValueError for a rate that is not above 0, a mode too near half the rate, and a
     response that no mode explains.
     """

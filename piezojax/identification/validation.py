@@ -124,7 +124,7 @@ def validate(
     """Validate ``system`` by its free runs over other ``records`` of its stage.
 
     The state before each record, and the zero of its sensor, are estimated on the
-    samples ``estimate``; the errors count over what follows. By default these are the
+    samples ``estimate``; errors count over the samples after it. By default it is the
     first fifth, at most 20 000 samples, or as many more as the input needs to cover
     90 % of its range in the record, at most half of it and 100 000 samples. The state
     is that after a slow motion from rest over three levels of the input, the levels

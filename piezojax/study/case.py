@@ -41,11 +41,10 @@ class Case:
     """A study with its loop and its search space.
 
     ``references`` are those of tuning before the unseen ones, in um or in the units of
-    the axes.
-    ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
+    the axes. ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
     names to the plants of a sweep, which replace the plant of the loop. ``notes`` are
-    sentences: on starts that differ from the controller of the study, and on a design
-    whose voltage stays within the record. ``plant_about`` is the origin of a plant from
+    sentences about starts that differ from the controller of the study, and about a
+    design whose voltage stays within the record. ``plant_about`` is the origin of a plant from
     a record or a file, with the bound on its error. ``amplifier`` maps the voltage of
     the actuator to that of the piezo, both in V; it is part of the plant, and None if
     the study has none. ``beside`` maps names to the controllers that the tuned one is
@@ -80,7 +79,7 @@ class Case:
 
     @property
     def highest_reference(self) -> float | tuple[float, ...]:
-        """Highest value of all references, um; a tuple on a stage with axes.
+        """Highest value of all references, um; a tuple on several axes.
 
         It is the operating point of the margins of a study.
         """

@@ -40,7 +40,7 @@ class RecordPlant(Table):
     input. ``train``, ``validate`` and ``test`` are first samples and the samples after
     the last. ``among`` and ``test`` need the model "all". ``order``, ``window``,
     ``oversample`` and ``steps`` are those of ``identify``. ``check`` are other records
-    of the stage, with the same columns, that the fitted plant is validated on.
+    of the stage, with the same columns, on which the fitted plant is validated.
     """
 
     record: tuple[Path, ...] = Field(

@@ -1,8 +1,8 @@
-"""State of a stage before a record: that after a slow motion over three levels.
+"""State of a stage before a record, after a slow motion over three levels.
 
-The last turning points determine most of the state of a hysteresis. A record tells them
-by its first part: the levels are taken whose free run scatters least about it, apart
-from what the states of linear parts explain.
+The last turning points determine most of the state of a hysteresis. They are estimated
+from the first part of a record: the free run from the chosen levels has the least
+scatter about it, apart from the part that the states of linear parts explain.
 """
 
 import itertools
@@ -226,7 +226,7 @@ def levels_before(
 
 
 class Start(eqx.Module):
-    """What came before a record: a slow motion over levels of the input, and more.
+    """State before a record: after a slow motion over levels of the input.
 
     ``ends`` are those of the range of the inputs. The zeros of the outputs and the
     linear states before the record are those that are ``most_likely`` if the other

@@ -3,7 +3,7 @@
 The response of a stage for small motions is fitted by resonances in parallel, a lag and
 a delay in series (``modal_model``), by weighted least squares (Pintelon and Schoukens,
 System Identification, 2012, chapter 9). Modes are added one by one, each where it
-explains most of what is left, until a further one would fit noise (Bayesian information
+explains most of the residual, until a further one would fit noise (Bayesian information
 criterion).
 """
 
@@ -100,7 +100,7 @@ def modal_fit(
     every = response.frequency, response.values, noise_deviation(response)
     data = lines_of(*merged(*every), held, least, count=2)
     searched = data.omega.size
-    # Half of the numbers at least are left to tell noise from modes.
+    # At least half of the numbers remain to distinguish noise from modes.
     most = min(most, max(1, (searched - 2) // 3))
     found: list[_Found] = []
     chosen = best = _Found(Shape(0, False, True), np.zeros(1), np.inf)
@@ -188,7 +188,7 @@ def _refined(point: np.ndarray, shape: Shape, data: Lines) -> _Found:
 
 
 def _with_another_mode(found: _Found, data: Lines) -> _Found:
-    """Return the fit with one mode more, begun where it explains most.
+    """Return the fit with one mode more, started where it explains most.
 
     The places that explain most are tried with several delays, because the phase of a
     delay repeats.
@@ -220,7 +220,7 @@ def _thinned(data: Lines) -> Lines:
 
 
 def _best(tried: list[_Found]) -> list[_Found]:
-    """Return the best of what was ``tried``, each apart from the others."""
+    """Return the best of the fits ``tried``, each refined by itself."""
     starts: list[_Found] = []
     for one in sorted(tried, key=_COST):
         if all(_apart(one, other) for other in starts):
@@ -311,7 +311,7 @@ def _apart(one: _Found, other: _Found) -> bool:
 
 
 def _with_lag(found: _Found, data: Lines) -> _Found:
-    """Return the best fit with a lag, begun at three time constants."""
+    """Return the best fit with a lag, started at three time constants."""
     shape = found.shape._replace(lag=True)
     n = 3 * shape.modes
     tried = [
@@ -338,7 +338,7 @@ def _freedom(found: _Found, data: Lines) -> int:
 
 
 def _criterion(one: _Found, found: list[_Found], data: Lines) -> float:
-    """Return the information criterion; the best fit of all gives the noise.
+    """Return the information criterion, with the noise of the best fit.
 
     It is infinite if a frequency or damping lies at a bound, far outside the measured
     band or without a peak: such modes imitate a lag or the noise.
