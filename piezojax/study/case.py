@@ -41,17 +41,17 @@ class Case:
     """A study with its loop and its search space.
 
     ``references`` are those of tuning before the unseen ones, in um or in the units of
-    the axes. ``fit`` is the fit of the plant to a record, None for other plants. ``plants`` maps
-    names to the plants of a sweep, which replace the plant of the loop. ``notes`` are
-    sentences about starts that differ from the controller of the study, and about a
-    design whose voltage stays within the record. ``plant_about`` is the origin of a plant from
-    a record or a file, with the bound on its error. ``amplifier`` maps the voltage of
-    the actuator to that of the piezo, both in V; it is part of the plant, and None if
-    the study has none. ``beside`` maps names to the controllers that the tuned one is
-    compared with. ``sensor_noise``, ``output_disturbance`` and ``input_disturbance``
-    are those of files; the study of a case with the first has its rms value.
-    ``saved_residual`` is that of a plant from a file, ``response`` the model of a plant
-    that is fitted to a frequency response.
+    the axes. ``fit`` is the fit of the plant to a record, None for other plants.
+    ``plants`` maps names to the plants of a sweep, which replace the plant of the loop.
+    ``notes`` are sentences about starts that differ from the controller of the study,
+    and about a design whose voltage stays within the record. ``plant_about`` is the
+    origin of a plant from a record or a file, with the bound on its error.
+    ``amplifier`` maps the voltage of the actuator to that of the piezo, both in V; it
+    is part of the plant, and None if the study has none. ``beside`` maps names to the
+    controllers that the tuned one is compared with. ``sensor_noise``,
+    ``output_disturbance`` and ``input_disturbance`` are those of files; the study of a
+    case with the first has its rms value. ``saved_residual`` is that of a plant from a
+    file, ``response`` the model of a plant that is fitted to a frequency response.
     """
 
     study: Study
