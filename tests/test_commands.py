@@ -155,7 +155,8 @@ def test_defaults_are_those_of_the_functions():
     defaults = {option.name: option.default for option in COMMANDS["identify"].params}
     assert defaults["model"] == DEFAULT
     for field in dataclasses.fields(Options):
-        assert defaults[field.name] == field.default
+        if field.default is not None:
+            assert defaults[field.name] == field.default
     assert (*TABLES, FIGURE) == NAMES
 
 

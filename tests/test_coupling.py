@@ -205,7 +205,7 @@ def test_results_of_several_axes_have_both_pictures(tmp_path):
     case = build(study_of(BASE | {"references": references}), "small.toml", seed=None)
     time = signals.time_grid(0.2, 500.0)
     paths = jnp.zeros((1, 100, 3)).at[0, :, 1].set(signals.sine(time))
-    holdout = Signals(paths, jnp.zeros((1, 1, 100, 3)), None, ((0, 0), (0, 1), (0, 2)))
+    holdout = Signals(paths, jnp.zeros((1, 1, 100, 3)), traces=((0, 0), (0, 1), (0, 2)))
     result = result_of(case.study)
     outcome = Outcome(result, case.loop, case.loop, case, holdout)
     tuning.write_results(outcome, tmp_path)

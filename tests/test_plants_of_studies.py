@@ -11,7 +11,7 @@ from piezojax.analysis.stability import stability_reports
 from piezojax.core.serial import read_about
 from piezojax.identification import read_record
 from piezojax.identification.estimators.estimate import Options
-from piezojax.identification.estimators.modal_fit import ModalFit, ModalValue
+from piezojax.identification.estimators.modal_model import ModalFit, ModalValue
 from piezojax.identification.residual_record import (
     ResidualRecord,
     Stretch,
@@ -22,7 +22,7 @@ from piezojax.report.fit_pictures import write_model
 from piezojax.study import Study, build
 from piezojax.tuning.data import make_data
 from piezojax.tuning.make_result import _residual_notes
-from piezojax.tuning.measured_response import margins_on_response
+from piezojax.tuning.response_margins import margins_on_response
 from piezojax.tuning.unexplained import residual_disturbances
 
 RATE, PERIOD = 1000.0, 200
@@ -219,14 +219,19 @@ def response_file(folder):
 def wrong_fit(response, held=None, most=0):
     """Stand for a fit of the mode, with a gain that is 10 % too large."""
     assert (held, response.unit) == (None, "um/V")
-    one = (
-        (ModalValue(100.0, 1.0),),
-        (ModalValue(0.02, 1e-3),),
-        (ModalValue(0.11, 1e-3),),
-    )
-    values = response.values
     return ModalFit(
-        *one, None, ModalValue(3e-4, 1e-6), 1.1 * values, 1e-3 * np.abs(values)
+        frequency=(ModalValue(100.0, 1.0),),
+        damping=(ModalValue(0.02, 1e-3),),
+        gain=(ModalValue(0.11, 1e-3),),
+        share=(),
+        static_gain=ModalValue(0.11, 1e-3),
+        lag=None,
+        delay=ModalValue(3e-4, 1e-6),
+        fitted=1.1 * response.values,
+        deviation=1e-3 * np.abs(response.values),
+        excess=None,
+        searched=response.frequency.size,
+        held=held,
     )
 
 

@@ -442,7 +442,7 @@ def test_a_cut_off_below_nyquist_is_accepted(study):
             "rat is unknown; allowed are title, rate, seed, axes, plant, actuator, "
             "sensor, controller, references, tune, parameters, objective, optimiser, "
             "disturbance, ensemble, constraints, pareto, holdout_draws, beside, "
-            "sweep; did you mean 'rate'?",
+            "sweep, structures; did you mean 'rate'?",
         ),
         ("actuator/uper", 1.0, "actuator.uper is unknown; allowed are resolution, "),
         (

@@ -21,11 +21,11 @@ from .front import trace_front
 from .limited_search import search_within_limits
 from .make_objective import make_objective
 from .make_result import constraint_outcomes, make_result
-from .measured_response import margins_on_response, response_alarms
 from .model_alarms import model_alarms
 from .outcome import Outcome
 from .reach import require_reach
 from .recorded_range import recorded_range_alarms
+from .response_margins import margins_on_response, response_alarms
 from .sliding import sliding_share
 from .structure_search import search_structures
 from .tip import tip_note

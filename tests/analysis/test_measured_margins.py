@@ -11,7 +11,7 @@ from piezojax.analysis.stability.measured_margins import (
     MeasuredMargins,
     measured_margins,
 )
-from piezojax.tuning.measured_response import response_alarms
+from piezojax.tuning.response_margins import response_alarms
 
 DT = 1e-3
 # L = 0.2 / (z - 1) with two samples of delay: states are the integral and two delays.

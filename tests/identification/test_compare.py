@@ -222,14 +222,14 @@ def test_fits_and_choice_do_not_use_the_test_part(made):
     off = 0.01 * (NOISE[:, 0] + 1e-4 * np.sin(np.arange(2000)))[1600:]
     assert report.test.rmse == pytest.approx(np.sqrt(np.mean(off**2)))
     notes = " ".join(ranking_notes(report))
-    assert "neither fits nor choice used" in notes
+    assert "neither the fits nor the choice used" in notes
     assert "held-out" not in notes
 
 
 def test_without_a_test_part_a_note_says_that_there_is_no_held_out_error(made):
     made()
     notes = " ".join(ranking_notes(identify_all(RICH).report))
-    assert "--test START:STOP holds samples" in notes
+    assert "--test START:STOP reserves samples" in notes
 
 
 @pytest.mark.parametrize(

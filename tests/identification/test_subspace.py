@@ -252,5 +252,5 @@ def test_bad_sizes_are_refused(p, order, message):
 def test_a_record_with_several_inputs_is_refused():
     draw = np.random.default_rng(0).standard_normal
     record = Record(draw((200, 2)), draw((200, 3)), DT, source="lab")
-    with pytest.raises(ValueError, match="lab: the record has 2 inputs; this needs"):
+    with pytest.raises(ValueError, match="lab: the record has 2 inputs; it needs"):
         subspace.identify_channel(record, 4, 3)

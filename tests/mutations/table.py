@@ -33,8 +33,8 @@ MUTATIONS = (
     Mutation(
         "validation residual from the training part",
         "tuning/unexplained.py",
-        "where = getattr(fit, part)",
-        "where = fit.train",
+        "for one in residual.parts[part]\n        for played",
+        'for one in residual.parts["train"]\n        for played',
         (_DATA,),
     ),
     Mutation(
@@ -47,8 +47,8 @@ MUTATIONS = (
     Mutation(
         "one noise draw for all references",
         "tuning/data.py",
-        "noise = as_array(random.standard_normal(shape))",
-        "noise = as_array(0.0 * random.standard_normal(shape)"
+        "return as_array(random.standard_normal(shape))",
+        "return as_array(0.0 * random.standard_normal(shape)"
         " + random.standard_normal(shape[1:]))",
         (_DATA,),
     ),

@@ -94,22 +94,26 @@ def linear_responses(
     inputs: Float[Array, " samples *m"],
     levels: Float[Array, " turns *m"],
     ends: Float[Array, " 2 *m"],
+    few: int = FEW,
 ) -> Array:
     """Return the free responses [states, samples, p] of the linear parts of ``system``.
 
     Each is the response to a deviation of one state before the record. The deviation
     equals the difference of this state between rest at both ``ends`` of the inputs. A
     hysteresis with many states has no such response: the path over ``levels``
-    determines its state. The few states of other models fade along the path of the
-    input, nearly linearly.
+    determines its state. Up to ``few`` states of other models fade along the path of
+    the input, nearly linearly.
     """
     state = _state_after(system, inputs[0], levels)
-    flat, unravel = ravel_pytree(_linear_states(system, state))
-    rests = [ravel_pytree(_linear_states(system, system.init(end)))[0] for end in ends]
+    flat, unravel = ravel_pytree(_linear_states(system, state, few))
+    rests = [
+        ravel_pytree(_linear_states(system, system.init(end), few))[0] for end in ends
+    ]
     size = jnp.abs(rests[1] - rests[0])
 
     def run(linear: Array) -> Array:
-        return _run_from(system, inputs, _with_linear(system, state, unravel(linear)))
+        moved = _with_linear(system, state, unravel(linear), few)
+        return _run_from(system, inputs, moved)
 
     def response(deviation: Array) -> Array:
         return jax.jvp(run, (flat,), (deviation,))[1]
@@ -117,26 +121,27 @@ def linear_responses(
     return jax.vmap(response)(jnp.diag(size))
 
 
-def _is_corrected(system: System, state: State) -> bool:
+def _is_corrected(system: System, state: State, few: int) -> bool:
     count = sum(leaf.size for leaf in jax.tree.leaves(state))
-    return not hystereses(system) or count <= FEW
+    return not hystereses(system) or count <= few
 
 
-def _linear_states(system: System, state: State) -> Any:
+def _linear_states(system: System, state: State, few: int) -> Any:
     """Return the states of the parts of ``system`` that are corrected."""
     if not isinstance(system, Series):
-        return state if _is_corrected(system, state) else ()
+        return state if _is_corrected(system, state, few) else ()
     return [
-        _linear_states(part, own) for part, own in zip(system.parts, state, strict=True)
+        _linear_states(part, own, few)
+        for part, own in zip(system.parts, state, strict=True)
     ]
 
 
-def _with_linear(system: System, state: State, linear: Any) -> State:
+def _with_linear(system: System, state: State, linear: Any, few: int) -> State:
     """Return ``state`` with the states of ``_linear_states`` replaced."""
     if not isinstance(system, Series):
-        return linear if _is_corrected(system, state) else state
+        return linear if _is_corrected(system, state, few) else state
     return tuple(
-        _with_linear(part, own, new)
+        _with_linear(part, own, new, few)
         for part, own, new in zip(system.parts, state, linear, strict=True)
     )
 
@@ -161,50 +166,20 @@ def levels_before(
     """Return the levels [TURNS, m] of the inputs whose free run fits best.
 
     ``inputs`` [samples, m] or [samples], ``outputs`` [samples, p] or [samples]. Errors
-    count over ``part``, apart from what the zeros of the sensor and the states of the
-    linear parts explain (``most_likely``). ``ranges`` [2, m] or [2] are the ends of the
-    range of the inputs; the levels lie up to BEYOND of it outside. Two levels are
-    searched on a grid and refined; then a third one is, before, between or after them.
-    Of levels that fit equally well the first are taken, for which the stage rests at
-    the first input.
+    count over ``part``, apart from the part that the zeros of the sensor and the states
+    of the linear parts explain (``most_likely``). ``ranges`` [2, m] or [2] are the ends
+    of the range of the inputs; the levels lie up to BEYOND of it outside. Two levels
+    are searched on a grid and refined; then a third one is, before, between or after
+    them. The search is made twice: with the few states of a hysteresis explained like
+    those of linear parts, which leaves fewer local optima, and without. The levels are
+    those with the least error without. Of levels that fit equally well the first are
+    taken, for which the stage rests at the first input.
     """
     width = ranges[1] - ranges[0]
     low, high = ranges[0] - BEYOND * width, ranges[1] + BEYOND * width
     u, y = inputs[: part.stop], outputs[part].reshape(part.stop - part.start, -1)
     drive = jnp.asarray(u)
     rest = np.broadcast_to(inputs[0], (TURNS, *np.shape(low))).astype(float)
-    start = Start(jnp.asarray(rest), jnp.asarray(ranges), jnp.zeros(()))
-    columns = np.asarray(_columns(system, drive, start))[:, part].reshape(-1, y.size).T
-    free, own = y.shape[1], columns.shape[1]
-
-    def best(candidates: np.ndarray, variance: float) -> tuple[np.ndarray, float]:
-        """Return the candidate that fits best, and its mean square."""
-        runs = in_batches(
-            lambda some: runs_after(system, drive, some), candidates, WIDTH
-        )
-        error = y - runs[:, part].reshape(len(candidates), *y.shape)
-        error = np.clip(np.nan_to_num(error, nan=1e15), -1e15, 1e15)
-        prior = np.sqrt(variance) * np.eye(own)[free:]
-        base, _ = np.linalg.qr(np.concatenate([columns, prior]))
-        # The prior's own rows have no error.
-        error = error.reshape(len(candidates), -1)
-        left = np.sum(error**2, axis=1) - np.sum((error @ base[: y.size]) ** 2, axis=1)
-        place = int(np.argmin(left))
-        return candidates[place], max(float(left[place]), 0.0) / y.size
-
-    def refined(levels: np.ndarray, variance: float) -> tuple[np.ndarray, float]:
-        step = 0.5 / (LEVELS - 1)
-        for _ in range(ROUNDS):
-            found, variance = best(
-                np.clip(levels + step * around * (high - low), low, high), variance
-            )
-            if np.array_equal(found, levels):
-                step *= 0.5
-            levels = found
-            if step < FINEST:
-                break
-        return levels, variance
-
     channels = [1] * (ranges.ndim - 1)
     steps = sorted(
         itertools.product((-1.0, 0.0, 1.0), repeat=TURNS), key=np.linalg.norm
@@ -214,15 +189,64 @@ def levels_before(
     pairs = [(a, a, b) for a, b in itertools.product(grid, grid)]
     shares = np.array(pairs).reshape(-1, TURNS, *channels)
     candidates = np.concatenate([rest[None], low + shares * (high - low)])
-    levels, variance = best(candidates, float(np.mean(np.var(y, axis=0))))
-    levels, variance = refined(levels, variance)
     third = low + grid.reshape(-1, *channels) * (high - low)
-    inserted = [
-        np.insert(levels[1:], place, level, axis=0)
-        for place in range(TURNS)
-        for level in third
-    ]
-    return refined(*best(np.stack([levels, *inserted]), variance))[0]
+
+    def columns_of(few: int) -> np.ndarray:
+        start = Start(jnp.asarray(rest), jnp.asarray(ranges), jnp.zeros(()))
+        found = np.asarray(_columns(system, drive, start, few))
+        return found[:, part].reshape(-1, y.size).T
+
+    def best(
+        candidates: np.ndarray, columns: np.ndarray, variance: float
+    ) -> tuple[np.ndarray, float]:
+        """Return the candidate that fits best, and its mean square."""
+        runs = in_batches(
+            lambda some: runs_after(system, drive, some), candidates, WIDTH
+        )
+        error = y - runs[:, part].reshape(len(candidates), *y.shape)
+        error = np.clip(np.nan_to_num(error, nan=1e15), -1e15, 1e15)
+        prior = np.sqrt(variance) * np.eye(columns.shape[1])[y.shape[1] :]
+        base, _ = np.linalg.qr(np.concatenate([columns, prior]))
+        # The prior's own rows have no error.
+        error = error.reshape(len(candidates), -1)
+        left = np.sum(error**2, axis=1) - np.sum((error @ base[: y.size]) ** 2, axis=1)
+        place = int(np.argmin(left))
+        return candidates[place], max(float(left[place]), 0.0) / y.size
+
+    def refined(
+        levels: np.ndarray, columns: np.ndarray, variance: float
+    ) -> tuple[np.ndarray, float]:
+        step = 0.5 / (LEVELS - 1)
+        for _ in range(ROUNDS):
+            moved = np.clip(levels + step * around * (high - low), low, high)
+            found, variance = best(moved, columns, variance)
+            if np.array_equal(found, levels):
+                step *= 0.5
+            levels = found
+            if step < FINEST:
+                break
+        return levels, variance
+
+    def searched(columns: np.ndarray) -> tuple[np.ndarray, float]:
+        variance = float(np.mean(np.var(y, axis=0)))
+        levels, variance = best(candidates, columns, variance)
+        levels, variance = refined(levels, columns, variance)
+        inserted = [
+            np.insert(levels[1:], place, level, axis=0)
+            for place in range(TURNS)
+            for level in third
+        ]
+        levels, variance = best(np.stack([levels, *inserted]), columns, variance)
+        return refined(levels, columns, variance)
+
+    columns = columns_of(0)
+    levels, variance = searched(columns)
+    all_columns = columns_of(FEW)
+    if all_columns.shape == columns.shape:
+        return levels
+    smooth, _ = searched(all_columns)
+    smooth, least = refined(smooth, columns, variance)
+    return smooth if least < variance else levels
 
 
 class Start(eqx.Module):
@@ -239,14 +263,14 @@ class Start(eqx.Module):
 
 
 def start_columns(
-    system: System, inputs: Float[Array, " samples *m"], start: Start
+    system: System, inputs: Float[Array, " samples *m"], start: Start, few: int = FEW
 ) -> Float[Array, "k samples p"]:
     """Return the effect of the unknowns before a record: zeros, then linear states.
 
     A zero is 1 in the unit of the output. A state is DEVIATION times its difference
-    between rest at both ends.
+    between rest at both ends. ``few`` is that of ``linear_responses``.
     """
-    responses = linear_responses(system, inputs, start.levels, start.ends)
+    responses = linear_responses(system, inputs, start.levels, start.ends, few)
     outputs = math.prod(responses.shape[2:])
     responses = responses.reshape(*responses.shape[:2], outputs)
     zeros = jnp.broadcast_to(jnp.eye(outputs)[:, None], (outputs, len(inputs), outputs))
@@ -255,8 +279,8 @@ def start_columns(
 
 
 @eqx.filter_jit
-def _columns(system: System, inputs: Array, start: Start) -> Array:
-    return start_columns(system, inputs, start)
+def _columns(system: System, inputs: Array, start: Start, few: int) -> Array:
+    return start_columns(system, inputs, start, few)
 
 
 def most_likely(

@@ -14,7 +14,6 @@ is correlated with the excitation.
 from typing import NamedTuple
 
 import numpy as np
-import scipy.signal
 
 from ...core.feedback import Observation
 from ...core.system import System
@@ -128,6 +127,8 @@ def _spectra(
     dt: float,
     segment: int | None,
 ) -> _Spectra:
+    import scipy.signal  # takes long to import
+
     size, count = segment_size(input.size, segment)
     settings = {"fs": 1.0 / dt, "nperseg": size, "detrend": "linear"}
     settings["scaling"] = "spectrum"

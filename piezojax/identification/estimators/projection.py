@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-import scipy.signal
 
 from ..records.record import Record
 
@@ -121,6 +120,8 @@ def _regressed(signals: np.ndarray, order: int, first: int) -> tuple[np.ndarray,
 
 def _response(solution: np.ndarray, excitation: np.ndarray) -> np.ndarray:
     """Return the output [samples] of the model under the excitation alone."""
+    import scipy.signal  # takes long to import
+
     signals = excitation.shape[1]
     order = (solution.size - signals - 1) // (signals + 1)
     below = np.r_[1.0, -solution[:order]]

@@ -6,7 +6,7 @@ Without feedback the past output does not help to predict the input from its own
 """
 
 import numpy as np
-import scipy.stats
+import scipy
 
 OWN, LAGS = 80, 3
 """Number of past samples of the input, and of the output, in a prediction. The input
