@@ -7,7 +7,7 @@ scatter about it, apart from the part that the states of linear parts explain.
 
 import itertools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -168,42 +168,94 @@ def levels_before(
     ``inputs`` [samples, m] or [samples], ``outputs`` [samples, p] or [samples]. Errors
     count over ``part``, apart from the part that the zeros of the sensor and the states
     of the linear parts explain (``most_likely``). ``ranges`` [2, m] or [2] are the ends
-    of the range of the inputs; the levels lie up to BEYOND of it outside. Two levels
-    are searched on a grid and refined; then a third one is, before, between or after
-    them. The search is made twice: with the few states of a hysteresis explained like
-    those of linear parts, which leaves fewer local optima, and without. The levels are
-    those with the least error without. Of levels that fit equally well the first are
-    taken, for which the stage rests at the first input.
+    of the range of the inputs; the levels lie up to BEYOND of it outside.
+
+    The search is made twice: with the few states of a hysteresis explained like those
+    of linear parts, which leaves fewer local optima, and without. The levels are those
+    with the least error without. Of levels that fit equally well the first are taken,
+    for which the stage rests at the first input.
     """
     width = ranges[1] - ranges[0]
     low, high = ranges[0] - BEYOND * width, ranges[1] + BEYOND * width
     u, y = inputs[: part.stop], outputs[part].reshape(part.stop - part.start, -1)
-    drive = jnp.asarray(u)
-    rest = np.broadcast_to(inputs[0], (TURNS, *np.shape(low))).astype(float)
-    channels = [1] * (ranges.ndim - 1)
-    steps = sorted(
-        itertools.product((-1.0, 0.0, 1.0), repeat=TURNS), key=np.linalg.norm
-    )
-    around = np.array(steps).reshape(-1, TURNS, *channels)
-    grid = np.linspace(0.0, 1.0, LEVELS)
-    pairs = [(a, a, b) for a, b in itertools.product(grid, grid)]
-    shares = np.array(pairs).reshape(-1, TURNS, *channels)
-    candidates = np.concatenate([rest[None], low + shares * (high - low)])
-    third = low + grid.reshape(-1, *channels) * (high - low)
+    search = _LevelSearch(system, jnp.asarray(u), y, part, low, high)
+    columns, every = (search.columns(jnp.asarray(ranges), few) for few in (0, FEW))
+    found, variance = search.levels(columns)
+    if every.shape == columns.shape:
+        return found
+    smooth, _ = search.levels(every)
+    smooth, least = search.refined(smooth, columns, variance)
+    return smooth if least < variance else found
 
-    def columns_of(few: int) -> np.ndarray:
-        start = Start(jnp.asarray(rest), jnp.asarray(ranges), jnp.zeros(()))
-        found = np.asarray(_columns(system, drive, start, few))
-        return found[:, part].reshape(-1, y.size).T
 
-    def best(
-        candidates: np.ndarray, columns: np.ndarray, variance: float
+class _LevelSearch(NamedTuple):
+    """Search for the levels, from ``low`` to ``high`` [m] or scalars.
+
+    The free runs of ``system`` under ``inputs`` are compared with the ``outputs``
+    [samples, p] of ``part``. ``columns`` [samples p, k] are the effects of the zeros
+    and of the states before the record; their amounts are the most likely ones.
+    """
+
+    system: System
+    inputs: Array
+    outputs: np.ndarray
+    part: slice
+    low: np.ndarray
+    high: np.ndarray
+
+    def columns(self, ends: Array, few: int) -> np.ndarray:
+        """Return the columns for a stage at rest, with ``few`` of start_columns."""
+        start = Start(jnp.asarray(self._rest()), ends, jnp.zeros(()))
+        found = np.asarray(_columns(self.system, self.inputs, start, few))
+        return found[:, self.part].reshape(-1, self.outputs.size).T
+
+    def levels(self, columns: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the levels that fit best, and their mean square.
+
+        Two levels are searched on a grid and refined; then a third one is, before,
+        between or after them.
+        """
+        grid = np.linspace(0.0, 1.0, LEVELS)
+        pairs = [(a, a, b) for a, b in itertools.product(grid, grid)]
+        candidates = np.concatenate([self._rest()[None], self._between(pairs)])
+        variance = float(np.mean(np.var(self.outputs, axis=0)))
+        found, variance = self._best(candidates, columns, variance)
+        found, variance = self.refined(found, columns, variance)
+        inserted = [
+            np.insert(found[1:], place, level, axis=0)
+            for place in range(TURNS)
+            for level in self._between(grid)
+        ]
+        found, variance = self._best(np.stack([found, *inserted]), columns, variance)
+        return self.refined(found, columns, variance)
+
+    def refined(
+        self, levels: np.ndarray, columns: np.ndarray, variance: float
     ) -> tuple[np.ndarray, float]:
-        """Return the candidate that fits best, and its mean square."""
-        runs = in_batches(
-            lambda some: runs_after(system, drive, some), candidates, WIDTH
+        """Return the best of the levels around ``levels``, and their mean square."""
+        shifts = sorted(
+            itertools.product((-1.0, 0.0, 1.0), repeat=TURNS), key=np.linalg.norm
         )
-        error = y - runs[:, part].reshape(len(candidates), *y.shape)
+        around = self._spread(shifts) * (self.high - self.low)
+        step = 0.5 / (LEVELS - 1)
+        for _ in range(ROUNDS):
+            moved = np.clip(levels + step * around, self.low, self.high)
+            found, variance = self._best(moved, columns, variance)
+            if np.array_equal(found, levels):
+                step *= 0.5
+            levels = found
+            if step < FINEST:
+                break
+        return levels, variance
+
+    def _best(
+        self, candidates: np.ndarray, columns: np.ndarray, variance: float
+    ) -> tuple[np.ndarray, float]:
+        y = self.outputs
+        runs = in_batches(
+            lambda some: runs_after(self.system, self.inputs, some), candidates, WIDTH
+        )
+        error = y - runs[:, self.part].reshape(len(candidates), *y.shape)
         error = np.clip(np.nan_to_num(error, nan=1e15), -1e15, 1e15)
         prior = np.sqrt(variance) * np.eye(columns.shape[1])[y.shape[1] :]
         base, _ = np.linalg.qr(np.concatenate([columns, prior]))
@@ -213,40 +265,17 @@ def levels_before(
         place = int(np.argmin(left))
         return candidates[place], max(float(left[place]), 0.0) / y.size
 
-    def refined(
-        levels: np.ndarray, columns: np.ndarray, variance: float
-    ) -> tuple[np.ndarray, float]:
-        step = 0.5 / (LEVELS - 1)
-        for _ in range(ROUNDS):
-            moved = np.clip(levels + step * around * (high - low), low, high)
-            found, variance = best(moved, columns, variance)
-            if np.array_equal(found, levels):
-                step *= 0.5
-            levels = found
-            if step < FINEST:
-                break
-        return levels, variance
+    def _rest(self) -> np.ndarray:
+        first = np.asarray(self.inputs[0])
+        return np.broadcast_to(first, (TURNS, *np.shape(self.low))).astype(float)
 
-    def searched(columns: np.ndarray) -> tuple[np.ndarray, float]:
-        variance = float(np.mean(np.var(y, axis=0)))
-        levels, variance = best(candidates, columns, variance)
-        levels, variance = refined(levels, columns, variance)
-        inserted = [
-            np.insert(levels[1:], place, level, axis=0)
-            for place in range(TURNS)
-            for level in third
-        ]
-        levels, variance = best(np.stack([levels, *inserted]), columns, variance)
-        return refined(levels, columns, variance)
+    def _spread(self, shares: Any) -> np.ndarray:
+        """Return ``shares`` with a further axis for the channels, if there is one."""
+        shares = np.asarray(shares)
+        return shares.reshape(*shares.shape, *[1] * np.ndim(self.low))
 
-    columns = columns_of(0)
-    levels, variance = searched(columns)
-    all_columns = columns_of(FEW)
-    if all_columns.shape == columns.shape:
-        return levels
-    smooth, _ = searched(all_columns)
-    smooth, least = refined(smooth, columns, variance)
-    return smooth if least < variance else levels
+    def _between(self, shares: Any) -> np.ndarray:
+        return self.low + self._spread(shares) * (self.high - self.low)
 
 
 class Start(eqx.Module):
