@@ -24,6 +24,9 @@ LONGEST = 32
 """Longest delay, in samples, that is interpolated; the rest of a longer one is a whole
 number of samples."""
 
+CERTAIN = 2.0
+"""Standard errors above which a delay counts as found."""
+
 FOLDED = 0.9
 """Share of half the rate above which a measured mode cannot be simulated."""
 
@@ -201,7 +204,6 @@ def _words(fit: ModalFit) -> str:
     ]
     several = "a resonance" if len(modes) == 1 else "resonances"
     lag = "" if fit.lag is None else f", a lag of {1e3 * fit.lag.value:.3g} ms"
-    return (
-        f"{several} at {' and '.join(modes)}{lag}, a delay of "
-        f"{1e6 * fit.delay.value:.3g} us"
-    )
+    shown = fit.delay.value > CERTAIN * fit.delay.error
+    delay = f", a delay of {1e6 * fit.delay.value:.3g} us" if shown else ""
+    return f"{several} at {' and '.join(modes)}{lag}{delay}"
