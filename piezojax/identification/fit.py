@@ -232,7 +232,6 @@ def identify(
     records = tuple(sorted(records, key=lambda record: -record.samples))
     train, validate = train_and_validation(records[0].samples, train, validate)
     check_train(records, train)
-    options = options or Options()
     check_approach(records, options)
     if model == DEFAULT:
         first, *beside = by_evidence(records, train)

@@ -133,6 +133,13 @@ def exact_figures(
     return found
 
 
+def exact_peak(stability: StabilityReports) -> float:
+    """Return the exact Ms of the tuned loop, infinite if it is unstable or unknown."""
+    figures = exact_figures(stability).values()
+    peaks = [found[PEAK] if found else None for found in figures]
+    return max((np.inf if peak is None else peak for peak in peaks), default=np.inf)
+
+
 def _figures(
     report: Any, axes: Sequence[StabilityReport]
 ) -> dict[str, float | None] | None:

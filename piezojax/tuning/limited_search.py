@@ -11,7 +11,7 @@ from ..solve.multi_start import Strategy, minimise
 from ..solve.problem import TOLERANCE
 from ..solve.search_state import SearchState
 from ..study import Case
-from .alarms import EXACT, PEAK, exact_figures
+from .alarms import EXACT, PEAK, exact_peak
 from .evaluator import Carried, Evaluator
 from .make_result import constraint_outcomes
 from .model_alarms import SLACK, worst_peak
@@ -100,9 +100,7 @@ def _alarming_peak(case: Case, stability: StabilityReports) -> float:
     limit, bound = case.study.limits.get(PEAK), case.plant_about.error_bound
     if limit is None or "after" in stability.problems:
         return 0.0
-    figures = exact_figures(stability).values()
-    peaks = [found[PEAK] if found else None for found in figures]
-    nominal = max(np.inf if peak is None else peak for peak in peaks)
+    nominal = exact_peak(stability)
     worst = 0.0
     if bound is not None and "after" in stability.loops:
         worst, _ = worst_peak(bound.respected, stability)

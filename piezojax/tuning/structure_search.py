@@ -14,7 +14,7 @@ from ..core.progress import Progress
 from ..core.recipe import Resonance
 from ..study import Case
 from ..study.with_notches import NOTCH, OFF, moved, place_of, with_notches
-from .alarms import EXACT, HELD_OUT, PEAK, exact_figures
+from .alarms import EXACT, HELD_OUT, PEAK, exact_peak
 from .outcome import Outcome
 from .result import Result, number
 from .structure_choice import (
@@ -224,11 +224,8 @@ def _without_needless(case: Case, tuned: _Tuned) -> list[Modes]:
 
 def _peak(case: Case, loop: Feedback) -> float:
     """Return the exact Ms of ``loop``, infinite if it is not stable or not known."""
-    study = case.study
-    reports = stability_reports({"after": loop}, case.highest_reference, study.dt)
-    figures = exact_figures(reports).values()
-    peaks = [found[PEAK] if found else None for found in figures]
-    return max((math.inf if p is None else p for p in peaks), default=math.inf)
+    at = case.highest_reference
+    return exact_peak(stability_reports({"after": loop}, at, case.study.dt))
 
 
 def _starts(
@@ -383,10 +380,7 @@ def _largest_peak(outcome: Outcome) -> float | None:
     perturbed = outcome.result.perturbed
     if perturbed is not None and PEAK in perturbed.constraints:
         return perturbed.constraints[PEAK].value
-    figures = exact_figures(outcome.stability).values()
-    peaks = [found[PEAK] if found else None for found in figures]
-    known = [peak for peak in peaks if peak is not None]
-    return max(known) if known and len(known) == len(peaks) else None
+    return number(exact_peak(outcome.stability))
 
 
 def _notch_gain(

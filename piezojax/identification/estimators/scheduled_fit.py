@@ -41,10 +41,7 @@ def fit_scheduled(
     to y(k). Levels may come in any order. Raises ValueError as ``empirical_response``
     and AmplitudeScheduled do.
     """
-    drive = [
-        np.sqrt(np.mean([np.mean(record.inputs**2) for record in records]))
-        for records in levels
-    ]
+    drive = [_rms(records) for records in levels]
     rising = np.argsort(drive)
     measured = [empirical_response(levels[i]) for i in rising]
     measured = [one.ahead() for one in measured] if ahead else measured
