@@ -268,6 +268,8 @@ def identify(
     alarms += _error_warnings(records, runs, validate)
     gains = ([], []) if held is None else held.gain_notes(records[0])
     alarms += gains[0]
+    residuals, missing, unexplained = residual_report(records, runs, train, validate)
+    alarms += missing
     checked = partial(
         record_warnings,
         train=train,
@@ -276,7 +278,6 @@ def identify(
         order=0 if shown.modes else estimate.order,
         hysteresis=estimate.hysteresis,
     )
-    residuals, unexplained = residual_report(records, runs, train, validate)
     report = FitReport(
         model=model,
         found=str(shown) if held is None else f"dynamics of {held.source}, held",

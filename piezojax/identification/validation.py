@@ -233,7 +233,11 @@ def _judged(
             for each in (run - record.outputs, record.outputs)
         )
     )
-    alarms = [*_error_alarms(check, about, share), *faults.warnings]
+    alarms = [
+        *_error_alarms(check, about, share),
+        *faults.alarms,
+        *faults.warnings,
+    ]
     notes = [*([] if alarms else _worse(check)), *_beyond(about, record)]
     return _Judged(check, run, faults.bound, alarms, notes)
 

@@ -81,7 +81,8 @@ def noisy(output, seed=0):
 
 def analysed(input, output, run, **more):
     record = Record(input, output, DT, source="made up", **more)
-    return residual_report([record], [run[:, None]], *HALVES)
+    report, alarms, warnings = residual_report([record], [run[:, None]], *HALVES)
+    return report, [*alarms, *warnings]
 
 
 INPUT = excitation()
@@ -174,7 +175,7 @@ def test_records_of_several_channels_have_no_bound():
     inputs = np.stack([excitation(1), excitation(2)], axis=1)
     run = answer(STAGE, inputs[:, 0])[:, None]
     record = Record(inputs, noisy(run[:, 0]), DT)
-    report, _ = residual_report([record], [run], *HALVES)
+    report, *_ = residual_report([record], [run], *HALVES)
     assert report.error_bound is None
     assert len(report.input_correlation) == 2
 
@@ -362,7 +363,9 @@ def short():
 def test_only_a_fit_without_the_mode_has_an_alarm(short, tmp_path):
     fits = [identify(short, model) for model in ("lag", "mode+lag")]
     poor, right = (fit.report for fit in fits)
-    assert any("leaves a peak at 7" in text for text in poor.warnings)
+    assert any("leaves a peak at 7" in text for text in poor.alarms)
+    assert set(poor.alarms) <= set(poor.warnings)
+    assert right.alarms == []
     assert right.warnings == []
     bounds = [
         fit.about.error_bound.at([780.0])[0]

@@ -1,6 +1,6 @@
 """Residual analysis of a fit: report and warnings."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,10 @@ from .peaks import LEAST, VISIBLE, Peak, unmodelled_peaks
 
 OTHER_GAIN = 1.25
 """Least factor between the motions of stage and model that raises a warning."""
+
+GROSS = 10.0
+"""Size of a peak that the model lacks, as a multiple of the model's own gain, that
+raises an alarm: a loop designed on this model does not know its stage."""
 
 WIDE = 0.5
 """Share of the lines in an octave with an error above the model's gain that counts as
@@ -50,10 +54,14 @@ def _independent(record: Record) -> np.ndarray:
 
 
 class Faults(NamedTuple):
-    """Bound on the error of a model, resonances that it lacks, and its warnings."""
+    """Bound on the error of a model, resonances that it lacks, and its warnings.
+
+    ``alarms`` are the warnings of resonances that make the model useless for a loop.
+    """
 
     bound: ErrorBound | None
     peaks: list[Peak]
+    alarms: list[str]
     warnings: list[str]
 
 
@@ -62,8 +70,8 @@ def residual_report(
     runs: Sequence[np.ndarray],
     train: slice,
     validate: slice,
-) -> tuple[ResidualReport, list[str]]:
-    """Return the analysis of the free ``runs`` [samples, p], and its warnings.
+) -> tuple[ResidualReport, list[str], list[str]]:
+    """Return the analysis of the free ``runs`` [samples, p], its alarms and warnings.
 
     ``train`` and ``validate`` are the samples of each record that the model was fitted
     and validated on.
@@ -83,7 +91,7 @@ def residual_report(
         unseen=unseen_in(records[0].inputs[:, 0], records[0].dt, train, validate),
         error_bound=faults.bound,
     )
-    return report, [
+    return report, faults.alarms, [
         *faults.warnings,
         *_coverage_warnings(report, records[0].dt),
         *_unseen_warnings(report),
@@ -93,18 +101,20 @@ def residual_report(
 def model_faults(
     records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
 ) -> Faults:
-    """Return bound, peaks and warnings from the free ``runs`` [samples, p].
+    """Return bound, peaks, alarms and warnings from the free ``runs`` [samples, p].
 
     Bound and peaks are those of ``ResidualReport``. The bound holds for the whole
-    records; peaks and warnings are those over ``part``.
+    records; everything else holds over ``part``.
     """
     bound, relative = _relative(records, runs, part)
     peaks = [] if relative is None else unmodelled_peaks(relative)
+    gross = [peak for peak in peaks if peak.times_gain > GROSS]
     return Faults(
         bound,
         peaks,
+        [*_peak_warnings(gross)],
         [
-            *_peak_warnings(peaks),
+            *_peak_warnings(peak for peak in peaks if peak.times_gain <= GROSS),
             *([] if peaks else _response_warnings(relative)),
             *_gain_warnings(records, runs, part),
         ],
@@ -131,7 +141,7 @@ def _relative(
         return None, None
 
 
-def _peak_warnings(peaks: Sequence[Peak]) -> Iterator[str]:
+def _peak_warnings(peaks: Iterable[Peak]) -> Iterator[str]:
     for peak in peaks:
         yield (
             f"the model leaves a peak at {peak.frequency_Hz:.4g} Hz, "
