@@ -125,6 +125,15 @@ class InverseHysteresis(Inverse):
         return jnp.clip(voltage - (output - wanted) / slope, self.lower, self.upper)
 
 
+MOSTLY = 0.8
+"""Share of the steps of a model against its input that points to a wrong sign."""
+
+FALLS = (
+    ". This one falls while the input rises: reverse the sign of the displacement, or "
+    "of the voltage, in the record or in the wiring"
+)
+
+
 def check_rising(model: System, lower: ScalarLike, upper: ScalarLike) -> None:
     """Raise ValueError if the output of ``model`` does not rise with its input.
 
@@ -143,10 +152,12 @@ def check_rising(model: System, lower: ScalarLike, upper: ScalarLike) -> None:
     wrong = ~(moved * rise > 0.0) & (moved != 0.0)
     if wrong.any():
         k = int(np.argmax(wrong))
+        falls = np.mean(moved * rise < 0.0) > MOSTLY
         raise ValueError(
             f"between {path[k]:g} and {path[k + 1]:g} V the output goes from "
             f"{outputs[k]:.6g} to {outputs[k + 1]:.6g} um; an inverse needs a model "
             "whose output rises with the input on every branch"
+            + (FALLS if falls else "")
         )
 
 

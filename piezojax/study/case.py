@@ -315,7 +315,11 @@ def _designed(
         try:
             controller = design(plant, study.dt, inner)
         except ValueError:
-            raise error from None
+            raise NoInverseError(
+                f"{error}. The model has none over its record either, "
+                f"{inner[0]:.4g} to {inner[1]:.4g} V: record several cycles over the "
+                "whole range, or name another plant.model"
+            ) from None
         note(
             f"controller.design: {error}. The model has an inverse over its record, "
             f"{inner[0]:.4g} to {inner[1]:.4g} V: the voltage stays between these"

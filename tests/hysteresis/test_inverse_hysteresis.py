@@ -169,16 +169,21 @@ def test_the_inverse_at_rest_stays_at_rest():
 
 
 @pytest.mark.parametrize(
-    "model",
+    ("model", "end"),
     [
-        NormalisedBoucWen(0.05, -1.0, 0.05, 0.6),  # 0.05 - 2 sigma rho < 0
-        ColemanHodgdon(0.02, 0.12, -0.05),  # a > 2 b |c|
-        PrandtlIshlinskii((), (5.0,), (0.1,)),  # constant after a turning point
-        Duhem(((-0.1,),), ((0.0,),)),
+        (NormalisedBoucWen(0.05, -1.0, 0.05, 0.6), "branch"),  # 0.05 - 2 sigma rho < 0
+        (ColemanHodgdon(0.02, 0.12, -0.05), "branch"),  # a > 2 b |c|
+        (PrandtlIshlinskii((), (5.0,), (0.1,)), "branch"),  # constant after a turn
+        (
+            Duhem(((-0.1,),), ((0.0,),)),
+            "reverse the sign of the displacement, or of the voltage, in the record or "
+            "in the wiring",
+        ),
     ],
 )
-def test_a_model_that_is_not_monotone_has_no_inverse(model):
-    with pytest.raises(ValueError, match=r"between .* V the output goes from .* rises"):
+def test_a_model_that_is_not_monotone_has_no_inverse(model, end):
+    message = rf"between .* V the output goes from .* rises .*{end}$"
+    with pytest.raises(ValueError, match=message):
         InverseHysteresis(model, LOWER, UPPER)
 
 

@@ -91,11 +91,15 @@ def residual_report(
         unseen=unseen_in(records[0].inputs[:, 0], records[0].dt, train, validate),
         error_bound=faults.bound,
     )
-    return report, faults.alarms, [
-        *faults.warnings,
-        *_coverage_warnings(report, records[0].dt),
-        *_unseen_warnings(report),
-    ]
+    return (
+        report,
+        faults.alarms,
+        [
+            *faults.warnings,
+            *_coverage_warnings(report, records[0].dt),
+            *_unseen_warnings(report),
+        ],
+    )
 
 
 def model_faults(
