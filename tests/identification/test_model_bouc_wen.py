@@ -142,6 +142,7 @@ def test_the_true_model_reproduces_the_shared_record(benchmark):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("optimised")
 def test_white_box_on_the_shared_record(benchmark):
     mean, fresh = benchmark
     fine = resample(mean, 8)
