@@ -227,7 +227,7 @@ class _Problem(NamedTuple):
         )
         jacobian = np.column_stack([rows, np.ones(left.size), *moved])
         freedom = max(left.size - jacobian.shape[1], 1)
-        return standard_errors(jacobian, float(np.sum(left**2)) / freedom)
+        return standard_errors(jacobian.T @ jacobian, float(np.sum(left**2)) / freedom)
 
 
 def _unknowns(record: Record, model: str) -> list[SearchParameter]:

@@ -57,8 +57,9 @@ ends. A point with a parameter that tends to its bound does not converge by itse
 FAILED_LOSS = 1e11
 """Least mean square of a simulation that counts as not finite."""
 
-UNDETERMINED = 1e-12
-"""Relative singular value of the Jacobian below which a direction is undetermined."""
+UNDETERMINED = 1e-14
+"""Relative eigenvalue of J'J, scaled to a unit diagonal, below which a direction is
+undetermined: rounding errors are a hundredth of it."""
 
 
 class Optimum(NamedTuple):
@@ -397,12 +398,13 @@ def _normal_equations(
 
 
 @eqx.filter_jit
-def _sensitivity(problem: Problem, unit: Array) -> tuple[Array, Array, Array]:
-    """Return the parameters and their slopes, and the residuals' weighted Jacobian."""
-    jacobian = jax.jacfwd(lambda unknown: problem.residuals(unknown))(unit)
-    from_unit = problem.space.from_unit
-    slopes = jax.jacfwd(lambda u: from_unit(u))(unit).diagonal()
-    return from_unit(unit), slopes, jacobian
+def _parameters(problem: Problem, free: Array) -> tuple[Array, Array]:
+    """Return the parameters at ``free``, and their derivatives."""
+
+    def values(free: Array) -> Array:
+        return problem.space.from_unit(squash(free))
+
+    return jax.jvp(values, (free,), (jnp.ones_like(free),))
 
 
 def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]:
@@ -412,25 +414,28 @@ def values_and_errors(optimum: Optimum) -> tuple[np.ndarray, list[float | None]]
     residuals. A parameter in a direction that the record does not determine has the
     error None.
     """
-    problem, unit = optimum.problem, as_array(optimum.units[0])
-    values, slopes, jacobian = map(np.asarray, _sensitivity(problem, unit))
-    jacobian = jacobian / np.where(slopes == 0.0, 1.0, slopes)
+    problem, free = optimum.problem, unsquash(as_array(optimum.units))
+    values, slopes = map(np.asarray, _parameters(problem, free[0]))
+    # All points, because the program of the descents is compiled for their number.
+    curvature = np.asarray(_normal_equations(problem, free)[2][0])
+    slopes = np.where(slopes == 0.0, 1.0, slopes)
     kinds = 2 if problem.whitening.size and float(problem.plain) else 1
     counted = kinds * int(np.sum(np.asarray(problem.weights) > 0))
-    variance = optimum.losses[0] / max(counted - unit.size, 1)
-    return values, standard_errors(jacobian, variance)
+    variance = optimum.losses[0] / max(counted - values.size, 1)
+    return values, standard_errors(curvature / np.outer(slopes, slopes), variance)
 
 
-def standard_errors(jacobian: np.ndarray, variance: float) -> list[float | None]:
+def standard_errors(curvature: np.ndarray, variance: float) -> list[float | None]:
     """Return the square roots of the diagonal of ``variance`` (J'J)^-1.
 
-    None for a parameter in a direction that the ``jacobian`` does not determine.
+    ``curvature`` is J'J. None for a parameter in a direction that it does not
+    determine.
     """
-    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.sqrt(np.diag(curvature))
     scale = np.where(scale > 0.0, scale, 1.0)
-    _, strength, directions = np.linalg.svd(jacobian / scale, full_matrices=False)
-    weak = strength < UNDETERMINED * strength[0]
-    known = np.sum(directions[weak] ** 2, axis=0) < 1e-6
+    strength, directions = np.linalg.eigh(curvature / np.outer(scale, scale))
+    weak = strength < UNDETERMINED * strength[-1]
+    known = np.sum(directions[:, weak] ** 2, axis=1) < 1e-6
     inverse = np.where(weak, 0.0, 1.0 / np.where(weak, 1.0, strength))
-    spread = np.sqrt(variance * np.sum((directions.T * inverse) ** 2, axis=1)) / scale
+    spread = np.sqrt(variance * (directions**2 @ inverse)) / scale
     return [float(d) if k else None for d, k in zip(spread, known, strict=True)]
