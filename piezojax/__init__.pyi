@@ -3,6 +3,7 @@ from . import catalog as catalog
 from . import control as control
 from . import core as core
 from . import dynamics as dynamics
+from . import exporting as exporting
 from . import hardware as hardware
 from . import hysteresis as hysteresis
 from . import identification as identification
@@ -31,6 +32,7 @@ from .core.system import Parallel as Parallel
 from .core.system import Series as Series
 from .core.system import System as System
 from .core.system import series as series
+from .exporting import export as export
 from .hardware import Saturation as Saturation
 from .hardware import Sensor as Sensor
 from .identification import Record as Record

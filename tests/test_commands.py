@@ -32,7 +32,7 @@ from piezojax.study import read
 
 COMMANDS = {
     name: importlib.import_module(f"piezojax.cli.{name}").main
-    for name in ("tune", "identify", "validate", "reproduce")
+    for name in ("tune", "identify", "validate", "export", "reproduce")
 }
 PNG = b"\x89PNG\r\n\x1a\n"
 STUDY = {
@@ -165,6 +165,7 @@ REFUSED = {
     "identify": ["nowhere.csv"],
     "sweep": ["nowhere.csv"],
     "validate": ["nowhere.json", "nowhere.csv"],
+    "export": ["nowhere.toml"],
     "reproduce": ["--table", "9-9"],
 }
 """Arguments that each command refuses."""
@@ -204,6 +205,8 @@ def arguments_for(command, request):
     if command == "validate":
         record = request.getfixturevalue("record")
         return [write_model(record.parent), record, *COLUMNS]
+    if command == "export":
+        return [write_model(request.getfixturevalue("tmp_path_factory").mktemp("m"))]
     return ["--table", "5-3"]
 
 
@@ -282,6 +285,44 @@ def test_validate_bad_arguments(record, tmp_path):
         call("validate", model, record, *COLUMNS, "--estimate", "0:300"),
         "estimate is 0:300; it must lie in 0:299",
     )
+
+
+# export
+
+
+def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
+    out = tmp_path / "c"
+    printed = succeeded(call("export", tuned[1], "--out", out)).stdout
+    assert names(out) == sorted(
+        ["Makefile", "controller.c", "controller.h", "test_controller.c", "vectors.csv"]
+    )
+    assert f"make -C {out} test" in printed
+    text = (out / "controller.c").read_text(encoding="utf-8")
+    assert "Study: small, seed 3." in text
+    assert "parameters.actuator_lower = -20.0;" in text
+    assert "parameters.actuator_upper = 120.0;" in text
+    columns = np.loadtxt(out / "vectors.csv", delimiter=",", skiprows=2).T
+    references = pj.read_about(tuned[1] / "gains.toml").reference_ranges[0]
+    assert columns[0].min() < references[0]
+    assert columns[0].max() > references[1]
+
+
+def test_export_of_a_model_needs_no_limits(tmp_path):
+    out = tmp_path / "c"
+    succeeded(call("export", write_model(tmp_path), "--out", out, "--name", "lag"))
+    assert "Record: first.csv." in (out / "lag.h").read_text(encoding="utf-8")
+
+
+def test_export_refuses_gains_with_an_alarm_unless_accepted(tmp_path):
+    path = tmp_path / "gains.toml"
+    about = pj.About(unsafe=["it rings"], limits=[(0.0, 1.0)])
+    pj.save(pj.control.PID(0.5, 3000.0, dt=5e-5), path, about)
+    out = tmp_path / "c"
+    failed(call("export", path, "--out", out), "was written with an alarm: it rings")
+    assert not out.exists()
+    result = call("export", path, "--out", out, "--accept-unsafe")
+    assert "ALARM: it rings" in succeeded(result).stdout
+    assert (out / "controller.h").read_text().startswith("/* UNSAFE: it rings")
 
 
 # tune

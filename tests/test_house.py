@@ -10,13 +10,16 @@ import piezojax
 
 SUBPACKAGES = (
     *("core", "signals", "dynamics", "hysteresis", "hardware", "control", "analysis"),
-    *("solve", "identification", "catalog", "study", "tuning", "sweeping"),
+    *("exporting", "solve", "identification", "catalog", "study", "tuning", "sweeping"),
     *("reproduction", "report", "cli"),
 )
 """Subpackages from the lowest up: each may import those before it, so that ``cli``
 alone imports ``report``."""
 
-ENTRIES = ("__init__", "tune", "identify", "validate", "sweep", "reproduce")
+ENTRIES = (
+    *("__init__", "tune", "identify", "validate", "sweep", "reproduce"),
+    "export",
+)
 """Modules at the top: they may import any subpackage; no subpackage imports them."""
 
 

@@ -193,7 +193,9 @@ def test_used_names_load_their_packages():
     assert every.isdisjoint(LATER)
 
 
-@pytest.mark.parametrize("command", ["tune", "identify", "sweep", "reproduce"])
+@pytest.mark.parametrize(
+    "command", ["tune", "identify", "export", "sweep", "reproduce"]
+)
 def test_help_does_not_wait_for_jax(command):
     modules = imported_by(
         "import runpy\n"

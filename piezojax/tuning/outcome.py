@@ -62,12 +62,17 @@ class Outcome:
     def about(self) -> About:
         """Origin of the tuned controller, for its file."""
         study = self.case.study
-        axes = study.axes
+        axes, drive = study.axes, study.actuator
         channels = zip(axes.names, axes.units, strict=True) if axes else ()
+        ends = (study.by_axis(limit) for limit in (drive.lower, drive.upper))
+        references = np.asarray(self.holdout.references)
+        samples = references.reshape(-1, study.axis_count if axes else 1)
         return About(
             study=self.case.name,
             seed=study.seed,
             rate_Hz=study.rate,
+            limits=[*zip(*ends, strict=True)],
+            reference_ranges=[(float(x.min()), float(x.max())) for x in samples.T],
             unsafe=self.result.alarms,
             units=dict(channels) or {"measured": "um", "command": "V"},
             parameter_units={

@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 YARDSTICK = "import jax, equinox, optimistix"
-COMMANDS = ("tune", "identify", "validate", "sweep", "reproduce")
+COMMANDS = ("tune", "identify", "validate", "export", "sweep", "reproduce")
 CASES = {
     YARDSTICK: (["-c", YARDSTICK], None),
     "import piezojax": (["-c", "import piezojax"], 1.25),

@@ -1,0 +1,75 @@
+"""``python -m piezojax.export FILE --out DIR``."""
+
+from pathlib import Path
+
+import click
+
+from ..core.files import numbered_folder
+from .command import RESULTS, Command, common, print_alarms, run
+
+SYSTEMS = ("gains.toml", "model.json")
+"""Files with a System in a folder of results, the first one first."""
+
+
+@click.command(cls=Command)
+@click.argument("source", type=click.Path(path_type=Path), metavar="FILE")
+@click.option(
+    "--to", type=click.Choice(["c"]), default="c", help="Language (default: c, C99)."
+)
+@click.option(
+    "--name", help="Begins all names in C (default: controller, or plant for a model)."
+)
+@click.option(
+    "--precision",
+    type=click.Choice(["double", "float"]),
+    default="double",
+    help="Type of all real numbers (default: double).",
+)
+@click.option(
+    "--limits",
+    type=(float, float),
+    multiple=True,
+    metavar="LOWEST HIGHEST",
+    help="Limits of the voltage, V, once for each axis (default: those of the study).",
+)
+@click.option(
+    "--accept-unsafe",
+    is_flag=True,
+    help="Export gains that were written with an alarm; the files say so.",
+)
+@common
+def main(source, to, name, precision, limits, accept_unsafe, out, seed, quiet):
+    """Export the System in FILE as C99 with a test of its own.
+
+    FILE is the gains.toml of tune, the model.json of identify, or the folder of their
+    results. `make test` in the new folder compiles the source and replays a simulation.
+    """
+    del to  # there is one language
+
+    def body(console):
+        from ..core.serial import load, read_about
+        from ..exporting import export
+
+        path = next(
+            (source / file for file in SYSTEMS if (source / file).is_file()), source
+        )
+        about = read_about(path)
+        # Alarms are judged by `export`, whose message names the option.
+        system = load(path, accept_unsafe=True)
+        folder = out or numbered_folder(RESULTS / f"{path.stem}_c")
+        files = export(
+            system,
+            folder,
+            name=name,
+            about=about,
+            limits=limits or None,
+            precision=precision,
+            seed=seed or 0,
+            accept_unsafe=accept_unsafe,
+        )
+        print_alarms(console, about.unsafe)
+        for file in files:
+            console.print(f"{file}", soft_wrap=True)
+        console.print(f"test: make -C {folder} test", soft_wrap=True)
+
+    run(quiet, body)

@@ -1,0 +1,8 @@
+"""Export of controllers and plants to other programs and to hardware."""
+
+from .driven import Driven as Driven
+from .driven import Seen as Seen
+from .exporter import export as export
+from .graph import Graph as Graph
+from .trace import NotScalarError as NotScalarError
+from .trace import trace as trace

@@ -1,0 +1,203 @@
+"""C99 source of the operations of a graph."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .graph import CARRY, CONSTANT, INPUT, READ, RESULT, Block, Graph, Node
+
+INFIX = {
+    "add": "+", "sub": "-", "mul": "*", "div": "/",
+    "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">=",
+}  # fmt: skip
+"""Operations that C writes between two real operands."""
+
+LOGICAL = {"and": "&&", "or": "||", "xor": "!=", "eq": "==", "ne": "!="}
+"""Operations that C writes between two boolean operands."""
+
+FUNCTIONS = {
+    "abs": "fabs", "acos": "acos", "asin": "asin", "atan": "atan", "atan2": "atan2",
+    "ceil": "ceil", "cos": "cos", "cosh": "cosh", "exp": "exp", "expm1": "expm1",
+    "floor": "floor", "log": "log", "log1p": "log1p", "pow": "pow", "rem": "fmod",
+    "round": "round", "sin": "sin", "sinh": "sinh", "sqrt": "sqrt", "tan": "tan",
+    "tanh": "tanh",
+}  # fmt: skip
+"""Functions of libm by the name of the operation in JAX."""
+
+TYPES = {"integer": "long", "boolean": "int"}
+
+
+class Precision(NamedTuple):
+    """A type of C for real numbers, and the suffix of its numbers and functions."""
+
+    real: str
+    suffix: str
+    dtype: type[np.floating]
+
+    def number(self, value: float) -> str:
+        """Return a number of C that has exactly this ``value``."""
+        rounded = self.dtype(value)
+        if np.isnan(rounded):
+            return "NAN"
+        if np.isinf(rounded):
+            return "HUGE_VAL" if rounded > 0 else "-HUGE_VAL"
+        text = repr(float(rounded)) if self.dtype is np.float64 else str(rounded)
+        return text + ("" if set(text) & set(".e") else ".0") + self.suffix
+
+
+DOUBLE = Precision("double", "", np.float64)
+SINGLE = Precision("float", "f", np.float32)
+PRECISIONS = {"double": DOUBLE, "float": SINGLE}
+"""Precisions by the name of the type."""
+
+
+def statements(
+    graph: Graph,
+    outputs: Sequence[int],
+    names: Callable[[int], str],
+    precision: Precision,
+) -> tuple[list[str], Callable[[int], str]]:
+    """Return the statements that compute ``outputs``, and the expression of a node.
+
+    ``names`` returns the expression of an input by its place. A comment names the
+    function of each group of operations.
+    """
+    writer = _Writer(graph, outputs, names, precision)
+    return list(writer.block(graph.block, "    ")), writer.expression
+
+
+class _Writer:
+    def __init__(
+        self,
+        graph: Graph,
+        outputs: Sequence[int],
+        names: Callable[[int], str],
+        precision: Precision,
+    ):
+        self.graph, self.names, self.precision = graph, names, precision
+        self.needed = graph.needed(outputs)
+        self.variables: dict[int, str] = {}
+
+    def expression(self, number: int) -> str:
+        node = self.graph.nodes[number]
+        if node.operation == CONSTANT:
+            return self._constant(node)
+        if node.operation == INPUT:
+            return self.names(int(node.value))
+        return self.variables[number]
+
+    def _constant(self, node: Node) -> str:
+        if node.kind == "real":
+            text = self.precision.number(float(node.value))
+        else:
+            text = str(int(node.value))
+        return f"({text})" if text.startswith("-") else text
+
+    def _type(self, node: Node) -> str:
+        return TYPES.get(node.kind, self.precision.real)
+
+    def _name(self, number: int) -> str:
+        return self.variables.setdefault(number, f"v{len(self.variables)}")
+
+    def block(self, block: Block, indent: str) -> Iterator[str]:
+        source = ""
+        for number in block.order:
+            if number < 0:
+                yield from self._loop(-1 - number, indent)
+                continue
+            node = self.graph.nodes[number]
+            if number not in self.needed or node.operation in (CONSTANT, INPUT, CARRY):
+                continue
+            if node.operation == RESULT:
+                continue
+            if node.source and node.source != source:
+                source = node.source
+                yield f"{indent}/* {source.replace('.<locals>', '')} */"
+            text = self._operation(node)
+            yield f"{indent}const {self._type(node)} {self._name(number)} = {text};"
+
+    def _loop(self, number: int, indent: str) -> Iterator[str]:
+        loop, nodes = self.graph.loops[number], self.graph.nodes
+        used = [i for i, node in enumerate(loop.carried) if node in self.needed]
+        if not used:
+            return
+        for place in used:
+            first, carried = loop.first[place], loop.carried[place]
+            kind, name = self._type(nodes[first]), self._name(carried)
+            yield f"{indent}{kind} {name} = {self.expression(first)};"
+        for i, node in enumerate(nodes):
+            if node.operation == RESULT and node.value[0] == number:
+                self.variables[i] = self._name(loop.carried[node.value[1]])
+        yield f"{indent}for (;;) {{"
+        inner = indent + "    "
+        yield from self.block(loop.head, inner)
+        yield f"{inner}if (!{self.expression(loop.condition)}) break;"
+        yield from self.block(loop.body, inner)
+        changed = [p for p in used if loop.carried[p] != loop.last[p]]
+        # An old value may be assigned to another carried one: keep them all first.
+        for p in changed:
+            kind = self._type(nodes[loop.carried[p]])
+            last = self.expression(loop.last[p])
+            yield f"{inner}const {kind} n{loop.carried[p]} = {last};"
+        for p in changed:
+            name = self.expression(loop.carried[p])
+            yield f"{inner}{name} = n{loop.carried[p]};"
+        yield f"{indent}}}"
+
+    def _operation(self, node: Node) -> str:
+        a, b, c = ([self.expression(n) for n in node.operands] + ["", ""])[:3]
+        name = node.operation
+        kinds = [self.graph.nodes[n].kind for n in node.operands]
+        if name == READ:
+            return f"{self.names(int(node.value)).partition('[')[0]}[{a}]"
+        if name == "select_n":
+            return f"{a} ? {c} : {b}"
+        if name in LOGICAL and kinds[0] == "boolean":
+            return f"{a} {LOGICAL[name]} {b}"
+        if name == "not":
+            return f"!{a}"
+        if name in INFIX:
+            return f"{a} {INFIX[name]} {b}"
+        if name == "neg":
+            return f"-{a}"
+        if name == "max":
+            return f"{a} > {b} ? {a} : {b}"
+        if name == "min":
+            return f"{a} < {b} ? {a} : {b}"
+        if name == "clamp":
+            return f"{b} < {a} ? {a} : ({b} > {c} ? {c} : {b})"
+        if name == "sign":
+            return self._converted(node, f"({a} > 0) - ({a} < 0)")
+        if name == "square":
+            return f"{a} * {a}"
+        if name == "integer_pow":
+            return self._power(a, int(node.value))
+        if name == "rsqrt":
+            return f"{self._one()} / sqrt{self.precision.suffix}({a})"
+        if name == "logistic":
+            return f"{self._one()} / ({self._one()} + exp{self.precision.suffix}(-{a}))"
+        if name == "is_finite":
+            return f"isfinite({a}) != 0"
+        if name == "convert_element_type":
+            if node.kind == "boolean":
+                return f"{a} != 0"
+            return self._converted(node, a)
+        if name == "rem" and node.kind == "integer":
+            return f"{a} % {b}"
+        if name == "abs" and node.kind == "integer":
+            return f"labs({a})"
+        if name in FUNCTIONS:
+            function = FUNCTIONS[name] + self.precision.suffix
+            return f"{function}({a}, {b})" if b else f"{function}({a})"
+        raise ValueError(f"the operation {name} has no form in C")
+
+    def _one(self) -> str:
+        return self.precision.number(1.0)
+
+    def _converted(self, node: Node, text: str) -> str:
+        return f"({self._type(node)})({text})"
+
+    def _power(self, base: str, exponent: int) -> str:
+        product = " * ".join([base] * abs(exponent)) or self._one()
+        return product if exponent >= 0 else f"{self._one()} / ({product})"

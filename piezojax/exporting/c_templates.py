@@ -1,0 +1,129 @@
+"""Texts of an exported C project, around its operations."""
+
+MAKEFILE = """\
+# `make test` compiles {name}.c and replays the golden vectors of the simulation.
+CFLAGS ?= -std=c99 -O2 -Wall -Wextra -pedantic -Werror -ffp-contract=off
+
+test: test_{name}
+	./test_{name} vectors.csv
+
+test_{name}: test_{name}.c {name}.c {name}.h
+	$(CC) $(CFLAGS) -o $@ test_{name}.c {name}.c -lm
+
+clean:
+	rm -f test_{name}
+
+.PHONY: test clean
+"""
+
+HEADER = """\
+/* {origin}
+
+   {name}_init starts at rest; {name}_step advances one sample. Signals: {units}.
+   There is no allocation, no global state, and no dependency but libm. */
+#ifndef {guard}
+#define {guard}
+
+typedef struct {{
+{parameters}
+}} {name}_parameters;
+
+typedef struct {{
+{state}
+}} {name}_state;
+
+{output}/* Return the exported parameters. They may be changed between two samples. */
+{defaults};
+
+/* Return 0, or the number of the first parameter outside its limits, from 1 on. */
+{check};
+
+/* Start at rest under these signals. */
+{init};
+
+/* Advance one sample. */
+{step};
+
+#endif
+"""
+
+SOURCE = """\
+/* {origin} */
+#include "{name}.h"
+
+#include <math.h>
+
+{defaults} {{
+    {name}_parameters parameters;
+{set}
+    return parameters;
+}}
+
+{check} {{
+{checks}
+    return 0;
+}}
+
+{init} {{
+{init_body}
+}}
+
+{step} {{
+{step_body}
+}}
+"""
+
+TEST = """\
+/* Replays the golden vectors of the simulation; returns 1 if an output differs. */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+#include "{name}.h"
+
+static int row_of(FILE *file, double *values, int count) {{
+    int i;
+    for (i = 0; i < count; i++)
+        if (fscanf(file, i ? ",%lf" : " %lf", &values[i]) != 1) return 0;
+    return 1;
+}}
+
+int main(int count, char **arguments) {{
+    double start[{starts}], row[{columns}], found[{outputs}], wanted;
+    double worst[{outputs}] = {{0}}, largest[{outputs}] = {{0}};
+    const {name}_parameters parameters = {name}_defaults();
+    {name}_state state;
+{output}    FILE *file = count == 2 ? fopen(arguments[1], "r") : NULL;
+    long samples = 0;
+    int i, failed = 0;
+    if (!file || !row_of(file, start, {starts}) || fscanf(file, " %*[^\\n]") < 0) {{
+        fprintf(stderr, "usage: %s vectors.csv\\n", arguments[0]);
+        return 2;
+    }}
+    if ({name}_check(&parameters)) {{
+        fprintf(stderr, "parameter %d is outside its limits\\n",
+                {name}_check(&parameters));
+        return 1;
+    }}
+    {name}_init(&state, &parameters{begin});
+    while (row_of(file, row, {columns})) {{
+{step}
+        for (i = 0; i < {outputs}; i++) {{
+            wanted = row[{inputs} + i];
+            if (!(fabs(found[i] - wanted) <= worst[i]))
+                worst[i] = fabs(found[i] - wanted);
+            if (fabs(wanted) > largest[i]) largest[i] = fabs(wanted);
+        }}
+        samples++;
+    }}
+    fclose(file);
+    for (i = 0; i < {outputs}; i++) {{
+        const int wrong = !(worst[i] <= {tolerance} * largest[i]);
+        printf("output %d: largest difference %.3g, largest value %.6g, "
+               "%ld samples: %s\\n",
+               i, worst[i], largest[i], samples, wrong ? "FAILED" : "passed");
+        failed |= wrong || samples == 0;
+    }}
+    return failed;
+}}
+"""

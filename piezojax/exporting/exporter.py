@@ -1,0 +1,156 @@
+"""Export of a controller or a plant to a folder of C99."""
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..core.about import About
+from ..core.axes import PerAxis
+from ..core.feedback import Observation
+from ..core.system import System, accepts
+from ..hardware import Saturation
+from .c_project import Interface, write_c
+from .driven import Driven, Seen
+
+HELD = 50
+"""Number of samples between the corners of the input of a plant."""
+
+AXES = 6
+"""Largest number of axes that is tried."""
+
+Limits = Sequence[tuple[float, float]]
+
+
+def export(
+    system: System,
+    folder: str | Path,
+    *,
+    name: str | None = None,
+    about: About | None = None,
+    limits: Limits | None = None,
+    precision: str = "double",
+    samples: int = 2000,
+    seed: int = 0,
+    accept_unsafe: bool = False,
+) -> list[Path]:
+    """Write ``system`` as C99 to a new ``folder``; return the paths of its files.
+
+    A controller leaves with the ``limits`` of its voltage, lowest and highest of each
+    axis (V), by default those of ``about``: the exported step saturates and tells the
+    controller what was applied, as in the simulated loop. Anything else is exported as
+    it is. ``name`` begins the names of the header: by default "controller" or "plant".
+    The golden vectors, ``samples`` long and drawn with ``seed``, cover the references
+    for which the gains were tuned, and three times their range.
+
+    Raises ValueError for a ``folder`` in use, a System with alarms (``about.unsafe``)
+    unless ``accept_unsafe``, a controller without limits, and a System that cannot be
+    written in scalar operations.
+    """
+    about = about or About()
+    if not accept_unsafe:
+        about.require_safe(
+            type(system).__name__,
+            "to export it all the same, pass accept_unsafe=True (--accept-unsafe)",
+        )
+    kind, axes = _kind_of(system)
+    draw = np.random.default_rng(seed)
+    if kind == "plant":
+        system, interface, inputs = _plant(system, axes, about, samples, draw)
+    else:
+        system, interface, inputs = _controller(
+            system, axes, limits or about.limits, about, samples, draw
+        )
+    name = name or kind
+    return write_c(system, interface, inputs, Path(folder), name, about, precision)
+
+
+def _kind_of(system: System) -> tuple[str, int]:
+    """Return "plant" or "controller", and the number of axes, 0 for scalar signals.
+
+    A plant takes voltages, a controller an Observation, which is a tuple too. Raises
+    ValueError for a System that takes neither.
+    """
+    for axes in range(AXES + 1):
+        if accepts(system, _signal(np.zeros(max(axes, 1)), axes)):
+            return "plant", axes
+    for axes in range(AXES + 1):
+        signal = _signal(np.zeros(max(axes, 1)), axes)
+        if accepts(system, Observation(signal, signal, signal, signal)):
+            return "controller", axes
+    raise ValueError(
+        f"a {type(system).__name__} takes neither the observation of a controller nor "
+        f"up to {AXES} voltages; only those can be exported"
+    )
+
+
+def _signal(values: Any, axes: int) -> Any:
+    """Return a scalar signal, or a tuple of one for each of ``axes``, from an array.
+
+    The axes of ``values`` come last.
+    """
+    if not axes:
+        return jnp.asarray(values[..., 0])
+    return tuple(jnp.asarray(values[..., axis]) for axis in range(axes))
+
+
+def _controller(
+    system: System,
+    axes: int,
+    limits: Limits,
+    about: About,
+    samples: int,
+    draw: np.random.Generator,
+) -> tuple[System, Interface, Any]:
+    """Return a controller with its limits, its signals, and inputs of a test."""
+    count = max(axes, 1)
+    if len(limits) != count:
+        raise ValueError(
+            f"a controller of {count} axes needs as many limits of its voltage, not "
+            f"{len(limits)}: give each as lowest and highest (--limits)"
+        )
+    parts = tuple(Saturation(*each) for each in limits)
+    system = Driven(system, PerAxis(parts) if axes else parts[0])
+    ends = np.array(about.reference_ranges or [(-1.0, 1.0)] * count)
+    middle, half = ends.mean(axis=1), 0.5 * np.ptp(ends, axis=1)
+    k = np.arange(samples + 1)[:, None]
+    swing = np.sin(2.0 * np.pi * (k / 397.0 + np.arange(count) / 7.0))
+    swing = np.where(k > 10, swing * np.where(k > samples // 2, 3.0, 1.0), 0.0)
+    reference = middle + half * swing
+    measured = np.concatenate([reference[:2], reference[:-2]])
+    measured = measured + 1e-2 * half * draw.standard_normal(measured.shape)
+    inputs = Seen(
+        *(_signal(x[:samples], axes) for x in (reference, reference[1:], measured))
+    )
+    rest, voltage = _signal(middle, axes), _signal(np.mean(limits, axis=1), axes)
+    start = Observation(rest, rest, rest, voltage)
+    return system, Interface(start, _first(inputs)), inputs
+
+
+def _plant(
+    system: System,
+    axes: int,
+    about: About,
+    samples: int,
+    draw: np.random.Generator,
+) -> tuple[System, Interface, Any]:
+    """Return a plant, its signals, and inputs of a test."""
+    count = max(axes, 1)
+    ends = np.array(about.input_ranges or [(0.0, 100.0)] * count)
+    steps = draw.uniform(ends[:, 0], ends[:, 1], (samples // HELD, count))
+    held = np.repeat(steps, HELD, axis=0)
+    ramp = np.linspace(0.0, 1.0, HELD)[:, None]
+    held[HELD:] = np.concatenate(
+        [a + ramp * (b - a) for a, b in itertools.pairwise(steps)]
+    )
+    inputs = _signal(held, axes)
+    first = _first(inputs)
+    return system, Interface(first, first), inputs
+
+
+def _first(tree: Any) -> Any:
+    return jax.tree.map(lambda x: x[0], tree)

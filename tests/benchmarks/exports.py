@@ -1,0 +1,76 @@
+"""Export of every controller and plant of the catalogue, compiled and tested.
+
+    python tests/benchmarks/exports.py [--precision float]
+
+Each System is exported as C; ``make test`` replays its golden vectors, 20 000 samples
+of a simulation with noise and saturation. The table has the number of lines of the
+source, and the largest difference as a share of the largest output, or the reason why
+the System is refused. Exits with 1 if a test fails.
+"""
+
+import argparse
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+import piezojax as pj
+from piezojax.catalog import CONTROLLERS, PLANTS
+from piezojax.exporting import NotScalarError
+
+SAMPLES = 20_000
+
+LIMITS = {"p753": (-20.0, 120.0), "p558": (-50.0, 50.0), "mirror": (-5.0, 5.0)}
+RANGES = {"p753": (0.0, 10.0), "p558": (-9.0, 9.0), "mirror": (-1.0, 1.0)}
+"""Limits of the voltage and of the references by the stage in a name."""
+
+
+def tested(make, name, precision):
+    """Return lines and relative difference of an export, and whether it passes."""
+    stage, axes = name.partition("_")[0], 1 if name.startswith("p753") else 3
+    about = pj.About(
+        limits=[LIMITS[stage]] * axes, reference_ranges=[RANGES[stage]] * axes
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "c"
+        _, source, *_ = pj.export(
+            make(), out, about=about, precision=precision, samples=SAMPLES
+        )
+        done = subprocess.run(
+            ["make", "-s", "test"], cwd=out, capture_output=True, text=True
+        )
+        found = re.findall(r"difference (\S+), largest value (\S+),", done.stdout)
+        shares = [float(a) / float(b.rstrip(",")) for a, b in found]
+        lines = source.read_text().count("\n")
+    return lines, max(shares, default=float("nan")), done.returncode == 0
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--precision", default="double")
+    precision = parser.parse_args().precision
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    table = Table(title=f"exports in {precision}")
+    for head in ("System", "lines", "difference", "test"):
+        table.add_column(head, justify="left" if head == "System" else "right")
+    passed = failed = 0
+    for name, make in (CONTROLLERS | PLANTS).items():
+        try:
+            lines, share, right = tested(make, name, precision)
+        except NotScalarError as error:
+            table.add_row(name, "", "", f"refused: {error}")
+            continue
+        passed, failed = passed + right, failed + (not right)
+        verdict = "passed" if right else "FAILED"
+        table.add_row(name, str(lines), f"{share:.1e}", verdict)
+    console.print(table)
+    console.print(f"{passed} passed, {failed} failed")
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,290 @@
+"""Controllers and plants as C: compiled, run, and compared with the simulation."""
+
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import piezojax as pj
+from piezojax.catalog import CONTROLLERS, PLANTS
+from piezojax.core.parameter import parameter
+from piezojax.exporting import Driven, NotScalarError, Seen, trace
+from piezojax.exporting.c_source import DOUBLE, statements
+from piezojax.exporting.graph import CONSTANT, INPUT
+
+LIMITS = [(-20.0, 120.0)]
+ABOUT = pj.About(
+    study="a study", seed=3, rate_Hz=2e4, limits=LIMITS, reference_ranges=[(0.0, 10.0)]
+)
+
+compiled = pytest.mark.skipif(
+    shutil.which("cc") is None or shutil.which("make") is None,
+    reason="there is no C compiler",
+)
+
+
+def made(folder):
+    """Run ``make test`` in a folder; return its exit status and output."""
+    done = subprocess.run(
+        ["make", "-s", "test"], cwd=folder, capture_output=True, text=True
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+# Compiled
+
+
+@compiled
+@pytest.mark.parametrize(
+    ("name", "samples"),
+    [
+        ("p753_adaptive_pi", 2000),
+        ("p753_bang_bang", 2000),
+        ("p753_kalman_disturbance_observer", 2000),
+        ("p753_repetitive", 4500),  # two periods and more: each is read and written
+    ],
+)
+def test_a_controller_equals_its_simulation(name, samples, tmp_path):
+    pj.export(CONTROLLERS[name](), tmp_path / "c", about=ABOUT, samples=samples)
+    status, text = made(tmp_path / "c")
+    assert status == 0, text
+    assert "passed" in text
+
+
+@compiled
+def test_a_controller_of_several_axes_equals_its_simulation(tmp_path):
+    about = pj.About(limits=[(-50.0, 50.0)] * 3, reference_ranges=[(-9.0, 9.0)] * 3)
+    files = pj.export(CONTROLLERS["p558_pid"](), tmp_path / "c", about=about)
+    status, text = made(tmp_path / "c")
+    assert status == 0, text
+    assert text.count("passed") == 3
+    assert "controller_output *output" in files[0].read_text()
+
+
+@compiled
+def test_a_plant_equals_its_simulation(tmp_path):
+    pj.export(PLANTS["p753_stage"](), tmp_path / "c")
+    status, text = made(tmp_path / "c")
+    assert status == 0, text
+
+
+@compiled
+def test_a_changed_sign_fails_the_test_of_the_export(tmp_path):
+    _, source, *_ = pj.export(CONTROLLERS["p753_pid"](), tmp_path / "c", about=ABOUT)
+    text = source.read_text()
+    assert text.count("reference - measured") == 1
+    source.write_text(text.replace("reference - measured", "reference + measured"))
+    status, text = made(tmp_path / "c")
+    assert status != 0
+    assert "FAILED" in text
+
+
+@compiled
+def test_a_parameter_outside_its_limits_is_found(tmp_path):
+    files = pj.export(CONTROLLERS["p753_pid"](), tmp_path / "c", about=ABOUT)
+    program = tmp_path / "c" / "program.c"
+    program.write_text(
+        '#include "controller.h"\n'
+        "int main(void) {\n"
+        "    controller_parameters changed = controller_defaults();\n"
+        "    if (controller_check(&changed)) return 100;\n"
+        "    changed.controller_anti_windup = -1.0;\n"
+        "    return controller_check(&changed);\n"
+        "}\n"
+    )
+    binary = tmp_path / "program"
+    subprocess.run(
+        ["cc", "-std=c99", "-o", binary, program, files[1], "-lm"], check=True
+    )
+    assert subprocess.run([binary]).returncode == 5  # the fifth parameter
+
+
+# The text
+
+
+def test_the_same_gains_give_the_same_text(tmp_path):
+    folders = [tmp_path / "a", tmp_path / "b"]
+    for folder in folders:
+        pj.export(CONTROLLERS["p753_inversion"](), folder, about=ABOUT)
+    one, other = (
+        {path.name: path.read_text() for path in folder.iterdir()} for folder in folders
+    )
+    assert one == other
+    assert set(one) == {
+        *("controller.h", "controller.c", "test_controller.c"),
+        *("vectors.csv", "Makefile"),
+    }
+
+
+def test_the_files_name_their_origin_and_units(tmp_path):
+    header, source, *_ = pj.export(
+        CONTROLLERS["p753_pid"](), tmp_path / "c", about=ABOUT, name="pid"
+    )
+    for path in (header, source):
+        text = path.read_text()
+        assert "Study: a study, seed 3." in text
+        assert "Sampling rate: 20000 Hz" in text
+    assert "proportional gain P, unit V/um" in header.read_text()
+    assert "void pid_init(pid_state *state," in header.read_text()
+
+
+def test_the_limits_are_those_of_the_study_unless_given(tmp_path):
+    def lower(folder, **options):
+        source = pj.export(CONTROLLERS["p753_pid"](), folder, about=ABOUT, **options)[1]
+        return source.read_text().partition("actuator_lower = ")[2].partition(";")[0]
+
+    assert lower(tmp_path / "a") == "-20.0"
+    assert lower(tmp_path / "b", limits=[(1.5, 9.0)]) == "1.5"
+
+
+def test_numbers_of_c_are_exact():
+    for value in (0.1, -1e-300, 3.0, 1e22, 5e-324):
+        assert float(DOUBLE.number(value)) == value
+        assert set(DOUBLE.number(value)) & set(".e")
+
+
+# What is refused
+
+
+def test_gains_with_an_alarm_are_refused_unless_accepted(tmp_path):
+    about = ABOUT.model_copy(update={"unsafe": ["it rings"]})
+    controller = CONTROLLERS["p753_pid"]()
+    with pytest.raises(
+        ValueError, match=r"an alarm: it rings; to export it all the same"
+    ):
+        pj.export(controller, tmp_path / "c", about=about)
+    assert not (tmp_path / "c").exists()
+    header, *_ = pj.export(controller, tmp_path / "c", about=about, accept_unsafe=True)
+    assert header.read_text().startswith("/* UNSAFE: it rings")
+
+
+def test_a_controller_without_limits_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="needs as many limits of its voltage, not 0"):
+        pj.export(CONTROLLERS["p753_pid"](), tmp_path / "c")
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"name": "a-b"}, "the name 'a-b' is not one of C"),
+        ({"precision": "half"}, "precision 'half': choose from double, float"),
+    ],
+)
+def test_bad_options_are_refused(options, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        pj.export(CONTROLLERS["p753_pid"](), tmp_path / "c", about=ABOUT, **options)
+
+
+class Sorted(pj.System):
+    """A System whose step has no form in scalar operations."""
+
+    gain: jax.Array = parameter("1", "gain")
+
+    def init(self, input=0.0):
+        return jnp.zeros(3)
+
+    def step(self, state, input):
+        state = jnp.sort(jnp.append(state[1:], self.gain * input))
+        return state, state[1]
+
+
+def test_a_system_without_scalar_form_is_refused_with_the_operation(tmp_path):
+    with pytest.raises(NotScalarError, match="its operation sort has no scalar form"):
+        pj.export(Sorted(2.0), tmp_path / "c")
+
+
+def test_a_system_with_other_inputs_is_refused(tmp_path):
+    class Labelled(pj.System):
+        def init(self, input):
+            return input["a"]
+
+        def step(self, state, input):
+            return input["a"], state
+
+    with pytest.raises(ValueError, match="only those can be exported"):
+        pj.export(Labelled(), tmp_path / "c")
+
+
+# The trace
+
+
+def run(function, *arguments):
+    """Return the outputs of the statements of ``function``, run as Python."""
+    graph, outputs = trace(function, *arguments)
+    values = [float(x) for leaf in jax.tree.leaves(arguments) for x in np.ravel(leaf)]
+    known = {}
+    for number in graph.block.order:
+        node = graph.nodes[number]
+        operands = [known[n] for n in node.operands]
+        if node.operation == CONSTANT:
+            known[number] = node.value
+        elif node.operation == INPUT:
+            known[number] = values[node.value]
+        elif node.operation == "select_n":
+            known[number] = operands[1 + int(operands[0])]
+        else:
+            known[number] = {
+                "add": lambda a, b: a + b,
+                "sub": lambda a, b: a - b,
+                "mul": lambda a, b: a * b,
+                "max": max,
+                "lt": lambda a, b: a < b,
+                "ge": lambda a, b: a >= b,
+                "eq": lambda a, b: a == b,
+                "clamp": lambda a, b, c: min(max(a, b), c),
+                "convert_element_type": lambda a: a,
+            }[node.operation](*operands)
+    return np.array([known[n] for each in outputs for n in each.ravel().tolist()])
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda a, b: a @ b,
+        lambda a, b: (a.T[::-1] + b).sum(axis=0),
+        lambda a, b: jnp.where(a < b, a, 2.0 * b)[1:, 0],
+        lambda a, b: jnp.max(jnp.concatenate([a, b], axis=1), axis=1),
+        lambda a, b: jax.lax.cond(a[0, 0] < 1.0, lambda: a[0], lambda: b[0]),
+        lambda a, b: jax.lax.scan(lambda c, x: (c + x, c * x), b[0], a)[1],
+        lambda a, b: jnp.einsum("ij,jk,ik->k", a, b, a),
+        lambda a, b: jax.lax.dynamic_slice(a[0], (a[1, 1].astype(int),), (1,)),
+        lambda a, b: a[0].at[b[1, 1].astype(int)].add(3.0),
+    ],
+)
+def test_arrays_become_the_scalars_that_jax_computes(function):
+    a = jnp.array([[1.5, -2.0, 4.0], [3.0, 1.0, -1.0], [0.5, 2.5, 7.0]])
+    b = jnp.array([[2.0, 5.0, -3.0], [1.0, 2.0, -7.0], [0.25, 4.0, 1.0]])
+    wanted = np.ravel(function(a, b))
+    np.testing.assert_allclose(run(function, a, b), wanted, rtol=1e-14)
+
+
+def test_a_loop_of_unknown_length_stays_a_loop():
+    def halved(x):
+        return jax.lax.while_loop(lambda y: y > 1.0, lambda y: 0.5 * y, x)
+
+    graph, (output,) = trace(halved, jnp.asarray(5.0))
+    lines, expression = statements(graph, [int(output)], lambda place: "x", DOUBLE)
+    text = "\n".join(lines)
+    assert "double v0 = x;" in text
+    assert "for (;;) {" in text
+    assert expression(int(output)) == "v0"
+
+
+def test_equal_operations_are_computed_once():
+    graph, outputs = trace(lambda x: (x * x + 1.0, x * x + 1.0), jnp.asarray(2.0))
+    assert outputs[0] == outputs[1]
+    assert sum(node.operation == "mul" for node in graph.nodes) == 1
+
+
+def test_the_voltage_goes_back_to_the_controller_after_its_limits():
+    system = Driven(CONTROLLERS["p753_pid"](), pj.Saturation(0.0, 1.0))
+    at = jnp.asarray(5.0)
+    state = system.init(pj.Observation(at, at, at, jnp.asarray(0.5)))
+    state, voltage = system.step(state, Seen(at + 100.0, at, at))
+    assert voltage == 1.0
+    assert state.applied == 1.0
+    assert state.controller.command > 1.0
