@@ -14,7 +14,10 @@ SYSTEMS = ("gains.toml", "model.json")
 @click.command(cls=Command)
 @click.argument("source", type=click.Path(path_type=Path), metavar="FILE")
 @click.option(
-    "--to", type=click.Choice(["c"]), default="c", help="Language (default: c, C99)."
+    "--to",
+    type=click.Choice(["c", "fmu"]),
+    default="c",
+    help="c: C99 with a test (default); fmu: FMU 2.0 for co-simulation.",
 )
 @click.option(
     "--name", help="Begins all names in C (default: controller, or plant for a model)."
@@ -39,12 +42,11 @@ SYSTEMS = ("gains.toml", "model.json")
 )
 @common
 def main(source, to, name, precision, limits, accept_unsafe, out, seed, quiet):
-    """Export the System in FILE as C99 with a test of its own.
+    """Export the System in FILE as C99 or as an FMU.
 
     FILE is the gains.toml of tune, the model.json of identify, or the folder of their
-    results. `make test` in the new folder compiles the source and replays a simulation.
+    results. `make test` in a folder of C compiles the source and replays a simulation.
     """
-    del to  # there is one language
 
     def body(console):
         from ..core.serial import load, read_about
@@ -56,10 +58,11 @@ def main(source, to, name, precision, limits, accept_unsafe, out, seed, quiet):
         about = read_about(path)
         # Alarms are judged by `export`, whose message names the option.
         system = load(path, accept_unsafe=True)
-        folder = out or numbered_folder(RESULTS / f"{path.stem}_c")
+        folder = out or numbered_folder(RESULTS / f"{path.stem}_{to}")
         files = export(
             system,
             folder,
+            to=to,
             name=name,
             about=about,
             limits=limits or None,
@@ -70,6 +73,7 @@ def main(source, to, name, precision, limits, accept_unsafe, out, seed, quiet):
         print_alarms(console, about.unsafe)
         for file in files:
             console.print(f"{file}", soft_wrap=True)
-        console.print(f"test: make -C {folder} test", soft_wrap=True)
+        if to == "c":
+            console.print(f"test: make -C {folder} test", soft_wrap=True)
 
     run(quiet, body)

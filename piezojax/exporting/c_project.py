@@ -17,8 +17,9 @@ from ..core.parameter import Parameter
 from ..core.paths import declared
 from ..core.rollout import simulate
 from ..core.system import System, resolve
-from .c_source import PRECISIONS, TYPES, Precision, statements
+from .c_source import PRECISIONS, TYPES, statements
 from .c_templates import HEADER, MAKEFILE, SOURCE, TEST
+from .driven import Driven
 from .trace import Memory, NotScalarError, trace
 
 TOLERANCE = {"double": 1e-12, "float": 1e-3}
@@ -67,16 +68,7 @@ def write_c(
     unknown ``precision``, and a System that has no form in scalar operations, with the
     operation.
     """
-    if not re.fullmatch(r"[a-z_][a-z0-9_]*", name):
-        raise ValueError(
-            f"the name {name!r} is not one of C: use small letters, digits and _"
-        )
-    if precision not in PRECISIONS:
-        raise ValueError(
-            f"precision {precision!r}: choose from {', '.join(PRECISIONS)}"
-        )
-    system = resolve(system)
-    code = _Code(system, interface, name, about, PRECISIONS[precision])
+    code = CProject(system, interface, name, about, precision)
     files = {
         f"{name}.h": code.header(),
         f"{name}.c": code.source(),
@@ -117,7 +109,7 @@ def _slots(tree: Any, word: str) -> list[Slot]:
     return found
 
 
-def _expressions(slots: Sequence[Slot], start: str) -> list[str]:
+def expressions(slots: Sequence[Slot], start: str) -> list[str]:
     """Return the expression of every scalar of ``slots`` behind ``start``."""
     return [
         f"{start}{slot.name}" if slot.size == 1 else f"{start}{slot.name}[{i}]"
@@ -126,9 +118,31 @@ def _expressions(slots: Sequence[Slot], start: str) -> list[str]:
     ]
 
 
-class _Code:
-    def __init__(self, system, interface, name, about, precision: Precision):
-        self.name, self.about, self.precision = name, about, precision
+class CProject:
+    """The texts of a C project; the arguments are those of ``write_c``.
+
+    ``parameters``, ``states``, ``starts``, ``inputs`` and ``outputs`` are the fields
+    and arguments in C, ``values`` the values of the parameters.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        interface: Interface,
+        name: str,
+        about: About,
+        precision: str = "double",
+    ):
+        if not re.fullmatch(r"[a-z_][a-z0-9_]*", name):
+            raise ValueError(
+                f"the name {name!r} is not one of C: use small letters, digits and _"
+            )
+        if precision not in PRECISIONS:
+            raise ValueError(
+                f"precision {precision!r}: choose from {', '.join(PRECISIONS)}"
+            )
+        system = resolve(system)
+        self.name, self.about, self.precision = name, about, PRECISIONS[precision]
         self.system, self.interface = system, jax.tree.map(jnp.asarray, interface)
         self.dynamic, self.static = eqx.partition(system, eqx.is_array)
         self.state = system.init(self.interface.start)
@@ -163,7 +177,7 @@ class _Code:
     def _declaration(self, slot: Slot) -> Parameter | None:
         return declared(self.system, slot.path)
 
-    def _meaning(self, slot: Slot) -> str:
+    def meaning(self, slot: Slot) -> str:
         declaration = self._declaration(slot)
         unit = self.about.parameter_units.get(slot.path.removeprefix("controller."))
         if declaration is None:
@@ -198,10 +212,10 @@ class _Code:
             "real": real,
         }
 
-    def _origin(self) -> str:
+    def origin(self) -> str:
         about = self.about
         kind = type(self.system).__name__
-        if kind == "Driven":
+        if isinstance(self.system, Driven):
             kind = f"{type(self.system.controller).__name__} with its voltage limits"
         lines = [f"{kind}, exported by piezojax {about.piezojax}."]
         if about.study:
@@ -223,10 +237,10 @@ class _Code:
             fields = self._fields(self.outputs, lambda slot: "")
             output = f"typedef struct {{\n{fields}\n}} {self.name}_output;\n\n"
         return HEADER.format(
-            origin=self._origin(),
+            origin=self.origin(),
             guard=guard,
             name=self.name,
-            parameters=self._fields(self.parameters, self._meaning),
+            parameters=self._fields(self.parameters, self.meaning),
             state=self._fields(self.states, lambda slot: ""),
             output=output,
             units=", ".join(f"{k} in {v}" for k, v in units.items()) or "as simulated",
@@ -236,7 +250,7 @@ class _Code:
     def source(self) -> str:
         signatures = self._signatures()
         return SOURCE.format(
-            origin=self._origin(),
+            origin=self.origin(),
             name=self.name,
             set=self._defaults(),
             checks=self._checks(),
@@ -251,7 +265,7 @@ class _Code:
         return str(int(value))
 
     def _defaults(self) -> str:
-        places = _expressions(self.parameters, "parameters.")
+        places = expressions(self.parameters, "parameters.")
         numbers = [self._number(v) for values in self.values for v in values]
         lines = [f"    {a} = {b};" for a, b in zip(places, numbers, strict=True)]
         return "\n".join(lines or ["    parameters.unused = 0;"])
@@ -268,7 +282,7 @@ class _Code:
                 "<=": declaration.most,
                 "<": declaration.below,
             }
-            for place in _expressions([slot], "parameters->"):
+            for place in expressions([slot], "parameters->"):
                 wrong = [
                     f"!({place} {sign} {self.precision.number(end)})"
                     for sign, end in tests.items()
@@ -282,10 +296,10 @@ class _Code:
         def init(dynamic, start):
             return eqx.combine(dynamic, self.static).init(start)
 
-        names = _expressions(self.starts, "")
+        names = expressions(self.starts, "")
         try:
             graph, outputs = trace(init, self.dynamic, self.interface.start)
-            names = [*_expressions(self.parameters, "parameters->"), *names]
+            names = [*expressions(self.parameters, "parameters->"), *names]
         except NotScalarError:
             # Equations of several unknowns are solved here, once for all.
             graph, outputs = trace(self.system.init, self.interface.start)
@@ -297,9 +311,9 @@ class _Code:
 
         graph, outputs = trace(step, self.dynamic, self.state, self.interface.input)
         names = [
-            *_expressions(self.parameters, "parameters->"),
-            *_expressions(self.states, "state->"),
-            *_expressions(self.inputs, ""),
+            *expressions(self.parameters, "parameters->"),
+            *expressions(self.states, "state->"),
+            *expressions(self.inputs, ""),
         ]
         return self._body(graph, outputs, names, self.inputs, result=True)
 
@@ -323,7 +337,7 @@ class _Code:
             lines.append(f"    const {kind} result = {results[0]};")
             returned = "\n    return result;"
         elif result:
-            targets = _expressions(self.outputs, "output->")
+            targets = expressions(self.outputs, "output->")
             lines += [f"    {a} = {b};" for a, b in zip(targets, results, strict=True)]
         lines += self._assignments(outputs[:count], expression)
         unused = ["state", "parameters", *(slot.name for slot in arguments)]
@@ -337,7 +351,7 @@ class _Code:
         places = {
             place: self._type(slot.dtype)
             for slot in self.states
-            for place in _expressions([slot], "state->")
+            for place in expressions([slot], "state->")
         }
         pairs, old = [], {}
         for slot, each in zip(self.states, states, strict=True):
@@ -353,7 +367,7 @@ class _Code:
                 yield f"        state->{slot.name}[i] = {expression(numbers[0])};"
                 continue
             texts = map(expression, numbers)
-            pairs += zip(_expressions([slot], "state->"), texts, strict=True)
+            pairs += zip(expressions([slot], "state->"), texts, strict=True)
         for place, text in pairs:
             if text in places and text != place and text not in old:
                 old[text] = f"s{len(old)}"
@@ -396,7 +410,7 @@ class _Code:
         if outputs == 1:
             step = f"        found[0] = {call});"
         else:
-            fields = _expressions(self.outputs, "output.")
+            fields = expressions(self.outputs, "output.")
             step = f"        {call}, &output);\n" + "\n".join(
                 f"        found[{i}] = {field};" for i, field in enumerate(fields)
             )

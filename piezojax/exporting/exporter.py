@@ -1,4 +1,4 @@
-"""Export of a controller or a plant to a folder of C99."""
+"""Export of a controller or a plant."""
 
 import itertools
 from collections.abc import Sequence
@@ -16,12 +16,16 @@ from ..core.system import System, accepts
 from ..hardware import Saturation
 from .c_project import Interface, write_c
 from .driven import Driven, Seen
+from .fmu import write_fmu
 
 HELD = 50
 """Number of samples between the corners of the input of a plant."""
 
 AXES = 6
 """Largest number of axes that is tried."""
+
+FORMS = ("c", "fmu")
+"""Forms of an export."""
 
 Limits = Sequence[tuple[float, float]]
 
@@ -30,6 +34,7 @@ def export(
     system: System,
     folder: str | Path,
     *,
+    to: str = "c",
     name: str | None = None,
     about: About | None = None,
     limits: Limits | None = None,
@@ -38,7 +43,9 @@ def export(
     seed: int = 0,
     accept_unsafe: bool = False,
 ) -> list[Path]:
-    """Write ``system`` as C99 to a new ``folder``; return the paths of its files.
+    """Write ``system`` to a new ``folder``; return the paths of its files.
+
+    ``to`` is "c", C99 with a test of its own, or "fmu", an FMU 2.0 for co-simulation.
 
     A controller leaves with the ``limits`` of its voltage, lowest and highest of each
     axis (V), by default those of ``about``: the exported step saturates and tells the
@@ -47,10 +54,13 @@ def export(
     The golden vectors, ``samples`` long and drawn with ``seed``, cover the references
     for which the gains were tuned, and three times their range.
 
-    Raises ValueError for a ``folder`` in use, a System with alarms (``about.unsafe``)
-    unless ``accept_unsafe``, a controller without limits, and a System that cannot be
-    written in scalar operations.
+    Raises ValueError for a ``folder`` in use, an unknown ``to``, a System with alarms
+    (``about.unsafe``) unless ``accept_unsafe``, a controller without limits, and a
+    System that cannot be written in scalar operations; for an FMU also without a
+    sampling rate in ``about`` or without a C compiler.
     """
+    if to not in FORMS:
+        raise ValueError(f"to is {to!r}: choose from {', '.join(FORMS)}")
     about = about or About()
     if not accept_unsafe:
         about.require_safe(
@@ -66,6 +76,10 @@ def export(
             system, axes, limits or about.limits, about, samples, draw
         )
     name = name or kind
+    if to == "fmu":
+        if precision != "double":
+            raise ValueError("the variables of an FMU are double; leave out precision")
+        return write_fmu(system, interface, Path(folder), name, about)
     return write_c(system, interface, inputs, Path(folder), name, about, precision)
 
 
