@@ -1,6 +1,7 @@
 """Origin of a saved System: the table ``about`` of its file."""
 
 from importlib.metadata import version
+from typing import Any
 
 from pydantic import BaseModel, Field
 
@@ -15,8 +16,8 @@ class About(BaseModel):
     sampling rate. ``units`` maps the channels of the System to their units, and
     ``parameter_units`` its parameters, by path; "" is an unknown unit.
     ``input_ranges`` are the least and greatest value of each input in the record.
-    ``limits`` are the lowest and highest voltage (V) of each axis that a controller was
-    tuned with, ``reference_ranges`` the least and greatest of its references.
+    ``actuator`` is the actuator that a controller was tuned with, as in a file of a
+    System, ``reference_ranges`` the least and greatest of its references on each axis.
     ``error_bound`` bounds the error of a fitted model, ``residual_rms`` is the rms
     error of each output on the validation part of its record, in the unit of the
     output, and ``checked`` lists the other records of its validation;
@@ -33,7 +34,7 @@ class About(BaseModel):
     units: dict[str, str] = {}
     parameter_units: dict[str, str] = {}
     input_ranges: list[tuple[float, float]] = []
-    limits: list[tuple[float, float]] = []
+    actuator: dict[str, Any] | None = None
     reference_ranges: list[tuple[float, float]] = []
     error_bound: ErrorBound | None = None
     residual_rms: list[float] = []

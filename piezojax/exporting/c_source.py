@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from .graph import CARRY, CONSTANT, INPUT, READ, RESULT, Block, Graph, Node
@@ -20,7 +21,7 @@ FUNCTIONS = {
     "abs": "fabs", "acos": "acos", "asin": "asin", "atan": "atan", "atan2": "atan2",
     "ceil": "ceil", "cos": "cos", "cosh": "cosh", "exp": "exp", "expm1": "expm1",
     "floor": "floor", "log": "log", "log1p": "log1p", "pow": "pow", "rem": "fmod",
-    "round": "round", "sin": "sin", "sinh": "sinh", "sqrt": "sqrt", "tan": "tan",
+    "sin": "sin", "sinh": "sinh", "sqrt": "sqrt", "tan": "tan",
     "tanh": "tanh",
 }  # fmt: skip
 """Functions of libm by the name of the operation in JAX."""
@@ -173,6 +174,9 @@ class _Writer:
             return f"{a} * {a}"
         if name == "integer_pow":
             return self._power(a, int(node.value))
+        if name == "round":
+            even = node.value == jax.lax.RoundingMethod.TO_NEAREST_EVEN
+            return f"{'rint' if even else 'round'}{self.precision.suffix}({a})"
         if name == "rsqrt":
             return f"{self._one()} / sqrt{self.precision.suffix}({a})"
         if name == "logistic":

@@ -12,7 +12,8 @@ import numpy as np
 from ..core.about import About
 from ..core.axes import PerAxis
 from ..core.feedback import Observation
-from ..core.system import System, accepts
+from ..core.serial import from_data
+from ..core.system import System, accepts, rest_output
 from ..hardware import Saturation
 from .c_project import Interface, write_c
 from .driven import Driven, Seen
@@ -47,8 +48,8 @@ def export(
 
     ``to`` is "c", C99 with a test of its own, or "fmu", an FMU 2.0 for co-simulation.
 
-    A controller leaves with the ``limits`` of its voltage, lowest and highest of each
-    axis (V), by default those of ``about``: the exported step saturates and tells the
+    A controller leaves with its actuator, that of ``about`` or ``limits``, the lowest
+    and highest voltage of each axis (V): the exported step saturates, and tells the
     controller what was applied, as in the simulated loop. Anything else is exported as
     it is. ``name`` begins the names of the header: by default "controller" or "plant".
     The golden vectors, ``samples`` long and drawn with ``seed``, cover the references
@@ -73,7 +74,7 @@ def export(
         system, interface, inputs = _plant(system, axes, about, samples, draw)
     else:
         system, interface, inputs = _controller(
-            system, axes, limits or about.limits, about, samples, draw
+            Driven(system, _actuator(axes, limits, about)), axes, about, samples, draw
         )
     name = name or kind
     if to == "fmu":
@@ -112,23 +113,25 @@ def _signal(values: Any, axes: int) -> Any:
     return tuple(jnp.asarray(values[..., axis]) for axis in range(axes))
 
 
-def _controller(
-    system: System,
-    axes: int,
-    limits: Limits,
-    about: About,
-    samples: int,
-    draw: np.random.Generator,
-) -> tuple[System, Interface, Any]:
-    """Return a controller with its limits, its signals, and inputs of a test."""
+def _actuator(axes: int, limits: Limits | None, about: About) -> System:
+    """Return the actuator with ``limits``, or that of ``about``."""
+    if limits is None and about.actuator is not None:
+        return from_data(about.actuator, "about.actuator")
     count = max(axes, 1)
-    if len(limits) != count:
+    if limits is None or len(limits) != count:
         raise ValueError(
-            f"a controller of {count} axes needs as many limits of its voltage, not "
-            f"{len(limits)}: give each as lowest and highest (--limits)"
+            "the limits of the voltage are unknown: give the lowest and the highest of "
+            f"each of {count} axes (--limits)"
         )
     parts = tuple(Saturation(*each) for each in limits)
-    system = Driven(system, PerAxis(parts) if axes else parts[0])
+    return PerAxis(parts) if axes else parts[0]
+
+
+def _controller(
+    system: Driven, axes: int, about: About, samples: int, draw: np.random.Generator
+) -> tuple[System, Interface, Any]:
+    """Return a controller with its actuator, its signals, and inputs of a test."""
+    count = max(axes, 1)
     ends = np.array(about.reference_ranges or [(-1.0, 1.0)] * count)
     middle, half = ends.mean(axis=1), 0.5 * np.ptp(ends, axis=1)
     k = np.arange(samples + 1)[:, None]
@@ -140,7 +143,8 @@ def _controller(
     inputs = Seen(
         *(_signal(x[:samples], axes) for x in (reference, reference[1:], measured))
     )
-    rest, voltage = _signal(middle, axes), _signal(np.mean(limits, axis=1), axes)
+    rest = _signal(middle, axes)
+    voltage = rest_output(system.actuator, _signal(np.zeros(count), axes))
     start = Observation(rest, rest, rest, voltage)
     return system, Interface(start, _first(inputs)), inputs
 

@@ -211,7 +211,8 @@ class _Tracer:
             return [self.product(left, right, params["dimension_numbers"])]
         if name in ELEMENTWISE:
             kind = _kind(equation.outvars[0].aval.dtype)
-            return [self.elementwise(name, operands, kind, params.get("y"))]
+            value = params.get("y", params.get("rounding_method"))
+            return [self.elementwise(name, operands, kind, value)]
         raise NotScalarError(f"its operation {name} has no scalar form")
 
     def _folded(self, equation: Any, operands: list[Numbers]) -> list[Numbers] | None:

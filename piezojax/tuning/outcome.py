@@ -19,6 +19,7 @@ from ..core.axes import axis_of
 from ..core.feedback import Feedback, LoopSample, loop_inputs
 from ..core.paths import parameters
 from ..core.rollout import simulate
+from ..core.serial import to_data
 from ..core.system import System, resolve
 from ..study import Case
 from .baselines import Baselines
@@ -62,16 +63,15 @@ class Outcome:
     def about(self) -> About:
         """Origin of the tuned controller, for its file."""
         study = self.case.study
-        axes, drive = study.axes, study.actuator
+        axes = study.axes
         channels = zip(axes.names, axes.units, strict=True) if axes else ()
-        ends = (study.by_axis(limit) for limit in (drive.lower, drive.upper))
         references = np.asarray(self.holdout.references)
         samples = references.reshape(-1, study.axis_count if axes else 1)
         return About(
             study=self.case.name,
             seed=study.seed,
             rate_Hz=study.rate,
-            limits=[*zip(*ends, strict=True)],
+            actuator=to_data(self.after.actuator),
             reference_ranges=[(float(x.min()), float(x.max())) for x in samples.T],
             unsafe=self.result.alarms,
             units=dict(channels) or {"measured": "um", "command": "V"},

@@ -36,11 +36,16 @@ def main():
     parser.add_argument("--controller", default="p753_disturbance_observer")
     parser.add_argument("--count", type=int, default=20)
     chosen = parser.parse_args()
-    about = pj.About(limits=[(-20.0, 120.0)], reference_ranges=[(0.0, 10.0)])
+    about = pj.About(reference_ranges=[(0.0, 10.0)])
     passed = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "c"
-        source = pj.export(CONTROLLERS[chosen.controller](), folder, about=about)[1]
+        source = pj.export(
+            CONTROLLERS[chosen.controller](),
+            folder,
+            about=about,
+            limits=[(-20.0, 120.0)],
+        )[1]
         text = source.read_text()
         drawn = random.Random(20).sample([*places(text)], chosen.count)
         for position, new in drawn:

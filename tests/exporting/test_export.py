@@ -11,13 +11,18 @@ import pytest
 import piezojax as pj
 from piezojax.catalog import CONTROLLERS, PLANTS
 from piezojax.core.parameter import parameter
+from piezojax.core.serial import to_data
 from piezojax.exporting import Driven, NotScalarError, Seen, trace
 from piezojax.exporting.c_source import DOUBLE, statements
 from piezojax.exporting.graph import CONSTANT, INPUT
 
-LIMITS = [(-20.0, 120.0)]
+ACTUATOR = to_data(pj.Saturation(-20.0, 120.0))
 ABOUT = pj.About(
-    study="a study", seed=3, rate_Hz=2e4, limits=LIMITS, reference_ranges=[(0.0, 10.0)]
+    study="a study",
+    seed=3,
+    rate_Hz=2e4,
+    actuator=ACTUATOR,
+    reference_ranges=[(0.0, 10.0)],
 )
 
 compiled = pytest.mark.skipif(
@@ -56,12 +61,32 @@ def test_a_controller_equals_its_simulation(name, samples, tmp_path):
 
 @compiled
 def test_a_controller_of_several_axes_equals_its_simulation(tmp_path):
-    about = pj.About(limits=[(-50.0, 50.0)] * 3, reference_ranges=[(-9.0, 9.0)] * 3)
-    files = pj.export(CONTROLLERS["p558_pid"](), tmp_path / "c", about=about)
+    about = pj.About(reference_ranges=[(-9.0, 9.0)] * 3)
+    limits = [(-50.0, 50.0), (-40.0, 40.0), (-30.0, 30.0)]
+    files = pj.export(
+        CONTROLLERS["p558_pid"](), tmp_path / "c", about=about, limits=limits
+    )
     status, text = made(tmp_path / "c")
     assert status == 0, text
     assert text.count("passed") == 3
     assert "controller_output *output" in files[0].read_text()
+
+
+@compiled
+def test_the_actuator_of_the_study_leaves_with_the_controller(tmp_path):
+    actuator = pj.series(
+        limits=pj.Saturation(-20.0, 120.0),
+        slew=pj.hardware.SlewLimit(1e4, 5e-5),
+        converter=pj.hardware.Quantiser(0.25),
+    )
+    about = ABOUT.model_copy(update={"actuator": to_data(actuator)})
+    pj.export(CONTROLLERS["p753_pid"](), tmp_path / "c", about=about)
+    status, text = made(tmp_path / "c")
+    assert status == 0, text
+    rows = np.loadtxt(tmp_path / "c" / "vectors.csv", delimiter=",", skiprows=2)
+    voltage = rows[:, -1]
+    assert np.all(voltage % 0.25 == 0.0)
+    assert np.abs(np.diff(voltage)).max() == 0.5  # V a sample
 
 
 @compiled
@@ -162,7 +187,7 @@ def test_gains_with_an_alarm_are_refused_unless_accepted(tmp_path):
 
 
 def test_a_controller_without_limits_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="needs as many limits of its voltage, not 0"):
+    with pytest.raises(ValueError, match="the limits of the voltage are unknown"):
         pj.export(CONTROLLERS["p753_pid"](), tmp_path / "c")
     assert not (tmp_path / "c").exists()
 

@@ -8,6 +8,7 @@ import pytest
 
 import piezojax as pj
 from piezojax.catalog import CONTROLLERS, PLANTS
+from piezojax.core.serial import to_data
 
 fmpy = pytest.importorskip("fmpy")
 pytestmark = pytest.mark.skipif(
@@ -15,7 +16,11 @@ pytestmark = pytest.mark.skipif(
 )
 
 RATE = 2e4
-ABOUT = pj.About(rate_Hz=RATE, limits=[(-20.0, 120.0)], reference_ranges=[(0.0, 10.0)])
+ABOUT = pj.About(
+    rate_Hz=RATE,
+    actuator=to_data(pj.Saturation(-20.0, 120.0)),
+    reference_ranges=[(0.0, 10.0)],
+)
 
 
 class Unit:
