@@ -301,6 +301,7 @@ def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     assert "Study: small, seed 3." in text
     assert re.search(r"parameters.actuator_\w*lower = -20.0;", text)
     assert re.search(r"parameters.actuator_\w*upper = 120.0;", text)
+    assert "Judged: tuned loop: sensitivity peak" in text
     columns = np.loadtxt(out / "vectors.csv", delimiter=",", skiprows=2).T
     references = pj.read_about(tuned[1] / "gains.toml").reference_ranges[0]
     assert columns[0].min() < references[0]
@@ -315,7 +316,7 @@ def test_export_of_a_model_needs_no_limits(tmp_path):
 
 def test_export_refuses_gains_with_an_alarm_unless_accepted(tmp_path):
     path = tmp_path / "gains.toml"
-    about = pj.About(unsafe=["it rings"])
+    about = pj.About(judged=["fine"], unsafe=["it rings"])
     pj.save(pj.control.PID(0.5, 3000.0, dt=5e-5), path, about)
     out = tmp_path / "c"
     command = ("export", path, "--out", out, "--limits", 0, 1)

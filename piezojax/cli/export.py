@@ -50,7 +50,7 @@ def main(source, to, name, precision, limits, accept_unsafe, out, seed, quiet):
 
     def body(console):
         from ..core.serial import load, read_about
-        from ..exporting import export
+        from ..exporting import export, export_alarms
 
         path = next(
             (source / file for file in SYSTEMS if (source / file).is_file()), source
@@ -70,7 +70,7 @@ def main(source, to, name, precision, limits, accept_unsafe, out, seed, quiet):
             seed=seed or 0,
             accept_unsafe=accept_unsafe,
         )
-        print_alarms(console, about.unsafe)
+        print_alarms(console, export_alarms(system, about))
         for file in files:
             console.print(f"{file}", soft_wrap=True)
         if to == "c":

@@ -16,6 +16,7 @@ class About(BaseModel):
     sampling rate. ``units`` maps the channels of the System to their units, and
     ``parameter_units`` its parameters, by path; "" is an unknown unit.
     ``input_ranges`` are the least and greatest value of each input in the record.
+    ``judged`` lists the margins that a controller was judged with, a sentence each.
     ``actuator`` is the actuator that a controller was tuned with, as in a file of a
     System, ``reference_ranges`` the least and greatest of its references on each axis.
     ``error_bound`` bounds the error of a fitted model, ``residual_rms`` is the rms
@@ -34,6 +35,7 @@ class About(BaseModel):
     units: dict[str, str] = {}
     parameter_units: dict[str, str] = {}
     input_ranges: list[tuple[float, float]] = []
+    judged: list[str] = []
     actuator: dict[str, Any] | None = None
     reference_ranges: list[tuple[float, float]] = []
     error_bound: ErrorBound | None = None

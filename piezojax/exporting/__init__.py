@@ -3,6 +3,7 @@
 from .driven import Driven as Driven
 from .driven import Seen as Seen
 from .exporter import export as export
+from .exporter import export_alarms as export_alarms
 from .graph import Graph as Graph
 from .trace import NotScalarError as NotScalarError
 from .trace import trace as trace

@@ -225,8 +225,8 @@ class CProject:
             lines.append(f"Record: {about.record}.")
         if about.rate_Hz:
             lines.append(f"Sampling rate: {about.rate_Hz:.9g} Hz; no other.")
-        if about.unsafe:
-            lines.insert(0, "UNSAFE: " + " ".join(about.unsafe))
+        lines += [f"Judged: {each}." for each in about.judged]
+        lines[:0] = [f"UNSAFE: {each}" for each in about.unsafe]
         return "\n   ".join(line.replace("*/", "* /") for line in lines)
 
     def header(self) -> str:

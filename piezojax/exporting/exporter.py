@@ -25,6 +25,8 @@ HELD = 50
 AXES = 6
 """Largest number of axes that is tried."""
 
+UNJUDGED = "no study has judged the stability of this controller"
+
 FORMS = ("c", "fmu")
 """Forms of an export."""
 
@@ -56,19 +58,21 @@ def export(
     for which the gains were tuned, and three times their range.
 
     Raises ValueError for a ``folder`` in use, an unknown ``to``, a System with alarms
-    (``about.unsafe``) unless ``accept_unsafe``, a controller without limits, and a
+    (``about.unsafe``) or a controller without margins (``about.judged``) unless
+    ``accept_unsafe``, a controller without limits, and a
     System that cannot be written in scalar operations; for an FMU also without a
     sampling rate in ``about`` or without a C compiler.
     """
     if to not in FORMS:
         raise ValueError(f"to is {to!r}: choose from {', '.join(FORMS)}")
     about = about or About()
+    kind, axes = _kind_of(system)
+    about = about.model_copy(update={"unsafe": export_alarms(system, about)})
     if not accept_unsafe:
         about.require_safe(
             type(system).__name__,
             "to export it all the same, pass accept_unsafe=True (--accept-unsafe)",
         )
-    kind, axes = _kind_of(system)
     draw = np.random.default_rng(seed)
     if kind == "plant":
         system, interface, inputs = _plant(system, axes, about, samples, draw)
@@ -82,6 +86,13 @@ def export(
             raise ValueError("the variables of an FMU are double; leave out precision")
         return write_fmu(system, interface, Path(folder), name, about)
     return write_c(system, interface, inputs, Path(folder), name, about, precision)
+
+
+def export_alarms(system: System, about: About) -> list[str]:
+    """Return the reasons not to export ``system``: those of its file, and one for a
+    controller that no study has judged."""
+    unjudged = _kind_of(system)[0] == "controller" and not about.judged
+    return [*about.unsafe, *([UNJUDGED] if unjudged else [])]
 
 
 def _kind_of(system: System) -> tuple[str, int]:

@@ -71,6 +71,7 @@ class Outcome:
             study=self.case.name,
             seed=study.seed,
             rate_Hz=study.rate,
+            judged=self.judged,
             actuator=to_data(self.after.actuator),
             reference_ranges=[(float(x.min()), float(x.max())) for x in samples.T],
             unsafe=self.result.alarms,
@@ -80,6 +81,32 @@ class Outcome:
                 for path in parameters(self.controller)
             },
         )
+
+    @property
+    def judged(self) -> list[str]:
+        """Margins of the tuned loop, a sentence each; none if they are not known."""
+        reports = [*self.stability.reports.get("after", {}).values()]
+        if "after" in self.stability.axes:
+            reports = [self.stability.axes["after"].report]
+        if not reports or not all(report.stable for report in reports):
+            return []
+        peak = max(float(report.sensitivity_peak or np.inf) for report in reports)
+        disk = min(float(report.disk_margin or 0.0) for report in reports)
+        found = [f"tuned loop: sensitivity peak {peak:.4g}, disk margin {disk:.4g}"]
+        drawn = self.result.perturbed
+        outcomes = [
+            *(("tuning", each) for each in self.result.constraints.items()),
+            *(
+                ("held-out", each)
+                for each in (drawn.constraints if drawn else {}).items()
+            ),
+        ]
+        return found + [
+            f"{name} {outcome.value:.4g} {outcome.unit} on the worst of {outcome.of} "
+            f"{kind} plants"
+            for kind, (name, outcome) in outcomes
+            if outcome.of > 1 and outcome.value is not None
+        ]
 
     @cached_property
     def limit(self) -> LimitReport | str:

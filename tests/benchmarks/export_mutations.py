@@ -36,7 +36,7 @@ def main():
     parser.add_argument("--controller", default="p753_disturbance_observer")
     parser.add_argument("--count", type=int, default=20)
     chosen = parser.parse_args()
-    about = pj.About(reference_ranges=[(0.0, 10.0)])
+    about = pj.About(judged=["not here"], reference_ranges=[(0.0, 10.0)])
     passed = []
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "c"

@@ -32,7 +32,7 @@ RANGES = {"p753": (0.0, 10.0), "p558": (-9.0, 9.0), "mirror": (-1.0, 1.0)}
 def tested(make, name, precision):
     """Return lines and relative difference of an export, and whether it passes."""
     stage, axes = name.partition("_")[0], 1 if name.startswith("p753") else 3
-    about = pj.About(reference_ranges=[RANGES[stage]] * axes)
+    about = pj.About(judged=["not here"], reference_ranges=[RANGES[stage]] * axes)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "c"
         _, source, *_ = pj.export(

@@ -19,6 +19,7 @@ from piezojax.exporting.graph import CONSTANT, INPUT
 ACTUATOR = to_data(pj.Saturation(-20.0, 120.0))
 ABOUT = pj.About(
     study="a study",
+    judged=["tuned loop: sensitivity peak 1.5"],
     seed=3,
     rate_Hz=2e4,
     actuator=ACTUATOR,
@@ -61,7 +62,7 @@ def test_a_controller_equals_its_simulation(name, samples, tmp_path):
 
 @compiled
 def test_a_controller_of_several_axes_equals_its_simulation(tmp_path):
-    about = pj.About(reference_ranges=[(-9.0, 9.0)] * 3)
+    about = pj.About(judged=["fine"], reference_ranges=[(-9.0, 9.0)] * 3)
     limits = [(-50.0, 50.0), (-40.0, 40.0), (-30.0, 30.0)]
     files = pj.export(
         CONTROLLERS["p558_pid"](), tmp_path / "c", about=about, limits=limits
@@ -152,6 +153,7 @@ def test_the_files_name_their_origin_and_units(tmp_path):
         text = path.read_text()
         assert "Study: a study, seed 3." in text
         assert "Sampling rate: 20000 Hz" in text
+        assert "Judged: tuned loop: sensitivity peak 1.5." in text
     assert "proportional gain P, unit V/um" in header.read_text()
     assert "void pid_init(pid_state *state," in header.read_text()
 
@@ -188,8 +190,18 @@ def test_gains_with_an_alarm_are_refused_unless_accepted(tmp_path):
 
 def test_a_controller_without_limits_is_refused(tmp_path):
     with pytest.raises(ValueError, match="the limits of the voltage are unknown"):
-        pj.export(CONTROLLERS["p753_pid"](), tmp_path / "c")
+        pj.export(CONTROLLERS["p753_pid"](), tmp_path / "c", accept_unsafe=True)
     assert not (tmp_path / "c").exists()
+
+
+def test_a_controller_that_no_study_judged_is_refused_unless_accepted(tmp_path):
+    controller, limits = CONTROLLERS["p753_pid"](), [(0.0, 1.0)]
+    with pytest.raises(ValueError, match="no study has judged the stability"):
+        pj.export(controller, tmp_path / "c", limits=limits)
+    header, *_ = pj.export(
+        controller, tmp_path / "c", limits=limits, accept_unsafe=True
+    )
+    assert header.read_text().startswith("/* UNSAFE: no study has judged")
 
 
 @pytest.mark.parametrize(

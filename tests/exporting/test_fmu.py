@@ -18,6 +18,7 @@ pytestmark = pytest.mark.skipif(
 RATE = 2e4
 ABOUT = pj.About(
     rate_Hz=RATE,
+    judged=["fine"],
     actuator=to_data(pj.Saturation(-20.0, 120.0)),
     reference_ranges=[(0.0, 10.0)],
 )
