@@ -15,9 +15,10 @@ SYSTEMS = ("gains.toml", "model.json")
 @click.argument("source", type=click.Path(path_type=Path), metavar="FILE")
 @click.option(
     "--to",
-    type=click.Choice(["c", "fmu"]),
+    type=click.Choice(["c", "fmu", "mat", "octave"]),
     default="c",
-    help="c: C99 with a test (default); fmu: FMU 2.0 for co-simulation.",
+    help="c: C99 with a test (default); fmu: FMU 2.0 for co-simulation; mat, octave: "
+    "the model linearised at rest.",
 )
 @click.option(
     "--name", help="Begins all names in C (default: controller, or plant for a model)."
@@ -42,7 +43,7 @@ SYSTEMS = ("gains.toml", "model.json")
 )
 @common
 def main(source, to, name, precision, limits, accept_unsafe, out, seed, quiet):
-    """Export the System in FILE as C99 or as an FMU.
+    """Export the System in FILE as C99, an FMU, or a linear model.
 
     FILE is the gains.toml of tune, the model.json of identify, or the folder of their
     results. `make test` in a folder of C compiles the source and replays a simulation.

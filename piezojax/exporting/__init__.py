@@ -5,5 +5,7 @@ from .driven import Seen as Seen
 from .exporter import export as export
 from .exporter import export_alarms as export_alarms
 from .graph import Graph as Graph
+from .linear_models import from_control as from_control
+from .linear_models import to_control as to_control
 from .trace import NotScalarError as NotScalarError
 from .trace import trace as trace

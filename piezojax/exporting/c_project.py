@@ -89,7 +89,7 @@ def _nodes(output: Any) -> list[int]:
     return output.ravel().tolist()
 
 
-def _slots(tree: Any, word: str) -> list[Slot]:
+def slots(tree: Any, word: str) -> list[Slot]:
     """Return the leaves of ``tree``, an array as one slot of its size.
 
     ``word`` begins a name that has no letter of its own.
@@ -149,11 +149,11 @@ class CProject:
         self.output = eqx.filter_eval_shape(
             system.step, self.state, self.interface.input
         )[1]
-        self.parameters = _slots(self.dynamic, "parameter")
-        self.states = _slots(self.state, "state")
-        self.starts = _slots(self.interface.start, "input")
-        self.inputs = _slots(self.interface.input, "input")
-        self.outputs = _slots(self.output, "output")
+        self.parameters = slots(self.dynamic, "parameter")
+        self.states = slots(self.state, "state")
+        self.starts = slots(self.interface.start, "input")
+        self.inputs = slots(self.interface.input, "input")
+        self.outputs = slots(self.output, "output")
         self.values = [np.ravel(leaf) for leaf in jax.tree.leaves(self.dynamic)]
 
     # Text

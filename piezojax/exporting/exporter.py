@@ -18,6 +18,10 @@ from ..hardware import Saturation
 from .c_project import Interface, write_c
 from .driven import Driven, Seen
 from .fmu import write_fmu
+from .linear_models import write_linear
+
+FAR = 1e6
+"""A voltage beyond the limits of every actuator, V."""
 
 HELD = 50
 """Number of samples between the corners of the input of a plant."""
@@ -27,7 +31,7 @@ AXES = 6
 
 UNJUDGED = "no study has judged the stability of this controller"
 
-FORMS = ("c", "fmu")
+FORMS = ("c", "fmu", "mat", "octave")
 """Forms of an export."""
 
 Limits = Sequence[tuple[float, float]]
@@ -48,7 +52,8 @@ def export(
 ) -> list[Path]:
     """Write ``system`` to a new ``folder``; return the paths of its files.
 
-    ``to`` is "c", C99 with a test of its own, or "fmu", an FMU 2.0 for co-simulation.
+    ``to`` is "c", C99 with a test of its own; "fmu", an FMU 2.0 for co-simulation; or
+    "mat" or "octave", the model linearised at rest for MATLAB or Octave.
 
     A controller leaves with its actuator, that of ``about`` or ``limits``, the lowest
     and highest voltage of each axis (V): the exported step saturates, and tells the
@@ -59,9 +64,9 @@ def export(
 
     Raises ValueError for a ``folder`` in use, an unknown ``to``, a System with alarms
     (``about.unsafe``) or a controller without margins (``about.judged``) unless
-    ``accept_unsafe``, a controller without limits, and a
-    System that cannot be written in scalar operations; for an FMU also without a
-    sampling rate in ``about`` or without a C compiler.
+    ``accept_unsafe``, a controller without limits, and a System that cannot be written
+    in scalar operations. An FMU takes a sampling rate and a C compiler too, a linear
+    model a sampling rate.
     """
     if to not in FORMS:
         raise ValueError(f"to is {to!r}: choose from {', '.join(FORMS)}")
@@ -81,9 +86,11 @@ def export(
             Driven(system, _actuator(axes, limits, about)), axes, about, samples, draw
         )
     name = name or kind
+    if to != "c" and precision != "double":
+        raise ValueError(f"the numbers of {to} are double; leave out precision")
+    if to in ("mat", "octave"):
+        return write_linear(system, interface, Path(folder), name, about, to)
     if to == "fmu":
-        if precision != "double":
-            raise ValueError("the variables of an FMU are double; leave out precision")
         return write_fmu(system, interface, Path(folder), name, about)
     return write_c(system, interface, inputs, Path(folder), name, about, precision)
 
@@ -155,7 +162,11 @@ def _controller(
         *(_signal(x[:samples], axes) for x in (reference, reference[1:], measured))
     )
     rest = _signal(middle, axes)
-    voltage = rest_output(system.actuator, _signal(np.zeros(count), axes))
+    lowest, highest = (
+        rest_output(system.actuator, _signal(np.full(count, end), axes))
+        for end in (-FAR, FAR)
+    )
+    voltage = jax.tree.map(lambda a, b: 0.5 * (a + b), lowest, highest)
     start = Observation(rest, rest, rest, voltage)
     return system, Interface(start, _first(inputs)), inputs
 

@@ -154,8 +154,8 @@ def test_the_same_gains_give_the_same_sources(tmp_path):
     ("about", "options", "message"),
     [
         (ABOUT.model_copy(update={"rate_Hz": None}), {}, "needs the sampling rate"),
-        (ABOUT, {"precision": "float"}, "the variables of an FMU are double"),
-        (ABOUT, {"to": "exe"}, "to is 'exe': choose from c, fmu"),
+        (ABOUT, {"precision": "float"}, "the numbers of fmu are double"),
+        (ABOUT, {"to": "exe"}, "to is 'exe': choose from c, fmu, mat, octave"),
     ],
 )
 def test_bad_options_are_refused(about, options, message, tmp_path):
