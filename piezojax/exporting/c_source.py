@@ -114,7 +114,7 @@ class _Writer:
                 continue
             if node.source and node.source != source:
                 source = node.source
-                yield f"{indent}/* {source.replace('.<locals>', '')} */"
+                yield f"{indent}/* {source} */"
             text = self._operation(node)
             yield f"{indent}const {self._type(node)} {self._name(number)} = {text};"
 

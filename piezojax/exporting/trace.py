@@ -456,6 +456,9 @@ def _source_of(equation: Any) -> str:
         return ""
     for frame in traceback.frames:
         path = Path(frame.file_name)
-        if "piezojax" in path.parts and "exporting" not in path.parts:
-            return frame.function_name
+        # Functions without a name are part of the one that holds them.
+        name = frame.function_name.partition(".<")[0]
+        own = "piezojax" in path.parts and "exporting" not in path.parts
+        if own and name[0] != "<":
+            return name
     return ""
