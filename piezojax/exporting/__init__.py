@@ -7,5 +7,5 @@ from .exporter import export_alarms as export_alarms
 from .graph import Graph as Graph
 from .linear_models import from_control as from_control
 from .linear_models import to_control as to_control
-from .trace import NotScalarError as NotScalarError
+from .node_arrays import NotScalarError as NotScalarError
 from .trace import trace as trace

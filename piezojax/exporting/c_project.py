@@ -1,9 +1,8 @@
-"""A System as a C99 project: header, source, golden vectors, and their test."""
+"""Header and source of a System in C99."""
 
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,19 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..core.about import About
-from ..core.files import fresh_folder, write_text
 from ..core.parameter import Parameter
 from ..core.paths import declared
-from ..core.rollout import simulate
 from ..core.system import System, resolve
 from .c_source import PRECISIONS, TYPES, statements
-from .c_templates import HEADER, MAKEFILE, SOURCE, TEST
+from .c_templates import HEADER, SOURCE
 from .driven import Driven
-from .trace import Memory, NotScalarError, trace
-
-TOLERANCE = {"double": 1e-12, "float": 1e-3}
-"""Largest difference from the golden vectors, as a share of their largest value."""
-
+from .node_arrays import Memory, NotScalarError
+from .trace import trace
 
 MANY = 8
 """Number of equal elements above which they are set in a loop."""
@@ -48,38 +42,6 @@ class Interface(NamedTuple):
 
     start: Any
     input: Any
-
-
-def write_c(
-    system: System,
-    interface: Interface,
-    inputs: Any,
-    folder: Path,
-    name: str,
-    about: About,
-    precision: str = "double",
-) -> list[Path]:
-    """Write ``system`` to the new ``folder`` as C99; return the paths of the files.
-
-    ``name`` begins every name of the header. ``inputs`` is a tree like
-    ``interface.input`` with a leading axis of samples; the outputs of the simulation
-    for it are the golden vectors of the test, which ``make test`` runs.
-    Raises ValueError for a ``folder`` in use, a ``name`` that is not one of C, an
-    unknown ``precision``, and a System that has no form in scalar operations, with the
-    operation.
-    """
-    code = CProject(system, interface, name, about, precision)
-    files = {
-        f"{name}.h": code.header(),
-        f"{name}.c": code.source(),
-        f"test_{name}.c": code.test(TOLERANCE[precision]),
-        "vectors.csv": code.vectors(inputs),
-        "Makefile": MAKEFILE.format(name=name),
-    }
-    folder = fresh_folder(folder)
-    for file, text in files.items():
-        write_text(folder / file, text)
-    return [folder / file for file in files]
 
 
 def _nodes(output: Any) -> list[int]:
@@ -119,7 +81,7 @@ def expressions(slots: Sequence[Slot], start: str) -> list[str]:
 
 
 class CProject:
-    """The texts of a C project; the arguments are those of ``write_c``.
+    """The texts of a C project; the arguments are those of ``c_export.write_c``.
 
     ``parameters``, ``states``, ``starts``, ``inputs`` and ``outputs`` are the fields
     and arguments in C, ``values`` the values of the parameters.
@@ -375,53 +337,3 @@ class CProject:
         for place, text in pairs:
             if text != place:
                 yield f"    {place} = {old.get(text, text)};"
-
-    # Golden vectors
-
-    def vectors(self, inputs: Any) -> str:
-        """Return a simulation as CSV: its start, then inputs and outputs by name."""
-        _, outputs = simulate(self.system, inputs, self.state)
-        columns = [
-            np.asarray(leaf).reshape(len(leaf))
-            for tree in (inputs, outputs)
-            for leaf in jax.tree.leaves(tree)
-        ]
-        names = [slot.name for slot in self.inputs]
-        results = [f"output_{i}" for i in range(len(self.outputs))]
-        start = [float(leaf) for leaf in jax.tree.leaves(self.interface.start)]
-        rows = np.column_stack(columns)
-        return "\n".join(
-            [
-                ",".join(repr(value) for value in start),
-                ",".join([*names, *results]),
-                *(",".join(repr(float(v)) for v in row) for row in rows),
-                "",
-            ]
-        )
-
-    def test(self, tolerance: float) -> str:
-        starts, inputs, outputs = (
-            len(part) for part in (self.starts, self.inputs, self.outputs)
-        )
-        real = self.precision.real
-        begin = "".join(f", ({real})start[{i}]" for i in range(starts))
-        given = "".join(f", ({real})row[{i}]" for i in range(inputs))
-        call = f"{self.name}_step(&state, &parameters{given}"
-        if outputs == 1:
-            step = f"        found[0] = {call});"
-        else:
-            fields = expressions(self.outputs, "output.")
-            step = f"        {call}, &output);\n" + "\n".join(
-                f"        found[{i}] = {field};" for i, field in enumerate(fields)
-            )
-        return TEST.format(
-            name=self.name,
-            starts=starts,
-            columns=inputs + outputs,
-            inputs=inputs,
-            outputs=outputs,
-            output=f"    {self.name}_output output;\n" if outputs > 1 else "",
-            begin=begin,
-            step=step,
-            tolerance=repr(tolerance),
-        )

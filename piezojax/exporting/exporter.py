@@ -15,7 +15,8 @@ from ..core.feedback import Observation
 from ..core.serial import from_data
 from ..core.system import System, accepts, rest_output
 from ..hardware import Saturation
-from .c_project import Interface, write_c
+from .c_export import write_c
+from .c_project import Interface
 from .driven import Driven, Seen
 from .fmu import write_fmu
 from .linear_models import write_linear

@@ -8,17 +8,15 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox.internal as eqxi
 import jax
 import numpy as np
 from jax.extend import core as jex
 
-from .graph import CARRY, INPUT, READ, Block, Graph, Kind, Loop
-
-Numbers = np.ndarray
-"""Array of the numbers of nodes, with the shape of the traced array."""
+from .graph import CARRY, INPUT, Block, Graph, Loop
+from .node_arrays import Memory, NodeArrays, NotScalarError, Numbers, kind_of
 
 ELEMENTWISE = {
     "abs", "acos", "add", "and", "asin", "atan", "atan2", "ceil", "clamp",
@@ -72,29 +70,6 @@ MOST = 15_000
 """Largest number of operations of a graph: compilers of C take minutes for more."""
 
 
-class NotScalarError(ValueError):
-    """The function has an operation that is not one of scalars."""
-
-
-class Memory(NamedTuple):
-    """A long array that stays an array, such as a stored period.
-
-    ``place`` is that of its first element among the inputs. ``writes`` are the elements
-    that have changed since, as pairs of the nodes of index and value.
-    """
-
-    place: int
-    size: int
-    writes: tuple[tuple[int, int], ...] = ()
-
-    def elements(self, graph: Graph) -> Numbers:
-        """Return the nodes of the elements. Raises NotScalarError after a write."""
-        if self.writes:
-            raise NotScalarError("it uses a long array as a whole after a change")
-        places = range(self.place, self.place + self.size)
-        return np.array([graph.add(INPUT, (), "real", place) for place in places], int)
-
-
 def trace(function: Callable, *arguments: Any) -> tuple[Graph, list[Any]]:
     """Return the graph of ``function`` and the nodes of its outputs, leaf by leaf.
 
@@ -111,7 +86,7 @@ def trace(function: Callable, *arguments: Any) -> tuple[Graph, list[Any]]:
     inputs = []
     for variable in closed.jaxpr.invars:
         size = math.prod(variable.aval.shape)
-        kind = _kind(variable.aval.dtype)
+        kind = kind_of(variable.aval.dtype)
         if len(variable.aval.shape) == 1 and size >= LONG and kind == "real":
             inputs.append(Memory(place, size))
             place += size
@@ -124,54 +99,35 @@ def trace(function: Callable, *arguments: Any) -> tuple[Graph, list[Any]]:
     return tracer.graph, tracer.evaluate(closed, inputs)
 
 
-def _kind(dtype: Any) -> Kind:
-    if np.issubdtype(dtype, np.bool_):
-        return "boolean"
-    if np.issubdtype(dtype, np.integer):
-        return "integer"
-    if np.issubdtype(dtype, np.floating):
-        return "real"
-    raise NotScalarError(f"it computes with {dtype}; the export has real numbers only")
-
-
 class _Tracer:
     def __init__(self):
         self.graph = Graph()
-        self._source = ""
+        self.arrays = NodeArrays(self.graph)
 
     def evaluate(self, closed: Any, inputs: Sequence[Any]) -> list[Any]:
         """Return the outputs of a closed jaxpr."""
         jaxpr = closed.jaxpr
         values: dict[Any, Numbers] = dict(zip(jaxpr.invars, inputs, strict=True))
         for variable, constant in zip(jaxpr.constvars, closed.consts, strict=True):
-            values[variable] = self.constants(np.asarray(constant))
+            values[variable] = self.arrays.constants(np.asarray(constant))
 
         def read(atom: Any) -> Any:
             if isinstance(atom, jex.Literal):
                 kind: Any = atom.aval
-                return self.constants(np.asarray(atom.val, kind.dtype))
+                return self.arrays.constants(np.asarray(atom.val, kind.dtype))
             return values[atom]
 
         for equation in jaxpr.eqns:
-            outer, self._source = self._source, _source_of(equation) or self._source
+            outer, self.arrays.source = (
+                self.arrays.source,
+                _source_of(equation) or self.arrays.source,
+            )
             results = self.equation(equation, [read(atom) for atom in equation.invars])
-            self._source = outer
+            self.arrays.source = outer
             values.update(zip(equation.outvars, results, strict=True))
             if len(self.graph.nodes) > MOST:
                 raise NotScalarError(f"it has more than {MOST} scalar operations")
         return [read(atom) for atom in jaxpr.outvars]
-
-    def constants(self, array: np.ndarray) -> Numbers:
-        kind = _kind(array.dtype)
-        plain = [self.graph.constant(value, kind) for value in array.ravel().tolist()]
-        return np.array(plain, int).reshape(array.shape)
-
-    def values(self, numbers: Numbers, dtype: Any) -> np.ndarray | None:
-        """Return the values of constants, or None if one is computed."""
-        nodes = [self.graph.nodes[number] for number in numbers.ravel()]
-        if any(node.operation != "constant" for node in nodes):
-            return None
-        return np.array([node.value for node in nodes], dtype).reshape(numbers.shape)
 
     def equation(self, equation: Any, operands: list[Any]) -> list[Any]:
         """Return the results of an equation of a jaxpr."""
@@ -181,7 +137,7 @@ class _Tracer:
             return operands
         inner = next((params[key] for key in CALLS if key in params), None)
         if any(isinstance(operand, Memory) for operand in operands):
-            found = self.in_memory(equation, operands)
+            found = self.arrays.in_memory(equation, operands)
             if found is not None:
                 return [found]
             if inner is None or name in ("scan", "while"):
@@ -205,52 +161,26 @@ class _Tracer:
             return self.moved(equation, operands)
         if name in FOLDS:
             axes = params.get("axes", range(operands[0].ndim))
-            return [self.reduced(FOLDS[name], operands[0], axes)]
+            return [self.arrays.reduced(FOLDS[name], operands[0], axes)]
         if name == "dot_general":
             left, right = operands
-            return [self.product(left, right, params["dimension_numbers"])]
+            return [self.arrays.product(left, right, params["dimension_numbers"])]
         if name in ELEMENTWISE:
-            kind = _kind(equation.outvars[0].aval.dtype)
+            kind = kind_of(equation.outvars[0].aval.dtype)
             value = params.get("y", params.get("rounding_method"))
-            return [self.elementwise(name, operands, kind, value)]
+            return [self.arrays.elementwise(name, operands, kind, value)]
         raise NotScalarError(f"its operation {name} has no scalar form")
 
     def _folded(self, equation: Any, operands: list[Numbers]) -> list[Numbers] | None:
         """Return the constant results of an equation whose operands are constants."""
         arrays = [
-            self.values(numbers, atom.aval.dtype)
+            self.arrays.values(numbers, atom.aval.dtype)
             for numbers, atom in zip(operands, equation.invars, strict=True)
         ]
         known = [array for array in arrays if array is not None]
         if len(known) < len(arrays):
             return None
-        return [self.constants(each) for each in _bound(equation, known)]
-
-    def elementwise(
-        self, name: str, operands: Sequence[Numbers], kind: Kind, value: Any = None
-    ) -> Numbers:
-        arrays = np.broadcast_arrays(*operands)
-        flat = zip(*(array.ravel() for array in arrays), strict=True)
-        numbers = [
-            self.scalar(name, [int(n) for n in each], kind, value) for each in flat
-        ]
-        return np.array(numbers, int).reshape(arrays[0].shape)
-
-    def scalar(self, name: str, operands: list[int], kind: Kind, value: Any) -> int:
-        """Return the node of an operation; neutral operands need none."""
-        nodes = [self.graph.nodes[number] for number in operands]
-        known = [node.value if node.operation == "constant" else None for node in nodes]
-        if name == "convert_element_type" and nodes[0].kind == kind:
-            return operands[0]
-        if name == "select_n" and known[0] is not None:
-            return operands[1 + int(known[0])]
-        if name == "select_n" and len(set(operands[1:])) == 1:
-            return operands[1]
-        if name in ("mul", "div") and known[1] == 1.0:
-            return operands[0]
-        if name == "mul" and known[0] == 1.0:
-            return operands[1]
-        return self.graph.add(name, operands, kind, value, self._source)
+        return [self.arrays.constants(each) for each in _bound(equation, known)]
 
     def moved(self, equation: Any, operands: list[Numbers]) -> list[Numbers]:
         """Return the numbers that an operation without arithmetic moves."""
@@ -259,106 +189,19 @@ class _Tracer:
             zip(operands, equation.invars, strict=True)
         ):
             index = place in MOVES[name]
-            array = self.values(numbers, atom.aval.dtype) if index else numbers
+            array = self.arrays.values(numbers, atom.aval.dtype) if index else numbers
             if array is None:
-                return [self.at_computed_place(name, operands)]
+                return [self.arrays.at_computed_place(name, operands)]
             arrays.append(array)
         found = _bound(equation, arrays)
         if any(((each < 0) | (each >= len(self.graph.nodes))).any() for each in found):
             raise NotScalarError(f"its {name} leaves the array")
         return found
 
-    def in_memory(self, equation: Any, operands: list[Any]) -> Numbers | Memory | None:
-        """Return the result of an equation that reads or writes one element.
-
-        None for every other equation.
-        """
-        name, (memory, *others) = equation.primitive.name, operands
-        shape = equation.outvars[0].aval.shape
-        if not isinstance(memory, Memory):
-            return None
-        if name in ("broadcast_in_dim", "reshape") and shape == (memory.size,):
-            return memory
-        if name == "dynamic_slice" and shape == (1,):
-            first, last = (self.constants(np.asarray(k)) for k in (0, memory.size - 1))
-            index = self.elementwise("clamp", [first, others[0], last], "integer")
-            return np.array([self._read(memory, int(index))])
-        if name not in ("scatter", "scatter-add") or others[1].size != 1:
-            return None
-        index, value = int(others[0].ravel()[0]), int(others[1].ravel()[0])
-        if name == "scatter-add":
-            value = self.scalar("add", [self._read(memory, index), value], "real", None)
-        return memory._replace(writes=(*memory.writes, (index, value)))
-
-    def _read(self, memory: Memory, index: int) -> int:
-        found = self.graph.add(READ, (index,), "real", memory.place, self._source)
-        for place, value in memory.writes:
-            same = self.scalar("eq", [place, index], "boolean", None)
-            found = self.scalar("select_n", [same, found, value], "real", None)
-        return found
-
-    def at_computed_place(self, name: str, operands: list[Numbers]) -> Numbers:
-        """Return one element read, or the array with one element written.
-
-        Every element is compared with the place, which suits short arrays.
-        """
-        array, index, *written = operands
-        single = array.ndim == 1 and index.size == 1
-        if name == "dynamic_slice" and single:
-            last = self.constants(np.asarray(array.size - 1))
-            zero = self.constants(np.asarray(0))
-            place = self.elementwise("clamp", [zero, index, last], "integer")
-            found = array[:1]
-            for k in range(1, array.size):
-                found = self._chosen(place, k, found, array[k : k + 1])
-            return found
-        if name in ("scatter", "scatter-add") and single and written[0].size == 1:
-            value, rows = written[0].ravel(), []
-            for k, old in enumerate(array[:, None]):
-                new = value
-                if name == "scatter-add":
-                    new = self.elementwise("add", [old, value], self._kind_of(old))
-                rows.append(self._chosen(index.ravel(), k, old, new))
-            return np.concatenate(rows)
-        raise NotScalarError(f"it uses an array at a computed place ({name})")
-
-    def _chosen(
-        self, place: Numbers, k: int, other: Numbers, value: Numbers
-    ) -> Numbers:
-        here = self.elementwise("eq", [place, self.constants(np.asarray(k))], "boolean")
-        return self.elementwise("select_n", [here, other, value], self._kind_of(value))
-
-    def reduced(self, name: str, operand: Numbers, axes: Sequence[int]) -> Numbers:
-        kept = [axis for axis in range(operand.ndim) if axis not in axes]
-        shape = [operand.shape[axis] for axis in kept]
-        rows = operand.transpose([*axes, *kept]).reshape(-1, *shape)
-        kind = self.graph.nodes[int(operand.ravel()[0])].kind
-        total = rows[0]
-        for row in rows[1:]:
-            total = self.elementwise(name, [total, row], kind)
-        return total
-
-    def product(self, left: Numbers, right: Numbers, dimensions: Any) -> Numbers:
-        """Return the sum of products over the contracted axes."""
-        (left_sum, right_sum), (left_batch, right_batch) = dimensions
-
-        def ordered(array: Numbers, batch: Any, summed: Any) -> tuple[Numbers, list]:
-            free = [a for a in range(array.ndim) if a not in batch and a not in summed]
-            shape = [array.shape[a] for a in free]
-            batches = [array.shape[a] for a in batch]
-            moved = array.transpose([*batch, *free, *summed])
-            return moved.reshape(math.prod(batches), math.prod(shape), -1), shape
-
-        a, rows = ordered(left, left_batch, left_sum)
-        b, columns = ordered(right, right_batch, right_sum)
-        products = self.elementwise("mul", [a[:, :, None, :], b[:, None, :, :]], "real")
-        batches = [left.shape[axis] for axis in left_batch]
-        return self.reduced("add", products, [3]).reshape([*batches, *rows, *columns])
-
     def cond(self, branches: Any, operands: list[Numbers]) -> list[Numbers]:
         """Return the results of the branch that the first operand selects."""
         index, *rest = operands
-        known = self.values(index, int)
+        known = self.arrays.values(index, int)
         if known is not None:
             return self.evaluate(
                 branches[int(np.clip(known, 0, len(branches) - 1))], rest
@@ -366,21 +209,16 @@ class _Tracer:
         found = self.evaluate(branches[0], rest)
         for number, branch in enumerate(branches[1:], 1):
             others = self.evaluate(branch, rest)
-            least = self.constants(np.asarray(number))
+            least = self.arrays.constants(np.asarray(number))
             if self.graph.nodes[int(index)].kind == "boolean":
                 chosen = index
             else:
-                chosen = self.elementwise("ge", [index, least], "boolean")
+                chosen = self.arrays.elementwise("ge", [index, least], "boolean")
             found = [
-                self.elementwise("select_n", [chosen, a, b], self._kind_of(a))
+                self.arrays.elementwise("select_n", [chosen, a, b], self.arrays.kind(a))
                 for a, b in zip(found, others, strict=True)
             ]
         return found
-
-    def _kind_of(self, numbers: Numbers) -> Kind:
-        return (
-            self.graph.nodes[int(numbers.ravel()[0])].kind if numbers.size else "real"
-        )
 
     def scan(self, params: Any, operands: list[Numbers]) -> list[Numbers]:
         """Return the results of a loop of known length, which is unrolled."""

@@ -1,0 +1,99 @@
+"""A System as a folder of C99: header, source, golden vectors, and their test."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..core.about import About
+from ..core.files import fresh_folder, write_text
+from ..core.rollout import simulate
+from ..core.system import System
+from .c_project import CProject, Interface, expressions
+from .c_templates import MAKEFILE, TEST
+
+TOLERANCE = {"double": 1e-12, "float": 1e-3}
+"""Largest difference from the golden vectors, as a share of their largest value."""
+
+
+def write_c(
+    system: System,
+    interface: Interface,
+    inputs: Any,
+    folder: Path,
+    name: str,
+    about: About,
+    precision: str = "double",
+) -> list[Path]:
+    """Write ``system`` to the new ``folder`` as C99; return the paths of the files.
+
+    ``name`` begins every name of the header. ``inputs`` is a tree like
+    ``interface.input`` with a leading axis of samples; the outputs of the simulation
+    for it are the golden vectors of the test, which ``make test`` runs.
+    Raises ValueError for a ``folder`` in use, a ``name`` that is not one of C, an
+    unknown ``precision``, and a System that has no form in scalar operations, with the
+    operation.
+    """
+    code = CProject(system, interface, name, about, precision)
+    files = {
+        f"{name}.h": code.header(),
+        f"{name}.c": code.source(),
+        f"test_{name}.c": test_program(code, TOLERANCE[precision]),
+        "vectors.csv": vectors(code, inputs),
+        "Makefile": MAKEFILE.format(name=name),
+    }
+    folder = fresh_folder(folder)
+    for file, text in files.items():
+        write_text(folder / file, text)
+    return [folder / file for file in files]
+
+
+def vectors(code: CProject, inputs: Any) -> str:
+    """Return a simulation as CSV: its start, then inputs and outputs by name."""
+    _, outputs = simulate(code.system, inputs, code.state)
+    columns = [
+        np.asarray(leaf).reshape(len(leaf))
+        for tree in (inputs, outputs)
+        for leaf in jax.tree.leaves(tree)
+    ]
+    names = [slot.name for slot in (*code.inputs, *code.outputs)]
+    start = [float(leaf) for leaf in jax.tree.leaves(code.interface.start)]
+    rows = np.column_stack(columns)
+    return "\n".join(
+        [
+            ",".join(repr(value) for value in start),
+            ",".join(names),
+            *(",".join(repr(float(v)) for v in row) for row in rows),
+            "",
+        ]
+    )
+
+
+def test_program(code: CProject, tolerance: float) -> str:
+    """Return the C program that replays the vectors and compares the outputs."""
+    starts, inputs, outputs = (
+        len(part) for part in (code.starts, code.inputs, code.outputs)
+    )
+    real = code.precision.real
+    begin = "".join(f", ({real})start[{i}]" for i in range(starts))
+    given = "".join(f", ({real})row[{i}]" for i in range(inputs))
+    call = f"{code.name}_step(&state, &parameters{given}"
+    if outputs == 1:
+        step = f"        found[0] = {call});"
+    else:
+        fields = expressions(code.outputs, "output.")
+        step = f"        {call}, &output);\n" + "\n".join(
+            f"        found[{i}] = {field};" for i, field in enumerate(fields)
+        )
+    return TEST.format(
+        name=code.name,
+        starts=starts,
+        columns=inputs + outputs,
+        inputs=inputs,
+        outputs=outputs,
+        output=f"    {code.name}_output output;\n" if outputs > 1 else "",
+        begin=begin,
+        step=step,
+        tolerance=repr(tolerance),
+    )

@@ -1,0 +1,193 @@
+"""Arrays of the nodes of a graph, and their arithmetic."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .graph import INPUT, READ, Graph, Kind
+
+Numbers = np.ndarray
+"""Array of the numbers of nodes, with the shape of the traced array."""
+
+
+class NotScalarError(ValueError):
+    """The function has an operation that is not one of scalars."""
+
+
+class Memory(NamedTuple):
+    """A long array that stays an array, such as a stored period.
+
+    ``place`` is that of its first element among the inputs. ``writes`` are the elements
+    that have changed since, as pairs of the nodes of index and value.
+    """
+
+    place: int
+    size: int
+    writes: tuple[tuple[int, int], ...] = ()
+
+    def elements(self, graph: Graph) -> Numbers:
+        """Return the nodes of the elements. Raises NotScalarError after a write."""
+        if self.writes:
+            raise NotScalarError("it uses a long array as a whole after a change")
+        places = range(self.place, self.place + self.size)
+        return np.array([graph.add(INPUT, (), "real", place) for place in places], int)
+
+
+def kind_of(dtype: Any) -> Kind:
+    """Return the kind of the scalars of ``dtype``.
+
+    Raises NotScalarError for complex numbers and all others that C99 has not here.
+    """
+    if np.issubdtype(dtype, np.bool_):
+        return "boolean"
+    if np.issubdtype(dtype, np.integer):
+        return "integer"
+    if np.issubdtype(dtype, np.floating):
+        return "real"
+    raise NotScalarError(f"it computes with {dtype}; the export has real numbers only")
+
+
+class NodeArrays:
+    """Arithmetic of arrays of nodes, which adds nodes to ``graph``.
+
+    ``source`` is the function that the next nodes come from.
+    """
+
+    def __init__(self, graph: Graph):
+        self.graph = graph
+        self.source = ""
+
+    def constants(self, array: np.ndarray) -> Numbers:
+        """Return the nodes of the elements of ``array``."""
+        kind = kind_of(array.dtype)
+        plain = [self.graph.constant(value, kind) for value in array.ravel().tolist()]
+        return np.array(plain, int).reshape(array.shape)
+
+    def values(self, numbers: Numbers, dtype: Any) -> np.ndarray | None:
+        """Return the values of constants, or None if one is computed."""
+        nodes = [self.graph.nodes[number] for number in numbers.ravel()]
+        if any(node.operation != "constant" for node in nodes):
+            return None
+        return np.array([node.value for node in nodes], dtype).reshape(numbers.shape)
+
+    def elementwise(
+        self, name: str, operands: Sequence[Numbers], kind: Kind, value: Any = None
+    ) -> Numbers:
+        """Return the nodes of an operation on each element; scalars are repeated."""
+        arrays = np.broadcast_arrays(*operands)
+        flat = zip(*(array.ravel() for array in arrays), strict=True)
+        numbers = [
+            self.scalar(name, [int(n) for n in each], kind, value) for each in flat
+        ]
+        return np.array(numbers, int).reshape(arrays[0].shape)
+
+    def scalar(self, name: str, operands: list[int], kind: Kind, value: Any) -> int:
+        """Return the node of an operation; neutral operands need none."""
+        nodes = [self.graph.nodes[number] for number in operands]
+        known = [node.value if node.operation == "constant" else None for node in nodes]
+        if name == "convert_element_type" and nodes[0].kind == kind:
+            return operands[0]
+        if name == "select_n" and known[0] is not None:
+            return operands[1 + int(known[0])]
+        if name == "select_n" and len(set(operands[1:])) == 1:
+            return operands[1]
+        if name in ("mul", "div") and known[1] == 1.0:
+            return operands[0]
+        if name == "mul" and known[0] == 1.0:
+            return operands[1]
+        return self.graph.add(name, operands, kind, value, self.source)
+
+    def in_memory(self, equation: Any, operands: list[Any]) -> Numbers | Memory | None:
+        """Return the result of an equation that reads or writes one element.
+
+        None for every other equation.
+        """
+        name, (memory, *others) = equation.primitive.name, operands
+        shape = equation.outvars[0].aval.shape
+        if not isinstance(memory, Memory):
+            return None
+        if name in ("broadcast_in_dim", "reshape") and shape == (memory.size,):
+            return memory
+        if name == "dynamic_slice" and shape == (1,):
+            first, last = (self.constants(np.asarray(k)) for k in (0, memory.size - 1))
+            index = self.elementwise("clamp", [first, others[0], last], "integer")
+            return np.array([self._read(memory, int(index))])
+        if name not in ("scatter", "scatter-add") or others[1].size != 1:
+            return None
+        index, value = int(others[0].ravel()[0]), int(others[1].ravel()[0])
+        if name == "scatter-add":
+            value = self.scalar("add", [self._read(memory, index), value], "real", None)
+        return memory._replace(writes=(*memory.writes, (index, value)))
+
+    def _read(self, memory: Memory, index: int) -> int:
+        found = self.graph.add(READ, (index,), "real", memory.place, self.source)
+        for place, value in memory.writes:
+            same = self.scalar("eq", [place, index], "boolean", None)
+            found = self.scalar("select_n", [same, found, value], "real", None)
+        return found
+
+    def at_computed_place(self, name: str, operands: list[Numbers]) -> Numbers:
+        """Return one element read, or the array with one element written.
+
+        Every element is compared with the place, which suits short arrays.
+        """
+        array, index, *written = operands
+        single = array.ndim == 1 and index.size == 1
+        if name == "dynamic_slice" and single:
+            last = self.constants(np.asarray(array.size - 1))
+            zero = self.constants(np.asarray(0))
+            place = self.elementwise("clamp", [zero, index, last], "integer")
+            found = array[:1]
+            for k in range(1, array.size):
+                found = self._chosen(place, k, found, array[k : k + 1])
+            return found
+        if name in ("scatter", "scatter-add") and single and written[0].size == 1:
+            value, rows = written[0].ravel(), []
+            for k, old in enumerate(array[:, None]):
+                new = value
+                if name == "scatter-add":
+                    new = self.elementwise("add", [old, value], self.kind(old))
+                rows.append(self._chosen(index.ravel(), k, old, new))
+            return np.concatenate(rows)
+        raise NotScalarError(f"it uses an array at a computed place ({name})")
+
+    def _chosen(
+        self, place: Numbers, k: int, other: Numbers, value: Numbers
+    ) -> Numbers:
+        here = self.elementwise("eq", [place, self.constants(np.asarray(k))], "boolean")
+        return self.elementwise("select_n", [here, other, value], self.kind(value))
+
+    def reduced(self, name: str, operand: Numbers, axes: Sequence[int]) -> Numbers:
+        """Return the nodes of an operation repeated along ``axes``, the first first."""
+        kept = [axis for axis in range(operand.ndim) if axis not in axes]
+        shape = [operand.shape[axis] for axis in kept]
+        rows = operand.transpose([*axes, *kept]).reshape(-1, *shape)
+        kind = self.graph.nodes[int(operand.ravel()[0])].kind
+        total = rows[0]
+        for row in rows[1:]:
+            total = self.elementwise(name, [total, row], kind)
+        return total
+
+    def product(self, left: Numbers, right: Numbers, dimensions: Any) -> Numbers:
+        """Return the sum of products over the contracted axes."""
+        (left_sum, right_sum), (left_batch, right_batch) = dimensions
+
+        def ordered(array: Numbers, batch: Any, summed: Any) -> tuple[Numbers, list]:
+            free = [a for a in range(array.ndim) if a not in batch and a not in summed]
+            shape = [array.shape[a] for a in free]
+            batches = [array.shape[a] for a in batch]
+            moved = array.transpose([*batch, *free, *summed])
+            return moved.reshape(math.prod(batches), math.prod(shape), -1), shape
+
+        a, rows = ordered(left, left_batch, left_sum)
+        b, columns = ordered(right, right_batch, right_sum)
+        products = self.elementwise("mul", [a[:, :, None, :], b[:, None, :, :]], "real")
+        batches = [left.shape[axis] for axis in left_batch]
+        return self.reduced("add", products, [3]).reshape([*batches, *rows, *columns])
+
+    def kind(self, numbers: Numbers) -> Kind:
+        return (
+            self.graph.nodes[int(numbers.ravel()[0])].kind if numbers.size else "real"
+        )
