@@ -42,6 +42,12 @@ def require_reach(case: Case, data: Data) -> None:
             else f"reduce references.amplitude, now {amplitudes[axis]:g}, or "
             f"change references.offset, now {offsets[axis]:g}"
         )
+        if case.plant_about.record is not None:
+            remedy += (
+                ". The stroke is that of the model: if the stage has another, the "
+                f"columns of {case.plant_about.record} are in another unit, or the "
+                "record is of another stage"
+            )
         raise ValueError(
             f"references.{part}: {signal} spans "
             f"{bottoms[run]:.4g} to {tops[run]:.4g} {unit}, beyond the stroke of "

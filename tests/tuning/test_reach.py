@@ -1,6 +1,7 @@
 """References beyond the stroke of the stage are refused before tuning."""
 
 import copy
+import dataclasses
 
 import pytest
 
@@ -58,6 +59,14 @@ def test_tuning_refuses_a_reference_with_stroke_and_remedy():
         "-20 to 120 um between the limits of the actuator: reduce "
         "references.amplitude, now 75, or change references.offset, now 0"
     )
+
+
+def test_the_stroke_of_a_fitted_model_points_to_its_record():
+    case = case_of({"amplitude": 75.0})
+    fitted = dataclasses.replace(case, plant_about=pj.About(record="bench.csv"))
+    message = "now 0. The stroke is that of the model: .* columns of bench.csv are in"
+    with pytest.raises(ValueError, match=message):
+        require_reach(fitted, make_data(fitted))
 
 
 @pytest.mark.parametrize(
