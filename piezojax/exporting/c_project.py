@@ -287,6 +287,15 @@ class CProject:
         arguments: Sequence[Slot],
         result: bool = False,
     ) -> str:
+        # A long array stays where it is; elsewhere its elements are copied.
+        own = [f"state->{slot.name}[0]" for slot in self.states]
+        own += [""] * len(self.outputs)
+        outputs = [
+            each.elements(graph)
+            if isinstance(each, Memory) and names[each.place] != place
+            else each
+            for each, place in zip(outputs, own, strict=False)
+        ]
         flat = [int(n) for each in outputs for n in _nodes(each)]
         lines, expression = statements(
             graph, flat, lambda place: names[place], self.precision

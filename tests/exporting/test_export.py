@@ -246,6 +246,25 @@ def test_a_system_with_other_inputs_is_refused(tmp_path):
         pj.export(Labelled(), tmp_path / "c")
 
 
+class Swapped(pj.System):
+    """Two long arrays that change places, of which one starts as a parameter."""
+
+    table: jax.Array = parameter("1", "table", converter=jnp.asarray)
+
+    def init(self, input=0.0):
+        return self.table, jnp.full(self.table.shape, input)
+
+    def step(self, state, input):
+        return (state[1], state[0]), state[0][7] + 10.0 * state[1][299] + input
+
+
+@compiled
+def test_long_arrays_are_copied_where_they_move(tmp_path):
+    pj.export(Swapped(np.arange(300.0)), tmp_path / "c")
+    status, text = made(tmp_path / "c")
+    assert status == 0, text
+
+
 # The trace
 
 
