@@ -7,7 +7,7 @@ import numpy as np
 from .estimators.loop_response import joint_response
 from .estimators.projection import excited_part
 from .estimators.welch import spectral_response
-from .records.record import EVEN, Record
+from .records.record import Record, rises_evenly
 
 FOLLOWS = 0.5
 """Least share of the output's power that the input explains."""
@@ -52,8 +52,7 @@ def assumed_units(record: Record) -> list[str]:
 def _clocks(record: Record) -> Iterator[str]:
     for side, columns in (("input", record.inputs), ("output", record.outputs)):
         for column in columns.T:
-            steps = np.diff(column)
-            if np.all(steps > 0.0) and np.std(steps) < EVEN * np.mean(steps):
+            if rises_evenly(column):
                 yield (
                     f"the {side} column looks like a time axis: it rises steadily from "
                     f"{column[0]:.4g} to {column[-1]:.4g}; name the column of the "

@@ -11,6 +11,7 @@ from piezojax.core.error_bound import UNSEEN
 from piezojax.core.serial import read_about
 from piezojax.identification import FitReport
 from piezojax.identification.plausibility import plausibility_warnings
+from piezojax.identification.records.record import rises_evenly
 from piezojax.identification.residuals.bound import (
     ABSORBED,
     error_bound,
@@ -350,6 +351,21 @@ def test_plausible_columns_pass(seed):
     assert plausibility_warnings(Record(input, output, DT)) == []
     nanometres = Record(input, 1e3 * output, DT, output_units="nm")
     assert plausibility_warnings(nanometres) == []
+
+
+@pytest.mark.parametrize(
+    ("column", "even"),
+    [
+        ([3.0], False),
+        ([3.0, 4.0], False),
+        ([3.0, 4.0, 5.0], True),
+        ([3.0, 4.0, 6.0], False),
+        ([5.0, 4.0, 3.0], False),
+        ([3.0, np.nan, 5.0], False),
+    ],
+)
+def test_a_time_axis_has_three_samples_in_even_steps(column, even):
+    assert rises_evenly(np.array(column)) is even
 
 
 # In a fit

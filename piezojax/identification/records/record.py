@@ -342,11 +342,18 @@ def _refuse_time_axes(
         if len(names) > 1:
             keys = given.split(",") if isinstance(given, str) else np.atleast_1d(given)
         for key, name in zip(keys, names, strict=True):
-            steps = np.diff(read.values[name])
-            even = np.all(steps > 0.0) and np.std(steps) < EVEN * np.mean(steps)
-            if even and str(key).strip().isdecimal():
+            column = read.values[name]
+            if rises_evenly(column) and str(key).strip().isdecimal():
                 raise ValueError(
                     f"{path.name}: column {key} ({name!r}), taken as the {role}, rises "
-                    f"in even steps of {np.mean(steps):.4g}, as a time axis does: name "
-                    "the columns of time, input and output"
+                    f"in even steps of {np.mean(np.diff(column)):.4g}, as a time axis "
+                    "does: name the columns of time, input and output"
                 )
+
+
+def rises_evenly(column: np.ndarray) -> bool:
+    """Return whether ``column`` rises in even steps, as a time axis does."""
+    steps = np.diff(column)
+    if steps.size < 2 or np.any(steps <= 0.0):
+        return False
+    return bool(np.std(steps) < EVEN * np.mean(steps))
