@@ -267,7 +267,15 @@ def test_validate_ends_with_an_alarm_for_another_stage(tmp_path):
     assert "ALARM: bench.csv: the model does not hold on this record" in result.stdout
     with pytest.raises(ValueError, match="a model of another stage"):
         pj.load(out / "model.json")
-    again = call("validate", out / "model.json", record, *COLUMNS, "--quiet")
+    again = call(
+        "validate",
+        out / "model.json",
+        record,
+        *COLUMNS,
+        "--quiet",
+        "--out",
+        tmp_path / "again",
+    )
     assert again.exit_code == 3
     assert again.stdout == ""
     assert "ALARM" in again.stderr
