@@ -22,6 +22,7 @@ from ..core.rollout import simulate
 from ..core.serial import to_data
 from ..core.system import System, resolve
 from ..study import Case
+from .alarms import exact_figures, exact_peak
 from .baselines import Baselines
 from .coupling import Coupling, coupling_matrix
 from .drive import Drive, drive_of
@@ -85,13 +86,11 @@ class Outcome:
     @property
     def judged(self) -> list[str]:
         """Margins of the tuned loop, a sentence each; none if they are not known."""
-        reports = [*self.stability.reports.get("after", {}).values()]
-        if "after" in self.stability.axes:
-            reports = [self.stability.axes["after"].report]
-        if not reports or not all(report.stable for report in reports):
+        figures = [found for found in exact_figures(self.stability).values() if found]
+        peak = exact_peak(self.stability)
+        if not np.isfinite(peak):
             return []
-        peak = max(float(report.sensitivity_peak or np.inf) for report in reports)
-        disk = min(float(report.disk_margin or 0.0) for report in reports)
+        disk = min(found["disk_margin"] or 0.0 for found in figures)
         found = [f"tuned loop: sensitivity peak {peak:.4g}, disk margin {disk:.4g}"]
         drawn = self.result.perturbed
         outcomes = [
