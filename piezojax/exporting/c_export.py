@@ -10,7 +10,7 @@ from ..core.about import About
 from ..core.files import fresh_folder, write_text
 from ..core.rollout import simulate
 from ..core.system import System
-from .c_project import CProject, Interface, expressions
+from .c_project import CProject, Interface
 from .c_templates import MAKEFILE, TEST
 
 TOLERANCE = {"double": 1e-12, "float": 1e-3}
@@ -77,23 +77,16 @@ def test_program(code: CProject, tolerance: float) -> str:
     )
     real = code.precision.real
     begin = "".join(f", ({real})start[{i}]" for i in range(starts))
-    given = "".join(f", ({real})row[{i}]" for i in range(inputs))
-    call = f"{code.name}_step(&state, &parameters{given}"
-    if outputs == 1:
-        step = f"        found[0] = {call});"
-    else:
-        fields = expressions(code.outputs, "output.")
-        step = f"        {call}, &output);\n" + "\n".join(
-            f"        found[{i}] = {field};" for i, field in enumerate(fields)
-        )
+    given = [f"({real})row[{i}]" for i in range(inputs)]
+    found = [f"found[{i}]" for i in range(outputs)]
     return TEST.format(
         name=code.name,
         starts=starts,
         columns=inputs + outputs,
         inputs=inputs,
         outputs=outputs,
-        output=f"    {code.name}_output output;\n" if outputs > 1 else "",
+        output=code.output_variable,
         begin=begin,
-        step=step,
+        step=code.step_call(["&state", "&parameters", *given], found),
         tolerance=repr(tolerance),
     )

@@ -140,6 +140,7 @@ class CProject:
         return declared(self.system, slot.path)
 
     def meaning(self, slot: Slot) -> str:
+        """Return meaning, limits and unit of a parameter."""
         declaration = self._declaration(slot)
         unit = self.about.parameter_units.get(slot.path.removeprefix("controller."))
         if declaration is None:
@@ -162,7 +163,7 @@ class CProject:
         return self._type(self.outputs[0].dtype) if len(self.outputs) == 1 else "void"
 
     def _signatures(self) -> dict[str, str]:
-        name, real = self.name, self.precision.real
+        name = self.name
         more = "" if len(self.outputs) == 1 else f", {name}_output *output"
         both = f"{name}_state *state, const {name}_parameters *parameters"
         return {
@@ -171,10 +172,29 @@ class CProject:
             "init": f"void {name}_init({both}{self._arguments(self.starts)})",
             "step": f"{self._returned} {name}_step({both}"
             f"{self._arguments(self.inputs)}{more})",
-            "real": real,
         }
 
+    def step_call(self, arguments: Sequence[str], targets: Sequence[str]) -> str:
+        """Return the lines that step and assign each output to one of ``targets``.
+
+        ``arguments`` are the expressions of state, parameters and inputs. Several
+        outputs pass through a variable ``output``.
+        """
+        call = f"{self.name}_step({', '.join(arguments)}"
+        if len(targets) == 1:
+            return f"        {targets[0]} = {call});"
+        fields = zip(targets, expressions(self.outputs, "output."), strict=True)
+        lines = [f"        {target} = {field};" for target, field in fields]
+        return "\n".join([f"        {call}, &output);", *lines])
+
+    @property
+    def output_variable(self) -> str:
+        """Declaration of the variable of ``step_call``, "" if it needs none."""
+        several = len(self.outputs) > 1
+        return f"    {self.name}_output output;\n" if several else ""
+
     def origin(self) -> str:
+        """Return what the code is, where it comes from, and its alarms first."""
         about = self.about
         kind = type(self.system).__name__
         if isinstance(self.system, Driven):
@@ -192,6 +212,7 @@ class CProject:
         return "\n   ".join(line.replace("*/", "* /") for line in lines)
 
     def header(self) -> str:
+        """Return the text of the header."""
         signatures, guard = self._signatures(), f"{self.name.upper()}_H"
         units = self.about.units
         output = ""
@@ -210,6 +231,7 @@ class CProject:
         )
 
     def source(self) -> str:
+        """Return the text of the source."""
         signatures = self._signatures()
         return SOURCE.format(
             origin=self.origin(),

@@ -26,6 +26,32 @@ FUNCTIONS = {
 }  # fmt: skip
 """Functions of libm by the name of the operation in JAX."""
 
+FORMS = {
+    "select_n": "{a} ? {c} : {b}",
+    "not": "!{a}",
+    "neg": "-{a}",
+    "max": "{a} > {b} ? {a} : {b}",
+    "min": "{a} < {b} ? {a} : {b}",
+    "clamp": "{b} < {a} ? {a} : ({b} > {c} ? {c} : {b})",
+    "sign": "({type})(({a} > 0) - ({a} < 0))",
+    "square": "{a} * {a}",
+    "rsqrt": "{one} / sqrt{f}({a})",
+    "logistic": "{one} / ({one} + exp{f}(-{a}))",
+    "is_finite": "isfinite({a}) != 0",
+    "convert_element_type": "({type})({a})",
+}
+"""Other operations of the operands a, b and c; f is the suffix of functions."""
+
+OF_KIND = {
+    ("convert_element_type", "boolean"): "{a} != 0",
+    ("rem", "integer"): "{a} % {b}",
+    ("abs", "integer"): "labs({a})",
+}
+"""Operations with another form for a result of this kind."""
+
+NOTHING = (CONSTANT, INPUT, CARRY, RESULT)
+"""Operations that have no statement."""
+
 TYPES = {"integer": "long", "boolean": "int"}
 
 
@@ -108,9 +134,7 @@ class _Writer:
                 yield from self._loop(-1 - number, indent)
                 continue
             node = self.graph.nodes[number]
-            if number not in self.needed or node.operation in (CONSTANT, INPUT, CARRY):
-                continue
-            if node.operation == RESULT:
+            if number not in self.needed or node.operation in NOTHING:
                 continue
             if node.source and node.source != source:
                 source = node.source
@@ -152,45 +176,19 @@ class _Writer:
         kinds = [self.graph.nodes[n].kind for n in node.operands]
         if name == READ:
             return f"{self.names(int(node.value)).partition('[')[0]}[{a}]"
-        if name == "select_n":
-            return f"{a} ? {c} : {b}"
         if name in LOGICAL and kinds[0] == "boolean":
             return f"{a} {LOGICAL[name]} {b}"
-        if name == "not":
-            return f"!{a}"
         if name in INFIX:
             return f"{a} {INFIX[name]} {b}"
-        if name == "neg":
-            return f"-{a}"
-        if name == "max":
-            return f"{a} > {b} ? {a} : {b}"
-        if name == "min":
-            return f"{a} < {b} ? {a} : {b}"
-        if name == "clamp":
-            return f"{b} < {a} ? {a} : ({b} > {c} ? {c} : {b})"
-        if name == "sign":
-            return self._converted(node, f"({a} > 0) - ({a} < 0)")
-        if name == "square":
-            return f"{a} * {a}"
         if name == "integer_pow":
             return self._power(a, int(node.value))
         if name == "round":
             even = node.value == jax.lax.RoundingMethod.TO_NEAREST_EVEN
             return f"{'rint' if even else 'round'}{self.precision.suffix}({a})"
-        if name == "rsqrt":
-            return f"{self._one()} / sqrt{self.precision.suffix}({a})"
-        if name == "logistic":
-            return f"{self._one()} / ({self._one()} + exp{self.precision.suffix}(-{a}))"
-        if name == "is_finite":
-            return f"isfinite({a}) != 0"
-        if name == "convert_element_type":
-            if node.kind == "boolean":
-                return f"{a} != 0"
-            return self._converted(node, a)
-        if name == "rem" and node.kind == "integer":
-            return f"{a} % {b}"
-        if name == "abs" and node.kind == "integer":
-            return f"labs({a})"
+        form = OF_KIND.get((name, node.kind)) or FORMS.get(name)
+        if form is not None:
+            more = {"one": self._one(), "f": self.precision.suffix}
+            return form.format(a=a, b=b, c=c, type=self._type(node), **more)
         if name in FUNCTIONS:
             function = FUNCTIONS[name] + self.precision.suffix
             return f"{function}({a}, {b})" if b else f"{function}({a})"
@@ -198,9 +196,6 @@ class _Writer:
 
     def _one(self) -> str:
         return self.precision.number(1.0)
-
-    def _converted(self, node: Node, text: str) -> str:
-        return f"({self._type(node)})({text})"
 
     def _power(self, base: str, exponent: int) -> str:
         product = " * ".join([base] * abs(exponent)) or self._one()

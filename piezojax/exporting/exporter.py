@@ -73,7 +73,7 @@ def export(
         raise ValueError(f"to is {to!r}: choose from {', '.join(FORMS)}")
     about = about or About()
     kind, axes = _kind_of(system)
-    about = about.model_copy(update={"unsafe": export_alarms(system, about)})
+    about = about.model_copy(update={"unsafe": _alarms(kind, about)})
     if not accept_unsafe:
         about.require_safe(
             type(system).__name__,
@@ -99,7 +99,11 @@ def export(
 def export_alarms(system: System, about: About) -> list[str]:
     """Return the reasons not to export ``system``: those of its file, and one for a
     controller that no study has judged."""
-    unjudged = _kind_of(system)[0] == "controller" and not about.judged
+    return _alarms(_kind_of(system)[0], about)
+
+
+def _alarms(kind: str, about: About) -> list[str]:
+    unjudged = kind == "controller" and not about.judged
     return [*about.unsafe, *([UNJUDGED] if unjudged else [])]
 
 

@@ -132,14 +132,11 @@ def _interface(
         f", this->{slot.name if slot.name in inputs else 'start_' + slot.name}"
         for slot in code.starts
     )
-    given = "".join(f", this->{name}" for name in inputs)
-    call = f"{code.name}_step(&this->state, &this->parameters{given}"
-    if len(outputs) == 1:
-        step = f"        this->{outputs[0]} = {call});"
-    else:
-        step = f"        {call}, &output);\n" + "\n".join(
-            f"        this->{name} = output.{name};" for name in outputs
-        )
+    given = [f"this->{name}" for name in inputs]
+    step = code.step_call(
+        ["&this->state", "&this->parameters", *given],
+        [f"this->{name}" for name in outputs],
+    )
     return FMU.format(
         name=code.name,
         guid=guid,
@@ -148,7 +145,7 @@ def _interface(
             f"    double {name};"
             for name in [*inputs, *(f"start_{n}" for n in starts), *outputs]
         ),
-        output=f"    {code.name}_output output;\n" if len(outputs) > 1 else "",
+        output=code.output_variable,
         cases="\n".join(
             f"    case {number}: return &this->{variable.place.partition('->')[2]};"
             for number, variable in enumerate(variables)

@@ -48,7 +48,7 @@ def write_linear(
     )
     rate = 1.0 / model.dt
     frequency = np.geomspace(1e-4 * rate, 0.5 * rate, LINES)
-    response = frequency_response(model, frequency)
+    response = np.asarray(model.frequency_response(frequency))
     folder = fresh_folder(folder)
     if to == "octave":
         path = folder / f"{name}.m"
@@ -57,13 +57,6 @@ def write_linear(
     path = folder / f"{name}.mat"
     write_bytes(path, _mat(model, inputs, outputs, frequency, response))
     return [path]
-
-
-def frequency_response(model: StateSpace, frequency: np.ndarray) -> np.ndarray:
-    """Return C (zI - A)^-1 B + D [lines, outputs, inputs] at ``frequency`` (Hz)."""
-    A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
-    z = np.exp(2j * np.pi * frequency * model.dt)[:, None, None]
-    return C @ np.linalg.solve(z * np.eye(len(A)) - A, B[None].astype(complex)) + D
 
 
 def to_control(model: StateSpace) -> Any:

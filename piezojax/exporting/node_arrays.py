@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .graph import INPUT, READ, Graph, Kind
+from .graph import CONSTANT, INPUT, READ, Graph, Kind
 
 Numbers = np.ndarray
 """Array of the numbers of nodes, with the shape of the traced array."""
@@ -68,7 +68,7 @@ class NodeArrays:
     def values(self, numbers: Numbers, dtype: Any) -> np.ndarray | None:
         """Return the values of constants, or None if one is computed."""
         nodes = [self.graph.nodes[number] for number in numbers.ravel()]
-        if any(node.operation != "constant" for node in nodes):
+        if any(node.operation != CONSTANT for node in nodes):
             return None
         return np.array([node.value for node in nodes], dtype).reshape(numbers.shape)
 
@@ -86,7 +86,7 @@ class NodeArrays:
     def scalar(self, name: str, operands: list[int], kind: Kind, value: Any) -> int:
         """Return the node of an operation; neutral operands need none."""
         nodes = [self.graph.nodes[number] for number in operands]
-        known = [node.value if node.operation == "constant" else None for node in nodes]
+        known = [node.value if node.operation == CONSTANT else None for node in nodes]
         if name == "convert_element_type" and nodes[0].kind == kind:
             return operands[0]
         if name == "select_n" and known[0] is not None:
@@ -188,6 +188,7 @@ class NodeArrays:
         return self.reduced("add", products, [3]).reshape([*batches, *rows, *columns])
 
     def kind(self, numbers: Numbers) -> Kind:
+        """Return the kind of the first of ``numbers``, "real" if there are none."""
         return (
             self.graph.nodes[int(numbers.ravel()[0])].kind if numbers.size else "real"
         )

@@ -243,39 +243,39 @@ class _Tracer:
         of_head, of_body = operands[:heads], operands[heads : heads + bodies]
         first = operands[heads + bodies :]
         graph = self.graph
-        flat = [int(n) for array in first for n in array.ravel()]
-        mark = len(graph.nodes)
-        carried, place = [], 0
+        before, mark = _flat(first), len(graph.nodes)
         head, body = Block(), Block()
         with graph.inside(head):
-            for array in first:
-                ids = []
-                for n in array.ravel():
-                    ids.append(
-                        graph.add(CARRY, (), graph.nodes[int(n)].kind, (mark, place))
-                    )
-                    place += 1
-                carried.append(np.array(ids, int).reshape(array.shape))
-            (condition,) = self.evaluate(params["cond_jaxpr"], [*of_head, *carried])
+            carried = [
+                graph.add(CARRY, (), graph.nodes[number].kind, (mark, place))
+                for place, number in enumerate(before)
+            ]
+            inside = _like(first, carried)
+            (condition,) = self.evaluate(params["cond_jaxpr"], [*of_head, *inside])
             with graph.inside(body):
-                last = self.evaluate(params["body_jaxpr"], [*of_body, *carried])
-        results = graph.add_loop(
-            Loop(
-                tuple(flat),
-                tuple(int(n) for array in carried for n in array.ravel()),
-                head,
-                int(condition),
-                body,
-                tuple(int(n) for array in last for n in array.ravel()),
-            )
+                last = self.evaluate(params["body_jaxpr"], [*of_body, *inside])
+        loop = Loop(
+            tuple(before),
+            tuple(carried),
+            head,
+            int(condition),
+            body,
+            tuple(_flat(last)),
         )
-        found, place = [], 0
-        for array in first:
-            found.append(
-                np.array(results[place : place + array.size], int).reshape(array.shape)
-            )
-            place += array.size
-        return found
+        return _like(first, graph.add_loop(loop))
+
+
+def _flat(arrays: Sequence[Numbers]) -> list[int]:
+    return [int(n) for array in arrays for n in array.ravel()]
+
+
+def _like(arrays: Sequence[Numbers], flat: Sequence[int]) -> list[Numbers]:
+    """Return the numbers ``flat`` in arrays of the shapes of ``arrays``."""
+    rest = iter(flat)
+    return [
+        np.array([next(rest) for _ in range(array.size)], int).reshape(array.shape)
+        for array in arrays
+    ]
 
 
 def _bound(equation: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
