@@ -1,5 +1,8 @@
+import atexit
 import gc
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 # Each core has a worker: further threads of linear algebra would wait for
@@ -23,6 +26,16 @@ os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 # Tests do not need the source locations of the operations of a program.
 jax.config.update("jax_traceback_in_locations_limit", 0)
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
+
+# The workers share what they compile: many tests need the same programs. The first
+# process makes the folder and removes it; the others find it in the environment.
+PROGRAMS = "PIEZOJAX_TEST_PROGRAMS"
+if PROGRAMS not in os.environ:
+    os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="piezojax-programs-")
+    atexit.register(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True)
+jax.config.update("jax_compilation_cache_dir", os.environ[PROGRAMS])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.01)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
 @pytest.fixture
