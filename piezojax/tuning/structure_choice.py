@@ -44,8 +44,10 @@ class Structure(BaseModel):
     no such plants; None if a run diverges or stays at a voltage limit. ``log_errors``
     are the logarithms of these errors (um), None where a run is lost.
     ``sensitivity_peak`` is the largest on the plants of the hold-out, or the exact one
-    of the nominal plant. ``alarms`` counts the reasons not to use the gains, ``gains``
-    holds them by path, and ``reason`` tells why the structure was chosen or not.
+    of the nominal plant. ``needless`` are the modes of ``at_Hz`` that do not limit the
+    loop with their notch switched off. ``alarms`` counts the reasons not to use the
+    gains, ``gains`` holds them by path, and ``reason`` tells why the structure was
+    chosen or not.
     """
 
     notches: int
@@ -56,6 +58,7 @@ class Structure(BaseModel):
     worst_um: float | None = None
     sensitivity_peak: float | None = None
     alarms: int = 0
+    needless: list[float] = []
     log_errors: list[float | None] = []
     modes: list[ModeInLoop] = []
     gains: dict[str, float] = {}
@@ -89,7 +92,8 @@ def criterion_text(worth: float) -> str:
     return (
         "the fewest notches to which no larger number is preferred; each further notch "
         f"must lower the error on the hold-out by more than {100.0 * worth:g} %, all "
-        f"by more than {ERRORS:g} standard errors, and each must act on a mode"
+        f"by more than {ERRORS:g} standard errors, and each must act on a mode that "
+        "limits the loop without it"
     )
 
 
@@ -121,8 +125,10 @@ def choose(structures: Sequence[Structure], worth: float) -> int | None:
     """Return the index of the structure to use, None if none has been tuned.
 
     Only structures with the fewest alarms come into question, and of these only those
-    whose notches all act on a mode, if there are any. Of structures with the same
-    number of notches the one with the lowest error counts.
+    whose notches all act on a mode, if there are any. A structure with a needless notch
+    does not, if the one without that notch does: what it gains comes from the phase of
+    the notch and not from the mode. Of structures with the same number of notches the
+    one with the lowest error counts.
     """
     tuned = [i for i, one in enumerate(structures) if one.gains]
     stable = [i for i in tuned if structures[i].error_um is not None] or tuned
@@ -131,6 +137,8 @@ def choose(structures: Sequence[Structure], worth: float) -> int | None:
     fewest = min(structures[i].alarms for i in stable)
     usable = [i for i in stable if structures[i].alarms == fewest]
     usable = [i for i in usable if not structures[i].idle] or usable
+    among = [set(structures[i].at_Hz) for i in usable]
+    usable = [i for i in usable if not _is_replaced(structures[i], among)]
     best: dict[int, int] = {}
     for i in sorted(usable, key=lambda i: structures[i].error_um or math.inf):
         best.setdefault(structures[i].notches, i)
@@ -141,6 +149,11 @@ def choose(structures: Sequence[Structure], worth: float) -> int | None:
         if not any(is_worth(one, other, worth) for other in larger):
             return best[count]
     raise AssertionError("nothing is larger than the largest")
+
+
+def _is_replaced(one: Structure, among: Sequence[set[float]]) -> bool:
+    """Return whether ``one`` less a needless notch is ``among`` others."""
+    return any(set(one.at_Hz) - {mode} in among for mode in one.needless)
 
 
 def explain(structures: Sequence[Structure], chosen: int) -> None:
@@ -164,6 +177,9 @@ def _reason(one: Structure, best: Structure) -> str:
     if one.idle:
         shown = ", ".join(f"{frequency:.4g}" for frequency in one.idle)
         return f"no notch acts on the mode at {shown} Hz"
+    if one.needless:
+        shown = ", ".join(f"{frequency:.4g}" for frequency in one.needless)
+        return f"the mode at {shown} Hz does not limit the loop with its notch off"
     gain = gain_of(best, one)
     ratio = math.exp(-gain.mean)
     if one.notches <= best.notches:

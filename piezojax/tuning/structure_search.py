@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..analysis.plant_modes import PlantMode, plant_modes
-from ..analysis.stability import stability_reports
+from ..analysis.stability import StabilityReports, stability_reports
 from ..core.feedback import Feedback
 from ..core.paths import get, replace
 from ..core.progress import Progress
@@ -58,10 +58,10 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
     The first notch is placed at the mode around which |S| of the loop tuned without
     notches is largest, each further one where that of the loop tuned with the notches
     so far is. A mode that makes less than ``LIMITING`` of |L| limits no loop and gets
-    no notch. At last the notches of the chosen structure are tried one by one: if the
-    loop keeps its limit on Ms with a notch switched off, it is tuned without that notch
-    too. ``Ctrl-C`` ends the search with the structures so far. Raises ValueError if no
-    structure could be tuned, and as ``with_notches``.
+    no notch. If the chosen structure has a notch at a mode that does not limit its loop
+    (``_needless``), it is tuned without that notch too. ``Ctrl-C`` ends the search with
+    the structures so far. Raises ValueError if no structure could be tuned, and as
+    ``with_notches``.
     """
     table = case.study.structures
     assert table is not None
@@ -106,12 +106,14 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
         going = going and run(at, previous)
         if not going:
             break
-    while going:
-        best = _best(found, table.worth)
+    while going and (best := _best(found, table.worth)) is not None:
+        without = [
+            tuple(other for other in best.at if other != mode)
+            for mode in best.at
+            if mode.frequency in best.row.needless
+        ]
         fewer = [
-            at
-            for at in (_without_needless(case, best) if best else ())
-            if len(at) in table.notches and set(at) not in tried
+            at for at in without if len(at) in table.notches and set(at) not in tried
         ]
         if not fewer or not run(fewer[0], best):
             break
@@ -174,7 +176,7 @@ def _limiting(modes: Sequence[PlantMode], tuned: _Tuned | None) -> list[PlantMod
     returned, in the order of their gain in an integral control, which falls with
     frequency.
     """
-    seen = _in_loop(modes, tuned.outcome) if tuned else None
+    seen = _in_loop(modes, tuned.outcome.stability) if tuned else None
     had = tuned.at if tuned else ()
     if seen is None:
         free = [mode for mode in modes if mode not in had]
@@ -188,13 +190,14 @@ def _limiting(modes: Sequence[PlantMode], tuned: _Tuned | None) -> list[PlantMod
 
 
 def _in_loop(
-    modes: Sequence[PlantMode], outcome: Outcome
+    modes: Sequence[PlantMode], stability: StabilityReports
 ) -> list[tuple[float, float]] | None:
     """Return the part of |L| that each mode makes, and the largest |S| around it.
 
-    The larger of both branches counts. None if the tuned loop could not be linearised.
+    The larger of both branches counts. None if the loop ``after`` could not be
+    linearised.
     """
-    loops = outcome.stability.loops.get("after", {}).values()
+    loops = stability.loops.get("after", {}).values()
     if not loops:
         return None
     found = []
@@ -206,26 +209,28 @@ def _in_loop(
     return found
 
 
-def _without_needless(case: Case, tuned: _Tuned) -> list[Modes]:
-    """Return the modes of ``tuned`` without each notch that its loop does not need.
+def _needless(case: Case, at: Modes, loop: Feedback) -> list[PlantMode]:
+    """Return the modes ``at`` that do not limit ``loop`` with their notch switched off.
 
-    The notch that was added last is left out: the structure without it is known.
+    A mode limits it if |S| around the mode is then above the limit of the study on Ms,
+    or the loop unstable, and if the mode makes enough of |L| to be the cause: at least
+    1 - 1/limit, because without the mode |1 + L| is about 1 or larger there.
     """
     limit = case.study.limits.get(PEAK, math.inf)
     found = []
-    for i, mode in enumerate(tuned.at[:-1], 1):
+    for i, mode in enumerate(at, 1):
         path = f"{place_of(case)}.filter.{NOTCH.format(i)}.depth"
-        without = replace(tuned.outcome.after, {path: OFF})
-        peak = _peak(case, without)
-        if math.isfinite(peak) and peak <= limit * (1.0 + EXACT):
-            found.append(tuple(other for other in tuned.at if other != mode))
+        off = {"after": replace(loop, {path: OFF})}
+        stability = stability_reports(off, case.highest_reference, case.study.dt)
+        seen = _in_loop([mode], stability)
+        if seen is None:
+            continue
+        ((part, sensitivity),) = seen
+        above = sensitivity > limit * (1.0 + EXACT)
+        above |= not math.isfinite(exact_peak(stability))
+        if not above or part < 1.0 - 1.0 / limit:
+            found.append(mode)
     return found
-
-
-def _peak(case: Case, loop: Feedback) -> float:
-    """Return the exact Ms of ``loop``, infinite if it is not stable or not known."""
-    at = case.highest_reference
-    return exact_peak(stability_reports({"after": loop}, at, case.study.dt))
 
 
 def _starts(
@@ -318,7 +323,7 @@ def _row_of(
         return _notch_gain(frequency, damping, depth, angle, dt)
 
     wheres = [f"{place}.filter.{NOTCH.format(i)}" for i in range(1, len(at) + 1)]
-    seen = _in_loop(modes, outcome) or [(math.nan, math.nan)] * len(modes)
+    seen = _in_loop(modes, outcome.stability) or [(math.nan, math.nan)] * len(modes)
     errors = _errors(result)
     known = [error for error in errors if error is not None]
     stable = bool(known) and len(known) == len(errors)
@@ -331,6 +336,7 @@ def _row_of(
         worst_um=max(known) if stable else None,
         sensitivity_peak=_largest_peak(outcome),
         alarms=len(result.alarms) - _slight(result),
+        needless=[mode.frequency for mode in _needless(case, at, outcome.after)],
         log_errors=[None if error is None else math.log(error) for error in errors],
         modes=[
             ModeInLoop(
