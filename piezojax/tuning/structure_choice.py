@@ -44,10 +44,10 @@ class Structure(BaseModel):
     no such plants; None if a run diverges or stays at a voltage limit. ``log_errors``
     are the logarithms of these errors (um), None where a run is lost.
     ``sensitivity_peak`` is the largest on the plants of the hold-out, or the exact one
-    of the nominal plant. ``needless`` are the modes of ``at_Hz`` that do not limit the
-    loop with their notch switched off. ``alarms`` counts the reasons not to use the
-    gains, ``gains`` holds them by path, and ``reason`` tells why the structure was
-    chosen or not.
+    of the nominal plant. ``needless`` are the modes of ``at_Hz`` that make too little
+    of |L| to limit the loop with their notch switched off. ``alarms`` counts the
+    reasons not to use the gains, ``gains`` holds them by path, and ``reason`` tells why
+    the structure was chosen or not.
     """
 
     notches: int
@@ -92,8 +92,8 @@ def criterion_text(worth: float) -> str:
     return (
         "the fewest notches to which no larger number is preferred; each further notch "
         f"must lower the error on the hold-out by more than {100.0 * worth:g} %, all "
-        f"by more than {ERRORS:g} standard errors, and each must act on a mode that "
-        "limits the loop without it"
+        f"by more than {ERRORS:g} standard errors, and each must act on a mode "
+        "that is large enough to limit the loop"
     )
 
 
@@ -179,7 +179,7 @@ def _reason(one: Structure, best: Structure) -> str:
         return f"no notch acts on the mode at {shown} Hz"
     if one.needless:
         shown = ", ".join(f"{frequency:.4g}" for frequency in one.needless)
-        return f"the mode at {shown} Hz does not limit the loop with its notch off"
+        return f"the mode at {shown} Hz is too small to limit the loop"
     gain = gain_of(best, one)
     ratio = math.exp(-gain.mean)
     if one.notches <= best.notches:

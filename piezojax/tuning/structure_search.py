@@ -7,14 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ..analysis.plant_modes import PlantMode, plant_modes
-from ..analysis.stability import StabilityReports, stability_reports
-from ..core.feedback import Feedback
 from ..core.paths import get, replace
 from ..core.progress import Progress
 from ..core.recipe import Resonance
 from ..study import Case
 from ..study.with_notches import NOTCH, OFF, moved, place_of, with_notches
-from .alarms import EXACT, HELD_OUT, PEAK, exact_peak
+from .alarms import HELD_OUT, PEAK, exact_peak
 from .outcome import Outcome
 from .result import Result, number
 from .structure_choice import (
@@ -58,10 +56,9 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
     The first notch is placed at the mode around which |S| of the loop tuned without
     notches is largest, each further one where that of the loop tuned with the notches
     so far is. A mode that makes less than ``LIMITING`` of |L| limits no loop and gets
-    no notch. If the chosen structure has a notch at a mode that does not limit its loop
-    (``_needless``), it is tuned without that notch too. ``Ctrl-C`` ends the search with
-    the structures so far. Raises ValueError if no structure could be tuned, and as
-    ``with_notches``.
+    no notch. If the chosen structure has a needless notch, it is tuned without it too.
+    ``Ctrl-C`` ends the search with the structures so far. Raises ValueError if no
+    structure could be tuned, and as ``with_notches``.
     """
     table = case.study.structures
     assert table is not None
@@ -176,7 +173,7 @@ def _limiting(modes: Sequence[PlantMode], tuned: _Tuned | None) -> list[PlantMod
     returned, in the order of their gain in an integral control, which falls with
     frequency.
     """
-    seen = _in_loop(modes, tuned.outcome.stability) if tuned else None
+    seen = _in_loop(modes, tuned.outcome) if tuned else None
     had = tuned.at if tuned else ()
     if seen is None:
         free = [mode for mode in modes if mode not in had]
@@ -190,14 +187,13 @@ def _limiting(modes: Sequence[PlantMode], tuned: _Tuned | None) -> list[PlantMod
 
 
 def _in_loop(
-    modes: Sequence[PlantMode], stability: StabilityReports
+    modes: Sequence[PlantMode], outcome: Outcome
 ) -> list[tuple[float, float]] | None:
     """Return the part of |L| that each mode makes, and the largest |S| around it.
 
-    The larger of both branches counts. None if the loop ``after`` could not be
-    linearised.
+    The larger of both branches counts. None if the tuned loop could not be linearised.
     """
-    loops = stability.loops.get("after", {}).values()
+    loops = outcome.stability.loops.get("after", {}).values()
     if not loops:
         return None
     found = []
@@ -206,30 +202,6 @@ def _in_loop(
         L = np.array([loop.response(lines) for loop in loops])
         part = float(np.max(np.abs(L[:, len(AROUND) // 2])) * mode.share)
         found.append((part, float(np.max(1.0 / np.abs(1.0 + L)))))
-    return found
-
-
-def _needless(case: Case, at: Modes, loop: Feedback) -> list[PlantMode]:
-    """Return the modes ``at`` that do not limit ``loop`` with their notch switched off.
-
-    A mode limits it if |S| around the mode is then above the limit of the study on Ms,
-    or the loop unstable, and if the mode makes enough of |L| to be the cause: at least
-    1 - 1/limit, because without the mode |1 + L| is about 1 or larger there.
-    """
-    limit = case.study.limits.get(PEAK, math.inf)
-    found = []
-    for i, mode in enumerate(at, 1):
-        path = f"{place_of(case)}.filter.{NOTCH.format(i)}.depth"
-        off = {"after": replace(loop, {path: OFF})}
-        stability = stability_reports(off, case.highest_reference, case.study.dt)
-        seen = _in_loop([mode], stability)
-        if seen is None:
-            continue
-        ((part, sensitivity),) = seen
-        above = sensitivity > limit * (1.0 + EXACT)
-        above |= not math.isfinite(exact_peak(stability))
-        if not above or part < 1.0 - 1.0 / limit:
-            found.append(mode)
     return found
 
 
@@ -323,7 +295,11 @@ def _row_of(
         return _notch_gain(frequency, damping, depth, angle, dt)
 
     wheres = [f"{place}.filter.{NOTCH.format(i)}" for i in range(1, len(at) + 1)]
-    seen = _in_loop(modes, outcome.stability) or [(math.nan, math.nan)] * len(modes)
+    seen = _in_loop(modes, outcome) or [(math.nan, math.nan)] * len(modes)
+    part_of = {mode: part for mode, (part, _) in zip(modes, seen, strict=True)}
+    # With |1 + L| at least 1 without the mode, a smaller part of |L| cannot make |S|
+    # exceed its limit.
+    cause = 1.0 - 1.0 / case.study.limits.get(PEAK, math.inf)
     errors = _errors(result)
     known = [error for error in errors if error is not None]
     stable = bool(known) and len(known) == len(errors)
@@ -336,7 +312,11 @@ def _row_of(
         worst_um=max(known) if stable else None,
         sensitivity_peak=_largest_peak(outcome),
         alarms=len(result.alarms) - _slight(result),
-        needless=[mode.frequency for mode in _needless(case, at, outcome.after)],
+        needless=[
+            mode.frequency
+            for where, mode in zip(wheres, at, strict=True)
+            if part_of[mode] < cause * notch_gain(where, mode.angle)
+        ],
         log_errors=[None if error is None else math.log(error) for error in errors],
         modes=[
             ModeInLoop(

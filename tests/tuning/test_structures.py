@@ -14,7 +14,7 @@ import piezojax as pj
 from piezojax.analysis.plant_modes import plant_modes
 from piezojax.control import FilteredCommand
 from piezojax.core.error_bound import ErrorBound
-from piezojax.core.paths import get, get_part, replace
+from piezojax.core.paths import get, get_part
 from piezojax.core.progress import Silent
 from piezojax.core.recipe import Resonance
 from piezojax.dynamics import Modes
@@ -385,24 +385,21 @@ def notched(loop):
     return tuple(round(float(notch.frequency)) for notch in parts)
 
 
-def searched(tuning, monkeypatch, needless=None, **changes):
-    """Search; ``needless`` maps notched frequencies to those that limit nothing."""
-
-    def pretended(case, at, loop):
-        none = (needless or {}).get(tuple(round(mode.frequency) for mode in at), ())
-        return [mode for mode in at if round(mode.frequency) in none]
-
-    monkeypatch.setattr(searching, "_needless", pretended)
-    outcome = search_structures(case_of(**changes), tuning, Silent())
-    return outcome.result
+def searched(tuning, **changes):
+    return search_structures(case_of(**changes), tuning, Silent()).result
 
 
-ALL = {(): [0.5, 0.3, 1e-4], (400,): [0.05, 0.6, 1e-3], (900,): [0.5, 0.1, 1e-4]}
+ALL = {
+    (): [0.5, 0.3, 1e-4],
+    (400,): [0.4, 0.6, 1e-3],
+    (900,): [0.5, 0.4, 1e-4],
+    (400, 900): [0.4, 0.4, 1e-3],
+}
 
 
-def test_each_notch_goes_where_the_tuned_loop_is_limited(monkeypatch):
+def test_each_notch_goes_where_the_tuned_loop_is_limited():
     tuning = Pretended({(): 1.0, (400,): 0.5, (400, 900): 0.1}, ALL)
-    result = searched(tuning, monkeypatch)
+    result = searched(tuning)
     assert tuning.calls == [(), (400,), (400, 900)]
     rows = result.structures.structures
     assert [r.chosen for r in rows] == [False, False, True, False]
@@ -421,109 +418,60 @@ def test_each_notch_goes_where_the_tuned_loop_is_limited(monkeypatch):
     assert structures_figure(alone, "small") is None
 
 
-def test_no_notch_where_no_mode_limits_the_loop(monkeypatch):
+def test_no_notch_where_no_mode_limits_the_loop():
     tuning = Pretended({(): 1.0}, {(): [0.09, 0.02, 1e-4]})
-    rows = searched(tuning, monkeypatch).structures.structures
+    rows = searched(tuning).structures.structures
     assert tuning.calls == [()]
     assert [r.chosen for r in rows] == [True, False, False, False]
 
 
-def test_a_notch_that_the_loop_does_not_need_is_dropped(monkeypatch):
+def test_a_notch_that_the_loop_does_not_need_is_dropped():
     """The mode at 400 Hz limits the first loop, but nothing once 900 Hz has a notch."""
     errors = {(): 1.0, (400,): 0.8, (400, 900): 0.1, (900,): 0.101}
-    needless = {(400, 900): (400,)}
-    tuning = Pretended(errors, ALL)
-    rows = searched(tuning, monkeypatch, needless).structures.structures
+    parts = ALL | {(400, 900): [0.1, 0.4, 1e-3]}
+    tuning = Pretended(errors, parts)
+    rows = searched(tuning).structures.structures
     assert tuning.calls == [(), (400,), (400, 900), (900,)]
     assert [r.at_Hz for r in rows if r.chosen] == [pytest.approx([900.0])]
     # If the smaller structure cannot be tuned, the larger one stays.
-    tuning = Pretended(errors | {(900,): None}, ALL)
-    rows = searched(tuning, monkeypatch, needless).structures.structures
+    tuning = Pretended(errors | {(900,): None}, parts)
+    rows = searched(tuning).structures.structures
     assert [r.chosen for r in rows] == [False, False, True, False, False]
     assert len(tuning.calls) == 4
     # With its notch needed, the other structure is not even tried.
     tuning = Pretended(errors, ALL)
-    assert searched(tuning, monkeypatch).structures.structures[2].chosen
+    assert searched(tuning).structures.structures[2].chosen
     assert tuning.calls == [(), (400,), (400, 900)]
 
 
-def test_a_notch_at_a_mode_that_limits_nothing_is_not_chosen(monkeypatch):
-    """Its phase halves the error, but the loop keeps its limit without it."""
-    tuning = Pretended({(): 1.0, (400,): 0.5}, ALL)
-    changes = {"structures": {"notches": [0, 1]}}
-    rows = searched(tuning, monkeypatch, {(400,): (400,)}, **changes)
-    rows = rows.structures.structures
-    assert [r.chosen for r in rows] == [True, False]
-    assert rows[1].reason == (
-        "the mode at 400 Hz does not limit the loop with its notch off"
-    )
-    rows = searched(tuning, monkeypatch, **changes).structures.structures
-    assert [r.chosen for r in rows] == [False, True]
-
-
-def limits(integral, limit, unnotched):
-    """Return whether the mode of STUDY without a notch limits the loop; by SciPy."""
-    shares = 1.0 - sum(MODES["share"]), *MODES["share"]
-    num, den = np.zeros(1), np.ones(1)
-    for f, damping, share in zip(
-        MODES["frequency"], MODES["damping"], shares, strict=True
-    ):
-        w = 2.0 * np.pi * f
-        mode = [0.1 * share * w**2], [1.0, 2.0 * damping * w, w**2]
-        (b,), a, _ = signal.cont2discrete(mode, DT)
-        num = np.polyadd(np.polymul(num, a), np.polymul(b, den))
-        den = np.polymul(den, a)
-    for f, damping in {FIRST, SECOND} - {unnotched}:
-        w = 2.0 * np.pi * f
-        notch = [1.0, 2.0 * damping * w, w**2], [1.0, 2.0 * WIDTH * w, w**2]
-        b, a = signal.bilinear(*notch, fs=w / (2.0 * np.tan(w * DT / 2.0)))
-        num, den = np.polymul(num, b), np.polymul(den, a)
-    proportional = STUDY["controller"]["proportional"]
-    num = np.polymul(num, [proportional + integral * DT, -proportional])
-    den = np.polymul(den, [1.0, -1.0])
-    closed = np.polyadd(num, den)
-    f, damping = unnotched
-    angle = 2.0 * np.pi * f * DT * (1.0 + damping * np.linspace(-4.0, 4.0, 801))
-    z = np.exp(1j * angle)
-    sensitivity = np.abs(np.polyval(den, z) / np.polyval(closed, z))
-    return sensitivity.max() > limit or np.abs(np.roots(closed)).max() >= 1.0
-
-
-WIDTH = 0.3
-
-
 @pytest.mark.parametrize(
-    ("integral", "limit", "needless"),
-    [
-        (1000.0, 1.8, [400, 900]),
-        (1000.0, 1.5, [900]),
-        (2500.0, 1.8, [900]),
-        (8000.0, 1.8, [900]),  # unstable without the first notch, with a small |S|
+    ("limit", "part", "needed"),
+    [  # with its notch of depth 0.3 off, the mode makes part/0.3 of |L|
+        ("off", 0.29, False),
+        ("off", 0.31, True),  # could make the loop unstable: 1.03
+        (1.8, 0.13, False),
+        (1.8, 0.14, True),  # 0.467, and |1 + L| of 1/1.8 is 0.444 from 1
     ],
 )
-def test_which_notches_a_loop_needs(integral, limit, needless):
-    expected = [
-        round(mode[0]) for mode in (FIRST, SECOND) if not limits(integral, limit, mode)
-    ]
-    assert expected == needless
-    case = case_of(constraints={"sensitivity_peak": limit, "delay_margin": "off"})
-    at = tuple(searching._shown_modes(case)[0][:2])
-    notches = [Resonance(mode.frequency, mode.damping) for mode in at]
-    variant = with_notches(case, notches)
-    values = {"controller.controller.integral": integral}
-    for i, mode in enumerate(at, 1):
-        values |= {
-            f"controller.filter.notch_{i}.frequency": mode.frequency,
-            f"controller.filter.notch_{i}.damping": WIDTH,
-            f"controller.filter.notch_{i}.depth": mode.damping / WIDTH,
-        }
-    found = searching._needless(case, at, replace(variant.loop, values))
-    assert [round(mode.frequency) for mode in found] == needless
+def test_a_notch_at_a_mode_that_cannot_limit_the_loop_is_not_chosen(
+    limit, part, needed
+):
+    """The notch halves the error all the same, by its phase."""
+    tuning = Pretended({(): 1.0, (400,): 0.5}, ALL | {(400,): [part, 0.05, 1e-4]})
+    result = searched(
+        tuning,
+        structures={"notches": [0, 1]},
+        constraints={"sensitivity_peak": limit, "delay_margin": "off"},
+    )
+    rows = result.structures.structures
+    assert [r.chosen for r in rows] == [not needed, needed]
+    if not needed:
+        assert rows[1].reason == "the mode at 400 Hz is too small to limit the loop"
 
 
-def test_the_search_goes_on_from_the_gains_before(monkeypatch):
+def test_the_search_goes_on_from_the_gains_before():
     tuning = Pretended({(): 1.0, (400,): 0.5, (400, 900): 0.1}, ALL)
-    searched(tuning, monkeypatch)
+    searched(tuning)
     none, one, two = tuning.starts
     assert none is None
     assert one.shape == (6, 4)
@@ -553,19 +501,19 @@ def test_a_mode_below_the_error_bound_of_the_model_may_be_noise():
     assert searching._shown_modes(bounded(2.0))[0] == []
 
 
-def test_structures_that_cannot_be_tuned_are_rows(monkeypatch):
+def test_structures_that_cannot_be_tuned_are_rows():
     tuning = Pretended({(): None, (400,): 0.5, (400, 900): 0.47}, ALL)
-    rows = searched(tuning, monkeypatch).structures.structures
+    rows = searched(tuning).structures.structures
     assert rows[0].reason == "the loop diverges everywhere"
     assert rows[1].chosen
     hopeless = Pretended(dict.fromkeys([(), (400,), (400, 900), (400, 900, 1600)]), ALL)
     with pytest.raises(ValueError, match=r"^the loop diverges everywhere$"):
-        searched(hopeless, monkeypatch)
+        searched(hopeless)
 
 
-def test_an_interrupt_keeps_the_best_structure_so_far(monkeypatch):
+def test_an_interrupt_keeps_the_best_structure_so_far():
     tuning = Pretended({(): 1.0}, ALL, status="interrupted")
-    result = searched(tuning, monkeypatch)
+    result = searched(tuning)
     assert tuning.calls == [()]
     assert result.status == "interrupted"
     assert result.structures.structures[0].chosen
