@@ -310,6 +310,7 @@ def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     assert re.search(r"parameters.actuator_\w*lower = -20.0;", text)
     assert re.search(r"parameters.actuator_\w*upper = 120.0;", text)
     assert "Judged: tuned loop: sensitivity peak" in text
+    assert "Plants: the nominal one only." in text
     columns = np.loadtxt(out / "vectors.csv", delimiter=",", skiprows=2).T
     references = pj.read_about(tuned[1] / "gains.toml").reference_ranges[0]
     assert columns[0].min() < references[0]

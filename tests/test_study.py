@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from piezojax.study import (
     read,
     shipped,
 )
+from piezojax.study.ensemble_table import EnsembleTable
 
 SHIPPED = sorted(path.stem for path in shipped().parent.glob("*.toml"))
 
@@ -109,6 +111,14 @@ def test_shipped_studies_are_valid(name):
     study = load(shipped(name))
     assert study.parameters
     assert study.references.unseen
+
+
+def test_the_ranges_of_the_plants_are_named():
+    ranges = load(shipped("nv200")).ensemble.ranges
+    assert ranges[0] == "gain +- 10 %"
+    assert ranges[-1] == "mode_damping 0.01 to 0.03"
+    table = EnsembleTable(standard_errors=Path("out") / "fit.json")
+    assert table.ranges == ["the standard errors of fit.json"]
 
 
 def test_the_default_study_has_a_realistic_stage_and_rivals():

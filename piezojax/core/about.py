@@ -16,7 +16,8 @@ class About(BaseModel):
     sampling rate. ``units`` maps the channels of the System to their units, and
     ``parameter_units`` its parameters, by path; "" is an unknown unit.
     ``input_ranges`` are the least and greatest value of each input in the record.
-    ``judged`` lists the margins that a controller was judged with, a sentence each.
+    ``judged`` lists the margins that a controller was judged with, a sentence each,
+    and ``plants`` the ranges of the plants on which they hold.
     ``actuator`` is the actuator that a controller was tuned with, as in a file of a
     System, ``reference_ranges`` the least and greatest of its references on each axis.
     ``error_bound`` bounds the error of a fitted model, ``residual_rms`` is the rms
@@ -36,6 +37,7 @@ class About(BaseModel):
     parameter_units: dict[str, str] = {}
     input_ranges: list[tuple[float, float]] = []
     judged: list[str] = []
+    plants: list[str] = []
     actuator: dict[str, Any] | None = None
     reference_ranges: list[tuple[float, float]] = []
     error_bound: ErrorBound | None = None
@@ -43,6 +45,21 @@ class About(BaseModel):
     checked: list[str] = []
     standard_errors: dict[str, float] = {}
     unsafe: list[str] = []
+
+    def origin(self, subject: str) -> list[str]:
+        """Return the head of a file that holds ``subject``, the alarms first."""
+        seed = "" if self.seed is None else f", seed {self.seed}"
+        rate = "" if not self.rate_Hz else f"{self.rate_Hz:.9g} Hz; no other"
+        lines = [
+            *(f"UNSAFE: {each}" for each in self.unsafe),
+            f"{subject}, exported by piezojax {self.piezojax}.",
+            *([f"Study: {self.study}{seed}."] if self.study else []),
+            *([f"Record: {self.record}."] if self.record else []),
+            *([f"Sampling rate: {rate}."] if rate else []),
+            *(f"Judged: {each}." for each in self.judged),
+            *([f"Plants: {'; '.join(self.plants)}."] if self.plants else []),
+        ]
+        return [line.replace("\n", " ") for line in lines]
 
     def require_safe(self, name: str, remedy: str) -> None:
         """Raise ValueError, ending in ``remedy``, if the System ``name`` is unsafe."""

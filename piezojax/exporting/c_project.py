@@ -195,20 +195,10 @@ class CProject:
 
     def origin(self) -> str:
         """Return what the code is, where it comes from, and its alarms first."""
-        about = self.about
         kind = type(self.system).__name__
         if isinstance(self.system, Driven):
             kind = f"{type(self.system.controller).__name__} with its voltage limits"
-        lines = [f"{kind}, exported by piezojax {about.piezojax}."]
-        if about.study:
-            seed = "" if about.seed is None else f", seed {about.seed}"
-            lines.append(f"Study: {about.study}{seed}.")
-        if about.record:
-            lines.append(f"Record: {about.record}.")
-        if about.rate_Hz:
-            lines.append(f"Sampling rate: {about.rate_Hz:.9g} Hz; no other.")
-        lines += [f"Judged: {each}." for each in about.judged]
-        lines[:0] = [f"UNSAFE: {each}" for each in about.unsafe]
+        lines = self.about.origin(kind)
         return "\n   ".join(line.replace("*/", "* /") for line in lines)
 
     def header(self) -> str:

@@ -15,6 +15,8 @@ from ..dynamics.linearise import linearise
 from ..dynamics.state_space import StateSpace
 from .c_project import Interface, slots
 
+SUBJECT = "Model linearised at rest"
+
 LINES = 500
 """Number of frequencies of the response beside a model."""
 
@@ -55,7 +57,8 @@ def write_linear(
         write_text(path, _function(model, inputs, outputs, name, about))
         return [path]
     path = folder / f"{name}.mat"
-    write_bytes(path, _mat(model, inputs, outputs, frequency, response))
+    origin = "\n".join(about.origin(SUBJECT))
+    write_bytes(path, _mat(model, inputs, outputs, frequency, response, origin))
     return [path]
 
 
@@ -92,12 +95,14 @@ def _mat(
     outputs: list[str],
     frequency: np.ndarray,
     response: np.ndarray,
+    origin: str,
 ) -> bytes:
-    """Return a file of MATLAB with model and response."""
+    """Return a file of MATLAB with model, response and ``origin``."""
     from scipy.io import savemat
 
     buffer = io.BytesIO()
     content = {
+        "origin": origin,
         **{key: np.asarray(getattr(model, key)) for key in "ABCD"},
         "Ts": model.dt,
         "inputs": np.array(inputs, dtype=object),
@@ -117,12 +122,12 @@ def _function(
     about: About,
 ) -> str:
     """Return a function of MATLAB and Octave that returns the model."""
+    head = about.origin(f"{name.upper()}  {SUBJECT}")
+    alarms = len(about.unsafe)
     lines = [
+        *(f"% {each}" for each in head[:alarms]),
         f"function sys = {name}()",
-        f"% {name.upper()}  Model linearised at rest, from piezojax {about.piezojax}.",
-        *(f"% UNSAFE: {each}" for each in about.unsafe),
-        *([f"% Study: {about.study}."] if about.study else []),
-        *(f"% Judged: {each}." for each in about.judged),
+        *(f"% {each}" for each in head[alarms:]),
         *(f"{key} = [{_rows(np.asarray(getattr(model, key)))}];" for key in "ABCD"),
         f"sys = ss(A, B, C, D, {model.dt!r});",
         f"sys.InputName = {_cells(inputs)};",

@@ -35,6 +35,19 @@ class EnsembleTable(Table):
     aggregate: Literal["mean", "worst", "cvar"] = "mean"
     tail: Annotated[float, Field(gt=0.0, le=1.0)] = 0.25
 
+    @property
+    def ranges(self) -> list[str]:
+        """Ranges of the drawn plants, a phrase each."""
+        errors = self.standard_errors
+        return [
+            *(f"{name} +- {100.0 * part:g} %" for name, part in self.spread.items()),
+            *(
+                f"{name} {low:g} to {high:g}"
+                for name, (low, high) in self.range.items()
+            ),
+            *([f"the standard errors of {errors.name}"] if errors else []),
+        ]
+
     @model_validator(mode="after")
     def _consistent(self) -> "EnsembleTable":
         if not (self.spread or self.range or self.standard_errors):

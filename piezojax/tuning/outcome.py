@@ -32,6 +32,8 @@ from .step_tests import StepResult, StepRun
 
 _BEYOND = 1e9  # um or V
 
+NOMINAL = "the nominal one only"
+
 Logs = tuple[LoopSample, LoopSample]
 """Samples of a run, of NumPy arrays, before and after tuning."""
 
@@ -73,6 +75,7 @@ class Outcome:
             seed=study.seed,
             rate_Hz=study.rate,
             judged=self.judged,
+            plants=study.ensemble.ranges if study.ensemble else [NOMINAL],
             actuator=to_data(self.after.actuator),
             reference_ranges=[(float(x.min()), float(x.max())) for x in samples.T],
             unsafe=self.result.alarms,

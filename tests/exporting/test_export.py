@@ -20,6 +20,7 @@ ACTUATOR = to_data(pj.Saturation(-20.0, 120.0))
 ABOUT = pj.About(
     study="a study",
     judged=["tuned loop: sensitivity peak 1.5"],
+    plants=["gain +- 10 %", "mode_frequency 3600 to 4400"],
     seed=3,
     rate_Hz=2e4,
     actuator=ACTUATOR,
@@ -154,6 +155,7 @@ def test_the_files_name_their_origin_and_units(tmp_path):
         assert "Study: a study, seed 3." in text
         assert "Sampling rate: 20000 Hz" in text
         assert "Judged: tuned loop: sensitivity peak 1.5." in text
+        assert "Plants: gain +- 10 %; mode_frequency 3600 to 4400." in text
     assert "proportional gain P, unit V/um" in header.read_text()
     assert "void pid_init(pid_state *state," in header.read_text()
 

@@ -74,6 +74,19 @@ def test_the_function_of_octave_holds_the_same_numbers(tmp_path):
     assert "sys.InputName = {'input'};" in text
 
 
+def test_unsafe_gains_say_so_first(tmp_path):
+    about = ABOUT.model_copy(
+        update={"unsafe": ["it rings"], "plants": ["gain +- 10 %"]}
+    )
+    options = {"about": about, "accept_unsafe": True}
+    (path,) = pj.export(PID, tmp_path / "m", to="octave", **options)
+    assert path.read_text().startswith("% UNSAFE: it rings\nfunction sys = ")
+    (path,) = pj.export(PID, tmp_path / "x", to="mat", **options)
+    origin = loadmat(path, simplify_cells=True)["origin"].splitlines()
+    assert origin[0] == "UNSAFE: it rings"
+    assert {"Study: a study.", "Judged: fine.", "Plants: gain +- 10 %."} < set(origin)
+
+
 def test_models_go_to_python_control_and_back():
     model = pj.dynamics.linearise(LAG, 0.0, dt=DT)
     there = to_control(model)
