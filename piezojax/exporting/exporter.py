@@ -20,6 +20,7 @@ from .c_project import Interface
 from .driven import Driven, Seen
 from .fmu import write_fmu
 from .linear_models import write_linear
+from .vendor import write_vendor
 
 FAR = 1e6
 """A voltage beyond the limits of every actuator, V."""
@@ -32,7 +33,7 @@ AXES = 6
 
 UNJUDGED = "no study has judged the stability of this controller"
 
-FORMS = ("c", "fmu", "mat", "octave")
+FORMS = ("c", "fmu", "mat", "octave", "vendor")
 """Forms of an export."""
 
 Limits = Sequence[tuple[float, float]]
@@ -49,12 +50,15 @@ def export(
     precision: str = "double",
     samples: int = 2000,
     seed: int = 0,
+    before: str | Path | None = None,
     accept_unsafe: bool = False,
 ) -> list[Path]:
     """Write ``system`` to a new ``folder``; return the paths of its files.
 
     ``to`` is "c", C99 with a test of its own; "fmu", an FMU 2.0 for co-simulation; or
-    "mat" or "octave", the model linearised at rest for MATLAB or Octave.
+    "mat" or "octave", the model linearised at rest for MATLAB or Octave; or "vendor",
+    the parameters of an E727, NV200 or Stabilizer as the file of its vendor, with a
+    copy of the file ``before`` that was saved from the device.
 
     A controller leaves with its actuator, that of ``about`` or ``limits``, the lowest
     and highest voltage of each axis (V): the exported step saturates, and tells the
@@ -71,6 +75,8 @@ def export(
     """
     if to not in FORMS:
         raise ValueError(f"to is {to!r}: choose from {', '.join(FORMS)}")
+    if before is not None and to != "vendor":
+        raise ValueError("before is a file of a device: it needs to='vendor'")
     about = about or About()
     kind, axes = _kind_of(system)
     about = about.model_copy(update={"unsafe": _alarms(kind, about)})
@@ -79,6 +85,9 @@ def export(
             type(system).__name__,
             "to export it all the same, pass accept_unsafe=True (--accept-unsafe)",
         )
+    if to == "vendor":
+        saved = None if before is None else Path(before)
+        return write_vendor(system, Path(folder), name or kind, about, saved)
     draw = np.random.default_rng(seed)
     if kind == "plant":
         system, interface, inputs = _plant(system, axes, about, samples, draw)
