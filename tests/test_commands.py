@@ -323,6 +323,25 @@ def test_export_of_a_model_needs_no_limits(tmp_path):
     assert "Record: first.csv." in (out / "lag.h").read_text(encoding="utf-8")
 
 
+def test_export_compares_the_file_of_a_device(tmp_path):
+    path, saved, out = (tmp_path / name for name in ("gains.toml", "old.ini", "x"))
+    span = {"avmin": -20.0, "avmax": 130.0, "posmin": 0.0, "posmax": 80.0}
+    pj.save(pj.control.NV200(ki=70.0004, **span), path, pj.About(judged=["fine"]))
+    saved.write_text("[Device Parameters]\nki = 55.5\n")
+    command = ("export", path, "--to", "vendor", "--out", out)
+    printed = succeeded(call(*command, "--before", saved)).stdout
+    assert names(out) == [
+        "controller.ini",
+        "controller_parameters.csv",
+        f"{saved.name}.backup",
+    ]
+    assert re.search(r"ki +│ +55.5 │ +70.000 │ 1/s +│ integral gain", printed)
+    failed(call(*command), f"--out {out} already holds results")
+    failed(call(*command[:-1], tmp_path / "y", "--before", path), "no section headers")
+    refused = call("export", path, "--before", saved, "--out", tmp_path / "y")
+    failed(refused, "before is a file of a device")
+
+
 def test_export_refuses_gains_with_an_alarm_unless_accepted(tmp_path):
     path = tmp_path / "gains.toml"
     about = pj.About(judged=["fine"], unsafe=["it rings"])

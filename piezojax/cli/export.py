@@ -15,10 +15,10 @@ SYSTEMS = ("gains.toml", "model.json")
 @click.argument("source", type=click.Path(path_type=Path), metavar="FILE")
 @click.option(
     "--to",
-    type=click.Choice(["c", "fmu", "mat", "octave"]),
+    type=click.Choice(["c", "fmu", "mat", "octave", "vendor"]),
     default="c",
     help="c: C99 with a test (default); fmu: FMU 2.0 for co-simulation; mat, octave: "
-    "the model linearised at rest.",
+    "the model linearised at rest; vendor: the file of an E727, NV200 or Stabilizer.",
 )
 @click.option(
     "--name", help="Begins all names in C (default: controller, or plant for a model)."
@@ -37,13 +37,19 @@ SYSTEMS = ("gains.toml", "model.json")
     help="Limits of the voltage, V, once for each axis (default: those of the study).",
 )
 @click.option(
+    "--before",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="SAVED",
+    help="The file saved from the device: compared, and kept as a backup (vendor).",
+)
+@click.option(
     "--accept-unsafe",
     is_flag=True,
     help="Export gains that were written with an alarm; the files say so.",
 )
 @common
-def main(source, to, name, precision, limits, accept_unsafe, out, seed, quiet):
-    """Export the System in FILE as C99, an FMU, or a linear model.
+def main(source, to, name, precision, limits, before, accept_unsafe, out, seed, quiet):
+    """Export the System in FILE as C99, an FMU, a linear model, or a vendor's file.
 
     FILE is the gains.toml of tune, the model.json of identify, or the folder of their
     results. `make test` in a folder of C compiles the source and replays a simulation.
@@ -51,7 +57,8 @@ def main(source, to, name, precision, limits, accept_unsafe, out, seed, quiet):
 
     def body(console):
         from ..core.serial import load, read_about
-        from ..exporting import export, export_alarms
+        from ..exporting import device_values, export, export_alarms
+        from ..report.device_table import device_table
 
         path = next(
             (source / file for file in SYSTEMS if (source / file).is_file()), source
@@ -69,11 +76,14 @@ def main(source, to, name, precision, limits, accept_unsafe, out, seed, quiet):
             limits=limits or None,
             precision=precision,
             seed=seed or 0,
+            before=before,
             accept_unsafe=accept_unsafe,
         )
         print_alarms(console, export_alarms(system, about))
         for file in files:
             console.print(f"{file}", soft_wrap=True)
+        if to == "vendor":
+            console.print(device_table(device_values(system, before)))
         if to == "c":
             console.print(f"test: make -C {folder} test", soft_wrap=True)
 
