@@ -15,10 +15,11 @@ SYSTEMS = ("gains.toml", "model.json")
 @click.argument("source", type=click.Path(path_type=Path), metavar="FILE")
 @click.option(
     "--to",
-    type=click.Choice(["c", "fmu", "mat", "octave", "vendor"]),
+    type=click.Choice(["c", "fmu", "mat", "octave", "biquads", "vendor"]),
     default="c",
     help="c: C99 with a test (default); fmu: FMU 2.0 for co-simulation; mat, octave: "
-    "the model linearised at rest; vendor: the file of an E727, NV200 or Stabilizer.",
+    "the model linearised at rest; biquads: the linear feedback as second-order "
+    "sections; vendor: the file of an E727, NV200 or Stabilizer.",
 )
 @click.option(
     "--name", help="Begins all names in C (default: controller, or plant for a model)."

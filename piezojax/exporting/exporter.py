@@ -15,6 +15,7 @@ from ..core.feedback import Observation
 from ..core.serial import from_data
 from ..core.system import System, accepts, rest_output
 from ..hardware import Saturation
+from .biquads import write_biquads
 from .c_export import write_c
 from .c_project import Interface
 from .driven import Driven, Seen
@@ -33,7 +34,7 @@ AXES = 6
 
 UNJUDGED = "no study has judged the stability of this controller"
 
-FORMS = ("c", "fmu", "mat", "octave", "vendor")
+FORMS = ("c", "fmu", "mat", "octave", "biquads", "vendor")
 """Forms of an export."""
 
 Limits = Sequence[tuple[float, float]]
@@ -55,10 +56,11 @@ def export(
 ) -> list[Path]:
     """Write ``system`` to a new ``folder``; return the paths of its files.
 
-    ``to`` is "c", C99 with a test of its own; "fmu", an FMU 2.0 for co-simulation; or
-    "mat" or "octave", the model linearised at rest for MATLAB or Octave; or "vendor",
-    the parameters of an E727, NV200 or Stabilizer as the file of its vendor, with a
-    copy of the file ``before`` that was saved from the device.
+    ``to`` is "c", C99 with a test of its own; "fmu", an FMU 2.0 for co-simulation;
+    "mat" or "octave", the model linearised at rest for MATLAB or Octave; "biquads", the
+    linear feedback of a controller as second-order sections; or "vendor", the
+    parameters of an E727, NV200 or Stabilizer as the file of its vendor, with a copy of
+    the file ``before`` that was saved from the device.
 
     A controller leaves with its actuator, that of ``about`` or ``limits``, the lowest
     and highest voltage of each axis (V): the exported step saturates, and tells the
@@ -100,6 +102,8 @@ def export(
         raise ValueError(f"the numbers of {to} are double; leave out precision")
     if to in ("mat", "octave"):
         return write_linear(system, interface, Path(folder), name, about, to)
+    if to == "biquads":
+        return write_biquads(system, interface, Path(folder), name, about)
     if to == "fmu":
         return write_fmu(system, interface, Path(folder), name, about)
     return write_c(system, interface, inputs, Path(folder), name, about, precision)
