@@ -123,7 +123,8 @@ class Space(eqx.Module):
             if not low <= value <= high:
                 raise ValueError(
                     f"{path} starts at {float(value):g}; its bounds "
-                    f"{float(low):g} to {float(high):g} must include the start"
+                    f"{float(low):g} to {float(high):g} must include the start: set "
+                    "the start or the bounds in the study"
                 )
         return jnp.clip(self.to_unit(values), INSIDE, 1.0 - INSIDE)
 

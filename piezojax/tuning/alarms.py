@@ -23,7 +23,10 @@ differs from that of tuning."""
 AMPLIFIED = 2.0
 """Largest |y/r| without a note."""
 
-_TIGHTEN = "lower the upper bounds of the gains, or raise 'candidates' and 'steps'"
+_TIGHTEN = (
+    "begin with gains of a stable loop and bounds that contain such gains, "
+    "or raise 'candidates' and 'steps'"
+)
 
 
 def alarms_of(
