@@ -120,7 +120,8 @@ def fit_responses(
         )
     report = chosen.report
     title = f"{report.lines} lines: median error {100.0 * report.error:.2g} %"
-    console.print(parameter_table(report.parameters, title))
+    units = chosen.about.parameter_units
+    console.print(parameter_table(report.parameters, title, units))
     console.print(f"found: {report.found}", soft_wrap=True)
     notes = [*(report.measured.notes if report.measured else []), *report.notes]
     for note in notes:

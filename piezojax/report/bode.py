@@ -68,6 +68,8 @@ def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
             _sensitivities(sensitivity, curves, report, label, style)
     gain.axhline(1.0, color=REFERENCE, lw=0.8)
     gain.set(ylabel="|L| (-)", title="Loop transfer function, cut at the plant's input")
+    low, high = gain.get_ylim()
+    gain.set_ylim(max(low, 1e-6), high)  # a zero at half the rate is of no interest
     gain.legend(fontsize=7.5)
     phase.axhline(-180.0, color=REFERENCE, lw=0.8)
     phase.set(xlabel="frequency (Hz)", ylabel="phase of L (°)")

@@ -296,17 +296,25 @@ def fit_table(report: FitReport) -> Table:
 
 
 def parameter_table(
-    parameters: Mapping[str, FittedParameter], table: Table | str
+    parameters: Mapping[str, FittedParameter],
+    table: Table | str,
+    units: Mapping[str, str] | None = None,
 ) -> Table:
-    """Return ``table``, or a new one of this title, with a row for each parameter."""
+    """Return ``table``, or a new one of this title, with a row for each parameter.
+
+    With ``units``, by path, a column has the unit of each.
+    """
     table = Table(title=table) if isinstance(table, str) else table
     table.add_column("parameter", no_wrap=True)
     table.add_column("value", justify="right")
     table.add_column("standard error", justify="right")
+    if units is not None:
+        table.add_column("unit", no_wrap=True)
     for path, parameter in parameters.items():
         deviation = parameter.standard_error
         shown = "-" if deviation is None else f"{deviation:.2g}"
-        table.add_row(path, f"{parameter.value:.5g}", shown)
+        unit = [] if units is None else [units.get(path) or "-"]
+        table.add_row(path, f"{parameter.value:.5g}", shown, *unit)
     return table
 
 

@@ -188,7 +188,7 @@ def hysteresis_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
     left.set(
         xlabel=f"{drive} ({drive_unit})",
         ylabel=f"{_quantity(trace)} ({unit})",
-        title=f"{name}: the stage's hysteresis, in the tuned loop",
+        title=f"{name}: displacement over voltage, tuned loop",
     )
     for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
         error = 1e3 * (log.displacement - log.reference)
