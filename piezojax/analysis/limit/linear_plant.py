@@ -171,10 +171,12 @@ def gain_from_noise(
     for _ in range(_ROUNDS):
         left = own - 2.0 * gain * both + gain**2 * other
         weight = 1.0 / np.maximum(left, np.finfo(float).tiny)
-        power = np.sum(weight * np.abs(driven) ** 2)
-        if power == 0.0:
-            break
-        gain = np.sum(weight * np.real(np.conj(driven) * moved)) / power
+        # Signals of an unstable loop may overflow: the gain is then not a number.
+        with np.errstate(over="ignore", invalid="ignore"):
+            power = np.sum(weight * np.abs(driven) ** 2)
+            if power == 0.0:
+                break
+            gain = np.sum(weight * np.real(np.conj(driven) * moved)) / power
     if not (np.isfinite(gain) and gain > 0.0):
         raise ValueError("the stage does not move as its linear model does")
     return float(gain)
