@@ -10,8 +10,9 @@ from ..core.about import About
 from ..core.files import fresh_folder, write_text
 from ..core.rollout import simulate
 from ..core.system import System
-from .c_project import CProject, Interface
+from .c_project import CProject
 from .c_templates import MAKEFILE, TEST
+from .slots import Interface
 
 TOLERANCE = {"double": 1e-12, "float": 1e-3}
 """Largest difference from the golden vectors, as a share of their largest value."""

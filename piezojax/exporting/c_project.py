@@ -1,9 +1,9 @@
 """Header and source of a System in C99."""
 
-import math
 import re
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,70 +14,11 @@ from ..core.about import About
 from ..core.parameter import Parameter
 from ..core.paths import declared
 from ..core.system import System, resolve
-from .c_source import PRECISIONS, TYPES, statements
-from .c_templates import HEADER, SOURCE
+from .c_bodies import Fields, StepBodies, init_body, step_bodies
+from .c_source import PRECISIONS
+from .c_templates import HEADER, PREPARED_TYPE, SOURCE
 from .driven import Driven
-from .node_arrays import Memory, NotScalarError
-from .trace import trace
-
-MANY = 8
-"""Number of equal elements above which they are set in a loop."""
-
-
-class Slot(NamedTuple):
-    """A scalar of a tree: its path, its name in C, and its type."""
-
-    path: str
-    name: str
-    dtype: Any
-    size: int = 1
-
-
-class Interface(NamedTuple):
-    """Signals of an exported System.
-
-    ``start`` is an example of the input of ``init``, ``input`` one of ``step``. The
-    function ``step`` has an argument for each leaf, named by its path.
-    """
-
-    start: Any
-    input: Any
-
-
-def _nodes(output: Any) -> list[int]:
-    """Return the nodes of an output of a trace."""
-    if isinstance(output, Memory):
-        return [n for pair in output.writes for n in pair]
-    return output.ravel().tolist()
-
-
-def slots(tree: Any, word: str) -> list[Slot]:
-    """Return the leaves of ``tree``, an array as one slot of its size.
-
-    ``word`` begins a name that has no letter of its own.
-    """
-    found, taken = [], set()
-    for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        path = ".".join(jax.tree_util.keystr((key,), simple=True) for key in keys)
-        name = re.sub(r"\W+", "_", path)
-        if not name or name[0].isdigit():
-            name = f"{word}_{name}".rstrip("_")
-        base, count = name, 1
-        while name in taken:
-            count += 1
-            name = f"{base}_{count}"
-        taken.add(name)
-        found.append(Slot(path, name, leaf.dtype, math.prod(jnp.shape(leaf))))
-    return found
-
-
-def expressions(slots: Sequence[Slot], start: str) -> list[str]:
-    """Return the expression of every scalar of ``slots`` behind ``start``."""
-    return [
-        f"{start}{slot.name}" if slot.size == 1 else f"{start}{slot.name}[{i}]"
-        for slot in slots
-        for i in range(slot.size)
-    ]
+from .slots import PREPARED, Interface, Slot, expressions, slots, type_of
 
 
 class CProject:
@@ -106,26 +47,34 @@ class CProject:
         system = resolve(system)
         self.name, self.about, self.precision = name, about, PRECISIONS[precision]
         self.system, self.interface = system, jax.tree.map(jnp.asarray, interface)
-        self.dynamic, self.static = eqx.partition(system, eqx.is_array)
+        dynamic = eqx.filter(system, eqx.is_array)
         self.state = system.init(self.interface.start)
         self.output = eqx.filter_eval_shape(
             system.step, self.state, self.interface.input
         )[1]
-        self.parameters = slots(self.dynamic, "parameter")
+        self.parameters = slots(dynamic, "parameter")
         self.states = slots(self.state, "state")
         self.starts = slots(self.interface.start, "input")
         self.inputs = slots(self.interface.input, "input")
         self.outputs = slots(self.output, "output")
-        self.values = [np.ravel(leaf) for leaf in jax.tree.leaves(self.dynamic)]
+        self.values = [np.ravel(leaf) for leaf in jax.tree.leaves(dynamic)]
 
     # Text
 
+    @property
+    def _all_fields(self) -> Fields:
+        return Fields(
+            self.parameters, self.states, self.starts, self.inputs, self.outputs
+        )
+
+    @cached_property
+    def _step(self) -> StepBodies:
+        return step_bodies(
+            self.system, self.state, self.interface, self._all_fields, self.precision
+        )
+
     def _type(self, dtype: Any) -> str:
-        if np.issubdtype(dtype, np.bool_):
-            return TYPES["boolean"]
-        if np.issubdtype(dtype, np.integer):
-            return TYPES["integer"]
-        return self.precision.real
+        return type_of(dtype, self.precision)
 
     def _fields(self, slots: Sequence[Slot], comment: Callable[[Slot], str]) -> str:
         lines = []
@@ -169,6 +118,7 @@ class CProject:
         return {
             "defaults": f"{name}_parameters {name}_defaults(void)",
             "check": f"int {name}_check(const {name}_parameters *parameters)",
+            "prepare": f"void {name}_prepare({name}_parameters *parameters)",
             "init": f"void {name}_init({both}{self._arguments(self.starts)})",
             "step": f"{self._returned} {name}_step({both}"
             f"{self._arguments(self.inputs)}{more})",
@@ -203,17 +153,23 @@ class CProject:
 
     def header(self) -> str:
         """Return the text of the header."""
-        signatures, guard = self._signatures(), f"{self.name.upper()}_H"
+        name, signatures = self.name, self._signatures()
         units = self.about.units
         output = ""
         if len(self.outputs) > 1:
             fields = self._fields(self.outputs, lambda slot: "")
-            output = f"typedef struct {{\n{fields}\n}} {self.name}_output;\n\n"
+            output = f"typedef struct {{\n{fields}\n}} {name}_output;\n\n"
+        fields = self._fields(self.parameters, self.meaning)
+        prepared = ""
+        if self._step.prepared:
+            prepared = PREPARED_TYPE.format(name=name, fields=self._step.prepared)
+            fields += f"\n    {name}_{PREPARED} {PREPARED};"
         return HEADER.format(
             origin=self.origin(),
-            guard=guard,
-            name=self.name,
-            parameters=self._fields(self.parameters, self.meaning),
+            guard=f"{name.upper()}_H",
+            name=name,
+            prepared=prepared,
+            parameters=fields,
             state=self._fields(self.states, lambda slot: ""),
             output=output,
             units=", ".join(f"{k} in {v}" for k, v in units.items()) or "as simulated",
@@ -228,8 +184,11 @@ class CProject:
             name=self.name,
             set=self._defaults(),
             checks=self._checks(),
-            init_body=self._init_body(),
-            step_body=self._step_body(),
+            init_body=init_body(
+                self.system, self.interface, self._all_fields, self.precision
+            ),
+            prepare_body=self._step.prepare,
+            step_body=self._step.step,
             **signatures,
         )
 
@@ -265,96 +224,3 @@ class CProject:
                 if wrong:
                     lines.append(f"    if ({' || '.join(wrong)}) return {number};")
         return "\n".join(lines or ["    (void)parameters;"])
-
-    def _init_body(self) -> str:
-        def init(dynamic, start):
-            return eqx.combine(dynamic, self.static).init(start)
-
-        names = expressions(self.starts, "")
-        try:
-            graph, outputs = trace(init, self.dynamic, self.interface.start)
-            names = [*expressions(self.parameters, "parameters->"), *names]
-        except NotScalarError:
-            # Equations of several unknowns are solved here, once for all.
-            graph, outputs = trace(self.system.init, self.interface.start)
-        return self._body(graph, outputs, names, self.starts)
-
-    def _step_body(self) -> str:
-        def step(dynamic, state, input):
-            return eqx.combine(dynamic, self.static).step(state, input)
-
-        graph, outputs = trace(step, self.dynamic, self.state, self.interface.input)
-        names = [
-            *expressions(self.parameters, "parameters->"),
-            *expressions(self.states, "state->"),
-            *expressions(self.inputs, ""),
-        ]
-        return self._body(graph, outputs, names, self.inputs, result=True)
-
-    def _body(
-        self,
-        graph: Any,
-        outputs: list[Any],
-        names: list[str],
-        arguments: Sequence[Slot],
-        result: bool = False,
-    ) -> str:
-        # A long array stays where it is; elsewhere its elements are copied.
-        own = [f"state->{slot.name}[0]" for slot in self.states]
-        own += [""] * len(self.outputs)
-        outputs = [
-            each.elements(graph)
-            if isinstance(each, Memory) and names[each.place] != place
-            else each
-            for each, place in zip(outputs, own, strict=False)
-        ]
-        flat = [int(n) for each in outputs for n in _nodes(each)]
-        lines, expression = statements(
-            graph, flat, lambda place: names[place], self.precision
-        )
-        count = len(self.states)
-        results = [expression(int(n)) for each in outputs[count:] for n in each.ravel()]
-        returned = ""
-        if result and len(self.outputs) == 1:
-            kind = self._type(self.outputs[0].dtype)
-            lines.append(f"    const {kind} result = {results[0]};")
-            returned = "\n    return result;"
-        elif result:
-            targets = expressions(self.outputs, "output->")
-            lines += [f"    {a} = {b};" for a, b in zip(targets, results, strict=True)]
-        lines += self._assignments(outputs[:count], expression)
-        unused = ["state", "parameters", *(slot.name for slot in arguments)]
-        lines[:0] = [f"    (void){name};" for name in unused]
-        return "\n".join(lines) + returned
-
-    def _assignments(
-        self, states: Sequence[Any], expression: Callable[[int], str]
-    ) -> Iterator[str]:
-        """Yield the lines that assign the next state; each value is read before."""
-        places = {
-            place: self._type(slot.dtype)
-            for slot in self.states
-            for place in expressions([slot], "state->")
-        }
-        pairs, old = [], {}
-        for slot, each in zip(self.states, states, strict=True):
-            if isinstance(each, Memory):
-                # Before all others: an index may be a state.
-                for index, value in each.writes:
-                    at = f"state->{slot.name}[{expression(index)}]"
-                    yield f"    {at} = {expression(value)};"
-                continue
-            numbers = [int(n) for n in each.ravel()]
-            if len(numbers) > MANY and len(set(numbers)) == 1:
-                yield f"    for (long i = 0; i < {slot.size}; i++)"
-                yield f"        state->{slot.name}[i] = {expression(numbers[0])};"
-                continue
-            texts = map(expression, numbers)
-            pairs += zip(expressions([slot], "state->"), texts, strict=True)
-        for place, text in pairs:
-            if text in places and text != place and text not in old:
-                old[text] = f"s{len(old)}"
-                yield f"    const {places[text]} {old[text]} = {text};"
-        for place, text in pairs:
-            if text != place:
-                yield f"    {place} = {old.get(text, text)};"

@@ -1,6 +1,7 @@
 """C99 source of the operations of a graph."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -84,13 +85,15 @@ def statements(
     outputs: Sequence[int],
     names: Callable[[int], str],
     precision: Precision,
+    held: Mapping[int, str] = MappingProxyType({}),
 ) -> tuple[list[str], Callable[[int], str]]:
     """Return the statements that compute ``outputs``, and the expression of a node.
 
-    ``names`` returns the expression of an input by its place. A comment names the
-    function of each group of operations.
+    ``names`` returns the expression of an input by its place, ``held`` has those of
+    nodes that are computed elsewhere. A comment names the function of each group of
+    operations.
     """
-    writer = _Writer(graph, outputs, names, precision)
+    writer = _Writer(graph, outputs, names, precision, held)
     return list(writer.block(graph.block, "    ")), writer.expression
 
 
@@ -101,12 +104,15 @@ class _Writer:
         outputs: Sequence[int],
         names: Callable[[int], str],
         precision: Precision,
+        held: Mapping[int, str],
     ):
         self.graph, self.names, self.precision = graph, names, precision
-        self.needed = graph.needed(outputs)
+        self.needed, self.held = graph.needed(outputs, held), held
         self.variables: dict[int, str] = {}
 
     def expression(self, number: int) -> str:
+        if number in self.held:
+            return self.held[number]
         node = self.graph.nodes[number]
         if node.operation == CONSTANT:
             return self._constant(node)
@@ -134,7 +140,9 @@ class _Writer:
                 yield from self._loop(-1 - number, indent)
                 continue
             node = self.graph.nodes[number]
-            if number not in self.needed or node.operation in NOTHING:
+            if number not in self.needed or number in self.held:
+                continue
+            if node.operation in NOTHING:
                 continue
             if node.source and node.source != source:
                 source = node.source

@@ -24,7 +24,7 @@ HEADER = """\
 #ifndef {guard}
 #define {guard}
 
-typedef struct {{
+{prepared}typedef struct {{
 {parameters}
 }} {name}_parameters;
 
@@ -32,8 +32,11 @@ typedef struct {{
 {state}
 }} {name}_state;
 
-{output}/* Return the exported parameters. They may be changed between two samples. */
+{output}/* Return the exported parameters, prepared. */
 {defaults};
+
+/* Prepare changed parameters for the next samples. */
+{prepare};
 
 /* Return 0, or the number of the first parameter outside its limits, from 1 on. */
 {check};
@@ -47,6 +50,14 @@ typedef struct {{
 #endif
 """
 
+PREPARED_TYPE = """\
+/* Numbers that {name}_prepare computes from the parameters. */
+typedef struct {{
+{fields}
+}} {name}_prepared;
+
+"""
+
 SOURCE = """\
 /* {origin} */
 #include "{name}.h"
@@ -56,6 +67,7 @@ SOURCE = """\
 {defaults} {{
     {name}_parameters parameters;
 {set}
+    {name}_prepare(&parameters);
     return parameters;
 }}
 
@@ -66,6 +78,10 @@ SOURCE = """\
 
 {init} {{
 {init_body}
+}}
+
+{prepare} {{
+{prepare_body}
 }}
 
 {step} {{

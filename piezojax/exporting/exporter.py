@@ -17,10 +17,10 @@ from ..core.system import System, accepts, rest_output
 from ..hardware import Saturation
 from .biquads import write_biquads
 from .c_export import write_c
-from .c_project import Interface
 from .driven import Driven, Seen
 from .fmu import write_fmu
 from .linear_models import write_linear
+from .slots import Interface
 from .vendor import write_vendor
 
 FAR = 1e6

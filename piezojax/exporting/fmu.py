@@ -19,8 +19,9 @@ import numpy as np
 from ..core.about import About
 from ..core.files import fresh_folder, write_bytes
 from ..core.system import System
-from .c_project import CProject, Interface, expressions
+from .c_project import CProject
 from .fmu_template import FMU
+from .slots import Interface, expressions
 
 PLATFORMS = {"Linux": ("linux64", "so"), "Darwin": ("darwin64", "dylib")}
 """Folder and extension of a binary by operating system."""

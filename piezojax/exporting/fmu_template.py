@@ -83,6 +83,7 @@ status fmi2EnterInitializationMode(void *it) {{
 }}
 
 static void begin(instance *this) {{
+    {name}_prepare(&this->parameters);
     {name}_init(&this->state, &this->parameters{begin});
     this->started = 1;
 }}
@@ -134,6 +135,7 @@ status fmi2DoStep(void *it, double time, double step, int keep) {{
     if (!this->started || samples < 1.0) return ERROR;
     if (fabs(step / SAMPLE - samples) > 1e-3) return ERROR;
     if ({name}_check(&this->parameters)) return ERROR;
+    {name}_prepare(&this->parameters);
     for (k = 0.0; k < samples; k += 1.0) {{
 {step}
     }}

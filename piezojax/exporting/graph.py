@@ -1,6 +1,6 @@
 """Graph of scalar operations, the form in which a System leaves piezojax."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -34,9 +34,11 @@ class Node(NamedTuple):
 class Block:
     """Nodes in the order of their computation, with the loops between them.
 
-    A loop stands as -1 - i, i its number in ``Graph.loops``.
+    A loop stands as -1 - i, i its number in ``Graph.loops``. ``level`` is the number of
+    loops around the nodes.
     """
 
+    level: int = 0
     order: list[int] = field(default_factory=list)
     known: dict[tuple, int] = field(default_factory=dict)
 
@@ -60,15 +62,22 @@ class Loop(NamedTuple):
 class Graph:
     """Scalar operations, each stored once.
 
-    ``nodes`` holds all operations by number, ``block`` the order of those outside any
-    loop.
+    ``nodes`` holds all operations by number, ``levels`` the number of loops around
+    each, and ``block`` the order of those outside any loop. An operation whose operands
+    do not change in a loop stands before the loop.
     """
 
     def __init__(self):
         self.nodes: list[Node] = []
+        self.levels: list[int] = []
         self.loops: list[Loop] = []
         self.block = Block()
         self._open = [self.block]
+
+    @property
+    def level(self) -> int:
+        """Number of loops around the next node."""
+        return self._open[-1].level
 
     @contextmanager
     def inside(self, block: Block) -> Iterator[Block]:
@@ -97,8 +106,12 @@ class Graph:
         for block in reversed(self._open):
             if key in block.known:
                 return block.known[key]
-        block = self._open[-1]
+        level = max((self.levels[n] for n in operands), default=0)
+        if operation in (CARRY, RESULT):
+            level = self.level
+        block = next(each for each in reversed(self._open) if each.level == level)
         self.nodes.append(Node(operation, tuple(operands), kind, value, source))
+        self.levels.append(level)
         number = block.known[key] = len(self.nodes) - 1
         block.order.append(number)
         return number
@@ -113,8 +126,11 @@ class Graph:
             for place, first in enumerate(loop.first)
         ]
 
-    def needed(self, outputs: Sequence[int]) -> set[int]:
-        """Return the numbers of the nodes that ``outputs`` depend on."""
+    def needed(self, outputs: Sequence[int], held: Collection[int] = ()) -> set[int]:
+        """Return the numbers of the nodes that ``outputs`` depend on.
+
+        What the nodes ``held`` depend on does not count.
+        """
         carried = {
             number: (loop, place)
             for loop in self.loops
@@ -127,6 +143,8 @@ class Graph:
             if number in found:
                 continue
             found.add(number)
+            if number in held:
+                continue
             node = self.nodes[number]
             open_ += node.operands
             if node.operation == RESULT:

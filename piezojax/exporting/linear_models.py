@@ -13,7 +13,7 @@ from ..core.files import fresh_folder, write_bytes, write_text
 from ..core.system import System, resolve
 from ..dynamics.linearise import linearise
 from ..dynamics.state_space import StateSpace
-from .c_project import Interface, slots
+from .slots import Interface, slots
 
 SUBJECT = "Model linearised at rest"
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .graph import CONSTANT, INPUT, READ, Graph, Kind
+from .simplify import Simplifier
 
 Numbers = np.ndarray
 """Array of the numbers of nodes, with the shape of the traced array."""
@@ -58,6 +59,7 @@ class NodeArrays:
     def __init__(self, graph: Graph):
         self.graph = graph
         self.source = ""
+        self._simplifier = Simplifier(graph)
 
     def constants(self, array: np.ndarray) -> Numbers:
         """Return the nodes of the elements of ``array``."""
@@ -84,20 +86,8 @@ class NodeArrays:
         return np.array(numbers, int).reshape(arrays[0].shape)
 
     def scalar(self, name: str, operands: list[int], kind: Kind, value: Any) -> int:
-        """Return the node of an operation; neutral operands need none."""
-        nodes = [self.graph.nodes[number] for number in operands]
-        known = [node.value if node.operation == CONSTANT else None for node in nodes]
-        if name == "convert_element_type" and nodes[0].kind == kind:
-            return operands[0]
-        if name == "select_n" and known[0] is not None:
-            return operands[1 + int(known[0])]
-        if name == "select_n" and len(set(operands[1:])) == 1:
-            return operands[1]
-        if name in ("mul", "div") and known[1] == 1.0:
-            return operands[0]
-        if name == "mul" and known[0] == 1.0:
-            return operands[1]
-        return self.graph.add(name, operands, kind, value, self.source)
+        """Return the node of an operation."""
+        return self._simplifier.add(name, operands, kind, value, self.source)
 
     def in_memory(self, equation: Any, operands: list[Any]) -> Numbers | Memory | None:
         """Return the result of an equation that reads or writes one element.

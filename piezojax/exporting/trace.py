@@ -244,7 +244,8 @@ class _Tracer:
         first = operands[heads + bodies :]
         graph = self.graph
         before, mark = _flat(first), len(graph.nodes)
-        head, body = Block(), Block()
+        level = graph.level + 1
+        head, body = Block(level), Block(level)
         with graph.inside(head):
             carried = [
                 graph.add(CARRY, (), graph.nodes[number].kind, (mark, place))

@@ -5,6 +5,12 @@
 Each controller of the catalogue is exported as C and steps a million times through its
 golden vectors, in double and in float; ``simulate`` runs over the same inputs. The best
 of five turns counts.
+
+    python tests/benchmarks/export_speed.py --by-hand
+
+The controller and the plant of loop.c, which is written by hand, are exported with the
+same gains and step in a plain loop (export_loop.c). Both loops are compiled with the
+same flags and run one lane over the same reference and noise; their RMS errors agree.
 """
 
 import re
@@ -14,8 +20,10 @@ import tempfile
 import time
 from pathlib import Path
 
+import engines
 import jax
 import numpy as np
+import piezojax_engine
 from rich.console import Console
 from rich.table import Table
 
@@ -30,6 +38,9 @@ NAMES = (
 TURNS, ROUNDS, SAMPLES = 5, 500, 2000
 ABOUT = pj.About(judged=["not here"], reference_ranges=[(0.0, 10.0)])
 LIMITS = (-20.0, 120.0)
+HERE = Path(__file__).parent
+FLAGS = (engines.GCC_FLAGS, "-O2 -ffp-contract=off", engines.GCC_FLAGS + " -flto")
+STEPS = 100_000
 
 PROGRAM = """\
 #include <stdio.h>
@@ -103,7 +114,46 @@ def in_jax(name):
     return 1e9 * min(times) / 100_000
 
 
+def beside_loop_c(flags):
+    """Return ns a step of the exported loop and of loop.c, and their RMS errors, um."""
+    gains, reference, noise = (rows[0] for rows in engines.problem(1, STEPS))
+    loop = piezojax_engine.loop(gains)
+    with tempfile.TemporaryDirectory() as scratch:
+        parts = {"controller": loop.controller, "plant": loop.plant}
+        for name, part in parts.items():
+            limits = [LIMITS] if name == "controller" else None
+            pj.export(part, Path(scratch) / name, about=ABOUT, limits=limits)
+        sources = [
+            *(Path(scratch) / name / f"{name}.c" for name in parts),
+            *(HERE / name for name in ("export_loop.c", "loop.c")),
+        ]
+        folders = [f"-I{Path(scratch) / name}" for name in parts]
+        command = ["gcc", *flags.split(), *folders, "-o", f"{scratch}/loop", *sources]
+        subprocess.run([*command, "-lm"], check=True)
+        data = np.concatenate([gains, reference, noise]).tobytes()
+        done = subprocess.run(
+            [f"{scratch}/loop", str(STEPS)], input=data, capture_output=True, check=True
+        )
+    return tuple(map(float, done.stdout.split()))
+
+
+def by_hand():
+    """Return a table of the exported loop beside loop.c."""
+    table = Table(title="a step of controller and plant")
+    for head in ("flags of gcc", "exported", "loop.c", "ratio", "RMS errors differ by"):
+        table.add_column(head, justify="left" if head == "flags of gcc" else "right")
+    for flags in FLAGS:
+        exported, plain, rms, wanted = beside_loop_c(flags)
+        times = f"{exported:.1f} ns", f"{plain:.1f} ns", f"{exported / plain:.2f}"
+        table.add_row(flags, *times, f"{abs(rms / wanted - 1.0):.0e}")
+    return table
+
+
 def main():
+    console = Console(width=None if sys.stdout.isatty() else 100)
+    if sys.argv[1:] == ["--by-hand"]:
+        console.print(by_hand())
+        return
     table = Table(title="a step of a controller")
     for head in ("controller", "numbers of state", "C double", "C float", "simulate"):
         table.add_column(head, justify="left" if head == "controller" else "right")
@@ -112,7 +162,7 @@ def main():
         single = in_c(name, "float")[2]
         times = (f"{ns:.0f} ns" for ns in (double, single, in_jax(name)))
         table.add_row(name, str(numbers), *times)
-    Console(width=None if sys.stdout.isatty() else 100).print(table)
+    console.print(table)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,9 @@
 
 import shutil
 import subprocess
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,8 @@ from piezojax.core.serial import to_data
 from piezojax.exporting import Driven, NotScalarError, Seen, trace
 from piezojax.exporting.c_source import DOUBLE, statements
 from piezojax.exporting.graph import CONSTANT, INPUT
+from piezojax.exporting.prepared import prepared_nodes
+from piezojax.exporting.products import shorten_products
 
 ACTUATOR = to_data(pj.Saturation(-20.0, 120.0))
 ABOUT = pj.About(
@@ -127,6 +131,55 @@ def test_a_parameter_outside_its_limits_is_found(tmp_path):
         ["cc", "-std=c99", "-o", binary, program, files[1], "-lm"], check=True
     )
     assert subprocess.run([binary]).returncode == 5  # the fifth parameter
+
+
+@compiled
+def test_parameters_changed_while_running_act_once_prepared(tmp_path):
+    controller: Any = CONTROLLERS["p753_disturbance_observer"]()
+    changed = eqx.tree_at(lambda c: c.cutoff, controller, 0.5 * controller.cutoff)
+    _, source, *_ = pj.export(controller, tmp_path / "c", about=ABOUT)
+    (tmp_path / "c" / "program.c").write_text(
+        "#include <stdio.h>\n"
+        '#include "controller.h"\n'
+        "int main(void) {\n"
+        "    controller_parameters p = controller_defaults();\n"
+        "    controller_state state;\n"
+        "    int k;\n"
+        "    controller_init(&state, &p, 5.0, 5.0, 5.0, 40.0);\n"
+        "    for (k = 0; k < 20; k++) {\n"
+        "        if (k == 10) {\n"
+        "            p.controller_cutoff *= 0.5;\n"
+        "            controller_prepare(&p);\n"
+        "        }\n"
+        '        printf("%.17g\\n", controller_step(&state, &p, 5.0, 5.1, 4.9));\n'
+        "    }\n"
+        "    return 0;\n"
+        "}\n"
+    )
+    command = ["cc", "-std=c99", "-o", "program", "program.c", source, "-lm"]
+    subprocess.run(command, cwd=tmp_path / "c", check=True)
+    done = subprocess.run([tmp_path / "c" / "program"], capture_output=True, text=True)
+    actuator = pj.Saturation(-20.0, 120.0)
+    at = jnp.asarray(5.0)
+    state = Driven(controller, actuator).init(pj.Observation(at, at, at, 8.0 * at))
+    seen, wanted = Seen(at, at + 0.1, at - 0.1), []
+    for k in range(20):
+        system = Driven(controller if k < 10 else changed, actuator)
+        state, voltage = system.step(state, seen)
+        wanted.append(float(voltage))
+    found = [float(line) for line in done.stdout.split()]
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    unchanged = Driven(controller, actuator)
+    assert abs(float(unchanged.step(state, seen)[1]) - found[-1]) > 1e-6
+
+
+@compiled
+def test_a_step_computes_nothing_that_depends_on_parameters_alone(tmp_path):
+    controller = CONTROLLERS["p753_disturbance_observer"]()
+    _, source, *_ = pj.export(controller, tmp_path / "c", about=ABOUT)
+    step = source.read_text().partition("controller_step(")[2]
+    assert "/ parameters" not in step
+    assert "parameters->controller_cutoff" not in step
 
 
 # The text
@@ -290,6 +343,7 @@ def run(function, *arguments):
                 "sub": lambda a, b: a - b,
                 "mul": lambda a, b: a * b,
                 "max": max,
+                "abs": abs,
                 "lt": lambda a, b: a < b,
                 "ge": lambda a, b: a >= b,
                 "eq": lambda a, b: a == b,
@@ -330,6 +384,38 @@ def test_a_loop_of_unknown_length_stays_a_loop():
     assert "double v0 = x;" in text
     assert "for (;;) {" in text
     assert expression(int(output)) == "v0"
+
+
+def test_what_does_not_change_in_a_loop_is_computed_before_it():
+    def powers(x, y):
+        return jax.lax.while_loop(lambda z: z < x, lambda z: z * (y + 1.0), y)
+
+    graph, (output,) = trace(powers, jnp.asarray(50.0), jnp.asarray(2.0))
+    assert [graph.nodes[n].operation for n in graph.block.order if n >= 0].count("add")
+    assert prepared_nodes(graph, [int(output)], 1) == []
+    (loop,) = prepared_nodes(graph, [int(output)], 2)
+    assert graph.nodes[loop].operation == "result"
+
+
+def test_a_product_with_a_sign_and_its_signal_has_no_branch():
+    def decay(x, y):
+        return jnp.where(x >= 0.0, 0.5, -0.5) * y * x
+
+    graph, (output,) = trace(decay, jnp.asarray(-3.0), jnp.asarray(2.0))
+    operations = [graph.nodes[n].operation for n in graph.needed([int(output)])]
+    assert "abs" in operations
+    assert "select_n" not in operations
+
+
+@pytest.mark.parametrize("rounded", [False, True])
+def test_a_quotient_that_is_rounded_stays_one(rounded):
+    def scaled(step, x):
+        return jnp.round(x / step) if rounded else x / step
+
+    graph, (output,) = trace(scaled, jnp.asarray(0.1), jnp.asarray(0.3))
+    shorten_products(graph, 1)
+    last = graph.nodes[graph.nodes[int(output)].operands[0] if rounded else int(output)]
+    assert last.operation == ("div" if rounded else "mul")
 
 
 def test_equal_operations_are_computed_once():

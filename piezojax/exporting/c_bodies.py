@@ -1,0 +1,189 @@
+"""Bodies of the functions of an exported System in C: init, prepare and step."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from ..core.system import System
+from .c_source import TYPES, Precision, statements
+from .graph import Graph
+from .node_arrays import Memory, NotScalarError
+from .prepared import prepared_nodes
+from .products import shorten_products
+from .slots import PREPARED, Interface, Slot, expressions, type_of
+from .trace import trace
+
+MANY = 8
+"""Number of equal elements above which they are set in a loop."""
+
+EMPTY = "    (void)parameters;"
+
+
+class Fields(NamedTuple):
+    """Fields and arguments of an exported System in C."""
+
+    parameters: list[Slot]
+    states: list[Slot]
+    starts: list[Slot]
+    inputs: list[Slot]
+    outputs: list[Slot]
+
+
+class StepBodies(NamedTuple):
+    """Texts of a step: fields and computation of what is prepared, and the step."""
+
+    prepared: str
+    prepare: str
+    step: str
+
+
+def init_body(
+    system: System, interface: Interface, fields: Fields, precision: Precision
+) -> str:
+    """Return the body of ``init``, which computes the state at rest."""
+    dynamic, static = eqx.partition(system, eqx.is_array)
+
+    def init(dynamic, start):
+        return eqx.combine(dynamic, static).init(start)
+
+    names = expressions(fields.starts, "")
+    try:
+        graph, outputs = trace(init, dynamic, interface.start)
+        names = [*expressions(fields.parameters, "parameters->"), *names]
+    except NotScalarError:
+        # Equations of several unknowns are solved here, once for all.
+        graph, outputs = trace(system.init, interface.start)
+    outputs = _copied(graph, outputs, fields, names)
+    lines, expression = statements(
+        graph, _flat(outputs), lambda place: names[place], precision
+    )
+    lines += _assignments(fields, outputs, expression, precision)
+    return "\n".join([*_unused(fields.starts), *lines])
+
+
+def step_bodies(
+    system: System, state: Any, interface: Interface, fields: Fields, precision: Any
+) -> StepBodies:
+    """Return the texts of ``prepare`` and ``step``; ``state`` is an example."""
+    dynamic, static = eqx.partition(system, eqx.is_array)
+
+    def step(dynamic, state, input):
+        return eqx.combine(dynamic, static).step(state, input)
+
+    graph, outputs = trace(step, dynamic, state, interface.input)
+    parameters = expressions(fields.parameters, "parameters->")
+    names = [
+        *parameters,
+        *expressions(fields.states, "state->"),
+        *expressions(fields.inputs, ""),
+    ]
+    outputs = _copied(graph, outputs, fields, names)
+    shorten_products(graph, len(parameters))
+    nodes = prepared_nodes(graph, _flat(outputs), len(parameters))
+    held = {n: f"parameters->{PREPARED}.p{i}" for i, n in enumerate(nodes)}
+    prepared, prepare = _prepared(graph, nodes, names, held, precision)
+    lines, expression = statements(
+        graph, _flat(outputs), lambda place: names[place], precision, held
+    )
+    count = len(fields.states)
+    results = [expression(int(n)) for each in outputs[count:] for n in each.ravel()]
+    returned = []
+    if len(results) == 1:
+        kind = type_of(fields.outputs[0].dtype, precision)
+        lines.append(f"    const {kind} result = {results[0]};")
+        returned = ["    return result;"]
+    else:
+        targets = expressions(fields.outputs, "output->")
+        lines += [f"    {a} = {b};" for a, b in zip(targets, results, strict=True)]
+    lines += _assignments(fields, outputs[:count], expression, precision)
+    body = "\n".join([*_unused(fields.inputs), *lines, *returned])
+    return StepBodies(prepared, prepare, body)
+
+
+def _prepared(
+    graph: Graph,
+    nodes: Sequence[int],
+    names: Sequence[str],
+    held: dict[int, str],
+    precision: Precision,
+) -> tuple[str, str]:
+    """Return the fields of the prepared numbers, and the body that computes them."""
+    lines, expression = statements(graph, nodes, lambda place: names[place], precision)
+    lines += [f"    {held[n]} = {expression(n)};" for n in nodes]
+    fields = []
+    for n in nodes:
+        node = graph.nodes[n]
+        kind = TYPES.get(node.kind, precision.real)
+        source = f" /* {node.source} */" if node.source else ""
+        fields.append(f"    {kind} {held[n].rpartition('.')[2]};{source}")
+    return "\n".join(fields), "\n".join(lines or [EMPTY])
+
+
+def _copied(
+    graph: Graph, outputs: Sequence[Any], fields: Fields, names: Sequence[str]
+) -> list[Any]:
+    """Return the outputs; a long array that moves is copied element by element."""
+    own = [f"state->{slot.name}[0]" for slot in fields.states]
+    own += [""] * len(fields.outputs)
+    return [
+        each.elements(graph)
+        if isinstance(each, Memory) and names[each.place] != place
+        else each
+        for each, place in zip(outputs, own, strict=False)
+    ]
+
+
+def _flat(outputs: Sequence[Any]) -> list[int]:
+    """Return the nodes of the outputs of a trace."""
+    return [
+        int(n)
+        for each in outputs
+        for n in (
+            [n for pair in each.writes for n in pair]
+            if isinstance(each, Memory)
+            else np.ravel(each)
+        )
+    ]
+
+
+def _unused(arguments: Sequence[Slot]) -> list[str]:
+    names = ["state", "parameters", *(slot.name for slot in arguments)]
+    return [f"    (void){name};" for name in names]
+
+
+def _assignments(
+    fields: Fields,
+    states: Sequence[Any],
+    expression: Callable[[int], str],
+    precision: Precision,
+) -> Iterator[str]:
+    """Yield the lines that assign the next state; each value is read before."""
+    places = {
+        place: type_of(slot.dtype, precision)
+        for slot in fields.states
+        for place in expressions([slot], "state->")
+    }
+    pairs, old = [], {}
+    for slot, each in zip(fields.states, states, strict=True):
+        if isinstance(each, Memory):
+            # Before all others: an index may be a state.
+            for index, value in each.writes:
+                at = f"state->{slot.name}[{expression(index)}]"
+                yield f"    {at} = {expression(value)};"
+            continue
+        numbers = [int(n) for n in each.ravel()]
+        if len(numbers) > MANY and len(set(numbers)) == 1:
+            yield f"    for (long i = 0; i < {slot.size}; i++)"
+            yield f"        state->{slot.name}[i] = {expression(numbers[0])};"
+            continue
+        texts = map(expression, numbers)
+        pairs += zip(expressions([slot], "state->"), texts, strict=True)
+    for place, text in pairs:
+        if text in places and text != place and text not in old:
+            old[text] = f"s{len(old)}"
+            yield f"    const {places[text]} {old[text]} = {text};"
+    for place, text in pairs:
+        if text != place:
+            yield f"    {place} = {old.get(text, text)};"
