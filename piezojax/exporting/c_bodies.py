@@ -9,7 +9,7 @@ import numpy as np
 from ..core.system import System
 from .c_source import TYPES, Precision, statements
 from .graph import Graph
-from .node_arrays import Memory, NotScalarError
+from .memory import Memory, NotScalarError
 from .prepared import prepared_nodes
 from .products import shorten_products
 from .slots import PREPARED, Interface, Slot, expressions, type_of
@@ -129,7 +129,8 @@ def _copied(
     own += [""] * len(fields.outputs)
     return [
         each.elements(graph)
-        if isinstance(each, Memory) and names[each.place] != place
+        if isinstance(each, Memory)
+        and (names[each.place] != place or each.offset is not None)
         else each
         for each, place in zip(outputs, own, strict=False)
     ]

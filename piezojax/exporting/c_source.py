@@ -18,6 +18,9 @@ INFIX = {
 LOGICAL = {"and": "&&", "or": "||", "xor": "!=", "eq": "==", "ne": "!="}
 """Operations that C writes between two boolean operands."""
 
+BITWISE = {"and": "&", "or": "|", "xor": "^"}
+"""Operations that C writes between two integer operands."""
+
 FUNCTIONS = {
     "abs": "fabs", "acos": "acos", "asin": "asin", "atan": "atan", "atan2": "atan2",
     "ceil": "ceil", "cos": "cos", "cosh": "cosh", "exp": "exp", "expm1": "expm1",
@@ -46,6 +49,7 @@ FORMS = {
 OF_KIND = {
     ("convert_element_type", "boolean"): "{a} != 0",
     ("rem", "integer"): "{a} % {b}",
+    ("not", "integer"): "~{a}",
     ("abs", "integer"): "labs({a})",
 }
 """Operations with another form for a result of this kind."""
@@ -186,6 +190,8 @@ class _Writer:
             return f"{self.names(int(node.value)).partition('[')[0]}[{a}]"
         if name in LOGICAL and kinds[0] == "boolean":
             return f"{a} {LOGICAL[name]} {b}"
+        if name in BITWISE:
+            return f"{a} {BITWISE[name]} {b}"
         if name in INFIX:
             return f"{a} {INFIX[name]} {b}"
         if name == "integer_pow":

@@ -2,38 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from .graph import CONSTANT, INPUT, READ, Graph, Kind
+from .graph import CONSTANT, READ, Graph, Kind
+from .memory import Memory, NotScalarError, Numbers, whole_index
 from .simplify import Simplifier
-
-Numbers = np.ndarray
-"""Array of the numbers of nodes, with the shape of the traced array."""
-
-
-class NotScalarError(ValueError):
-    """The function has an operation that is not one of scalars."""
-
-
-class Memory(NamedTuple):
-    """A long array that stays an array, such as a stored period.
-
-    ``place`` is that of its first element among the inputs. ``writes`` are the elements
-    that have changed since, as pairs of the nodes of index and value.
-    """
-
-    place: int
-    size: int
-    writes: tuple[tuple[int, int], ...] = ()
-
-    def elements(self, graph: Graph) -> Numbers:
-        """Return the nodes of the elements. Raises NotScalarError after a write."""
-        if self.writes:
-            raise NotScalarError("it uses a long array as a whole after a change")
-        places = range(self.place, self.place + self.size)
-        return np.array([graph.add(INPUT, (), "real", place) for place in places], int)
 
 
 def kind_of(dtype: Any) -> Kind:
@@ -92,24 +67,54 @@ class NodeArrays:
     def in_memory(self, equation: Any, operands: list[Any]) -> Numbers | Memory | None:
         """Return the result of an equation that reads or writes one element.
 
-        None for every other equation.
+        Also of one that only reshapes a long array, or takes a stretch of it. None for
+        every other equation.
         """
         name, (memory, *others) = equation.primitive.name, operands
         shape = equation.outvars[0].aval.shape
         if not isinstance(memory, Memory):
             return None
-        if name in ("broadcast_in_dim", "reshape") and shape == (memory.size,):
-            return memory
-        if name == "dynamic_slice" and shape == (1,):
-            first, last = (self.constants(np.asarray(k)) for k in (0, memory.size - 1))
-            index = self.elementwise("clamp", [first, others[0], last], "integer")
-            return np.array([self._read(memory, int(index))])
-        if name not in ("scatter", "scatter-add") or others[1].size != 1:
+        if name in ("broadcast_in_dim", "reshape", "squeeze", "expand_dims"):
+            same = math.prod(shape) == memory.size
+            return memory._replace(shape=shape) if same else None
+        if name == "slice" and not equation.params["strides"]:
+            others = [self._integer(i) for i in equation.params["start_indices"]]
+        if name in ("slice", "dynamic_slice") and memory.window(shape) and others:
+            last = np.subtract(memory.shape, shape)
+            index = self._flat_index(memory, [int(each) for each in others], last)
+            if math.prod(shape) > 1:
+                return memory._replace(shape=shape, offset=index)
+            return np.full(shape, self._read(memory, index))
+        axes = len(memory.shape)
+        if name not in ("scatter", "scatter-add") or memory.offset is not None:
             return None
-        index, value = int(others[0].ravel()[0]), int(others[1].ravel()[0])
+        if others[1].size != 1 or not whole_index(equation, axes):
+            return None
+        index = self._flat_index(memory, others[0].ravel().tolist())
+        value = int(others[1].ravel()[0])
         if name == "scatter-add":
             value = self.scalar("add", [self._read(memory, index), value], "real", None)
         return memory._replace(writes=(*memory.writes, (index, value)))
+
+    def _flat_index(
+        self, memory: Memory, indices: Sequence[int], last: Any = None
+    ) -> int:
+        """Return the index in the stored array; ``last`` are limits of each axis."""
+        parts = [] if memory.offset is None else [memory.offset]
+        for axis, index in enumerate(indices):
+            if last is not None:
+                ends = (self._integer(0), self._integer(int(last[axis])))
+                limited = [np.asarray(n) for n in (ends[0], index, ends[1])]
+                index = int(self.elementwise("clamp", limited, "integer"))
+            stride = self._integer(math.prod(memory.shape[axis + 1 :]))
+            parts.append(self.scalar("mul", [index, stride], "integer", None))
+        total = parts[0]
+        for part in parts[1:]:
+            total = self.scalar("add", [total, part], "integer", None)
+        return total
+
+    def _integer(self, value: int) -> int:
+        return self.graph.constant(value, "integer")
 
     def _read(self, memory: Memory, index: int) -> int:
         found = self.graph.add(READ, (index,), "real", memory.place, self.source)

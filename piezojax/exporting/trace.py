@@ -16,7 +16,8 @@ import numpy as np
 from jax.extend import core as jex
 
 from .graph import CARRY, INPUT, Block, Graph, Loop
-from .node_arrays import Memory, NodeArrays, NotScalarError, Numbers, kind_of
+from .memory import Memory, NotScalarError, Numbers
+from .node_arrays import NodeArrays, kind_of
 
 ELEMENTWISE = {
     "abs", "acos", "add", "and", "asin", "atan", "atan2", "ceil", "clamp",
@@ -85,16 +86,17 @@ def trace(function: Callable, *arguments: Any) -> tuple[Graph, list[Any]]:
     place = 0
     inputs = []
     for variable in closed.jaxpr.invars:
-        size = math.prod(variable.aval.shape)
+        shape = variable.aval.shape
+        size = math.prod(shape)
         kind = kind_of(variable.aval.dtype)
-        if len(variable.aval.shape) == 1 and size >= LONG and kind == "real":
-            inputs.append(Memory(place, size))
+        if size >= LONG and kind == "real":
+            inputs.append(Memory(place, shape))
             place += size
             continue
         numbers = [
             tracer.graph.add(INPUT, (), kind, place + i, "") for i in range(size)
         ]
-        inputs.append(np.array(numbers, int).reshape(variable.aval.shape))
+        inputs.append(np.array(numbers, int).reshape(shape))
         place += size
     return tracer.graph, tracer.evaluate(closed, inputs)
 

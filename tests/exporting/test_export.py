@@ -56,6 +56,7 @@ def made(folder):
         ("p753_bang_bang", 2000),
         ("p753_kalman_disturbance_observer", 2000),
         ("p753_repetitive", 4500),  # two periods and more: each is read and written
+        ("p753_iterative_learning", 6500),  # three trials: both rows
     ],
 )
 def test_a_controller_equals_its_simulation(name, samples, tmp_path):
@@ -63,6 +64,18 @@ def test_a_controller_equals_its_simulation(name, samples, tmp_path):
     status, text = made(tmp_path / "c")
     assert status == 0, text
     assert "passed" in text
+
+
+@compiled
+def test_a_filter_that_amplifies_rounding_errors_has_a_wider_tolerance(tmp_path):
+    about = pj.About(judged=["fine"], reference_ranges=[(-9.0, 9.0)] * 3)
+    controller = CONTROLLERS["p558_disturbance_observer"]()
+    limits = [(-50.0, 50.0)] * 3
+    files = pj.export(controller, tmp_path / "c", about=about, limits=limits)
+    status, text = made(tmp_path / "c")
+    assert status == 0, text
+    text = files[2].read_text().partition("worst[i] <= ")[2]
+    assert 1e-12 < float(text.partition(" ")[0]) < 1e-10
 
 
 @compiled
@@ -316,6 +329,28 @@ class Swapped(pj.System):
 @compiled
 def test_long_arrays_are_copied_where_they_move(tmp_path):
     pj.export(Swapped(np.arange(300.0)), tmp_path / "c")
+    status, text = made(tmp_path / "c")
+    assert status == 0, text
+
+
+class Grid(pj.System):
+    """A long table of two axes, of which rows and elements are taken."""
+
+    table: jax.Array = parameter("1", "table", converter=jnp.asarray)
+
+    def init(self, input=0.0):
+        return self.table, jnp.zeros((), jnp.int32)
+
+    def step(self, state, input):
+        table, k = state
+        row = table[k % 3]
+        table = table.at[k % 3, 2 * k % 200].add(input)
+        return (table, k + 1), row[k % 200] + table[(k + 1) % 3, 7] + table[0, 0]
+
+
+@compiled
+def test_rows_and_elements_of_a_long_table_are_those_of_jax(tmp_path):
+    pj.export(Grid(np.arange(600.0).reshape(3, 200)), tmp_path / "c")
     status, text = made(tmp_path / "c")
     assert status == 0, text
 
