@@ -78,7 +78,8 @@ class NodeArrays:
             same = math.prod(shape) == memory.size
             return memory._replace(shape=shape) if same else None
         if name == "slice" and not equation.params["strides"]:
-            others = [self._integer(i) for i in equation.params["start_indices"]]
+            starts = equation.params["start_indices"]
+            others = [np.asarray(self._integer(i)) for i in starts]
         if name in ("slice", "dynamic_slice") and memory.window(shape) and others:
             last = np.subtract(memory.shape, shape)
             index = self._flat_index(memory, [int(each) for each in others], last)
