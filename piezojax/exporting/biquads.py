@@ -11,8 +11,8 @@ from ..core.files import fresh_folder, write_text
 from ..core.rollout import simulate
 from ..core.system import Affine, System, resolve
 from ..dynamics.linearise import linearise, split_static
-from .c_project import Interface
 from .driven import Driven, Seen
+from .slots import Interface
 
 CONVENTION = (
     "Sections in series, each y = b0 x + b1 x1 + b2 x2 - a1 y1 - a2 y2 with a0 = 1.",
