@@ -24,8 +24,8 @@ AMPLIFIED = 2.0
 """Largest |y/r| without a note."""
 
 _TIGHTEN = (
-    "begin with gains of a stable loop and bounds that contain such gains, "
-    "or raise 'candidates' and 'steps'"
+    "begin with gains of a stable loop, lower the bounds of the gains, or raise "
+    "'candidates' and 'steps'"
 )
 
 
