@@ -1,11 +1,12 @@
-"""Export of every controller and plant of the catalogue, compiled and tested.
+"""Export of the catalogue and of all models that are fitted, compiled and tested.
 
-    python tests/benchmarks/exports.py [--precision float]
+    python tests/benchmarks/exports.py [--precision float] [--models]
 
-Each System is exported as C; ``make test`` replays its golden vectors, 20 000 samples
-of a simulation with noise and saturation. The table has the number of lines of the
-source, and the largest difference as a share of the largest output, or the reason why
-the System is refused. Exits with 1 if a test fails.
+Each controller and plant of the catalogue, or with --models each model that
+``identify`` fits, is exported as C; ``make test`` replays its golden vectors, 20 000
+samples of a simulation with noise and saturation. The table has the number of lines of
+the source, and the largest difference as a share of the largest output, or the reason
+why the System is refused. Exits with 1 if a test fails.
 """
 
 import argparse
@@ -15,12 +16,19 @@ import sys
 import tempfile
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+from export_models import MODELS
 from rich.console import Console
 from rich.table import Table
 
 import piezojax as pj
 from piezojax.catalog import CONTROLLERS, PLANTS
+from piezojax.core.axes import Packed
 from piezojax.exporting import NotScalarError
+from piezojax.exporting.c_export import write_c
+from piezojax.exporting.slots import Interface
 
 SAMPLES = 20_000
 
@@ -33,37 +41,57 @@ def tested(make, name, precision):
     """Return lines and relative difference of an export, and whether it passes."""
     stage, axes = name.partition("_")[0], 1 if name.startswith("p753") else 3
     about = pj.About(judged=["not here"], reference_ranges=[RANGES[stage]] * axes)
+    limits = [LIMITS[stage]] * axes
+    options = {"precision": precision, "samples": SAMPLES}
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "c"
-        _, source, *_ = pj.export(
-            make(),
-            out,
-            about=about,
-            limits=[LIMITS[stage]] * axes,
-            precision=precision,
-            samples=SAMPLES,
-        )
-        done = subprocess.run(
-            ["make", "-s", "test"], cwd=out, capture_output=True, text=True
-        )
-        found = re.findall(r"difference (\S+), largest value (\S+),", done.stdout)
-        shares = [float(a) / float(b.rstrip(",")) for a, b in found]
-        lines = source.read_text().count("\n")
+        pj.export(make(), out, about=about, limits=limits, **options)
+        return replayed(out, "controller" if name in CONTROLLERS else "plant")
+
+
+def tested_model(make, _, precision):
+    """Return the same of a model, whose input has ramps and noise, V."""
+    draw = np.random.default_rng(0)
+    corners = draw.uniform(0.0, 100.0, SAMPLES // 50)
+    ramps = np.interp(np.arange(SAMPLES), np.arange(0, SAMPLES, 50), corners)
+    voltage = jnp.asarray(ramps + 0.01 * draw.standard_normal(SAMPLES))
+    system = make()
+    if isinstance(system, Packed):
+        voltage = (voltage,)
+    first = jax.tree.map(lambda x: x[0], voltage)
+    with tempfile.TemporaryDirectory() as folder:
+        out, interface = Path(folder) / "c", Interface(first, first)
+        write_c(system, interface, voltage, out, "plant", pj.About(), precision)
+        return replayed(out, "plant")
+
+
+def replayed(out, name):
+    """Return lines and difference of the export in ``out``, and whether it passes."""
+    done = subprocess.run(
+        ["make", "-s", "test"], cwd=out, capture_output=True, text=True
+    )
+    found = re.findall(r"difference (\S+), largest value (\S+),", done.stdout)
+    shares = [float(a) / float(b.rstrip(",")) for a, b in found]
+    lines = (out / f"{name}.c").read_text().count("\n")
     return lines, max(shares, default=float("nan")), done.returncode == 0
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--precision", default="double")
-    precision = parser.parse_args().precision
+    parser.add_argument("--models", action="store_true")
+    chosen = parser.parse_args()
+    precision = chosen.precision
+    test = tested_model if chosen.models else tested
+    systems = MODELS if chosen.models else CONTROLLERS | PLANTS
     console = Console(width=None if sys.stdout.isatty() else 120)
     table = Table(title=f"exports in {precision}")
     for head in ("System", "lines", "difference", "test"):
         table.add_column(head, justify="left" if head == "System" else "right")
     passed = failed = 0
-    for name, make in (CONTROLLERS | PLANTS).items():
+    for name, make in systems.items():
         try:
-            lines, share, right = tested(make, name, precision)
+            lines, share, right = test(make, name, precision)
         except NotScalarError as error:
             table.add_row(name, "", "", f"refused: {error}")
             continue
