@@ -57,7 +57,7 @@ MUTATIONS = (
         "study/ensemble.py",
         'stream = 3 if part == "holdout" else 2',
         "stream = 2",
-        (_ROBUST, "-k", "no_plant_of_the_holdout"),
+        (_ROBUST, "-k", "holdout_and_tuning"),
     ),
     Mutation(
         "SW without its shift",
@@ -79,7 +79,7 @@ MUTATIONS = (
         "tuning/objective.py",
         "return jnp.mean(joined)",
         "return jnp.mean(joined[1:] if joined.size > 1 else joined)",
-        (_ROBUST, "-k", "joined"),
+        (_ROBUST, "-k", "aggregated"),
     ),
     Mutation(
         "perturbed plants start with the nominal holding voltage",

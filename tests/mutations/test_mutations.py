@@ -1,5 +1,6 @@
 """The tables of mutations apply to the code; run.py and sample.py take minutes."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,11 @@ def test_every_mutation_applies_to_the_code(mutation):
     files = [part for part in mutation.tests if part.endswith(".py")]
     assert files
     assert all((ROOT / file).is_file() for file in files)
+    # Names after -k: one that no test has leaves the mutation untried.
+    if "-k" in mutation.tests:
+        word = mutation.tests[mutation.tests.index("-k") + 1]
+        texts = [(ROOT / file).read_text(encoding="utf-8") for file in files]
+        assert re.search(rf"def test\w*{word}", "".join(texts))
 
 
 @pytest.mark.parametrize("file", MODULES)
