@@ -368,7 +368,7 @@ def tuned(tmp_path_factory):
 def test_tune_writes_its_results(tuned):
     _, out = tuned
     assert set(names(out)) >= {
-        *("result.json", "gains.toml"),
+        *("result.json", "gains.toml", "study.toml"),
         *("tracking.png", "hysteresis.png", "convergence.png"),
         *("stability.json", "stability.png", "limit.json"),
     }
@@ -623,7 +623,7 @@ def test_ctrl_c_while_drawing_keeps_the_result(study, tmp_path, monkeypatch):
     result = call("tune", study, "--out", tmp_path / "out")
     assert result.exit_code == 130
     assert "Traceback" not in result.output
-    assert names(tmp_path / "out") == ["gains.toml", "result.json"]
+    assert names(tmp_path / "out") == ["gains.toml", "result.json", "study.toml"]
     assert pj.load_result(tmp_path / "out").status == "step limit"
 
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
-from ..core.files import write_text
 from .command import (
     Command,
     common,
@@ -56,7 +55,7 @@ def main(
         from .. import study as studies
         from ..tuning.baselines import Budget
 
-        paths = [_study_path(name) for name in study] or [studies.shipped()]
+        paths = [study_path(name) for name in study] or [studies.shipped()]
         if len(paths) > 1 or studies.is_comparison_study(paths[0]):
             if baselines:
                 raise ValueError("--baselines takes one study, not a comparison")
@@ -167,8 +166,6 @@ def _tune(
 def _compare(
     paths: Sequence[Path], out: Path | None, seed: int | None, console: Console
 ) -> None:
-    import tomli_w
-
     from .. import study as studies
     from ..report.comparison_map import (
         comparison_table,
@@ -188,10 +185,6 @@ def _compare(
                 subfolder = folder / outcome.case.name
                 subfolder.mkdir()
                 write_numbers(outcome, subfolder)
-                text = tomli_w.dumps(
-                    outcome.case.study.model_dump(mode="json", exclude_none=True)
-                )
-                write_text(subfolder / "study.toml", text)
 
             comparison = compare(title, entries, progress=bar, done=keep)
             bar.finish()
@@ -218,7 +211,8 @@ def _compare(
     exit_unsafe(alarms)
 
 
-def _study_path(study: Path) -> Path:
+def study_path(study: Path) -> Path:
+    """Return the path of a study file, or of the study shipped under a name."""
     from .. import study as studies
 
     if study.suffix or study.exists():

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import tomli_w
 from matplotlib.figure import Figure
 
 from ..core.axes import axis_of
@@ -36,7 +37,7 @@ _PERIODS = 4.0  # of the reference, drawn from the end of the run
 
 
 def write_results(outcome: Outcome, folder: Path) -> None:
-    """Write result.json, gains.toml and the pictures into ``folder``.
+    """Write result.json, gains.toml, study.toml and the pictures into ``folder``.
 
     A stage with several axes also has pictures of their coupling, and of the contours
     if the study has any.
@@ -73,13 +74,15 @@ def write_results(outcome: Outcome, folder: Path) -> None:
 
 
 def write_numbers(outcome: Outcome, folder: Path) -> None:
-    """Write result.json and gains.toml into ``folder``."""
+    """Write result.json, gains.toml and study.toml into ``folder``."""
     both = {"drive": outcome.drive, "steps": outcome.steps}
     found = {f"{name}_before": before for name, (before, _) in both.items()}
     found |= {name: after for name, (_, after) in both.items()}
     result = outcome.result.model_copy(update=found)
     write_text(folder / RESULT_FILE, result.model_dump_json(indent=2) + "\n")
     save(outcome.controller, folder / GAINS_FILE, outcome.about)
+    study = outcome.case.study.model_dump(mode="json", exclude_none=True)
+    write_text(folder / "study.toml", tomli_w.dumps(study))
 
 
 def _quantity(trace: Trace) -> str:
