@@ -1,14 +1,15 @@
 """Bodies of the functions of an exported System in C: init, prepare and step."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from ..core.system import System
-from .c_source import TYPES, Precision, statements
-from .graph import Graph
+from .c_source import NOTHING, TYPES, Precision, statements
+from .compensated import compensate
+from .graph import READ, Graph
 from .memory import Memory, NotScalarError
 from .prepared import prepared_nodes
 from .products import shorten_products
@@ -32,17 +33,30 @@ class Fields(NamedTuple):
 
 
 class StepBodies(NamedTuple):
-    """Texts of a step: fields and computation of what is prepared, and the step."""
+    """Texts of a step: fields and computation of what is prepared, and the step.
+
+    ``rounding`` is the state of the rounding errors, if there are any, ``operations``
+    the number of operations of the step, in which loops count once.
+    """
 
     prepared: str
     prepare: str
     step: str
+    rounding: list[Slot]
+    operations: int
 
 
 def init_body(
-    system: System, interface: Interface, fields: Fields, precision: Precision
+    system: System,
+    interface: Interface,
+    fields: Fields,
+    precision: Precision,
+    rounding: Sequence[Slot] = (),
 ) -> str:
-    """Return the body of ``init``, which computes the state at rest."""
+    """Return the body of ``init``, which computes the state at rest.
+
+    The states ``rounding`` begin at 0.
+    """
     dynamic, static = eqx.partition(system, eqx.is_array)
 
     def init(dynamic, start):
@@ -55,6 +69,9 @@ def init_body(
     except NotScalarError:
         # Equations of several unknowns are solved here, once for all.
         graph, outputs = trace(system.init, interface.start)
+    for slot in rounding:
+        outputs.append(np.full(slot.size, graph.constant(0.0, "real")))
+    fields = fields._replace(states=[*fields.states, *rounding])
     outputs = _copied(graph, outputs, fields, names)
     lines, expression = statements(
         graph, _flat(outputs), lambda place: names[place], precision
@@ -73,12 +90,17 @@ def step_bodies(
         return eqx.combine(dynamic, static).step(state, input)
 
     graph, outputs = trace(step, dynamic, state, interface.input)
+    rounding: list[Slot] = []
+    if precision.compensated:
+        outputs, rounding = _compensated(graph, outputs, fields)
     parameters = expressions(fields.parameters, "parameters->")
     names = [
         *parameters,
         *expressions(fields.states, "state->"),
         *expressions(fields.inputs, ""),
+        *expressions(rounding, "state->"),
     ]
+    fields = fields._replace(states=[*fields.states, *rounding])
     outputs = _copied(graph, outputs, fields, names)
     shorten_products(graph, len(parameters))
     nodes = prepared_nodes(graph, _flat(outputs), len(parameters))
@@ -99,7 +121,47 @@ def step_bodies(
         lines += [f"    {a} = {b};" for a, b in zip(targets, results, strict=True)]
     lines += _assignments(fields, outputs[:count], expression, precision)
     body = "\n".join([*_unused(fields.inputs), *lines, *returned])
-    return StepBodies(prepared, prepare, body)
+    operations = _operations(graph, _flat(outputs), held)
+    return StepBodies(prepared, prepare, body, rounding, operations)
+
+
+def _compensated(
+    graph: Graph, outputs: list[Any], fields: Fields
+) -> tuple[list[Any], list[Slot]]:
+    """Return ``outputs`` with compensated states, and the state "rounding"."""
+    before = fields.parameters, fields.states, fields.inputs
+    places = np.cumsum([0, *(slot.size for part in before for slot in part)]).tolist()
+    parts = list(
+        zip(fields.states, outputs, places[len(fields.parameters) :], strict=False)
+    )
+    nodes = {
+        place + i: int(number)
+        for slot, each, place in parts
+        if isinstance(each, np.ndarray) and np.issubdtype(slot.dtype, np.floating)
+        for i, number in enumerate(each.ravel())
+    }
+    found = compensate(graph, nodes, places[-1])
+    if not found:
+        return outputs, []
+    states = [
+        np.array([found.get(place + i, (n,))[0] for i, n in enumerate(each.ravel())])
+        if isinstance(each, np.ndarray)
+        else each
+        for _, each, place in parts
+    ]
+    errors = np.array([error for _, error in found.values()])
+    name = "rounding"
+    while name in {slot.name for slot in fields.states}:
+        name += "_"
+    rounding = [Slot(name, name, np.dtype(float), len(errors))]
+    return [*states, errors, *outputs[len(parts) :]], rounding
+
+
+def _operations(graph: Graph, outputs: Sequence[int], held: Collection[int]) -> int:
+    """Return the number of operations of a step; what is ``held`` does not count."""
+    needed = graph.needed(outputs, held).difference(held)
+    kinds = (graph.nodes[n].operation for n in needed)
+    return sum(kind not in (*NOTHING, READ) for kind in kinds)
 
 
 def _prepared(

@@ -15,7 +15,7 @@ from .c_project import CProject
 from .c_templates import MAKEFILE, TEST
 from .slots import Interface
 
-TOLERANCE = {"double": 1e-12, "float": 1e-3}
+TOLERANCE = {"double": 1e-12, "float": 1e-3, "compensated": 1e-3}
 """Largest difference from the golden vectors, as a share of their largest value."""
 
 LOOSEST = 1e-10
@@ -47,8 +47,7 @@ def write_c(
         amplified = 2.0 * rounding_error(code, inputs, outputs)
         tolerance = min(max(tolerance, amplified), LOOSEST)
     files = {
-        f"{name}.h": code.header(),
-        f"{name}.c": code.source(),
+        **code.files(),
         f"test_{name}.c": test_program(code, tolerance),
         "vectors.csv": vectors(code, inputs, outputs),
         "Makefile": MAKEFILE.format(name=name),

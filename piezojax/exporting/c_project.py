@@ -73,6 +73,15 @@ class CProject:
             self.system, self.state, self.interface, self._all_fields, self.precision
         )
 
+    @property
+    def rounding(self) -> list[Slot]:
+        """The state of the rounding errors of compensated states, if there are any."""
+        return self._step.rounding
+
+    def operations(self) -> int:
+        """Return the number of operations of a step; loops count once."""
+        return self._step.operations
+
     def _type(self, dtype: Any) -> str:
         return type_of(dtype, self.precision)
 
@@ -143,6 +152,15 @@ class CProject:
         several = len(self.outputs) > 1
         return f"    {self.name}_output output;\n" if several else ""
 
+    def step_block(self, arguments: Sequence[str], targets: Sequence[str]) -> str:
+        """Return the lines of ``step_call`` as a block with its variable."""
+        call = self.step_call(arguments, targets)
+        return f"    {{\n{self.output_variable}{call}\n    }}"
+
+    def files(self) -> dict[str, str]:
+        """Return the texts of header and source by the names of their files."""
+        return {f"{self.name}.h": self.header(), f"{self.name}.c": self.source()}
+
     def origin(self) -> str:
         """Return what the code is, where it comes from, and its alarms first."""
         kind = type(self.system).__name__
@@ -170,7 +188,7 @@ class CProject:
             name=name,
             prepared=prepared,
             parameters=fields,
-            state=self._fields(self.states, lambda slot: ""),
+            state=self._fields([*self.states, *self.rounding], lambda slot: ""),
             output=output,
             units=", ".join(f"{k} in {v}" for k, v in units.items()) or "as simulated",
             **signatures,
@@ -185,7 +203,11 @@ class CProject:
             set=self._defaults(),
             checks=self._checks(),
             init_body=init_body(
-                self.system, self.interface, self._all_fields, self.precision
+                self.system,
+                self.interface,
+                self._all_fields,
+                self.precision,
+                self.rounding,
             ),
             prepare_body=self._step.prepare,
             step_body=self._step.step,

@@ -61,11 +61,15 @@ TYPES = {"integer": "long", "boolean": "int"}
 
 
 class Precision(NamedTuple):
-    """A type of C for real numbers, and the suffix of its numbers and functions."""
+    """A type of C for real numbers, and the suffix of its numbers and functions.
+
+    ``compensated`` states carry their rounding errors.
+    """
 
     real: str
     suffix: str
     dtype: type[np.floating]
+    compensated: bool = False
 
     def number(self, value: float) -> str:
         """Return a number of C that has exactly this ``value``."""
@@ -80,8 +84,9 @@ class Precision(NamedTuple):
 
 DOUBLE = Precision("double", "", np.float64)
 SINGLE = Precision("float", "f", np.float32)
-PRECISIONS = {"double": DOUBLE, "float": SINGLE}
-"""Precisions by the name of the type."""
+COMPENSATED = SINGLE._replace(compensated=True)
+PRECISIONS = {"double": DOUBLE, "float": SINGLE, "compensated": COMPENSATED}
+"""Precisions by the name of their option."""
 
 
 def statements(
