@@ -301,9 +301,13 @@ def test_validate_bad_arguments(record, tmp_path):
 def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     out = tmp_path / "c"
     printed = succeeded(call("export", tuned[1], "--out", out)).stdout
-    assert names(out) == sorted(
-        ["Makefile", "controller.c", "controller.h", "test_controller.c", "vectors.csv"]
-    )
+    made = ["Makefile", "controller.c", "controller.h", "test_controller.c"]
+    assert names(out) == sorted([*made, "vectors.csv", "report.json"])
+    assert "cost of float" in printed
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert report["written"] == "double"
+    assert list(report["references"]) == ["SIN50", "SW50"]
+    assert abs(report["references"]["SIN50"]["percent"]["float"]) < 1.0
     assert f"make -C {out} test" in printed
     text = (out / "controller.c").read_text(encoding="utf-8")
     assert "Study: small, seed 3." in text
@@ -315,6 +319,19 @@ def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     references = pj.read_about(tuned[1] / "gains.toml").reference_ranges[0]
     assert columns[0].min() < references[0]
     assert columns[0].max() > references[1]
+
+
+def test_export_without_its_study_is_not_judged(tuned, tmp_path):
+    path = tmp_path / "gains.toml"
+    path.write_bytes((tuned[1] / "gains.toml").read_bytes())
+    result = call("export", path, "--out", tmp_path / "c", "--precision", "float")
+    assert "note: not judged in the simulated loop: study" in succeeded(result).stdout
+    assert "report.json" not in names(tmp_path / "c")
+    about = pj.read_about(path).model_copy(update={"rate_Hz": 1e4})
+    pj.save(pj.load(path), path, about)
+    study = tuned[1] / "study.toml"
+    result = call("export", path, "--out", tmp_path / "d", "--study", study)
+    failed(result, "is for 20000 Hz, the controller for 10000 Hz")
 
 
 def test_export_of_a_model_needs_no_limits(tmp_path):

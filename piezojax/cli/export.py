@@ -1,11 +1,17 @@
 """``python -m piezojax.export FILE --out DIR``."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ..core.files import numbered_folder
 from .command import RESULTS, Command, common, print_alarms, run
+from .tune import study_path
+
+if TYPE_CHECKING:
+    from ..core.about import About
+    from ..exporting.compiled_loop import Runs
 
 SYSTEMS = ("gains.toml", "model.json")
 """Files with a System in a folder of results, the first one first."""
@@ -26,9 +32,16 @@ SYSTEMS = ("gains.toml", "model.json")
 )
 @click.option(
     "--precision",
-    type=click.Choice(["double", "float"]),
+    type=click.Choice(["double", "float", "compensated"]),
     default="double",
-    help="Type of all real numbers (default: double).",
+    help="Type of all real numbers (default: double); compensated is float whose sums "
+    "carry their rounding errors, which float becomes where it costs too much.",
+)
+@click.option(
+    "--study",
+    type=click.Path(path_type=Path),
+    help="Study whose references judge a controller in C (default: the study.toml "
+    "beside FILE).",
 )
 @click.option(
     "--limits",
@@ -49,17 +62,25 @@ SYSTEMS = ("gains.toml", "model.json")
     help="Export gains that were written with an alarm; the files say so.",
 )
 @common
-def main(source, to, name, precision, limits, before, accept_unsafe, out, seed, quiet):
+def main(
+    source, to, name, precision, study, limits, before, accept_unsafe, out, seed, quiet
+):
     """Export the System in FILE as C99, an FMU, a linear model, or a vendor's file.
 
     FILE is the gains.toml of tune, the model.json of identify, or the folder of their
     results. `make test` in a folder of C compiles the source and replays a simulation.
+    A controller in C is also compiled here and judged in the simulated loop of its
+    study; report.json has its errors in double and float, and the time of a step.
     """
 
     def body(console):
+        from ..core.files import read_model
         from ..core.serial import load, read_about
         from ..exporting import device_values, export, export_alarms
+        from ..exporting.exporter import REPORT
+        from ..exporting.judge import ExportReport
         from ..report.device_table import device_table
+        from ..report.export_tables import print_judgement
 
         path = next(
             (source / file for file in SYSTEMS if (source / file).is_file()), source
@@ -68,6 +89,18 @@ def main(source, to, name, precision, limits, before, accept_unsafe, out, seed, 
         # Alarms are judged by `export`, whose message names the option.
         system = load(path, accept_unsafe=True)
         folder = out or numbered_folder(RESULTS / f"{path.stem}_{to}")
+        runs = None
+        if to == "c" and about.study is not None:
+            try:
+                runs = _runs(study or path.with_name("study.toml"), about)
+            except ValueError as error:
+                if study is not None:
+                    raise
+                console.print(
+                    f"note: not judged in the simulated loop: {error}; name its study "
+                    "(--study)",
+                    soft_wrap=True,
+                )
         files = export(
             system,
             folder,
@@ -79,13 +112,32 @@ def main(source, to, name, precision, limits, before, accept_unsafe, out, seed, 
             seed=seed or 0,
             before=before,
             accept_unsafe=accept_unsafe,
+            runs=runs,
         )
         print_alarms(console, export_alarms(system, about))
         for file in files:
             console.print(f"{file}", soft_wrap=True)
         if to == "vendor":
             console.print(device_table(device_values(system, before)))
+        if runs is not None:
+            print_judgement(
+                read_model(ExportReport, folder / REPORT, "is no report"), console
+            )
         if to == "c":
             console.print(f"test: make -C {folder} test", soft_wrap=True)
 
     run(quiet, body)
+
+
+def _runs(path: Path, about: "About") -> "Runs":
+    """Return the runs of the study at ``path``, that of the controller ``about``."""
+    from .. import study as studies
+    from ..tuning.exported_runs import make_runs
+
+    case = studies.read(study_path(path), about.seed)
+    if case.study.rate != about.rate_Hz:
+        raise ValueError(
+            f"{path} is for {case.study.rate:g} Hz, the controller for "
+            f"{about.rate_Hz:g} Hz"
+        )
+    return make_runs(case)

@@ -143,3 +143,60 @@ int main(int count, char **arguments) {{
     return failed;
 }}
 """
+
+LOOP = """\
+#include "controller.h"
+#include "plant.h"
+#include "sensor.h"
+
+int state_bytes(void) {{
+    return (int)sizeof(controller_state);
+}}
+
+/* Simulate the loop: fill `seen` with the inputs of the controller of each sample, and
+   `moved` with the displacements. */
+void run(long samples, const double *start, const double *row, double *seen,
+         double *moved) {{
+    const controller_parameters parameters = controller_defaults();
+    const plant_parameters of_plant = plant_defaults();
+    const sensor_parameters of_sensor = sensor_defaults();
+    controller_state state;
+    plant_state plant;
+    sensor_state sensor;
+    double y[{axes}], z[{axes}], u[{axes}];
+    int i;
+    controller_init(&state, &parameters, {begin});
+    plant_init(&plant, &of_plant, {voltage});
+    sensor_init(&sensor, &of_sensor, {displacement});
+    for (i = 0; i < {axes}; i++) y[i] = start[4 * {axes} + i];
+    for (; samples > 0; samples--) {{
+{sense}
+        for (i = 0; i < {axes}; i++) {{
+            moved[i] = y[i];
+            seen[i] = row[i];
+            seen[{axes} + i] = row[{axes} + i];
+            seen[2 * {axes} + i] = z[i];
+        }}
+{control}
+{move}
+        for (i = 0; i < {axes}; i++) y[i] += row[3 * {axes} + i];
+        row += 5 * {axes};
+        seen += 3 * {axes};
+        moved += {axes};
+    }}
+}}
+
+/* Step the controller alone, to measure its time. */
+double replay(long samples, const double *start, const double *seen) {{
+    const controller_parameters parameters = controller_defaults();
+    controller_state state;
+    double u[{axes}], sum = 0.0;
+    controller_init(&state, &parameters, {begin});
+    for (; samples > 0; samples--) {{
+{control}
+        sum += u[0];
+        seen += 3 * {axes};
+    }}
+    return sum;
+}}
+"""

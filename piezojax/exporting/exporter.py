@@ -12,13 +12,16 @@ import numpy as np
 from ..core.about import About
 from ..core.axes import PerAxis
 from ..core.feedback import Observation
+from ..core.files import write_text
 from ..core.serial import from_data
 from ..core.system import System, accepts, rest_output
 from ..hardware import Saturation
 from .biquads import write_biquads
 from .c_export import write_c
+from .compiled_loop import Runs
 from .driven import Driven, Seen
 from .fmu import write_fmu
+from .judge import judge
 from .linear_models import write_linear
 from .slots import Interface
 from .vendor import write_vendor
@@ -37,6 +40,9 @@ UNJUDGED = "no study has judged the stability of this controller"
 FORMS = ("c", "fmu", "mat", "octave", "biquads", "vendor")
 """Forms of an export."""
 
+REPORT = "report.json"
+"""Name of the report on a controller that is judged."""
+
 Limits = Sequence[tuple[float, float]]
 
 
@@ -53,6 +59,7 @@ def export(
     seed: int = 0,
     before: str | Path | None = None,
     accept_unsafe: bool = False,
+    runs: Runs | None = None,
 ) -> list[Path]:
     """Write ``system`` to a new ``folder``; return the paths of its files.
 
@@ -68,6 +75,12 @@ def export(
     it is. ``name`` begins the names of the header: by default "controller" or "plant".
     The golden vectors, ``samples`` long and drawn with ``seed``, cover the references
     for which the gains were tuned, and three times their range.
+
+    ``precision`` is "double", "float", or "compensated", float whose sums carry their
+    rounding errors. A controller in C with ``runs``, from
+    ``piezojax.tuning.exported_runs.make_runs``, is compiled and judged in the simulated
+    loop: the last file is the report, and "float" becomes "compensated" where it costs
+    too much.
 
     Raises ValueError for a ``folder`` in use, an unknown ``to``, a System with alarms
     (``about.unsafe``) or a controller without margins (``about.judged``) unless
@@ -106,7 +119,16 @@ def export(
         return write_biquads(system, interface, Path(folder), name, about)
     if to == "fmu":
         return write_fmu(system, interface, Path(folder), name, about)
-    return write_c(system, interface, inputs, Path(folder), name, about, precision)
+    report = None
+    if runs is not None and isinstance(system, Driven):
+        report = judge(system, interface, runs, precision)
+        precision = report.written
+    folder = Path(folder)
+    files = write_c(system, interface, inputs, folder, name, about, precision)
+    if report is not None:
+        files.append(folder / REPORT)
+        write_text(files[-1], report.model_dump_json(indent=2) + "\n")
+    return files
 
 
 def export_alarms(system: System, about: About) -> list[str]:

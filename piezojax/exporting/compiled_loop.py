@@ -1,0 +1,142 @@
+"""Compiled controller in the simulated loop, whose plant and sensor are C in double."""
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.about import About
+from ..core.system import System
+from .c_project import CProject
+from .c_templates import LOOP
+from .fmu import FLAGS
+from .memory import NotScalarError
+from .slots import Interface
+
+TURNS = 5
+"""Number of times that the steps are measured; the fastest counts."""
+
+
+class RunTrace(NamedTuple):
+    """Error of ``axis`` under the reference ``name``, over the runs ``runs``.
+
+    ``unit`` is that of the axis.
+    """
+
+    name: str
+    unit: str
+    runs: slice
+    axis: int
+
+
+class Runs(NamedTuple):
+    """Runs that judge a compiled controller of n axes.
+
+    ``at_rest`` and ``move`` are the inputs of ``sensor`` and ``plant``. The n columns
+    of each signal are, in ``starts``: reference, next reference, reading, voltage (V)
+    and displacement at rest; in ``rows``: reference, next reference, noise of unit
+    variance, disturbance of the displacement, and disturbance of the voltage (V). Other
+    signals are in the units of the axes. Errors count from sample ``settle`` on.
+    """
+
+    plant: System
+    sensor: System
+    move: Interface
+    sense: Interface
+    starts: Float[np.ndarray, "runs columns"]
+    rows: Float[np.ndarray, "runs samples columns"]
+    traces: tuple[RunTrace, ...]
+    settle: int
+
+
+class Steps(NamedTuple):
+    """Runs of a compiled controller.
+
+    ``displacements`` are in the units of the axes, ``ns`` is the time of a step, and
+    ``state_bytes`` the size of the state.
+    """
+
+    displacements: Float[np.ndarray, "runs samples axes"]
+    ns: float
+    state_bytes: int
+
+
+class CompiledLoop:
+    """The loop of ``runs`` around any form of its controller in C.
+
+    Raises ValueError without a C compiler, and for a plant or sensor that has no form
+    in scalar operations.
+    """
+
+    def __init__(self, runs: Runs):
+        compiler = shutil.which("cc")
+        if compiler is None:
+            raise ValueError("there is no C compiler (cc)")
+        arrays = (np.ascontiguousarray(x, float) for x in (runs.starts, runs.rows))
+        self.starts, self.rows = arrays
+        self.compiler, about = compiler, About()
+        try:
+            self.plant = CProject(runs.plant, runs.move, "plant", about)
+            self.sensor = CProject(runs.sensor, runs.sense, "sensor", about)
+            self.around = {**self.plant.files(), **self.sensor.files()}
+        except NotScalarError as error:
+            raise ValueError(f"the stage cannot be compiled: {error}") from None
+
+    def steps(self, code: CProject) -> Steps:
+        """Run the controller ``code``, whose name is "controller"."""
+        count, samples, _ = self.rows.shape
+        axes = len(code.outputs)
+        moved = np.empty((count, samples, axes))
+        seen, took = np.empty((samples, 3 * axes)), []
+        with tempfile.TemporaryDirectory() as scratch:
+            library = self._library(code, Path(scratch))
+            for run, start in enumerate(self.starts):
+                signals = map(_pointer, (start, self.rows[run], seen, moved[run]))
+                library.run(ctypes.c_long(samples), *signals)
+            signals = [_pointer(self.starts[-1]), _pointer(seen)]
+            for _ in range(TURNS):
+                begin = time.perf_counter()
+                library.replay(ctypes.c_long(samples), *signals)
+                took.append(time.perf_counter() - begin)
+            return Steps(moved, 1e9 * min(took) / samples, library.state_bytes())
+
+    def _library(self, code: CProject, folder: Path) -> ctypes.CDLL:
+        axes, real = len(code.outputs), code.precision.real
+
+        def each(text: str, first: int = 0) -> list[str]:
+            return [text.format(first * axes + i) for i in range(axes)]
+
+        seen = [f"({real})seen[{i}]" for i in range(3 * axes)]
+        added = zip(each("u[{}]"), each("row[{}]", 4), strict=True)
+        pushed = [f"{voltage} + {more}" for voltage, more in added]
+        loop = LOOP.format(
+            axes=axes,
+            begin=", ".join(f"({real})start[{i}]" for i in range(4 * axes)),
+            voltage=", ".join(each("start[{}]", 3)),
+            displacement=", ".join([*each("start[{}]", 4), *["0.0"] * axes]),
+            sense=self.sensor.step_block(
+                ["&sensor", "&of_sensor", *each("y[{}]"), *each("row[{}]", 2)],
+                each("z[{}]"),
+            ),
+            control=code.step_block(["&state", "&parameters", *seen], each("u[{}]")),
+            move=self.plant.step_block(["&plant", "&of_plant", *pushed], each("y[{}]")),
+        )
+        files = {"loop.c": loop, **code.files(), **self.around}
+        for file, text in files.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        sources = [file for file in files if file.endswith(".c")]
+        command = [self.compiler, *FLAGS, "-o", "loop.so", *sources, "-lm"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+        if done.returncode:
+            raise ValueError(f"{self.compiler} fails: {done.stderr.strip()}")
+        return ctypes.CDLL(str(folder / "loop.so"))
+
+
+def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)

@@ -1,0 +1,133 @@
+"""Error of an exported controller in the simulated loop, by reference and precision."""
+
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from ..core.about import About
+from ..core.system import System
+from .c_project import CProject
+from .compiled_loop import CompiledLoop, Runs, RunTrace, Steps
+from .slots import Interface
+
+WORST_PERCENT = 5.0
+"""Largest accepted cost of a precision, percent of the error in double."""
+
+
+class FormFigures(BaseModel):
+    """Figures of a step in one precision; ``ns`` is its time on this machine."""
+
+    operations: int
+    state_bytes: int
+    ns: float
+
+
+class ReferenceCost(BaseModel):
+    """Errors under a reference by precision, in ``unit``, nm or nrad.
+
+    ``rms`` is the RMS error, ``cost`` what a precision adds to that of double,
+    ``percent`` the share. ``difference`` is the RMS difference between the
+    displacements of a precision and those of double; that of an unstable loop is large
+    in any precision.
+    """
+
+    unit: str
+    rms: dict[str, float]
+    cost: dict[str, float] = {}
+    percent: dict[str, float] = {}
+    difference: dict[str, float] = {}
+
+
+class ExportReport(BaseModel):
+    """Judgement of an exported controller; ``written`` is its precision.
+
+    ``why`` is the reason if that is not the one asked for, ``not_judged`` the reason if
+    there are no figures.
+    """
+
+    model_config = ConfigDict(ser_json_inf_nan="strings")
+
+    written: str
+    why: str | None = None
+    not_judged: str | None = None
+    warnings: list[str] = []
+    forms: dict[str, FormFigures] = {}
+    references: dict[str, ReferenceCost] = {}
+
+    def costly(self, precision: str) -> list[str]:
+        """Return the references on which ``precision`` costs too much, a text each."""
+        return [
+            f"{precision} costs {cost.cost[precision]:.3g} {cost.unit} under {name}, "
+            f"{cost.percent[precision]:.3g} % of the error"
+            for name, cost in self.references.items()
+            if not cost.percent[precision] <= WORST_PERCENT  # NaN is costly
+        ]
+
+
+def judge(
+    system: System, interface: Interface, runs: Runs, precision: str = "double"
+) -> ExportReport:
+    """Return the report on ``system`` in double and float, compiled, over ``runs``.
+
+    For the ``precision`` "float" the report chooses "compensated" if float costs more
+    than ``WORST_PERCENT`` of the error under a reference.
+    """
+    report = ExportReport(written=precision)
+    try:
+        loop = CompiledLoop(runs)
+        exact = _add(report, "double", system, interface, loop, runs)
+        if not np.isfinite(exact.displacements).all():
+            raise ValueError("the loop diverges")
+        _add(report, "float", system, interface, loop, runs, exact)
+        if precision == "float" and (costly := report.costly("float")):
+            report.written, report.why = "compensated", "; ".join(costly)
+        if report.written == "compensated":
+            _add(report, "compensated", system, interface, loop, runs, exact)
+    except ValueError as error:
+        return ExportReport(written=precision, not_judged=str(error))
+    if report.written != "double":
+        costly = report.costly(report.written)
+        report.warnings = [f"{each}: use double" for each in costly]
+    return report
+
+
+def _add(
+    report: ExportReport,
+    precision: str,
+    system: System,
+    interface: Interface,
+    loop: CompiledLoop,
+    runs: Runs,
+    exact: Steps | None = None,
+) -> Steps:
+    """Add the figures of a precision to ``report``, with its cost against ``exact``."""
+    code = CProject(system, interface, "controller", About(), precision)
+    steps = loop.steps(code)
+    report.forms[precision] = FormFigures(
+        operations=code.operations(), state_bytes=steps.state_bytes, ns=steps.ns
+    )
+    for trace in runs.traces:
+        wanted = _counted(runs.rows[..., : len(code.outputs)], runs, trace)
+        found = _counted(steps.displacements, runs, trace)
+        costs = report.references.setdefault(
+            trace.name, ReferenceCost(unit=f"n{trace.unit[1:]}", rms={})
+        )
+        costs.rms[precision] = _rms(found - wanted)
+        if exact is not None:
+            before = costs.rms["double"]
+            cost = costs.cost[precision] = costs.rms[precision] - before
+            costs.percent[precision] = 100.0 * cost / (before or cost or 1.0)
+            costs.difference[precision] = _rms(
+                found - _counted(exact.displacements, runs, trace)
+            )
+    return steps
+
+
+def _counted(signals: np.ndarray, runs: Runs, trace: RunTrace) -> np.ndarray:
+    return signals[trace.runs, runs.settle :, trace.axis]
+
+
+def _rms(errors: Any) -> float:
+    """Return the RMS of ``errors`` (um or urad) in nm or nrad."""
+    return 1e3 * float(np.sqrt(np.mean(np.square(errors))))

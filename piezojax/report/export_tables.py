@@ -1,0 +1,41 @@
+"""Table of an exported controller in the simulated loop."""
+
+from rich.console import Console
+from rich.table import Table
+
+from ..exporting.judge import ExportReport
+
+
+def print_judgement(report: ExportReport, console: Console) -> None:
+    """Print errors by reference and precision, the cost of a step, and warnings."""
+    if report.not_judged is not None:
+        text = f"note: not judged in the simulated loop: {report.not_judged}"
+        console.print(text, soft_wrap=True)
+        return
+    table = Table(title=f"compiled in the simulated loop; written: {report.written}")
+    table.add_column("rms error")
+    for precision in report.forms:
+        table.add_column(precision, justify="right")
+    others = list(report.forms)[1:]
+    for precision in others:
+        table.add_column(f"cost of {precision}", justify="right")
+    for name, found in report.references.items():
+        table.add_row(
+            name,
+            *(f"{rms:.4g} {found.unit}" for rms in found.rms.values()),
+            *(
+                f"{found.cost[each]:+.2g} {found.unit}, {found.percent[each]:+.2g} %"
+                for each in others
+            ),
+        )
+    console.print(table)
+    for precision, form in report.forms.items():
+        console.print(
+            f"{precision}: {form.operations} operations and {form.ns:.0f} ns a step, "
+            f"{form.state_bytes} bytes of state",
+            soft_wrap=True,
+        )
+    if report.why is not None:
+        console.print(f"note: {report.written}, because {report.why}", soft_wrap=True)
+    for warning in report.warnings:
+        console.print(f"WARNING: {warning}", style="bold", soft_wrap=True)
