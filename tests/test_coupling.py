@@ -212,6 +212,6 @@ def test_results_of_several_axes_have_both_pictures(tmp_path):
     # No axis is driven alone and there is no step, so these two are missing.
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
-        *("result.json", "gains.toml"),
+        *("result.json", "gains.toml", "study.toml"),
         *("tracking.png", "hysteresis.png", "contour.png"),
     }

@@ -110,7 +110,7 @@ def test_safe_gains_raise_no_alarm():
         ),
         (
             {"constraints": {"effort": outcome("effort", [99.0], 50.0)}},
-            "effort is 99 V rms on 1 of 1 tuned plants, above its limit 50 V rms: low",
+            "effort is 99 V rms on 1 of 1 tuned plants, above its limit 50 V rms: be",
         ),
         (
             {"perturbed": perturbed(effort=outcome("effort", [1.0, math.nan], 50.0))},
