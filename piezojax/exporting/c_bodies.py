@@ -81,7 +81,11 @@ def init_body(
 
 
 def step_bodies(
-    system: System, state: Any, interface: Interface, fields: Fields, precision: Any
+    system: System,
+    state: Any,
+    interface: Interface,
+    fields: Fields,
+    precision: Precision,
 ) -> StepBodies:
     """Return the texts of ``prepare`` and ``step``; ``state`` is an example."""
     dynamic, static = eqx.partition(system, eqx.is_array)

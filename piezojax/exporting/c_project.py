@@ -59,8 +59,6 @@ class CProject:
         self.outputs = slots(self.output, "output")
         self.values = [np.ravel(leaf) for leaf in jax.tree.leaves(dynamic)]
 
-    # Text
-
     @property
     def _all_fields(self) -> Fields:
         return Fields(

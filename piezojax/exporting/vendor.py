@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,13 @@ def device_values(system: System, before: Path | None = None) -> list[Value]:
     Raises ValueError for a System without a file of a vendor, a value out of the range
     of the device, and a saved file of another kind.
     """
-    file, (_, saved) = _file_of(system), _saved(system, before)
+    return _values(system, _saved(system, before)[1])
+
+
+def _values(system: System, saved: Mapping[str, str]) -> list[Value]:
     return [
         value._replace(saved=saved.get(value.parameter, ""))
-        for value in file.values(_rounded(system))
+        for value in _file_of(system).values(_rounded(system))
     ]
 
 
@@ -44,8 +48,8 @@ def write_vendor(
     The saved file ``before`` is copied beside them. Raises ValueError for a ``folder``
     in use and as ``device_values`` does.
     """
-    file, values = _file_of(system), device_values(system, before)
-    content, saved = _saved(system, before)
+    file, (content, saved) = _file_of(system), _saved(system, before)
+    values = _values(system, saved)
     head = about.origin(f"Parameters of {type(system).__name__}")
     table = io.StringIO()
     csv.writer(table, lineterminator="\n").writerows([Value._fields, *values])

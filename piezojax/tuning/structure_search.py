@@ -56,9 +56,9 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
     The first notch is placed at the mode around which |S| of the loop tuned without
     notches is largest, each further one where that of the loop tuned with the notches
     so far is. A mode that makes less than ``LIMITING`` of |L| limits no loop and gets
-    no notch. If the chosen structure has a needless notch, it is tuned without it too.
-    ``Ctrl-C`` ends the search with the structures so far. Raises ValueError if no
-    structure could be tuned, and as ``with_notches``.
+    no notch. If the chosen structure has a needless notch (``Structure.needless``), it
+    is tuned without it too. ``Ctrl-C`` ends the search with the structures so far.
+    Raises ValueError if no structure could be tuned, and as ``with_notches``.
     """
     table = case.study.structures
     assert table is not None
