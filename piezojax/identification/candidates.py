@@ -38,8 +38,8 @@ CREEP = "exponential_creep"
 """The creep tried first: the most general one."""
 
 DYNAMICS = ("arma", "lag")
-"""Dynamics of a chain, richest first; the last is tried on any record. A resonance that
-the records show comes before them."""
+"""Dynamics of a chain, richest first, of records that show no resonance; the last is
+tried on any of these."""
 
 
 LINEAR = "state_space"
@@ -92,12 +92,18 @@ def supported_parts(
     training = training_record(records, train)
     found, extent = excitation(records, train), extent_of(training)
     shown = dynamics_parts(training)
-    dynamics = [shown] if shown not in DYNAMICS else []
+    if extent.modes:
+        # The error of a free run does not tell whether the mode is needed: creep and
+        # hysteresis dominate it.
+        without = (
+            f"the training part shows a resonance at {extent.modes[0].frequency:.4g} Hz"
+        )
+        untried += [UntriedModel(name, without) for name in DYNAMICS]
+        return SupportedParts(tuple(creeps), (shown,)), untried
+    dynamics = []
     for name in DYNAMICS:
         needed = _parameter_count(name, extent)
-        # A transient that rings excites dynamics, whatever the frequencies of the rest.
-        excited = 2 * found >= needed or bool(extent.modes)
-        if excited or name == DYNAMICS[-1]:
+        if 2 * found >= needed or name == DYNAMICS[-1]:
             dynamics.append(name if extent.slew is None else f"{name}+slew")
         else:
             untried.append(UntriedModel(name, _too_few(found, needed)))
