@@ -12,13 +12,15 @@ from ..core.arrays import largest, smallest
 from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, TrackingFigures
 from .stability.differentiable import (
+    BANDS,
     Sensitivity,
     bandwidth_of,
     closed_loop_peak_of,
     delay_margin_of,
     disk_margin_of,
     gain_margin_of,
-    peak_of,
+    largest_by_band,
+    peaks_of,
     phase_margin_of,
     references_followed,
     sensitivities,
@@ -36,8 +38,9 @@ CAP = 3.0
 and the size of the violation has no meaning."""
 
 
-MarginFigures = dict[str, Float[Array, "*plants branches"]]
-"""Limited margins of a loop on each plant and branch, by constraint."""
+MarginFigures = dict[str, Float[Array, "..."]]
+"""Limited margins of a loop by constraint: [plants, branches], and the sensitivity
+peaks [plants, branches, bands]."""
 
 
 class LoopFigures(NamedTuple):
@@ -90,7 +93,7 @@ class Constraint(NamedTuple):
             )
 
     def read(self, loop: LoopFigures) -> Array:
-        """Return the values [plants] or [plants, branches] in ``unit``."""
+        """Return the values [plants], or with further axes, in ``unit``."""
         return self.values(getattr(loop, self.source), loop.dt)
 
 
@@ -99,11 +102,11 @@ def _largest(runs: Array) -> Array:
     return largest(runs.reshape(runs.shape[0], -1))
 
 
-def _peak(sensitivity: Sensitivity, error: Array | None) -> Array:
-    """Return the largest Ms of a plant within ``error`` of the model."""
+def _peaks(sensitivity: Sensitivity, error: Array | None) -> Array:
+    """Return the largest |S| [bands] of a plant within ``error`` of the model."""
     if error is None:
-        return peak_of(sensitivity)
-    return largest(worst_sensitivity(sensitivity[:, 0, 0], error))
+        return peaks_of(sensitivity)
+    return largest_by_band(worst_sensitivity(sensitivity[:, 0, 0], error))
 
 
 def _delay(sensitivity: Sensitivity, error: Array | None) -> Array:
@@ -135,7 +138,7 @@ def _phase(sensitivity: Sensitivity, error: Array | None) -> Array:
 
 
 _MARGINS: dict[str, Callable[[Sensitivity, Array | None], Array]] = {
-    "sensitivity_peak": _peak,
+    "sensitivity_peak": _peaks,
     "disk_margin": _disk,
     "delay_margin": _delay,
     "gain_margin": _gain,
@@ -156,8 +159,9 @@ def margin_figures(
 ) -> MarginFigures:
     """Return the margins [branches] among the constraints ``names``.
 
-    They are those of ``loop`` linearised at ``point``; ``error`` bounds the relative
-    error of a plant of one axis; None if no bound is known.
+    The sensitivity peaks are [branches, bands], those of ``peaks_of``. The margins are
+    those of ``loop`` linearised at ``point``; ``error`` bounds the relative error of a
+    plant of one axis; None if no bound is known.
     """
     found: MarginFigures = {}
     if not _MARGINS.keys().isdisjoint(names):
@@ -273,21 +277,25 @@ def constraint_count(names: Iterable[str], plants: int, margin_plants: int) -> i
 
     A limit on runs counts once for each of ``plants``, a limit on steps once for each
     of ``plants`` and step, a limit on margins once for each of ``margin_plants`` and
-    branch.
+    branch, that on the sensitivity peak in each band.
     """
+    bands = {"sensitivity_peak": BANDS}
     each = {
         "margins": margin_plants * len(BRANCHES),
         "steps": plants * len(STEPS),
         "tracking": plants,
         "extremes": plants,
     }
-    return sum(each[CONSTRAINTS[name].source] for name in names)
+    return sum(each[CONSTRAINTS[name].source] * bands.get(name, 1) for name in names)
 
 
 def violations(
     limits: Mapping[str, Array | float], loop: LoopFigures
 ) -> Float[Array, " constraints"]:
-    """Return the ``excess`` over each of ``limits`` on each plant, step or branch."""
+    """Return the ``excess`` over each of ``limits`` on each plant, step or branch.
+
+    The order is that of ``constraint_count``.
+    """
     found = [
         excess(name, limit, CONSTRAINTS[name].read(loop)).ravel()
         for name, limit in limits.items()
@@ -315,8 +323,11 @@ def worst_excess(
     limits: Mapping[str, float], margins: MarginFigures
 ) -> Float[Array, " plants"]:
     """Return the largest ``excess`` of the ``margins`` on each plant."""
-    found = [excess(name, limits[name], values) for name, values in margins.items()]
-    return jnp.max(jnp.stack(found), axis=(0, 2))
+    found = [
+        jnp.max(excess(name, limits[name], values), axis=range(1, values.ndim))
+        for name, values in margins.items()
+    ]
+    return jnp.max(jnp.stack(found), axis=0)
 
 
 def worst_by_plant(limits: Iterable[str], loop: LoopFigures) -> dict[str, Array]:

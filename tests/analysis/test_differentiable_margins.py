@@ -16,6 +16,7 @@ from piezojax.analysis.stability import (
 )
 from piezojax.analysis.stability.conserved import LinearLoop
 from piezojax.analysis.stability.differentiable import (
+    BANDS,
     UNLIMITED_DELAY,
     UNLIMITED_GAIN,
     bandwidth_of,
@@ -24,6 +25,7 @@ from piezojax.analysis.stability.differentiable import (
     disk_margin_of,
     gain_margin_of,
     peak_of,
+    peaks_of,
     phase_margin_of,
     references_followed,
     sensitivities,
@@ -200,7 +202,12 @@ def test_an_unknown_branch_is_refused():
 
 # Several axes
 
-FIGURES = (peak_of, disk_margin_of, delay_margin_of)
+FIGURES = (
+    peak_of,
+    disk_margin_of,
+    delay_margin_of,
+    lambda S: jnp.log(peaks_of(S)) @ jnp.arange(1.0, BANDS + 1.0),
+)
 ANGLES = np.linspace(0.0, np.pi, 4001)
 
 
@@ -223,6 +230,26 @@ def test_figures_of_two_axes_equal_those_of_numpy():
     alone = [float(delay_margin_of(one_axis(S[:, i, i]))) for i in range(2)]
     assert delay_margin_of(S) == pytest.approx(min(alone))
     assert alone[1] < 0.9 * alone[0]
+
+
+@pytest.mark.parametrize("lines", [257, 300, 513, 16_001])
+def test_the_peaks_are_those_of_the_octaves(lines):
+    rng = np.random.default_rng(lines)
+    S = rng.standard_normal((lines, 2, 2)) + 1j * rng.standard_normal((lines, 2, 2))
+    for matrices in (S, S[:, :1, :1]):
+        found = peaks_of(matrices)
+        sizes = np.linalg.svd(matrices, compute_uv=False)[:, 0]
+        assert found.shape == (BANDS,)
+        assert np.max(found) == pytest.approx(sizes.max(), rel=1e-7)
+        for octave in range(1, 6):
+            stop, start = (lines >> (octave - shift) for shift in (1, 0))
+            expected = sizes[start:stop].max()
+            assert found[-octave] == pytest.approx(expected, rel=1e-7)
+    # Every line is in one band: a peak anywhere is seen.
+    for line in (0, 1, 2, 5, lines // 3, lines - 1):
+        lone = np.ones((lines, 1, 1), complex)
+        lone[line] = 3.0
+        assert sorted(peaks_of(lone)) == pytest.approx([1.0] * (BANDS - 1) + [3.0])
 
 
 def test_a_delay_beyond_the_margin_of_one_axis_makes_two_axes_unstable():

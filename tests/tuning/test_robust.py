@@ -16,8 +16,10 @@ from piezojax.analysis.constraints import (
     LoopFigures,
     constraint_count,
     violations,
+    worst_excess,
 )
 from piezojax.analysis.stability import OperatingPoint, stability_report
+from piezojax.analysis.stability.differentiable import BANDS
 from piezojax.analysis.step_response import StepFigures
 from piezojax.catalog import p753, p753_stage
 from piezojax.core.metrics import ExtremeFigures, TrackingFigures
@@ -154,12 +156,27 @@ def test_constraint_count_equals_the_number_of_violations(names):
     figures = LoopFigures(
         TrackingFigures(*[runs] * len(TrackingFigures._fields)),
         ExtremeFigures(*[runs] * len(ExtremeFigures._fields)),
-        dict.fromkeys(names, jnp.ones((5, 2))),
+        dict.fromkeys(names, jnp.ones((5, 2)))
+        | {"sensitivity_peak": jnp.ones((5, 2, BANDS))},
         StepFigures(*[jnp.ones((3, 4))] * len(StepFigures._fields)),
         dt=5e-5,
     )
     limits = dict.fromkeys(names, 1.5)
     assert constraint_count(limits, 3, 5) == violations(limits, figures).size
+
+
+def test_the_worst_excess_is_that_of_any_margin_branch_or_band():
+    limits = {"sensitivity_peak": 2.0, "delay_margin": 1.0}
+    peaks = np.ones((3, 2, BANDS))
+    peaks[1, 0, 7] = 4.0
+    delays = np.full((3, 2), 0.5)
+    delays[2] = 3.0, 0.25
+    margins = {
+        "sensitivity_peak": jnp.asarray(peaks),
+        "delay_margin": jnp.asarray(delays),
+    }
+    expected = np.log([2.0, 2.0, 4.0])
+    np.testing.assert_allclose(worst_excess(limits, margins), expected)
 
 
 def test_the_limit_is_kept_and_active_at_the_exact_margin(outcome):

@@ -53,6 +53,10 @@ BAND = math.log(10.0) * -3.0 / 20.0
 LEAST = 512
 """Least number of samples of the impulse response, for loops of a low rate."""
 
+BANDS = 10
+"""Number of bands of ``peaks_of``: octaves down from the Nyquist frequency, and what is
+left below them."""
+
 Sensitivity = Complex[Array, "*batch lines axes axes"]
 
 _SQUARINGS = 24
@@ -236,7 +240,32 @@ def peak_of(sensitivity: Sensitivity) -> Float[Array, ""]:
 
     On several axes it depends on the units of the commands.
     """
-    return _largest_singular(sensitivity)
+    return _largest_singular(sensitivity, (sensitivity.shape[0],))[0]
+
+
+@jax.jit
+def peaks_of(sensitivity: Sensitivity) -> Float[Array, " bands"]:
+    """Return the largest singular value of S in each of ``BANDS`` bands.
+
+    A limit on each holds if and only if ``peak_of`` keeps it. A search needs them all:
+    where two peaks are equally high, the slope of the higher says nothing of the other,
+    and each step would be turned back by the one that it did not see.
+    """
+    return _largest_singular(sensitivity, _ends(sensitivity.shape[0]))
+
+
+def largest_by_band(values: Float[Array, " lines"]) -> Float[Array, " bands"]:
+    """Return the largest of ``values`` in each band of ``peaks_of``."""
+    return jnp.stack([largest(values[band]) for band in _bands(_ends(values.size))])
+
+
+def _ends(lines: int) -> tuple[int, ...]:
+    """Return the ends of the bands, each of one line or more."""
+    return tuple(max(lines >> (BANDS - band), band) for band in range(1, BANDS + 1))
+
+
+def _bands(ends: tuple[int, ...]) -> list[slice]:
+    return [*map(slice, (0, *ends[:-1]), ends)]
 
 
 @jax.jit
@@ -246,21 +275,29 @@ def disk_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
     On one axis it is that of ``StabilityReport``. On several axes it is a lower bound
     of that of ``MultiAxisReport``, which scales the axes at each frequency.
     """
-    return 1.0 / _largest_singular(sensitivity - 0.5 * jnp.eye(sensitivity.shape[-1]))
+    lines, axes, _ = sensitivity.shape
+    return 1.0 / _largest_singular(sensitivity - 0.5 * jnp.eye(axes), (lines,))[0]
 
 
-def _largest_singular(matrices: Sensitivity) -> Float[Array, ""]:
-    """Return the largest singular value of all ``matrices``, with finite derivatives.
+def _largest_singular(
+    matrices: Sensitivity, ends: tuple[int, ...]
+) -> Float[Array, " bands"]:
+    """Return the largest singular value of ``matrices`` up to each of ``ends``.
 
-    On several axes it is the norm of order 2^25 of the singular values, which is never
-    below the largest. Its derivative exists where singular values are equal, and it
-    needs no LAPACK, whose calls from XLA may deadlock on a CPU.
+    Each band begins where the one before ends.
+
+    The derivatives are finite. On several axes it is the norm of order 2^25 of the
+    singular values, which is never below the largest. Its derivative exists where
+    singular values are equal, and it needs no LAPACK, whose calls from XLA may deadlock
+    on a CPU.
     """
+    bands = _bands(ends)
     if matrices.shape[-1] == 1:
-        return largest(jnp.abs(matrices).ravel())
+        sizes = jnp.abs(matrices).ravel()
+        return jnp.stack([largest(sizes[band]) for band in bands])
     sizes = jnp.exp(_log_norm(jax.lax.stop_gradient(matrices)))
-    worst = matrices[jnp.argmax(sizes)]
-    return jnp.exp(_log_norm(worst))
+    worst = [band.start + jnp.argmax(sizes[band]) for band in bands]
+    return jnp.exp(_log_norm(matrices[jnp.stack(worst)]))
 
 
 def _log_norm(matrix: Complex[Array, "*lines q q"]) -> Float[Array, "*lines"]:
