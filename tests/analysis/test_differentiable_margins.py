@@ -195,6 +195,13 @@ def test_an_unstable_loop_gives_a_barrier_with_a_gradient():
     assert slope > 0.0
 
 
+def test_an_unstable_loop_has_no_margins():
+    found = sensitivity(pid_loop(1e5), 5.0)
+    assert peak_of(found) > 1e3
+    for margin in (gain_margin_of, phase_margin_of, delay_margin_of):
+        assert margin(found) == 0.0
+
+
 def test_an_unknown_branch_is_refused():
     with pytest.raises(ValueError, match=r"branch 'up'; it must be one of"):
         sensitivity(pid_loop(), OperatingPoint(branch="up"))

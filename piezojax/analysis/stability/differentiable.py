@@ -47,6 +47,10 @@ finite logarithm."""
 UNLIMITED_GAIN = 120.0
 """Gain margin (dB) of a loop that no gain makes unstable."""
 
+NO_MARGIN = 1e3
+"""Peak of |S| above which gain, phase and delay margin are 0. A stable loop has less
+than 0.1 degrees left, and crossings of an unstable one say nothing."""
+
 BAND = math.log(10.0) * -3.0 / 20.0
 """Logarithm of |y/r| at the end of the band of a loop: -3 dB."""
 
@@ -383,8 +387,13 @@ def _delay_margin(sensitivity: Complex[Array, " lines"]) -> Float[Array, ""]:
 def _least_of_axes(
     margin: Callable[[Array], Array], sensitivity: Sensitivity
 ) -> Float[Array, ""]:
+    """Return the least ``margin`` of an axis, 0 for an axis with none left."""
+
+    def left(axis: Complex[Array, " lines"]) -> Float[Array, ""]:
+        return jnp.where(jnp.max(jnp.abs(axis)) > NO_MARGIN, 0.0, margin(axis))
+
     axes = jnp.diagonal(sensitivity, axis1=-2, axis2=-1)
-    return smallest(jax.vmap(margin, in_axes=-1)(axes))
+    return smallest(jax.vmap(left, in_axes=-1)(axes))
 
 
 def _gain_crossings(
