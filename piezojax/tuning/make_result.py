@@ -66,11 +66,8 @@ def make_result(
     after_scores = _chosen(evaluator.figures(after, data.tuning), names, tuned)
     unit = np.asarray(search.unit)
     values = case.space.from_unit(as_array(unit))
-    at_bound = [
-        path
-        for path, place in zip(case.space.paths, unit, strict=True)
-        if place < 1e-2 or place > 1.0 - 1e-2
-    ]
+    places = dict(zip(case.space.paths, unit, strict=True))
+    bounds_reached = {path: side for path in places if (side := _side(places[path]))}
     return Result(
         study=case.name,
         title=case.study.title,
@@ -78,7 +75,7 @@ def make_result(
         method=case.study.optimiser.method,
         gains=_named(case, values),
         start=_named(case, case.space.from_unit(case.space.start(case.loop))),
-        at_bound=at_bound,
+        at_bound=list(bounds_reached),
         before=_chosen(before, names, tuned),
         after=after_scores,
         holdout_before=holdout_before,
@@ -105,7 +102,7 @@ def make_result(
         warnings=[
             *case.notes,
             *search.warnings,
-            *_warnings(case, at_bound, after_scores, holdout),
+            *_warnings(case, bounds_reached, after_scores, holdout),
             *worse_than_the_start(_chosen(before, names, tuned), after_scores),
         ],
         history=search.losses_by_start,
@@ -117,6 +114,9 @@ def make_result(
         seed=case.study.seed,
     )
 
+
+EDGE = 1e-2
+"""Distance, as a share of the range, within which a gain is at a bound."""
 
 _VERSIONED = ("piezojax", "jax", "jaxlib", "optimistix", "jaxopt", "equinox", "numpy")
 
@@ -168,8 +168,15 @@ def _named(case: Case, values: jax.Array) -> dict[str, float]:
     return dict(zip(case.space.paths, map(float, values), strict=True))
 
 
+def _side(place: float) -> str:
+    """Return the bound that ``place``, from 0 to 1 in the range, is at; "" if none."""
+    if place < EDGE:
+        return "lower"
+    return "upper" if place > 1.0 - EDGE else ""
+
+
 def _warnings(
-    case: Case, at_bound: list[str], after: Scores, holdout: Scores
+    case: Case, bounds_reached: Mapping[str, str], after: Scores, holdout: Scores
 ) -> list[str]:
     found = []
     found += _residual_notes(case)
@@ -186,8 +193,9 @@ def _warnings(
             f"the plant is scheduled by the level of its drive: limits on margins hold "
             f"at each of its {levels} levels, the printed margins at rest only"
         )
-    if at_bound:
-        found.append(f"at the edge of its bounds: {', '.join(at_bound)}")
+    if bounds_reached:
+        sides = ", ".join(f"{path} ({side})" for path, side in bounds_reached.items())
+        found.append(f"at the edge of its bounds: {sides}")
     for where, figures in (("tuning", after), ("hold-out", holdout)):
         railed = [n for n, share in figures.saturated_percent.items() if share > 0]
         if railed:

@@ -431,7 +431,7 @@ def test_a_weight_on_effort_lowers_the_effort(light):
 def test_gains_at_a_bound_have_a_note(light):
     result = light.result
     assert result.at_bound == [INTEGRAL]
-    assert f"at the edge of its bounds: {INTEGRAL}" in result.warnings
+    assert f"at the edge of its bounds: {INTEGRAL} (lower)" in result.warnings
     assert result.gains[INTEGRAL] == pytest.approx(1.0, rel=0.2)
 
 
