@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ..exporting.compiled_loop import Runs
 
 SYSTEMS = ("gains.toml", "model.json")
-"""Files with a System in a folder of results, the first one first."""
+"""Files that may hold the System of a folder of results, in order of preference."""
 
 
 @click.command(cls=Command)
@@ -28,14 +28,15 @@ SYSTEMS = ("gains.toml", "model.json")
     "sections; vendor: the file of an E727, NV200 or Stabilizer.",
 )
 @click.option(
-    "--name", help="Begins all names in C (default: controller, or plant for a model)."
+    "--name",
+    help="Prefix of files and C names (default: controller, or plant for a model).",
 )
 @click.option(
     "--precision",
     type=click.Choice(["double", "float", "compensated"]),
     default="double",
-    help="Type of all real numbers (default: double); compensated is float whose sums "
-    "carry their rounding errors, which float becomes where it costs too much.",
+    help="Type of all real numbers in C (default: double); compensated is float whose "
+    "sums carry their rounding errors. float becomes compensated if it costs too much.",
 )
 @click.option(
     "--study",
@@ -54,23 +55,24 @@ SYSTEMS = ("gains.toml", "model.json")
     "--before",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     metavar="SAVED",
-    help="The file saved from the device: compared, and kept as a backup (vendor).",
+    help="File saved from the device, for a comparison and a backup (--to vendor).",
 )
 @click.option(
     "--accept-unsafe",
     is_flag=True,
-    help="Export gains that were written with an alarm; the files say so.",
+    help="Export gains with an alarm or without a judgement; the files begin with it.",
 )
 @common
 def main(
     source, to, name, precision, study, limits, before, accept_unsafe, out, seed, quiet
 ):
-    """Export the System in FILE as C99, an FMU, a linear model, or a vendor's file.
+    """Export the System in FILE as C99, an FMU, a linear model or a vendor's file.
 
-    FILE is the gains.toml of tune, the model.json of identify, or the folder of their
-    results. `make test` in a folder of C compiles the source and replays a simulation.
-    A controller in C is also compiled here and judged in the simulated loop of its
-    study; report.json has its errors in double and float, and the time of a step.
+    FILE is the gains.toml of tune, the model.json of identify, or the folder that holds
+    one of them. For C, `make test` in the new folder compiles the source and replays a
+    simulation. A controller in C is also compiled here and judged in the simulated loop
+    of its study; report.json has its errors in double and float, and the time of a
+    step.
     """
 
     def body(console):
@@ -86,7 +88,7 @@ def main(
             (source / file for file in SYSTEMS if (source / file).is_file()), source
         )
         about = read_about(path)
-        # Alarms are judged by `export`, whose message names the option.
+        # `export` refuses alarms; its message names the option.
         system = load(path, accept_unsafe=True)
         folder = out or numbered_folder(RESULTS / f"{path.stem}_{to}")
         runs = None
@@ -130,7 +132,10 @@ def main(
 
 
 def _runs(path: Path, about: "About") -> "Runs":
-    """Return the runs of the study at ``path``, that of the controller ``about``."""
+    """Return the runs of the study at ``path`` for a controller with ``about``.
+
+    Raises ValueError if study and controller have different sampling rates.
+    """
     from .. import study as studies
     from ..tuning.exported_runs import make_runs
 

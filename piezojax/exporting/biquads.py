@@ -1,4 +1,4 @@
-"""The feedback of a controller as a chain of second-order sections."""
+"""Linear feedback of a controller as second-order sections (biquads)."""
 
 from pathlib import Path
 
@@ -18,15 +18,16 @@ CONVENTION = (
     "Sections in series, each y = b0 x + b1 x1 + b2 x2 - a1 y1 - a2 y2 with a0 = 1.",
     "a1 and a2 have the signs of textbooks and SciPy: a device that adds a1 y1 and "
     "a2 y2 needs both signs changed.",
-    "x is the input, y the output, x1 and y1 those of the last sample.",
-    "Input: the error, reference minus measurement. Output: the voltage less that at "
-    "rest. A feedforward of the reference, limits and anti-windup are left out.",
+    "x is the input and y the output; x1, y1 are one sample old, x2, y2 two samples.",
+    "Input: the error, reference minus measurement. Output: the voltage minus the "
+    "voltage at rest. Reference feedforward, limits and anti-windup are left out.",
 )
-"""Equation of a section and its signs, in the head of a file."""
+"""Equation and sign convention of a section, for the head of the file."""
 
 SAMPLES, SHARE, TOLERANCE = 200, 0.05, 1e-6
-"""Test of linearity: one period of a sine in samples, its amplitude as a share of half
-the references, and the largest difference as a share of the largest output."""
+"""Linearity test: samples in one period of the sine, its amplitude as a share of half
+the reference range, and the largest accepted difference as a share of the largest
+output."""
 
 
 def write_biquads(
@@ -34,9 +35,10 @@ def write_biquads(
 ) -> list[Path]:
     """Write the feedback of a controller to the new ``folder`` as CSV; return the path.
 
-    Each row is a section. Raises ValueError for a ``folder`` in use, a plant, several
-    axes, an unknown sampling rate, a controller that learns or counts samples, and a
-    feedback that the chain does not reproduce because it is not linear.
+    Each row is a section. The sections hold the controller linearised at rest. Raises
+    ValueError for a ``folder`` in use, a plant, several axes, an unknown sampling rate,
+    a controller that learns or counts samples, and a nonlinear feedback, which the
+    sections do not reproduce.
     """
     if not isinstance(system, Driven) or isinstance(interface.input.measured, tuple):
         raise ValueError("biquads hold the feedback of a controller of one axis")
@@ -75,13 +77,15 @@ def write_biquads(
 
 
 def sections_of(A: np.ndarray, b: np.ndarray, c: np.ndarray, d: float) -> np.ndarray:
-    """Return the second-order sections of ``c (z I - A)^-1 b + d``, as SciPy has them.
+    """Return the second-order sections of ``c (z I - A)^-1 b + d`` in SciPy's layout.
 
-    States without effect are left out. Samples of delay are sections of their own.
+    For n states, ``A`` is [n, n], ``b`` and ``c`` are [n]. The result is [sections, 6]
+    with the columns b0, b1, b2, a0, a1, a2. Uncontrollable and unobservable states are
+    removed. Each sample of pure delay is a section of its own.
     """
     from scipy.signal import zpk2sos
 
-    for _ in range(2):  # keep the reachable states, then those of the dual system
+    for _ in range(2):  # remove uncontrollable states, then unobservable ones
         basis = _krylov(A, b)
         A, b, c = (basis.T @ A @ basis).T, basis.T @ c, basis.T @ b
     poles = np.linalg.eigvals(A)
@@ -99,7 +103,7 @@ def sections_of(A: np.ndarray, b: np.ndarray, c: np.ndarray, d: float) -> np.nda
 
 
 def _krylov(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis of the states that an input ``b`` reaches."""
+    """Return an orthonormal basis [n, r] of the r states controllable from ``b``."""
     basis, v = np.zeros((len(b), 0)), b
     while basis.shape[1] < len(b):
         size = np.linalg.norm(v)

@@ -1,4 +1,4 @@
-"""Bodies of the functions of an exported System in C: init, prepare and step."""
+"""Bodies of the C functions of an exported System: init, prepare and step."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -17,13 +17,13 @@ from .slots import PREPARED, Interface, Slot, expressions, type_of
 from .trace import trace
 
 MANY = 8
-"""Number of equal elements above which they are set in a loop."""
+"""Largest array of equal elements that is assigned without a loop."""
 
 EMPTY = "    (void)parameters;"
 
 
 class Fields(NamedTuple):
-    """Fields and arguments of an exported System in C."""
+    """Struct fields and function arguments of an exported System in C."""
 
     parameters: list[Slot]
     states: list[Slot]
@@ -33,10 +33,10 @@ class Fields(NamedTuple):
 
 
 class StepBodies(NamedTuple):
-    """Texts of a step: fields and computation of what is prepared, and the step.
+    """C text of the prepared fields and of the bodies of ``prepare`` and ``step``.
 
-    ``rounding`` is the state of the rounding errors, if there are any, ``operations``
-    the number of operations of the step, in which loops count once.
+    ``rounding`` lists the slots of rounding errors in the state, if any. ``operations``
+    is the number of operations of a step; the body of a loop counts once.
     """
 
     prepared: str
@@ -55,7 +55,7 @@ def init_body(
 ) -> str:
     """Return the body of ``init``, which computes the state at rest.
 
-    The states ``rounding`` begin at 0.
+    The states ``rounding`` start at 0.
     """
     dynamic, static = eqx.partition(system, eqx.is_array)
 
@@ -67,7 +67,7 @@ def init_body(
         graph, outputs = trace(init, dynamic, interface.start)
         names = [*expressions(fields.parameters, "parameters->"), *names]
     except NotScalarError:
-        # Equations of several unknowns are solved here, once for all.
+        # Equations are solved here, once, for the exported parameters.
         graph, outputs = trace(system.init, interface.start)
     for slot in rounding:
         outputs.append(np.full(slot.size, graph.constant(0.0, "real")))
@@ -87,7 +87,7 @@ def step_bodies(
     fields: Fields,
     precision: Precision,
 ) -> StepBodies:
-    """Return the texts of ``prepare`` and ``step``; ``state`` is an example."""
+    """Return the bodies of ``prepare`` and ``step``; ``state`` gives the shapes."""
     dynamic, static = eqx.partition(system, eqx.is_array)
 
     def step(dynamic, state, input):
@@ -132,7 +132,7 @@ def step_bodies(
 def _compensated(
     graph: Graph, outputs: list[Any], fields: Fields
 ) -> tuple[list[Any], list[Slot]]:
-    """Return ``outputs`` with compensated states, and the state "rounding"."""
+    """Return ``outputs`` with compensated states, and the slot of their errors."""
     before = fields.parameters, fields.states, fields.inputs
     places = np.cumsum([0, *(slot.size for part in before for slot in part)]).tolist()
     parts = list(
@@ -162,7 +162,7 @@ def _compensated(
 
 
 def _operations(graph: Graph, outputs: Sequence[int], held: Collection[int]) -> int:
-    """Return the number of operations of a step; what is ``held`` does not count."""
+    """Return the number of operations of a step, without the nodes ``held``."""
     needed = graph.needed(outputs, held).difference(held)
     kinds = (graph.nodes[n].operation for n in needed)
     return sum(kind not in (*NOTHING, READ) for kind in kinds)
@@ -190,7 +190,7 @@ def _prepared(
 def _copied(
     graph: Graph, outputs: Sequence[Any], fields: Fields, names: Sequence[str]
 ) -> list[Any]:
-    """Return the outputs; a long array that moves is copied element by element."""
+    """Return the outputs; a long array that changes its field is copied by element."""
     own = [f"state->{slot.name}[0]" for slot in fields.states]
     own += [""] * len(fields.outputs)
     return [
@@ -226,7 +226,10 @@ def _assignments(
     expression: Callable[[int], str],
     precision: Precision,
 ) -> Iterator[str]:
-    """Yield the lines that assign the next state; each value is read before."""
+    """Yield the lines that assign the next state.
+
+    An old value that another field needs is saved in a variable first.
+    """
     places = {
         place: type_of(slot.dtype, precision)
         for slot in fields.states
@@ -235,7 +238,7 @@ def _assignments(
     pairs, old = [], {}
     for slot, each in zip(fields.states, states, strict=True):
         if isinstance(each, Memory):
-            # Before all others: an index may be a state.
+            # Written first: the index may be a state that changes below.
             for index, value in each.writes:
                 at = f"state->{slot.name}[{expression(index)}]"
                 yield f"    {at} = {expression(value)};"

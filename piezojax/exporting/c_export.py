@@ -1,4 +1,4 @@
-"""A System as a folder of C99: header, source, golden vectors, and their test."""
+"""Export of a System as C99: header, source, golden vectors, and a test."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from .c_templates import MAKEFILE, TEST
 from .slots import Interface
 
 TOLERANCE = {"double": 1e-12, "float": 1e-3, "compensated": 1e-3}
-"""Largest difference from the golden vectors, as a share of their largest value."""
+"""Accepted difference from the golden vectors, as a share of their largest value."""
 
 LOOSEST = 1e-10
 """Largest tolerance in double, for a System that amplifies rounding errors."""
@@ -33,12 +33,12 @@ def write_c(
 ) -> list[Path]:
     """Write ``system`` to the new ``folder`` as C99; return the paths of the files.
 
-    ``name`` begins every name of the header. ``inputs`` is a tree like
-    ``interface.input`` with a leading axis of samples; the outputs of the simulation
-    for it are the golden vectors of the test, which ``make test`` runs.
-    Raises ValueError for a ``folder`` in use, a ``name`` that is not one of C, an
-    unknown ``precision``, and a System that has no form in scalar operations, with the
-    operation.
+    ``name`` is the prefix of every name in the header. ``inputs`` is a pytree like
+    ``interface.input`` whose leaves have a leading axis of samples. The simulated
+    outputs for it are the golden vectors, which ``make test`` replays.
+    Raises ValueError for a ``folder`` in use, a ``name`` that is no C identifier, an
+    unknown ``precision``, and a System that cannot be written in scalar operations; the
+    message names the operation.
     """
     code = CProject(system, interface, name, about, precision)
     _, outputs = simulate(code.system, inputs, code.state)
@@ -59,10 +59,10 @@ def write_c(
 
 
 def rounding_error(code: CProject, inputs: Any, outputs: Any) -> float:
-    """Return the change of ``outputs`` if the parameters change in their last bit.
+    """Return the relative change of ``outputs`` if each parameter changes by one bit.
 
-    It is a share of the largest value of an output, and shows how far two correct
-    programs may differ.
+    The bit is the last one, up or down at random. The change is a share of the largest
+    value of its output. It shows how far two correct programs may differ.
     """
     draw = np.random.default_rng(0)
 
@@ -83,7 +83,7 @@ def rounding_error(code: CProject, inputs: Any, outputs: Any) -> float:
 
 
 def vectors(code: CProject, inputs: Any, outputs: Any) -> str:
-    """Return a simulation as CSV: its start, then inputs and outputs by name."""
+    """Return a simulation as CSV: start, column names, and a row for each sample."""
     columns = [
         np.asarray(leaf).reshape(len(leaf))
         for tree in (inputs, outputs)

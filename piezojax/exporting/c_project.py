@@ -22,10 +22,10 @@ from .slots import PREPARED, Interface, Slot, expressions, slots, type_of
 
 
 class CProject:
-    """The texts of a C project; the arguments are those of ``c_export.write_c``.
+    """Header and source of a System; the arguments are those of ``c_export.write_c``.
 
-    ``parameters``, ``states``, ``starts``, ``inputs`` and ``outputs`` are the fields
-    and arguments in C, ``values`` the values of the parameters.
+    ``parameters``, ``states``, ``starts``, ``inputs`` and ``outputs`` are the slots of
+    fields and arguments in C. ``values`` holds a flat array for each parameter.
     """
 
     def __init__(
@@ -73,11 +73,11 @@ class CProject:
 
     @property
     def rounding(self) -> list[Slot]:
-        """The state of the rounding errors of compensated states, if there are any."""
+        """Slots of the rounding errors of compensated states, if there are any."""
         return self._step.rounding
 
     def operations(self) -> int:
-        """Return the number of operations of a step; loops count once."""
+        """Return the number of operations of a step; the body of a loop counts once."""
         return self._step.operations
 
     def _type(self, dtype: Any) -> str:
@@ -132,7 +132,7 @@ class CProject:
         }
 
     def step_call(self, arguments: Sequence[str], targets: Sequence[str]) -> str:
-        """Return the lines that step and assign each output to one of ``targets``.
+        """Return the lines that call ``step`` and assign its outputs to ``targets``.
 
         ``arguments`` are the expressions of state, parameters and inputs. Several
         outputs pass through a variable ``output``.
@@ -146,21 +146,21 @@ class CProject:
 
     @property
     def output_variable(self) -> str:
-        """Declaration of the variable of ``step_call``, "" if it needs none."""
+        """Declaration of the variable that ``step_call`` uses, "" if it uses none."""
         several = len(self.outputs) > 1
         return f"    {self.name}_output output;\n" if several else ""
 
     def step_block(self, arguments: Sequence[str], targets: Sequence[str]) -> str:
-        """Return the lines of ``step_call`` as a block with its variable."""
+        """Return the lines of ``step_call`` as a C block that declares its variable."""
         call = self.step_call(arguments, targets)
         return f"    {{\n{self.output_variable}{call}\n    }}"
 
     def files(self) -> dict[str, str]:
-        """Return the texts of header and source by the names of their files."""
+        """Return the texts of header and source by file name."""
         return {f"{self.name}.h": self.header(), f"{self.name}.c": self.source()}
 
     def origin(self) -> str:
-        """Return what the code is, where it comes from, and its alarms first."""
+        """Return the head of a file: the alarms, then the System and its origin."""
         kind = type(self.system).__name__
         if isinstance(self.system, Driven):
             kind = f"{type(self.system.controller).__name__} with its voltage limits"

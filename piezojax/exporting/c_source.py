@@ -13,13 +13,13 @@ INFIX = {
     "add": "+", "sub": "-", "mul": "*", "div": "/",
     "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">=",
 }  # fmt: skip
-"""Operations that C writes between two real operands."""
+"""Infix operators of C for real and integer operands, by operation of JAX."""
 
 LOGICAL = {"and": "&&", "or": "||", "xor": "!=", "eq": "==", "ne": "!="}
-"""Operations that C writes between two boolean operands."""
+"""Infix operators of C for boolean operands."""
 
 BITWISE = {"and": "&", "or": "|", "xor": "^"}
-"""Operations that C writes between two integer operands."""
+"""Infix operators of C for integer operands."""
 
 FUNCTIONS = {
     "abs": "fabs", "acos": "acos", "asin": "asin", "atan": "atan", "atan2": "atan2",
@@ -44,7 +44,7 @@ FORMS = {
     "is_finite": "isfinite({a}) != 0",
     "convert_element_type": "({type})({a})",
 }
-"""Other operations of the operands a, b and c; f is the suffix of functions."""
+"""Expressions of other operations: operands a, b and c, suffix f of functions."""
 
 OF_KIND = {
     ("convert_element_type", "boolean"): "{a} != 0",
@@ -52,18 +52,18 @@ OF_KIND = {
     ("not", "integer"): "~{a}",
     ("abs", "integer"): "labs({a})",
 }
-"""Operations with another form for a result of this kind."""
+"""Expressions that replace those above for a result of this kind."""
 
 NOTHING = (CONSTANT, INPUT, CARRY, RESULT)
-"""Operations that have no statement."""
+"""Operations without a statement in C."""
 
 TYPES = {"integer": "long", "boolean": "int"}
 
 
 class Precision(NamedTuple):
-    """A type of C for real numbers, and the suffix of its numbers and functions.
+    """C type of real numbers, with the suffix of its literals and functions.
 
-    ``compensated`` states carry their rounding errors.
+    With ``compensated``, states that are sums carry their rounding errors.
     """
 
     real: str
@@ -72,7 +72,7 @@ class Precision(NamedTuple):
     compensated: bool = False
 
     def number(self, value: float) -> str:
-        """Return a number of C that has exactly this ``value``."""
+        """Return the C literal of ``value``, rounded to this precision."""
         rounded = self.dtype(value)
         if np.isnan(rounded):
             return "NAN"
@@ -86,7 +86,7 @@ DOUBLE = Precision("double", "", np.float64)
 SINGLE = Precision("float", "f", np.float32)
 COMPENSATED = SINGLE._replace(compensated=True)
 PRECISIONS = {"double": DOUBLE, "float": SINGLE, "compensated": COMPENSATED}
-"""Precisions by the name of their option."""
+"""Precisions by the value of the option."""
 
 
 def statements(
@@ -96,11 +96,11 @@ def statements(
     precision: Precision,
     held: Mapping[int, str] = MappingProxyType({}),
 ) -> tuple[list[str], Callable[[int], str]]:
-    """Return the statements that compute ``outputs``, and the expression of a node.
+    """Return the statements that compute ``outputs``, and a function of a node.
 
-    ``names`` returns the expression of an input by its place, ``held`` has those of
-    nodes that are computed elsewhere. A comment names the function of each group of
-    operations.
+    The function returns the C expression of the node. ``names`` returns the expression
+    of an input by its place; ``held`` holds the expressions of nodes that are computed
+    elsewhere. A comment names the Python function behind each group of operations.
     """
     writer = _Writer(graph, outputs, names, precision, held)
     return list(writer.block(graph.block, "    ")), writer.expression
@@ -177,7 +177,7 @@ class _Writer:
         yield f"{inner}if (!{self.expression(loop.condition)}) break;"
         yield from self.block(loop.body, inner)
         changed = [p for p in used if loop.carried[p] != loop.last[p]]
-        # An old value may be assigned to another carried one: keep them all first.
+        # New values may depend on old ones: compute all before assigning any.
         for p in changed:
             kind = self._type(nodes[loop.carried[p]])
             last = self.expression(loop.last[p])

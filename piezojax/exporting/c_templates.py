@@ -1,4 +1,4 @@
-"""Texts of an exported C project, around its operations."""
+"""Templates of an exported C project: Makefile, header, source, test and loop."""
 
 MAKEFILE = """\
 # `make test` compiles {name}.c and replays the golden vectors of the simulation.
@@ -20,7 +20,7 @@ HEADER = """\
 /* {origin}
 
    {name}_init starts at rest; {name}_step advances one sample. Signals: {units}.
-   There is no allocation, no global state, and no dependency but libm. */
+   No allocation, no global state, and no dependency except libm. */
 #ifndef {guard}
 #define {guard}
 
@@ -32,16 +32,16 @@ typedef struct {{
 {state}
 }} {name}_state;
 
-{output}/* Return the exported parameters, prepared. */
+{output}/* Return the exported parameters, ready for {name}_step. */
 {defaults};
 
-/* Prepare changed parameters for the next samples. */
+/* Recompute the numbers that depend on parameters: call it after a change. */
 {prepare};
 
-/* Return 0, or the number of the first parameter outside its limits, from 1 on. */
+/* Return 0, or the number (from 1) of the first parameter outside its limits. */
 {check};
 
-/* Start at rest under these signals. */
+/* Set the state at rest under these signals. */
 {init};
 
 /* Advance one sample. */
@@ -153,8 +153,8 @@ int state_bytes(void) {{
     return (int)sizeof(controller_state);
 }}
 
-/* Simulate the loop: fill `seen` with the inputs of the controller of each sample, and
-   `moved` with the displacements. */
+/* Simulate the loop: write the controller inputs of each sample to `seen`, and the
+   displacements to `moved`. */
 void run(long samples, const double *start, const double *row, double *seen,
          double *moved) {{
     const controller_parameters parameters = controller_defaults();
@@ -186,7 +186,7 @@ void run(long samples, const double *start, const double *row, double *seen,
     }}
 }}
 
-/* Step the controller alone, to measure its time. */
+/* Run the controller alone on the inputs `seen`, to time its steps. */
 double replay(long samples, const double *start, const double *seen) {{
     const controller_parameters parameters = controller_defaults();
     controller_state state;

@@ -1,8 +1,8 @@
-"""Compensated sums: the rounding error of a state is carried beside it.
+"""Compensated summation of the states of an exported System.
 
-A state that is a sum with itself, such as an integral, has a second number, the
+A state whose next value is a sum with itself, such as an integral, is stored with the
 rounding error of its value (Knuth, The Art of Computer Programming 2, 4.2.2; Neumaier,
-ZAMM 54, 1974). It then counts increments far below the last digit of its value.
+ZAMM 54, 1974). It then accumulates increments far below the last digit of its value.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from .graph import INPUT, Graph
 
 SUMS = {"add", "sub"}
-"""Operations with a rounding error that is carried."""
+"""Operations whose rounding error is carried."""
 
 PASSING = {*SUMS, "neg", "select_n", "max", "min", "clamp"}
 """Operations that pass on the error of an operand."""
@@ -19,11 +19,11 @@ PASSING = {*SUMS, "neg", "select_n", "max", "min", "clamp"}
 def compensate(
     graph: Graph, next_states: Mapping[int, int], first: int
 ) -> dict[int, tuple[int, int]]:
-    """Return the next value of each compensated state, and its error, as nodes.
+    """Return the nodes of next value and next error of each compensated state.
 
-    ``next_states`` maps places of states among the inputs to the nodes of their next
-    values; the places of the result are those of the states that are compensated.
-    Their errors are inputs from place ``first`` on, in the order of the result.
+    ``next_states`` maps the place of each state among the inputs to the node of its
+    next value. The result maps the places of the compensated states. Their errors are
+    new inputs from place ``first`` on, in the order of the result.
     """
     needed = sorted(graph.needed(list(next_states.values())))
     places = _summed(graph, needed, next_states)
@@ -39,10 +39,10 @@ def compensate(
 def _summed(
     graph: Graph, needed: Sequence[int], next_states: Mapping[int, int]
 ) -> list[int]:
-    """Return the places of the states whose next value is a sum with the state."""
+    """Return the places of the states whose next value is a sum with themselves."""
     bits = {place: 1 << i for i, place in enumerate(next_states)}
-    reads: dict[int, int] = {}  # states in the value of a node, a bit each
-    summed: dict[int, int] = {}  # those that passed through a sum
+    reads: dict[int, int] = {}  # states that reach a node, one bit each
+    summed: dict[int, int] = {}  # those that reach it through a sum
     for number in needed:
         node = graph.nodes[number]
         reads[number] = summed[number] = 0
@@ -58,7 +58,7 @@ def _summed(
 
 
 class _Errors:
-    """Nodes of the rounding errors of nodes, ``of`` those that are not exact."""
+    """Nodes of rounding errors; ``of`` maps each inexact node to its error."""
 
     def __init__(self, graph: Graph):
         self.graph = graph
@@ -70,13 +70,13 @@ class _Errors:
         return self.graph.add(name, operands, kind, None, "compensate")
 
     def follow(self, number: int) -> None:
-        """Add the error of the node ``number`` if it passes on one of an operand."""
+        """Add the error of the node ``number`` if it passes on that of an operand."""
         name, operands, kind, *_ = self.graph.nodes[number]
         known = any(operand in self.of for operand in operands)
         if not known or name not in PASSING or kind != "real":
             return
         if self.graph.levels[number] > 0:
-            return  # within a loop, whose result has no error
+            return  # in a loop, whose result counts as exact
         a, b = operands[0], operands[-1]
         left, right = (self.of.get(operand, self.zero) for operand in (a, b))
         if name in SUMS:
@@ -103,7 +103,7 @@ class _Errors:
         self.of[number] = error
 
     def renormalised(self, number: int) -> tuple[int, int]:
-        """Return the nodes of value plus error, rounded, and of what is left."""
+        """Return the nodes of the rounded sum of value and error, and of its error."""
         error = self.of[number]
         finite = self._add("is_finite", error, test=True)
         error = self._add("select_n", finite, self.zero, error)

@@ -1,4 +1,4 @@
-"""Compiled controller in the simulated loop, whose plant and sensor are C in double."""
+"""Compiled controller in a simulated loop; plant and sensor are C in double."""
 
 import ctypes
 import shutil
@@ -20,13 +20,13 @@ from .memory import NotScalarError
 from .slots import Interface
 
 TURNS = 5
-"""Number of times that the steps are measured; the fastest counts."""
+"""Number of timing runs; the fastest counts."""
 
 
 class RunTrace(NamedTuple):
-    """Error of ``axis`` under the reference ``name``, over the runs ``runs``.
+    """Tracking error of ``axis`` under the reference ``name``, in the slice ``runs``.
 
-    ``unit`` is that of the axis.
+    ``unit`` is the unit of the axis, um or urad.
     """
 
     name: str
@@ -36,13 +36,13 @@ class RunTrace(NamedTuple):
 
 
 class Runs(NamedTuple):
-    """Runs that judge a compiled controller of n axes.
+    """Plant, sensor and signals of the runs that judge a compiled controller.
 
-    ``at_rest`` and ``move`` are the inputs of ``sensor`` and ``plant``. The n columns
-    of each signal are, in ``starts``: reference, next reference, reading, voltage (V)
-    and displacement at rest; in ``rows``: reference, next reference, noise of unit
-    variance, disturbance of the displacement, and disturbance of the voltage (V). Other
-    signals are in the units of the axes. Errors count from sample ``settle`` on.
+    ``sense`` and ``move`` are the signals of ``sensor`` and ``plant``. For n axes, each
+    signal has n columns. ``starts`` holds reference, next reference, reading, voltage
+    (V) and displacement at rest. ``rows`` holds reference, next reference, noise of
+    unit variance, disturbance of the displacement, and disturbance of the voltage (V).
+    Other signals are in the units of the axes. Errors count from sample ``settle`` on.
     """
 
     plant: System
@@ -56,10 +56,10 @@ class Runs(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Runs of a compiled controller.
+    """Results of the runs of a compiled controller.
 
-    ``displacements`` are in the units of the axes, ``ns`` is the time of a step, and
-    ``state_bytes`` the size of the state.
+    ``displacements`` are in the units of the axes. ``ns`` is the time of a step in ns,
+    and ``state_bytes`` the size of the controller's state in bytes.
     """
 
     displacements: Float[np.ndarray, "runs samples axes"]
@@ -68,10 +68,10 @@ class Steps(NamedTuple):
 
 
 class CompiledLoop:
-    """The loop of ``runs`` around any form of its controller in C.
+    """Feedback loop of ``runs``, for a controller in C in any precision.
 
-    Raises ValueError without a C compiler, and for a plant or sensor that has no form
-    in scalar operations.
+    Raises ValueError without a C compiler, and for a plant or sensor that cannot be
+    written in scalar operations.
     """
 
     def __init__(self, runs: Runs):
@@ -89,7 +89,7 @@ class CompiledLoop:
             raise ValueError(f"the stage cannot be compiled: {error}") from None
 
     def steps(self, code: CProject) -> Steps:
-        """Run the controller ``code``, whose name is "controller"."""
+        """Run and time the controller ``code``, which must be named "controller"."""
         count, samples, _ = self.rows.shape
         axes = len(code.outputs)
         moved = np.empty((count, samples, axes))

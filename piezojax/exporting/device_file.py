@@ -1,4 +1,4 @@
-"""Parameters of a device as text, in its range and with its digits."""
+"""Parameters of a device as text, with its digits and checked against its ranges."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -9,13 +9,13 @@ import numpy as np
 from ..core.parameter import declarations
 
 DIGITS = 12
-"""Significant digits of a number for which a device declares no step."""
+"""Significant digits of a number without a declared step."""
 
 
 class Value(NamedTuple):
-    """A value in a file of a device: its key and text there, unit and meaning.
+    """A parameter in the file of a device: key, text of the value, unit and meaning.
 
-    ``saved`` is its text in the file saved before, "" if that lacks it.
+    ``saved`` is the text in the file saved from the device, or "" if it has none.
     """
 
     parameter: str
@@ -26,13 +26,13 @@ class Value(NamedTuple):
 
 
 class DeviceFile(NamedTuple):
-    """File of the parameters of a device.
+    """Format of the parameter file of a device.
 
-    ``values`` returns the values of a device that is rounded already, and ``notes`` the
-    sentences at the head of the file, given the keys and values of the file saved
-    before. ``read`` returns the keys and values of such a file; it raises ValueError
-    for another file. ``body`` returns the text of the values, and of the other keys in
-    the text of the saved file if it keeps them.
+    ``values`` returns the values of a device whose parameters are rounded already.
+    ``notes`` returns the sentences at the head of the file, given the device and the
+    keys and values of the saved file. ``read`` returns the keys and values of a saved
+    file; it raises ValueError for a file of another kind. ``body`` returns the text of
+    the values, given the text of the saved file; some formats keep its other keys.
     """
 
     suffix: str
@@ -50,10 +50,10 @@ def value_of(
     least: float = -np.inf,
     most: float = np.inf,
 ) -> Value:
-    """Return a field of ``device`` under ``key``, by default its name.
+    """Return a field of ``device`` under ``key``, by default the name of the field.
 
-    Raises ValueError, with the range, for a value outside the limits of the field or
-    outside ``least`` to ``most``.
+    Raises ValueError for a value outside the limits of the field or outside ``least``
+    to ``most``; the message states the range.
     """
     declared, value = dict(declarations(device))[field], getattr(device, field)
     limits = {"least": max(declared.least, least), "most": min(declared.most, most)}
@@ -64,9 +64,9 @@ def value_of(
 
 
 def number(value: Any, step: float | None = None) -> str:
-    """Return ``value`` without an exponent, which not every device reads.
+    """Return ``value`` without an exponent, which some devices cannot read.
 
-    It has the decimals of ``step``, or up to 12 significant digits without one.
+    The text has the decimals of ``step``; without a step, up to 12 significant digits.
     """
     if step is None:
         return np.format_float_positional(

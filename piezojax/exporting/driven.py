@@ -1,4 +1,4 @@
-"""Controller with its actuator: what runs on the hardware, from samples to voltages."""
+"""Controller with its actuator, as on the hardware: from samples to voltages."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -9,9 +9,10 @@ from ..core.system import System
 
 
 class Seen(NamedTuple):
-    """Input of a controller on its hardware at sample k, um.
+    """Input of an exported controller at sample k, in the units of the axes.
 
-    ``reference`` is r(k), ``next_reference`` r(k+1) and ``measured`` z(k).
+    ``reference`` is r(k), ``next_reference`` r(k+1) and ``measured`` z(k). Each is a
+    scalar, or a tuple of one scalar per axis.
     """
 
     reference: Signal
@@ -20,7 +21,7 @@ class Seen(NamedTuple):
 
 
 class DrivenState(NamedTuple):
-    """States of controller and actuator, and the voltage applied last (V)."""
+    """States of controller and actuator, and the last applied voltage (V)."""
 
     controller: State
     actuator: State
@@ -28,9 +29,10 @@ class DrivenState(NamedTuple):
 
 
 class Driven(System):
-    """A ``controller`` that receives the voltage of its ``actuator``, as in a Feedback.
+    """A ``controller`` with its ``actuator``, whose voltage is fed back to it.
 
-    Its output is the voltage after the limits of the actuator, V.
+    The controller receives the last applied voltage, as in a Feedback. The output is
+    the voltage of the actuator (V), after its limits.
     """
 
     part_units: ClassVar[PartUnits] = {"controller": {"u": "V"}}
@@ -41,7 +43,7 @@ class Driven(System):
     def init(self, input: Any) -> DrivenState:
         """Return the state at rest under the Observation ``input``: a bumpless start.
 
-        ``input.applied`` is the voltage that is applied at that moment.
+        ``input.applied`` is the voltage (V) that is applied at the start.
         """
         controller = self.controller.init(input)
         return DrivenState(controller, self.actuator.init(input.applied), input.applied)

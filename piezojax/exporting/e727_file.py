@@ -1,4 +1,4 @@
-"""Commands SPA of the E-727, in the general command set (GCS 2.0) of PI."""
+"""SPA commands of the E-727, in the General Command Set of PI (GCS 2.0)."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ IDS = {
     "integral_time": 0x07000301,
     "derivative_time": 0x07000302,
 }
-"""Numbers of the parameters, in the order of writing."""
+"""Numbers of the parameters, in the order in which they are written."""
 
 MOST_REJECTION = 0.98
 
@@ -53,23 +53,24 @@ def _notes(device: E727, saved: Mapping[str, str]) -> list[str]:
     slew = float(device.slew_rate) < NO_SLEW
     return [
         f"Scale: {float(device.scale):.6g} V/um for P = 1, as entered in the study.",
-        "Not in the manual, as simulated: "
+        "Options that the manual does not specify, as simulated: "
         f"structure {device.structure}, anti-windup {device.anti_windup}, "
-        "the law of a notch with a bandwidth other than 1.",
-        "Item 1 is the axis, of 0x05000000 and 0x05000001 the input channel: change it "
-        "for others.",
-        "Switch the servo off; send the lines that begin with SPA, each followed by "
-        "ERR?; read all values back with SPA? and compare; then close the loop.",
-        "SPA is volatile. HPA? names the command levels and the types; ranges and "
-        "digits of the device are unknown.",
-        "Control mode 0x07030100 must be 1 (PID), servo update time 0x0E000200 5e-05.",
+        "the transfer function of a notch with a bandwidth other than 1.",
+        "Item 1 is the axis; for 0x05000000 and 0x05000001 it is the input channel. "
+        "Change it for other axes and channels.",
+        "Switch the servo off. Send the lines that begin with SPA, each followed by "
+        "ERR?. Read all values back with SPA? and compare them. Then close the loop.",
+        "SPA writes to volatile memory. HPA? lists the command levels and the types; "
+        "the ranges and digits of the device are unknown.",
+        "The control mode 0x07030100 must be 1 (PID), and the servo update time "
+        "0x0E000200 must be 5e-05 s.",
         "The unit of the slew rate is not in the manual; um/s is assumed."
         if slew
-        else "The slew rate 0x07000200 stays as it is: it was simulated without one.",
+        else "The slew rate 0x07000200 is not written: the simulation had no limit.",
         *(
             []
             if device.derivative_time > 0.0
-            else ["The manual asks for D > 0, and here D is off: read 0 back."]
+            else ["The manual asks for D > 0, but D is off: check that it reads 0."]
         ),
     ]
 

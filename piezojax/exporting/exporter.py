@@ -30,18 +30,18 @@ FAR = 1e6
 """A voltage beyond the limits of every actuator, V."""
 
 HELD = 50
-"""Number of samples between the corners of the input of a plant."""
+"""Samples between the corners of the piecewise linear test input of a plant."""
 
 AXES = 6
-"""Largest number of axes that is tried."""
+"""Largest number of axes of an exported System."""
 
 UNJUDGED = "no study has judged the stability of this controller"
 
 FORMS = ("c", "fmu", "mat", "octave", "biquads", "vendor")
-"""Forms of an export."""
+"""Formats of an export: the values of the option ``to``."""
 
 REPORT = "report.json"
-"""Name of the report on a controller that is judged."""
+"""File name of the report on a judged controller."""
 
 Limits = Sequence[tuple[float, float]]
 
@@ -63,30 +63,31 @@ def export(
 ) -> list[Path]:
     """Write ``system`` to a new ``folder``; return the paths of its files.
 
-    ``to`` is "c", C99 with a test of its own; "fmu", an FMU 2.0 for co-simulation;
-    "mat" or "octave", the model linearised at rest for MATLAB or Octave; "biquads", the
-    linear feedback of a controller as second-order sections; or "vendor", the
-    parameters of an E727, NV200 or Stabilizer as the file of its vendor, with a copy of
-    the file ``before`` that was saved from the device.
+    ``to`` is "c", C99 with its own test; "fmu", an FMU 2.0 for co-simulation; "mat" or
+    "octave", the model linearised at rest for MATLAB or Octave; "biquads", the linear
+    feedback of a controller as second-order sections; or "vendor", the parameters of an
+    E727, NV200 or Stabilizer in the file format of the vendor. ``before`` is a file
+    saved from that device; the export compares the values and keeps a copy.
 
-    A controller leaves with its actuator, that of ``about`` or ``limits``, the lowest
-    and highest voltage of each axis (V): the exported step saturates, and tells the
-    controller what was applied, as in the simulated loop. Anything else is exported as
-    it is. ``name`` begins the names of the header: by default "controller" or "plant".
-    The golden vectors, ``samples`` long and drawn with ``seed``, cover the references
-    for which the gains were tuned, and three times their range.
+    A controller is exported with its actuator: a saturation at ``limits``, the lowest
+    and highest voltage of each axis (V), or without them the actuator of ``about``. As
+    in the simulated loop, the applied voltage is fed back to the controller. A plant is
+    exported alone. ``name`` is the prefix of files and C names, by default "controller"
+    or "plant". The golden vectors have ``samples`` samples, for a plant rounded down to
+    a multiple of ``HELD``, and random draws from ``seed``. The reference of a
+    controller covers the range that the gains were tuned for, then three times that
+    range.
 
-    ``precision`` is "double", "float", or "compensated", float whose sums carry their
-    rounding errors. A controller in C with ``runs``, from
-    ``piezojax.tuning.exported_runs.make_runs``, is compiled and judged in the simulated
-    loop: the last file is the report, and "float" becomes "compensated" where it costs
-    too much.
+    ``precision`` is "double", "float", or "compensated": float whose sums carry their
+    rounding errors. With ``runs`` (``piezojax.tuning.exported_runs.make_runs``), a
+    controller in C is also compiled and judged in the simulated loop. The last path is
+    then the report, and "float" becomes "compensated" if float costs too much.
 
     Raises ValueError for a ``folder`` in use, an unknown ``to``, a System with alarms
     (``about.unsafe``) or a controller without margins (``about.judged``) unless
     ``accept_unsafe``, a controller without limits, and a System that cannot be written
-    in scalar operations. An FMU takes a sampling rate and a C compiler too, a linear
-    model a sampling rate.
+    in scalar operations. An FMU, a linear model and biquads need a sampling rate; an
+    FMU also needs a C compiler.
     """
     if to not in FORMS:
         raise ValueError(f"to is {to!r}: choose from {', '.join(FORMS)}")
@@ -132,8 +133,10 @@ def export(
 
 
 def export_alarms(system: System, about: About) -> list[str]:
-    """Return the reasons not to export ``system``: those of its file, and one for a
-    controller that no study has judged."""
+    """Return the reasons not to export ``system``, a sentence each.
+
+    They are the alarms of its file, and one for a controller that no study has judged.
+    """
     return _alarms(_kind_of(system)[0], about)
 
 
@@ -145,7 +148,7 @@ def _alarms(kind: str, about: About) -> list[str]:
 def _kind_of(system: System) -> tuple[str, int]:
     """Return "plant" or "controller", and the number of axes, 0 for scalar signals.
 
-    A plant takes voltages, a controller an Observation, which is a tuple too. Raises
+    A plant takes a voltage for each axis, a controller an Observation. Raises
     ValueError for a System that takes neither.
     """
     for axes in range(AXES + 1):
@@ -162,9 +165,9 @@ def _kind_of(system: System) -> tuple[str, int]:
 
 
 def _signal(values: Any, axes: int) -> Any:
-    """Return a scalar signal, or a tuple of one for each of ``axes``, from an array.
+    """Return ``values`` [..., axes] as a tuple of one signal per axis.
 
-    The axes of ``values`` come last.
+    With 0 ``axes``, return the only column of ``values`` as a scalar signal.
     """
     if not axes:
         return jnp.asarray(values[..., 0])
@@ -172,7 +175,7 @@ def _signal(values: Any, axes: int) -> Any:
 
 
 def _actuator(axes: int, limits: Limits | None, about: About) -> System:
-    """Return the actuator with ``limits``, or that of ``about``."""
+    """Return a saturation at ``limits`` (V), by default the actuator of ``about``."""
     if limits is None and about.actuator is not None:
         return from_data(about.actuator, "about.actuator")
     count = max(axes, 1)
@@ -188,7 +191,7 @@ def _actuator(axes: int, limits: Limits | None, about: About) -> System:
 def _controller(
     system: Driven, axes: int, about: About, samples: int, draw: np.random.Generator
 ) -> tuple[System, Interface, Any]:
-    """Return a controller with its actuator, its signals, and inputs of a test."""
+    """Return a controller with its actuator, its signals, and its test inputs."""
     count = max(axes, 1)
     ends = np.array(about.reference_ranges or [(-1.0, 1.0)] * count)
     middle, half = ends.mean(axis=1), 0.5 * np.ptp(ends, axis=1)
@@ -218,10 +221,14 @@ def _plant(
     samples: int,
     draw: np.random.Generator,
 ) -> tuple[System, Interface, Any]:
-    """Return a plant, its signals, and inputs of a test."""
+    """Return a plant, its signals, and its test inputs.
+
+    The tests begin at rest in the middle of the input range.
+    """
     count = max(axes, 1)
     ends = np.array(about.input_ranges or [(0.0, 100.0)] * count)
     steps = draw.uniform(ends[:, 0], ends[:, 1], (samples // HELD, count))
+    steps[0] = ends.mean(axis=1)  # the operating point of a linear export
     held = np.repeat(steps, HELD, axis=0)
     ramp = np.linspace(0.0, 1.0, HELD)[:, None]
     held[HELD:] = np.concatenate(

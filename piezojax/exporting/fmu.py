@@ -1,4 +1,4 @@
-"""A System as an FMU 2.0 for co-simulation: Simulink, dSPACE, Modelica and others.
+"""Export of a System as an FMU 2.0 for co-simulation, as in Simulink or Modelica.
 
 Standard: Functional Mock-up Interface 2.0.4, Modelica Association, 2022.
 """
@@ -29,11 +29,11 @@ PLATFORMS = {"Linux": ("linux64", "so"), "Darwin": ("darwin64", "dylib")}
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
 
 EPOCH = (2000, 1, 1, 0, 0, 0)
-"""Time of every file in the FMU: the same gains give the same bytes."""
+"""Timestamp of all files in the FMU, so that equal gains give equal bytes."""
 
 
 class Variable(NamedTuple):
-    """A real variable: its name, its place in C, and its attributes in the FMU."""
+    """A real variable: its name, its expression in C, and its attributes in the FMU."""
 
     name: str
     place: str
@@ -47,13 +47,13 @@ def write_fmu(
 ) -> list[Path]:
     """Write ``system`` to the new ``folder`` as an FMU 2.0; return its path.
 
-    It holds the C source and a binary for this platform. Its step is the sampling time;
-    a communication step of several samples holds the inputs. Real parameters can be
-    set; a signal of ``init`` that is no input of ``step``, as the voltage applied
-    before, is a parameter too.
+    The FMU holds the C source and a binary for this platform. Its step is one sample; a
+    communication step of several samples holds the inputs. Real parameters can be set.
+    A signal of ``init`` that is not an input of ``step``, such as the voltage applied
+    at the start, is a parameter as well.
 
     Raises ValueError if ``about`` has no sampling rate, without a C compiler ``cc``, on
-    an unknown platform, and as ``write_c`` does.
+    an unsupported platform, and in the cases of ``write_c``.
     """
     if about.rate_Hz is None:
         raise ValueError("an FMU needs the sampling rate, and the file names none")
@@ -91,7 +91,7 @@ def write_fmu(
 
 
 def _variables(code: CProject) -> list[Variable]:
-    """Return parameters, inputs and outputs; their order gives the references."""
+    """Return parameters, inputs and outputs in the order of their value references."""
     found = []
     for slot, values in zip(code.parameters, code.values, strict=True):
         if not np.issubdtype(slot.dtype, np.floating):
@@ -108,7 +108,7 @@ def _variables(code: CProject) -> list[Variable]:
     for slot in code.starts:
         if slot.name not in inputs:
             place = f"this->start_{slot.name}"
-            meaning = "its value before the first sample"
+            meaning = "value before the first sample"
             found.append(
                 Variable(
                     f"start_{slot.name}", place, "parameter", at[slot.name], meaning
@@ -125,7 +125,7 @@ def _variables(code: CProject) -> list[Variable]:
 def _interface(
     code: CProject, variables: list[Variable], guid: str, rate: float
 ) -> str:
-    """Return the C source of the functions of the standard."""
+    """Return the C source of the FMI functions."""
     inputs = [slot.name for slot in code.inputs]
     starts = [slot.name for slot in code.starts if slot.name not in inputs]
     outputs = [slot.name for slot in code.outputs]
@@ -165,7 +165,7 @@ def _interface(
 def _description(
     code: CProject, variables: list[Variable], guid: str, rate: float
 ) -> str:
-    """Return modelDescription.xml."""
+    """Return the text of modelDescription.xml."""
     root = ElementTree.Element(
         "fmiModelDescription",
         fmiVersion="2.0",

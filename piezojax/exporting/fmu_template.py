@@ -1,4 +1,4 @@
-"""Text of the functions of FMI 2.0 around an exported System."""
+"""Template of the FMI 2.0 functions around an exported System."""
 
 FMU = """\
 /* Functions of FMI 2.0 for co-simulation, around {name}.c. */
@@ -147,7 +147,7 @@ status fmi2CancelStep(void *it) {{
     return ERROR;
 }}
 
-/* There are no other types, no derivatives, no saved states, and no pending steps. */
+/* Not supported: other types, derivatives, saved states, and pending steps. */
 #define NONE(function, type) \\
     status function(void *it, const reference_number *numbers, size_t count, \\
                     type *values) {{ \\

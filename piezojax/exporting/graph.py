@@ -1,4 +1,4 @@
-"""Graph of scalar operations, the form in which a System leaves piezojax."""
+"""Graph of scalar operations, the intermediate form of an exported System."""
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,17 +10,20 @@ Kind = Literal["real", "integer", "boolean"]
 
 CONSTANT, INPUT, CARRY, RESULT = "constant", "input", "carry", "result"
 READ = "read"
-"""Operations of nodes that compute nothing: a number, an input by its place, the value
-of a loop before an iteration, the one after its last, and an element of an array of
-inputs, whose ``value`` is the place of the first element."""
+"""Operations of nodes that compute nothing.
+
+They are a constant, an input by its place, a carried value before an iteration of a
+loop, a result of a loop after its last iteration, and an element of an array of inputs.
+The ``value`` of the last is the place of the first element of the array."""
 
 
 class Node(NamedTuple):
     """A scalar operation: its name in JAX, its operands, and the type of its result.
 
-    ``operands`` are numbers of nodes. ``value`` is the number of a constant, the place
-    of an input, an exponent, or the loop and place of a value of a loop. ``source`` is
-    the function that computes it.
+    ``operands`` are numbers of nodes. ``value`` is the value of a constant, the place
+    of an input, the exponent of a power, the method of a rounding, or a key and the
+    place of a carried value or result of a loop; for a result the key is the number of
+    the loop. ``source`` is the Python function that the operation comes from.
     """
 
     operation: str
@@ -32,10 +35,11 @@ class Node(NamedTuple):
 
 @dataclass
 class Block:
-    """Nodes in the order of their computation, with the loops between them.
+    """Nodes and loops in the order of their computation.
 
-    A loop stands as -1 - i, i its number in ``Graph.loops``. ``level`` is the number of
-    loops around the nodes.
+    ``order`` holds the numbers of nodes, and -1 - i for loop i of ``Graph.loops``.
+    ``level`` is the number of loops around the block. ``known`` maps the content of
+    each node to its number.
     """
 
     level: int = 0
@@ -46,9 +50,9 @@ class Block:
 class Loop(NamedTuple):
     """A loop that repeats ``body`` while a condition holds.
 
-    ``first`` are the values before the loop, ``carried`` the nodes that stand for them
-    in the loop, ``last`` the values after an iteration. ``condition`` is computed in
-    ``head``.
+    ``first`` are the nodes of the values before the loop, ``carried`` those of the
+    values at the start of an iteration, and ``last`` those of the values at its end.
+    ``condition`` is the node of the condition, which ``head`` computes.
     """
 
     first: tuple[int, ...]
@@ -63,8 +67,8 @@ class Graph:
     """Scalar operations, each stored once.
 
     ``nodes`` holds all operations by number, ``levels`` the number of loops around
-    each, and ``block`` the order of those outside any loop. An operation whose operands
-    do not change in a loop stands before the loop.
+    each, and ``block`` the order of those outside any loop. A loop-invariant operation
+    is placed before its loop.
     """
 
     def __init__(self):
@@ -76,12 +80,12 @@ class Graph:
 
     @property
     def level(self) -> int:
-        """Number of loops around the next node."""
+        """Number of loops around the block that is being filled."""
         return self._open[-1].level
 
     @contextmanager
     def inside(self, block: Block) -> Iterator[Block]:
-        """Add nodes to ``block``, which may use all nodes outside it."""
+        """Add nodes to ``block`` in this context; they may use the nodes outside it."""
         self._open.append(block)
         try:
             yield block
@@ -100,8 +104,8 @@ class Graph:
         value: Any = None,
         source: str = "",
     ) -> int:
-        """Return the number of a node, which is new unless the same one is known."""
-        # Constants are compared as text: 0.0 equals -0.0, and no number equals nan.
+        """Return the number of a node, which is added unless an equal one is known."""
+        # Constants are compared as text, because 0.0 == -0.0 and nan != nan.
         key = (operation, tuple(operands), kind, repr(value))
         for block in reversed(self._open):
             if key in block.known:
@@ -129,7 +133,7 @@ class Graph:
     def needed(self, outputs: Sequence[int], held: Collection[int] = ()) -> set[int]:
         """Return the numbers of the nodes that ``outputs`` depend on.
 
-        What the nodes ``held`` depend on does not count.
+        The nodes ``held`` are included, but not what they depend on.
         """
         carried = {
             number: (loop, place)

@@ -1,4 +1,4 @@
-"""Error of an exported controller in the simulated loop, by reference and precision."""
+"""Errors of an exported controller in a simulated loop, by reference and precision."""
 
 from typing import Any
 
@@ -12,11 +12,14 @@ from .compiled_loop import CompiledLoop, Runs, RunTrace, Steps
 from .slots import Interface
 
 WORST_PERCENT = 5.0
-"""Largest accepted cost of a precision, percent of the error in double."""
+"""Largest accepted cost of a precision, in percent of the error in double."""
 
 
 class FormFigures(BaseModel):
-    """Figures of a step in one precision; ``ns`` is its time on this machine."""
+    """Cost of a step in one precision.
+
+    ``ns`` is its time on this machine in ns, and ``state_bytes`` the size of the state.
+    """
 
     operations: int
     state_bytes: int
@@ -24,12 +27,11 @@ class FormFigures(BaseModel):
 
 
 class ReferenceCost(BaseModel):
-    """Errors under a reference by precision, in ``unit``, nm or nrad.
+    """Tracking errors under a reference by precision, in ``unit`` (nm or nrad).
 
-    ``rms`` is the RMS error, ``cost`` what a precision adds to that of double,
-    ``percent`` the share. ``difference`` is the RMS difference between the
-    displacements of a precision and those of double; that of an unstable loop is large
-    in any precision.
+    ``rms`` is the RMS error. ``cost`` is its increase over the RMS error in double, and
+    ``percent`` that increase in percent of it. ``difference`` is the RMS difference
+    from the displacements in double; in an unstable loop it is large in any precision.
     """
 
     unit: str
@@ -40,10 +42,10 @@ class ReferenceCost(BaseModel):
 
 
 class ExportReport(BaseModel):
-    """Judgement of an exported controller; ``written`` is its precision.
+    """Report on an exported controller; ``written`` is its precision.
 
-    ``why`` is the reason if that is not the one asked for, ``not_judged`` the reason if
-    there are no figures.
+    ``why`` is the reason if ``written`` differs from the requested precision, and
+    ``not_judged`` the reason if there are no figures.
     """
 
     model_config = ConfigDict(ser_json_inf_nan="strings")
@@ -56,7 +58,7 @@ class ExportReport(BaseModel):
     references: dict[str, ReferenceCost] = {}
 
     def costly(self, precision: str) -> list[str]:
-        """Return the references on which ``precision`` costs too much, a text each."""
+        """Return a sentence for each reference where ``precision`` costs too much."""
         return [
             f"{precision} costs {cost.cost[precision]:.3g} {cost.unit} under {name}, "
             f"{cost.percent[precision]:.3g} % of the error"
@@ -68,10 +70,10 @@ class ExportReport(BaseModel):
 def judge(
     system: System, interface: Interface, runs: Runs, precision: str = "double"
 ) -> ExportReport:
-    """Return the report on ``system`` in double and float, compiled, over ``runs``.
+    """Return the report on ``system``, compiled in double and float, over ``runs``.
 
-    For the ``precision`` "float" the report chooses "compensated" if float costs more
-    than ``WORST_PERCENT`` of the error under a reference.
+    If ``precision`` is "float" and float costs more than ``WORST_PERCENT`` of the error
+    under a reference, ``written`` is "compensated".
     """
     report = ExportReport(written=precision)
     try:

@@ -18,7 +18,7 @@ from .slots import Interface, slots
 SUBJECT = "Model linearised at rest"
 
 LINES = 500
-"""Number of frequencies of the response beside a model."""
+"""Number of frequencies of the exported frequency response."""
 
 
 def write_linear(
@@ -31,11 +31,12 @@ def write_linear(
 ) -> list[Path]:
     """Write ``system``, linearised at rest, to the new ``folder``; return the path.
 
-    The operating point is that of ``interface``: at rest in the middle of the
-    references and of the voltages. ``to`` is "mat", a file of MATLAB that SciPy reads
-    too, or "octave", a function of MATLAB and Octave that returns the model. Both hold
-    A, B, C, D, the sampling time, the names of inputs and outputs, and the frequency
-    response from 1/10 000 of the sampling rate up to half of it.
+    The operating point is that of ``interface``: the state at rest under its ``start``,
+    and its ``input``. ``to`` is "mat", a MATLAB file that SciPy also reads, or
+    "octave", a function for MATLAB and Octave that returns the model. Both hold A, B,
+    C, D, the sampling time, and the names of inputs and outputs. The MATLAB file also
+    holds the frequency response [outputs, inputs, frequencies] from 1/10 000 of the
+    sampling rate up to half of it.
 
     Raises ValueError for a ``folder`` in use, and if neither ``about`` nor the parts of
     the system name a sampling rate.
@@ -74,7 +75,7 @@ def to_control(model: StateSpace) -> Any:
 
 
 def from_control(system: Any) -> StateSpace:
-    """Return a discrete-time linear ``system`` of python-control.
+    """Return a discrete-time linear ``system`` of python-control as a StateSpace.
 
     Raises ValueError for a system in continuous time or without a sampling time.
     """
@@ -97,7 +98,7 @@ def _mat(
     response: np.ndarray,
     origin: str,
 ) -> bytes:
-    """Return a file of MATLAB with model, response and ``origin``."""
+    """Return the bytes of a MATLAB file with model, response and ``origin``."""
     from scipy.io import savemat
 
     buffer = io.BytesIO()
@@ -108,7 +109,7 @@ def _mat(
         "inputs": np.array(inputs, dtype=object),
         "outputs": np.array(outputs, dtype=object),
         "frequency_Hz": frequency,
-        "response": response.transpose(1, 2, 0),  # as freqresp of MATLAB
+        "response": response.transpose(1, 2, 0),  # axes as in freqresp of MATLAB
     }
     savemat(buffer, content)
     return buffer.getvalue()
@@ -121,7 +122,7 @@ def _function(
     name: str,
     about: About,
 ) -> str:
-    """Return a function of MATLAB and Octave that returns the model."""
+    """Return the text of a function for MATLAB and Octave that returns the model."""
     head = about.origin(f"{name.upper()}  {SUBJECT}")
     alarms = len(about.unsafe)
     lines = [

@@ -1,4 +1,4 @@
-"""Long arrays that stay arrays in C, such as stored periods and trials."""
+"""Long arrays that remain arrays in C, such as stored periods and trials."""
 
 import math
 from typing import Any, NamedTuple
@@ -8,20 +8,19 @@ import numpy as np
 from .graph import INPUT, Graph
 
 Numbers = np.ndarray
-"""Array of the numbers of nodes, with the shape of the traced array."""
+"""Array of node numbers, with the shape of the traced array."""
 
 
 class NotScalarError(ValueError):
-    """The function has an operation that is not one of scalars."""
+    """The traced function has an operation without a scalar form."""
 
 
 class Memory(NamedTuple):
-    """A long array, of which single elements are read and written.
+    """A long array, or a slice of one, with access to single elements.
 
-    ``place`` is that of its first element among the inputs. ``writes`` are the elements
-    that have changed since, as pairs of the nodes of index and value. ``offset`` is the
-    node of the index of the first element in the stored array, which is flat, if this
-    is a part of it.
+    ``place`` is the place of the first element of the stored array among the inputs.
+    ``writes`` are the elements changed since, as pairs of index node and value node.
+    For a slice, ``offset`` is the node of the flat index of its first element.
     """
 
     place: int
@@ -37,22 +36,22 @@ class Memory(NamedTuple):
     def elements(self, graph: Graph) -> Numbers:
         """Return the nodes of the elements.
 
-        Raises NotScalarError after a write, and for a part at a computed place.
+        Raises NotScalarError after a write, and for a slice.
         """
         if self.writes or self.offset is not None:
-            raise NotScalarError("it uses a long array as a whole after a change")
+            raise NotScalarError("it uses a whole long array after a write or slice")
         places = range(self.place, self.place + self.size)
         nodes = [graph.add(INPUT, (), "real", place) for place in places]
         return np.array(nodes, int).reshape(self.shape)
 
     def window(self, sizes: tuple[int, ...]) -> bool:
-        """Return whether a slice of ``sizes`` is one stretch of the stored array."""
+        """Return whether a slice of ``sizes`` is contiguous in the stored array."""
         ones = next((i for i, size in enumerate(sizes) if size != 1), len(sizes))
         return tuple(sizes[ones + 1 :]) == self.shape[ones + 1 :]
 
 
 def whole_index(equation: Any, axes: int) -> bool:
-    """Return whether a scatter writes one element by an index for each axis."""
+    """Return whether a scatter writes one element, with one index per axis."""
     numbers = equation.params["dimension_numbers"]
     every = tuple(range(axes))
     return (

@@ -1,4 +1,4 @@
-"""Arrays of the nodes of a graph, and their arithmetic."""
+"""Arithmetic of arrays of graph nodes."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from .simplify import Simplifier
 def kind_of(dtype: Any) -> Kind:
     """Return the kind of the scalars of ``dtype``.
 
-    Raises NotScalarError for complex numbers and all others that C99 has not here.
+    Raises NotScalarError for complex numbers and other types that are not exported.
     """
     if np.issubdtype(dtype, np.bool_):
         return "boolean"
@@ -28,7 +28,7 @@ def kind_of(dtype: Any) -> Kind:
 class NodeArrays:
     """Arithmetic of arrays of nodes, which adds nodes to ``graph``.
 
-    ``source`` is the function that the next nodes come from.
+    ``source`` is the Python function that the next nodes come from.
     """
 
     def __init__(self, graph: Graph):
@@ -43,7 +43,7 @@ class NodeArrays:
         return np.array(plain, int).reshape(array.shape)
 
     def values(self, numbers: Numbers, dtype: Any) -> np.ndarray | None:
-        """Return the values of constants, or None if one is computed."""
+        """Return the values of the nodes, or None unless all are constants."""
         nodes = [self.graph.nodes[number] for number in numbers.ravel()]
         if any(node.operation != CONSTANT for node in nodes):
             return None
@@ -52,7 +52,7 @@ class NodeArrays:
     def elementwise(
         self, name: str, operands: Sequence[Numbers], kind: Kind, value: Any = None
     ) -> Numbers:
-        """Return the nodes of an operation on each element; scalars are repeated."""
+        """Return the nodes of an elementwise operation; operands are broadcast."""
         arrays = np.broadcast_arrays(*operands)
         flat = zip(*(array.ravel() for array in arrays), strict=True)
         numbers = [
@@ -61,14 +61,14 @@ class NodeArrays:
         return np.array(numbers, int).reshape(arrays[0].shape)
 
     def scalar(self, name: str, operands: list[int], kind: Kind, value: Any) -> int:
-        """Return the node of an operation."""
+        """Return the node of a scalar operation."""
         return self._simplifier.add(name, operands, kind, value, self.source)
 
     def in_memory(self, equation: Any, operands: list[Any]) -> Numbers | Memory | None:
-        """Return the result of an equation that reads or writes one element.
+        """Return the result of an equation on a long array, or None.
 
-        Also of one that only reshapes a long array, or takes a stretch of it. None for
-        every other equation.
+        The equation may read or write one element, reshape the array, or take a
+        contiguous slice of it. The result of every other equation is None.
         """
         name, (memory, *others) = equation.primitive.name, operands
         shape = equation.outvars[0].aval.shape
@@ -100,7 +100,7 @@ class NodeArrays:
     def _flat_index(
         self, memory: Memory, indices: Sequence[int], last: Any = None
     ) -> int:
-        """Return the index in the stored array; ``last`` are limits of each axis."""
+        """Return the node of the flat index; ``last`` limits the index of each axis."""
         parts = [] if memory.offset is None else [memory.offset]
         for axis, index in enumerate(indices):
             if last is not None:
@@ -125,9 +125,9 @@ class NodeArrays:
         return found
 
     def at_computed_place(self, name: str, operands: list[Numbers]) -> Numbers:
-        """Return one element read, or the array with one element written.
+        """Return one element at a computed index, or the array with it written.
 
-        Every element is compared with the place, which suits short arrays.
+        The index is compared with that of every element, which suits short arrays.
         """
         array, index, *written = operands
         single = array.ndim == 1 and index.size == 1
@@ -147,7 +147,7 @@ class NodeArrays:
                     new = self.elementwise("add", [old, value], self.kind(old))
                 rows.append(self._chosen(index.ravel(), k, old, new))
             return np.concatenate(rows)
-        raise NotScalarError(f"it uses an array at a computed place ({name})")
+        raise NotScalarError(f"it uses an array at a computed index ({name})")
 
     def _chosen(
         self, place: Numbers, k: int, other: Numbers, value: Numbers
@@ -156,7 +156,7 @@ class NodeArrays:
         return self.elementwise("select_n", [here, other, value], self.kind(value))
 
     def reduced(self, name: str, operand: Numbers, axes: Sequence[int]) -> Numbers:
-        """Return the nodes of an operation repeated along ``axes``, the first first."""
+        """Return the nodes of a reduction along ``axes``, from the first element on."""
         kept = [axis for axis in range(operand.ndim) if axis not in axes]
         shape = [operand.shape[axis] for axis in kept]
         rows = operand.transpose([*axes, *kept]).reshape(-1, *shape)

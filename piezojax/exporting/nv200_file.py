@@ -1,4 +1,4 @@
-"""Parameter file of the NV200, which PiSoWorks and the library nv200 1.6.0 load."""
+"""Parameter file of the NV200, for PiSoWorks and the library nv200 1.6.0."""
 
 import configparser
 import io
@@ -13,10 +13,10 @@ FIELDS = (
     *("notchf", "notchb", "setlpf", "poslpf", "sr", "kp", "ki", "kd"),
     *("pcf", "setlpon", "poslpon", "notchon"),
 )
-"""Keys in the order of writing: frequencies before widths, gains before switches."""
+"""Keys in the order of the file: frequencies before widths, gains before switches."""
 
 FEEDFORWARD = {"pcf_x": 1.0, "pcf_v": 1e4, "pcf_a": 1e4}
-"""Largest values of ``pcf``: that of the manual, and those of PiSoWorks."""
+"""Largest values of ``pcf``: the first from the manual, the others from PiSoWorks."""
 
 SWITCHES = ("setlpon", "poslpon", "notchon")
 
@@ -41,13 +41,14 @@ def _notes(device: NV200, saved: Mapping[str, str]) -> list[str]:
         f"Scale of the gains: {scale:.6g} V/um for 1, as entered in the study."
         if scale
         else "Scale of the gains: ASSUMED from the ranges; measure it first.",
-        "Not in the manual, as simulated: "
+        "Options that the manual does not specify, as simulated: "
         f"integration {device.integration}, anti-windup {device.anti_windup}, "
         f"filter of the setpoint {device.setpoint_filter}, "
         f"depth of the notch {float(device.notch_depth):.6g}.",
-        "Open the loop (cl,0), load, read all values back and compare; then close it.",
+        "Open the loop (cl,0), load the file, read all values back and compare them. "
+        "Then close the loop.",
         "Loading overwrites the memory of the actuator: keep a backup.",
-        "Library nv200 1.6.0: DeviceParamFile.read, then restore_parameters.",
+        "In the library nv200 1.6.0: DeviceParamFile.read, then restore_parameters.",
         *([f"PiSoWorks may load 0 as on: check {', '.join(off)}."] if off else []),
         *(
             ["PiSoWorks cuts pcf to whole numbers: send pcf as a command."]

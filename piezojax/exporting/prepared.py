@@ -1,4 +1,4 @@
-"""Numbers of a step that depend on parameters alone, which are computed beforehand."""
+"""Nodes of a step that depend on parameters alone and are computed in advance."""
 
 from collections.abc import Sequence
 
@@ -6,10 +6,10 @@ from .graph import CARRY, CONSTANT, INPUT, READ, RESULT, Graph
 
 
 def prepared_nodes(graph: Graph, outputs: Sequence[int], parameters: int) -> list[int]:
-    """Return the nodes to compute beforehand, of which ``outputs`` make use.
+    """Return the nodes to compute in advance, from which ``outputs`` are computed.
 
-    They depend on the first ``parameters`` inputs alone, and the step computes nothing
-    else that does, except within loops.
+    They depend on the first ``parameters`` inputs alone. The step computes no other
+    such node, except inside loops.
     """
     varying = varying_nodes(graph, parameters)
     fixed = {
@@ -23,7 +23,7 @@ def prepared_nodes(graph: Graph, outputs: Sequence[int], parameters: int) -> lis
 
 
 def varying_nodes(graph: Graph, parameters: int) -> set[int]:
-    """Return the nodes that change while the first ``parameters`` inputs do not."""
+    """Return the nodes that may change while the first ``parameters`` inputs do not."""
     loops = {
         number: (loop.condition, loop.first[place], loop.last[place])
         for loop in graph.loops

@@ -1,4 +1,4 @@
-"""Products of a signal and parameters, rewritten to take one multiplication."""
+"""Rewriting of products of a signal and parameters as one multiplication."""
 
 from .graph import CONSTANT, Graph
 from .prepared import varying_nodes
@@ -7,16 +7,16 @@ SHARP = {
     *("floor", "ceil", "round", "sign", "rem", "convert_element_type"),
     *("eq", "ne", "lt", "le", "gt", "ge"),
 }
-"""Operations whose result a rounding error of an operand may change by a step."""
+"""Discontinuous operations: a rounding error of an operand may cause a jump."""
 
 
 def shorten_products(graph: Graph, parameters: int) -> None:
     """Rewrite products of a signal x with numbers that depend on parameters alone.
 
     The first ``parameters`` inputs are parameters. With such numbers p and q, x / p
-    becomes x * (1 / p), and x * p * q becomes x * (p * q). A step then waits for fewer
-    operations, with fewer divisions. The results differ by rounding errors; operands
-    of ``SHARP`` remain as they are.
+    becomes x * (1 / p), and x * p * q becomes x * (p * q). A step then has a shorter
+    chain of operations and fewer divisions. The results differ by rounding errors; the
+    operands of ``SHARP`` operations are not rewritten.
     """
     _Products(graph, parameters).rewrite()
 
@@ -32,7 +32,7 @@ class _Products:
             for operand in node.operands
         }
         self.products: dict[int, tuple[int, int]] = {}
-        """Signal and factor of a node."""
+        """Signal and factor of each product, by node."""
 
     def rewrite(self) -> None:
         for number in range(len(self.graph.nodes)):
@@ -49,7 +49,7 @@ class _Products:
         return number not in self.varying and self.graph.levels[number] == 0
 
     def _product(self, number: int) -> tuple[int, int] | None:
-        """Return signal and factor of a node, or None if it is no such product."""
+        """Return signal and factor of a node, or None if it is not such a product."""
         node = self.graph.nodes[number]
         if node.kind != "real" or number not in self.varying:
             return None
@@ -73,7 +73,7 @@ class _Products:
         return self._added("div", (self.graph.constant(1.0, "real"), number))
 
     def _times(self, one: int, other: int) -> int:
-        """Return the node of the product of two numbers, computed if it is constant."""
+        """Return the node of a product of two nodes; constants are multiplied here."""
         a, b = self._value(one), self._value(other)
         if a is not None and b is not None:
             return self.graph.constant(a * b, "real")

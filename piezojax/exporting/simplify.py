@@ -1,4 +1,4 @@
-"""Simplifications of an operation when it enters a graph."""
+"""Simplification of operations as they are added to a graph."""
 
 from typing import Any
 
@@ -6,22 +6,22 @@ from .graph import CONSTANT, Graph, Kind
 
 
 class Simplifier:
-    """Adds operations to ``graph`` that compute the same in fewer steps.
+    """Builder that adds simplified operations to ``graph``.
 
-    A neutral operand, as 0 in a sum, adds no operation. A product with the sign of x
-    and with x has the absolute value of x instead: the sign of a noisy signal is a
-    branch that no processor predicts.
+    An operation with a neutral operand, such as 0 in a sum, is left out. The product of
+    x and the sign of x becomes the absolute value of x, because the sign of a noisy
+    signal is a branch that processors cannot predict.
     """
 
     def __init__(self, graph: Graph):
         self.graph = graph
         self._signs: dict[int, tuple[int, int]] = {}
-        """x and p of a node that is p for x >= 0, and -p otherwise."""
+        """x and p of each node that is p for x >= 0, and -p otherwise."""
 
     def add(
         self, name: str, operands: list[int], kind: Kind, value: Any, source: str
     ) -> int:
-        """Return the node of an operation."""
+        """Return the node of an operation, simplified if possible."""
         neutral = self._neutral(name, operands, kind)
         if neutral is not None:
             return neutral
@@ -33,7 +33,7 @@ class Simplifier:
         return number
 
     def _neutral(self, name: str, operands: list[int], kind: Kind) -> int | None:
-        """Return the operand that the operation returns, or None."""
+        """Return the operand that equals the result, or None."""
         known = [self._constant(number) for number in operands]
         if name == "convert_element_type":
             return operands[0] if self.graph.nodes[operands[0]].kind == kind else None
@@ -74,6 +74,6 @@ class Simplifier:
             self._signs[number] = x, operands[2]
 
     def _constant(self, number: int) -> Any:
-        """Return the value of a constant, None for every other node."""
+        """Return the value of a constant, or None for every other node."""
         node = self.graph.nodes[number]
         return node.value if node.operation == CONSTANT else None

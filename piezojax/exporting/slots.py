@@ -1,4 +1,4 @@
-"""Fields and arguments of C: the scalars of a tree, by name."""
+"""Struct fields and function arguments in C, one for each leaf of a pytree."""
 
 import math
 import re
@@ -16,7 +16,7 @@ PREPARED = "prepared"
 
 
 class Slot(NamedTuple):
-    """A scalar of a tree: its path, its name in C, and its type."""
+    """A leaf of a pytree: its path, its name in C, its dtype, and its element count."""
 
     path: str
     name: str
@@ -25,10 +25,10 @@ class Slot(NamedTuple):
 
 
 class Interface(NamedTuple):
-    """Signals of an exported System.
+    """Example signals of an exported System.
 
-    ``start`` is an example of the input of ``init``, ``input`` one of ``step``. The
-    function ``step`` has an argument for each leaf, named by its path.
+    ``start`` is an input of ``init``, and ``input`` an input of ``step``. Both C
+    functions have one argument for each leaf, named by its path.
     """
 
     start: Any
@@ -36,9 +36,9 @@ class Interface(NamedTuple):
 
 
 def slots(tree: Any, word: str) -> list[Slot]:
-    """Return the leaves of ``tree``, an array as one slot of its size.
+    """Return a slot for each leaf of ``tree``; an array is one slot.
 
-    ``word`` begins a name that has no letter of its own.
+    ``word`` is the prefix of a name that is empty or begins with a digit.
     """
     found, taken = [], {PREPARED}
     for keys, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
@@ -56,7 +56,7 @@ def slots(tree: Any, word: str) -> list[Slot]:
 
 
 def expressions(slots: Sequence[Slot], start: str) -> list[str]:
-    """Return the expression of every scalar of ``slots`` behind ``start``."""
+    """Return the C expression of each element of ``slots``, with prefix ``start``."""
     return [
         f"{start}{slot.name}" if slot.size == 1 else f"{start}{slot.name}[{i}]"
         for slot in slots
@@ -65,7 +65,7 @@ def expressions(slots: Sequence[Slot], start: str) -> list[str]:
 
 
 def type_of(dtype: Any, precision: Precision) -> str:
-    """Return the type in C of scalars of ``dtype``."""
+    """Return the C type of scalars of ``dtype``."""
     if np.issubdtype(dtype, np.bool_):
         return TYPES["boolean"]
     if np.issubdtype(dtype, np.integer):

@@ -40,15 +40,16 @@ def _notes(device: Stabilizer, saved: Mapping[str, str]) -> list[str]:
     gains = ", ".join(f"{name} {float(getattr(device, name)):.9g}" for name in names)
     return [
         "y = b0 x + b1 x1 + b2 x2 - a1 y1 - a2 y2 with a0 = 1: a1 and a2 have the "
-        "signs of textbooks; x is the input, y the output, x1 and y1 those of the last "
-        "sample.",
-        "Firmware with repr (idsp 0.20 or later). The array ba = [b0,b1,b2,a1,a2] of "
-        "v0.11 has these signs; v0.8 and v0.9 add a1 y1 and a2 y2: change both signs.",
-        f"These are the gains of typ Pid with order I: {gains}.",
+        "signs of textbooks; x is the input and y the output; x1, y1 are one sample "
+        "old, x2, y2 two samples.",
+        "This file needs firmware with repr (idsp 0.20 or later). The array "
+        "ba = [b0,b1,b2,a1,a2] of v0.11 has the same signs; v0.8 and v0.9 add a1 y1 "
+        "and a2 y2: change both signs.",
+        f"The same biquad as typ Pid with order I: {gains}.",
         "Set the field u (offset in later versions) to -(b0 + b1 + b2) times the set "
         "point in V; it is not in this file.",
-        "Channel 0, biquad 0: change the paths for others. Send each line with "
-        "python -m miniconf -b mqtt -d dt/sinara/dual-iir/+ and read it back.",
+        "The paths name channel 0 and biquad 0: change them for others. Send each line "
+        "with python -m miniconf -b mqtt -d dt/sinara/dual-iir/+ and read it back.",
     ]
 
 

@@ -1,7 +1,7 @@
-"""Tracing: the scalar operations of a function of JAX.
+"""Tracing of a JAX function into a graph of scalar operations.
 
-JAX traces the function; every array of the trace becomes a NumPy array with the numbers
-of its nodes. Operations that only move elements act on these numbers.
+JAX traces the function. Every array of the trace becomes a NumPy array of node numbers.
+Operations that only move elements act on these numbers.
 """
 
 import math
@@ -26,7 +26,7 @@ ELEMENTWISE = {
     "max", "min", "mul", "ne", "neg", "not", "or", "pow", "rem", "round", "rsqrt",
     "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan", "tanh", "xor",
 }  # fmt: skip
-"""Operations of C, element by element."""
+"""Elementwise operations that C can compute."""
 
 MOVES = {
     **dict.fromkeys(("broadcast_in_dim", "concatenate", "expand_dims", "pad"), ()),
@@ -38,10 +38,10 @@ MOVES = {
     "scatter": (1,),
     "scatter-add": (1,),
 }
-"""Operations that move elements, with the places of those operands that are indices."""
+"""Operations that move elements, with the positions of their index operands."""
 
 CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
-"""Parameters that hold the function of a call."""
+"""Parameters of an equation that hold the jaxpr of a call."""
 
 FOLDS = {
     "reduce_sum": "add",
@@ -59,27 +59,27 @@ SAME = (
     *("copy", "copy_p", "nonbatchable", "nontraceable"),
     *("optimization_barrier", "stop_gradient"),
 )
-"""Operations that change nothing."""
+"""Operations that return their operands."""
 
 ALIASES = {"add_any": "add"}
 """Operations under a second name."""
 
 LONG = 256
-"""Least length of an array that stays an array."""
+"""Smallest size of a real input that remains an array in C."""
 
 MOST = 15_000
-"""Largest number of operations of a graph: compilers of C take minutes for more."""
+"""Largest number of nodes of a graph; C compilers take minutes for more."""
 
 
 def trace(function: Callable, *arguments: Any) -> tuple[Graph, list[Any]]:
     """Return the graph of ``function`` and the nodes of its outputs, leaf by leaf.
 
-    Inputs are numbered through all elements of the leaves of ``arguments``. Raises
-    NotScalarError for an operation that has no scalar form.
+    The place of an input is its index among all elements of the leaves of
+    ``arguments``. Raises NotScalarError for an operation that has no scalar form.
     """
     closed: Any = jax.make_jaxpr(function)(*arguments)
-    # Solvers bind operations of Equinox that have no form but their implementation, by
-    # which it cannot replace those within a derivative.
+    # Solvers use primitives of Equinox that exist only as Python implementations.
+    # Equinox replaces them here, but raises TypeError for some inside a derivative.
     with suppress(TypeError):
         closed = eqxi.finalise_jaxpr(closed)
     tracer = _Tracer()
@@ -185,7 +185,7 @@ class _Tracer:
         return [self.arrays.constants(each) for each in _bound(equation, known)]
 
     def moved(self, equation: Any, operands: list[Numbers]) -> list[Numbers]:
-        """Return the numbers that an operation without arithmetic moves."""
+        """Return the node numbers after an operation that only moves elements."""
         name, arrays = equation.primitive.name, []
         for place, (numbers, atom) in enumerate(
             zip(operands, equation.invars, strict=True)
@@ -197,7 +197,7 @@ class _Tracer:
             arrays.append(array)
         found = _bound(equation, arrays)
         if any(((each < 0) | (each >= len(self.graph.nodes))).any() for each in found):
-            raise NotScalarError(f"its {name} leaves the array")
+            raise NotScalarError(f"its {name} reads outside the array")
         return found
 
     def cond(self, branches: Any, operands: list[Numbers]) -> list[Numbers]:
@@ -223,7 +223,7 @@ class _Tracer:
         return found
 
     def scan(self, params: Any, operands: list[Numbers]) -> list[Numbers]:
-        """Return the results of a loop of known length, which is unrolled."""
+        """Return the results of a scan, which is unrolled."""
         consts, count = params["num_consts"], params["num_carry"]
         shared, carry = operands[:consts], operands[consts : consts + count]
         rows = operands[consts + count :]
@@ -240,7 +240,7 @@ class _Tracer:
         return [*carry, *(np.stack(each) for each in zip(*collected, strict=True))]
 
     def while_loop(self, params: Any, operands: list[Numbers]) -> list[Numbers]:
-        """Return the results of a loop that stays a loop."""
+        """Return the results of a while loop, which remains a loop in C."""
         heads, bodies = params["cond_nconsts"], params["body_nconsts"]
         of_head, of_body = operands[:heads], operands[heads : heads + bodies]
         first = operands[heads + bodies :]
@@ -273,7 +273,7 @@ def _flat(arrays: Sequence[Numbers]) -> list[int]:
 
 
 def _like(arrays: Sequence[Numbers], flat: Sequence[int]) -> list[Numbers]:
-    """Return the numbers ``flat`` in arrays of the shapes of ``arrays``."""
+    """Return the numbers ``flat`` as arrays with the shapes of ``arrays``."""
     rest = iter(flat)
     return [
         np.array([next(rest) for _ in range(array.size)], int).reshape(array.shape)
@@ -282,7 +282,7 @@ def _like(arrays: Sequence[Numbers], flat: Sequence[int]) -> list[Numbers]:
 
 
 def _bound(equation: Any, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the results of an equation for the values or numbers ``arrays``."""
+    """Return the results of an equation on ``arrays`` of values or node numbers."""
     results = equation.primitive.bind(
         *(jax.numpy.asarray(array) for array in arrays), **equation.params
     )
@@ -297,7 +297,7 @@ def _source_of(equation: Any) -> str:
         return ""
     for frame in traceback.frames:
         path = Path(frame.file_name)
-        # Functions without a name are part of the one that holds them.
+        # A nested function or lambda has the name of the function that encloses it.
         name = frame.function_name.partition(".<")[0]
         own = "piezojax" in path.parts and "exporting" not in path.parts
         if own and name[0] != "<":

@@ -1,4 +1,4 @@
-"""Parameters of a controller as the file of its vendor, compared with a saved one."""
+"""Parameter file of a vendor's controller, compared with a saved file."""
 
 import csv
 import dataclasses
@@ -21,14 +21,14 @@ FILES: dict[type[System], DeviceFile] = {
     NV200: NV200_FILE,
     Stabilizer: STABILIZER_FILE,
 }
-"""Files of devices by the class of the controller."""
+"""File formats of devices, by class of the controller."""
 
 
 def device_values(system: System, before: Path | None = None) -> list[Value]:
     """Return the values of a device, with those of its saved file ``before``.
 
-    Raises ValueError for a System without a file of a vendor, a value out of the range
-    of the device, and a saved file of another kind.
+    Raises ValueError for a System without a vendor's file, a value out of the range of
+    the device, and a saved file of another kind.
     """
     return _values(system, _saved(system, before)[1])
 
@@ -46,7 +46,7 @@ def write_vendor(
     """Write the file of a device and a table to the new ``folder``; return the paths.
 
     The saved file ``before`` is copied beside them. Raises ValueError for a ``folder``
-    in use and as ``device_values`` does.
+    in use, and in the cases of ``device_values``.
     """
     file, (content, saved) = _file_of(system), _saved(system, before)
     values = _values(system, saved)
@@ -79,12 +79,12 @@ def _file_of(system: System) -> DeviceFile:
 
 
 def _rounded(system: Any) -> Any:
-    """Return a device with the values that it takes, checked by its constructor."""
+    """Return a device with rounded parameters, which its constructor checks."""
     return dataclasses.replace(system).typed()
 
 
 def _saved(system: System, before: Path | None) -> tuple[str, dict[str, str]]:
-    """Return text, and keys with values, of a saved file, both empty without one."""
+    """Return text, and values by key, of a saved file; both are empty without one."""
     if before is None:
         return "", {}
     try:

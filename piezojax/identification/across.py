@@ -1,7 +1,7 @@
 """Errors of a model on records that its fit left out, one record at a time.
 
-A part of the same record holds the same excitation as the part that was fitted, and may
-rank models the wrong way round. Another record does not.
+A part of the same record holds the same excitation as the part that was fitted, so its
+errors may rank models wrongly. Another record has its own excitation.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,10 +19,10 @@ FitTo = Callable[[tuple[Record, ...], slice], Fit]
 def errors_across(
     records: Sequence[Record], fit_to: FitTo
 ) -> tuple[np.ndarray, ...] | None:
-    """Return the errors [samples, p] on each of ``records``, left out of a fit.
+    """Return the errors [samples, p] on each of ``records``, after a fit to the others.
 
-    Each fit takes all samples of the other records. As in ``validate``, the state
-    before the record that was left out, and its zero, come from its first part, and the
+    Each fit takes all samples of the other records. As in ``validate``, the initial
+    state and the zero of the left-out record are estimated on its first part, and the
     errors are those over the rest. Returns None if a fit fails or a free run diverges:
     such a model does not hold on another record.
     """

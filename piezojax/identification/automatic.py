@@ -25,7 +25,7 @@ CREEP = "exponential_creep"
 """Creep of the default model."""
 
 CLEARLY = 0.8
-"""Share of the first model's error below which another one is chosen."""
+"""Ratio to the error of the first model below which another one is chosen."""
 
 LEAST, SAMPLES = 1000, 4000
 """Fewest samples from which a hysteresis is chosen, and fewest that a trial uses."""
@@ -45,9 +45,10 @@ def automatic(
 ) -> str:
     """Return the default chain for ``record``, the training samples.
 
-    The hysteresis is the one with the least error after short fits to ``record`` and
-    those ``beside`` it, which are made at a lower sampling rate if that resolves the
-    resonances. With ``dynamics``, which are held, the chain has no others.
+    The hysteresis is the first of ``HYSTERESES``, unless another one has a clearly
+    smaller error (``CLEARLY``) after short fits to ``record`` and those ``beside`` it.
+    The fits use a lower sampling rate if it resolves the resonances. With ``dynamics``,
+    which are held, the chain has no other dynamics.
     """
     hysteresis = hysteresis_for([record, *beside], progress, dynamics)
     return _chain_of(hysteresis, record, dynamics)
@@ -63,9 +64,9 @@ def hysteresis_for(
     progress: Progress | None = None,
     dynamics: HeldDynamics | None = None,
 ) -> str:
-    """Return the name of the hysteresis in ``HYSTERESES`` that describes them best.
+    """Return the name of the hysteresis in ``HYSTERESES`` that fits ``records`` best.
 
-    Dynamics, if they are not held, and bounds are those of the first record.
+    Bounds, and the dynamics if they are not held, are derived from the first record.
     """
     first, *others = HYSTERESES
     if records[0].samples < LEAST:
@@ -109,9 +110,9 @@ def _error(
 ) -> float:
     """Return the rms error after a short fit; with several records, after one to each.
 
-    The error of a fit to one of several is that on the others. It is infinite if there
-    is no fit, or if the fitted hysteresis has no inverse over the range of the input,
-    which designs of controllers need.
+    With several records, each fit is evaluated on the other records. The error is
+    infinite if a fit fails, or if the fitted hysteresis has no inverse over the range
+    of the input, because controllers need the inverse.
     """
     first = records[0]
     shape = structure(_chain_of(name, first, dynamics), first, dynamics)

@@ -38,8 +38,8 @@ CREEP = "exponential_creep"
 """The creep tried first: the most general one."""
 
 DYNAMICS = ("arma", "lag")
-"""Dynamics of a chain, richest first, of records that show no resonance; the last is
-tried on any of these."""
+"""Dynamics of a chain for records that show no resonance, richest first; the last is
+tried on all of these records."""
 
 
 LINEAR = "state_space"
@@ -123,7 +123,7 @@ def excitation(records: Sequence[Record], train: slice) -> int:
 def _too_few(found: int, needed: int) -> str:
     return (
         f"{found} {'frequency' if found == 1 else 'frequencies'} in the training part "
-        f"determine {2 * found} parameters of linear dynamics, and it has {needed}"
+        f"determine {2 * found} parameters of linear dynamics; the model has {needed}"
     )
 
 
@@ -183,9 +183,10 @@ def first_round(
 def later_rounds(
     records: Sequence[Record], train: slice
 ) -> list[Callable[[Sequence[str]], list[Candidate]]]:
-    """Return a function for each later round, from the best chains to its candidates.
+    """Return the later rounds, each a function of the best chains.
 
-    The first of these rounds replaces the creep, the second takes simpler dynamics.
+    The function returns the candidates of its round. The first of these rounds replaces
+    the creep, the second takes simpler dynamics.
     """
     if _not_single_channel(records):
         return []

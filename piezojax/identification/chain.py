@@ -31,7 +31,7 @@ OFFSET = "calibration.offset"
 """Parameter that stands for the zero of the sensor."""
 
 FRACTION = 0.2
-"""Shortest delay, in samples, for which a model with a mode has a delay."""
+"""Delay, in samples, above which a model with a mode has a part for it."""
 
 
 def chain(name: str) -> list[str]:
@@ -175,7 +175,7 @@ def structure(
         held = dynamics.at(record.dt)
         parts |= {place: Recipe(system, {}) for place, system in held.items()}
     reach = 2.0 * extent.span
-    # Without a hysteresis nothing else turns volts into the output's unit.
+    # A hysteresis converts volts to the unit of the output; without one this gain does.
     slope = extent.slope
     if "hysteresis" in parts:
         slope = -1.0 if falls else 1.0

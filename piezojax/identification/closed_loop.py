@@ -33,8 +33,8 @@ APPROACHES = {
     "model whitens the errors, biased towards -1 / controller if not; needs neither "
     "reference nor controller",
     "indirect": "free run of the whole loop from its excitation, with a known "
-    "controller; unbiased whatever the noise, as wrong as the controller, and blind to "
-    "limits of the voltage",
+    "controller; unbiased whatever the noise, as inaccurate as the controller; "
+    "ignores voltage limits",
     "joint": "prediction error from the part of the input that responds to the "
     "excitation; unbiased for long records whatever the noise; linear chains only",
 }
@@ -42,20 +42,21 @@ APPROACHES = {
 
 REPLAYED = 0.05
 """Error of the controller's voltage, as a share of the deviation of the recorded one,
-from which the controller is not the one of the loop."""
+above which the controller does not match that of the loop."""
 
 NOISY = 0.5
 """Share of noise in the input from which joint is noticeably biased."""
 
 WIDER = 4.0
-"""Factor on the bounds of the modes that a record shows. Narrow ones protect them from
-the errors of a hysteresis, as the noise model does here, and they are less certain."""
+"""Factor on the bounds of the modes that a record shows. In an open loop narrow bounds
+protect the modes from the errors of a hysteresis. Here the noise model protects them,
+and the modes that a record shows are less certain."""
 
 
 class LoopFit(NamedTuple):
-    """An optimum, the stage in its best System, and the bias of the approach in words.
+    """An optimum, the stage in its best System, and a ``text`` on the bias.
 
-    ``inside`` is the path of the stage in the fitted System, with its dot.
+    ``inside`` is the path of the stage in the fitted System, with a dot at its end.
     ``scatter_known`` tells whether the standard errors of the optimum hold.
     """
 
@@ -130,7 +131,7 @@ def loop_fit(
     if not found.warnings or not excited or hystereses(found.system):
         return found
     again = _joint(model, records, train, options, progress)
-    return again._replace(text=f"{again.text}; direct was not: {found.warnings[0]}")
+    return again._replace(text=f"{again.text}; direct rejected: {found.warnings[0]}")
 
 
 def _direct(
@@ -183,15 +184,15 @@ def _joint(
     warnings = []
     if max(share) > NOISY:
         warnings.append(
-            f"{excited:.2g} % of the input's power respond to the excitation: joint "
-            "keeps a share of the noise, and was biased by several percent on such "
-            "records; use a stronger excitation, direct or indirect"
+            f"only {excited:.2g} % of the input's power responds to the excitation: "
+            "joint keeps a share of the noise, and was biased by several percent on "
+            "such records; use a stronger excitation, direct or indirect"
         )
     text = (
         "joint, from the part of the input that responds to the excitation "
         f"({excited:.3g} % of its power); unbiased for a long record"
     )
-    # The scatter of the first stage is in no standard error of the second.
+    # The standard errors of the fit do not include the scatter of the projection.
     return LoopFit(optimum, optimum.system, shape, text, warnings, scatter_known=False)
 
 
@@ -232,8 +233,8 @@ def _indirect(
     if off > REPLAYED:
         warnings.append(
             "the controller does not explain the recorded voltage: it is "
-            f"{100.0 * off:.2g} % of its deviation away; gains, limits or timing are "
-            "others, and the indirect estimate is as wrong"
+            f"{100.0 * off:.2g} % of its deviation away; gains, limits or timing "
+            "differ, and the indirect estimate is as inaccurate"
         )
     text = (
         "indirect, free run of the whole loop; unbiased whatever the noise if the "
@@ -249,7 +250,7 @@ _FITS = {"direct": _direct, "indirect": _indirect, "joint": _joint}
 
 
 def _structure(model: str, record: Record) -> Structure:
-    """Return the chain with wide bounds, whose edges are then reported."""
+    """Return the chain with wide bounds; a parameter at a bound raises a warning."""
     return structure(model, record, reach=WIDER)._replace(whitening=())
 
 
@@ -260,7 +261,7 @@ def feedback_warnings(records: Sequence[Record], train: slice) -> list[str]:
         if (record.inputs.shape[1], record.outputs.shape[1]) != (1, 1):
             continue
         if record.closed_loop:
-            known = "its reference or dither says that it"
+            known = "its reference or dither shows that it"
         else:
             share = feedback_share(record.input[train], record.output[train])
             if share < SHARE:
@@ -289,7 +290,10 @@ def without_noise(record: Record) -> Record:
 
 
 def whiteness(problem: Problem, unit: np.ndarray) -> Correlation:
-    """Return the largest autocorrelation of the prediction errors of a record."""
+    """Return the largest autocorrelation of the prediction errors of all records.
+
+    It is the largest relative to its bound.
+    """
     errors = np.asarray(problem.whitened(problem.errors(as_array(unit))))
     tests = [
         autocorrelation(each[used > 0.0])

@@ -42,8 +42,8 @@ def identify_all(
 ) -> ModelRanking:
     """Fit every model that ``records`` support, and choose one by RULE.
 
-    Several records of one input and one output are chosen on by RULE_ACROSS: each
-    record in turn is left out of a fit and predicted by it.
+    For several records of one input and one output the rule is RULE_ACROSS: each record
+    in turn is left out of a fit and predicted by it.
 
     The first round fits each hysteresis (only the named ones, if any are named) with
     the richest creep and dynamics that the records support, a linear model, and the
@@ -66,7 +66,7 @@ def identify_all(
     first, untried = first_round(records, train, options, hysteresis)
     search = Search(records, train, validate, options, progress or Silent())
     if len(records) > 1 and single_channel(records):
-        # The choice must not see the test.
+        # The choice must not use the test part.
         search.left_out = tuple(
             record if test is None else record.until(test.start) for record in records
         )

@@ -37,10 +37,10 @@ class Criteria(NamedTuple):
 def correlation_time(signal: np.ndarray) -> float:
     """Return the number of samples of ``signal`` [n] per independent sample.
 
-    The integrated autocorrelation 1 + 2 sum rho_k (Bayley and Hammersley 1946, J. R.
-    Stat. Soc. Suppl. 8(2)), at least 1 and 1 for white noise. The sum ends at the first
-    pair of neighbouring lags whose sum is not positive (Geyer 1992, Stat. Sci. 7(4),
-    initial positive sequence), beyond which the estimate is noise.
+    It is the integrated autocorrelation 1 + 2 sum rho_k (Bayley and Hammersley 1946, J.
+    R. Stat. Soc. Suppl. 8(2)), at least 1, the value of white noise. The sum ends at
+    the first pair of neighbouring lags whose sum is not positive (Geyer 1992, Stat.
+    Sci. 7(4), initial positive sequence), beyond which the estimate is noise.
     """
     centred = np.asarray(signal, dtype=float) - np.mean(signal)
     n = centred.size
@@ -124,7 +124,7 @@ def first_equivalent(
     """Return for each fit the index of the first fit that is equivalent to it.
 
     Two forms of one model, such as stops and plays, have the same number of parameters
-    and the same free run, except for the points at which their descents ended. Fits are
+    and the same free run, up to small differences of their optima. Fits are
     equivalent if their runs differ by less than EQUIVALENT_RUN of the smaller rms error
     and their BIC by less than EQUIVALENT_BIC. No record distinguishes such fits, so the
     choice between them must not depend on rounding.

@@ -82,10 +82,11 @@ class Spectra(NamedTuple):
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted plant, its report, the records and the simulated outputs (their unit).
+    """A fitted plant, its report, the records and the simulated outputs.
 
-    ``system`` holds the input in force before the first record. ``count`` is the number
-    of fitted parameters. ``held`` are the dynamics that were not fitted, if any.
+    The outputs are in the units of the records. ``system`` stores the input at which
+    the first record begins. ``count`` is the number of fitted parameters. ``held`` are
+    the dynamics that were not fitted, if any.
     """
 
     system: System
@@ -170,8 +171,8 @@ class Fit:
     def _parameter_units(self) -> dict[str, str]:
         """Return the units of the parameters of the System, by path.
 
-        Parts declare V and um, which stand for the units of the record. With several
-        channels the parameters may be in any of their units: those are "".
+        Parts declare V and um, which stand for the units of the record. If its channels
+        have several units, that of a parameter is not known: it is "".
         """
         record = self.record
         sides = {"V": set(record.input_units), "um": set(record.output_units)}
@@ -218,8 +219,9 @@ def identify(
     ``method`` is a name in METHODS; left out, it is the first that can fit the model.
     The model is fitted over the samples ``train`` of each record (the first half of the
     longest if left out) and validated by its free run on ``validate`` (the rest if left
-    out); a record without samples there is only fitted. Each of several records has its
-    own zero and its own state before it. The records of the fit are the longest first.
+    out). A record without samples in ``validate`` is used for the fit only. Each of
+    several records has its own zero of the sensor and its own initial state.
+    ``Fit.records`` are sorted by length, the longest first.
     A record with a reference or dither, or an approach in ``options.closed_loop``, is
     fitted as one of a closed loop, which only ``output_error`` does without bias.
     Raises ValueError for an unknown model or method, an empty part, records of
@@ -352,7 +354,7 @@ def _fit_error(
 def _error_warnings(
     records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
 ) -> list[str]:
-    # In a closed loop a model explains the response to the excitation, and no noise.
+    # In a closed loop a model explains the response to the excitation, not the noise.
     errors, outputs = (
         np.concatenate([excited_columns(record, each)[part] for record, each in pairs])
         for pairs in (

@@ -28,14 +28,14 @@ CONTINUOUS = (Mode, Modes, FirstOrderLag, SecondOrderLag, FractionalDelay)
 """Parts whose parameters are those of continuous time: they suit any sample time."""
 
 DECADE = 10.0
-"""Ratio to the highest excited frequency of a record, within which its error tells that
-of the hysteresis at all higher frequencies."""
+"""Width of the band below the highest excited frequency of a record, as a ratio. The
+error in this band is taken for that of the hysteresis at all higher frequencies."""
 
 LEAST_GAIN, MOST_GAIN = 1.0 / 3.0, 1.5
-"""Gain for small motions over the slope of a record that a piezo may have."""
+"""Bounds for a piezo on the gain for small motions over the slope of a record."""
 
 LINEAR = 1e-6
-"""Largest relative error of a multiple of the output that counts as linear."""
+"""Largest relative deviation from f(a u) = a f(u) that counts as linear."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class HeldDynamics:
     def at(self, dt: float) -> dict[str, System]:
         """Return the parts at the sample time ``dt`` (s) of a record.
 
-        Raises ValueError for another sample time and parts that have only their own.
+        Raises ValueError for a part that exists only at another sample time.
         """
         if math.isclose(dt, self.dt, rel_tol=1e-9):
             return dict(self.parts)
@@ -131,9 +131,10 @@ class HeldDynamics:
 def held_dynamics(system: System, about: About, source: str) -> HeldDynamics:
     """Return the linear dynamics of a saved ``system``.
 
-    Of a series they are the parts behind its last hysteresis or creep, without gains
+    In a series they are the parts behind its last hysteresis or creep, without gains
     and offsets. A static gain other than 1 is divided out. Raises ValueError if there
-    are none, or if they are not linear, of several signals, or of no sample time.
+    are none, if they are nonlinear, diverge or have several inputs or outputs, for a
+    static gain of 0, and if the sample time is not known.
     """
     nonlinear = bool(hystereses(system))
     if isinstance(system, Series):
@@ -188,7 +189,7 @@ def _check_linear(tail: System, source: str) -> None:
 
 
 def bound_text(bound: ErrorBound | None, dt: float) -> str:
-    """Return a line on the ``bound`` of a plant of the sample time ``dt`` (s)."""
+    """Return a text on the ``bound`` of a plant with the sample time ``dt`` (s)."""
     rate = f"the plant runs at {1.0 / dt:.6g} Hz"
     if bound is None:
         return f"{rate}; the record does not bound its error"
@@ -203,11 +204,11 @@ def bound_text(bound: ErrorBound | None, dt: float) -> str:
 def combined_bound(
     slow: ErrorBound | None, fast: ErrorBound | None, dt: float
 ) -> ErrorBound | None:
-    """Return the bound of a plant of which two records show two parts.
+    """Return the bound of a plant that was identified from two records.
 
     ``slow`` is that of the whole plant on the record of hysteresis and creep, ``fast``
-    that of the dynamics that were held. At lines that the slow record excites its bound
-    counts. Elsewhere hysteresis and dynamics may both be wrong: the error of the
+    that of the dynamics that were held. At lines that the slow record excites, its
+    bound holds. Elsewhere hysteresis and dynamics may both be wrong: the error of the
     hysteresis is the least bound in the highest decade of the slow record, because it
     is one factor at all higher frequencies. The sample time of the plant is ``dt`` (s).
     None if the slow record has no bound or excites nothing.

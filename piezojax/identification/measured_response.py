@@ -1,4 +1,4 @@
-"""Frequency responses from records over time, by amplitude of the input."""
+"""Frequency responses from time-domain records, by amplitude of the input."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,15 +17,15 @@ ALIKE = 1.1
 """Ratio of rms amplitudes up to which records count as of one amplitude."""
 
 HIGHEST = 0.8
-"""Share of half the rate below which the response to a held input is kept: above it,
-the images of each frequency are as large as itself."""
+"""Share of half the rate below which the response to a held input is kept: near half
+the rate the image of a component is as large as the component itself."""
 
 CERTAIN = 3.0
 """Standard errors by which the total variance must exceed the noise."""
 
 RESPONSE_METHODS = {
-    "welch": "averaged spectra of any record, with coherence; leakage is not in the "
-    "band",
+    "welch": "averaged spectra of any record, with coherence; its band does not "
+    "include leakage",
     "local_polynomial": "any record, or periodic with a transient; no leakage",
     "robust": "periods of multisines in steady state; several realisations tell "
     "nonlinear distortion from noise",
@@ -56,8 +56,8 @@ class Measurement(BaseModel):
     ``band_percent`` is half the 95 % band of the magnitude, ``noise_percent`` the
     deviation due to noise and ``distortion_percent`` that of the nonlinear distortion
     of one realisation, each relative to the magnitude, the median over the lines; None
-    where it cannot be told. ``resolution_Hz`` is the width of the band from which a
-    line was estimated, 0 for a line by itself. ``coherence`` is the median.
+    where it is not known. ``resolution_Hz`` is the width of the band from which a line
+    was estimated, 0 for a line by itself. ``coherence`` is the median over the lines.
     """
 
     method: str
@@ -81,10 +81,10 @@ def measure_responses(
 ) -> list[tuple[FrequencyResponse, Measurement]]:
     """Return the response at each amplitude of the ``records``, the lowest first.
 
-    Records whose inputs have one rms amplitude are realisations of one response: they
-    are averaged. Two or more periodic ones tell nonlinear distortion from noise. Raises
-    ValueError for an unknown method, records of several inputs or outputs or of
-    different sample times, units or periods, and as the methods do.
+    Records with the same rms amplitude of the input (``ALIKE``) are realisations of one
+    response: they are averaged. Two or more periodic ones separate nonlinear distortion
+    from noise. Raises ValueError for an unknown method, records of several inputs or
+    outputs or of different sample times, units or periods, and as the methods do.
     """
     if settings.method not in RESPONSE_METHODS:
         raise ValueError(
@@ -192,7 +192,7 @@ def _by_welch(
         spectral_response(r.input, r.output, r.dt, segment=size, least=1e-4)
         for r in records
     ]
-    # The variance of a regression with one unknown: over one average less.
+    # Variance of a regression with one unknown: divide by one average less.
     estimates = [
         LineEstimates(
             one.frequency,
@@ -246,8 +246,8 @@ def _periodic(
             each.append(periodic_local_polynomial(*signals))
     if len(each) == 1:
         notes.append(
-            "one realisation: the band holds the noise, and no nonlinear distortion; "
-            "repeat it with other random phases"
+            "one realisation: the band includes the noise but no nonlinear distortion; "
+            "repeat the measurement with other random phases"
         )
         return _averaged(each, properties)
     found = robust_response(each)
@@ -302,8 +302,8 @@ def _measurement(
 def distortion_level(found: FrequencyResponse) -> np.ndarray | None:
     """Return the deviation [lines] of the distortion of a realisation, smoothed.
 
-    None if it was not told apart, or if the total variance does not exceed that of the
-    noise with certainty.
+    None if it was not separated from the noise, or if the total variance does not
+    exceed that of the noise by ``CERTAIN`` standard errors.
     """
     distortion, noise, total = found.distortion, found.noise, found.variance
     if distortion is None or noise is None or total is None:

@@ -121,12 +121,12 @@ def _optimum_warnings(
 
 
 def _by_regression(estimator: Callable) -> Callable[..., Estimate]:
-    """Return the method that fits the model (3.32) by ``estimator``."""
+    """Return the method that fits ``HystereticARMA``, (3.32), by ``estimator``."""
 
     def estimate(model, records, train, options, progress) -> Estimate:
         del model, options
         record = _single(records)
-        progress.stage("searching for the c of the hysteresis")
+        progress.stage("searching for the parameter c of the hysteresis")
         found = estimator(record, train=train)
         errors = parameters(found.standard_errors)
         named = {
@@ -170,7 +170,8 @@ def _by_steady_state(
         if np.ndim(value) == 0
     }
     warnings = [
-        f"the model runs at {1.0 / fine.dt:g} Hz on input means: see identify.resample"
+        f"the model runs at {1.0 / fine.dt:g} Hz and takes the mean of the input over "
+        "each sample: see identification.resample"
     ]
     count = sum(int(np.size(value)) for value in parameters(system).values())
     return Estimate(system, (response[phase],), named, warnings, count=count)
@@ -182,7 +183,7 @@ def _by_nonnegative_least_squares(
     del options
     record = _single(records)
     progress.stage(f"searching for the lag behind the {model} model")
-    # Weights are not below 0: where the output falls, the chain turns its sign.
+    # The weights are nonnegative: for a falling output the chain inverts the sign.
     x, y = record.input[train], record.output[train]
     sign = float(np.sign(np.cov(x, y)[0, 1])) or 1.0
     found = preisach_with_lag(
@@ -225,12 +226,12 @@ METHODS: dict[str, Method] = {
         "Levenberg-Marquardt on the free-run error", (), _by_output_error, True
     ),
     "instrumental_variables": Method(
-        "(3.32) by regression, unbiased under sensor noise",
+        "instrumental variables for a hysteretic ARMA model; no bias by sensor noise",
         ("hysteretic_arma",),
         _by_regression(instrumental_variables),
     ),
     "least_squares": Method(
-        "(3.32) by (3.35); sensor noise biases it",
+        "least squares for a hysteretic ARMA model; sensor noise biases it",
         ("hysteretic_arma",),
         _by_regression(least_squares),
     ),

@@ -1,4 +1,4 @@
-"""Search for a model: fits, what other records say of them, and their order."""
+"""Search for a model: fits, their errors on other records, and their ranking."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -31,9 +31,9 @@ class _LabelledProgress:
 class Search:
     """Search state: fits, failed models and waiting candidates.
 
-    ``fitted`` is called after each fit. ``left_out`` are the records to leave out of a
-    fit in turn, none to choose on the validation part; ``across`` holds the errors on
-    them by model, None where one of them has none.
+    ``fitted`` is called after each fit. ``left_out`` are the records that are left out
+    of a fit in turn; if there are none, the validation part decides. ``across`` holds
+    the errors on them by model, None for a model that fails on one of them.
     """
 
     def __init__(
@@ -54,6 +54,7 @@ class Search:
         self.fitted: Callable[[], None] = lambda: None
 
     def fit(self, candidates: Sequence[Candidate], total: int) -> None:
+        """Fit ``candidates``, of about ``total`` models in the whole search."""
         self.waiting = list(candidates)
         for candidate in candidates:
             number = len(self.fits) + len(self.failed) + 1
@@ -82,7 +83,7 @@ class Search:
                 self.fits[candidate.model] = fit
             self.waiting.remove(candidate)
             if candidate.model in self.fits:
-                # A fit is kept before it is judged: that takes as long again.
+                # Keep the fit first: its evaluation on other records takes as long.
                 self.fitted()
                 if self.left_out:
                     self.across[candidate.model] = errors_across(
@@ -129,9 +130,9 @@ class Search:
         }
 
     def duplicates(self) -> dict[str, str]:
-        """Return each model that is equivalent to an earlier one, and that model.
+        """Return the earlier equivalent of each model that has one.
 
-        The order is that of the list of hysteresis parts, not that of the fits.
+        "Earlier" refers to the list of hysteresis parts, not to the order of the fits.
         """
         if not self.fits:
             return {}
@@ -164,7 +165,7 @@ class Search:
         return {models[i]: well[i] for i in order}
 
     def _judged(self, model: str) -> Sequence[np.ndarray] | None:
-        """Return the errors that the choice compares, None for those of no use."""
+        """Return the errors that the choice compares, None if the model failed."""
         if self.is_across():
             return self.across.get(model)
         return self.fits[model].errors(self.validate)
@@ -172,12 +173,12 @@ class Search:
     def is_across(self) -> bool:
         """Return whether any model has errors on records left out of its fits.
 
-        Until one has, there is only the validation part to go by.
+        Until then the models are compared on the validation part.
         """
         return any(self.across.values())
 
     def note(self, model: str, duplicates: Mapping[str, str]) -> str:
-        """Return what there is to say of ``model`` beside its errors."""
+        """Return a note if ``model`` fails on other records or has an equivalent."""
         if self.across.get(model, ()) is None:
             return "no model of a record that its fit left out: it fails there"
         if model in duplicates:

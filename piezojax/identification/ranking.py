@@ -11,8 +11,8 @@ from .fit import Fit, FitError
 RULE = (
     "lowest BIC among the models whose validation error is not above the smallest by "
     f"more than {MARGIN:g} standard errors of the difference; BIC from the training "
-    "part, with the effective number of samples; of several ways to write one model, "
-    "the one listed first"
+    "part, with the effective number of samples; of equivalent models, the one listed "
+    "first"
 )
 """Rule for the choice of the best model."""
 

@@ -19,7 +19,7 @@ Part = Literal["train", "validate"]
 PARTS: tuple[Part, ...] = ("train", "validate")
 
 SUFFIX = ".residual.npz"
-"""Ending of the file of a residual, after the stem of that of its model."""
+"""Suffix of a residual file, after the stem of the name of its model file."""
 
 EQUAL = 1e-3
 """Largest relative difference of the residual's rms from that in the model's file."""
@@ -41,7 +41,7 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class ResidualRecord:
-    """Residual of a model: what it leaves of its records, by part, and its motion.
+    """Residual and simulated output of a model over its records, by part.
 
     Each part holds a Stretch of each record that has samples there, in the units of the
     outputs; ``dt`` is the sample time, s.

@@ -15,7 +15,7 @@ SAME_MODE = 0.1
 """Largest relative difference of the frequencies of one mode at two amplitudes."""
 
 CERTAIN = 3.0
-"""Standard errors from which a change counts as certain."""
+"""Least change, in standard errors, that counts as certain."""
 
 
 class LevelValue(BaseModel):
@@ -44,8 +44,8 @@ class LevelsReport(BaseModel):
     """Modes at several amplitudes of the input, the content of ``amplitudes.json``.
 
     ``levels`` are the sources and ``amplitudes`` their rms amplitudes, None if they are
-    not known; ``chosen`` is the place of the level whose model has the least error over
-    all levels.
+    not known; ``chosen`` is the index of the level whose model has the smallest worst
+    error over all levels.
     """
 
     levels: list[str]
@@ -69,9 +69,9 @@ class ResponseLevels:
 
 
 def compare_levels(models: Sequence[ResponseModel]) -> ResponseLevels:
-    """Return the change of the modes over ``models``, in the order given.
+    """Return the change of the modes over ``models``, from the first to the last.
 
-    The first is compared with the last; if all amplitudes are known, they are sorted.
+    If all amplitudes are known, the models are sorted by amplitude first.
     Raises ValueError for fewer than two models, or models of different rate or unit.
     """
     kinds = {(one.about.rate_Hz, one.response.unit) for one in models}
@@ -150,7 +150,7 @@ def _changes(models: Sequence[ResponseModel]) -> tuple[list[LevelChange], list[s
 
 
 def _place(fit: ModalFit, frequency: float) -> int | None:
-    """Return the mode of ``fit`` near ``frequency`` (Hz), None if there is none."""
+    """Return the index of the mode of ``fit`` near ``frequency`` (Hz), or None."""
     distances = [abs(one.value / frequency - 1.0) for one in fit.frequency]
     place = int(np.argmin(distances))
     return place if distances[place] < SAME_MODE else None

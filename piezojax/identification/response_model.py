@@ -31,7 +31,7 @@ FOLDED = 0.9
 """Share of half the rate above which a measured mode cannot be simulated."""
 
 LARGE = 2.0
-"""Mean square of the residual, relative to the variance, from which a note says so."""
+"""Mean square of the residual over the variance from which a note reports it."""
 
 
 class ResponseReport(BaseModel):
@@ -79,9 +79,10 @@ def identify_response(
 ) -> ResponseModel:
     """Return the modes, lag and delay of ``response`` as a System of ``rate`` in Hz.
 
-    With ``held`` the response was measured at this rate through converters that hold
-    the input, if it does not say so itself; otherwise by an analogue analyser. At most
-    ``most`` modes are fitted, by the variances of the response if it has any.
+    For a response that does not state how it was measured, ``held`` means through
+    converters at this rate that hold the input; otherwise an analogue analyser is
+    assumed. At most ``most`` modes are fitted; the lines are weighted by the variances
+    of the response, if it has any.
     ``measured`` goes into the report. The saved model carries a bound on its error, so
     that a study limits the margins under errors that the response does not show. Raises
     ValueError for a rate that is not above 0, a mode too near half the rate, and a
@@ -130,7 +131,7 @@ def identify_response(
 
 
 def _notes(fit: ModalFit, response: FrequencyResponse) -> Iterator[str]:
-    """Yield what the user should know of the fit."""
+    """Yield notes on merged lines, a large residual and biased damping."""
     if fit.searched < response.frequency.size:
         yield (
             f"the search merged {response.frequency.size} lines into {fit.searched}; "

@@ -24,16 +24,16 @@ SHARE = 0.2
 """First share of a record, on which its initial state and zero are estimated."""
 
 COVERED = 0.9
-"""Share of each input's range in the record that it has covered by the end of that
-part. Before it has, no model can tell the zero from the memory of earlier motions: only
-larger extrema wipe it out."""
+"""Share of its range in the record that each input has covered by the end of that part.
+Before that no model distinguishes the zero from the memory of earlier motions, which
+only larger extrema wipe out."""
 
 LATEST = 0.5
-"""Largest part of a record that is spent on the estimate."""
+"""Largest share of a record that is used for the estimate."""
 
 MOST = 20_000, 100_000
-"""Most samples of that part, if it is not given: of the first part, and of one that
-goes on until the input has covered its range."""
+"""Most samples of the default part for the estimate: of the first share, and of its
+extension until the inputs have covered their ranges."""
 
 WINDOWS = 40
 """Number of stretches in which the error is compared with amplitude and rate."""
@@ -125,10 +125,10 @@ def validate(
 
     The state before each record, and the zero of its sensor, are estimated on the
     samples ``estimate``; errors count over the samples after it. By default it is the
-    first fifth, at most 20 000 samples, or as many more as the input needs to cover
-    90 % of its range in the record, at most half of it and 100 000 samples. The state
-    is that after a slow motion from rest over three levels of the input, the levels
-    with the least error. No parameter of the model changes.
+    first fifth of the record, at most 20 000 samples. It is extended until the input
+    has covered 90 % of its range in the record, to at most half of the record and
+    100 000 samples. The state is that after a slow motion from rest over the three
+    levels of the input with the least error. No parameter of the model changes.
 
     Raises ValueError if there is no record, for units that cannot be converted to those
     of the model, another sampling rate, an ``estimate`` that leaves no samples for the
@@ -243,7 +243,10 @@ def _judged(
 
 
 def _part(record: Record, estimate: slice | None) -> slice:
-    """Return the samples from which to estimate; ValueError if none are left."""
+    """Return the samples on which state and zero are estimated.
+
+    Raises ValueError if ``estimate`` leaves no samples for the errors.
+    """
     samples = record.samples
     if estimate is None:
         return default_part(record)

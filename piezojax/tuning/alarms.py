@@ -58,7 +58,7 @@ def alarms_of(
 
 
 def peak_notes(stability: StabilityReports) -> list[str]:
-    """Return a note if the tuned loop amplifies a frequency of its reference."""
+    """Return a note if the largest |y/r| of the tuned loop exceeds ``AMPLIFIED``."""
     reports = stability.reports.get("after", {}).values()
     found = [report.following for report in reports if report.following is not None]
     worst = max(found, key=lambda one: one.closed_loop_peak, default=None)

@@ -19,8 +19,8 @@ def figures_beside(
 ) -> dict[str, Beside]:
     """Return the figures of the controllers that the study names beside its own.
 
-    If it names any, those of its own gains and of ``after`` follow as "before" and
-    "tuned".
+    If it names any, the figures of its own gains and of ``after`` follow under the keys
+    "before" and "tuned".
     """
     if not case.beside:
         return {}

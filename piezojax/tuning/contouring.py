@@ -13,9 +13,9 @@ from ..signals.contour_error import nearest_on
 from ..study import Study
 from .outcome import Logs
 
-_MOST = 2  # contours of a study
-_POINTS = 1500  # of each path
-_FINER, _SEGMENTS = 16, 64_000  # most points of the path for each sample, and in all
+_MOST = 2  # most contours of a study
+_POINTS = 1500  # approximate number of instants at which a run is evaluated
+_FINER, _SEGMENTS = 16, 64_000  # most points of a path per sample, and in total
 
 
 class Contour(NamedTuple):
@@ -61,9 +61,9 @@ class ContourErrors(NamedTuple):
 
 
 def contours_in(study: Study) -> list[Contour]:
-    """Return the first two references, at most, with a contour of two axes of one unit.
+    """Return the contours of ``study`` in two axes of one unit, the first two at most.
 
-    Axes of different units have no common distance.
+    In axes of different units a distance is not defined.
     """
     if study.axes is None:
         return []
@@ -76,7 +76,10 @@ def contours_in(study: Study) -> list[Contour]:
 
 
 def _axes_of(study: Study, name: str) -> tuple[int, int] | None:
-    """Return the axes of the contour of a reference: a trajectory drives two."""
+    """Return the two axes of the contour of a reference, None if it has no contour.
+
+    A trajectory from a file has a contour if it drives two axes.
+    """
     assert study.axes is not None
     if name not in study.references.files:
         return motions.contour_axes(name, study.axes.names)

@@ -28,8 +28,8 @@ class Coupling(NamedTuple):
     def percent(self) -> Float[np.ndarray, "driven measured"]:
         """Errors as percentages of the driven amplitude, [driven, measured].
 
-        Between axes of different units they are in the measured unit per 100 of the
-        driven unit.
+        Between axes of different units an entry is the error in the measured unit for
+        an amplitude of 100 in the driven unit.
         """
         return 100.0 * self.errors / self.amplitudes[:, None]
 
@@ -37,11 +37,11 @@ class Coupling(NamedTuple):
 def coupling_matrix(study: Study, errors: Mapping[str, float | None]) -> Coupling:
     """Return the coupling of a study's axes from RMS ``errors`` by trace name.
 
-    Examples of ``errors`` are those of ``Result.holdout`` and ``Result.coupling``
-    together. References that drive several axes are left out, because they do not show
-    coupling, and so are trajectories of files, whose amplitude is another. Over several
-    references that drive the same axis the mean square is taken.
-    The diagonal holds the tracking errors. Raises ValueError for a study of one axis.
+    ``errors`` may join those of ``Result.holdout`` and ``Result.coupling``. References
+    that drive several axes are left out, because they do not show coupling. So are
+    trajectories from files, because their amplitudes differ from those of the study.
+    The squares of several references that drive the same axis are averaged. The
+    diagonal holds the tracking errors. Raises ValueError for a study of one axis.
     """
     if study.axes is None:
         raise ValueError("the study has one axis; coupling needs several")

@@ -25,7 +25,7 @@ from .unexplained import STRETCHES, residual_disturbances
 class Data:
     """Signals of a case for tuning and for the hold-out, with their traces."""
 
-    tuned: int  # number of traces tuned on, the first of all
+    tuned: int  # number of traces tuned on; they come first
     traces: tuple[Trace, ...]
     tuning: Signals
     holdout: Signals

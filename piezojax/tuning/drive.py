@@ -84,7 +84,7 @@ def _rms(values: np.ndarray) -> float:
 def _rms_above(voltage: Float[np.ndarray, " samples"]) -> float:
     """Return the rms of the part of ``voltage`` above ``HIGH`` times the rate.
 
-    A Hann window keeps the slow part out of the high lines.
+    A Hann window reduces the leakage of slow motion into high frequencies.
     """
     count = voltage.size
     window = np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2

@@ -39,11 +39,11 @@ RUN_BLOCK = 8
 
 
 class Carried(NamedTuple):
-    """Plants whose margins a search computes, of those on which they are limited.
+    """Part of the plants with limited margins: those whose margins a search computes.
 
     ``excess`` is the largest ln(value/limit) over all plants and limits. ``stages`` are
-    the carried ones, at ``places`` among all. If all are carried, ``stages`` is None
-    and ``excess`` 0.
+    the carried plants, and ``places`` their indices among all. If all are carried,
+    ``stages`` is None and ``excess`` 0.
     """
 
     excess: float
@@ -56,7 +56,7 @@ class Evaluator:
 
     ``start`` is the first sample that counts, ``limits`` are those of the study,
     ``model_error`` [lines] bounds the relative error of the plant if its record gives
-    a bound; ``step_test`` is that of limits on steps. ``margin_stages`` are those on
+    a bound; ``step_test`` evaluates the limits on steps. ``margin_stages`` are those on
     which margins are limited, None for the loop's own alone. ``clock`` measures the
     compile time.
     """
@@ -149,9 +149,9 @@ class Evaluator:
         stages: Stage,
         signals: Signals | None = None,
     ) -> Any:
-        """Return ``function(loop, stages, signals)`` of any number of stacked stages.
+        """Return ``function(loop, stages, signals)`` for any number of stacked stages.
 
-        Its program takes ``width`` of them.
+        The compiled program evaluates ``width`` stages at a time.
         """
         dynamic, static = eqx.partition(stages, eqx.is_array)
         shapes = None if signals is None else signals.noise.shape
@@ -169,9 +169,9 @@ class Evaluator:
     def worst_plants(self, loop: Feedback, before: Carried | None = None) -> Carried:
         """Return the plants that a search from ``loop`` carries: ``CARRIED`` at most.
 
-        They are the worst by the excess over the limits on margins. Up to half of them
-        are the worst of those carried ``before``, so that a search does not forget
-        plants whose limit was active.
+        They have the largest excess over the limits on margins. Up to half of them are
+        the worst of those carried ``before``, so that a search keeps the plants whose
+        limits were active.
         """
         stages = self.margin_stages
         if _count(stages) <= CARRIED or not uses(self.limits, "margins"):
@@ -247,8 +247,8 @@ def _count(stages: Stage | None) -> int:
 def drawn_stages(case: Case, part: Part) -> Stage | None:
     """Return the nominal stage and the drawn stages of ``part``, stacked.
 
-    Margins are limited at each level of a scheduled plant too. None if there is no
-    other stage than the nominal one.
+    For "margins" the stages at each level of a scheduled plant follow. None if there is
+    no other stage than the nominal one.
     """
     drawn = case.ensemble.stages(part) if case.ensemble else None
     levels = level_stages(case.loop) if part == "margins" else None

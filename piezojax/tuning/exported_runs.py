@@ -1,4 +1,4 @@
-"""Runs of a study that judge its exported controller."""
+"""Runs of a study on which its exported controller is tested."""
 
 import equinox as eqx
 import jax

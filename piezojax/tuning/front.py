@@ -29,10 +29,10 @@ def trace_front(
 ) -> list[FrontPoint]:
     """Return the best gains found for each limit of the study's front.
 
-    The limits are solved from the loosest to the tightest by ``strategy``. The first
-    starts from the result of ``search``, each later one from the gains of the limit
-    before. If a tighter limit gives a lower loss than a looser one, the looser one is
-    solved again from the tighter one's gains, which keep both limits.
+    ``strategy`` tunes for the limits from the loosest to the tightest. The first search
+    starts from the result of ``search``, each later one from the gains of the previous
+    limit. If a tighter limit gives a lower loss than a looser one, the gains for the
+    looser one are tuned again, from those for the tighter one, which keep both limits.
     """
     table = case.study.pareto
     assert table is not None
@@ -80,8 +80,9 @@ def non_dominated(
 ) -> list[Place]:
     """Return the points ``found`` on the front, without dominated ones.
 
-    ``found`` runs from the loosest limit to the tightest. Each point that is worse than
-    the next tighter one is replaced by ``solve``, which starts from that one's gains.
+    ``found`` is sorted from the loosest limit to the tightest. Each point that is worse
+    than the next tighter one is replaced by ``solve(limit, unit)``, which starts from
+    the gains ``unit`` of that next one.
     """
     found = list(found)
     for i in reversed(range(len(found) - 1)):

@@ -19,8 +19,8 @@ def levels_of(plant: System) -> int:
 def level_stages(loop: Feedback) -> Stage | None:
     """Return the stages of ``loop`` at each level of its drive, stacked.
 
-    Each has the linear model of one level, whatever its drive: the margins at rest are
-    those of a single level. None if the plant is not scheduled.
+    Each stage has the linear model of one level at every drive, because the scheduled
+    plant, linearised at rest, shows a single level. None if it is not scheduled.
     """
     count = levels_of(loop.plant)
     if count == 0:

@@ -37,10 +37,10 @@ def search_within_limits(
 
     ``also`` are further points [points, n] from which the search may start.
 
-    The defaults among the limits are rarely active, and margins in every loss cost time
-    to compile. Unless the study limits a margin itself, the box is searched without
-    them first, and again with them if the result violates any. If margins are limited
-    on many plants, a search uses only the worst of them.
+    The default limits are rarely active, and a loss with margins takes longer to
+    compile. Unless the study limits a margin itself, the box is searched without the
+    default limits first, and again with them if the result violates one. If margins are
+    limited on many plants, a search uses only the worst of them.
     """
     study = case.study
     own = {
@@ -93,9 +93,10 @@ def exact_stability(case: Case, search: SearchState) -> StabilityReports:
 
 
 def _alarming_peak(case: Case, stability: StabilityReports) -> float:
-    """Return the exact Ms, or that within the error bound, if other gains are needed.
+    """Return Ms if it exceeds its limit, otherwise 0.
 
-    Otherwise return 0. Ms of an unstable loop is infinite.
+    It is the exact Ms or that within the error bound, whichever is larger. Ms of an
+    unstable loop is infinite.
     """
     limit, bound = case.study.limits.get(PEAK), case.plant_about.error_bound
     if limit is None or "after" in stability.problems:
@@ -119,10 +120,10 @@ def _repeated(
 ) -> Found:
     """Repeat the search, up to REPEATS times, while its result misses a limit.
 
-    The search computes S on the lines of an impulse response. Between two lines it may
-    miss the peak of a lightly damped mode of the closed loop: if the exact Ms exceeds
-    its limit, the limit is tightened. If a drawn plant violates a limit, the plants
-    that are worst now replace part of those that the search carries.
+    The search computes S on a grid of frequencies. Between two of them it may miss the
+    peak of a lightly damped mode of the closed loop: if the exact Ms exceeds its limit,
+    the limit of the next search is tightened. If a drawn plant violates a limit, the
+    worst plants replace part of those that the search carries.
     """
     limits = dict(case.study.limits)
     try:

@@ -89,9 +89,9 @@ def margins_on(
 
 
 class StepTest(eqx.Module):
-    """Steps of the reference from rest: ``ends`` (um), and the ``noise`` of the sensor.
+    """Steps of the reference from rest: ``ends``, and rms ``noise`` of the sensor.
 
-    A run has a number of ``samples``, ``dt`` in s.
+    Both are in um. A run has ``samples`` samples with the sample time ``dt`` (s).
     """
 
     ends: Float[Array, "steps 2"]
@@ -117,21 +117,22 @@ class Objective(eqx.Module):
     which has one value for each stage and reference. ``aggregate`` joins the
     references: ``geometric_mean`` (mean of logarithms: a tenfold improvement counts the
     same on every reference), ``mean_square``, or ``worst`` (a smooth maximum of the
-    logarithms). ``weights`` are those of the references (equal if left out). Of a
-    ``resting`` trace, that of an axis that should not move, only the part of the error
-    above its scale counts.
+    logarithms). ``weights`` are those of the references (equal if left out). A
+    ``resting`` trace is that of an axis that should not move; only the part of its
+    error above the scale counts.
 
     ``stages``, stacked on a leading axis, replace the loop's own. ``over`` joins them:
-    their mean, the worst, or the mean of the worst share ``tail``. ``effort_weight``
+    their mean, the worst, or the mean over the worst share ``tail``. ``effort_weight``
     and ``slew_weight`` weight the mean RMS voltage and the mean RMS change of voltage
     per sample, both as a share of ``voltage_span``, which are added to the error.
 
     ``limits`` are the limits of constraints by name (``constraints.CONSTRAINTS``). They
     must hold on every stage; limits on margins must hold on every one of
-    ``margin_stages``, at the reference ``highest`` (um), for all plants within the
-    relative error ``model_error`` [lines] of these. ``step_test`` is that of limits on
-    steps, None on several axes. ``loss`` is an augmented
-    Lagrangian with ``multipliers`` and ``penalty``.
+    ``margin_stages``, at the reference ``highest`` (um). The limits on Ms and the delay
+    margin must also hold for all plants within the relative error ``model_error``
+    [lines] of these stages. ``step_test`` evaluates the limits on steps, None on
+    several axes. ``loss`` is an augmented Lagrangian with ``multipliers`` and
+    ``penalty``.
     """
 
     loop: Feedback
@@ -187,7 +188,7 @@ class Objective(eqx.Module):
         )
 
     def with_limits(self, limits: Mapping[str, float]) -> "Objective":
-        """Return the objective with other limits of the same constraints."""
+        """Return the objective with ``limits``, by name of their constraint."""
         arrays = {name: as_array(limit) for name, limit in limits.items()}
         return dataclasses.replace(self, limits=arrays)
 
@@ -236,7 +237,7 @@ class Objective(eqx.Module):
         square = jnp.mean(figures.rms_error**2, axis=2)
         normalised = jnp.sqrt(square + _FLOOR**2) / self.scale
         if any(self.resting):
-            # A smooth maximum with 1: only errors above the scale cost.
+            # A smooth maximum with 1: only errors above the scale count.
             above = jnp.logaddexp(0.0, _SHARPNESS * jnp.log(normalised)) / _SHARPNESS
             normalised = jnp.where(jnp.array(self.resting), jnp.exp(above), normalised)
         # Voltage limits turn divergence into a limit cycle between them.
@@ -291,7 +292,7 @@ class Objective(eqx.Module):
     def value_and_verdict(
         self, unit: Float[Array, " n"]
     ) -> tuple[Float[Array, ""], Verdict]:
-        """Return ``loss`` and ``verdict`` from one simulation."""
+        """Return ``loss`` and ``verdict`` from the same simulation."""
         return self._evaluate(self.figures(unit))[:2]
 
     def _evaluate(self, figures: LoopFigures) -> tuple[Array, Verdict, Array]:
@@ -305,7 +306,7 @@ class Objective(eqx.Module):
         return loss, Verdict(alone, violation), added
 
     def errors(self, unit: Float[Array, " n"], every: int) -> Errors:
-        """Return the objective and each ``every``-th error of a run."""
+        """Return the loss, its terms, and every ``every``-th error of each run."""
         loop, errors = self._sampled(unit, every)
         assert errors is not None
         tracking = loop.tracking

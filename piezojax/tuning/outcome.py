@@ -123,7 +123,7 @@ class Outcome:
             study.sensor.measured_noise is not None
             or study.disturbance.input is not None
         ):
-            return "the limit is known for white noise of the sensor and no other input"
+            return "the limit is known for white sensor noise and no input disturbance"
         names, signals = study.references.tune, self.holdout
         count, disturbance = len(names), signals.disturbance
         try:

@@ -7,8 +7,8 @@ from ..study import Case
 from .data import Data
 
 SLACK = 0.02
-"""Share of the stroke by which a reference may leave it, because the displacement at a
-limit varies a little with noise, drift and history."""
+"""Share of the stroke by which a reference may exceed it: the displacement at a voltage
+limit varies slightly with noise, drift and history."""
 
 
 def require_reach(case: Case, data: Data) -> None:

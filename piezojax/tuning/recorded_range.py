@@ -8,7 +8,7 @@ from ..study import Case
 from .data import Data, holding_inputs, own_stage
 
 COVERED = 0.25
-"""Least ratio of the ranges of record and actuator, in either sense."""
+"""Least ratio of the smaller to the larger of the ranges of record and actuator."""
 
 SLACK = 0.1
 """Share of the recorded range by which the references may leave it: hysteresis changes
@@ -16,10 +16,10 @@ the input that holds a displacement by as much."""
 
 
 def recorded_range_alarms(case: Case, data: Data) -> Iterator[str]:
-    """Yield alarms for references outside the record, and for ranges far apart.
+    """Yield alarms for references outside the record, and for ranges that differ.
 
-    The range of the record and that of the actuator are far apart if their ratio is
-    beyond COVERED. Only a fitted plant has a recorded range.
+    The ranges of record and actuator differ if the smaller is at most COVERED times the
+    larger. Only a fitted plant has a recorded range.
     """
     study, ranges = case.study, case.plant_about.input_ranges
     if len(ranges) != study.axis_count:

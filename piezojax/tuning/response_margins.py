@@ -45,7 +45,7 @@ def response_alarms(
 ) -> Iterator[str]:
     """Yield alarms for limits that hold on the model and not on the measured response.
 
-    An excess of SLACK does not count, because the response has noise.
+    A relative excess up to SLACK does not count, because the response has noise.
     """
     after = found.get("after")
     if after is None:

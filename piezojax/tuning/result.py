@@ -24,9 +24,9 @@ GAINS_FILE = "gains.toml"
 
 
 class Scores(BaseModel):
-    """Tracking errors (um) of one set of gains by reference, of the worst draw.
+    """Tracking errors (um) of one set of gains by reference, each of its worst draw.
 
-    Errors are None for a run that diverged.
+    The error of a reference is None if a run diverges.
     """
 
     per_reference_rms_um: dict[str, float | None]
@@ -184,9 +184,10 @@ class Beside(BaseModel):
     ``nominal_rms_um`` is the geometric mean of the errors of the driven axes over all
     references of the hold-out, on the nominal plant; ``geomean_rms_um`` and
     ``worst_rms_um`` are its median and its largest value over ``plants`` held-out
-    plants. They are None if a run diverges or stays at a voltage limit, on ``unstable``
-    of the plants. ``sensitivity_peak`` is the largest on these plants, on the nominal
-    one without them; None if it is not limited.
+    plants. On a plant on which a run diverges or stays at a voltage limit the error is
+    infinite; ``unstable`` counts these plants. An infinite figure is None.
+    ``sensitivity_peak`` is the largest on these plants, on the nominal one without
+    them; None if it is not limited.
     """
 
     nominal_rms_um: float | None
@@ -252,7 +253,7 @@ class Result(BaseModel):
     sliding_before: SlidingShare | None = None
     sliding: SlidingShare | None = None
     structures: StructureSearch | None = None
-    """Structures of the controller that were tuned; these gains are of the chosen."""
+    """Structures of the controller that were tuned; ``gains`` are of the chosen one."""
     units: dict[str, str] = {}
     gain_units: dict[str, str] = {}
     """Declared units of ``gains``; "" without a declaration."""
@@ -260,7 +261,7 @@ class Result(BaseModel):
     """Steps of the gains that are typed into a device."""
     warnings: list[str]
     alarms: list[str] = []
-    """Reasons not to use the gains; with any, ``load`` refuses their file."""
+    """Reasons not to use the gains; if there are any, ``load`` refuses their file."""
     history: list[list[float | None]]
     times_s: list[float] = []
     evaluations: int
@@ -271,7 +272,7 @@ class Result(BaseModel):
 
     @property
     def heading(self) -> str:
-        """Title of tables and pictures, which mentions any alarm."""
+        """Title of tables and figures; it gives the number of alarms, if any."""
         if not self.alarms:
             return self.title
         count = "an alarm" if len(self.alarms) == 1 else f"{len(self.alarms)} alarms"

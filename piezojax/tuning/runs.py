@@ -29,7 +29,7 @@ class RunNoise(NamedTuple):
     input_disturbance: Float[Array, "..."] | None
 
     def of(self, *run: int | slice) -> "RunNoise":
-        """Return those of one run, or of a slice of runs."""
+        """Return the noise and disturbances of one run, or of a slice of runs."""
         return jax.tree.map(lambda x: x[run], self)
 
     def undisturbed(self) -> "RunNoise":
@@ -95,7 +95,7 @@ def sampled(
     beside: Metric | None = None,
     every: int = 1,
 ) -> tuple[Any, Array | None]:
-    """Return the figures of ``evaluate``, and each ``every``-th error (um) of a run.
+    """Return the figures of ``evaluate``, and every ``every``-th error (um) of a run.
 
     The errors are those of the samples from ``start`` on, with time on the last axis;
     None unless ``every`` is above 1.
@@ -118,8 +118,8 @@ def sampled(
         counted = jax.tree.map(lambda x: x[start // every :], error)
         return figures, jnp.stack(counted) if isinstance(counted, tuple) else counted
 
-    # With a copy of the parameters for each run, their gradients are summed once, at
-    # the end, and not in each step.
+    # Each run has a copy of the parameters: their gradients are summed once, after the
+    # run, and not at each sample.
     runs = signals.noise.shape[:2]
     copies = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*runs, *jnp.shape(x))), parameters

@@ -19,7 +19,7 @@ from .objective import Objective
 FORWARD_BELOW, FORWARD_BELOW_WITH_AXES = 5, 64
 """Numbers of parameters below which forward-mode differentiation is used, with one axis
 and with several. With several axes the reverse pass takes minutes to compile, three
-times as long."""
+times as long as the forward pass."""
 
 
 def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:
@@ -54,7 +54,7 @@ def search_box(
 
     ``also`` are further points [points, n] that may become starts.
     ``Ctrl-C`` ends the search with the best point so far; the strategy is None if it
-    was not compiled yet. Raises ValueError if the loop diverges or stays at a voltage
+    has not been compiled. Raises ValueError if the loop diverges or stays at a voltage
     limit at every point tried.
     """
     own, table = np.asarray(case.space.start(case.loop)), case.study.optimiser

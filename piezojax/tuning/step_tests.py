@@ -13,8 +13,8 @@ class StepResult(BaseModel):
     """Figures of one step of a loop of one axis, without noise.
 
     ``before_um`` and ``after_um`` are the references; the figures are those of
-    ``StepFigures``, in s and as shares of the height. A time is None if it is longer
-    than the run, and all are None if the run diverges.
+    ``StepFigures``, in s and as shares of the height. A time is None if it exceeds the
+    length of the run. All figures are None if the run diverges.
     """
 
     before_um: float
@@ -48,9 +48,10 @@ class StepResult(BaseModel):
 
 
 class StepRun(NamedTuple):
-    """Run of a loop with ``step_reference``: time after the step in s, and um.
+    """Run of a loop with ``step_reference``.
 
-    ``ends`` are the references before and after the step.
+    ``ends`` are the references (um) before and after the step, ``time`` is measured
+    from the step (s), ``displacement`` is in um.
     """
 
     ends: tuple[float, float]

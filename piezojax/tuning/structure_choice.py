@@ -8,21 +8,21 @@ import numpy as np
 from pydantic import BaseModel
 
 ERRORS = 2.0
-"""Standard errors by which a structure must be better to be worth more notches."""
+"""Standard errors by which further notches must lower the error to be worth it."""
 
 ATTENUATION = 0.7
-"""Gain at its mode below which a notch acts on it."""
+"""Gain of a notch at its mode below which it acts on the mode."""
 
 
 LIMITING = 0.1
-"""Part of |L| from which on a mode may limit a loop: a smaller one changes |S| by less
-than a ninth."""
+"""Least contribution of a mode to |L| that may limit a loop: a smaller one changes |S|
+by less than a ninth, where |1 + L| is at least 1 without the mode."""
 
 
 class ModeInLoop(BaseModel):
     """Mode of the plant in a tuned loop; ``frequency_Hz`` is its natural frequency.
 
-    ``part_of_loop_gain`` is the part of |L| that the mode makes there, ``sensitivity``
+    ``part_of_loop_gain`` is the modulus of the mode's term in L there, ``sensitivity``
     the largest |S| around it, and ``notch`` the gain of the notches there. The first
     two are None if the loop could not be linearised.
     """
@@ -44,10 +44,10 @@ class Structure(BaseModel):
     no such plants; None if a run diverges or stays at a voltage limit. ``log_errors``
     are the logarithms of these errors (um), None where a run is lost.
     ``sensitivity_peak`` is the largest on the plants of the hold-out, or the exact one
-    of the nominal plant. ``needless`` are the modes of ``at_Hz`` that make too little
-    of |L| to limit the loop with their notch switched off. ``alarms`` counts the
-    reasons not to use the gains, ``gains`` holds them by path, and ``reason`` tells why
-    the structure was chosen or not.
+    of the nominal plant. ``needless`` are the modes of ``at_Hz`` that contribute too
+    little to |L| to limit the loop, even with their notch switched off. ``alarms``
+    counts the reasons not to use the gains, ``gains`` holds them by path, and
+    ``reason`` tells why the structure was chosen or not.
     """
 
     notches: int
@@ -68,7 +68,7 @@ class Structure(BaseModel):
 
     @property
     def idle(self) -> list[float]:
-        """Frequencies (Hz) of the notches' modes on which they do not act."""
+        """Frequencies (Hz) of modes whose notch does not attenuate them enough."""
         acted = {m.frequency_Hz: m.notch for m in self.modes}
         return [f for f in self.at_Hz if acted.get(f, 1.0) > ATTENUATION]
 
@@ -98,10 +98,10 @@ def criterion_text(worth: float) -> str:
 
 
 def gain_of(smaller: Structure, larger: Structure) -> Gain:
-    """Return by how much ``larger`` has the lower error, in pairs on the same plants.
+    """Return the improvement by ``larger``, from pairs of errors on the same plants.
 
-    Pairs with a lost run are left out; without any pair the gain is 0. The standard
-    error of a single pair is 0.
+    Pairs with a lost run are left out; without any pair the gain is 0. With a single
+    pair the standard error is 0.
     """
     pairs = [
         one - other
@@ -124,11 +124,11 @@ def is_worth(smaller: Structure, larger: Structure, worth: float) -> bool:
 def choose(structures: Sequence[Structure], worth: float) -> int | None:
     """Return the index of the structure to use, None if none has been tuned.
 
-    Only structures with the fewest alarms come into question, and of these only those
-    whose notches all act on a mode, if there are any. A structure with a needless notch
-    does not, if the one without that notch does: what it gains comes from the phase of
-    the notch and not from the mode. Of structures with the same number of notches the
-    one with the lowest error counts.
+    The candidates are the structures with the fewest alarms; among these, if there are
+    any, those whose notches all act on a mode. A structure with a needless notch is no
+    candidate if the one without that notch is: its lower error is due to the phase of
+    the notch, not to the mode. Of the candidates with the same number of notches the
+    one with the lowest error is compared.
     """
     tuned = [i for i, one in enumerate(structures) if one.gains]
     stable = [i for i in tuned if structures[i].error_um is not None] or tuned
@@ -152,7 +152,7 @@ def choose(structures: Sequence[Structure], worth: float) -> int | None:
 
 
 def _is_replaced(one: Structure, among: Sequence[set[float]]) -> bool:
-    """Return whether ``one`` less a needless notch is ``among`` others."""
+    """Return whether ``one`` without a needless notch is ``among`` the candidates."""
     return any(set(one.at_Hz) - {mode} in among for mode in one.needless)
 
 
@@ -173,7 +173,7 @@ def _reason(one: Structure, best: Structure) -> str:
     if one.error_um is None:
         return "a run diverges or stays at a voltage limit"
     if one.alarms > best.alarms:
-        return f"{one.alarms} alarms, those of the chosen one are {best.alarms}"
+        return f"{one.alarms} alarms; the chosen structure has {best.alarms}"
     if one.idle:
         shown = ", ".join(f"{frequency:.4g}" for frequency in one.idle)
         return f"no notch acts on the mode at {shown} Hz"

@@ -54,10 +54,11 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
     """Tune each structure of the study and return the Outcome of the chosen one.
 
     The first notch is placed at the mode around which |S| of the loop tuned without
-    notches is largest, each further one where that of the loop tuned with the notches
-    so far is. A mode that makes less than ``LIMITING`` of |L| limits no loop and gets
-    no notch. If the chosen structure has a needless notch (``Structure.needless``), it
-    is tuned without it too. ``Ctrl-C`` ends the search with the structures so far.
+    notches is largest, each further one at the mode around which |S| of the loop tuned
+    so far is largest. A mode that contributes less than ``LIMITING`` to |L| does not
+    limit the loop and gets no notch. If the chosen structure has a needless notch
+    (``Structure.needless``), the controller is tuned without that notch too. ``Ctrl-C``
+    ends the search with the structures so far.
     Raises ValueError if no structure could be tuned, and as ``with_notches``.
     """
     table = case.study.structures
@@ -95,8 +96,8 @@ def search_structures(case: Case, tune: Tune, progress: Progress) -> Outcome:
         at = (*at, *others[: count - len(at)])
         if len(at) < count:
             reason = (
-                f"not tuned: of {len(modes)} modes of the plant, no other makes "
-                f"{LIMITING:g} of the loop gain"
+                f"not tuned: of {len(modes)} modes of the plant, no other contributes "
+                f"{LIMITING:g} to the loop gain |L|"
             )
             rows.append(_untuned(count, at, reason))
             continue
@@ -143,10 +144,10 @@ def _best(found: Sequence[_Tuned], worth: float) -> _Tuned | None:
 
 
 def _shown_modes(case: Case) -> tuple[list[PlantMode], list[str]]:
-    """Return the modes of the plant, and a note on those that its record denies.
+    """Return the modes of the plant, and a note on those below its error bound.
 
-    A fitted model has an error bound; a mode that makes a smaller part of the response
-    may be a fit to noise.
+    A mode of a fitted model whose share of the response is below the error bound may be
+    a fit to noise. It is left out.
     """
     study = case.study
     highest = case.highest_reference
@@ -162,16 +163,16 @@ def _shown_modes(case: Case) -> tuple[list[PlantMode], list[str]]:
     return shown, [
         f"structures: no notch is tried at {', '.join(dropped)} Hz, because the error "
         "bound of the model is larger than its mode there; a record with a chirp up to "
-        "half the sampling rate tells more"
+        "half the sampling rate lowers the bound"
     ]
 
 
 def _limiting(modes: Sequence[PlantMode], tuned: _Tuned | None) -> list[PlantMode]:
     """Return the modes without a notch that limit the ``tuned`` loop, worst first.
 
-    The worst is the one around which |S| is largest. Without a tuned loop all modes are
-    returned, in the order of their gain in an integral control, which falls with
-    frequency.
+    The worst is the one around which |S| is largest. Without a linearised loop all
+    modes without a notch are returned, sorted by gain over frequency: their order under
+    integral control.
     """
     seen = _in_loop(modes, tuned.outcome) if tuned else None
     had = tuned.at if tuned else ()
@@ -189,9 +190,10 @@ def _limiting(modes: Sequence[PlantMode], tuned: _Tuned | None) -> list[PlantMod
 def _in_loop(
     modes: Sequence[PlantMode], outcome: Outcome
 ) -> list[tuple[float, float]] | None:
-    """Return the part of |L| that each mode makes, and the largest |S| around it.
+    """Return the contribution of each mode to |L|, and the largest |S| around it.
 
-    The larger of both branches counts. None if the tuned loop could not be linearised.
+    The larger value of both branches counts. None if the tuned loop could not be
+    linearised.
     """
     loops = outcome.stability.loops.get("after", {}).values()
     if not loops:
@@ -210,9 +212,10 @@ def _starts(
 ) -> np.ndarray | None:
     """Return points of the box of ``variant`` from which its search may start.
 
-    They are the gains of the study with the notches on, and those of ``previous`` with
-    the further notches on, and with all of them at their modes again. A notch that is
-    off has no derivative by its frequency.
+    They are the gains of the study with all notches switched on; those of ``previous``
+    with the further notches switched on; and those of ``previous`` with all notches set
+    to their modes again. The loss does not depend on the frequency of a notch that is
+    switched off.
     """
     if not at:
         return None
@@ -297,8 +300,8 @@ def _row_of(
     wheres = [f"{place}.filter.{NOTCH.format(i)}" for i in range(1, len(at) + 1)]
     seen = _in_loop(modes, outcome) or [(math.nan, math.nan)] * len(modes)
     part_of = {mode: part for mode, (part, _) in zip(modes, seen, strict=True)}
-    # With |1 + L| at least 1 without the mode, a smaller part of |L| cannot make |S|
-    # exceed its limit.
+    # With |1 + L| at least 1 without the mode, a smaller contribution to |L| cannot
+    # make |S| exceed its limit.
     cause = 1.0 - 1.0 / case.study.limits.get(PEAK, math.inf)
     errors = _errors(result)
     known = [error for error in errors if error is not None]
@@ -336,8 +339,8 @@ def _row_of(
 def _slight(result: Result) -> int:
     """Return the number of limits that held-out plants miss by less than HELD_OUT.
 
-    These plants were not tuned on, and some of any structure may be a little worse than
-    those that were.
+    The gains were not tuned on these plants. With any structure some of them may be
+    slightly worse than the plants of tuning.
     """
     outcomes = result.perturbed.constraints.values() if result.perturbed else ()
     count = 0
@@ -374,7 +377,7 @@ def _notch_gain(
 ) -> float:
     """Return the gain of a ``Notch`` at ``angle`` (rad/sample).
 
-    By the bilinear transform, prewarped at its ``frequency`` (Hz).
+    It is discretised by the bilinear transform, prewarped at its ``frequency`` (Hz).
     """
     ratio = math.tan(0.5 * angle) / math.tan(math.pi * frequency * dt)
     rest, damped = 1.0 - ratio**2, 2.0j * damping * ratio

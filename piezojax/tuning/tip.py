@@ -21,7 +21,7 @@ def tip_note(case: Case, loop: Feedback, data: Data, start: int) -> str | None:
 
     A record does not tell whether a lag of its fitted plant belongs to the stage or to
     its sensor. If it belongs to the sensor, the loop controls the reading of the
-    sensor, and the tip is ahead of that. Samples before ``start`` do not count.
+    sensor, and the tip leads that reading. Samples before ``start`` do not count.
     """
     dt = case.study.dt
     lags = [lag for lag in lags_of(case.loop.plant) if lag > dt]

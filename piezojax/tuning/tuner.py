@@ -41,11 +41,13 @@ def tune(
 
     ``study`` is a Case, the path of a study file, or None for the default study. With a
     budget as ``baselines``, the baselines are run on the same objective afterwards.
-    Each of the ``structures`` of a study is tuned; the Outcome is that of the chosen.
+    Each of the ``structures`` of a study is tuned; the Outcome is that of the chosen
+    one.
     ``Ctrl-C`` ends the search and keeps the best gains found so far. A start that
     diverges or stays at a voltage limit is replaced by the best of the candidates.
-    Raises ValueError if a reference is beyond the stroke of the stage, or if neither
-    the start nor any candidate gives a stable loop.
+    Raises ValueError if a reference is beyond the stroke of the stage, if neither the
+    start nor any candidate gives a stable loop, or for ``baselines`` of a study with
+    ``structures``.
     """
     progress = progress or Silent()
     case = study if isinstance(study, Case) else read(study or shipped())
@@ -86,7 +88,7 @@ def _tune(
             case, data, evaluator, before, after, search, clock, kept, front
         )
     except KeyboardInterrupt:
-        # The gains found are kept; only a second interrupt ends the report too.
+        # Keep the gains; only a second interrupt ends this evaluation too.
         search.status = "interrupted"
         result = make_result(
             case, data, evaluator, before, after, search, clock, {}, None

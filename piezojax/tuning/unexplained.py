@@ -11,8 +11,8 @@ STRETCHES = 2
 """Number of stretches of the residual that disturb each reference."""
 
 OVERLAP, LEAST, MOST = 4, 12, 64
-"""Number of beginnings tried for each length of a reference that the residual holds;
-fewest and most beginnings in all."""
+"""Starting points in the residual that are tried per length of the reference; fewest
+and most starting points in total."""
 
 FAST = 100
 """Samples of the moving mean that is subtracted to compare fast changes: most loops
@@ -30,14 +30,15 @@ def residual_disturbances(
     """Return the worst stretches of ``residual`` under ``reference``, in its unit.
 
     Without them, a controller that contains the fitted model would be tuned and
-    evaluated as if the stage were that model. The errors of a hysteresis follow the
-    path of the stage: the residual is played as far as the reference (um) has
-    travelled, or as time has passed, whichever is farther; forwards and backwards until
-    the reference ends. ``time_s`` are the times of the reference's samples, ``part``
-    names the part of the records. Of many beginnings, evenly spaced over that part of
-    each record, two are chosen: one with the largest deviation, for loops that follow
-    slowly, and one with the largest fast changes. Several axes travel and deviate
-    together, each in units of its own residual.
+    evaluated as if the stage were that model. The errors of a hysteresis depend on the
+    path of the stage. The residual therefore advances with the distance that the
+    reference travels, or with time if that advances it farther. It is played forwards
+    and backwards until the reference ends. ``time_s`` are the times of the samples of
+    the reference, ``part`` names the part of the records. Of many starting points,
+    evenly spaced over that part of each record, two are chosen: the one with the
+    largest deviation, for slow loops, and the one with the largest fast changes.
+    Several axes share one distance, and one deviation in which each axis is divided by
+    the deviation of its residual.
     """
     path = reference.reshape(len(reference), -1)
     whole = np.concatenate([one.residual for one in residual.parts[part]])
@@ -65,8 +66,11 @@ def _played(
     passed: Samples,
     part: Part,
 ) -> Iterator[Float[np.ndarray, "samples axes"]]:
-    """Yield the residual of ``record`` from each beginning; ``passed`` in samples."""
-    # Initial loading is a single event.
+    """Yield the residual of ``record`` from each starting point.
+
+    ``passed`` is the time since the start of the reference, in samples of the record.
+    """
+    # In training the initial loading is left out: it occurs once.
     first = 0 if part == "validate" else _end_of_loading(record.simulated)
     residual = record.residual[first:]
     moved = np.linalg.norm(np.diff(record.simulated[first:], axis=0), axis=1)
@@ -92,7 +96,7 @@ def _end_of_loading(simulated: Float[np.ndarray, "samples axes"]) -> int:
 def _place(distance: Samples, travelled: Float[np.ndarray, " places"]) -> Samples:
     """Return the samples at which the record has ``travelled`` each ``distance``.
 
-    Every second round goes backwards.
+    The record is played forwards and backwards in turn.
     """
     places = np.arange(float(travelled.size))
     rounds, rest = np.divmod(distance, travelled[-1])

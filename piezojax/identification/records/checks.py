@@ -68,7 +68,7 @@ def cycles(input: np.ndarray) -> int:
         return 0
     first = min(1.0, strokes[0] / strokes[1])
     last = min(1.0, strokes[-1] / strokes[-2])
-    # Add a twentieth, so that noise at the ends does not remove a cycle.
+    # Add a twentieth: noise at the ends must not remove a cycle.
     return int((first + strokes.size - 2 + last) / 2.0 + 0.05)
 
 

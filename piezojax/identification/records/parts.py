@@ -29,9 +29,9 @@ def train_and_validation(
 ) -> tuple[slice, slice]:
     """Return the parts to fit and to validate on, by default the halves of a record.
 
-    A part to validate on that is left out is what follows the part to fit, or, if
-    nothing does, what comes before it. Raises ValueError for a part that is empty or
-    outside of the ``samples``, and if the part to fit leaves none to validate on.
+    Without ``validate``, the model is validated on the samples after ``train``, or on
+    those before it if none follow. Raises ValueError for a part that is empty or
+    outside the ``samples``, and if ``train`` leaves no samples to validate on.
     """
     train = _closed(train or slice(0, samples // 2), samples)
     if validate is None:
@@ -57,9 +57,9 @@ def train_validation_and_test(
 ) -> tuple[slice, slice, slice | None]:
     """Return the parts to fit, to validate and to test on; there may be no test.
 
-    Left out, train and validate are the halves of the samples before the test. Raises
-    ValueError for a part that is empty or outside of the ``samples``, and for a test
-    that shares samples with the others.
+    By default ``train`` and ``validate`` are the halves of the samples before ``test``.
+    Raises ValueError for a part that is empty or outside the ``samples``, and for a
+    ``test`` that shares samples with the others.
     """
     if test is None:
         return *train_and_validation(samples, train, validate), None

@@ -279,7 +279,7 @@ def read_record(
 
     Raises ValueError, naming the column and the sample, for a file that cannot be read,
     a missing column, missing numbers, unsorted time, uneven time without ``resample``,
-    contradicting sample times, a reference or dither in a unit that cannot be
+    contradictory sample times, a reference or dither in a unit that cannot be
     converted, a record that is too short, or, without ``time``, a column given by its
     number that rises in even steps, as a time axis does.
     """
@@ -334,7 +334,7 @@ def _refuse_time_axes(
 ) -> None:
     """Raise ValueError if a column given by its number seems to be the time.
 
-    A column that is given by its name is meant; ``identify`` warns of it.
+    A column given by its name is accepted; ``identify`` warns about it.
     """
     for role, given in roles.items():
         names = read.names[role]

@@ -18,8 +18,8 @@ class FrequencyResponse:
     ``variance`` [lines] is the expected square of the modulus of the error of
     ``values``, None if it is not known, and ``freedom`` the number of real degrees of
     freedom from which it was estimated (infinite for a known variance). ``noise``
-    [lines] is the part of the variance due to noise, None if it was not told apart from
-    nonlinear distortion; then ``values`` are the mean of ``realisations`` responses.
+    [lines] is the part of the variance due to noise, None if it was not separated from
+    nonlinear distortion. ``values`` are the mean of ``realisations`` responses.
     ``coherence`` [lines] is from 0 to 1. ``amplitude`` is the rms deviation of the
     input from its mean, None if it is not known. ``resolution`` (Hz) is the width of
     the band from which a line was estimated, 0 for a line by itself. ``held`` is the
@@ -86,9 +86,9 @@ class FrequencyResponse:
     def distortion(self) -> np.ndarray | None:
         """Variance [lines] of the nonlinear distortion of a realisation, or None.
 
-        It is the excess of the total variance over that of the noise, without bias, so
-        that it scatters around 0 where there is no distortion. Source: Pintelon and
-        Schoukens, System Identification, 2nd ed., section 4.3.1.
+        It is the excess of the total variance over that of the noise. This estimate is
+        unbiased: it scatters around 0 where there is no distortion. Source: Pintelon
+        and Schoukens, System Identification, 2nd ed., section 4.3.1.
         """
         if self.variance is None or self.noise is None:
             return None
@@ -98,8 +98,8 @@ class FrequencyResponse:
         """Return half the confidence bands [lines] of magnitude and phase (rad).
 
         The error is circular complex normal with the estimated variance, so the part
-        along or across the response follows Student's t distribution. A phase that is
-        not known has half the band pi. Raises ValueError without a variance.
+        along or across the response follows Student's t distribution. If the
+        phase is not known, half its band is pi. Raises ValueError without a variance.
         """
         import scipy.stats  # takes long to import
 

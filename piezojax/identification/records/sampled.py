@@ -71,8 +71,8 @@ def read_sampled(
     """Read the columns of each of ``roles`` from a file in one of ``formats.FORMATS``.
 
     Columns and sample time are given as for ``read_record``. Unless ``even``, the steps
-    of the time column may differ; it must have ``least`` samples or more. Raises
-    ValueError as ``read_record`` does.
+    of the time column may differ. The message on a time column of fewer than two
+    samples asks for ``least`` samples. Raises ValueError as ``read_record`` does.
     """
     columns = read_columns(path)
     try:

@@ -25,11 +25,11 @@ for 15 averages (Bendat and Piersol, Random Data, 4th ed., 9.2)."""
 
 LEAST = 1e-10
 """Least input power of a line, as a share of the strongest line. The confidence
-interval tells whether it suffices."""
+interval tells whether the power suffices."""
 
 LEAKAGE = 4.0
-"""Power that a line leaks through a Hann window into a line at a distance of d lines,
-times d^6, with a factor of ten to spare."""
+"""Share of the power of a line that leaks through a Hann window into the line at a
+distance of d lines, times d^6, with a safety factor of ten."""
 
 CERTAIN = 1.0
 """Half-width of the interval of the relative error above which a line counts as not
@@ -65,7 +65,7 @@ class RelativeError(NamedTuple):
 
     @property
     def sure(self) -> np.ndarray:
-        """Whether the error [lines] is surely above 0, for all lines at once."""
+        """Whether the error [lines] is above 0 with certainty, at all lines at once."""
         return self.error > 2.0 * self.margin
 
     @property
@@ -112,7 +112,7 @@ def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeErro
 def _closed_loop_error(
     record: Record, run: np.ndarray, part: slice, segment: int
 ) -> RelativeError:
-    """Return the relative error, from what the excitation of a loop explains."""
+    """Return the relative error, from responses to the excitation of a loop."""
     signals, input, error = (
         each[part] for each in (record.excitation, record.input, record.output - run)
     )
@@ -163,7 +163,8 @@ def error_bound(
 def joined(bounds: Sequence[ErrorBound]) -> ErrorBound:
     """Return one bound from those of several records.
 
-    At lines that several records excite the largest bound counts.
+    The bound at a line is the largest of the records that excite it, or, if none does,
+    the smallest of all.
     """
     if len(bounds) == 1:
         return bounds[0]

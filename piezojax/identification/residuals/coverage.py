@@ -19,7 +19,7 @@ BEYOND = 0.15
 """Share of the input's training range by which a sample must leave it to count."""
 
 OFTEN = 0.01
-"""Share of such samples in the validation part that counts as another range."""
+"""Share of such samples in the validation part above which its range is new."""
 
 
 class Coverage(BaseModel):

@@ -1,4 +1,4 @@
-"""Feedback from the output to the input of a record, from their predictability.
+"""Detection of feedback from the output to the input of a record.
 
 Without feedback the past output does not help to predict the input from its own past
 (Caines and Chan, IEEE Trans. Automatic Control 20, 1975; Ljung, System Identification,
@@ -10,10 +10,10 @@ import scipy
 
 OWN, LAGS = 80, 3
 """Number of past samples of the input, and of the output, in a prediction. The input
-has more, because the output of a stage tells of inputs that are long past."""
+has more, because the output of a stage contains information on much older inputs."""
 
 STRETCH = 1000
-"""Samples that are predicted with one set of coefficients: a chirp changes."""
+"""Samples that are predicted with one set of coefficients; those of a chirp vary."""
 
 SHARE = 0.01
 """Least share of the unpredictable part of the input that past outputs explain, from
@@ -55,9 +55,10 @@ def feedback_share(input: np.ndarray, output: np.ndarray) -> float:
 
 
 def _left(input: np.ndarray, output: np.ndarray) -> tuple[float, float, int]:
-    """Return the squares that the own past leaves, those that both leave, and rows.
+    """Return the residual sums of squares of two predictions, and the number of rows.
 
-    y(k) does not count, which an input that acts within its sample moves too.
+    The first predicts the input from its own past, the second from the past outputs
+    too. y(k) is left out, because an input that acts within its sample changes it.
     """
     u, y = input - input.mean(), output - output.mean()
     windows = np.lib.stride_tricks.sliding_window_view

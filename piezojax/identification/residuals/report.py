@@ -19,7 +19,7 @@ OTHER_GAIN = 1.25
 
 GROSS = 10.0
 """Size of a peak that the model lacks, as a multiple of the model's own gain, that
-raises an alarm: a loop designed on this model does not know its stage."""
+raises an alarm: a controller designed on this model does not suit the stage."""
 
 WIDE = 0.5
 """Share of the lines in an octave with an error above the model's gain that counts as
@@ -30,11 +30,11 @@ class ResidualReport(BaseModel):
     """Analysis of the free-run error over the validation part.
 
     ``whiteness`` holds the autocorrelation of each output's residual,
-    ``input_correlation`` its correlation with each input (outputs vary slowest); for
-    records of a closed loop with the reference and the dither, because noise is in the
-    input.
-    ``peaks`` are resonances that the model lacks. ``coverage`` is the band and range of
-    the whole records, ``unseen`` the part of validation that training does not cover.
+    ``input_correlation`` its correlation with each input (outputs vary slowest). For
+    records of a closed loop it is the correlation with the reference and the dither,
+    because the input contains noise. ``peaks`` are resonances that the model lacks.
+    ``coverage`` is the band and range of the whole records, ``unseen`` the part of
+    validation that training does not cover.
     ``error_bound`` bounds the relative error of the model over frequency; it is None,
     and ``peaks`` is empty, for records of several inputs or outputs, and for records
     that are too short.
@@ -155,7 +155,7 @@ def _peak_warnings(peaks: Iterable[Peak]) -> Iterator[str]:
 
 
 def _response_warnings(found: RelativeError | None) -> Iterator[str]:
-    """Warn of an octave in which the response is wrong by more than the gain."""
+    """Yield a warning if the error exceeds the model's gain in most of an octave."""
     if found is None:
         return
     seen = found.gain > VISIBLE * found.gain[0]
