@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import hashlib
 import importlib
 import io
 import json
@@ -311,6 +312,8 @@ def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     assert f"make -C {out} test" in printed
     text = (out / "controller.c").read_text(encoding="utf-8")
     assert "Study: small, seed 3." in text
+    written = (tuned[1] / "study.toml").read_bytes()
+    assert f"SHA-256 of study.toml: {hashlib.sha256(written).hexdigest()}." in text
     assert re.search(r"parameters.actuator_\w*lower = -20.0;", text)
     assert re.search(r"parameters.actuator_\w*upper = 120.0;", text)
     assert "Judged: tuned loop: sensitivity peak" in text
@@ -319,6 +322,19 @@ def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     references = pj.read_about(tuned[1] / "gains.toml").reference_ranges[0]
     assert columns[0].min() < references[0]
     assert columns[0].max() > references[1]
+
+
+def test_export_beside_another_study_is_not_judged(tuned, tmp_path):
+    for name in ("gains.toml", "study.toml"):
+        (tmp_path / name).write_bytes((tuned[1] / name).read_bytes())
+    other = (tmp_path / "study.toml").read_text().replace("seed = 3", "seed = 3\n# a")
+    (tmp_path / "study.toml").write_text(other)  # a comment changes nothing
+    result = succeeded(call("export", tmp_path / "gains.toml", "--out", tmp_path / "a"))
+    assert "note: not judged" not in result.stdout
+    (tmp_path / "study.toml").write_text(other.replace("SW50", "SW40"))
+    result = succeeded(call("export", tmp_path / "gains.toml", "--out", tmp_path / "b"))
+    assert "is not the study of" in result.stdout
+    assert "report.json" not in names(tmp_path / "b")
 
 
 def test_export_without_its_study_is_not_judged(tuned, tmp_path):

@@ -94,7 +94,7 @@ def main(
         runs = None
         if to == "c" and about.study is not None:
             try:
-                runs = _runs(study or path.with_name("study.toml"), about)
+                runs = _runs(study, path, about)
             except ValueError as error:
                 if study is not None:
                     raise
@@ -131,18 +131,25 @@ def main(
     run(quiet, body)
 
 
-def _runs(path: Path, about: "About") -> "Runs":
-    """Return the runs of the study at ``path`` for a controller with ``about``.
+def _runs(named: Path | None, file: Path, about: "About") -> "Runs":
+    """Return the runs of the study at ``named`` for a controller with ``about``.
 
-    Raises ValueError if study and controller have different sampling rates.
+    Without a path it is the study.toml beside the ``file`` of the controller. Raises
+    ValueError if study and controller have different sampling rates, and for a
+    study.toml that is not that of the controller.
     """
     from .. import study as studies
     from ..tuning.exported_runs import make_runs
+    from ..tuning.result import STUDY_FILE
 
-    case = studies.read(study_path(path), about.seed)
+    path = study_path(named or file.with_name(STUDY_FILE))
+    case = studies.read(path, about.seed)
     if case.study.rate != about.rate_Hz:
         raise ValueError(
             f"{path} is for {case.study.rate:g} Hz, the controller for "
             f"{about.rate_Hz:g} Hz"
         )
+    known = None if named else about.study_sha256
+    if known and studies.sha256_of(case.study) != known:
+        raise ValueError(f"{path} is not the study of {file}: its SHA-256 differs")
     return make_runs(case)

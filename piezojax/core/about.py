@@ -12,9 +12,10 @@ class About(BaseModel):
     """Origin of a saved System, and the reasons not to use it.
 
     ``piezojax`` is the version that wrote the file. ``study`` is the name of the study
-    with its ``seed``, ``record`` the origin of the record of a fit, and ``rate_Hz`` the
-    sampling rate. ``units`` maps the channels of the System to their units, and
-    ``parameter_units`` its parameters, by path; "" is an unknown unit.
+    with its ``seed``, ``study_sha256`` the hash of its file, ``record`` the origin of
+    the record of a fit, and ``rate_Hz`` the sampling rate. ``units`` maps the channels
+    of the System to their units, and ``parameter_units`` its parameters, by path; "" is
+    an unknown unit.
     ``input_ranges`` are the least and greatest value of each input in the record.
     ``judged`` lists the margins that a controller was judged with, a sentence each,
     and ``plants`` the ranges of the plants on which they hold.
@@ -30,6 +31,7 @@ class About(BaseModel):
 
     piezojax: str = Field(default_factory=lambda: version("piezojax"))
     study: str | None = None
+    study_sha256: str | None = None
     seed: int | None = None
     record: str | None = None
     rate_Hz: float | None = None  # noqa: N815
@@ -49,11 +51,13 @@ class About(BaseModel):
     def origin(self, subject: str) -> list[str]:
         """Return the head of a file that holds ``subject``, the alarms first."""
         seed = "" if self.seed is None else f", seed {self.seed}"
+        hashed = self.study_sha256
         rate = "" if not self.rate_Hz else f"{self.rate_Hz:.9g} Hz; no other"
         lines = [
             *(f"UNSAFE: {each}" for each in self.unsafe),
             f"{subject}, exported by piezojax {self.piezojax}.",
             *([f"Study: {self.study}{seed}."] if self.study else []),
+            *([f"SHA-256 of study.toml: {hashed}."] if hashed else []),
             *([f"Record: {self.record}."] if self.record else []),
             *([f"Sampling rate: {rate}."] if rate else []),
             *(f"Judged: {each}." for each in self.judged),

@@ -3,17 +3,16 @@
 from pathlib import Path
 
 import numpy as np
-import tomli_w
 from matplotlib.figure import Figure
 
 from ..core.axes import axis_of
 from ..core.files import write_text
 from ..core.serial import save
 from ..signals.waveforms import parse
-from ..study import Study
+from ..study import Study, as_toml
 from ..tuning.contouring import contour_errors, contours_in
 from ..tuning.outcome import Logs, Outcome, tracking_rms
-from ..tuning.result import GAINS_FILE, RESULT_FILE
+from ..tuning.result import GAINS_FILE, RESULT_FILE, STUDY_FILE
 from ..tuning.traces import Trace, traces_of
 from .contour_path import contour_figure
 from .coupling_map import coupling_figure
@@ -81,8 +80,7 @@ def write_numbers(outcome: Outcome, folder: Path) -> None:
     result = outcome.result.model_copy(update=found)
     write_text(folder / RESULT_FILE, result.model_dump_json(indent=2) + "\n")
     save(outcome.controller, folder / GAINS_FILE, outcome.about)
-    study = outcome.case.study.model_dump(mode="json", exclude_none=True)
-    write_text(folder / "study.toml", tomli_w.dumps(study))
+    write_text(folder / STUDY_FILE, as_toml(outcome.case.study))
 
 
 def _quantity(trace: Trace) -> str:

@@ -14,7 +14,9 @@ from .comparison_study import read_compared as read_compared
 from .ensemble import Ensemble as Ensemble
 from .ensemble import Stage as Stage
 from .schema import Study as Study
+from .schema import as_toml as as_toml
 from .schema import load as load
+from .schema import sha256_of as sha256_of
 
 DEFAULT = "p753_learned_inverse"
 """Name of the default study."""

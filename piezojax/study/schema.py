@@ -1,8 +1,10 @@
 """Tables of a study file, and their validation."""
 
+import hashlib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import tomli_w
 from pydantic import Field, field_validator, model_validator
 
 from ..analysis.constraints import CONSTRAINTS, limits_of
@@ -378,6 +380,16 @@ class Study(Table):
             return motions.parse(reference, self.axes.names)
         signals.parse(reference)
         return {"": reference}
+
+
+def as_toml(study: Study) -> str:
+    """Return the text of ``study`` as a file, with every default written out."""
+    return tomli_w.dumps(study.model_dump(mode="json", exclude_none=True))
+
+
+def sha256_of(study: Study) -> str:
+    """Return the SHA-256 of ``as_toml``, which names a study whatever its comments."""
+    return hashlib.sha256(as_toml(study).encode("utf-8")).hexdigest()
 
 
 def load(path: str | Path) -> Study:

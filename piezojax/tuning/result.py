@@ -21,6 +21,7 @@ from .structure_choice import StructureSearch
 
 RESULT_FILE = "result.json"
 GAINS_FILE = "gains.toml"
+STUDY_FILE = "study.toml"
 
 
 class Scores(BaseModel):
