@@ -121,7 +121,7 @@ def study_of(name, plant, steps):
             "controller.derivative_filter": log(1e-5, 1e-2),
         },
         "constraints": {"sensitivity_peak": LIMIT, "delay_margin": "off"},
-        "optimiser": {"starts": 3, "candidates": 32, "steps": steps},
+        "optimiser": {"steps": steps},
     }
     light = len(plant.modes) - 1
     if light:
