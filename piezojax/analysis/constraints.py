@@ -69,6 +69,7 @@ class Constraint(NamedTuple):
     first axis, from the field ``source`` of the LoopFigures and dt in s. A limit must
     lie above ``above`` and below ``below``. ``default`` is the limit of a study that
     names none. ``one_axis`` is True if the figure is known for one axis only.
+    ``bands`` is the number of values for each plant and branch.
     """
 
     unit: str
@@ -79,6 +80,7 @@ class Constraint(NamedTuple):
     below: float = math.inf
     default: float | None = None
     one_axis: bool = False
+    bands: int = 1
 
     def check(self, name: str, limit: Any) -> None:
         """Raise ValueError unless ``limit`` is a number in its bounds, or ``OFF``."""
@@ -193,6 +195,7 @@ CONSTRAINTS: dict[str, Constraint] = {
         _margin("sensitivity_peak"),
         above=1.0,
         default=2.0,
+        bands=BANDS,
     ),
     "disk_margin": Constraint(
         "1", "at least", "margins", _margin("disk_margin"), below=2.0
@@ -279,14 +282,14 @@ def constraint_count(names: Iterable[str], plants: int, margin_plants: int) -> i
     of ``plants`` and step, a limit on margins once for each of ``margin_plants`` and
     branch, that on the sensitivity peak in each band.
     """
-    bands = {"sensitivity_peak": BANDS}
     each = {
         "margins": margin_plants * len(BRANCHES),
         "steps": plants * len(STEPS),
         "tracking": plants,
         "extremes": plants,
     }
-    return sum(each[CONSTRAINTS[name].source] * bands.get(name, 1) for name in names)
+    kinds = [CONSTRAINTS[name] for name in names]
+    return sum(each[kind.source] * kind.bands for kind in kinds)
 
 
 def violations(

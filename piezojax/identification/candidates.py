@@ -91,7 +91,6 @@ def supported_parts(
         creeps = [""]
     training = training_record(records, train)
     found, extent = excitation(records, train), extent_of(training)
-    shown = dynamics_parts(training)
     if extent.modes:
         # The error of a free run does not tell whether the mode is needed: creep and
         # hysteresis dominate it.
@@ -99,7 +98,7 @@ def supported_parts(
             f"the training part shows a resonance at {extent.modes[0].frequency:.4g} Hz"
         )
         untried += [UntriedModel(name, without) for name in DYNAMICS]
-        return SupportedParts(tuple(creeps), (shown,)), untried
+        return SupportedParts(tuple(creeps), (dynamics_parts(training),)), untried
     dynamics = []
     for name in DYNAMICS:
         needed = _parameter_count(name, extent)

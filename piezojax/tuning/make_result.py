@@ -66,8 +66,8 @@ def make_result(
     after_scores = _chosen(evaluator.figures(after, data.tuning), names, tuned)
     unit = np.asarray(search.unit)
     values = case.space.from_unit(as_array(unit))
-    places = dict(zip(case.space.paths, unit, strict=True))
-    bounds_reached = {path: side for path in places if (side := _side(places[path]))}
+    sides = zip(case.space.paths, map(_side, unit), strict=True)
+    bounds_reached = {path: side for path, side in sides if side}
     return Result(
         study=case.name,
         title=case.study.title,

@@ -15,7 +15,7 @@ axis: 0.5 % for Q = 32 at 400 Hz. The response of a loop that rings for longer t
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -62,6 +62,8 @@ BANDS = 10
 left below them."""
 
 Sensitivity = Complex[Array, "*batch lines axes axes"]
+
+_WHOLE = (slice(0, None),)
 
 _SQUARINGS = 24
 """Number of squarings of a Gram matrix that give its largest eigenvalue, with a
@@ -244,7 +246,7 @@ def peak_of(sensitivity: Sensitivity) -> Float[Array, ""]:
 
     On several axes it depends on the units of the commands.
     """
-    return _largest_singular(sensitivity, (sensitivity.shape[0],))[0]
+    return _largest_singular(sensitivity, _WHOLE)[0]
 
 
 @jax.jit
@@ -255,21 +257,24 @@ def peaks_of(sensitivity: Sensitivity) -> Float[Array, " bands"]:
     where two peaks are equally high, the slope of the higher says nothing of the other,
     and each step would be turned back by the one that it did not see.
     """
-    return _largest_singular(sensitivity, _ends(sensitivity.shape[0]))
+    return _largest_singular(sensitivity, _octaves(sensitivity.shape[0]))
 
 
 def largest_by_band(values: Float[Array, " lines"]) -> Float[Array, " bands"]:
     """Return the largest of ``values`` in each band of ``peaks_of``."""
-    return jnp.stack([largest(values[band]) for band in _bands(_ends(values.size))])
+    return _largest_in(_octaves(values.size), values)
 
 
-def _ends(lines: int) -> tuple[int, ...]:
-    """Return the ends of the bands, each of one line or more."""
-    return tuple(max(lines >> (BANDS - band), band) for band in range(1, BANDS + 1))
-
-
-def _bands(ends: tuple[int, ...]) -> list[slice]:
+def _octaves(lines: int) -> list[slice]:
+    """Return the bands of ``peaks_of``, each of one line or more."""
+    ends = [max(lines >> (BANDS - band), band) for band in range(1, BANDS + 1)]
     return [*map(slice, (0, *ends[:-1]), ends)]
+
+
+def _largest_in(
+    bands: Sequence[slice], values: Float[Array, " lines"]
+) -> Float[Array, " bands"]:
+    return jnp.stack([largest(values[band]) for band in bands])
 
 
 @jax.jit
@@ -279,26 +284,22 @@ def disk_margin_of(sensitivity: Sensitivity) -> Float[Array, ""]:
     On one axis it is that of ``StabilityReport``. On several axes it is a lower bound
     of that of ``MultiAxisReport``, which scales the axes at each frequency.
     """
-    lines, axes, _ = sensitivity.shape
-    return 1.0 / _largest_singular(sensitivity - 0.5 * jnp.eye(axes), (lines,))[0]
+    shifted = sensitivity - 0.5 * jnp.eye(sensitivity.shape[-1])
+    return 1.0 / _largest_singular(shifted, _WHOLE)[0]
 
 
 def _largest_singular(
-    matrices: Sensitivity, ends: tuple[int, ...]
+    matrices: Sensitivity, bands: Sequence[slice]
 ) -> Float[Array, " bands"]:
-    """Return the largest singular value of ``matrices`` up to each of ``ends``.
-
-    Each band begins where the one before ends.
+    """Return the largest singular value of ``matrices`` in each of the ``bands``.
 
     The derivatives are finite. On several axes it is the norm of order 2^25 of the
     singular values, which is never below the largest. Its derivative exists where
     singular values are equal, and it needs no LAPACK, whose calls from XLA may deadlock
     on a CPU.
     """
-    bands = _bands(ends)
     if matrices.shape[-1] == 1:
-        sizes = jnp.abs(matrices).ravel()
-        return jnp.stack([largest(sizes[band]) for band in bands])
+        return _largest_in(bands, jnp.abs(matrices).ravel())
     sizes = jnp.exp(_log_norm(jax.lax.stop_gradient(matrices)))
     worst = [band.start + jnp.argmax(sizes[band]) for band in bands]
     return jnp.exp(_log_norm(matrices[jnp.stack(worst)]))
