@@ -35,14 +35,15 @@ SYSTEMS = ("gains.toml", "model.json")
     "--precision",
     type=click.Choice(["double", "float", "compensated"]),
     default="double",
-    help="Type of all real numbers in C (default: double); compensated is float whose "
-    "sums carry their rounding errors. float becomes compensated if it costs too much.",
+    help="Type of all real numbers in C (default: double); compensated: float with the "
+    "rounding errors of sums carried along. If float adds too much error, compensated "
+    "is written instead.",
 )
 @click.option(
     "--study",
     type=click.Path(path_type=Path),
-    help="Study whose references judge a controller in C (default: the study.toml "
-    "beside FILE).",
+    help="Study on whose references a controller in C is judged (default: the "
+    "study.toml beside FILE).",
 )
 @click.option(
     "--limits",
@@ -60,7 +61,8 @@ SYSTEMS = ("gains.toml", "model.json")
 @click.option(
     "--accept-unsafe",
     is_flag=True,
-    help="Export gains with an alarm or without a judgement; the files begin with it.",
+    help="Export gains that have an alarm or that no study has judged; the files begin "
+    "with the alarm.",
 )
 @common
 def main(
@@ -134,7 +136,7 @@ def main(
 def _runs(named: Path | None, file: Path, about: "About") -> "Runs":
     """Return the runs of the study at ``named`` for a controller with ``about``.
 
-    Without a path it is the study.toml beside the ``file`` of the controller. Raises
+    ``named`` defaults to the study.toml beside the ``file`` of the controller. Raises
     ValueError if study and controller have different sampling rates, and for a
     study.toml that is not that of the controller.
     """

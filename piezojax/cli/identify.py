@@ -43,7 +43,8 @@ class _Gain(click.ParamType):
 @click.option(
     "--controller",
     metavar="DEVICE",
-    help="Measure the scale of the gains of nv200 or e727, from its error and voltage.",
+    help="Measure the scale of the gains of an nv200 or e727, from a record of its "
+    "error and voltage.",
 )
 @click.option(
     "--gain",
@@ -61,8 +62,8 @@ class _Gain(click.ParamType):
 @click.option(
     "--held/--not-held",
     default=None,
-    help="With --response: measured through converters that hold the input, at the "
-    "rate of the record or --rate (default: held in a record over time).",
+    help="With --response: converters held the input between samples, at the rate of "
+    "the record or --rate (default: held in a record over time).",
 )
 @click.option("--unit", help="With --response: unit of a file of a response  [um/V]")
 @click.option(
@@ -81,12 +82,12 @@ class _Gain(click.ParamType):
 @click.option(
     "--skip",
     type=click.IntRange(min=0),
-    help="With --response: periods that robust leaves out at the start  [1]",
+    help="With --response: periods at the start that the method robust discards  [1]",
 )
 @click.option(
     "--segment",
     type=click.IntRange(min=1),
-    help="With --response: samples in a segment of welch.",
+    help="With --response: samples in a segment of the method welch.",
 )
 @click.option(
     "--dynamics",
@@ -97,7 +98,7 @@ class _Gain(click.ParamType):
     "--closed-loop",
     type=click.Choice(["direct", "indirect", "joint"]),
     help="Approach to a record of a closed loop (default with a --reference or "
-    "--dither: direct; joint where its noise model fails).",
+    "--dither: direct, or joint where the noise model of direct fails).",
 )
 @click.option(
     "--loop-controller",
@@ -105,7 +106,10 @@ class _Gain(click.ParamType):
     help="With --closed-loop indirect: gains.toml or the catalogued controller that "
     "closed the loop.",
 )
-@click.option("--among", help="With 'all': compare only these and linear models.")
+@click.option(
+    "--among",
+    help="With 'all': compare only these hysteresis models (A,B) and linear models.",
+)
 @record_columns
 @click.option(
     "--method",

@@ -38,7 +38,7 @@ class Amplitudes(click.ParamType):
 class ResponseOptions(NamedTuple):
     """Options of ``--response``.
 
-    None and 1 are the values of options that were not given.
+    An option that was not given is None, () or 1.
     """
 
     method: str | None
@@ -141,7 +141,9 @@ def _read(
     from ..identification.records.response_file import read_responses
 
     if columns["rate"] is None:
-        raise ValueError("a file of --response needs a --rate, that of the controller")
+        raise ValueError(
+            "a file of --response needs a --rate: the sampling rate of the controller"
+        )
     if columns["period"] or options.realisations != 1 or options.skip is not None:
         raise ValueError(
             "--period, --realisations and --skip need a --method: the RECORD is then "
@@ -177,7 +179,7 @@ def _measured(
 
     if options.unit is not None or options.amplitudes:
         raise ValueError(
-            "--unit and --amplitude are those of a file of a response; with --method "
+            "--unit and --amplitude describe a file of a response; with --method "
             "they come from the record"
         )
     loaded = [read_record(record, **columns) for record in records]

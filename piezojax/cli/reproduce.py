@@ -88,7 +88,7 @@ def main(tables, calibrate, out, seed, quiet):
             )
         console.print(f"results in {folder}", soft_wrap=True)
         if interrupted:
-            console.print("interrupted: the tables finished so far")
+            console.print("interrupted: these are the tables finished so far")
             exit_interrupted()
 
     def calibration(console):

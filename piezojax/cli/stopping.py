@@ -35,7 +35,7 @@ def handled(handlers: dict[signal.Signals, Handler]) -> Iterator[None]:
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """End the process at once on SIGTERM, with the exit status of a shell.
+    """End the process at once on SIGTERM, with the exit status 143.
 
     No results are lost while a command imports, reads its files or prints; while
     it computes, ``Bar`` handles the signal.

@@ -121,7 +121,7 @@ def _report(
     else:
         console.print(
             f"shard {shard[0]}/{shard[1]} is complete, {result.chunks} chunks; the "
-            f"data set is merged when all other shards are in {folder}",
+            f"data set is merged when all other shards in {folder} are complete",
             soft_wrap=True,
         )
 

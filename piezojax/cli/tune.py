@@ -44,11 +44,11 @@ def main(
     STUDY is a TOML file or the name of a study that comes with piezojax; without it, a
     PI with a learned inverse is tuned on the P-753 stage. Several studies, or a
     comparison (controllers and rates in one file, as comparison/p753), are tuned one
-    after another, each into its own folder, and end in one table and picture.
+    after another, each into its own folder. One table and one picture compare them.
 
     Exit status 3 means that the run finished with an alarm: the loop violates a limit,
     diverges or stays at a voltage limit, or the model is not validated. The alarms are
-    printed first, and gains.toml loads with accept_unsafe only.
+    printed first, and gains.toml loads only with accept_unsafe.
     """
 
     def body(console: Console) -> None:

@@ -29,8 +29,8 @@ from .terminal import Bar
 def main(model, records, estimate, out, seed, quiet, **columns):
     """Judge a fitted MODEL on other RECORDs of its stage, and save it with the verdict.
 
-    No parameter of the model changes. The file model.json in the results carries the
-    alarms, and an error bound that also holds for these records: name it in a study.
+    No parameter of the model changes. The file model.json in the results holds the
+    alarms and an error bound that also covers these records; use this file in a study.
     """
     del seed  # nothing is random
 

@@ -32,8 +32,8 @@ def comparison_table(comparison: ComparisonResult) -> Table:
     """Return errors before and after tuning by controller and rate, in nm rms."""
     table = Table(
         title=Text(
-            f"{comparison.title}\nrms tracking error, nm: geometric mean over the "
-            "references, noise not tuned on\n(new: references not tuned on either; "
+            f"{comparison.title}\nrms tracking error on held-out noise, nm: geometric "
+            "mean over the references\n(new: references that were not tuned on; "
             "* before: gains scaled from another rate; ! tuned: with an alarm)"
         )
     )

@@ -154,7 +154,7 @@ def ranking_notes(report: RankingReport) -> list[str]:
         notes.append("interrupted: the best of the models fitted so far")
     notes.append(f"best: {report.best} ({report.rule})")
     if report.test is None:
-        used = "each record left out" if report.across else "the validation part"
+        used = "the left-out records" if report.across else "the validation part"
         notes.append(
             f"the choice used {used}, so the error there is not a held-out error; "
             "--test START:STOP reserves samples for one"

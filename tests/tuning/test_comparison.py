@@ -220,7 +220,7 @@ def test_the_studies_of_a_comparison_can_be_tuned_separately(compared):
 def test_the_command_ends_with_the_table(compared):
     printed, out, _ = compared
     assert "2 of 2: continuous at 5 kHz" in printed
-    assert "rms tracking error, nm" in printed
+    assert "rms tracking error on held-out noise, nm" in printed
     assert "held-out perturbed plants" in printed
     assert "lowest on held-out plants at 5 kHz: " in printed
     assert "geometric mean" in printed
