@@ -112,14 +112,14 @@ class ChargeDriveState(NamedTuple):
 class ChargeDrive(System):
     """Charge amplifier with grounded load, from a command v to a voltage u.
 
-    The network C_s, R_s of the amplifier and the load C_L, R_L take up the same charge:
+    The network C_s, R_s of the amplifier and the load C_L, R_L carry the same current:
 
     ``C_s dv/dt + v / R_s = dq/dt + u / R_L``
 
     where q is the charge of the load and u its voltage. For a linear load u = q/C_L
     this is (2.12) with leakage, ``q / v = C_s (s + 1/(C_s R_s)) / (s + 1/(C_L R_L))``:
-    the charge follows the command at frequencies above 1 / (C_L R_L), the voltage at
-    frequencies below.
+    above 1 / (C_L R_L), in rad/s, the charge follows the command; below it, the voltage
+    does.
 
     ``load`` is a System from q / C_L in V to u in V; a linear load is ``Affine()``. In
     a piezo the hysteresis lies between voltage and charge, and the displacement is

@@ -1,1 +1,1 @@
-"""Stability of loops and the limit of linear control."""
+"""Analysis of loops: stability, constraints, steps, the limit of linear control."""

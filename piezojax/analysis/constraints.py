@@ -39,8 +39,8 @@ and the size of the violation has no meaning."""
 
 
 MarginFigures = dict[str, Float[Array, "..."]]
-"""Limited margins of a loop by constraint: [plants, branches], and the sensitivity
-peaks [plants, branches, bands]."""
+"""Margins of a loop by constraint, [plants, branches]; the sensitivity peaks are
+[plants, branches, bands]."""
 
 
 class LoopFigures(NamedTuple):
@@ -67,9 +67,9 @@ class Constraint(NamedTuple):
 
     ``values(source, dt)`` returns the values of the figure, with the plants on the
     first axis, from the field ``source`` of the LoopFigures and dt in s. A limit must
-    lie above ``above`` and below ``below``. ``default`` is the limit of a study that
-    names none. ``one_axis`` is True if the figure is known for one axis only.
-    ``bands`` is the number of values for each plant and branch.
+    lie above ``above`` and below ``below``. ``default`` is the limit if a study gives
+    none. ``one_axis`` is True if the figure is known for one axis only. ``bands`` is
+    the number of values for each plant and branch.
     """
 
     unit: str
@@ -105,14 +105,14 @@ def _largest(runs: Array) -> Array:
 
 
 def _peaks(sensitivity: Sensitivity, error: Array | None) -> Array:
-    """Return the largest |S| [bands] of a plant within ``error`` of the model."""
+    """Return the largest |S| [bands] over the plants within ``error`` of the model."""
     if error is None:
         return peaks_of(sensitivity)
     return largest_by_band(worst_sensitivity(sensitivity[:, 0, 0], error))
 
 
 def _delay(sensitivity: Sensitivity, error: Array | None) -> Array:
-    """Return the least delay margin of a plant within ``error`` of the model."""
+    """Return the least delay margin over the plants within ``error`` of the model."""
     nominal = delay_margin_of(sensitivity)
     if error is None:
         return nominal
@@ -122,7 +122,7 @@ def _delay(sensitivity: Sensitivity, error: Array | None) -> Array:
 
 
 def _disk(sensitivity: Sensitivity, error: Array | None) -> Array:
-    """Return the disk margin of the model, itself a margin for errors of the model."""
+    """Return the disk margin of the model, itself a margin against model errors."""
     del error
     return disk_margin_of(sensitivity)
 
@@ -159,11 +159,11 @@ def margin_figures(
     point: OperatingPoint,
     error: Float[Array, " lines"] | None,
 ) -> MarginFigures:
-    """Return the margins [branches] among the constraints ``names``.
+    """Return the figures [branches] of those ``names`` that are margins.
 
-    The sensitivity peaks are [branches, bands], those of ``peaks_of``. The margins are
-    those of ``loop`` linearised at ``point``; ``error`` bounds the relative error of a
-    plant of one axis; None if no bound is known.
+    The loop is linearised at ``point``. The sensitivity peaks are those of
+    ``peaks_of``, [branches, bands]. ``error`` bounds the relative error of a plant of
+    one axis; it is None if no bound is known.
     """
     found: MarginFigures = {}
     if not _MARGINS.keys().isdisjoint(names):
@@ -243,16 +243,16 @@ CONSTRAINTS: dict[str, Constraint] = {
         one_axis=True,
     ),
 }
-"""Constraints by their name in a study; each holds for every plant and reference of
-the objective. The margins, the bandwidth (-3 dB) and the peak of y/r are those of the
-loop, linearised at the highest reference on both branches of the hysteresis; for a
-fitted plant the sensitivity peak and the delay margin are the worst within the error
-bound of its model. On several axes the peak is the largest singular value of S, the
-disk margin a lower bound of that of all axes at once, and gain, phase and delay margin
-are the least of one axis with the others closed. Times and the steady-state error, a
-share of the height, are those of the worst of four steps without noise
-(``step_response``). The others are the largest values in the runs; ``overshoot`` is a
-share of the range of the reference."""
+"""Constraints by their name in a study; each holds for every plant and reference of the
+objective. The margins, the bandwidth (-3 dB) and the peak of y/r are those of the loop,
+linearised at the highest reference on both branches of the hysteresis; for a fitted
+plant the sensitivity peak and the delay margin are the worst within the error bound of
+its model. On several axes the sensitivity peak is the largest singular value of S, and
+the disk margin is a lower bound of that of all axes at once. The gain, phase and delay
+margins are those of the worst axis with the others closed. The times and the
+steady-state error, a share of the height, are those of the worst of four steps without
+noise (``step_response``). The others are the largest values in the runs; ``overshoot``
+is a share of the range of the reference."""
 
 
 def limits_of(written: Mapping[str, Any]) -> dict[str, float]:
@@ -278,9 +278,10 @@ def uses(names: Iterable[str], source: Source) -> bool:
 def constraint_count(names: Iterable[str], plants: int, margin_plants: int) -> int:
     """Return the number of ``violations`` of the limits ``names``.
 
-    A limit on runs counts once for each of ``plants``, a limit on steps once for each
-    of ``plants`` and step, a limit on margins once for each of ``margin_plants`` and
-    branch, that on the sensitivity peak in each band.
+    A limit on runs counts once for each of ``plants``, and a limit on steps once for
+    each of ``plants`` and step. A limit on margins counts once for each of
+    ``margin_plants`` and branch, and the limit on the sensitivity peak also once for
+    each band.
     """
     each = {
         "margins": margin_plants * len(BRANCHES),

@@ -13,7 +13,7 @@ from ..core.system import System
 from ..dynamics import StateSpace, linearise
 
 LIGHT = 0.2
-"""Damping ratio below which a pair of poles is a mode; that of a filter is larger."""
+"""Damping ratio below which a pair of poles is a mode; filters have larger ones."""
 
 HIGHEST = 0.45
 """Highest frequency of a mode, in cycles per sample."""
@@ -23,9 +23,9 @@ class PlantMode(NamedTuple):
     """Mode of a plant: undamped natural ``frequency`` (Hz) and ``damping`` ratio.
 
     Its term in the partial fractions of the plant peaks near ``angle`` (rad/sample).
-    ``gain`` is the modulus of this term there, in the unit of the plant, and ``share``
-    the same over that of the whole plant. A mode that is hardly excited or measured has
-    a small gain.
+    ``gain`` is the modulus of this term at ``angle``, in the unit of the plant.
+    ``share`` is ``gain`` over the modulus of the whole plant at ``angle``. A mode that
+    is hardly excited or measured has a small gain.
     """
 
     frequency: float

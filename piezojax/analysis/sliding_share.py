@@ -84,7 +84,7 @@ def _watched(node: Any) -> Any:
 
 
 def sliding_mode_of(loop: Feedback) -> SlidingMode | ContinuousSlidingMode | None:
-    """Return the sliding mode in the controller whose s is m e + de/dt.
+    """Return the only sliding mode of the controller, if its s is m e + de/dt.
 
     None if there is no sliding mode, if there are several, or if it is a SlidingMode
     whose order is not two.

@@ -20,7 +20,7 @@ BAND, FINE = 0.02, 0.001
 """Settling bands around the reference, as shares of the height."""
 
 START, END = 0.1, 0.9
-"""Shares of the height between which a step rises."""
+"""Shares of the height between which the rise time is measured."""
 
 LAST = 0.1
 """Share of a run, at its end, over which the steady-state error is averaged."""
@@ -37,8 +37,8 @@ class StepFigures(NamedTuple):
     - ``steady_state_error``: mean distance from the reference in the last tenth of the
       run, as a share of the height.
 
-    A time that is longer than the run is a number above the length of the run, which
-    falls as the displacement comes nearer to the reference.
+    If the displacement does not rise or settle within the run, the time is longer than
+    the run and falls as the displacement comes nearer to the reference.
     """
 
     rise_time: Array
@@ -52,8 +52,8 @@ class StepFigures(NamedTuple):
 def step_ends(references: np.ndarray) -> np.ndarray:
     """Return the references (um) before and after each step of ``NAMES``, [4, 2].
 
-    The large ones span the range in which the ``references`` are for nine tenths of the
-    time: the extremes may be short overshoots that no stage could hold.
+    The large steps span the 5 % to 95 % quantiles of the ``references``: the extremes
+    may be short overshoots that no stage could hold.
     """
     low, high = np.quantile(references, [0.05, 0.95])
     middle, half = (low + high) / 2.0, SMALL * (high - low) / 2.0
@@ -93,9 +93,9 @@ def figures_of(
     dt: ScalarLike,
     noise: ScalarLike,
 ) -> StepFigures:
-    """Return the figures of one run with ``step_reference``; arguments as above."""
+    """Return the figures of a run with ``step_reference``; see ``step_figures``."""
     height = ends[1] - ends[0]
-    # Sample 1 is the first at which the reference is the new one.
+    # The reference steps at sample 1.
     share = (displacement[1:] - ends[0]) / height
     share = jnp.nan_to_num(share, nan=1e6, posinf=1e6, neginf=-1e6)
     error = share - 1.0
@@ -112,7 +112,7 @@ def figures_of(
 
 
 def _reached(share: Float[Array, " samples"], level: float) -> Array:
-    """Return the first place at which ``share`` is above ``level``, in samples."""
+    """Return the time, in samples, at which ``share`` first reaches ``level``."""
     above = share >= level
     at = jnp.argmax(above)
     here, before = share[at], jnp.where(at > 0, share[at - 1], 0.0)
@@ -124,7 +124,7 @@ def _reached(share: Float[Array, " samples"], level: float) -> Array:
 
 
 def _settled(error: Float[Array, " samples"], band: ScalarLike) -> Array:
-    """Return the place from which ``error`` stays within ``band``, in samples."""
+    """Return the time, in samples, from which ``error`` stays within ``band``."""
     size = jnp.abs(error)
     outside = size > band
     last = error.size - 1 - jnp.argmax(outside[::-1])

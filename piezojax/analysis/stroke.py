@@ -38,8 +38,8 @@ def stroke_of(
 
     The displacements at rest include the whole creep and the static gain, however slow
     the stage; those of the drive include both branches of the hysteresis. Noise or
-    drift only widen the stroke. An axis with a displacement that is not finite has no
-    bounds.
+    drift only widen the stroke. An axis with a displacement that is not finite has
+    infinite bounds.
     """
     ends = _ends(np.array(lower), np.array(upper))
     alone = ends.shape[2] == 1

@@ -1,4 +1,4 @@
-"""Table of the parameters of a device, beside those that were saved before."""
+"""Table of the saved and the exported parameters of a device."""
 
 from collections.abc import Sequence
 

@@ -9,7 +9,7 @@ from ..identification.estimators.frequency import EmpiricalResponse
 from .figures import AFTER, BEFORE, MEASURED, figure
 
 SHOWN = 60
-"""Largest number of singular values drawn, unless the order is near it or above."""
+"""Number of singular values drawn, or five more than the order if that is larger."""
 
 
 def singular_values_figure(

@@ -27,7 +27,7 @@ CAUSES: dict[str | None, str] = {
     "predicted": "leaves an error that a linear filter of the reference would cancel",
     None: "is too nonlinear to name a cause",
 }
-"""Explanations of a large error, by the share that exceeds that of the limit most."""
+"""Explanations of a large error, by the share that most exceeds that of the limit."""
 
 
 def write_limit(report: LimitReport | str, folder: Path, title: str = "") -> None:
@@ -115,7 +115,7 @@ def _errors(ax: Axes, report: LimitReport) -> None:
 
 
 def _spectra(ax: Axes, report: LimitReport) -> None:
-    """Draw the spectra of the reference whose error is the most times its limit."""
+    """Draw the spectra of the reference with the largest ratio of error to limit."""
     worst = report.worst
     densities = report.densities(worst)
     for name, colour, width, label in (

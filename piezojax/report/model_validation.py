@@ -25,7 +25,7 @@ from .fit_pictures import MODEL_FILE, display_unit
 VALIDATION_FILE, VALIDATION_PICTURE = "validation.json", "validation.png"
 
 DRAWN = 6
-"""Most records in one picture."""
+"""Largest number of records in one picture."""
 
 WORDS = {"amplitude": "input range in a stretch", "rate": "input slope"}
 

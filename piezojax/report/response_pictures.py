@@ -74,7 +74,7 @@ def measured_figure(
     """Draw a response with its 95 % band, the levels of its errors, and the model.
 
     The levels are the standard deviations of the noise and of the nonlinear distortion
-    of one realisation; below, what the model leaves.
+    of one realisation. The lowest panel shows the residual of the model.
     """
     hertz, unit = response.frequency, response.unit.replace("um", "µm")
     panels = 2 if fit is None else 3

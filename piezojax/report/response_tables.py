@@ -8,7 +8,7 @@ from .response_pictures import level_labels
 
 
 def measurement_table(found: Measurement) -> Table:
-    """Return how a response was measured, and how well."""
+    """Return the table of the settings and the accuracy of a measured response."""
     table = Table(title=f"response by {found.method}")
     table.add_column("", no_wrap=True)
     table.add_column("value", justify="right")
@@ -35,7 +35,7 @@ def measurement_table(found: Measurement) -> Table:
 
 
 def levels_table(found: ResponseLevels) -> Table:
-    """Return each parameter at every amplitude, and its change."""
+    """Return the table of each parameter at every amplitude, and of its change."""
     table = Table(title="modes by amplitude of the input (± standard error)")
     table.add_column("parameter", no_wrap=True)
     for label in level_labels(found):

@@ -20,9 +20,9 @@ _COLUMNS = {
     "overshoot": ("over-\nshoot %", 100.0),
     "steady_state_error": ("error\nleft %", 100.0),
 }
-"""Columns of the table: title with unit, and that unit in the figure's own."""
+"""Columns of the table: title with unit, and the factor from s or a share to it."""
 
-_ROOM = 4.0  # settling times shown
+_ROOM = 4.0  # length of the picture, in settling times
 
 
 def steps_table(steps: Loops) -> Table:

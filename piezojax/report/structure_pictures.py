@@ -48,7 +48,7 @@ def _nanometres(value: float | None) -> str:
 def structures_figure(search: StructureSearch | None, title: str) -> Figure | None:
     """Draw the errors of each structure, and the modes in the loop of the chosen one.
 
-    None without two structures that were tuned.
+    Return None if fewer than two structures were tuned.
     """
     tuned = [one for one in search.structures if one.log_errors] if search else []
     if len(tuned) < 2:

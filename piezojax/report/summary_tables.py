@@ -118,7 +118,7 @@ def beside_table(result: Result) -> Table:
 
 
 _ANY_PEAK = 100.0
-"""Ms above which the impulse response of S is that of an unstable loop."""
+"""Ms above which the loop counts as unstable: the impulse response of S grows."""
 
 
 def perturbed_text(perturbed: Perturbed) -> str:
@@ -302,7 +302,7 @@ def parameter_table(
 ) -> Table:
     """Return ``table``, or a new one of this title, with a row for each parameter.
 
-    With ``units``, by path, a column has the unit of each.
+    ``units`` holds the units by path; with it the table has a column of units.
     """
     table = Table(title=table) if isinstance(table, str) else table
     table.add_column("parameter", no_wrap=True)
@@ -368,7 +368,7 @@ def _place_of_the_lag(report: FitReport) -> list[str]:
 
 
 WIDE = 3
-"""Most columns of one table, so that it fits into 80 characters."""
+"""Largest number of columns of one table, so that it fits into 80 characters."""
 
 
 def reproduction_table(

@@ -210,7 +210,7 @@ def convergence_figure(outcome: Outcome) -> Figure:
     history = np.array(outcome.result.history, dtype=float)
     geometric = outcome.case.study.objective.aggregate == "geometric_mean"
     shown = np.exp(history) if geometric else history
-    # No start may have met the limits: then none is the best.
+    # If no start met the limits, none is the best.
     last = history[-1]
     best = int(np.nanargmin(last)) if np.isfinite(last).any() else -1
     picture = figure(6.0, 3.6)

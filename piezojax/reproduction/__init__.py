@@ -7,7 +7,7 @@ from .cell import Cell as Cell
 from .summary import summarise as summarise
 
 CHAPTERS = (chapter3, chapter4, chapter5, chapter6, chapter7, chapter8)
-"""One module for each chapter: ``TABLES``, and ``cells`` to simulate one of them."""
+"""One module for each chapter, with ``TABLES`` and a function ``cells(table)``."""
 
 TABLES: dict[str, Callable[[str], list[Cell]]] = {
     table: chapter.cells for chapter in CHAPTERS for table in chapter.TABLES

@@ -95,8 +95,8 @@ def _chapter4() -> Experiment:
 
 
 EXPERIMENTS = {"chapter 5": _chapter5(), "chapter 4": _chapter4()}
-"""Experiments by name. None contains the traditional column of Table 4-5, because its
-gains are not printed."""
+"""Experiments by name. None contains the traditional column of Table 4-5, because the
+gains behind it are not printed."""
 
 
 class HalfFit(NamedTuple):

@@ -48,7 +48,7 @@ def title_of(table: str) -> str:
 
 
 def window(name: str) -> float:
-    """Return the shortest time (s) of at least 1 s in which a signal repeats."""
+    """Return the shortest time (s), at least 1 s, after which a signal repeats."""
     kind, frequency = signals.parse(name)
     assert frequency is not None
     repeat = PERIODS[kind] / frequency

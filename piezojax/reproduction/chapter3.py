@@ -18,7 +18,7 @@ TABLES = {"3-6": ("voros", "trapezoid"), "3-7": ("trapezoid", "quadratic")}
 """Discretisation schemes of each table, which are its columns."""
 
 AMPLITUDE = 35.0
-"""Amplitude of the inputs, V; those of the thesis swing by 70 V."""
+"""Amplitude of the inputs, V; those of the thesis have 70 V peak to peak."""
 
 C_BOUNDS = (-0.1, -0.01)
 """Bounds of c, 1/V, around its first fit in the thesis, -0.0378."""

@@ -27,7 +27,7 @@ The response to the jump of SW at its start decays in this time.
 """
 
 SHORT = 1.0
-"""Longest window of a shortened run, s; SW10 and SW30 repeat after a longer time."""
+"""Longest window of a shortened run, s; the windows of SW and PWSW are longer."""
 
 SEED = 0
 """Seed of the sensor noise."""

@@ -147,7 +147,8 @@ def select(
     """Select the suspect numbers of ``problem`` by forward selection, and fit them.
 
     Each round takes the finalist of the screening with the best cross-validated ratio.
-    The selection ends when this ratio is not better by ``MIN_IMPROVEMENT``.
+    The selection ends when this ratio is not better by ``MIN_IMPROVEMENT``, or after
+    ``MAX_SUSPECTS`` numbers.
     """
     progress = Silent() if progress is None else progress
     names, begin = problem.space.paths, starts(problem)

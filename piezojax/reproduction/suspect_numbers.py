@@ -18,7 +18,7 @@ anyway.
 
 A candidate is varied by a factor on its printed value. Its bounds are a factor of 100
 in both directions for tuned numbers (10 for alpha, which ends at 1), and 3 for numbers
-that were measured or describe a signal, as for the quantities of the stage.
+that were measured or describe a signal, similar to the factors of the fitted stage.
 """
 
 from collections.abc import Iterable

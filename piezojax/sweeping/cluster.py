@@ -49,7 +49,7 @@ def dask_client(where: str) -> Iterator["Client"]:
         return
     if int(where) < 1:
         raise ValueError(f"--dask {where}: at least 1 worker is needed")
-    # Spawned, because JAX has threads and a forked copy of them may hang.
+    # Workers are spawned: JAX has threads, and a forked process may hang.
     with (
         dask_option({"distributed.worker.multiprocessing-method": "spawn"}),
         LocalCluster(
@@ -75,7 +75,7 @@ def cluster_chunks(
     """
     from distributed import wait
 
-    # The annotation of Client includes coroutines, which an asynchronous one returns.
+    # Annotations of Client include coroutines, which only asynchronous ones return.
     synchronous: Any = client
 
     case = _pickled(simulator.case)

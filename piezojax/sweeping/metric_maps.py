@@ -75,7 +75,7 @@ def metric_maps(dataset: "Dataset", name: str) -> list[MetricMap]:
 
 
 def _mean(variable: Any, name: str) -> np.ndarray:
-    """Return the mean over references and draws: of logarithms, unless of a share."""
+    """Return the mean over references and draws, geometric unless of a share."""
     over = [d for d in ("reference", "draw") if d in variable.dims]
     if not over:
         return np.asarray(variable.values)

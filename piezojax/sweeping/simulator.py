@@ -32,7 +32,7 @@ _TOLERANCE = 1e-6
 
 
 class LoopWithMetric(System):
-    """A loop that also accumulates a metric, so that one run gives both."""
+    """A loop that also accumulates a metric: one run gives signals and metric."""
 
     loop: Feedback
     metric: Metric
@@ -51,8 +51,8 @@ class Simulator:
     """Simulator of the chunks of the plan of a case.
 
     References and noise are those of the hold-out of the study, the same for every
-    point. A block is ``plan.width`` points that follow one reference. Therefore a sweep
-    of a hundred thousand points reads no more inputs than a single point.
+    point. The ``plan.width`` points of a block follow the same references. Therefore a
+    sweep of a hundred thousand points needs no more input data than a single point.
     """
 
     def __init__(self, case: Case):
@@ -191,7 +191,7 @@ class Simulator:
         device: Any = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> dict[str, np.ndarray] | None:
-        """Return the results of a chunk, or None if ``stopped`` becomes true meanwhile.
+        """Return the results of a chunk, or None if ``stopped`` returns True meanwhile.
 
         The results are arrays [points, plants, references, draws, ...]; the sensitivity
         is [points, plants]. Copies of the last point fill the last block.

@@ -1,4 +1,4 @@
-"""The folder of a sweep: its manifest and the chunks that are done, each in a file."""
+"""Folder of a sweep: its manifest, and one file for each finished chunk."""
 
 import hashlib
 import json

@@ -34,9 +34,9 @@ class SweepResult:
     """Result of one run of a sweep.
 
     ``chunks`` is the number of chunks in the share of this run; it simulated
-    ``simulated`` of them (``lane_steps`` samples) in ``core_s`` seconds of cores or
-    devices and ``wall_s`` seconds of time. ``finished`` is true if the data set
-    ``path`` exists.
+    ``simulated`` of them (``lane_steps`` samples) in ``core_s`` seconds of core or
+    device time and ``wall_s`` seconds of wall time. ``finished`` is true if the data
+    set ``path`` exists.
     """
 
     simulator: Simulator
@@ -205,7 +205,7 @@ def _simulate(
             now = time.perf_counter()
             each = (now - begin) / number
             if number == 1:
-                first = now  # before, the workers of a cluster start and compile
+                first = now  # earlier, the workers of a cluster start and compile
             else:
                 each = (now - first) / (number - 1)
             progress.advance(math.nan, remaining(each * (len(todo) - number)))

@@ -31,11 +31,11 @@ class LimitComparison:
 
     ``tuned`` is the error of the loop. ``limit`` is the least error of a linear
     controller designed for this reference, ``one_controller`` the error on this
-    reference of the one controller with the least geometric mean over all references.
-    ``disturbance`` is the whole of d, ``unpredicted`` the part that the reference does
-    not predict. The spectrum of that part lies above the noise's up to ``bandwidth``
-    (Hz). ``tuned_shares`` is None if the loop is too nonlinear for its error to be the
-    sum of shares.
+    reference of the one controller with the least geometric-mean error over all
+    references. ``disturbance`` is the whole disturbance, and ``unpredicted`` its part
+    that the reference does not predict. ``bandwidth`` is the highest frequency (Hz) at
+    which the spectrum of that part lies above that of the noise. ``tuned_shares`` is
+    None if the loop is too nonlinear for its error to be the sum of shares.
     """
 
     tuned: float
@@ -124,7 +124,7 @@ class LimitReport:
 
     @property
     def near_one_controller(self) -> int:
-        """Number of references whose error is near that of the one controller."""
+        """Number of references within ``NEAR`` times the one controller's error."""
         return sum(
             one.tuned <= NEAR * one.one_controller for one in self.references.values()
         )

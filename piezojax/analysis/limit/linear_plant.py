@@ -157,8 +157,8 @@ def gain_from_noise(
     residual displacement is then uncorrelated with the noise, as a disturbance must be.
     Lines are weighted by 1 / (power of the residual), updated in rounds. A hysteresis
     responds less to small fast motions than to large slow ones. The reference predicts
-    the large ones, and feedback acts on the small ones. Raises ValueError if there is
-    no positive gain.
+    the large ones; feedback acts on the small ones, so their gain is the one estimated.
+    Raises ValueError if there is no positive gain.
     """
     runs = tuple(range(response.ndim - 1))
     driven = np.mean(response * np.conj(noise), axis=runs)

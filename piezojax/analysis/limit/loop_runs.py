@@ -43,8 +43,8 @@ def noise_free_error(
     """Return the error (um) of ``loop`` around ``plant``, without noise.
 
     ``left`` (um) is the residual of the linear plant in each run and acts as a
-    disturbance. With the noise of the run, the error would equal the error of the run.
-    ``left`` and the error are [references, draws, samples].
+    disturbance. With the noise of the run added, this simulation would reproduce the
+    run. ``left`` and the error are [references, draws, samples].
     """
     # The disturbance of sample k moves the displacement at k + 1.
     ahead = np.concatenate([left[..., 1:], left[..., -1:]], axis=-1)

@@ -9,11 +9,12 @@ hysteresis: a run without noise has another disturbance. The disturbance depends
 controller too; ``verify_limit`` measures how much that matters.
 
 One linear filter of the reference predicts part of the disturbance on all references.
-With full preview that part costs nothing. Feedback acts on the rest, known by its
-spectrum at a stated resolution, and ``wiener`` computes the least error that it can
+With full preview that part costs nothing. Feedback acts on the rest, whose spectrum is
+known at a stated resolution. ``wiener`` computes the least error that feedback can
 leave: for each reference with a controller designed for it, and for all references with
-the one controller of least geometric mean. The first is the limit. The second is not a
-lower bound for one reference, but a fair comparison for a loop with one set of gains.
+the one controller of least geometric-mean error. The first is the limit. The second is
+not a lower bound for one reference, but a fair comparison for a loop with one set of
+gains.
 
 The limit ignores the cost of voltage, the limits of the actuator, and plants other than
 this one. A nonlinear controller, or one that uses the period of the reference, may do
@@ -42,7 +43,7 @@ from .wiener import (
 SEGMENT = 0.1
 """Length of the windows of the spectra, s; its inverse is their resolution."""
 
-_LINEAR = 1.2  # largest RMS sum of the shares of a linear loop, over its error
+_LINEAR = 1.2  # largest root sum square of the shares of a linear loop, over its error
 
 
 def performance_limit(

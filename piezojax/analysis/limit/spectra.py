@@ -90,8 +90,9 @@ class ReferencePredictor:
 def grid_size(segment: int) -> int:
     """Return the number of points around the circle for windows of ``segment`` samples.
 
-    The factors of a spectrum have a longer memory than the spectrum: the circle has 32
-    times as many points as a window, and at least 2^14 for the memory of the plant.
+    The factors of a spectrum have a longer memory than the spectrum. The circle
+    therefore has at least 32 times as many points as a window, and at least 2^14
+    because of the memory of the plant.
     """
     return max(2**14, 2 ** int(np.ceil(np.log2(32 * segment))))
 

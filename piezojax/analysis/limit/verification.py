@@ -5,8 +5,8 @@ moves the stage differently and meets another disturbance. The one linear contro
 that is best for the disturbance of a loop's runs is therefore simulated on the same
 stage, with the same noise. The disturbance of its own runs is measured, the best
 controller for that is simulated, and so on. Once this converges, predicted and
-simulated error agree as far as the linear model holds, and a linear controller has
-reached the limit, with hysteresis, creep and the actuator's limits.
+simulated error agree as far as the linear model holds. A linear controller has then
+reached the limit on a stage with hysteresis, creep and limits of the actuator.
 """
 
 from typing import Any, NamedTuple
@@ -28,7 +28,7 @@ from .loop_runs import simulate_runs
 from .performance import SEGMENT
 from .wiener import common_response, error_shares, inner_response
 
-_TAIL = 1e-7  # share of the largest tap below which last taps are cut off
+_TAIL = 1e-7  # share of the largest tap below which trailing taps are cut off
 
 
 class LimitInput(NamedTuple):

@@ -105,7 +105,7 @@ def common_response(
     tolerance: float = 1e-4,
     rounds: int = 100,
 ) -> np.ndarray:
-    """Return T of the one controller with the least geometric mean over ``spectra``.
+    """Return T of the one controller of least geometric-mean error over ``spectra``.
 
     ``spectra`` is [references, N]. The mean of logarithms is concave and lies below its
     tangent. The T that is optimal for the spectra weighted by 1 / (mean square error)

@@ -3,8 +3,8 @@
 Two functions compute a sensitivity peak. ``stability_report`` is exact: it refines the
 frequency response of the linearised loop at its peaks, for loops of one or several
 axes. Use it to assess a loop. ``sensitivity_peak`` is differentiable and cheap: it
-takes the impulse response of a loop of one axis. Use it in objectives, constraints and
-sweeps.
+samples S from the impulse response of the same loops. Use it in objectives, constraints
+and sweeps.
 """
 
 from .assess import AxesStability as AxesStability

@@ -85,7 +85,7 @@ class AxesCurves(NamedTuple):
 
 @dataclass(frozen=True)
 class AxesStability:
-    """Report and linear loop of several axes, on the branch with the smaller margin."""
+    """Report and linear loop of several axes, on one branch of the hysteresis."""
 
     report: MultiAxisReport
     loop: LinearAxes

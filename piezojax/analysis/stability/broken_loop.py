@@ -93,10 +93,10 @@ class BrokenLoop(System):
     ) -> tuple[BrokenState, Signal]:
         """Step with the loop closed for small motions, with ``added`` (V) at the plant.
 
-        Return the voltage that acts there. It differs from that of the operating point
-        by ``added``, exactly. Its derivatives with respect to the state and to
-        ``moved``, the deviations of r(k) and r(k+1) from the reference, are those of
-        the actuator's voltage.
+        Return the new state and the voltage that acts there. This voltage is exactly
+        that of the operating point plus ``added``. Its derivatives with respect to the
+        state and to ``moved``, the deviations of r(k) and r(k+1) from the reference,
+        are those of the actuator's voltage.
         """
         controller, actuator, sensor, applied = self._answer(state, moved)
         acting = jax.tree.map(
@@ -196,7 +196,7 @@ def cut(
     state: LoopState | None,
     kind: type[BrokenLoop] = BrokenLoop,
 ) -> BrokenLoop:
-    """Return ``loop`` cut at the place that ``kind`` selects, as ``broken_loop`` does.
+    """Return ``loop`` cut as by ``broken_loop``, as an instance of ``kind``.
 
     ``side`` is +1 on the ascending branch and -1 on the descending one.
     """

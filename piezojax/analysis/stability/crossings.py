@@ -14,7 +14,7 @@ PER_DECADE = 400
 _AROUND = np.concatenate(
     [-np.geomspace(30.0, 0.03, 40), [0.0], np.geomspace(0.03, 30.0, 40)]
 )
-_PEAKS = 8  # highest points of the grid that are refined
+_PEAKS = 8  # number of local maxima on the grid that are refined
 
 Function = Callable[[np.ndarray], np.ndarray]
 

@@ -58,8 +58,8 @@ LEAST = 512
 """Least number of samples of the impulse response, for loops of a low rate."""
 
 BANDS = 10
-"""Number of bands of ``peaks_of``: octaves down from the Nyquist frequency, and what is
-left below them."""
+"""Number of bands of ``peaks_of``: octaves down from the Nyquist frequency, and one
+band below them."""
 
 Sensitivity = Complex[Array, "*batch lines axes axes"]
 
@@ -103,7 +103,7 @@ class SmallFollowing(SmallMotion):
     """Closed loop linearised around an operating point, from reference to displacement.
 
     Input: the deviations of r(k) and r(k+1) from the reference of ``broken``, um.
-    Output: the deviation of the displacement y(k) from it, um.
+    Output: the deviation of the displacement y(k) from the operating point, um.
     """
 
     def _moved(self, state: BrokenState, input: Any) -> tuple[BrokenState, Scalar]:
@@ -253,9 +253,9 @@ def peak_of(sensitivity: Sensitivity) -> Float[Array, ""]:
 def peaks_of(sensitivity: Sensitivity) -> Float[Array, " bands"]:
     """Return the largest singular value of S in each of ``BANDS`` bands.
 
-    A limit on each holds if and only if ``peak_of`` keeps it. A search needs them all:
-    where two peaks are equally high, the slope of the higher says nothing of the other,
-    and each step would be turned back by the one that it did not see.
+    All bands meet a limit if and only if ``peak_of`` meets it. A search needs every
+    band: where two peaks are equally high, the gradient of one contains nothing about
+    the other, and a step that lowers the one is rejected because it raises the other.
     """
     return _largest_singular(sensitivity, _octaves(sensitivity.shape[0]))
 
@@ -424,8 +424,8 @@ def bandwidth_of(
     """Return the lowest frequency, Hz, at which |y/r| falls below -3 dB.
 
     It is interpolated between two lines. If |y/r| does not fall below -3 dB, it is the
-    Nyquist frequency; if it is below at 0 Hz already, 1e-3 of the distance of two
-    lines, so that its logarithm is finite.
+    Nyquist frequency. If |y/r| is below -3 dB at 0 Hz already, it is 1e-3 of the line
+    spacing, so that its logarithm is finite.
     """
     gain = jnp.log(jnp.abs(followed)) - BAND
     below = gain < 0.0

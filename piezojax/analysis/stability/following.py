@@ -20,7 +20,7 @@ class Following:
     feedforward. A step leaves the branch and is simulated instead (``step_response``).
 
     - ``bandwidth_Hz``, ``bandwidth_1dB_Hz``: lowest frequencies at which |y/r| falls
-      below -3 dB and -1 dB; infinite if it does not up to the Nyquist frequency;
+      below -3 dB and -1 dB; infinite if it stays above up to the Nyquist frequency;
     - ``closed_loop_peak``: largest |y/r|, at ``closed_loop_peak_Hz``.
     """
 

@@ -32,8 +32,8 @@ class StabilityReport:
 
     L is its loop transfer function (see ``BrokenLoop``), S = 1/(1+L), T = L/(1+L). All
     figures are those of the sampled loop up to the Nyquist frequency. For an unstable
-    loop only the poles are given, and all else is None. A margin that no change reaches
-    is infinite, and its frequency is None.
+    loop only the poles are given, and all else is None. A margin is infinite, and its
+    frequency None, if no change of its kind makes the loop unstable.
 
     - ``stable``: every pole of the closed loop is inside the unit circle;
     - ``poles``: of the closed loop in the z plane, largest first. They leave out the
@@ -133,8 +133,8 @@ def located_report(
 def linear_loop(loop: Feedback, at: Any = 0.0) -> tuple[LinearLoop, LoopState]:
     """Return L of a loop of one axis as matrices, and the operating state.
 
-    L is the argument of ``report_of`` and of plots. Arguments and errors are those of
-    ``stability_report``; for several axes use ``linear_axes``.
+    Arguments and errors are those of ``stability_report``; for several axes use
+    ``linear_axes``.
     """
     A, B, C, D, dt, start = _matrices(loop, OperatingPoint.at(at), FollowedLoop)
     cut = without_conserved(balanced(LinearLoop(A, B[:, 0], C[0], dt)))
@@ -148,8 +148,8 @@ def linear_loop(loop: Feedback, at: Any = 0.0) -> tuple[LinearLoop, LoopState]:
 def linear_axes(loop: Feedback, at: Any) -> tuple[LinearAxes, LinearAxes, LoopState]:
     """Return L of a loop cut in all its axes as matrices, and the operating state.
 
-    It is first cut at the plant's inputs, then at the displacements. Arguments and
-    errors are those of ``stability_report``.
+    The first L is cut at the plant's inputs, the second at the displacements. Arguments
+    and errors are those of ``stability_report``.
     """
     A, B, C, _, dt, start = _matrices(loop, OperatingPoint.at(at), BrokenLoop)
     cut = LinearAxes(A, B, C, dt)

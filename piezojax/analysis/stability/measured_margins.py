@@ -16,13 +16,13 @@ Response = Complex[np.ndarray, " lines"]
 class MeasuredMargins(BaseModel):
     """Margins of a loop whose plant is known at ``lines`` measured frequencies alone.
 
-    ``stable`` tells whether 1 + L goes around 0 as often as with the model, with which
-    the loop is stable. ``sensitivity_peak`` is the largest |S| at a line, at
+    ``stable`` is True if 1 + L encircles 0 as often as with the model, with which the
+    loop is stable. ``sensitivity_peak`` is the largest |S| at a line, at
     ``sensitivity_peak_Hz``. Crossings are interpolated between two lines;
     ``gain_margin_dB`` is the smallest gain above 1, ``phase_margin_deg`` the smallest
     phase, lag or lead, ``delay_margin_samples`` the smallest delay. A margin without a
-    crossing within the lines is None. Nothing is known outside them, from ``lowest_Hz``
-    to ``highest_Hz``.
+    crossing within the lines is None. The lines extend from ``lowest_Hz`` to
+    ``highest_Hz``; nothing is known outside this band.
     """
 
     lines: int
@@ -43,8 +43,8 @@ def measured_margins(
 
     ``frequency`` (Hz, increasing) are the measured lines and ``ratio`` the measured
     response over that of the model there: L = C P_model P_measured / P_model. The model
-    contains what the sampling of the plant adds to an analogue response. Lines above
-    half the rate do not count. Raises ValueError if fewer than two are left.
+    contains the effect of sampling on an analogue response. Lines above half the rate
+    do not count. Raises ValueError if fewer than two are left.
     """
     kept = frequency < FOLDED * 0.5 / loop.dt
     frequency, ratio = frequency[kept], ratio[kept]
@@ -74,10 +74,11 @@ def measured_margins(
 
 
 def _encirclements(L: Response, modelled: Response) -> int:
-    """Return how often 1 + L goes around 0 more often than with the model.
+    """Return the encirclements of 0 by 1 + L, less those with the model.
 
-    The change (1 + L) / (1 + L_model) is real at 0 Hz and at half the rate, where it is
-    taken to be as near to the real axis as at the first and last line.
+    The ratio (1 + L) / (1 + L_model) is real at 0 Hz and at half the rate. The change
+    of its phase from the first to the last line is therefore rounded to a multiple of
+    pi.
     """
     change = (1.0 + L) / (1.0 + modelled)
     phase = np.unwrap(np.angle(change))
