@@ -80,7 +80,7 @@ says "ours". Those with an argument ``rate`` (Hz) are made for the rate of the s
 
 
 def deviations_of(plant: str) -> tuple[str, ...]:
-    """Return the deviations that an ensemble may draw of a catalogued plant.
+    """Return the names of the deviations of a catalogued plant in an ensemble.
 
     They are its positional arguments; an unknown plant has none.
     """

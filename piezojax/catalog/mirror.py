@@ -98,8 +98,8 @@ def multi_axis() -> MultiAxisSlidingMode:
     """Return the control of chapter 7 on the model of 12 states and a sample of delay.
 
     ``SURFACE``, ``REACHING``, ``PROPORTIONAL`` and ``INTEGRAL`` are ours: a random
-    search found them by the largest margin of all axes at once around ``stage()``. The
-    surface is scaled by the inverse of S B, so the sliding variable is in V.
+    search maximised the simultaneous margin of all axes around ``stage()``. The surface
+    is scaled by the inverse of S B, so the sliding variable is in V.
 
     The gains hold for that model alone. On the model of 24 states the loop is unstable
     (largest pole 1.25), because the prediction of chapter 7 needs a model of every
@@ -158,7 +158,7 @@ def _surface_scale(plant: MatrixARMA) -> np.ndarray:
 def loop(
     controller: System, plant: System | None = None, noise_rms: float = NOISE_RMS
 ) -> Feedback:
-    """Return ``controller`` around the mirror, ``stage()`` unless given.
+    """Return the loop of ``controller`` and ``plant``, by default ``stage()``.
 
     Drives are limited to +-10 V, about thirty times those of the records.
     ``noise_rms`` in um.

@@ -51,7 +51,7 @@ def allocation(method: str = "bounded") -> Allocation:
 
 
 def stage(actuator: StateSpace, method: str = "bounded") -> Series:
-    """Return the stage from a wanted to a reached pose with four equal actuators.
+    """Return the stage with four equal actuators, from a wanted to a reached pose.
 
     Named parts ``allocation``, ``actuators`` and ``plate``. Raises ValueError unless
     ``actuator`` has one input and one output, both in um.

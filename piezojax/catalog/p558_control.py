@@ -67,10 +67,10 @@ ARX = (
 """(8.40)-(8.42): coefficients of y(k-1), y(k-2) and u(k-1), u(k-2) by axis."""
 
 REPAIRS = (1.043, 0.404, 0.491)
-"""Factors on the numerators of (8.40)-(8.42) that give the DC gains of (7.53): as
-printed the DC gains are 0.995, 2.32 and 1.92. With the printed Rx and Ry models neither
-table is reproduced; with the printed Z model the observer increases the error at
-5 Hz."""
+"""Factors on the numerators of (8.40)-(8.42) that give the DC gains of (7.53); the
+printed models have 0.995, 2.32 and 1.92. With the printed Rx and Ry models neither
+Table 8-2 nor Table 8-3 is reproduced; with the printed Z model the observer increases
+the error at 5 Hz."""
 
 ARX_MODELS = ("repaired", "printed")
 
@@ -234,7 +234,7 @@ def loop(
     noise_rms: tuple[float, float, float] = NOISE_RMS,
     plant: System | None = None,
 ) -> Feedback:
-    """Return ``controller`` around the stage, (7.53) unless given, without limits.
+    """Return a loop of ``controller`` and ``plant``, by default (7.53), unlimited.
 
     ``noise_rms`` in um, urad, urad.
     """

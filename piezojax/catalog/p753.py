@@ -247,7 +247,7 @@ def adaptive_disturbance_observer(table: str = "5-2") -> AdaptiveInverse:
 def with_adaptive_inverse(controller: System) -> AdaptiveInverse:
     """Return ``controller`` in an AdaptiveInverse (ours), um to V.
 
-    Its share of 0 makes it equal to ``controller``. The initial weights and the lead
+    At its initial share of 0 it equals ``controller``. The initial weights and the lead
     follow from the printed gain and poles, the weights of the stops from a typical
     hysteresis.
     """
@@ -268,7 +268,7 @@ def with_adaptive_inverse(controller: System) -> AdaptiveInverse:
 def pid() -> PID:
     """Return a PID baseline (ours; the thesis prints none), um to V.
 
-    An integral action of 60 V/(um s) crosses over near 400 rad/s.
+    The integral gain of 3000 V/(um s) puts the crossover near 400 rad/s.
     """
     return PID(0.5, 3000.0, 0.0, 1e-4, 100.0, dt=DT)
 

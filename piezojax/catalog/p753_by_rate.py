@@ -57,7 +57,7 @@ is left out: its integral gain looks ten times too small (see
 
 BANG_BANG_CONTROL_WEIGHT = {1_000: 50.0, 20_000: 20.0}
 """R of bang-bang switching with Q = 1 for ``chapter4_plant``: ours, not printed. With
-the printed K and surface it is the first of 1, 2, 5, 10, 20, 50, ... at which the
+the printed K and surface it is the smallest of 1, 2, 5, 10, 20, 50, ... for which the
 voltage stays within its limits on sines of 5 um, and the best of that series."""
 
 
@@ -143,9 +143,9 @@ def continuous(rate: int = 20_000) -> ContinuousSlidingMode:
 def bang_bang(rate: int = 20_000) -> SlidingMode:
     """Return the nominal DSMC with bang-bang switching (1 and 20 kHz), um to V.
 
-    K is printed; R is found by trial. With the R of 1, by which
-    ``p753_chapter4.bang_bang`` gives the printed step on the stage of chapter 5, the
-    voltage hits its limits on that of chapter 4.
+    K is printed; R is found by trial. With R = 1 of ``p753_chapter4.bang_bang`` the
+    stage of chapter 5 shows the printed step, but on the stage of chapter 4 the voltage
+    hits its limits.
     """
     model = p753_chapter4.model(rate)
     near = _start("bang_bang", p753_chapter4.BANG_BANG_GAINS, rate)

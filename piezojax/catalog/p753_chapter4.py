@@ -117,9 +117,9 @@ BANG_BANG_GAINS = {1_000: 3.0, 20_000: 1.0}
 """K in V, section 4.5.4.1."""
 
 BANG_BANG_CONTROL_WEIGHT = 1.0
-"""R of the nominal DSMC with Q = 1: ours, not printed. With the R = 400 of Table 4-2
-K = 1 is too small to move the stage; at an R of about 1 and below the voltage limits
-determine the response."""
+"""R of the nominal DSMC with Q = 1: ours, not printed. With R = 400 (Table 4-2), K = 1
+is too small to move the stage; for R of about 1 and below, the voltage limits determine
+the response."""
 
 FILTERS = {1_000: (0.3, 0.001), 20_000: (0.1, 1e-4)}
 """Alpha and beta, section 4.5.4.1; the other rates are not printed."""
@@ -207,9 +207,10 @@ def continuous(rate: int = 20_000) -> ContinuousSlidingMode:
 def plant() -> Series:
     """Return the stage at 20 kHz, V to um, with the dynamics of Table 3-2.
 
-    The hysteresis of chapter 5, then the denominator and the y_2 numerator of Table 3-2
-    scaled to unit DC gain. Its slowest pole is faster than that of ``p753.plant``,
-    under which the gains of Table 4-4 are unstable with the printed filter.
+    The hysteresis is that of chapter 5. The dynamics have the denominator and the y_2
+    numerator of Table 3-2, scaled to unit DC gain. The slowest pole is faster than that
+    of ``p753.plant``, with which the gains of Table 4-4 and the printed filter give an
+    unstable loop.
     """
     printed = p753.ARMA_HYSTERESIS["3-2"]
     dynamics = ARMA(printed["autoregressive"], printed["moving_2"])

@@ -1,6 +1,6 @@
 """The P-753 with Coleman-Hodgdon or Preisach hysteresis, and control by its inverse.
 
-The thesis names the inverse Preisach model as its first future work. The stage with
+The thesis names the inverse Preisach model first among its future work. The stage with
 Preisach hysteresis, the record for the fits of both inverses, and the fits are ours.
 Gains and dynamics are the printed ones of ``p753``.
 """

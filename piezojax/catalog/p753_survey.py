@@ -166,9 +166,9 @@ def feedforward_notch_pi() -> FeedforwardFeedback:
 def feedforward_h_infinity() -> FeedforwardFeedback:
     """Return H-infinity control of (5.33) with an inverse feedforward, um to V; ours.
 
-    The weights are those of ``p753.mixed_sensitivity_inversion``, from V instead of um.
-    A low-pass filters the command. The feedforward is the inverse of (5.33) without its
-    zeros, behind a low-pass.
+    The weights are those of ``p753.mixed_sensitivity_inversion``, for a command in V
+    instead of um. A low-pass filters the command. The feedforward is the inverse of
+    (5.33) without its zeros, behind a low-pass.
     """
     control = WeightedMixedSensitivity(
         scaled_to_dc(ARMA(**p753.DYNAMICS_BEHIND_HYSTERESIS), p753.GAIN),
@@ -191,7 +191,7 @@ def adaptive_pi() -> Anticipation:
     """Return ``simc_pi`` in an AdaptiveInverse, um to V.
 
     The inverse leads the stage by the lag of the sensor; a negative lead of the
-    reference compensates this lead.
+    Anticipation compensates for it.
     """
     return Anticipation(p753.with_adaptive_inverse(simc_pi()), (0.0,))
 

@@ -101,9 +101,9 @@ class LogarithmicCreep(Fittable):
     After a step of x at t = 0, y grows in proportion to log10(t) from t = ``shortest``
     to ``longest``: the logarithmic law of section 2.4.1. A sum of exponentials of equal
     gain extends the law to any input: two per decade, from a decade before ``shortest``
-    to a decade after ``longest``. They follow it within 3 % of the creep in a decade. y
-    has the unit of x; ``direct`` as in ``ExponentialCreep``. Raises ValueError unless 0
-    < shortest < longest.
+    to a decade after ``longest``. The sum follows the law within 3 % of the creep in a
+    decade. y has the unit of x; ``direct`` as in ``ExponentialCreep``. Raises
+    ValueError unless 0 < shortest < longest.
     """
 
     part: ClassVar[Part] = Part(

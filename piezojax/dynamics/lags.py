@@ -1,4 +1,4 @@
-"""Lags of a stage, one of which may be that of its sensor."""
+"""First-order lags of a plant, and the inverse of such a lag."""
 
 from typing import Any, Protocol, runtime_checkable
 

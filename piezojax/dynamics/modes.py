@@ -24,13 +24,13 @@ SHARE_OFF = 0.05
 class Modes(Designed, Fittable):
     """Resonances in parallel, ``sum_i share_i mode_i(x)``, then first-order lags.
 
-    Each mode is that of ``Mode``. ``share`` holds the shares of the static gain of all
-    modes but the first, which has the rest: the static gain is 1, and the output has
+    Each mode is that of ``Mode``. ``share`` holds the share of each mode but the first
+    in the static gain; the first has the rest. The static gain is 1, and the output has
     the unit of x. ``time_constant`` holds the time constants of lags in series behind
     the modes, if any. All are discretised together, exactly for an input x held between
-    samples; a Mode followed by a FirstOrderLag holds its output between samples too,
-    and is half a sample early. Raises ValueError for parameters outside their limits,
-    and for lists of different length.
+    samples; a Mode followed by a FirstOrderLag also holds the output of the mode
+    between samples, so that its response is half a sample early. Raises ValueError for
+    parameters outside their limits, and for lists of different length.
     """
 
     part: ClassVar[Part] = Part(

@@ -72,8 +72,8 @@ def fast_part(model: StateSpace, angle: float, share: float = 0.1) -> StateSpace
     A mode is slow if its natural frequency abs(log z) is below a tenth of ``angle``
     (rad per sample): a mode of creep, or an integrator with its pole at z = 1. The
     slowest modes are removed, as many as possible while the response at ``angle``
-    changes by at most the share ``share``. The gain at rest of the result differs from
-    that of ``model``.
+    changes by at most ``share``, relative to its largest entry. The gain at rest of the
+    result differs from that of ``model``.
     """
     A, B, C = (np.asarray(matrix) for matrix in (model.A, model.B, model.C))
     rates = natural_frequencies(np.linalg.eigvals(A))

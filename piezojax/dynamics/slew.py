@@ -12,17 +12,19 @@ OFF = 0.8, 1.25
 """Bounds of a rate, as multiples of the one estimated from the record."""
 
 SHORTEST = 2.0
-"""Samples in which the voltage crosses the range of a record that shows no limit."""
+"""Samples in which the initial rate crosses the range of a record that shows no
+limit."""
 
 
 class AmplifierSlew(Fittable):
     """Mean over each sample of a voltage that follows its input at a limited rate.
 
     Within a sample the voltage v moves from its last value towards the input u, by at
-    most ``rate`` dt, and stays there; the part behind it takes a voltage held over the
-    sample, which is the mean. Small motions pass unchanged. ``hardware.SlewLimit``
-    has the voltage at the end of each sample instead. Input and output in V. Raises
-    ValueError for a rate that is not positive.
+    most ``rate`` dt, and then stays constant. The output is the mean of v over the
+    sample, because the next part of the chain takes a voltage held over the sample.
+    Small motions pass unchanged. ``hardware.SlewLimit`` returns the voltage at the end
+    of each sample instead. Input and output in V. Raises ValueError for a rate that is
+    not positive.
     """
 
     part: ClassVar[Part] = Part("slew", "drive", "Slew limit of the amplifier")

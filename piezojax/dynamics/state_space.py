@@ -14,7 +14,7 @@ from ..core.system import System
 from .arma import ARMA
 
 STABILISED_MODULUS = 1.0 - 1e-6
-"""Largest modulus of a pole that ``stabilised`` has moved."""
+"""Largest modulus of a pole after ``stabilised`` has moved it."""
 
 
 class StateSpace(System):

@@ -42,8 +42,8 @@ class BoucWen(Hysteresis):
     laws: ClassVar[Laws] = differential_laws(without=("counter-clockwise",))
 
     alpha: Scalar = parameter("N/m", "slope from z = 0")
-    beta_gamma: Scalar = parameter("N^(1 - nu)/m", "bend against the velocity's sign")
-    beta_delta: Scalar = parameter("N^(1 - nu)/m", "bend with the velocity")
+    beta_gamma: Scalar = parameter("N^(1 - nu)/m", "coefficient of |y'| |z|^(nu - 1) z")
+    beta_delta: Scalar = parameter("N^(1 - nu)/m", "coefficient of y' |z|^nu")
     nu: Scalar = parameter("1", "sharpness of the bend", above=0.0, default=1.0)
     substeps: int = parts_of_a_step()
 

@@ -63,8 +63,8 @@ class ColemanHodgdon(Hysteresis, Fittable):
         "Coleman-Hodgdon: y' = |x'| (a x + c y) + b x'",
     )
 
-    a: Scalar = parameter("um/V^2", "pull by the input")
-    b: Scalar = parameter("um/V", "slope just after a turn at the origin")
+    a: Scalar = parameter("um/V^2", "coefficient of |x'| x")
+    b: Scalar = parameter("um/V", "slope at the origin, x = y = 0")
     c: Scalar = parameter("1/V", "decay along the path of the input", below=0.0)
     rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
     rest_output: Scalar = parameter("um", "output of the virgin state", default=0.0)
@@ -130,7 +130,7 @@ class ColemanHodgdon(Hysteresis, Fittable):
 
 
 def _direction(dx: Scalar) -> Scalar:
-    # +1 at rest, as in (3.26): |dx| then has the slope +1 there, never NaN.
+    # +1 at rest, as in (3.26): the derivative of |dx| is then +1 there, not NaN.
     return jnp.where(dx >= 0.0, 1.0, -1.0)
 
 

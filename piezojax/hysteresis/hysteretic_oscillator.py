@@ -59,6 +59,6 @@ class HystereticOscillator(Hysteresis):
         return state, state.displacement
 
     def inverse(self, lower: ScalarLike, upper: ScalarLike) -> Inverse:
-        """Raise ValueError: the output follows the input through a mass."""
+        """Raise ValueError: the model contains dynamics."""
         del lower, upper
         raise ValueError("a HystereticOscillator contains dynamics and has no inverse")

@@ -126,7 +126,7 @@ class InverseHysteresis(Inverse):
 
 
 MOSTLY = 0.8
-"""Share of the steps of a model against its input that points to a wrong sign."""
+"""Share of steps against the input above which the sign is probably wrong."""
 
 FALLS = (
     ". This one falls while the input rises: reverse the sign of the displacement, or "

@@ -43,9 +43,9 @@ class NormalisedBoucWen(Hysteresis, Fittable):
     model ``classical()``. Source: Ikhouane and Rodellar, Systems with Hysteresis, 2007.
 
     With ``k_w > 0``, as (2.5) requires, loops run clockwise, as for a dissipating force
-    over a displacement. The displacement of a piezo lags its voltage, and loops run
-    counter-clockwise: ``k_w < 0`` (Low and Guo 1995). The material starts on its virgin
-    curve from ``rest_input`` (V), where w = 0.
+    over a displacement. The displacement of a piezo lags its voltage, so that its loops
+    run counter-clockwise; this needs ``k_w < 0`` (Low and Guo 1995). The material
+    starts on its virgin curve from ``rest_input`` (V), where w = 0.
 
     ``scheme`` is ``"runge_kutta"``, with ``substeps`` parts per step, of fourth order
     except where w changes sign; or ``"exact"``, the closed form on every monotone
@@ -72,7 +72,7 @@ class NormalisedBoucWen(Hysteresis, Fittable):
     k_x: Scalar = parameter("um/V", "slope of the line")
     k_w: Scalar = parameter("um", "height of the hysteretic part")
     rho: Scalar = parameter("1/V", "slope of w from w = 0", above=0.0)
-    sigma: Scalar = parameter("1", "share of loading in the bend", above=0.5)
+    sigma: Scalar = parameter("1", "share of the |x'| term in the bend", above=0.5)
     n: Scalar = parameter("1", "sharpness of the bend", least=1.0, default=1.0)
     rest_input: Scalar = parameter("V", "input of the virgin state", default=0.0)
     scheme: str = eqx.field(static=True, default="runge_kutta")

@@ -45,8 +45,8 @@ class Preisach(Hysteresis, Designed):
     ``high`` the output is flat.
 
     Within a cell the weight is distributed over relays on the diagonal of the cell,
-    where alpha - beta is that of its corners. The relays therefore lie on n lines of
-    constant width alpha - beta = k (high - low)/n, k = 0 ... n-1. On each line the
+    where alpha - beta equals that of its corners. The relays therefore lie on n lines
+    of constant width alpha - beta = k (high - low)/n, k = 0 ... n-1. On each line the
     relays are up exactly as far as the position of a play operator of that width. The
     memory thus consists of n scalars, without turning points or relays (Brokate and
     Sprekels, Hysteresis and Phase Transitions, 1996, section 2.2). The laws of the

@@ -67,7 +67,6 @@ class _Blend(System):
 
 
 def fast_share(rate: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the share of the fast density; ``rate`` is relative to that of share
-    1/2."""
+    """Return the share of the fast density; it is 1/2 at a relative ``rate`` of 1."""
     square = rate**2
     return square / (1.0 + square)

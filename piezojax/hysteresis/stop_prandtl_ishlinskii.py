@@ -87,7 +87,7 @@ class StopPrandtlIshlinskii(Hysteresis, Fittable):
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
         fields, bounds = plays_recipe(extent)
-        # The polynomial is the axis of the loop, above the slope at its turning points.
+        # The polynomial is the axis of the loop, steeper than a branch after a turn.
         fields["polynomial"] = (1.3 * extent.slope, 0.0, 0.0)
         return Recipe(
             cls(**fields),
