@@ -207,6 +207,6 @@ def test_bad_orders_are_refused(order):
 
 def test_too_few_lines_are_refused():
     data = empirical_response([measured(0), measured(1)])
-    message = "99 lines are too few for 80 block rows; take 79 or less"
+    message = "99 lines are too few for 80 block rows; take 79 or fewer"
     with pytest.raises(ValueError, match=message):
         fit_response(data, 5, rows=80)

@@ -183,7 +183,7 @@ def test_realisations_must_excite_the_same_lines():
     other = steady_response(*_tone(LINES[80:180]), DT, PERIOD)
     with pytest.raises(ValueError, match="only 20 of 100 lines are excited in all"):
         robust_response([one, other])
-    with pytest.raises(ValueError, match="one realisation does not tell distortion"):
+    with pytest.raises(ValueError, match="one realisation cannot separate"):
         robust_response([one])
     rates = [*records(0, 1, 3), Record(*_tone(LINES), 2 * DT, period=PERIOD)]
     with pytest.raises(ValueError, match=r"differ in \(rate, period, unit of input"):

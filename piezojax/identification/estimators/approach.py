@@ -1,8 +1,8 @@
-"""State of a stage before a record, after a slow motion over three levels.
+"""State of a stage before a record, modelled by a slow motion over three levels.
 
 The last turning points determine most of the state of a hysteresis. They are estimated
 from the first part of a record: the free run from the chosen levels has the least
-scatter about it, apart from the part that the states of linear parts explain.
+mean-square error, after the contribution of the states of linear parts is removed.
 """
 
 import itertools
@@ -39,7 +39,7 @@ FINEST = 1.0 / 1024.0
 """Share of the input's range to which the levels are refined."""
 
 ROUNDS = 20
-"""Most rounds of a refinement."""
+"""Largest number of rounds of a refinement."""
 
 WIDTH = 3**TURNS
 """Candidates that are simulated together."""
@@ -100,9 +100,9 @@ def linear_responses(
 
     Each is the response to a deviation of one state before the record. The deviation
     equals the difference of this state between rest at both ``ends`` of the inputs. A
-    hysteresis with many states has no such response: the path over ``levels``
-    determines its state. Up to ``few`` states of other models fade along the path of
-    the input, nearly linearly.
+    hysteresis with more than ``few`` states has no such response: the path over
+    ``levels`` determines its state. One with at most ``few`` states is treated as
+    linear, because its memory fades nearly linearly along the path of the input.
     """
     state = _state_after(system, inputs[0], levels)
     flat, unravel = ravel_pytree(_linear_states(system, state, few))
@@ -166,14 +166,15 @@ def levels_before(
     """Return the levels [TURNS, m] of the inputs whose free run fits best.
 
     ``inputs`` [samples, m] or [samples], ``outputs`` [samples, p] or [samples]. Errors
-    count over ``part``, apart from the part that the zeros of the sensor and the states
-    of the linear parts explain (``most_likely``). ``ranges`` [2, m] or [2] are the ends
-    of the range of the inputs; the levels lie up to BEYOND of it outside.
+    count over ``part``, after the contribution of the zeros of the sensor and of the
+    states of the linear parts is removed (``most_likely``). ``ranges`` [2, m] or [2]
+    are the ends of the range of the inputs; the levels may lie outside it by up to
+    BEYOND times its width.
 
-    The search is made twice: with the few states of a hysteresis explained like those
-    of linear parts, which leaves fewer local optima, and without. The levels are those
-    with the least error without. Of levels that fit equally well the first are taken,
-    for which the stage rests at the first input.
+    The search is made twice: with and without treating a hysteresis of few states as
+    linear. The former has fewer local optima; the error of the latter decides. If
+    levels fit equally well, those at which the stage rests at the first input are
+    preferred.
     """
     width = ranges[1] - ranges[0]
     low, high = ranges[0] - BEYOND * width, ranges[1] + BEYOND * width
@@ -193,7 +194,8 @@ class _LevelSearch(NamedTuple):
 
     The free runs of ``system`` under ``inputs`` are compared with the ``outputs``
     [samples, p] of ``part``. ``columns`` [samples p, k] are the effects of the zeros
-    and of the states before the record; their amounts are the most likely ones.
+    and of the states before the record; their coefficients are those of
+    ``most_likely``.
     """
 
     system: System
@@ -204,16 +206,16 @@ class _LevelSearch(NamedTuple):
     high: np.ndarray
 
     def columns(self, ends: Array, few: int) -> np.ndarray:
-        """Return the columns for a stage at rest, with ``few`` of start_columns."""
+        """Return the columns for a stage at rest, ``few`` as in ``start_columns``."""
         start = Start(jnp.asarray(self._rest()), ends, jnp.zeros(()))
         found = np.asarray(_columns(self.system, self.inputs, start, few))
         return found[:, self.part].reshape(-1, self.outputs.size).T
 
     def levels(self, columns: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the levels that fit best, and their mean square.
+        """Return the levels that fit best, and their mean square error.
 
-        Two levels are searched on a grid and refined; then a third one is, before,
-        between or after them.
+        Two levels are searched on a grid and refined; then a third one is inserted
+        before, between or after them, and all are refined.
         """
         grid = np.linspace(0.0, 1.0, LEVELS)
         pairs = [(a, a, b) for a, b in itertools.product(grid, grid)]
@@ -232,7 +234,7 @@ class _LevelSearch(NamedTuple):
     def refined(
         self, levels: np.ndarray, columns: np.ndarray, variance: float
     ) -> tuple[np.ndarray, float]:
-        """Return the best of the levels around ``levels``, and their mean square."""
+        """Return the best levels around ``levels``, and their mean square error."""
         shifts = sorted(
             itertools.product((-1.0, 0.0, 1.0), repeat=TURNS), key=np.linalg.norm
         )
@@ -282,8 +284,8 @@ class Start(eqx.Module):
     """State before a record: after a slow motion over levels of the input.
 
     ``ends`` are those of the range of the inputs. The zeros of the outputs and the
-    linear states before the record are those that are ``most_likely`` if the other
-    errors have the ``variance``.
+    linear states before the record follow from ``most_likely``, for other errors of the
+    ``variance``.
     """
 
     levels: Float[Array, " turns *m"]
@@ -294,10 +296,11 @@ class Start(eqx.Module):
 def start_columns(
     system: System, inputs: Float[Array, " samples *m"], start: Start, few: int = FEW
 ) -> Float[Array, "k samples p"]:
-    """Return the effect of the unknowns before a record: zeros, then linear states.
+    """Return the effect of sensor zeros (offsets), then of states before a record.
 
-    A zero is 1 in the unit of the output. A state is DEVIATION times its difference
-    between rest at both ends. ``few`` is that of ``linear_responses``.
+    A coefficient of 1 stands for a zero of 1 in the unit of the output, or for a state
+    of DEVIATION times its difference between rest at both ends. ``few`` is that of
+    ``linear_responses``.
     """
     responses = linear_responses(system, inputs, start.levels, start.ends, few)
     outputs = math.prod(responses.shape[2:])
@@ -318,12 +321,13 @@ def most_likely(
     counted: Float[Array, " samples"],
     variance: Float[Array, ""],
 ) -> Float[Array, " k"]:
-    """Return the most likely amounts of ``columns`` in ``error``.
+    """Return the maximum a posteriori coefficients of ``columns`` in ``error``.
 
-    The amounts of the states have a standard deviation of 1 (see ``start_columns``),
-    those of the zeros an infinite one, and the other errors have the ``variance``. Only
-    samples with ``counted`` equal to 1 are used. The amounts minimise the sum of the
-    squared errors plus ``variance`` times the squared amounts of the states.
+    The coefficients of the states have a prior standard deviation of 1 (see
+    ``start_columns``), those of the zeros an infinite one, and the other errors have
+    the ``variance``. Only samples with ``counted`` equal to 1 are used. The
+    coefficients minimise the sum of the squared errors plus ``variance`` times the
+    squared coefficients of the states.
     """
     seen = columns * counted[:, None]
     normal = jnp.einsum("ksp,lsp->kl", seen, seen)

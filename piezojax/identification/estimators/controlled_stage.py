@@ -1,4 +1,4 @@
-"""A stage under its controller, as a System of the signals that excite the loop."""
+"""Closed loop of a stage and its controller, driven by reference and dither."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ class ControlledState(NamedTuple):
 
 
 class ControlledStage(System):
-    """A ``plant`` whose output a ``controller`` feeds back, without noise or limits.
+    """Closed loop of ``plant`` and ``controller``, without noise or limits.
 
     Input [3]: r(k) and r(k+1) (um), and the dither at k (V), which is added to the
     command; output y(k+1) (um). The loop begins at rest under ``voltage`` (V), or under
@@ -64,10 +64,10 @@ def loop_drive(record: Record) -> np.ndarray:
 
 
 def replayed(controller: System, record: Record) -> np.ndarray:
-    """Return the voltage [samples] of ``controller`` for the recorded signals.
+    """Return the command of ``controller`` plus the dither [samples], for a record.
 
-    It receives the reference and the measured output of ``record``, and its own last
-    command as the applied voltage.
+    The controller receives the recorded reference and output, and its own last command
+    as the applied voltage.
     """
     drive = loop_drive(record)
     inputs = np.column_stack([drive, record.output])

@@ -36,9 +36,9 @@ class Options:
     ``order`` is the number of states of a linear model, ``window`` the number p of past
     and future samples in the Hankel-Toeplitz regression, ``oversample`` the number of
     simulated samples per sample of a periodic record, ``steps`` the largest number of
-    steps of a descent. ``dynamics`` are those that the fit of a chain holds.
+    steps of a descent. ``dynamics`` are held fixed in the fit of a chain.
     ``closed_loop`` is one of ``closed_loop.APPROACHES`` to a record of a closed loop,
-    chosen by the record if left out; ``controller`` is the controller that closed it,
+    by default chosen from the record; ``controller`` is the controller that closed it,
     for ``indirect``.
     """
 

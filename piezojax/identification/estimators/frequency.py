@@ -16,8 +16,8 @@ EXCITED = 1e-4
 """Least input power of an excited line, as a share of the strongest line."""
 
 INDEPENDENT = 1e-6
-"""Least ratio of the smallest to the largest eigenvalue of the input power matrix of a
-line, below which the inputs count as dependent."""
+"""Ratio of the smallest to the largest eigenvalue of the input power matrix of a line
+below which the inputs count as dependent."""
 
 
 CONFIDENCE = 1.96

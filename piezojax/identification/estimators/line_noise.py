@@ -9,10 +9,10 @@ WINDOW = 7
 """Lines of the local parabola whose residual is the noise."""
 
 SCANNED = 1000
-"""Number of such parabolas."""
+"""Approximate number of such parabolas."""
 
 STEADY = 40.0
-"""Degrees of freedom of a variance from which weights are computed."""
+"""Degrees of freedom to which a variance is smoothed before it gives weights."""
 
 MERGED = 2e-3
 """Largest relative width of the band whose lines are merged: a fifth of the width of a
@@ -68,7 +68,7 @@ def _scatter(frequency: np.ndarray, values: np.ndarray):
 
 
 def _level(power: np.ndarray, gain: np.ndarray, most: float):
-    """Return the function a + b gain that fits ``power``, without values above it.
+    """Return the function a + b gain, with a, b >= 0, that fits ``power``.
 
     Values above ``most`` times the fit are left out.
     """
@@ -87,10 +87,10 @@ def _level(power: np.ndarray, gain: np.ndarray, most: float):
 def merged(
     frequency: np.ndarray, values: np.ndarray, deviation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return at most some thousand lines with what all of them tell.
+    """Return the lines, averaged in narrow bands if there are more than MOST_LINES.
 
-    Lines within a band of the relative width MERGED become their mean, weighted by
-    1 / deviation^2. Up to MOST_LINES lines are returned as they are.
+    Lines within a band of the relative width MERGED become their mean, weighted by 1 /
+    deviation^2.
     """
     if frequency.size <= MOST_LINES:
         return frequency, values, deviation

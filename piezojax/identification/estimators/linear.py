@@ -126,7 +126,7 @@ def _without_feedthrough(
 ) -> StateSpace:
     """Set D to zero unless its mean-square output exceeds ``left``, the fit's error.
 
-    A loop needs a held input to reach the sampled output one sample later.
+    In a loop, a held input acts on the sampled output one sample later.
     """
     D = np.asarray(model.D)
     added = 2.0 * np.real(np.einsum("pa,lab,pb->", D, measured.power, D))
@@ -139,7 +139,10 @@ def _without_feedthrough(
 def steady_run(
     model: System, inputs: Float[Array, "n m"], settle: int
 ) -> Float[Array, "n p"]:
-    """Return the free run from rest, after the first ``settle`` inputs."""
+    """Return the free run under ``inputs``, from rest or from a settled state.
+
+    The state settles from rest under the first ``settle`` inputs.
+    """
     state = model.init(inputs[0])
     if settle:
         state, _ = simulate(model, inputs[:settle], state)

@@ -1,11 +1,11 @@
 """Local polynomial method: a frequency response without leakage, and its noise.
 
 The discrete Fourier transforms of a finite record obey ``Y = G U + T + V`` with the
-transient T, which is as smooth over frequency as the response G. Both are polynomials
-in a window of neighbouring lines; what they leave is the noise V. Sources: Schoukens,
-Vandersteen, Barbe and Pintelon, Nonparametric preprocessing in system identification,
-European Journal of Control 15 (2009); Pintelon and Schoukens, System Identification,
-2nd ed., sections 7.2 (arbitrary input) and 7.3 (periodic input).
+transient T, which is as smooth over frequency as the response G. Both are modelled by
+polynomials in a window of neighbouring lines; the residual is the noise V. Sources:
+Schoukens, Vandersteen, Barbe and Pintelon, Nonparametric preprocessing in system
+identification, European Journal of Control 15 (2009); Pintelon and Schoukens, System
+Identification, 2nd ed., sections 7.2 (arbitrary input) and 7.3 (periodic input).
 """
 
 import numpy as np
@@ -30,13 +30,13 @@ CHUNK = 20_000
 def local_polynomial(
     input: np.ndarray, output: np.ndarray, dt: float, least: float = EXCITED
 ) -> LineEstimates:
-    """Estimate the response to any ``input`` [samples], best to one without gaps.
+    """Estimate the response to any ``input`` [samples], best with all lines excited.
 
     In each window of 2 HALF + 1 lines the response and the transient are parabolas. One
-    line in HALF + 1 is returned: estimates nearer to each other are hardly more than
-    one. Windows in which the input has less than the share ``least`` of the power of
-    the strongest are left out, as are those that do not determine the response. ``dt``
-    in s. Raises ValueError if no line is left.
+    line in HALF + 1 is returned, because closer estimates use mostly the same lines.
+    Windows are left out if the input has less than the share ``least`` of the power in
+    the strongest, or if they do not determine the response. ``dt`` in s. Raises
+    ValueError if no line is left.
     """
     samples = input.size
     u, y = (np.fft.rfft(signal - signal.mean()) for signal in (input, output))
@@ -95,15 +95,16 @@ def periodic_local_polynomial(
     period: int,
     least: float = EXCITED,
 ) -> LineEstimates:
-    """Estimate the response to an ``input`` of two ``period`` (samples) or more.
+    """Estimate the response to a periodic ``input`` [samples] of two periods or more.
 
-    Between the lines of the input, the spectra hold transient and noise alone: a
-    parabola over 2 BETWEEN of these lines gives the transient in each line of the
-    input, and the noise. The response is not smoothed over frequency. Whole periods at
-    the end of the record are used, from the first transient on; noise of the input
-    counts. ``least`` as for ``local_polynomial``; lines in which the input has less
-    than CLEAR times its variance are left out too. Raises ValueError for fewer than two
-    periods, or a period too short.
+    The ``period`` is in samples. Between the lines of the input, the spectra contain
+    only transient and noise: a parabola over 2 BETWEEN of these lines gives the
+    transient in each line of the input, and the noise. The response is not smoothed
+    over frequency. All whole periods at the end of the record are used, including the
+    transient; the variance includes the noise of the input. ``least`` as for
+    ``local_polynomial``; lines in which the input has less than CLEAR times its
+    variance are left out too. Raises ValueError for fewer than two periods, or a period
+    too short.
     """
     count = input.size // period
     if count < 2:
@@ -113,7 +114,7 @@ def periodic_local_polynomial(
     if (period // 2) * (count - 1) < 2 * BETWEEN + 2:
         raise ValueError(
             f"the period is {period} samples; too few lines lie below half the rate "
-            f"to tell transient from noise"
+            f"to separate transient and noise"
         )
     used = count * period
     signals = np.stack([input[-used:], output[-used:]])

@@ -6,9 +6,9 @@ the input. From the input to the output the cross spectrum gives
     (G S_w - conj(K_y) S_v) / (S_w + |K_y|^2 S_v)
 
 with the spectrum S_w of ``K_r r + d`` and that S_v of v: the response of the stage
-where the excitation is strong, and ``-1 / K_y`` where the noise is (Ljung, System
-Identification, 2nd ed., 13.4). The approaches ``indirect`` and ``joint`` use only what
-is correlated with the excitation.
+where the excitation is strong, and ``-1 / K_y`` where the noise is strong (Ljung,
+System Identification, 2nd ed., 13.4). The approaches ``indirect`` and ``joint`` use
+only what is correlated with the excitation.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ from .welch import (
 )
 
 CONDITION = 1e-9
-"""Least ratio of the eigenvalues of the spectrum of two excitations in a line."""
+"""Regularisation of the spectrum matrix of the excitations, as a share of its trace."""
 
 
 def loop_response(
@@ -41,14 +41,14 @@ def loop_response(
 ) -> SpectralResponse:
     """Estimate the frequency response of the stage from a record of a closed loop.
 
-    ``direct`` is that of Welch from input to output: it is biased towards ``-1 / K_y``,
-    K_y the response of the controller from output to input, by the share of the input
-    that comes from noise. ``joint`` is the ratio of the responses of output and input
-    to the excitation, and ``indirect`` takes that of the input from the ``controller``;
-    both are unbiased for long records, whatever the noise, and ``indirect`` is as wrong
-    as its controller. With a reference and a dither, both count by their power.
-    ``segment`` as for ``spectral_response``. Direct and joint average a periodic record
-    by its periods, and are then the same.
+    ``direct`` is the estimate of Welch from input to output. The noise in the input
+    biases it towards ``-1 / K_y``, where ``-K_y`` is the response of the controller
+    from output to input. ``joint`` is the ratio of the responses of output and input to
+    the excitation; ``indirect`` computes the response of the input from the
+    ``controller``. Both are unbiased for long records, whatever the noise, but an error
+    of the controller biases ``indirect``. A reference and a dither are weighted by
+    their power. ``segment`` as for ``spectral_response``. For a periodic record, direct
+    and joint average over the periods and give the same result.
 
     Raises ValueError for another approach, a record without an excitation, or
     ``indirect`` without a controller.
@@ -93,8 +93,8 @@ def joint_response(
 
     ``excitation`` [samples, k], the other signals [samples], other arguments as for
     ``spectral_response``. Noise that is independent of the excitation leaves the
-    estimate unbiased for long records. The power is that of the input which the
-    excitation explains.
+    estimate unbiased for long records. ``power`` is the part of the input power that
+    the excitation explains.
 
     Raises ValueError for an excitation that never changes, and as
     ``spectral_response``.

@@ -48,8 +48,8 @@ PLACES = 100
 """Frequencies at which a new mode is tried."""
 
 LEAST_VARIANCE = 1e-6
-"""Least variance of weighted residuals that counts if the noise is not known: below it
-is rounding."""
+"""Least variance of weighted residuals if the noise is not known; smaller values are
+rounding errors."""
 
 KNOWN_VARIANCE = 0.5
 """Variance of weighted residuals, real or imaginary, if the noise is known."""
@@ -62,10 +62,11 @@ PENALTY = 2.0
 best of many trial frequencies."""
 
 EDGE = 1e-3
-"""Distance from a bound, as a share of the range, that counts as on it."""
+"""Distance from a bound, as a share of the range, within which a value is at it."""
 
 STARTS = 2
-"""Descents for each added mode, from the grid search and from rational functions."""
+"""Largest number of descents for each added mode from the grid search, and from
+rational functions."""
 
 ITERATIONS = 6
 """Sanathanan-Koerner iterations of a rational function."""
@@ -86,11 +87,11 @@ def modal_fit(
     """Return the modes, the lag and the delay that ``response`` shows.
 
     ``held`` is the sample time (s) if the response was measured through converters that
-    hold the input, as by the controller of the loop, and does not say so itself. There
-    are at most ``most`` modes. The lines are weighted by their variance, if it is
-    known, else by the noise that neighbouring lines show. If there are very many, the
-    search merges neighbouring lines; the last descent uses all. Raises ValueError if no
-    mode explains the response.
+    hold the input, such as those of the controller, and ``response.held`` is not set.
+    There are at most ``most`` modes. The lines are weighted by their variance, if it is
+    known, else by the noise estimated from neighbouring lines. If there are very many
+    lines, the search merges neighbouring ones; the last descent uses all. Raises
+    ValueError if no mode explains the response.
     """
     if not np.any(response.values):
         raise ValueError(f"{response.source}: the response is 0 at every line")
@@ -141,10 +142,10 @@ def modal_fit(
 
 
 def _on_all(found: list[_Found], data: Lines, every: Lines) -> _Found:
-    """Return the best of the fits ``found`` to merged ``data``, on ``every`` line.
+    """Return the best of the fits ``found`` to merged ``data``, refined on all lines.
 
-    The first was chosen; each of the others has a mode less. A lag or a mode that
-    imitates the error of merged lines is left out: all lines do not show it.
+    The first fit is the chosen one; each of the others has one mode less. This removes
+    a lag or a mode that only imitates the error of merging.
     """
     tried: list[_Found] = []
     best = None
@@ -220,7 +221,7 @@ def _thinned(data: Lines) -> Lines:
 
 
 def _best(tried: list[_Found]) -> list[_Found]:
-    """Return the best of the fits ``tried``, each refined by itself."""
+    """Return the best STARTS of the fits ``tried`` that differ from each other."""
     starts: list[_Found] = []
     for one in sorted(tried, key=_COST):
         if all(_apart(one, other) for other in starts):

@@ -27,8 +27,8 @@ DELAYS = 16
 """A quarter of the longest delay, in units of 1 / the highest angular frequency."""
 
 IMAGES = 4
-"""Images of a frequency on either side that count: those left out are smaller than the
-first by a factor of about 40. The search makes do with two."""
+"""Images (aliases) of a frequency on either side that count: those left out are smaller
+than the first by a factor of about 40. The search uses two."""
 
 BLOCK = 4096
 """Lines evaluated at a time."""
@@ -209,7 +209,7 @@ class ModalFit:
     """Modes with the largest static gain first, their lag and delay, and the fit.
 
     ``frequency`` (Hz), ``damping`` (1) and ``gain`` (unit of the response, at rest) of
-    each mode; ``share`` is that of the static gain of each mode but the first.
+    each mode; ``share`` is the share of each mode but the first in the static gain.
     ``static_gain`` is that of all modes, in the unit of the response. ``lag`` is the
     time constant (s), None if the response shows none, and ``delay`` in s. The standard
     errors come from the covariance of all parameters.
@@ -309,8 +309,9 @@ def error_bound(
     ``measured`` is a response with the standard ``deviation`` [lines] of real and
     imaginary part. At its lines the bound is the residual plus the 99 % radius of the
     noise, relative to the model; below the first line it is that of the first. Above
-    the last line nothing was excited. Of more than MOST_LINES lines the largest value
-    of each narrow band counts. Raises ValueError if no line lies below half the rate.
+    the last line nothing was excited. With more than MOST_LINES lines, the largest
+    value in each narrow band is used. Raises ValueError if no line lies below half the
+    rate.
     """
     fitted = fit.response_at(measured.frequency)
     error = np.abs(measured.values - fitted) + CONFIDENCE * deviation

@@ -1,4 +1,4 @@
-"""The Bouc-Wen oscillator as a structure to fit: box and starts from the record."""
+"""Bouc-Wen oscillator as a Structure, with bounds and starts from a record."""
 
 import numpy as np
 

@@ -37,7 +37,7 @@ CELLS = range(3, 11)
 
 LEAST_EFFECT = 1e-3
 """Least rms change of the output (um) for a change of the weights of norm 1 um, in the
-direction of least effect. Below it, nanometres of output would decide about tenths of a
+direction of least effect. Below it, nanometres of output would determine tenths of a
 micrometre of weight."""
 
 TOO_FEW = {
@@ -184,7 +184,7 @@ class _Problem(NamedTuple):
         return Chain(hysteresis, dynamics)
 
     def errors(self, system: Series) -> np.ndarray:
-        """Return the errors of the free run over the part, um."""
+        """Return the errors of the free run over the training part, um."""
         run = np.asarray(_free_run(system, as_array(self.seen.input)))
         return (run - self.seen.output)[self.train]
 

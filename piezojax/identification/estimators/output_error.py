@@ -42,7 +42,7 @@ PASSES = 3
 """Number of searches for the starts of several records, each followed by a fit."""
 
 NOISE_PASSES = 4
-"""Largest number of times that a noise model and the parameters are fitted in turn."""
+"""Largest number of alternate fits of a noise model and the parameters."""
 
 NOISE_SETTLED = 1e-3
 """Relative change of the mean square of the prediction error that ends these passes."""
@@ -76,7 +76,7 @@ class Optimum(NamedTuple):
 
     @property
     def system(self) -> System:
-        """The best System; with several records, at the zero of the first."""
+        """The best System; with several records, its zero is that of the structure."""
         problem = self.problem
         return problem.space.put(problem.system, as_array(self.units[0]))
 
@@ -85,8 +85,8 @@ class Problem(eqx.Module):
     """Fit of one System to several records, padded to one length with zero weights.
 
     A single record begins at rest. Each of several records has its own start, stacked
-    in ``starts``. The errors have the weight ``plain`` (0 or 1), and those behind the
-    filter ``whitening``, if it has coefficients, the weight ``share``.
+    in ``starts``. ``plain`` (0 or 1) is the weight of the errors, ``share`` that of the
+    errors filtered by ``whitening``, if it has coefficients.
     """
 
     system: System
@@ -155,7 +155,7 @@ class Problem(eqx.Module):
         return eqx.tree_at(lambda problem: problem.share, self, plain / white)
 
     def predicting(self, unit: Float[Array, " n"]) -> "Problem":
-        """Return the problem of the prediction errors, whitened as those at ``unit``.
+        """Return the problem of prediction errors, with the noise model at ``unit``.
 
         The first samples, for which the filter lacks earlier errors, do not count.
         """
@@ -300,7 +300,7 @@ def output_error(
     zero of each take the place of the structure's ``own`` parameters.
 
     With a ``noise_model`` the error is that of the prediction by the model and an
-    autoregressive model of its errors, which are fitted in turn (Ljung, System
+    autoregressive model of its errors, which are fitted alternately (Ljung, System
     Identification, 2nd ed., 3.2 and 13.4): feedback from the output to the input then
     leaves the fit unbiased, as long as the noise model whitens the errors. ``drives``
     are as in ``problem_of``. Raises ValueError when no start leads to a finite

@@ -43,8 +43,8 @@ def fit_preisach(
 
     Cells that no turn of the input reaches are determined only by ``smoothing``. Its
     square is the weight of the squared differences between neighbours relative to the
-    mean squared error; 0 stands for none. Weights on the diagonal give at least 1 % of
-    the mean slope of the record, so that the model has a continuous inverse.
+    mean squared error; 0 means no smoothing. Weights on the diagonal give at least 1 %
+    of the mean slope of the record, so that the model has a continuous inverse.
 
     Raises ValueError for an empty ``train``, limits that do not hold the record's
     input, ``cells`` or ``smoothing`` out of range, or an output that falls while the
@@ -66,7 +66,7 @@ def fit_rate_dependent_preisach(
     smoothing: float = 0.0,
     start: str = "virgin",
 ) -> RateDependentPreisach:
-    """Return the two densities, of equal share at ``rate`` (V/s), that fit best.
+    """Return the model with densities of equal share at ``rate`` (V/s) that fits best.
 
     For a given rate the output (2.10) is linear in both densities. Each is fitted as in
     fit_preisach. A record with a single speed does not determine both. Raises

@@ -24,15 +24,16 @@ RIDGE = 1e-12
 excitation does not determine them all."""
 
 STABLE = 0.9999
-"""Largest modulus of a pole of the model; beyond it all are scaled."""
+"""Largest modulus of a pole of the model; if one is larger, all poles are scaled."""
 
 
 def projected(signal: np.ndarray, excitation: np.ndarray) -> np.ndarray:
     """Return the response of ``signal`` [samples] to ``excitation`` [samples, k].
 
     The model is linear, of the order with the least Akaike information criterion. The
-    response keeps about the share coefficients over samples of the noise. Raises
-    ValueError for an excitation that never changes, and for too few samples.
+    share of the noise that remains is about the number of coefficients over the number
+    of samples. Raises ValueError for an excitation that never changes, and for too few
+    samples.
     """
     check_excitation(excitation)
     both = np.column_stack([signal, excitation])
@@ -97,7 +98,7 @@ def excited_part(record: Record) -> Record:
 
 
 def _regressed(signals: np.ndarray, order: int, first: int) -> tuple[np.ndarray, float]:
-    """Return the coefficients of the first signal on the past, and the squares left.
+    """Return the coefficients for the first signal, and the residual sum of squares.
 
     They are those of its own past, then those of each excitation from its present on,
     then the mean.

@@ -106,7 +106,7 @@ def refined_instrumental_variables(
 def _rows(
     x: np.ndarray, y: np.ndarray, poles: int, zeros: int, delay: int
 ) -> np.ndarray:
-    """Return the regressors of y(k): past outputs, negative, and past inputs."""
+    """Return the regressors of y(k): negated past outputs, and past inputs."""
     past = [-_shifted(y, i) for i in range(1, poles + 1)]
     driven = [_shifted(x, delay + i) for i in range(zeros + 1)]
     return np.stack([*past, *driven], axis=1)[SETTLE:]

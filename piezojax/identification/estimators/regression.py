@@ -82,10 +82,10 @@ def instrumental_variables(
 
     Rows and outputs are filtered by the inverse denominator. The instruments are the
     same rows with the free run of the last model in place of the measured output. The
-    iteration starts at least squares and ends when the denominator has converged (Young
-    and Jakeman, Int. J. Control 29, 1979). White noise on the output then causes no
-    bias, and the variance equals that of the output-error fit, whose standard errors
-    s^2 (J'J)^-1 are returned, c included.
+    iteration starts from the least-squares estimate and ends when the denominator has
+    converged (Young and Jakeman, Int. J. Control 29, 1979). White noise on the output
+    then causes no bias, and the variance equals that of the output-error fit, whose
+    standard errors s^2 (J'J)^-1 are returned, c included.
     """
     problem = _Problem(record, structure or Orders(), _part(record, train))
     c, theta = _search(problem, problem.refined, c)

@@ -1,9 +1,9 @@
 """Linear dynamics that a record of a hysteretic stage shows: modes, lags, delay.
 
 The stage is modelled as plays followed by a transfer function (a Hammerstein model),
-both fitted in turn to the signals above the slowest frequencies. The order is the
-lowest one whose errors are as white and small as those of the next; resonances and lags
-are read off from its poles.
+both fitted in turn to the signals above the slowest frequencies. The order rises as
+long as a further mode or lag clearly lowers the white error; resonances and lags follow
+from the poles.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from .refined import TransferFunction, refined_instrumental_variables
 from .slew_rate import slew_rate, slewed
 
 SHORTEST = 400
-"""Least number of samples in which dynamics are looked for."""
+"""Least number of samples from which dynamics are identified."""
 
 LONGEST = 40_000
 """Number of samples that are used, those in which the output moves fastest."""
@@ -35,22 +35,22 @@ LAGS, DELAYS = 1, 6
 """Most lags of a model, and longest delay in samples."""
 
 DROPS = (0.99, 0.95)
-"""Factors by which the first and the second mode must lower the white error to be
-shown. A harmonic of the hysteresis that meets the first resonance looks like another,
-weak one."""
+"""Factors by which the first and the second mode must lower the white error to count. A
+harmonic of the hysteresis near the first resonance looks like a second, weak one."""
 
 EVIDENCE = 20.0
-"""Least rise of the log likelihood by a mode: in a short record a smaller one is
-chance."""
+"""Least rise of the log likelihood by a mode: in a short record a smaller rise occurs
+by chance."""
 
 NEGLIGIBLE = 1e-6
-"""White error, as a share of the output, below which no mode is looked for."""
+"""White error, as a share of the output, below which no further mode is tried."""
 
 LAG_DROP = 0.995
 """Factor by which a lag or a sample of delay must lower the white error."""
 
 DIPOLE = 1.0
-"""Distance of a zero, as a share of a pole's distance from 1, that cancels a lag."""
+"""Distance, as a share of a pole's distance from 1, within which a zero cancels a
+lag."""
 
 HIGHEST = 0.45
 """Largest frequency of a mode, cycles per sample."""
@@ -67,9 +67,9 @@ class LinearDynamics(NamedTuple):
     """Resonances, strongest first, time constants of lags (s) and the delay (s).
 
     ``delay`` is beyond the one sample between input and output. ``slope`` is that of
-    the output over the full range of the input, below the resonances. Both are None
-    where no dynamics could be looked for. ``whitening`` is the filter of the errors.
-    ``slew`` is the slew rate of the input (its unit per s), None if it shows no limit.
+    the output over the full range of the input, below the resonances. Both are None if
+    no dynamics could be identified. ``whitening`` is the filter of the errors. ``slew``
+    is the slew rate of the input (its unit per s), None if it shows no limit.
     """
 
     modes: tuple[Resonance, ...] = ()
@@ -110,7 +110,8 @@ def _found(input: bytes, output: bytes, dt: float) -> LinearDynamics:
     moved = _above_slowest(y)
 
     def cost(x: np.ndarray) -> float:
-        # A mode and a lag. Steps tell the rate without the plays, which take long.
+        # One mode and one lag. The plays take long, and steps show the rate without
+        # them.
         try:
             model = refined_instrumental_variables(_above_slowest(x), moved, 3, 3)
         except (ValueError, np.linalg.LinAlgError):

@@ -58,7 +58,7 @@ def fit_response(
     if 2 * lines * inputs < rows * (inputs + outputs):
         raise ValueError(
             f"{lines} lines are too few for {rows} block rows; take "
-            f"{2 * lines * inputs // (inputs + outputs)} or less"
+            f"{2 * lines * inputs // (inputs + outputs)} or fewer"
         )
     basis, singular_values = _observability(_data(measured), rows)
     start, moved = _realised(basis[:, :order], measured)
@@ -69,7 +69,7 @@ def fit_response(
 def refined(
     model: StateSpace, measured: EmpiricalResponse, steps: int = STEPS
 ) -> tuple[StateSpace, Float[np.ndarray, " steps"]]:
-    """Return ``model`` moved to fit ``measured`` best, and the cost of each step.
+    """Return ``model`` adjusted to fit ``measured``, and the cost of each step.
 
     The descent is Levenberg-Marquardt over modes whose poles are
     ``sigmoid(a) exp(j b)``, stable for all a and b. It starts from the modes of

@@ -1,11 +1,10 @@
-"""Robust method for multisines: noise and nonlinear distortion told apart.
+"""Robust method for multisines: separation of noise and nonlinear distortion.
 
-A stage with a weak nonlinearity, driven by a multisine of random phases, answers as a
+A stage with a weak nonlinearity, driven by a multisine of random phases, responds as a
 linear system, the best linear approximation, plus a disturbance that repeats with the
-period and changes with the phases. What changes from period to period is noise; what
-changes from one realisation of the phases to the next is noise and nonlinear
-distortion. Source: Pintelon and Schoukens, System Identification, 2nd ed., section
-4.3.1.
+period and changes with the phases. The scatter between periods is due to noise; the
+scatter between realisations of the phases is due to noise and nonlinear distortion.
+Source: Pintelon and Schoukens, System Identification, 2nd ed., section 4.3.1.
 """
 
 from collections.abc import Sequence
@@ -24,7 +23,8 @@ class LineEstimates(NamedTuple):
 
     ``frequency`` [lines] in Hz; ``response`` [lines]; ``variance`` [lines], the
     expected square of the modulus of its error; ``freedom``, the real degrees of
-    freedom of the variance; ``resolution`` (Hz), the width of the band behind a line.
+    freedom of the variance; ``resolution`` (Hz), the width of the band from which a
+    line is estimated.
     """
 
     frequency: np.ndarray
@@ -61,10 +61,10 @@ def steady_response(
 
     It is the ratio of the mean spectra over the whole periods (``period`` samples) at
     the end of the record, without the first ``skip`` of them, which hold the transient.
-    The periods give the noise, also that of the input. Lines in which the input has
-    less than the share ``least`` of the power of its strongest line, or less than CLEAR
-    times its variance, are left out. Raises ValueError if fewer than two periods are
-    left.
+    The scatter between the periods gives the noise of output and input. Lines in which
+    the input has less than the share ``least`` of the power of its strongest line, or
+    less than CLEAR times its variance, are left out. Raises ValueError if fewer than
+    two periods are left.
     """
     count = input.size // period - skip
     if skip < 0 or count < 2:
@@ -90,12 +90,12 @@ def steady_response(
 def robust_response(realisations: Sequence[LineEstimates]) -> RobustResponse:
     """Return the mean response of two or more ``realisations``, and its variances.
 
-    Only lines of all realisations count. Raises ValueError for a single realisation, or
-    if less than half of the lines of the first are common to all.
+    Only lines common to all realisations are used. Raises ValueError for a single
+    realisation, or if less than half of the lines of the first are common to all.
     """
     count, first = len(realisations), realisations[0]
     if count < 2:
-        raise ValueError("one realisation does not tell distortion from the response")
+        raise ValueError("one realisation cannot separate distortion and response")
     step = (
         first.frequency[0]
         if first.frequency.size == 1

@@ -21,7 +21,7 @@ SAME_LEVEL = 0.1
 """Largest relative difference of the rms inputs of records of one level."""
 
 OFFSET = 0.1
-"""Mean of an input, as a share of its rms about it, from which a note says so."""
+"""Mean of an input, as a share of its rms about it, above which a note warns."""
 
 
 def fit_scheduled(
@@ -60,12 +60,12 @@ def by_amplitude(
 ) -> Estimate:
     """Fit dynamics scheduled by drive level to periodic records of several levels.
 
-    Records whose rms inputs differ by less than SAME_LEVEL have one level. The common
-    start is a linear model of ``options.order`` states of all records, which weighs
-    each level by the inverse of its mean-square input: equal relative errors count
-    alike. The model maps u(k) to y(k+1), as a loop expects of its plant: it is fitted
-    to the transfer matrix one sample ahead. Raises ValueError for one channel, for a
-    single level, and as ``empirical_response`` and ``fit_response`` do.
+    Records whose rms inputs differ by less than SAME_LEVEL share a level. The common
+    start is a linear model of ``options.order`` states, fitted to all records. Each
+    record is weighted by the inverse of its mean-square input, so that equal relative
+    errors count alike. The model maps u(k) to y(k+1), as a loop expects of its plant:
+    it is fitted to the transfer matrix one sample ahead. Raises ValueError for one
+    channel, for a single level, and as ``empirical_response`` and ``fit_response`` do.
     """
     if records[0].inputs.shape[1] == 1 and records[0].outputs.shape[1] == 1:
         raise ValueError(
@@ -81,7 +81,7 @@ def by_amplitude(
     progress.stage("measuring the transfer matrices")
     try:
         for level in levels:
-            empirical_response(level)  # each level must do alone
+            empirical_response(level)  # each level alone must determine it
     except ValueError as error:
         drives = ", ".join(f"{len(level)} at {_rms(level):.3g}" for level in levels)
         unit = records[0].input_unit
@@ -105,7 +105,7 @@ def by_amplitude(
     if max(offsets) > OFFSET:
         warnings.append(
             "the inputs have a mean: the level of the model is their rms about it, and "
-            "in a loop the mean of the drive counts too"
+            "in a loop the level includes the mean of the drive"
         )
     named = {
         f"level {i}, {record_level:.4g} {records[0].input_unit} rms: largest pole "
@@ -136,7 +136,7 @@ def _run(
 ) -> Float[np.ndarray, "n p"]:
     """Return the outputs of a ``model`` one sample ahead, at the times of ``inputs``.
 
-    It has settled during a period before them, from which the first output follows.
+    It runs over one more period first, so that it has settled.
     """
     whole = np.concatenate([inputs[:period], inputs])
     return np.asarray(steady_run(model, as_array(whole), 0))[period - 1 : -1]

@@ -1,4 +1,4 @@
-"""Slew rate of the amplifier in front of a stage that a record with steps shows."""
+"""Slew rate of the amplifier in front of a stage, from a record with steps."""
 
 from collections.abc import Callable
 
@@ -9,25 +9,25 @@ JUMP, STEPS, RARE = 0.05, 5, 0.02
 steps that show a slew rate, and largest share of samples with one."""
 
 SAMPLES = tuple(np.geomspace(0.75, 75.0, 12))
-"""Samples that the largest step may take at the slew rate."""
+"""Numbers of samples tried for the largest step at the slew rate."""
 
 ROUNDS = 3
-"""Refinements of the slew rate, each by half of the logarithm of the last."""
+"""Refinements of the slew rate, each with half the logarithmic step of the last."""
 
 DROP = 0.95
 """Factor by which a slew rate must lower the error."""
 
 
 def has_steps(x: np.ndarray) -> bool:
-    """Return whether ``x`` [samples] jumps several times, and rests or moves slowly."""
+    """Return whether ``x`` [samples] has several steps and is slow between them."""
     jumps = np.abs(np.diff(x)) > JUMP * np.ptp(x)
     return int(np.sum(jumps)) >= STEPS and bool(np.mean(jumps) < RARE)
 
 
 def slewed(x: np.ndarray, most: float) -> np.ndarray:
-    """Return the mean over each sample of ``x`` moving by at most ``most`` in one.
+    """Return the mean over each sample of ``x`` limited to a change of ``most`` in one.
 
-    As ``dynamics.AmplifierSlew``, at rest under the first sample.
+    The result is that of ``dynamics.AmplifierSlew`` from rest under the first sample.
     """
     found, last = np.empty_like(x), float(x[0])
     for k, value in enumerate(x.tolist()):
@@ -40,9 +40,9 @@ def slewed(x: np.ndarray, most: float) -> np.ndarray:
 def slew_rate(x: np.ndarray, cost: Callable[[np.ndarray], float]) -> float | None:
     """Return the largest change of ``x`` in a sample at the slew rate, or None.
 
-    ``cost`` is the error that an input leaves. The best rate of a geometric grid is
-    refined, and counts if its input leaves clearly less than ``x`` itself and the
-    largest step takes more than a sample: a shorter ramp looks like a delay.
+    ``cost`` returns the error of a fit with a given input. The best rate of a geometric
+    grid is refined. It is returned if it gives a clearly lower error than ``x`` itself,
+    and if the largest step takes more than a sample: a shorter ramp looks like a delay.
     """
     if not has_steps(x):
         return None

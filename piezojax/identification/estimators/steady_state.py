@@ -133,7 +133,7 @@ def _inside(space: Space, system: System, free: Float[Array, " n"]) -> System:
 
 
 class _Problem(eqx.Module):
-    """Parameters of ``put`` against one steady period of a record."""
+    """Fit of the parameters of ``put`` to one steady period of a record."""
 
     put: Callable[[Array], System]
     input: Array

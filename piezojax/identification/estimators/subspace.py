@@ -29,7 +29,7 @@ Estimator = Callable[[Rows, Targets], Theta]
 
 
 def least_squares(X: Rows, Y: Targets, tolerance: float = 1e-15) -> Theta:
-    """Return the smallest theta that fits ``Y = X theta^T`` best, (6.16).
+    """Return the least-squares theta of least norm for ``Y = X theta^T``, (6.16).
 
     Directions of X below ``tolerance`` times the strongest one are left out.
     """

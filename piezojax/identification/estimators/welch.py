@@ -49,11 +49,11 @@ def spectral_response(
 
     With a ``period`` (samples) it is the ratio of the discrete Fourier transforms,
     averaged over the whole periods at the end of the record: exact in steady state.
-    Without one it is that of Welch, from half-overlapping segments of ``segment``
-    samples under a Hann window, without their means and slopes. Lines in which the
-    input has less than the share ``least`` of the power of its strongest line are left
-    out. ``dt`` in s. Source of the variance: Bendat and
-    Piersol, Random Data, 4th ed., section 9.2.
+    Without one it is the estimate of Welch, from half-overlapping segments of
+    ``segment`` samples under a Hann window, with means and slopes removed. Lines in
+    which the input has less than the share ``least`` of the power of its strongest line
+    are left out. ``dt`` in s. Source of the variance: Bendat and Piersol, Random Data,
+    4th ed., section 9.2.
 
     Raises ValueError for signals of different length, fewer than two whole periods or
     segments, or an input that never changes.
@@ -156,6 +156,6 @@ def segment_size(samples: int, segment: int | None) -> tuple[int, int]:
 
 
 def _excited(power: np.ndarray, least: float) -> np.ndarray:
-    """Return the lines, without that at frequency zero, which the input excites."""
+    """Return the lines that the input excites, without the line at 0 Hz."""
     alternating = np.r_[0.0, power[1:]]
     return np.flatnonzero(alternating > least * alternating.max())
