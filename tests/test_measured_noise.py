@@ -156,7 +156,7 @@ def test_a_record_plays_other_stretches_in_the_holdout(folder):
     )
     frequency, sizes, _ = levels(slow.record[:, 0], RATE)
     assert sizes[0, frequency > 600.0].sum() < 1e-3 * sizes[0].sum()
-    assert "nothing above 500 Hz" in slow.note
+    assert "no frequency above 500 Hz" in slow.note
 
 
 def test_a_study_has_the_noise_of_its_files(folder):
@@ -197,7 +197,7 @@ def test_a_study_has_the_noise_of_its_files(folder):
         ({"file": "none.npz"}, "sensor.measured_noise: record .*none.npz: No such"),
         (
             {"file": "slow.npz"},
-            "says nothing above 500 Hz, and the sensor is r",
+            "no frequency above 500 Hz, and the sensor is sam",
         ),
         (
             {"file": "short.npz", "play": "record"},
@@ -205,7 +205,7 @@ def test_a_study_has_the_noise_of_its_files(folder):
         ),
         ({"file": "tiny.npz"}, "tiny.npz has 511 samples; at least 512"),
         ({"file": "flat.npz"}, "column 'z_um' never changes"),
-        ({"unit": "nm"}, "column 'z_um' is in um by the file, and unit is nm"),
+        ({"unit": "nm"}, "column 'z_um' is in um in the file, but unit is nm"),
         ({"frequency": "z_um"}, "column 'z_um' is named twice|name the column"),
         (
             {"file": "psd.npz", "frequency": "f", "column": "s"},
@@ -221,7 +221,7 @@ def test_a_study_has_the_noise_of_its_files(folder):
         ),
         (
             {"file": "psd.npz", "frequency": "f", "column": "s", "unit": "um^2/Hz"},
-            "the file says nothing above 4 Hz",
+            "the file covers no frequency above 4 Hz",
         ),
     ],
 )

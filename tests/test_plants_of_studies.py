@@ -180,7 +180,7 @@ def test_several_axes_play_their_residuals_together():
     [
         ({"record": []}, "plant.record: Tuple should have at least 1 item"),
         ({"among": ["duhem"]}, 'plant: among and test need model = "all"'),
-        ({"model": "all"}, "plant: method needs one model; all uses the default of"),
+        ({"model": "all"}, 'plant: method needs one model; model = "all" uses'),
         (
             {"period": 1},
             "plant.period is 1: Input should be greater than or eq",

@@ -788,7 +788,9 @@ def test_references_last_a_second_by_default(study):
 
 def test_a_reference_at_half_the_rate(refusal):
     message = refusal({"references/unseen": ["SIN10000"]})
-    assert message == "references: SIN10000 is not below half the rate, 10000 Hz"
+    assert message == (
+        "references: the frequency of SIN10000 is not below half the rate, 10000 Hz"
+    )
 
 
 def test_a_front_has_at_least_two_limits(study, refusal):

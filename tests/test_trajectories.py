@@ -56,7 +56,7 @@ def test_a_trajectory_is_linear_between_its_samples(folder, start):
     share = instants * 500.0 - index
     expected = (1.0 - share) * PATH[index] + share * PATH[index + 1]
     np.testing.assert_allclose(found.values[:, 0], 2.0 * expected - 3.0, atol=1e-6)
-    assert "501 samples of scan.csv at 500 Hz, linear between them, at 1000" in (
+    assert "501 samples of scan.csv at 500 Hz, interpolated linearly at 1000" in (
         found.note
     )
 
@@ -93,7 +93,7 @@ def test_a_short_trajectory_is_held_or_repeated(folder):
     # 501 samples of 2 ms: the period is 1.002 s.
     values = again.values[:, 0]
     np.testing.assert_allclose(values[1002:2004], values[:1002], atol=1e-6)
-    assert again.note.endswith("then from there again")
+    assert again.note.endswith("then repeated")
 
 
 def test_another_part_of_a_file_is_held_out(folder):
@@ -138,7 +138,7 @@ def test_columns_drive_their_axes(folder):
     np.savez(folder / "scan.npz", x_um=PATH, y=1e3 * PATH[::-1], dt=2e-3)
     table = {"scan": {"file": "scan.npz", "axes": {"X": "x_um", "Y": "y"}}}
     table["scan"]["unit"] = "nm"
-    with pytest.raises(ValueError, match="column 'x_um' is in um by the file, and uni"):
+    with pytest.raises(ValueError, match="column 'x_um' is in um in the file, but"):
         read_trajectories(study_of(table, **AXES), folder)
     np.savez(folder / "scan.npz", x_um=PATH, y_nm=1e3 * PATH[::-1], dt=2e-3)
     table["scan"] = {"file": "scan.npz", "axes": {"Y": "y_nm", "X": "x_um"}}
@@ -158,7 +158,7 @@ def test_columns_drive_their_axes(folder):
         ({}, "scan.csv: name the time column, or give its rate in Hz"),
         ({"time": "time_s", "column": "y_um"}, "column 'y_um' is missing; there are t"),
         ({"time": "time_s", "column": "time_s"}, "the column column is 'time_s'"),
-        ({"time": "time_s", "unit": "nm"}, "is in um by the file, and unit is nm"),
+        ({"time": "time_s", "unit": "nm"}, "is in um in the file, but unit is nm"),
         ({"rate": 500.0, "time": "time_s", "start": 2.0}, "start is 2 s; scan.csv end"),
         ({"time": "time_s", "start": 0.9}, r'holds 0.1 s from.*then = "hold" or then'),
         ({"time": "time_s", "rate": 400.0}, "the sample rate is 500 Hz by column"),
@@ -183,7 +183,7 @@ def test_a_bad_file_is_one_line(folder, table, message):
     [
         ("scan", {"scale": 0.0}, "files.scan: scale is 0"),
         ("SIN5", {}, "files.SIN5: SIN5 is the name of a signal"),
-        ("a b", {}, "files.a b: the name must begin with a letter"),
+        ("a b", {}, "files.a b: the name must begin with a letter or _"),
         ("other", {}, "files.other is in neither tune nor unseen"),
         ("scan", {"then": "stop"}, "files.scan.then"),
         ("scan", {"column": -1}, "files.scan.column"),

@@ -1,4 +1,4 @@
-"""Case of a study: the files read, the plant fitted, the loop and space built."""
+"""Case of a study: read its files, fit its plant, build its loop and search space."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -40,18 +40,19 @@ from .trajectories import read_trajectories
 class Case:
     """A study with its loop and its search space.
 
-    ``references`` are those of tuning before the unseen ones, in um or in the units of
-    the axes. ``fit`` is the fit of the plant to a record, None for other plants.
-    ``plants`` maps names to the plants of a sweep, which replace the plant of the loop.
-    ``notes`` are sentences about starts that differ from the controller of the study,
-    and about a design whose voltage stays within the record. ``plant_about`` is the
-    origin of a plant from a record or a file, with the bound on its error.
-    ``amplifier`` maps the voltage of the actuator to that of the piezo, both in V; it
-    is part of the plant, and None if the study has none. ``beside`` maps names to the
-    controllers that the tuned one is compared with. ``sensor_noise``,
-    ``output_disturbance`` and ``input_disturbance`` are those of files; the study of a
-    case with the first has its rms value. ``saved_residual`` is that of a plant from a
-    file, ``response`` the model of a plant that is fitted to a frequency response.
+    ``references`` holds those of tuning first, then the unseen ones, in um or in the
+    units of the axes. ``fit`` is the fit of the plant to a record, None for other
+    plants. ``plants`` maps names to the plants of a sweep, which replace the plant of
+    the loop. ``notes`` are sentences about files, the plant, a design whose voltage
+    stays within the record, and starts that differ from the controller of the study.
+    ``plant_about`` is the origin of a plant from a record or a file, with the bound on
+    its error. ``amplifier`` maps the voltage of the actuator to that of the piezo, both
+    in V; it is part of the plant, and None if the study has none. ``beside`` maps names
+    to the controllers with which the tuned one is compared. ``sensor_noise``,
+    ``output_disturbance`` and ``input_disturbance`` are read from files;
+    ``study.sensor.noise_rms`` is then the rms value of ``sensor_noise``.
+    ``saved_residual`` is the residual of a plant from a file, ``response`` the model of
+    a plant that is fitted to a frequency response.
     """
 
     study: Study
@@ -74,7 +75,8 @@ class Case:
 
     @cached_property
     def residual(self) -> ResidualRecord | None:
-        """Residual of the fitted plant, of this study or of a file; None without."""
+        """Residual of the plant, from the fit of this study or from its file, or
+        None."""
         return self.saved_residual if self.fit is None else ResidualRecord.of(self.fit)
 
     @property

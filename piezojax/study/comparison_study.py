@@ -48,7 +48,7 @@ class RateRange(RangeTable):
     def at(self, start: float, rate: float, path: str) -> dict[str, Any]:
         """Return the bounds at ``rate`` (Hz) for a ``start`` value.
 
-        Raises ValueError if ``factor`` meets a start that is not positive.
+        Raises ValueError for a ``factor`` with a start that is not positive.
         """
         if self.lower is not None and self.upper is not None:
             unit = rate if self.per_sample else 1.0

@@ -37,7 +37,7 @@ class EnsembleTable(Table):
 
     @property
     def ranges(self) -> list[str]:
-        """Ranges of the drawn plants, a phrase each."""
+        """Ranges of the drawn plants, as phrases."""
         errors = self.standard_errors
         return [
             *(f"{name} +- {100.0 * part:g} %" for name, part in self.spread.items()),

@@ -21,8 +21,8 @@ class SignalFile(Table):
     ``column`` is a name or a number from zero; it may be left out if the file has one
     column besides ``time``. On a stage with several axes, ``axes`` gives the column of
     each axis instead. The sample time comes from the column ``time``, from ``rate``
-    (Hz) or from the file. ``unit`` is that of columns whose unit neither the file nor
-    their name tells. The values are multiplied by ``scale``.
+    (Hz) or from the file. ``unit`` applies to columns whose unit is given neither by
+    the file nor by their name. The values are multiplied by ``scale``.
     """
 
     file: Path
@@ -38,9 +38,10 @@ class NoiseFile(SignalFile):
     """Measured noise or vibration in a file.
 
     ``play`` "spectrum" draws random noise with the spectrum of the record; "record"
-    plays stretches of the record itself, of its first half in tuning, of its second in
-    the hold-out. With ``frequency``, a column in Hz, the file holds a spectrum itself:
-    ``unit`` is then one of a density, such as um/sqrt(Hz) or um^2/Hz, and one-sided.
+    plays stretches of the record itself, from its first half in tuning and from its
+    second half in the hold-out. With ``frequency``, a column in Hz, the file holds a
+    spectrum itself: ``unit`` is then that of a one-sided density, such as um/sqrt(Hz)
+    or um^2/Hz.
     """
 
     play: Literal["spectrum", "record"] = "spectrum"
@@ -52,7 +53,7 @@ class NoiseFile(SignalFile):
             raise ValueError("scale is 0; there would be no noise")
         if self.frequency is not None and self.play == "record":
             raise ValueError(
-                'play is "record", but a file with a frequency holds a spectrum'
+                'play is "record", but a file with a frequency column is a spectrum'
             )
         return self
 
@@ -77,11 +78,11 @@ class TrajectoryTable(SignalFile):
 
 
 def check_trajectory_name(name: str) -> None:
-    """Raise ValueError for the name of a trajectory that is that of a signal."""
+    """Raise ValueError for a malformed name, or one that is the name of a signal."""
     if not NAME.fullmatch(name):
         raise ValueError(
-            f"files.{name}: the name must begin with a letter and hold letters, "
-            "digits, _ and -"
+            f"files.{name}: the name must begin with a letter or _ and contain only "
+            "letters, digits, _ and -"
         )
     if re.sub(r"[0-9.]+$", "", name) in waveforms.SIGNALS:
         raise ValueError(

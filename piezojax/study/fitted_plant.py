@@ -74,7 +74,7 @@ def fitted_plant(
 
 
 def on_axes(system: System, study: Study) -> System:
-    """Return ``system`` with a signal for each axis, if it has vectors instead.
+    """Return ``system`` with one scalar per axis, if its signals are vectors.
 
     A fit to records of several channels has vectors.
     """

@@ -25,9 +25,9 @@ def per_axis(study: Study, make: Callable[[int], Any]) -> Any:
 
 
 def make_actuator(study: Study) -> System:
-    """Return the actuator: limits, slew rate and converter, which a controller knows.
+    """Return the actuator: limits, slew rate and converter, known to the controller.
 
-    It maps the command to the voltage after them, V.
+    It maps the command (V) to the voltage (V) after them.
     """
     table = study.actuator
 
@@ -45,8 +45,8 @@ def make_actuator(study: Study) -> System:
 def make_amplifier(study: Study) -> System | None:
     """Return the delay and the bandwidth between actuator and plant, V to V.
 
-    The controller does not know the voltage behind them. None if the study has neither.
-    Raises ValueError for a delay above ``LONGEST`` samples.
+    The controller does not know the voltage behind them. Returns None if the study has
+    neither. Raises ValueError for a delay above ``LONGEST`` samples.
     """
     table = study.actuator
 

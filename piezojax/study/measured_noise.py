@@ -14,22 +14,22 @@ from .schema import Study
 from .signal_files import FileSignals, read_densities, read_signals
 
 SEGMENTS = 8
-"""Length of a record over that of the segments of its spectrum."""
+"""Ratio of the length of a record to that of a segment in Welch's method."""
 
 SHORTEST = 512
 """Least number of samples of a record of noise."""
 
 SAME = 1e-3
-"""Relative difference of sampling rates that count as one."""
+"""Largest relative difference of two sampling rates that count as equal."""
 
 HIGHEST = 0.9
 """Share of half the rate up to which the noise of a sensor must be known."""
 
 FINER = 8
-"""Factor on the rate of a record before it is interpolated linearly."""
+"""Factor by which a record is oversampled before its linear interpolation."""
 
 STEADY = 2.0
-"""Ratio of the rms values of both halves of a record from which a note says so."""
+"""Ratio of the rms values of both halves of a record above which a note warns."""
 
 
 class Density(NamedTuple):
@@ -58,7 +58,7 @@ class Density(NamedTuple):
     ) -> Float[np.ndarray, "n axes"]:
         """Return the levels of the noise sampled at ``rate`` (Hz).
 
-        What lies above half the rate is folded back.
+        Noise above half the rate is aliased.
         """
         found = self.at(frequency)
         for image in range(1, int(np.ceil(self.frequency[-1] / rate)) + 1):
@@ -72,7 +72,8 @@ class MeasuredNoise:
     """Noise of a file at the rate of a study, in the units of its axes.
 
     ``density`` gives random draws, ``record`` [samples, axes] stretches; one of them is
-    None. ``rms`` [axes] is that of the whole, ``note`` tells what was done.
+    None. ``rms`` [axes] is that of the whole noise; ``note`` describes its source and
+    its conversion.
     """
 
     rate: float
@@ -114,9 +115,9 @@ class MeasuredNoise:
 
 
 def _lines(samples: int, rate: float) -> tuple[Float[np.ndarray, " lines"], int]:
-    """Return the lines (Hz) of a period of twice ``samples``, and its length.
+    """Return the lines (Hz) of a period of twice ``samples`` or more, and its length.
 
-    Draws are cut from it, so that their ends are not alike.
+    A draw is a part of this period, so that its two ends are not correlated.
     """
     points = 2 * scipy.fft.next_fast_len(samples, real=True)
     return np.arange(1, points // 2 + 1) * rate / points, points
@@ -135,7 +136,7 @@ def read_noise(
 
     The noise of a ``sensor`` must be known up to nearly half the rate of the study.
     Raises ValueError, starting with ``where``, for a file that cannot be read, is too
-    short, or says too little, and for a spectrum that is to be played.
+    short, or does not cover the band.
     """
     if table.frequency is not None:
         density = Density(*read_densities(table, study, folder, where, units))
@@ -177,7 +178,7 @@ def read_noise(
 
 
 def confidence(segments: int) -> tuple[float, float]:
-    """Return the factors on Welch's level that bound the true one with 95 %.
+    """Return the factors on a level by Welch's method that bound its 95 % interval.
 
     They are those of chi-squared with 36 n^2 / (19 n - 1) degrees of freedom, for n
     segments with Hann windows that overlap by half (Percival and Walden, Spectral
@@ -192,8 +193,8 @@ def _check_band(known: float, study: Study, where: str, sensor: bool) -> None:
     """Raise ValueError if the noise of a sensor is not known up to half the rate."""
     if sensor and known < HIGHEST * 0.5 * study.rate:
         raise ValueError(
-            f"{where}: the file says nothing above {known:.6g} Hz, and the sensor is "
-            f"read at {study.rate:g} Hz: measure its noise up to "
+            f"{where}: the file covers no frequency above {known:.6g} Hz, and the "
+            f"sensor is sampled at {study.rate:g} Hz: measure its noise up to "
             f"{0.5 * study.rate:g} Hz"
         )
 
@@ -258,9 +259,12 @@ def _band(known: float, study: Study) -> str:
     """Return the part of a note on frequencies that the file does not reach."""
     nyquist = 0.5 * study.rate
     if known < nyquist * (1.0 - SAME):
-        return f"; it says nothing above {known:.6g} Hz, where there is no noise then"
+        return (
+            f"; the file covers no frequency above {known:.6g} Hz, so that there is no "
+            "noise above it"
+        )
     if known > nyquist * (1.0 + SAME):
-        return f"; what lies above {nyquist:g} Hz folds back, as at a converter"
+        return f"; noise above {nyquist:g} Hz is aliased, as by a converter"
     return ""
 
 
@@ -270,7 +274,7 @@ def _unsteady(values: Float[np.ndarray, "samples axes"], signals: FileSignals) -
         sizes = column[:half].std(), column[half:].std()
         if name and max(sizes) > STEADY * min(sizes):
             return (
-                f"; {name!r} is not steady: its halves have the rms values "
+                f"; {name!r} is not stationary: its halves have the rms values "
                 f"{sizes[0]:.3g} and {sizes[1]:.3g}"
             )
     return ""

@@ -33,8 +33,8 @@ def response_in_study_units(response: FrequencyResponse) -> FrequencyResponse:
     factors = factor(output, "um"), factor(input, "V")
     if None in factors:
         raise ValueError(
-            f"its unit is {response.unit!r}; it must be a length over a voltage, as "
-            "um/V or nm/mV"
+            f"its unit is {response.unit!r}; it must be a length over a voltage, such "
+            "as um/V or nm/mV"
         )
     ratio = (factors[0] or 1.0) / (factors[1] or 1.0)
     return dataclasses.replace(response, values=ratio * response.values, unit="um/V")
@@ -65,8 +65,8 @@ def check_rate(rate: float, study: Study, where: str) -> None:
 
 
 _REMEDIES = {
-    "plant.file": "name its record in [plant], which is converted, or fit it again in "
-    "V and um",
+    "plant.file": "name its record in [plant], so that its units are converted, or "
+    "fit it again in V and um",
     "controller.file": "tune it again in a study with these units",
 }
 

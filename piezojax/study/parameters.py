@@ -82,8 +82,8 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
 def _reaching(bounds: Range, start: float) -> Range:
     """Return ``bounds``, extended to a decade beyond a ``start`` outside them.
 
-    Only bounds on a logarithmic scale are extended. Declared ranges are
-    those of usual controllers; a design may start elsewhere.
+    Only bounds on a logarithmic scale are extended. Declared ranges suit common
+    controllers; a design may start outside them.
     """
     if bounds.scale != "log" or start <= 0.0:
         return bounds

@@ -20,8 +20,8 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 class ResponsePlant(Table):
     """A plant fitted to a frequency response, for the rate of the study.
 
-    ``response`` is the file, ``unit`` that of the response, output over input. With
-    ``held`` it was measured through converters at the rate of the study.
+    ``response`` is the file, ``unit`` that of the response, output over input. ``held``
+    is true for a response measured through converters at the rate of the study.
     """
 
     response: Path
@@ -34,13 +34,13 @@ class RecordPlant(Table):
 
     ``record``, or ``records``, is a file or a list of files of one stage. ``time``,
     ``input`` and ``output`` are columns, by name or number; several inputs and outputs
-    are lists.
-    ``record_rate`` is the sampling rate of the records, Hz, ``resample`` the rate that
-    they are interpolated at, and ``period`` the samples in a period of a periodic
-    input. ``train``, ``validate`` and ``test`` are first samples and the samples after
-    the last. ``among`` and ``test`` need the model "all". ``order``, ``window``,
-    ``oversample`` and ``steps`` are those of ``identify``. ``check`` are other records
-    of the stage, with the same columns, on which the fitted plant is validated.
+    are lists. ``record_rate`` is the sampling rate of the records, Hz, ``resample`` the
+    rate to which they are interpolated, and ``period`` the samples in a period of a
+    periodic input. ``train``, ``validate`` and ``test`` are pairs: the first sample and
+    the sample after the last. ``among`` and ``test`` need the model "all". ``order``,
+    ``window``, ``oversample`` and ``steps`` are those of ``identify``. ``check`` are
+    other records of the stage, with the same columns, on which the fitted plant is
+    validated.
     """
 
     record: tuple[Path, ...] = Field(
@@ -82,7 +82,9 @@ class RecordPlant(Table):
         if self.model != ALL and (self.among is not None or self.test is not None):
             raise ValueError('among and test need model = "all"')
         if self.model == ALL and self.method is not None:
-            raise ValueError("method needs one model; all uses the default of each")
+            raise ValueError(
+                'method needs one model; model = "all" uses the default of each'
+            )
         return self
 
     @property

@@ -67,9 +67,9 @@ class References(Table):
 
     ``tune`` are the references of the objective; ``unseen`` are used only to evaluate
     the tuned gains. ``amplitude`` and ``offset`` are in the unit of the axis (um on a
-    stage with one axis), ``duration`` and ``settle`` in s. Errors count after
-    ``settle``. ``files`` are trajectories in files, by name; they have an offset of
-    their own and no amplitude.
+    stage with one axis), ``duration`` and ``settle`` in s. Errors before ``settle`` are
+    ignored. ``files`` are trajectories in files, by name; they have an offset of their
+    own and no amplitude.
     """
 
     tune: tuple[str, ...] = Field(min_length=1)
@@ -178,9 +178,9 @@ class Study(Table):
 
     ``rate`` is the sampling rate, Hz. ``tune`` names parameters to tune: paths in the
     loop, or patterns such as ``controller.feedback.*``. ``parameters`` names further
-    ones. It also overrides the declared bounds, scales and starts. ``beside`` names
-    controllers to which the tuned one is compared. ``structures`` are numbers of
-    notches, of which the result has as many as are worth their parameters.
+    ones and overrides declared bounds, scales and starts. ``beside`` names controllers
+    to which the tuned one is compared. ``structures`` lists numbers of notches to
+    compare; the result has as many as are worth their parameters.
     """
 
     title: str
@@ -240,8 +240,8 @@ class Study(Table):
                 frequency = signals.parse(kind)[1] or 0.0
                 if frequency >= 0.5 * self.rate:
                     raise ValueError(
-                        f"references: {name} is not below half the rate, "
-                        f"{0.5 * self.rate:g} Hz"
+                        f"references: the frequency of {name} is not below half the "
+                        f"rate, {0.5 * self.rate:g} Hz"
                     )
         if round(table.settle * self.rate) >= samples:
             raise ValueError(
@@ -370,8 +370,8 @@ class Study(Table):
     def driven(self, reference: str) -> dict[str, str]:
         """Return the signals of a reference by the name of the driven axis.
 
-        The name is "" on a stage with one axis. That of a trajectory is the signal of
-        each of its axes. Raises ValueError for an unknown reference.
+        The name is "" on a stage with one axis. Each axis of a trajectory has the name
+        of the trajectory as its signal. Raises ValueError for an unknown reference.
         """
         if reference in self.references.files:
             axes = self.references.files[reference].axes if self.axes else ("",)
@@ -388,7 +388,7 @@ def as_toml(study: Study) -> str:
 
 
 def sha256_of(study: Study) -> str:
-    """Return the SHA-256 of ``as_toml``, which names a study whatever its comments."""
+    """Return the SHA-256 of ``as_toml``; it identifies a study and ignores comments."""
     return hashlib.sha256(as_toml(study).encode("utf-8")).hexdigest()
 
 

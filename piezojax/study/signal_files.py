@@ -49,9 +49,10 @@ def read_signals(
 ) -> FileSignals:
     """Read the signals of ``table``, the key ``where`` of ``study``, in ``units``.
 
-    The file lies in ``folder``; ``units`` are those of the axes. Raises ValueError,
-    starting with ``where``, for an unreadable file, an axis without a column, and units
-    that are unknown, contradict each other or cannot be converted.
+    The file lies in ``folder``; ``units`` are those of the axes. With ``even`` the
+    samples must be evenly spaced. Raises ValueError, starting with ``where``, for an
+    unreadable file, an axis without a column, and units that are unknown, contradict
+    each other or cannot be converted.
     """
     path = folder / table.file
     try:
@@ -76,7 +77,7 @@ def read_signals(
 
 
 _DENSITY = re.compile(r"(\w+?)\s*(/\s*(?:sqrt\(Hz\)|rtHz|Hz\^0\.5)|\^?2\s*/\s*Hz)")
-"""Unit of a density: of the amplitude, as um/sqrt(Hz), or of the power, um^2/Hz."""
+"""Unit of an amplitude density, such as um/sqrt(Hz), or a power density, um^2/Hz."""
 
 LEAST_LINES = 3
 
@@ -110,7 +111,9 @@ def read_densities(
         kept = frequency != 0.0
         frequency, levels = frequency[kept], levels[kept]
         if frequency.size < LEAST_LINES:
-            raise ValueError(f"{frequency.size} lines; at least {LEAST_LINES} needed")
+            raise ValueError(
+                f"the file has {frequency.size} lines; it must have {LEAST_LINES}"
+            )
         if frequency[0] < 0.0 or np.any(np.diff(frequency) <= 0.0):
             raise ValueError("the frequencies must be above 0 and increase")
     except ValueError as error:
@@ -132,7 +135,7 @@ def _density(
             f'"{wanted}/sqrt(Hz)" or "{wanted}^2/Hz"'
         )
     if known is not None and given is not None and known != given:
-        raise ValueError(f"column {name!r} is in {known} by the file, not in {given}")
+        raise ValueError(f"column {name!r} is in {known} in the file, not in {given}")
     ratio = _factor(name, found[1], None, wanted)
     power = "2" in found[2]
     return lambda level: ratio**2 * (level if power else level**2)
@@ -147,7 +150,9 @@ def _columns(table: SignalFile, study: Study, path: Path) -> dict[int, Key]:
     names = study.axes.names
     for name in table.axes:
         if name not in names:
-            raise ValueError(f"axes.{name} is no axis; there are {', '.join(names)}")
+            raise ValueError(
+                f"axes.{name} is not an axis; there are {', '.join(names)}"
+            )
     if table.column is not None or not table.axes:
         raise ValueError(
             "the stage has several axes: give the column of each, as in "
@@ -169,11 +174,11 @@ def _only_column(table: SignalFile, path: Path) -> Key:
 def _factor(name: str, known: str | None, given: str | None, wanted: str) -> float:
     """Return the factor from the unit of the column ``name`` to ``wanted``.
 
-    ``known`` is its unit by the file, ``given`` that of the study.
+    ``known`` is its unit in the file, ``given`` that of the study.
     """
     if known is not None and given is not None and known != given:
         raise ValueError(
-            f"column {name!r} is in {known} by the file, and unit is {given}: leave "
+            f"column {name!r} is in {known} in the file, but unit is {given}: leave "
             "unit out, or rename the column"
         )
     unit = known or given

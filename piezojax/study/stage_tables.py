@@ -85,9 +85,9 @@ class SensorTable(ElectronicsTable):
     """Noise of the sensor, um, and the properties of its electronics.
 
     ``noise_rms`` is white up to half the rate and is added behind the bandwidth and the
-    delay; ``measured_noise`` is that of a file instead. ``anti_aliasing`` (Hz), of
-    order ``anti_aliasing_order``, filters the displacement and the noise before the
-    converter.
+    delay; ``measured_noise`` replaces it by the noise of a file. ``anti_aliasing``
+    (Hz), of order ``anti_aliasing_order``, filters the displacement and the noise
+    before the converter.
     """
 
     noise_rms: ByAxis[NotNegative] = 0.0

@@ -13,7 +13,7 @@ MOST_NOTCHES = 4
 class StructuresTable(Table):
     """Structures of the controller that are tuned alike: numbers of ``notches``.
 
-    The notches filter the command of the part ``behind``, a path as
+    The notches filter the command of the part ``behind``, a path such as
     ``controller.feedback``. By default it is the feedback of the controller, or the
     controller if it has no such part. A notch is worth its parameters if it lowers the
     error on the hold-out by more than the share ``worth``, and by more than two

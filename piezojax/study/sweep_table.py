@@ -109,7 +109,7 @@ class SweepTable(Table):
 
 
 def require_quoted_paths(tables: Any) -> Any:
-    """Return ``tables``, whose keys are paths.
+    """Return ``tables`` unchanged, after a check that its keys are quoted paths.
 
     Raises ValueError for a path without quotes, which TOML splits into nested tables.
     """

@@ -31,7 +31,7 @@ def read_trajectories(study: Study, folder: Path) -> dict[str, Trajectory]:
 
     Between two samples of the file the reference is linear. Raises ValueError, naming
     the key, for a file that cannot be read or ends too early, and for a part of a file
-    that is both tuned on and called unseen.
+    that is used both in tuning and as unseen.
     """
     table, units = study.references, study.axes.units if study.axes else ("um",)
     time_s = study.dt * np.arange(round(table.duration * study.rate))
@@ -63,7 +63,7 @@ def _at(
             f"{where}.start is {table.start:g} s; {table.file.name} ends after "
             f"{signals.duration:.6g} s"
         )
-    # A reference of N samples lasts N - 1 steps; its last one may lie a step behind.
+    # A reference of N samples lasts N - 1 steps; it may end one step after the file.
     short = left + signals.dt < needed
     if short and table.then is None:
         raise ValueError(
@@ -108,20 +108,20 @@ def _note(
     else:
         source += f" at {rate:.6g} Hz"
     same = not uneven and np.isclose(rate, study.rate, rtol=1e-6)
-    text = source if same else f"{source}, linear between them, at {study.rate:g} Hz"
+    text = source if same else f"{source}, interpolated linearly at {study.rate:g} Hz"
     if rate > 1.001 * study.rate:
         text += " (samples between those of the study are left out)"
     end = min(table.start + needed, signals.duration)
     text += f"; {table.start:.6g} to {end:.6g} s of {signals.duration:.6g} s"
     if left + signals.dt < needed:
         text += ", then " + (
-            "its last value" if table.then == "hold" else "from there again"
+            "its last value held" if table.then == "hold" else "repeated"
         )
     return text
 
 
 def _check_unseen(study: Study, parts: Mapping) -> None:
-    """Raise ValueError for an unseen reference whose samples are tuned on."""
+    """Raise ValueError for an unseen reference that shares samples with a tuned one."""
     table = study.references
     for seen, unseen in product(table.tune, table.unseen):
         if seen not in parts or unseen not in parts:
@@ -132,5 +132,5 @@ def _check_unseen(study: Study, parts: Mapping) -> None:
             raise ValueError(
                 f"references.unseen: {unseen} shares the samples from "
                 f"{max(start, begin):g} to {min(end, stop):g} s of {file.name} with "
-                f"{seen}, which is tuned on: change the start of one of them"
+                f"{seen}, which is used in tuning: change the start of one of them"
             )

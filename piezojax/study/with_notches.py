@@ -1,4 +1,4 @@
-"""A case whose feedback passes notches, with their parameters tuned too."""
+"""Case with notches in its feedback, whose parameters are tuned too."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ def with_notches(case: Case, modes: Sequence[Resonance]) -> Case:
     The notches filter the command of the part ``structures.behind``. They are switched
     off, so that the loop is that of ``case``, and the search of the study starts there.
     Their frequencies stay near those of ``modes``. Without modes the controller is that
-    of the study. Raises ValueError for a part that is no controller, and for a
+    of the study. Raises ValueError for a part that is not a controller, and for a
     controller of a vendor, which has notches of its own.
     """
     study = case.study.model_copy(update={"structures": None})
@@ -105,8 +105,8 @@ def place_of(case: Case) -> str:
     ]
     if devices:
         raise ValueError(
-            f"structures: the notches of {devices[0]} are its own, and it has no place "
-            "for others; tune them under [parameters]"
+            f"structures: {devices[0]} has notches of its own and no place for others; "
+            "tune these under [parameters]"
         )
     return behind
 

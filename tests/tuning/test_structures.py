@@ -298,7 +298,7 @@ def test_bad_tables_in_one_line(changes, message, tmp_path):
             {"structures": {"notches": [0, 1], "behind": "controller.integral"}},
             "behind: controller.integral is a .*; it must map an Observation to a comm",
         ),
-        ({"controller": SERVO}, "structures: the notches of Servo are its own"),
+        ({"controller": SERVO}, "structures: Servo has notches of its own"),
     ],
 )
 def test_bad_places_of_notches(changes, message):
