@@ -118,8 +118,8 @@ class ChargeDrive(System):
 
     where q is the charge of the load and u its voltage. For a linear load u = q/C_L
     this is (2.12) with leakage, ``q / v = C_s (s + 1/(C_s R_s)) / (s + 1/(C_L R_L))``:
-    above 1 / (C_L R_L), in rad/s, the charge follows the command; below it, the voltage
-    does.
+    at frequencies above 1 / (C_L R_L) the charge follows the command, and below it the
+    voltage does.
 
     ``load`` is a System from q / C_L in V to u in V; a linear load is ``Affine()``. In
     a piezo the hysteresis lies between voltage and charge, and the displacement is

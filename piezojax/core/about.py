@@ -20,13 +20,13 @@ class About(BaseModel):
     ``judged`` lists the margins that a controller was judged with, a sentence each,
     and ``plants`` the ranges of the plants on which they hold.
     ``actuator`` is the actuator that a controller was tuned with, as in a file of a
-    System, ``reference_ranges`` the least and greatest of its references on each axis.
-    ``error_bound`` bounds the error of a fitted model, ``residual_rms`` is the rms
-    error of each output on the validation part of its record, in the unit of the
-    output, and ``checked`` lists the other records of its validation;
-    ``standard_errors`` are those of its parameters, by path. ``unsafe`` lists the
-    alarms raised when the System was made; ``load`` refuses a file with any. Keys of
-    later versions are ignored.
+    System. ``reference_ranges`` are the least and greatest value of its references on
+    each axis. ``error_bound`` bounds the error of a fitted model, ``residual_rms`` is
+    the rms error of each output on the validation part of its record, in the unit of
+    the output, and ``checked`` lists the other records of its validation.
+    ``standard_errors`` are the standard errors of its parameters, by path. ``unsafe``
+    lists the alarms raised when the System was made; ``load`` refuses a file with any.
+    Keys of later versions are ignored.
     """
 
     piezojax: str = Field(default_factory=lambda: version("piezojax"))
@@ -49,10 +49,10 @@ class About(BaseModel):
     unsafe: list[str] = []
 
     def origin(self, subject: str) -> list[str]:
-        """Return the head of a file that holds ``subject``, the alarms first."""
+        """Return the header lines of a file with ``subject``, the alarms first."""
         seed = "" if self.seed is None else f", seed {self.seed}"
         hashed = self.study_sha256
-        rate = "" if not self.rate_Hz else f"{self.rate_Hz:.9g} Hz; no other"
+        rate = "" if not self.rate_Hz else f"{self.rate_Hz:.9g} Hz only"
         lines = [
             *(f"UNSAFE: {each}" for each in self.unsafe),
             f"{subject}, exported by piezojax {self.piezojax}.",

@@ -64,7 +64,7 @@ def largest(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
 
 
 def smallest(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
-    """Return the smallest of ``values``, as ``largest``."""
+    """Return the smallest of ``values``, with the derivative of that element."""
     return -largest(-values)
 
 

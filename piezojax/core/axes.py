@@ -154,7 +154,7 @@ class PerAxis(System):
 
 
 class Packed(System):
-    """Adapter of a ``system`` with vectors to systems with tuples of scalars.
+    """Adapter from a ``system`` of vectors to signals that are tuples of scalars.
 
     Input and output are tuples with one scalar per axis or actuator. It suits a few
     parts of a loop, such as an allocation or a geometry.

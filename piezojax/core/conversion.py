@@ -2,7 +2,7 @@
 
 import re
 
-_IN = {  # factors to the unit that names the kind
+_IN = {  # factors to the base unit of each quantity
     "V": {"uV": 1e-6, "mV": 1e-3, "V": 1.0, "kV": 1e3},
     "um": {"pm": 1e-6, "nm": 1e-3, "um": 1.0, "mm": 1e3, "m": 1e6},
     "urad": {"nrad": 1e-3, "urad": 1.0, "mrad": 1e3, "rad": 1e6},
@@ -10,9 +10,9 @@ _IN = {  # factors to the unit that names the kind
 
 
 def factor(unit: str, wanted: str) -> float | None:
-    """Return the factor from ``unit`` to ``wanted``, None if there is none, as nm to V.
+    """Return the factor from ``unit`` to ``wanted``, or None, as for nm and V.
 
-    Both are units of voltage, length or angle, or the same text.
+    Units of voltage, length and angle are converted; an equal unit has the factor 1.
     """
     if unit == wanted:
         return 1.0

@@ -44,17 +44,17 @@ class ErrorBound(BaseModel):
             if len(getattr(self, name)) != lines:
                 raise ValueError(
                     f"{name} has {len(getattr(self, name))} lines and frequency "
-                    f"{lines}; they must have the same"
+                    f"{lines}; the numbers must be equal"
                 )
         if np.any(np.diff(self.frequency) <= 0.0):
             raise ValueError("frequency must increase from line to line")
         return self
 
     def at(self, frequency: Any) -> np.ndarray:
-        """Return the bound at ``frequency`` (Hz): the larger of both neighbours.
+        """Return the bound at ``frequency`` (Hz): the larger of the neighbouring lines.
 
-        Below the first line it is the bound of the first, above the last that of the
-        last.
+        Below the first line it is the bound of the first line, above the last line that
+        of the last.
         """
         below, above = self._neighbours(frequency)
         relative = np.asarray(self.relative)
@@ -74,7 +74,7 @@ class ErrorBound(BaseModel):
     def respected(self, frequency: np.ndarray) -> np.ndarray:
         """Return the bound ``at`` each ``frequency`` (Hz), 0 above a narrow record.
 
-        Above the band of a narrow record no gains are supported, and the remedy is
+        Above the band of a narrow record the bound is only an assumption; the remedy is
         another record, not other gains.
         """
         beyond = self.narrow & (frequency > self.highest)
@@ -117,7 +117,8 @@ def banded(
     """Return the lines of a bound [lines] merged in bands of ``WIDTH``.
 
     A band has the largest ``relative`` of its lines, and is excited if all of them are.
-    The last band ends at the last ``frequency``.
+    Its frequency is the geometric mean of its ends, that of the last band the last
+    ``frequency``.
     """
     band = np.floor(np.log(frequency / frequency[0]) / np.log1p(WIDTH))
     first = np.flatnonzero(np.diff(band, prepend=-1.0))

@@ -184,13 +184,13 @@ def holding_input(plant: System, output: Signal) -> Signal:
     no input reaches ``output``, the last iterate is returned and the loop starts with
     an error. Limits belong to the actuator of the loop, not to the plant, because the
     curve is flat beyond them. The iteration starts at 0. With several axes it starts at
-    ``output``, because commands have its unit and the pose 0 may be outside, or on the
-    edge of, the range of a stage with an allocation.
+    ``output``, because a command is then a pose, and the pose 0 may be outside, or on
+    the edge of, the range of a stage with an allocation.
     """
     return _holding_input(plant, jax.tree.map(as_array, output))
 
 
-# Traced once for all plants of a structure, because root finding is long to trace.
+# Traced once for all plants of a structure, because root finding is slow to trace.
 @eqx.filter_jit
 def _holding_input(plant: System, output: Signal) -> Signal:
     def residual(input, _):

@@ -1,4 +1,4 @@
-"""Declarations of parameters: unit, meaning, limits and search range, at the field."""
+"""Declarations of parameters in fields: unit, meaning, limits and search range."""
 
 import dataclasses
 import math
@@ -28,7 +28,7 @@ class Parameter:
     """Declaration of a parameter: its unit, meaning, limits and search range.
 
     ``above`` and ``below`` are exclusive limits, ``least`` and ``most`` inclusive ones.
-    ``typical`` is the range of a search for which the study gives no range, on
+    ``typical`` is the search range if the study gives none, on
     ``scale``: "log" for positive values that span decades, "logit" for values between 0
     and 1. The ``unit`` of a pure number is "1"; a name in brackets, as in "[u]/um",
     stands for a unit that only an outer System knows (see ``System.part_units``). A
@@ -176,12 +176,12 @@ def declarations(kind: Any) -> Iterator[tuple[str, Parameter]]:
 def rounded(value: Any, step: float | None) -> Any:
     """Return ``value`` rounded to a multiple of ``step``; its gradient is kept.
 
-    Nothing is rounded without a step.
+    Without a step, ``value`` is returned unchanged.
     """
     if step is None:
         return value
     nearest = jnp.round(value / step)
-    # A step may be the inverse of a whole number, which has no rounding error.
+    # A step such as 0.001 has a rounding error; its inverse, 1000, has none.
     count = round(1.0 / step)
     whole = abs(count * step - 1.0) < 1e-12
     nearest = nearest / count if whole else nearest * step

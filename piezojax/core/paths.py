@@ -1,4 +1,4 @@
-"""Paths of parameters in a tree of systems, as ``"controller.feedback.surface"``."""
+"""Paths of parameters in a tree of systems: ``"controller.feedback.surface"``."""
 
 import dataclasses
 import difflib
@@ -113,14 +113,14 @@ def get(system: eqx.Module, path: str) -> Any:
 def get_part(system: Any, path: str) -> Any:
     """Return the part of ``system`` at ``path``: a System, a tuple or a leaf.
 
-    Raises ValueError, with the parts that there are, if there is none.
+    Raises ValueError, listing the parts at the last valid path, if there is none.
     """
     node, known = system, ""
     for name in path.split("."):
         children = _children(node)
         if name not in children:
             raise ValueError(
-                f"no part {path!r}; {known or 'the whole'} has {', '.join(children)}"
+                f"no part {path!r}; {known or 'the system'} has {', '.join(children)}"
             )
         node, known = children[name], f"{known}.{name}".lstrip(".")
     return node

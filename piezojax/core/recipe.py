@@ -15,7 +15,7 @@ listed last and acts first."""
 class Resonance(NamedTuple):
     """Natural frequency (Hz) and damping ratio (1) of a resonance.
 
-    ``share`` is its part of the static gain of all resonances of the stage.
+    ``share`` is its share (1) of the static gain of all resonances of the stage.
     """
 
     frequency: float
@@ -28,9 +28,9 @@ class Extent(NamedTuple):
 
     ``modes``, ``lags`` and ``delay`` are the linear dynamics that the record shows,
     from which a recipe takes its starting values, the strongest resonance first.
-    ``slew`` is the slew rate of the amplifier. They are empty, delay and slew None, if
-    none were found or no search was made. ``reach`` is a factor on the distance of
-    bounds from the modes that were found.
+    ``slew`` is the slew rate of the amplifier. ``modes`` and ``lags`` are empty,
+    ``delay`` and ``slew`` None, if none were found or no search was made. ``reach``
+    multiplies the distance of the bounds from the modes that were found.
     """
 
     low: float  # V
@@ -62,10 +62,10 @@ class Recipe(NamedTuple):
     """First guess, bounds and starting values for fitting a System.
 
     ``system`` holds the first guess, ``bounds`` the Range of each fitted parameter by
-    its path in ``system``, ``alternatives`` the values of each further start by path.
-    ``gain`` is the path of a parameter that only scales the output. ``own`` holds the
-    paths of parameters with a separate value for each record: the state before it
-    began.
+    its path in ``system``. ``alternatives`` holds an entry for each start: the values
+    that differ from ``system``, by path. ``gain`` is the path of a parameter that only
+    scales the output. ``own`` holds the paths of parameters with a separate value for
+    each record: the state before it began.
     """
 
     system: System
@@ -93,7 +93,7 @@ class Fittable(System):
     part: ClassVar[Part]
     rising: ClassVar[bool] = False
     """Whether the output can only rise with the input. For a record in which it falls,
-    the recipe is that of the mirrored output, and the chain turns the sign."""
+    the recipe is that of the mirrored output, and the chain inverts the sign."""
 
     @classmethod
     @abc.abstractmethod

@@ -1,11 +1,11 @@
-"""Recursive least squares: one more row of a linear relation.
+"""Recursive least-squares updates by one row of a linear relation.
 
 The relation is ``target = weights @ row + error``. Both updates give the posterior mean
 of the weights and its covariance P. ``update`` carries P, so that a term may be added
-to it between rows; a root would have to be factorised for every row. ``update_root``
-carries a root S of P, P = S S^T. It keeps the small variances that P loses to rounding
-beside large ones: under exponential forgetting over long runs, nearly collinear rows,
-or a prior many decades above the posterior.
+to it between rows; a root would have to be factorised again at every row.
+``update_root`` carries a root S of P, P = S S^T. It keeps the small variances that P
+loses to rounding beside large ones: under exponential forgetting over long runs, nearly
+collinear rows, or a prior many decades above the posterior.
 """
 
 from typing import Any

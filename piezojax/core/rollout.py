@@ -62,7 +62,7 @@ def simulate(
 
     With ``metric``, reverse-mode differentiation stores one state per ``segment``
     samples and simulates the samples between them again, so that its memory stays small
-    too. A ``segment`` as long as the run makes one plain loop, for runs without reverse
+    too. A ``segment`` as long as the run gives one plain loop, for runs without reverse
     mode; it is a third faster for a batch of inputs with time first (``in_axes=1``).
     Use ``jax.vmap`` for batches, or ``in_blocks`` for many lanes.
 

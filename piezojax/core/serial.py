@@ -1,4 +1,4 @@
-"""Conversion of Systems to plain data in TOML or JSON files, without code, and back."""
+"""Conversion of Systems to and from plain data, without code, in TOML or JSON files."""
 
 import dataclasses
 import json
@@ -140,9 +140,9 @@ _PLAIN: dict[Any, tuple[Any, str]] = {
 def save(system: System, path: str | Path, about: About | None = None) -> None:
     """Write ``system`` to ``path`` (``.toml`` or ``.json``) atomically.
 
-    ``about`` is written beside it, as the table of that name. Raises ValueError for a
-    System that ``load`` would reject: its class is not registered, or a parameter is
-    outside its limits.
+    ``about`` is written to the same file, as the table of that name. Raises ValueError
+    for a System that ``load`` would reject: its class is not registered, or a parameter
+    is outside its limits.
     """
     path, data = Path(path), to_data(system)
     from_data(data, path.name)

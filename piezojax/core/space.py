@@ -37,7 +37,7 @@ class Range:
     """Bounds of a parameter in its ``unit``, and the scale on which it is searched.
 
     ``start`` is the starting value of a search; None keeps the value in the System.
-    Values are rounded to multiples of ``step``, which a device allows.
+    Values are rounded to multiples of ``step``, the resolution of a device.
     """
 
     lower: float

@@ -61,7 +61,7 @@ class Designed(System):
 
     ``resolved`` computes these numbers, such as a gain matrix from a model, and returns
     a System with the same state, input and output. ``simulate`` calls it once, before
-    the loop over time; in the step they would be computed and differentiated at every
+    the loop over time; in the step they would be recomputed and differentiated at every
     sample.
     """
 

@@ -59,7 +59,7 @@ def remove_stale(folder: Path) -> None:
     """Delete the temporary files of ended processes, two folders deep at most."""
     for pattern in (".*.part", "*/.*.part", "*/*/.*.part"):
         for path in filter(_is_stale, folder.glob(pattern)):
-            with suppress(OSError):  # another user's
+            with suppress(OSError):  # a file of another user
                 path.unlink(missing_ok=True)
 
 

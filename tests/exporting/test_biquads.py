@@ -114,7 +114,7 @@ def test_the_head_spells_out_signs_rate_and_origin(tmp_path):
     assert lines[1].startswith("# Feedback of PID as ")
     assert {
         "# Study: a study.",
-        "# Sampling rate: 20000 Hz; no other.",
+        "# Sampling rate: 20000 Hz only.",
         "# Judged: fine.",
         "# Plants: gain +- 10 %.",
     } < set(lines)
