@@ -19,7 +19,7 @@ class ActiveDampingState(NamedTuple):
 class ActiveDamping(System):
     """``u = controller + gain filter(z)``: an inner loop that damps a resonance.
 
-    The filter and the sign of the gain make the scheme:
+    The filter and the sign of the gain determine the scheme:
 
     - positive position feedback: ``SecondOrderLowPass`` near the resonance and a gain
       above 0 (Fanson and Caughey, AIAA J. 28, 1990);

@@ -15,7 +15,7 @@ Row = tuple[Scalar, ...]
 
 
 class TermsState(NamedTuple):
-    """Last positions and last position with its lead, and the stops, all um."""
+    """Last two positions, last position with its lead, and stop outputs, all in um."""
 
     positions: tuple[Scalar, Scalar]
     leading: Scalar
@@ -28,8 +28,8 @@ class MotionTerms(System):
     Input um; output um, um/s, um/s^2, and um for each of ``thresholds`` (um). A stop
     operator follows its input and saturates at its threshold. It is the dual of the
     play operator: the inverse of a Prandtl-Ishlinskii model is a weighted sum of the
-    output of the model and of stops of this output. A hysteresis that moves the stage
-    through slow dynamics has an output ahead of y: the stops follow ``y + lead dy/dt``.
+    output of the model and of stops of this output. The output of a hysteresis ahead of
+    slow dynamics leads y, so the stops follow ``y + lead dy/dt``.
     """
 
     thresholds: Row = parameter(
@@ -79,13 +79,13 @@ class AdaptiveInverse(System):
 
     The voltage of a stage is modelled as a weighted sum of its MotionTerms: position,
     velocity, acceleration and stop operators. Such a sum is the inverse of a gain, two
-    poles and a hysteresis ahead of them, if ``lead`` is about the sum of their time
-    constants. RecursiveWeights learns the weights from the applied voltage and the
-    terms of the measured displacement, both behind the same double lag at ``cutoff``.
-    The weighted sum of the reference's terms is fed forward. Gain, poles and hysteresis
-    need not be known, and the feedback corrects the remaining error. Sources: adaptive
-    inverse control, Widrow and Walach 1996; stop operators for the inverse of a
-    hysteresis, Kuhnen and Krejci 2007.
+    poles and a hysteresis ahead of them, if ``lead`` is about the sum of the time
+    constants of the poles. RecursiveWeights learns the weights from the applied voltage
+    and the terms of the measured displacement, both filtered by the same double lag at
+    ``cutoff``. The weighted sum of the reference's terms is fed forward. Gain, poles
+    and hysteresis need not be known, and the feedback corrects the remaining error.
+    Sources: adaptive inverse control, Widrow and Walach 1996; stop operators for the
+    inverse of a hysteresis, Kuhnen and Krejci 2007.
 
     With a ``share`` of 0 only ``controller`` acts. It sees the reference, measurement
     and voltage less the parts that are fed forward. Only changes of the motion are fed
@@ -93,8 +93,8 @@ class AdaptiveInverse(System):
     margins at rest are those of ``controller``. While the stage moves, learning forms a
     second, slow loop that these margins do not include.
 
-    ``weights`` are in V/um, V s/um and V s^2/um, then V/um for each stop. The start
-    fixes the offset of the voltage. Input an Observation, output V, one axis.
+    ``weights`` are in V/um, V s/um and V s^2/um, then V/um for each stop. The offset
+    of the voltage is set at the start. Input an Observation, output V, one axis.
 
     Raises ValueError for a parameter outside its limits or counts that do not match.
     """
@@ -148,7 +148,7 @@ class AdaptiveInverse(System):
     )
     offset_deviation: Scalar = parameter(
         "V",
-        "standard deviation of the voltage at zero",
+        "standard deviation of the voltage offset",
         above=0.0,
         scale="log",
         default=10.0,

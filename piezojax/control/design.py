@@ -1,4 +1,4 @@
-"""Initial controllers for an identified plant: stable and slow, to start tuning from.
+"""Initial controllers for tuning: stable, slow designs for an identified plant.
 
 A design is a function of a plant, the sample time of the loop in s and the limits of
 the actuator in V. Studies select it by its name in ``DESIGNS``. Each design is based on
@@ -23,7 +23,7 @@ Limits = tuple[float, float]
 def inversion_sliding_mode(
     plant: System, dt: float, limits: Limits
 ) -> InversionControl:
-    """Return an inversion-based PID-based sliding mode control (PID-SMC).
+    """Return an inversion-based sliding mode controller with a PID law (PID-SMC).
 
     ``dt`` in s. Raises ValueError if the hysteresis has no inverse between ``limits``
     (V), and in the cases of ``design_model``.

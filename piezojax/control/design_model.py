@@ -46,10 +46,10 @@ class DesignModel(NamedTuple):
 
     ``hysteresis`` is that of the plant, or None. ``static`` equals ``hysteresis``, or
     is a gain if the plant has no hysteresis that can be separated from its dynamics.
-    ``linear`` contains all other parts of the plant, unreduced; ``dynamics`` is its
-    fast part reduced to second order, a_1, a_2 | b_0, b_1, b_2 with b_0 not zero and
-    zeros inside the unit circle. ``limits`` are those of the actuator (V); ``rest`` is
-    the output of ``static`` (um) in the middle between them; ``dt`` in s.
+    ``linear`` is the plant behind ``static``, unreduced; ``dynamics`` is its fast part
+    reduced to second order, a_1, a_2 | b_0, b_1, b_2 with b_0 not zero and zeros inside
+    the unit circle. ``limits`` are those of the actuator (V); ``rest`` is the output of
+    ``static`` (um) in the middle between them; ``dt`` in s.
     """
 
     hysteresis: Hysteresis | None
@@ -140,7 +140,7 @@ def _separated(plant: System) -> tuple[Hysteresis | None, tuple[System, ...]]:
             "a design needs one hysteresis in series with linear parts; the plant has "
             f"{', '.join(type(part).__name__ for part in parts)}"
         )
-    # A slew limit acts on large steps alone, and not behind the hysteresis.
+    # A slew limit acts on large steps alone, and ahead of the hysteresis.
     apart = (Hysteresis, AmplifierSlew)
     others = tuple(part for part in parts if not isinstance(part, apart))
     return (hysteretic[0] if hysteretic else None), others
@@ -165,7 +165,9 @@ def _fast(system: System, input: Scalar, dt: float) -> StateSpace:
             "of each"
         )
     if not all(np.all(np.isfinite(m)) for m in (whole.A, whole.B, whole.C, whole.D)):
-        raise ValueError("a derivative of the plant is not finite; a design needs all")
+        raise ValueError(
+            "a derivative of the plant is not finite; a design needs finite ones"
+        )
     # Creep and other modes near z = 1 act far below the crossover, where the integral
     # suppresses them like any drift. At the crossover the plant has the gain of its
     # fast part, so a reduction to few states must not use any for the slow modes.

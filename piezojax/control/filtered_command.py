@@ -19,11 +19,11 @@ class FilteredCommandState(NamedTuple):
 class FilteredCommand(System):
     """``controller`` with its command filtered by ``filter``, of unit DC gain.
 
-    Filters in series are one filter. The applied voltage that the controller sees is
-    its own last command plus the change by the actuator behind the filter, so that its
-    anti-windup responds to the limits and not to the filter. In ``InversionControl`` or
-    ``FeedforwardFeedback`` the filter acts on the feedback alone. Input an Observation,
-    output in the unit of the controller's command.
+    ``filter`` may be a series of filters. As its applied voltage the controller sees
+    its own last command plus the amount by which the actuator changed the filtered
+    command, so that its anti-windup responds to the limits and not to the filter. In
+    ``InversionControl`` or ``FeedforwardFeedback`` the filter acts on the feedback
+    alone. Input an Observation, output in the unit of the controller's command.
     """
 
     controller: System

@@ -33,10 +33,10 @@ class KalmanFilter(Observer):
     The model (a_1, ..., a_n | b_0, ...) is
     ``y(k+1) = a_1 y(k) + a_2 y(k-1) + ... + b_0 u(k) + b_1 u(k-1) + ... + d(k)``, where
     u is the applied input and the drift d in um represents unmodelled effects:
-    hysteresis, creep, an error of the DC gain. ``gain`` corrects y(k), y(k-1), ..., one
-    for each a_i and two at least, and then d. The velocity of the Motion is
-    (y(k) - y(k-1)) / dt of the estimates, the state of chapter 4's second-order models.
-    With a gain of zero the model runs in open loop.
+    hysteresis, creep, an error of the DC gain. ``gain`` holds the gains of y(k),
+    y(k-1), ..., one for each a_i and at least two, and then that of d. The velocity of
+    the Motion is (y(k) - y(k-1)) / dt of the estimates, as in the second-order models
+    of chapter 4. With a gain of zero the model runs in open loop.
 
     Raises ValueError for a model without a_1 or a gain of another length.
     """
@@ -107,9 +107,9 @@ def steady_gain(
 ) -> Float[np.ndarray, " n"]:
     """Return the steady-state gain for x(k+1) = A x(k) + w, z = x_1 + v, cov w = ``Q``.
 
-    It corrects the estimate at k by the measurement at k. ``noise_rms`` of v in the
-    unit of z. Raises ValueError without a steady state: for a marginally stable mode
-    that the measurement does not show or that has no process noise.
+    It corrects the estimate at k by the measurement at k. ``noise_rms`` is the rms
+    value of v, in the unit of z. Raises ValueError without a steady state: for a
+    marginally stable mode that is not observable or has no process noise.
     """
     # Each pass doubles the number of steps of the Riccati recursion. It adds positive
     # terms only, so it stays accurate for small noise, where the eigenvalues of a Schur
@@ -139,8 +139,8 @@ def model_kalman(
 ) -> KalmanFilter:
     """Return the Kalman filter on ``model`` for given noise of sensor and process.
 
-    All in um: ``noise_rms`` of the sensor, ``process_rms`` of the random motion in a
-    sample, ``drift_rms`` of the change of the drift in a sample. Raises ValueError for
+    All in um: ``noise_rms`` of the sensor, ``process_rms`` of the random motion per
+    sample, ``drift_rms`` of the change of the drift per sample. Raises ValueError for
     a negative ``process_rms`` and for another value that is not above 0.
     """
     check("noise_rms in um", noise_rms, above=0.0)

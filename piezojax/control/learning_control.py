@@ -33,9 +33,9 @@ class LearningControl(System):
     in place of r. At the start of each trial the ``LearningLaw`` with ``gain``,
     ``smoothing`` and ``lead`` computes the corrections u from the trial before; in the
     first trial u is 0. The law uses later samples of that trial, and its Q-filter has
-    zero phase; ``RepetitiveControl`` learns continuously, in one endless trial. The
-    loop does not rest between trials, so the errors decay as long as the transients are
-    shorter than a period.
+    zero phase; ``RepetitiveControl`` learns continuously instead, without trials.
+    The loop does not rest between trials; the errors decay provided that the transients
+    are shorter than a period.
 
     Input an Observation, output that of ``feedback``. At rest without error u is zero.
     Raises ValueError unless ``lead`` and ``smoothing`` are shorter than the period.

@@ -22,7 +22,7 @@ class Observer(System):
     ``measured``; one with a model also uses ``applied``, in the unit of its input.
     """
 
-    if TYPE_CHECKING:  # a type checker would take a field for the first argument
+    if TYPE_CHECKING:  # a type checker would count a field as a constructor argument
 
         @property
         def dt(self) -> float: ...

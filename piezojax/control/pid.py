@@ -26,8 +26,8 @@ class PID(System):
 
     The command u is a voltage (V), or a displacement (um) ahead of an inverse of the
     plant. The derivative acts through a first-order filter. ``anti_windup`` drives the
-    integral by the difference of the applied and the last commanded u. The integral is
-    rectangular and has the unit of u, so a change of I causes no jump.
+    integral by the difference of the applied and the last commanded u. The integral
+    uses the rectangular rule and has the unit of u, so a change of I causes no jump.
 
     ``proportional_weight`` b and ``derivative_weight`` c are the set-point weights of
     Astrom and Hagglund (Advanced PID Control, 2006). With 1 the PID acts on the error

@@ -1,4 +1,4 @@
-"""Preview inverses: inputs by which a model follows a reference known in advance.
+"""Preview inverses: inputs that make a model follow a reference known in advance.
 
 A zero outside the unit circle makes the exact causal inverse unstable. An inverse that
 uses future values of the reference can be stable. These inverses act on a whole
@@ -67,10 +67,11 @@ class ExtrapolatedInverse(System):
 
     The references beyond r(k+1) are those of the line through r(k) and r(k+1), so that
     the few samples that the inverse looks ahead need not be known. At j samples the
-    error is about a T^2 j^2 / 2 for a reference with the acceleration a. Input r(k+1)
-    in um, output in the unit of the model's input: the ``inverse`` of an
-    ``InverseFeedforward`` or a ``FeedforwardFeedback``, alone or in series with an
-    inverse hysteresis. ``weights``, ``delay`` and ``causal`` as in ``PreviewInverse``.
+    error is about a T^2 j^2 / 2 for a reference with the acceleration a and the sample
+    time T. Input r(k+1) in um, output in the unit of the model's input: the ``inverse``
+    of an ``InverseFeedforward`` or a ``FeedforwardFeedback``, alone or in series with
+    an inverse hysteresis. ``weights``, ``delay`` and ``causal`` as in
+    ``PreviewInverse``.
     """
 
     causal: ARMA
@@ -118,8 +119,8 @@ def zero_phase_inverse(model: ARMA, margin: float = 1.0) -> PreviewInverse:
 
     It cancels the zeros inside the circle of radius ``margin`` and the phase of the
     others, B_u. The response from r to y is then B_u(z) B_u(1/z) / B_u(1)^2, which has
-    zero phase at all frequencies and is 1 at rest, but not elsewhere. The inverse uses
-    one sample of preview for each zero of B_u beyond the model's delay. Raises
+    zero phase at all frequencies and is 1 at rest, but not elsewhere. Beyond the
+    model's delay, the inverse uses one sample of preview for each zero of B_u. Raises
     ValueError for a margin outside (0, 1], a zero at z = 1 or b that are all zero.
     """
     scale, stable, unstable, delay = _split(model, margin)

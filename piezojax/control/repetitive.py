@@ -15,7 +15,7 @@ class RepetitiveState(NamedTuple):
     """States of controller and Q-filter, w(k) in um, and the delay line.
 
     ``line`` is a ring buffer of ``period - advance`` samples in um, ``index`` the place
-    of sample k in it: a step writes two samples and reads one at any period.
+    of sample k in it. A step writes two samples and reads one, whatever the period.
     """
 
     feedback: State

@@ -39,7 +39,7 @@ class SwitchingLaw(System):
 
     @abc.abstractmethod
     def driven(self, state: State, shortfall: Signal) -> State:
-        """Return ``state`` with its integral driven by ``shortfall``, anti-windup.
+        """Return ``state`` with its integral driven by ``shortfall`` (anti-windup).
 
         ``shortfall`` in [v] is the output that the actuator applied less the one that
         the law gave. A law without an integral returns its state.

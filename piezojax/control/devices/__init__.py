@@ -1,4 +1,4 @@
-"""Controllers of vendors, with the parameters as they are typed in."""
+"""Controllers of vendors and a generic servo, with parameters as typed in."""
 
 from .e727 import E727 as E727
 from .nv200 import NV200 as NV200

@@ -56,11 +56,11 @@ def _bandwidth(number: int):
 
 
 class E727(Device):
-    """PID and two notches of the E-727 at 20 kHz, with the meaning of its parameters.
+    """PID and two notches of the E-727 at 20 kHz, with the parameters of the device.
 
     ``proportional`` (0x07000300) is dimensionless, ``integral_time`` (0x07000301) and
     ``derivative_time`` (0x07000302) are in s; an integral time of 0 switches the
-    integral off. ``scale`` is V per um of error for P = 1, which has to be measured.
+    integral off. ``scale`` is in V per um of error for P = 1, and has to be measured.
     The notches (0x08000100 to 0x08000301) follow the PID; the filter of the measurement
     (0x05000000) is a Butterworth low-pass of order 2 if ``filter_type`` is 1. The slew
     rate (0x07000200) limits the setpoint.

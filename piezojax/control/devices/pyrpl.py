@@ -19,10 +19,10 @@ STEP_I = 1.0 / (2.0**32 * 2.0 * math.pi * CLOCK)
 """Steps of the gains in their registers."""
 
 MOST_P, MOST_I = 2.0**11, STEP_I * 2.0**23
-"""Ends of the registers: 24 bits with a sign."""
+"""Largest gains of the registers, 24 bits with a sign."""
 
 INTEGRAL = 4.0
-"""Range of the register of the integral, V."""
+"""Largest magnitude in the register of the integral, V."""
 
 FILTERS = ("filter_1", "filter_2", "filter_3", "filter_4")
 
