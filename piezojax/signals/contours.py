@@ -1,9 +1,9 @@
 """Contours: paths of two axes in time, and their names in a motion.
 
 A named contour stands for two signals of ``piezojax.signals``: ``Rx+Ry:CIRCLE5`` is a
-shorthand for ``Rx:SIN5 Ry:COS5``. Every contour starts on its path: for a loop at
-rest on its first point only the speed jumps (not on an axis that follows SIN,
-SCAN or the steps of a raster). With ``rise`` the functions below have no jump.
+shorthand for ``Rx:SIN5 Ry:COS5``. Every contour starts on its path, so for a loop at
+rest at the first point only the speed jumps. It does not jump on an axis that follows
+SIN, SCAN or the steps of a raster, nor with ``rise`` in the functions below.
 """
 
 import math

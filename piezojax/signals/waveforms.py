@@ -98,7 +98,7 @@ def cosine(
     amplitude: ScalarLike = 5.0,
     offset: ScalarLike = 0.0,
 ) -> Time:
-    """COS: the sine a quarter of a period later; it starts mid-range at full speed.
+    """COS: SIN advanced by a quarter of a period; it starts mid-range at full speed.
 
     With SIN on another axis it gives a circle around the middle of both ranges.
     """
@@ -188,7 +188,10 @@ def multisine(
     offset: ScalarLike = 0.0,
     tones: int = 20,
 ) -> Time:
-    """Equal tones up to ``frequency``, Schroeder phases; peak about ``amplitude``."""
+    """Equal tones up to ``frequency``, with Schroeder phases.
+
+    The largest deviation from ``offset`` is about ``amplitude``.
+    """
     number = jnp.arange(1, tones + 1)
     phase = -jnp.pi * number * (number - 1) / tones
     angle = 2.0 * jnp.pi * frequency * jnp.outer(time, number / tones) + phase
@@ -226,7 +229,7 @@ SIGNALS: dict[str, Callable[..., Time]] = {
     "COS": cosine,
     "SCAN": scan,
 }
-"""Signals by name in a study; a number after the name is the frequency: ``SIN10``."""
+"""Signals by name in a study; a number after it is the frequency in Hz: ``SIN10``."""
 
 THESIS = (
     "SIN1",
@@ -261,7 +264,7 @@ def parse(name: str) -> tuple[str, float | None]:
 def signal(
     name: str, time: Time, amplitude: ScalarLike = 5.0, offset: ScalarLike = 0.0
 ) -> Time:
-    """Return the signal called ``name`` (``"SIN10"``) on ``time``."""
+    """Return the signal called ``name``, such as ``"SIN10"``, on ``time``."""
     kind, frequency = parse(name)
     options = {} if frequency is None else {"frequency": frequency}
     return SIGNALS[kind](time, amplitude=amplitude, offset=offset, **options)

@@ -24,15 +24,15 @@ class Clock:
         return program
 
     def wait_for(self, program: Future) -> None:
-        """Wait for a program that another thread compiles; add to ``compile_s``."""
+        """Wait for a program compiled by another thread; add to ``compile_s``."""
         start = time.perf_counter()
         program.result()
         self.compile_s += time.perf_counter() - start
 
     def cpu_s(self) -> float:
-        """Return the processor seconds since the start, of all threads."""
+        """Return the processor time (s) of all threads since the start."""
         return time.process_time() - self._cpu
 
     def wall_s(self) -> float:
-        """Return the seconds since the start."""
+        """Return the wall time (s) since the start."""
         return time.perf_counter() - self._began

@@ -1,7 +1,7 @@
 """Damped Gauss-Newton: descents from several starts that advance side by side.
 
 The loss of a control loop has long, narrow, curved valleys, in which gradient methods
-zigzag. It is a sum of squared errors, so that the derivatives of the errors also give
+zigzag. The loss is a sum of squared errors, so the derivatives of the errors also give
 its curvature. A step along a curved valley leaves the floor of the valley; the errors
 at the end of the step, with the derivatives at its start, correct it (simplified Newton
 method: Deuflhard, Newton Methods for Nonlinear Problems, 2004).

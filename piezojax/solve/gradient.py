@@ -24,11 +24,11 @@ _guarded.defvjp(_guarded_forward, _guarded_backward)
 
 
 def with_finite_gradient(loss, *, forward: bool):
-    """Return ``loss`` of a vector with a finite gradient, computed with the value.
+    """Return ``loss``, a function of a vector, with a finite gradient.
 
-    The derivative of a diverged run is NaN and would spoil the memory of the optimiser;
-    it is replaced by zero. ``forward`` selects forward mode, faster for few parameters
-    and few lanes, else reverse mode.
+    The gradient is computed together with the value. That of a diverged run is NaN and
+    would spoil the memory of the optimiser; it is replaced by zero. ``forward`` selects
+    forward mode, faster for few parameters and few lanes, else reverse mode.
     """
 
     def guarded(unit):

@@ -74,7 +74,7 @@ class LocalModel(NamedTuple):
     def corrected(
         self, step: np.ndarray, residuals: np.ndarray, damping: float, box: Box
     ) -> np.ndarray:
-        """Return ``step`` corrected towards the least damped sum of squares.
+        """Return ``step`` corrected towards the minimum of the damped sum of squares.
 
         The correction uses the ``residuals`` at the end of the step and the derivatives
         at its start, and stays within the box.

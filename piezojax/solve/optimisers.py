@@ -172,4 +172,4 @@ METHODS: dict[str, Callable[[Function, Function, float], Optimiser]] = {
 """Optimisers by the name a study uses."""
 
 GAUSS_NEWTON = "gauss_newton"
-"""Name in a study of successive halving with Gauss-Newton descents on the errors."""
+"""Name a study uses for SuccessiveHalving, Gauss-Newton descents on the errors."""

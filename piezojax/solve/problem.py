@@ -14,7 +14,7 @@ FAILED_LOSS = 1e6
 """Loss in place of a value that is not finite, so that a line search can step back."""
 
 TOLERANCE = 1e-3
-"""A constraint violated by less than this counts as satisfied."""
+"""Largest violation with which a constraint counts as satisfied."""
 
 
 class Verdict(NamedTuple):

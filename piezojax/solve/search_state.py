@@ -20,8 +20,8 @@ class SearchState:
 
     ``loss`` is its objective, ``violation`` its largest violation of a constraint.
     ``losses_by_start`` holds the lowest loss of each of the ``starts`` after each step,
-    None while it diverges or violates a constraint; ``history`` the best of all against
-    time.
+    None before its first point that is finite and satisfies the constraints;
+    ``history`` holds the best of all against time.
     """
 
     unit: np.ndarray

@@ -109,7 +109,7 @@ class SuccessiveHalving:
         self, problem: Problem, units: np.ndarray, multipliers: Array
     ) -> tuple[GaussNewton, int]:
         """Return descents from ``units``, and the number of evaluations used."""
-        # All 0 in the first round; later there is only one descent.
+        # Multipliers are 0 in the first round; later there is only one descent.
         problem = problem.with_multipliers(multipliers[0])
         losses, verdicts = self._screened(problem, units)
 
