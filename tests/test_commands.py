@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import tomli_w
 from click.testing import CliRunner
+from golden import golden_vectors
 from rich.console import Console
 
 import piezojax as pj
@@ -318,7 +319,7 @@ def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     assert re.search(r"parameters.actuator_\w*upper = 120.0;", text)
     assert "Judged: tuned loop: sensitivity peak" in text
     assert "Plants: the nominal one only." in text
-    columns = np.loadtxt(out / "vectors.csv", delimiter=",", skiprows=2).T
+    columns = golden_vectors(out).T
     references = pj.read_about(tuned[1] / "gains.toml").reference_ranges[0]
     assert columns[0].min() < references[0]
     assert columns[0].max() > references[1]

@@ -50,7 +50,7 @@ def write_c(
         **code.files(),
         f"test_{name}.c": test_program(code, tolerance),
         "vectors.csv": vectors(code, inputs, outputs),
-        "Makefile": MAKEFILE.format(name=name),
+        "Makefile": _commented(code) + MAKEFILE.format(name=name),
     }
     folder = fresh_folder(folder)
     for file, text in files.items():
@@ -83,7 +83,10 @@ def rounding_error(code: CProject, inputs: Any, outputs: Any) -> float:
 
 
 def vectors(code: CProject, inputs: Any, outputs: Any) -> str:
-    """Return a simulation as CSV: start, column names, and a row for each sample."""
+    """Return a simulation as CSV: start, column names, and a row for each sample.
+
+    The origin stands before them in lines that begin with ``#``.
+    """
     columns = [
         np.asarray(leaf).reshape(len(leaf))
         for tree in (inputs, outputs)
@@ -92,7 +95,7 @@ def vectors(code: CProject, inputs: Any, outputs: Any) -> str:
     names = [slot.name for slot in (*code.inputs, *code.outputs)]
     start = [float(leaf) for leaf in jax.tree.leaves(code.interface.start)]
     rows = np.column_stack(columns)
-    return "\n".join(
+    return _commented(code) + "\n".join(
         [
             ",".join(repr(value) for value in start),
             ",".join(names),
@@ -100,6 +103,10 @@ def vectors(code: CProject, inputs: Any, outputs: Any) -> str:
             "",
         ]
     )
+
+
+def _commented(code: CProject) -> str:
+    return "".join(f"# {line}\n" for line in code.head())
 
 
 def test_program(code: CProject, tolerance: float) -> str:
@@ -112,6 +119,7 @@ def test_program(code: CProject, tolerance: float) -> str:
     given = [f"({real})row[{i}]" for i in range(inputs)]
     found = [f"found[{i}]" for i in range(outputs)]
     return TEST.format(
+        origin=code.origin(),
         name=code.name,
         starts=starts,
         columns=inputs + outputs,

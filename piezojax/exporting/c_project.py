@@ -159,13 +159,16 @@ class CProject:
         """Return the texts of header and source by file name."""
         return {f"{self.name}.h": self.header(), f"{self.name}.c": self.source()}
 
-    def origin(self) -> str:
-        """Return the head of a file: the alarms, then the System and its origin."""
+    def head(self) -> list[str]:
+        """Return the first lines of a file: the alarms, the System and its origin."""
         kind = type(self.system).__name__
         if isinstance(self.system, Driven):
             kind = f"{type(self.system.controller).__name__} with its voltage limits"
-        lines = self.about.origin(kind)
-        return "\n   ".join(line.replace("*/", "* /") for line in lines)
+        return self.about.origin(kind)
+
+    def origin(self) -> str:
+        """Return ``head`` as the text of a comment in C."""
+        return "\n   ".join(line.replace("*/", "* /") for line in self.head())
 
     def header(self) -> str:
         """Return the text of the header."""

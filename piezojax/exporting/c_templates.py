@@ -90,12 +90,21 @@ SOURCE = """\
 """
 
 TEST = """\
-/* Replays the golden vectors of the simulation; returns 1 if an output differs. */
+/* {origin}
+
+   Replays the golden vectors of the simulation; returns 1 if an output differs. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 
 #include "{name}.h"
+
+static int after_comments(FILE *file) {{
+    int first;
+    while ((first = getc(file)) == '#')
+        if (fscanf(file, "%*[^\\n] ") == EOF) return 0;
+    return ungetc(first, file) != EOF;
+}}
 
 static int row_of(FILE *file, double *values, int count) {{
     int i;
@@ -112,7 +121,8 @@ int main(int count, char **arguments) {{
 {output}    FILE *file = count == 2 ? fopen(arguments[1], "r") : NULL;
     long samples = 0;
     int i, failed = 0;
-    if (!file || !row_of(file, start, {starts}) || fscanf(file, " %*[^\\n]") < 0) {{
+    if (!file || !after_comments(file) || !row_of(file, start, {starts})
+        || fscanf(file, " %*[^\\n]") < 0) {{
         fprintf(stderr, "usage: %s vectors.csv\\n", arguments[0]);
         return 2;
     }}

@@ -171,7 +171,7 @@ def _description(
         fmiVersion="2.0",
         modelName=code.name,
         guid=guid,
-        description=code.origin().replace("\n   ", " "),
+        description=" ".join(code.head()),
         generationTool=f"piezojax {code.about.piezojax}",
         numberOfEventIndicators="0",
     )

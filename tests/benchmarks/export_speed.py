@@ -55,6 +55,9 @@ int main(void) {{
     FILE *file = fopen("vectors.csv", "r");
     clock_t begin;
     int i, k;
+    while ((i = getc(file)) == '#')
+        if (fscanf(file, "%*[^\\n] ") == EOF) return 1;
+    ungetc(i, file);
     for (i = 0; i < 4; i++)
         if (fscanf(file, i ? ",%lf" : "%lf", &start[i]) != 1) return 1;
     if (fscanf(file, " %*[^\\n]") < 0) return 1;

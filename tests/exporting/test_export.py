@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from golden import golden_vectors
 
 import piezojax as pj
 from piezojax.catalog import CONTROLLERS, PLANTS
@@ -102,7 +103,7 @@ def test_the_actuator_of_the_study_leaves_with_the_controller(tmp_path):
     pj.export(CONTROLLERS["p753_pid"](), tmp_path / "c", about=about)
     status, text = made(tmp_path / "c")
     assert status == 0, text
-    rows = np.loadtxt(tmp_path / "c" / "vectors.csv", delimiter=",", skiprows=2)
+    rows = golden_vectors(tmp_path / "c")
     voltage = rows[:, -1]
     assert np.all(voltage % 0.25 == 0.0)
     assert np.abs(np.diff(voltage)).max() == 0.5  # V a sample
@@ -213,10 +214,12 @@ def test_the_same_gains_give_the_same_text(tmp_path):
 
 
 def test_the_files_name_their_origin_and_units(tmp_path):
-    header, source, *_ = pj.export(
+    paths = pj.export(
         CONTROLLERS["p753_pid"](), tmp_path / "c", about=ABOUT, name="pid"
     )
-    for path in (header, source):
+    assert len(paths) == 5
+    header = paths[0]
+    for path in paths:
         text = path.read_text()
         assert "Study: a study, seed 3." in text
         assert "Sampling rate: 20000 Hz" in text
