@@ -41,7 +41,3 @@ _DRIVE = {
 """Rows of the table of the drive: figure, meaning and unit."""
 
 _NEED_CAPACITANCE = ("current_rms_A", "current_peak_A", "power_W")
-
-
-def _number(value: float | None) -> str:
-    return "diverges" if value is None else f"{value:.3g}"
