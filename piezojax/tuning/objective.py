@@ -194,7 +194,7 @@ class Objective(eqx.Module):
 
     def figures(self, unit: Float[Array, " n"]) -> LoopFigures:
         """Return the figures [stages, references, draws] of the loop at ``unit``."""
-        return self._sampled(unit)[0]
+        return _figures(self, unit)
 
     def _sampled(
         self, unit: Float[Array, " n"], every: int = 1
@@ -340,3 +340,9 @@ class Objective(eqx.Module):
         every = jnp.concatenate(parts)
         finite = jnp.all(jnp.isfinite(every))
         return jnp.where(finite, every, jnp.sqrt(FAILED_LOSS / every.size))
+
+
+@jax.jit
+def _figures(objective: Objective, unit: Float[Array, " n"]) -> LoopFigures:
+    # One trace serves loss, verdict and gradient in every program of a search.
+    return objective._sampled(unit)[0]
