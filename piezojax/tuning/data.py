@@ -18,7 +18,7 @@ from ..study import Case, Stage
 from ..study.measured_noise import MeasuredNoise
 from .runs import Signals
 from .traces import Trace, traces_of
-from .unexplained import STRETCHES, residual_disturbances
+from .unexplained import STRETCHES, Suppression, residual_disturbances, suppression_of
 
 
 @dataclass
@@ -36,11 +36,12 @@ class Data:
         return tuple(trace.name for trace in self.traces)
 
 
-def make_data(case: Case) -> Data:
+def make_data(case: Case, judged: Feedback | None = None) -> Data:
     """Return the signals of ``case``, the tuning references before the unseen ones.
 
     The noise of the hold-out comes from a random stream of its own. With a fitted plant
-    there are ``STRETCHES`` times as many draws.
+    there are ``STRETCHES`` times as many draws. With ``judged``, a loop of one axis,
+    the residual of the plant disturbs the hold-out where it harms that loop most.
     """
     study = case.study
     table = study.references
@@ -50,6 +51,15 @@ def make_data(case: Case) -> Data:
     streams = np.random.SeedSequence(study.seed).spawn(2)
     counts = study.objective.noise_draws, study.holdout_draws
     (holding,) = holding_inputs(own_stage(case.loop), references[:, 0])
+    worst_for = None
+    if judged is not None and case.residual is not None and not study.axes:
+        worst_for = suppression_of(
+            judged,
+            case.highest_reference,
+            references.shape[1],
+            round(table.settle * study.rate),
+            study.dt,
+        )
     tuning, holdout = (
         _signals(
             case,
@@ -59,9 +69,10 @@ def make_data(case: Case) -> Data:
             np.random.default_rng(stream),
             count,
             part,
+            loop,
         )
-        for stream, count, part in zip(
-            streams, counts, ("train", "validate"), strict=True
+        for stream, count, part, loop in zip(
+            streams, counts, ("train", "validate"), (None, worst_for), strict=True
         )
     )
     traces = traces_of(study)
@@ -85,6 +96,7 @@ def _signals(
     random: np.random.Generator,
     draws: int,
     part: Part,
+    loop: Suppression | None,
 ) -> Signals:
     count, samples, *axes = references.shape
     if case.residual is not None:
@@ -94,7 +106,9 @@ def _signals(
     disturbance = None
     if case.residual is not None:
         played = [
-            residual_disturbances(case.residual, reference, np.asarray(time_s), part)
+            residual_disturbances(
+                case.residual, reference, np.asarray(time_s), part, loop
+            )
             for reference in references
         ]
         disturbance = as_array(np.repeat(played, draws // STRETCHES, axis=1))

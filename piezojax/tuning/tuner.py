@@ -84,6 +84,7 @@ def _tune(
         if table.pareto is not None and strategy and search.status != "interrupted":
             front = trace_front(objective, case, search, strategy, evaluator, progress)
         progress.stage("evaluating on held-out noise")
+        data = make_data(case, after)
         result = make_result(
             case, data, evaluator, before, after, search, clock, kept, front
         )

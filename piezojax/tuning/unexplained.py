@@ -1,10 +1,18 @@
 """Residual of a fitted plant as disturbances of the loop."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
+from scipy.signal import fftconvolve
 
+from ..analysis.stability.differentiable import PADDING, sensitivity
+from ..analysis.stability.operating_point import OperatingPoint
+from ..core.arrays import Scalar, as_array
+from ..core.feedback import Feedback
 from ..identification.residual_record import Part, ResidualRecord, Stretch
 
 STRETCHES = 2
@@ -26,6 +34,7 @@ def residual_disturbances(
     reference: Float[np.ndarray, "samples ..."],
     time_s: Samples,
     part: Part,
+    loop: "Suppression | None" = None,
 ) -> Float[np.ndarray, "stretches samples ..."]:
     """Return the worst stretches of ``residual`` under ``reference``, in its unit.
 
@@ -34,11 +43,14 @@ def residual_disturbances(
     path of the stage. The residual therefore advances with the distance that the
     reference travels, or with time if that advances it farther. It is played forwards
     and backwards until the reference ends. ``time_s`` are the times of the samples of
-    the reference, ``part`` names the part of the records. Of many starting points,
-    evenly spaced over that part of each record, two are chosen: the one with the
-    largest deviation, for slow loops, and the one with the largest fast changes.
-    Several axes share one distance, and one deviation in which each axis is divided by
-    the deviation of its residual.
+    the reference, ``part`` names the part of the records.
+
+    Of many starting points, evenly spaced over that part of each record, two are
+    chosen: those with the largest error through ``loop``, each as it is or as its
+    change since its first sample, whichever is worse. Without ``loop`` they are the one
+    with the largest deviation, for slow loops, and the one with the largest fast
+    changes. Several axes share one distance, and one deviation in which each axis is
+    divided by the deviation of its residual.
     """
     path = reference.reshape(len(reference), -1)
     whole = np.concatenate([one.residual for one in residual.parts[part]])
@@ -48,6 +60,13 @@ def residual_disturbances(
         for one in residual.parts[part]
         for played in _played(one, path, time_s / residual.dt, part)
     ]
+
+    if loop is not None:
+        every = [one for each in stretches for one in (each, each - each[0])]
+        errors = np.array([loop.error(one[:, 0]) for one in every]).reshape(-1, 2)
+        largest = np.argsort(errors.max(axis=1), kind="stable")[-STRETCHES:]
+        chosen = [every[2 * i + np.argmax(errors[i])] for i in largest]
+        return np.stack(chosen).reshape(STRETCHES, *reference.shape)
 
     def slow(stretch: np.ndarray) -> float:
         return float(np.linalg.norm(np.std(stretch, axis=0) / sizes))
@@ -118,3 +137,37 @@ def _fast_rms(stretch: Samples) -> float:
     mean = (total[size:] - total[:-size]) / size
     middle = stretch[size // 2 :][: mean.size]
     return float(np.sqrt(np.mean((middle - mean) ** 2)))
+
+
+class Suppression(NamedTuple):
+    """Sensitivity S of a loop of one axis, as its impulse ``response``.
+
+    Errors count from the sample ``first`` on.
+    """
+
+    response: Samples
+    first: int
+
+    def error(self, disturbance: Samples) -> float:
+        """Return the rms error (um) of the linear loop under ``disturbance`` (um)."""
+        error = fftconvolve(disturbance, self.response)[: disturbance.size]
+        return float(np.sqrt(np.mean(error[self.first :] ** 2)))
+
+
+def suppression_of(
+    loop: Feedback, reference: float, samples: int, first: int, dt: float
+) -> Suppression | None:
+    """Return the suppression of disturbances around rest at ``reference`` (um).
+
+    The impulse response has ``samples`` samples. None if it does not decay, as that of
+    an unstable loop.
+    """
+    response = np.asarray(_response(loop, as_array(reference), samples, dt))
+    late = np.abs(response[samples // 2 :]).max()
+    return Suppression(response, first) if late < np.abs(response).max() else None
+
+
+@eqx.filter_jit
+def _response(loop: Feedback, reference: Scalar, samples: int, dt: float) -> Array:
+    lines = sensitivity(loop, OperatingPoint(reference, dt=dt), samples * dt)
+    return jnp.fft.irfft(lines[:, 0, 0], PADDING * samples)[:samples]
