@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from stand_ins import fit_of
 
+from piezojax.core.paths import replace
 from piezojax.identification.records.record import Record
 from piezojax.identification.residual_record import ResidualRecord
 from piezojax.solve.clock import Clock
@@ -16,7 +17,11 @@ from piezojax.tuning.data import make_data
 from piezojax.tuning.evaluator import Evaluator
 from piezojax.tuning.objective import FAILED_LOSS, Objective
 from piezojax.tuning.runs import Signals
-from piezojax.tuning.unexplained import residual_disturbances
+from piezojax.tuning.unexplained import (
+    Suppression,
+    residual_disturbances,
+    suppression_of,
+)
 
 STUDY = {
     "title": "a PID on a stage without dynamics",
@@ -100,17 +105,102 @@ REST, SLOW = np.zeros(400), 1e-9 * np.arange(400.0)
 """A constant reference, and a stage that hardly moves."""
 
 
-def played(residual, reference=REST, moved=SLOW, part="validate"):
+def played(residual, reference=REST, moved=SLOW, part="validate", loop=None):
     """Return the disturbances of a fit with the residual ``residual``.
 
-    The first has the largest deviation, the second the largest fast changes.
+    The first has the largest deviation, the second the largest fast changes; with
+    ``loop``, the last has the largest error through it.
     """
     case = case_of()
     record = Record(np.arange(400.0), moved + residual, case.study.dt)
     fit = fit_of(case.loop.plant, record, moved)
     time_s = case.study.dt * np.arange(float(len(reference)))
     residual = ResidualRecord.of(fit)
-    return residual_disturbances(residual, np.asarray(reference), time_s, part)
+    return residual_disturbances(residual, np.asarray(reference), time_s, part, loop)
+
+
+def test_a_loop_is_judged_where_the_residual_harms_it_most():
+    """A band that the loop passes lies between a large slow part and small fast one."""
+    time = np.arange(200.0)
+    residual = np.zeros(400)
+    residual[200:260] = 10.0 * np.sin(np.linspace(0.0, np.pi, 60))
+    residual[260:320] = 3.0 * np.sin(2.0 * np.pi * time[:60] / 12.0)
+    residual[320:380] = 2.0 * np.sin(2.0 * np.pi * time[:60] / 4.0)
+    # It passes only what changes over six samples: a window times a sine of 12 samples.
+    band = np.r_[0.0, np.sin(2.0 * np.pi * np.arange(1.0, 12.0) / 12.0)] / 6.0
+    first = 12
+    chosen = played(residual, np.zeros(48), loop=Suppression(band, first))
+
+    def error(stretch):
+        passed = [
+            sum(band[i] * stretch[k - i] for i in range(12)) for k in range(first, 48)
+        ]
+        return np.sqrt(np.mean(np.square(passed)))
+
+    assert np.ptp(chosen[-1]) == pytest.approx(6.0, rel=0.1)
+    assert error(chosen[-1]) == pytest.approx(3.0 / np.sqrt(2.0), rel=0.1)
+    for other in [*chosen, *played(residual, np.zeros(48))]:
+        assert error(other) <= error(chosen[-1]) + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("response", "least", "most"),
+    [
+        (np.r_[1.0, np.zeros(399)], 4.5, 5.5),  # open loop: the offset counts
+        (np.r_[1.0, -0.2 * 0.8 ** np.arange(399.0)], 0.0, 0.9),  # it decays
+    ],
+)
+def test_an_offset_counts_as_far_as_the_loop_leaves_it(response, least, most):
+    residual = 5.0 + 0.5 * np.sin(np.arange(400.0) / 60.0)
+    loop = Suppression(response, 100)
+    (*_, worst) = played(residual, np.zeros(400), loop=loop)
+    assert least <= loop.error(worst) <= most
+
+
+def integrator(gain):
+    """Return the loop of the study with this integral gain, times its sample time."""
+    case = case_of()
+    return case.study.dt, replace(
+        case.loop, {"controller.integral": gain / 5e-5 / 0.15}
+    )
+
+
+def test_the_suppression_is_the_sensitivity_of_the_loop():
+    """S of y(k+1) = y(k) + g e(k) + d(k+1) - d(k), by its recursion."""
+    dt, loop = integrator(0.3)
+    found = suppression_of(loop, 2.0, 400, 0, dt).response
+    output, displaced = np.zeros(400), np.r_[1.0, np.zeros(399)]
+    voltage = 0.0
+    for k in range(400):
+        output[k] = voltage + displaced[k]
+        voltage -= 0.3 * output[k]
+    np.testing.assert_allclose(found, output, atol=1e-9)
+
+
+def test_an_unstable_loop_has_no_suppression():
+    dt, loop = integrator(2.5)
+    assert suppression_of(loop, 2.0, 400, 0, dt) is None
+
+
+def test_the_holdout_is_the_worst_for_the_judged_loop():
+    case = case_of()
+    rng = np.random.default_rng(4)
+    moved = np.cumsum(rng.standard_normal(2000)) * 1e-6
+    residual = np.convolve(rng.standard_normal(2000), np.ones(20) / 20.0, "same")
+    record = Record(np.arange(2000.0), moved + residual, case.study.dt)
+    case = dataclasses.replace(case, fit=fit_of(case.loop.plant, record, moved))
+    plain, judged = make_data(case), make_data(case, case.loop)
+    np.testing.assert_array_equal(plain.holdout.noise, judged.holdout.noise)
+    np.testing.assert_array_equal(plain.tuning.disturbance, judged.tuning.disturbance)
+    reference = case.highest_reference
+    loop = suppression_of(case.loop, reference, 400, 0, case.study.dt)
+    for one, other in zip(
+        np.asarray(plain.holdout.disturbance),
+        np.asarray(judged.holdout.disturbance),
+        strict=True,
+    ):
+        assert loop.error(other[-1]) >= max(loop.error(each) for each in one) - 1e-12
+    assert not np.array_equal(plain.holdout.disturbance, judged.holdout.disturbance)
 
 
 def test_a_short_residual_is_reflected():
