@@ -17,6 +17,7 @@ import tomli_w
 from click.testing import CliRunner
 from golden import golden_vectors
 from rich.console import Console
+from rich.table import Table
 
 import piezojax as pj
 from piezojax.analysis.stability import OperatingPoint
@@ -524,6 +525,18 @@ def test_ctrl_c_during_the_search_keeps_the_best_gains(study, tmp_path, monkeypa
     assert re.search(r"interrupted after \d+ evaluations", printed)
     assert "Traceback" not in result.output
     assert len(assert_interrupted(tmp_path / "out").history) == 1
+
+
+def test_no_column_is_cut_in_a_pipe(capsys, monkeypatch):
+    table = Table()
+    for cell in ("a" * 70, "b" * 70):
+        table.add_column(cell, no_wrap=True)
+    monkeypatch.delenv("COLUMNS", raising=False)
+    console(quiet=False).print(table)
+    assert "a" * 70 + " ┃ " + "b" * 70 in capsys.readouterr().out
+    monkeypatch.setenv("COLUMNS", "60")
+    console(quiet=False).print(table)
+    assert max(map(len, capsys.readouterr().out.splitlines())) == 60
 
 
 def test_ctrl_c_waits_for_the_next_progress_report():

@@ -1,5 +1,6 @@
 """Terminal output of a command: console and progress."""
 
+import os
 import sys
 import time
 from contextlib import ExitStack
@@ -19,6 +20,9 @@ from .stopping import SIGNALS, handled, remember
 
 NOTE_EVERY = 30.0
 """Least time between two notes without a terminal, s."""
+
+PIPED = 200
+"""Width of tables without a terminal, unless COLUMNS is set: no column is cut."""
 
 
 class Bar:
@@ -106,4 +110,7 @@ class Bar:
 def console(quiet: bool) -> Console:
     """Return the console on which a command prints: standard output, or none."""
     # Titles and paths may contain brackets, so nothing printed is markup.
-    return Console(quiet=quiet, file=sys.stdout, highlight=False, markup=False)
+    found = Console(quiet=quiet, file=sys.stdout, highlight=False, markup=False)
+    if not found.is_terminal and "COLUMNS" not in os.environ:
+        found.width = PIPED
+    return found
