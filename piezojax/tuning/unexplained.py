@@ -29,12 +29,27 @@ suppress changes slower than a hundredth of the sampling rate."""
 Samples = Float[np.ndarray, " samples"]
 
 
+class Suppression(NamedTuple):
+    """Sensitivity S of a loop of one axis, as its impulse ``response``.
+
+    Errors count from the sample ``first`` on.
+    """
+
+    response: Samples
+    first: int
+
+    def error(self, disturbance: Samples) -> float:
+        """Return the rms error (um) of the linear loop under ``disturbance`` (um)."""
+        error = fftconvolve(disturbance, self.response)[: disturbance.size]
+        return float(np.sqrt(np.mean(error[self.first :] ** 2)))
+
+
 def residual_disturbances(
     residual: ResidualRecord,
     reference: Float[np.ndarray, "samples ..."],
     time_s: Samples,
     part: Part,
-    loop: "Suppression | None" = None,
+    loop: Suppression | None = None,
 ) -> Float[np.ndarray, "stretches samples ..."]:
     """Return the worst stretches of ``residual`` under ``reference``, in its unit.
 
@@ -60,7 +75,6 @@ def residual_disturbances(
         for one in residual.parts[part]
         for played in _played(one, path, time_s / residual.dt, part)
     ]
-
     if loop is not None:
         every = [one for each in stretches for one in (each, each - each[0])]
         errors = np.array([loop.error(one[:, 0]) for one in every]).reshape(-1, 2)
@@ -137,21 +151,6 @@ def _fast_rms(stretch: Samples) -> float:
     mean = (total[size:] - total[:-size]) / size
     middle = stretch[size // 2 :][: mean.size]
     return float(np.sqrt(np.mean((middle - mean) ** 2)))
-
-
-class Suppression(NamedTuple):
-    """Sensitivity S of a loop of one axis, as its impulse ``response``.
-
-    Errors count from the sample ``first`` on.
-    """
-
-    response: Samples
-    first: int
-
-    def error(self, disturbance: Samples) -> float:
-        """Return the rms error (um) of the linear loop under ``disturbance`` (um)."""
-        error = fftconvolve(disturbance, self.response)[: disturbance.size]
-        return float(np.sqrt(np.mean(error[self.first :] ** 2)))
 
 
 def suppression_of(
