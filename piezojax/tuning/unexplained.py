@@ -7,7 +7,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.signal import fftconvolve
 
 from ..analysis.stability.differentiable import PADDING, sensitivity
 from ..analysis.stability.operating_point import OperatingPoint
@@ -40,6 +39,8 @@ class Suppression(NamedTuple):
 
     def error(self, disturbance: Samples) -> float:
         """Return the rms error (um) of the linear loop under ``disturbance`` (um)."""
+        from scipy.signal import fftconvolve  # slow to import
+
         error = fftconvolve(disturbance, self.response)[: disturbance.size]
         return float(np.sqrt(np.mean(error[self.first :] ** 2)))
 
