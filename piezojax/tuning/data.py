@@ -51,11 +51,12 @@ def make_data(case: Case, judged: Feedback | None = None) -> Data:
     streams = np.random.SeedSequence(study.seed).spawn(2)
     counts = study.objective.noise_draws, study.holdout_draws
     (holding,) = holding_inputs(own_stage(case.loop), references[:, 0])
-    worst_for = None
-    if judged is not None and case.residual is not None and not study.axes:
+    worst_for, highest = None, case.highest_reference
+    one_axis = not isinstance(highest, tuple)
+    if judged is not None and case.residual is not None and one_axis:
         worst_for = suppression_of(
             judged,
-            case.highest_reference,
+            highest,
             references.shape[1],
             round(table.settle * study.rate),
             study.dt,
