@@ -1,11 +1,17 @@
 """Origin of a saved System: the table ``about`` of its file."""
 
+from collections.abc import Iterable
 from importlib.metadata import version
 from typing import Any
 
 from pydantic import BaseModel, Field
 
 from .error_bound import ErrorBound
+
+
+def commented(lines: Iterable[str]) -> str:
+    """Return ``lines`` as comments of a text file, each after ``#``."""
+    return "".join(f"# {line}\n" for line in lines)
 
 
 class About(BaseModel):

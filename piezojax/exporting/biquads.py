@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..core.about import About
+from ..core.about import About, commented
 from ..core.files import fresh_folder, write_text
 from ..core.rollout import simulate
 from ..core.system import Affine, System, resolve
@@ -66,13 +66,10 @@ def write_biquads(
         )
     about = about.model_copy(update={"rate_Hz": 1.0 / model.dt})
     head = about.origin(f"Feedback of {kind} as {len(sections)} biquads")
-    lines = [
-        *(f"# {line}" for line in (*head, *CONVENTION)),
-        "b0,b1,b2,a0,a1,a2",
-        *(",".join(repr(float(x)) for x in row) for row in sections),
-    ]
+    rows = (",".join(repr(float(x)) for x in row) for row in sections)
+    table = "\n".join(["b0,b1,b2,a0,a1,a2", *rows, ""])
     path = fresh_folder(folder) / f"{name}_biquads.csv"
-    write_text(path, "\n".join([*lines, ""]))
+    write_text(path, commented([*head, *CONVENTION]) + table)
     return [path]
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..core.about import About
+from ..core.about import About, commented
 from ..core.files import fresh_folder, write_text
 from ..core.rollout import simulate
 from ..core.system import System
@@ -50,7 +50,7 @@ def write_c(
         **code.files(),
         f"test_{name}.c": test_program(code, tolerance),
         "vectors.csv": vectors(code, inputs, outputs),
-        "Makefile": _commented(code) + MAKEFILE.format(name=name),
+        "Makefile": commented(code.head()) + MAKEFILE.format(name=name),
     }
     folder = fresh_folder(folder)
     for file, text in files.items():
@@ -95,7 +95,7 @@ def vectors(code: CProject, inputs: Any, outputs: Any) -> str:
     names = [slot.name for slot in (*code.inputs, *code.outputs)]
     start = [float(leaf) for leaf in jax.tree.leaves(code.interface.start)]
     rows = np.column_stack(columns)
-    return _commented(code) + "\n".join(
+    return commented(code.head()) + "\n".join(
         [
             ",".join(repr(value) for value in start),
             ",".join(names),
@@ -103,10 +103,6 @@ def vectors(code: CProject, inputs: Any, outputs: Any) -> str:
             "",
         ]
     )
-
-
-def _commented(code: CProject) -> str:
-    return "".join(f"# {line}\n" for line in code.head())
 
 
 def test_program(code: CProject, tolerance: float) -> str:

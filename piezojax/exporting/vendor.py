@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..control import E727, NV200, Stabilizer
-from ..core.about import About
+from ..core.about import About, commented
 from ..core.files import fresh_folder, write_bytes, write_text
 from ..core.system import System
 from .device_file import DeviceFile, Value
@@ -54,11 +54,9 @@ def write_vendor(
     table = io.StringIO()
     csv.writer(table, lineterminator="\n").writerows([Value._fields, *values])
     texts = {
-        f"{name}{file.suffix}": _commented(
-            [*head, *file.notes(_rounded(system), saved)]
-        )
+        f"{name}{file.suffix}": commented([*head, *file.notes(_rounded(system), saved)])
         + file.body(values, content),
-        f"{name}_parameters.csv": _commented(head) + table.getvalue(),
+        f"{name}_parameters.csv": commented(head) + table.getvalue(),
     }
     folder = fresh_folder(folder)
     for each, text in texts.items():
@@ -92,7 +90,3 @@ def _saved(system: System, before: Path | None) -> tuple[str, dict[str, str]]:
         return text, _file_of(system).read(text)
     except ValueError as error:
         raise ValueError(f"{before}: {error}") from None
-
-
-def _commented(lines: list[str]) -> str:
-    return "".join(f"# {line}\n" for line in lines)
