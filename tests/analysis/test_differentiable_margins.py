@@ -219,11 +219,15 @@ ANGLES = np.linspace(0.0, np.pi, 4001)
 
 
 def coupled(gains, coupling=0.4):
-    """Return S of two axes, L = K [[1, c], [c/2, 1]] z^-3 / (z - 1), by NumPy."""
+    """Return S of two axes, L = K [[1, c], [c/2, 1]] z^-3 / (z - 1)."""
     z = np.exp(1j * ANGLES[1:])[:, None, None]
     mixing = jnp.array([[1.0, coupling], [0.5 * coupling, 1.0]])
     L = gains[:, None] * mixing * z**-3 / (z - 1.0)
-    S = jnp.linalg.inv(jnp.eye(2) + L)
+    # By the adjugate: the LAPACK calls of XLA may deadlock on a CPU.
+    F = jnp.eye(2) + L
+    a, b, c, d = F[:, 0, 0], F[:, 0, 1], F[:, 1, 0], F[:, 1, 1]
+    adjugate = jnp.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
+    S = adjugate / (a * d - b * c)[:, None, None]
     return jnp.concatenate([jnp.zeros((1, 2, 2)), S])
 
 
