@@ -243,7 +243,7 @@ class Study(Table):
                         f"references: the frequency of {name} is not below half the "
                         f"rate, {0.5 * self.rate:g} Hz"
                     )
-        if round(table.settle * self.rate) >= samples:
+        if self.settled >= samples:
             raise ValueError(
                 f"references.settle is {table.settle:g} s; no sample is left after it"
             )
@@ -352,6 +352,11 @@ class Study(Table):
     def dt(self) -> float:
         """Sample time, s."""
         return 1.0 / self.rate
+
+    @property
+    def settled(self) -> int:
+        """First sample of a run that counts, after ``references.settle``."""
+        return round(self.references.settle * self.rate)
 
     @property
     def limits(self) -> dict[str, float]:

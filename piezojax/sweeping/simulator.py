@@ -74,7 +74,7 @@ class Simulator:
         self.run_noise = jax.tree.map(
             lambda x: x[chosen].reshape(self.reference.shape), data.run_noise
         )
-        self.start = round(study.references.settle * study.rate)
+        self.start = study.settled
         self.samples = self.reference.shape[1]
         self._programs: dict[Any, Callable] = {}
         self._inputs: dict[Any, Any] = {}

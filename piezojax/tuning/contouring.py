@@ -97,7 +97,7 @@ def contour_errors(study: Study, runs: dict[int, Logs]) -> list[ContourErrors]:
         logs = runs[contour.run]
         samples = len(logs[0].reference[contour.axes[0]])
         path = _path(study, contour, logs[0])
-        first = round(study.references.settle * study.rate)
+        first = study.settled
         shown = slice(first, None, max(1, (samples - first) // _POINTS))
         time = np.arange(samples)[shown] * study.dt
         before, after = (_error(log, contour.axes, path, shown) for log in logs)

@@ -64,7 +64,7 @@ class Evaluator:
     def __init__(self, clock: Clock, case: Case):
         self._clock, self._case = clock, case
         study = case.study
-        self.start = round(study.references.settle * study.rate)
+        self.start = study.settled
         self.limits = study.limits
         bound = case.plant_about.error_bound
         self.model_error = bound and as_array(bound.supported(lines(study.dt)))

@@ -59,7 +59,7 @@ def make_runs(case: Case) -> Runs:
             )
             for each in data.traces
         ),
-        round(study.references.settle * study.rate),
+        study.settled,
     )
 
 

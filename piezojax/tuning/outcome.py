@@ -134,7 +134,7 @@ class Outcome:
                 signals.references[:count],
                 signals.noise[:count],
                 None if disturbance is None else disturbance[:count],
-                start=round(study.references.settle * study.rate),
+                start=study.settled,
                 dt=study.dt,
             )
         # A failed analysis must not lose the tuned gains.
@@ -190,7 +190,7 @@ class Outcome:
                 runs,
                 constant,
                 study.dt,
-                round(study.references.settle * study.rate),
+                study.settled,
                 study.by_axis(capacitance)[axis] if capacitance is not None else None,
             )
         return found
