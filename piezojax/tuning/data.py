@@ -20,6 +20,9 @@ from .runs import Signals
 from .traces import Trace, traces_of
 from .unexplained import STRETCHES, Suppression, residual_disturbances, suppression_of
 
+_STREAMS: dict[Part, int] = {"train": 0, "validate": 1}
+"""Streams of one seed: the hold-out draws are new for every reference."""
+
 
 @dataclass
 class Data:
@@ -36,48 +39,17 @@ class Data:
         return tuple(trace.name for trace in self.traces)
 
 
-def make_data(case: Case, judged: Feedback | None = None) -> Data:
+def make_data(case: Case) -> Data:
     """Return the signals of ``case``, the tuning references before the unseen ones.
 
     The noise of the hold-out comes from a random stream of its own. With a fitted plant
-    there are ``STRETCHES`` times as many draws. With ``judged``, a loop of one axis,
-    the residual of the plant disturbs the hold-out where it harms that loop most.
+    there are ``STRETCHES`` times as many draws.
     """
     study = case.study
-    table = study.references
-    time_s = waveforms.time_grid(table.duration, study.rate)
-    references = case.references
-    # Two streams of one seed: the hold-out draws are new for every reference.
-    streams = np.random.SeedSequence(study.seed).spawn(2)
-    counts = study.objective.noise_draws, study.holdout_draws
-    (holding,) = holding_inputs(own_stage(case.loop), references[:, 0])
-    worst_for, highest = None, case.highest_reference
-    one_axis = not isinstance(highest, tuple)
-    if judged is not None and case.residual is not None and one_axis:
-        worst_for = suppression_of(
-            judged,
-            highest,
-            references.shape[1],
-            round(table.settle * study.rate),
-            study.dt,
-        )
-    tuning, holdout = (
-        _signals(
-            case,
-            references,
-            holding,
-            time_s,
-            np.random.default_rng(stream),
-            count,
-            part,
-            loop,
-        )
-        for stream, count, part, loop in zip(
-            streams, counts, ("train", "validate"), (None, worst_for), strict=True
-        )
-    )
+    (holding,) = holding_inputs(own_stage(case.loop), case.references[:, 0])
+    tuning, holdout = (_signals(case, part, holding) for part in _STREAMS)
     traces = traces_of(study)
-    count = len(table.tune)
+    count = len(study.references.tune)
     tuned = sum(trace.run < count for trace in traces)
     picked = tuple((t.run, t.axis) for t in traces) if study.axes else ()
     first = jax.tree.map(lambda x: x[:count], tuning)
@@ -89,16 +61,37 @@ def make_data(case: Case, judged: Feedback | None = None) -> Data:
     )
 
 
+def judging(data: Data, case: Case, loop: Feedback) -> Data:
+    """Return ``data`` with the residual of the plant where it harms ``loop`` most.
+
+    Only the hold-out changes. Without a residual, and on several axes, nothing does.
+    """
+    study, highest = case.study, case.highest_reference
+    if case.residual is None or isinstance(highest, tuple):
+        return data
+    samples = case.references.shape[1]
+    worst_for = suppression_of(loop, highest, samples, study.settled, study.dt)
+    return dataclasses.replace(
+        data, holdout=_signals(case, "validate", data.holdout.holding, worst_for)
+    )
+
+
 def _signals(
     case: Case,
-    references: np.ndarray,
-    holding: jax.Array,
-    time_s: jax.Array,
-    random: np.random.Generator,
-    draws: int,
     part: Part,
-    loop: Suppression | None,
+    holding: jax.Array | None,
+    loop: Suppression | None = None,
 ) -> Signals:
+    """Return the signals of all references; ``part`` is that of the record.
+
+    The training part is for tuning, the validation part for the hold-out.
+    """
+    study, references = case.study, case.references
+    time_s = waveforms.time_grid(study.references.duration, study.rate)
+    stream = np.random.SeedSequence(study.seed).spawn(len(_STREAMS))[_STREAMS[part]]
+    random = np.random.default_rng(stream)
+    drawn = {"train": study.objective.noise_draws, "validate": study.holdout_draws}
+    draws = drawn[part]
     count, samples, *axes = references.shape
     if case.residual is not None:
         draws *= STRETCHES

@@ -14,7 +14,7 @@ from ..study import Case, read, shipped
 from .alarms import alarms_of, peak_notes
 from .baselines import Budget, compare_baselines
 from .beside import figures_beside
-from .data import make_data
+from .data import judging, make_data
 from .device_alarms import device_alarms
 from .evaluator import Evaluator
 from .front import trace_front
@@ -84,7 +84,7 @@ def _tune(
         if table.pareto is not None and strategy and search.status != "interrupted":
             front = trace_front(objective, case, search, strategy, evaluator, progress)
         progress.stage("evaluating on held-out noise")
-        data = make_data(case, after)
+        data = judging(data, case, after)
         result = make_result(
             case, data, evaluator, before, after, search, clock, kept, front
         )

@@ -4,11 +4,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..analysis.stability.differentiable import PADDING, sensitivity
+from ..analysis.stability.differentiable import sensitivity_impulse
 from ..analysis.stability.operating_point import OperatingPoint
 from ..core.arrays import Scalar, as_array
 from ..core.feedback import Feedback
@@ -69,8 +68,6 @@ def residual_disturbances(
     divided by the deviation of its residual.
     """
     path = reference.reshape(len(reference), -1)
-    whole = np.concatenate([one.residual for one in residual.parts[part]])
-    sizes = np.maximum(whole.std(axis=0), np.finfo(float).tiny)
     stretches = [
         played
         for one in residual.parts[part]
@@ -82,6 +79,9 @@ def residual_disturbances(
         largest = np.argsort(errors.max(axis=1), kind="stable")[-STRETCHES:]
         chosen = [every[2 * i + np.argmax(errors[i])] for i in largest]
         return np.stack(chosen).reshape(STRETCHES, *reference.shape)
+
+    whole = np.concatenate([one.residual for one in residual.parts[part]])
+    sizes = np.maximum(whole.std(axis=0), np.finfo(float).tiny)
 
     def slow(stretch: np.ndarray) -> float:
         return float(np.linalg.norm(np.std(stretch, axis=0) / sizes))
@@ -169,5 +169,5 @@ def suppression_of(
 
 @eqx.filter_jit
 def _response(loop: Feedback, reference: Scalar, samples: int, dt: float) -> Array:
-    lines = sensitivity(loop, OperatingPoint(reference, dt=dt), samples * dt)
-    return jnp.fft.irfft(lines[:, 0, 0], PADDING * samples)[:samples]
+    point = OperatingPoint(reference, dt=dt)
+    return sensitivity_impulse(loop, point, samples * dt)[:, 0, 0]

@@ -26,8 +26,8 @@ MUTATIONS = (
     Mutation(
         "hold-out noise from the tuning's stream",
         "tuning/data.py",
-        "np.random.default_rng(stream),",
-        "np.random.default_rng(streams[0]),",
+        "[_STREAMS[part]]",
+        "[0]",
         (_DATA,),
     ),
     Mutation(

@@ -13,7 +13,7 @@ from piezojax.identification.residual_record import ResidualRecord
 from piezojax.solve.clock import Clock
 from piezojax.study import Study, build
 from piezojax.tuning import unexplained
-from piezojax.tuning.data import make_data
+from piezojax.tuning.data import judging, make_data
 from piezojax.tuning.evaluator import Evaluator
 from piezojax.tuning.objective import FAILED_LOSS, Objective
 from piezojax.tuning.runs import Signals
@@ -189,7 +189,7 @@ def test_the_holdout_is_the_worst_for_the_judged_loop():
     residual = np.convolve(rng.standard_normal(2000), np.ones(20) / 20.0, "same")
     record = Record(np.arange(2000.0), moved + residual, case.study.dt)
     case = dataclasses.replace(case, fit=fit_of(case.loop.plant, record, moved))
-    plain, judged = make_data(case), make_data(case, case.loop)
+    plain, judged = make_data(case), judging(make_data(case), case, case.loop)
     np.testing.assert_array_equal(plain.holdout.noise, judged.holdout.noise)
     np.testing.assert_array_equal(plain.tuning.disturbance, judged.tuning.disturbance)
     reference = case.highest_reference

@@ -127,6 +127,14 @@ def sensitivity(
     return _responses(loop, point, jnp.asarray([point.side]), duration)[0]
 
 
+def sensitivity_impulse(
+    loop: Feedback, at: Any = 0.0, duration: float | None = None
+) -> Float[Array, "samples axes axes"]:
+    """Return the impulse response of S; the arguments are those of ``sensitivity``."""
+    point = OperatingPoint.at(at)
+    return _impulses(loop, point, jnp.asarray([point.side]), duration)[0]
+
+
 def sensitivities(
     loop: Feedback, at: Any = 0.0, duration: float | None = None
 ) -> Sensitivity:
@@ -195,17 +203,26 @@ def _responses(
     sides: Float[Array, " branches"],
     duration: float | None,
 ) -> Sensitivity:
+    impulses = _impulses(loop, point, sides, duration)
+    padding = 1 if isinstance(point.signal, tuple) else PADDING
+    return jnp.fft.rfft(impulses, padding * impulses.shape[1], axis=1)
+
+
+def _impulses(
+    loop: Feedback,
+    point: OperatingPoint,
+    sides: Float[Array, " branches"],
+    duration: float | None,
+) -> Float[Array, "branches samples axes axes"]:
     signal, dt = point.signal, point.sample_time(loop)
     samples = round(_samples(dt) if duration is None else duration / dt)
-    impulse, padding = (
-        (_axes_impulse, 1) if isinstance(signal, tuple) else (_impulse, PADDING)
-    )
+    impulse = _axes_impulse if isinstance(signal, tuple) else _impulse
 
     def one(side: ScalarLike) -> Float[Array, "samples axes axes"]:
         broken = cut(loop, signal, side, point.state)
         return impulse(broken, samples, dt)
 
-    return jnp.fft.rfft(jax.vmap(one)(sides), padding * samples, axis=1)
+    return jax.vmap(one)(sides)
 
 
 def _impulse(
