@@ -20,6 +20,7 @@ from piezojax.identification.residual_record import (
 )
 from piezojax.report.fit_pictures import write_model
 from piezojax.study import Study, build
+from piezojax.study.schema import AxesTable
 from piezojax.tuning.data import make_data
 from piezojax.tuning.make_result import _residual_notes
 from piezojax.tuning.response_margins import margins_on_response
@@ -127,12 +128,26 @@ def test_a_saved_plant_keeps_its_residual(folder, case, tmp_path):
         )
     (note,) = _residual_notes(loaded)
     assert "this residual is a disturbance of the loop" in note
+    rmse = case.fit.report.validation.rmse
+    assert f"leaves {rmse:.3g} um rms of its record" in note
     residual_path(model).unlink()
     without = build(study, tmp_path / "study.toml")
     assert make_data(without).tuning.disturbance is None
     (note,) = _residual_notes(without)
     assert "the file of that residual is not beside the model" in note
     assert "\n" not in note
+
+
+def test_the_note_on_the_residual_has_the_unit_of_each_axis(case):
+    axes = AxesTable(names=("x", "tilt"), units=("um", "urad"))
+    several = dataclasses.replace(
+        case,
+        fit=None,
+        study=case.study.model_copy(update={"axes": axes}),
+        plant_about=case.plant_about.model_copy(update={"residual_rms": [0.125, 2.5]}),
+    )
+    (note,) = _residual_notes(several)
+    assert "leaves 0.125 um, 2.5 urad rms of its record unexplained" in note
 
 
 def test_a_residual_of_another_model_is_refused(case, tmp_path):
