@@ -1,5 +1,7 @@
 """Figures of other controllers on the hold-out, beside those of the tuned one."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,46 +12,43 @@ from ..core.progress import Progress
 from ..study import Case
 from .alarms import PEAK
 from .data import Data
-from .evaluator import Evaluator
+from .held_out import HeldOut
 from .result import Beside, log_errors, number
 
 
 def figures_beside(
-    case: Case, data: Data, evaluator: Evaluator, after: Feedback, progress: Progress
+    case: Case, data: Data, loops: Mapping[str, HeldOut], progress: Progress
 ) -> dict[str, Beside]:
     """Return the figures of the controllers that the study names beside its own.
 
-    If it names any, the figures of its own gains and of ``after`` follow under the keys
-    "before" and "tuned".
+    If it names any, the figures of ``loops`` follow, those of ``held_out_loops``.
     """
     if not case.beside:
         return {}
-    controllers = {
-        **case.beside,
-        "before": case.loop.controller,
-        "tuned": after.controller,
-    }
     driven = np.array([trace.driven for trace in data.traces])
-    stages = case.ensemble.stages("holdout") if case.ensemble else None
+    own = loops["before"]
+    others = {
+        name: replace(own, loop=_with_controller(own.loop, controller))
+        for name, controller in case.beside.items()
+    }
     found = {}
-    for name, controller in controllers.items():
+    for name, held_out in (others | dict(loops)).items():
         progress.stage(f"evaluating {name}")
-        own = case.loop
-        loop = Feedback(controller, own.plant, own.actuator, own.sensor)
-        nominal = evaluator.limited(loop, data.holdout)
-        plants = nominal
-        if stages is not None:
-            plants = evaluator.limited(loop, data.holdout, stages, stages)
-        (error,), errors = _errors(nominal, driven), _errors(plants, driven)
+        (error,) = _errors(held_out.nominal, driven)
+        plants = held_out.perturbed
         peak = np.inf
         if PEAK in case.study.limits:
-            peak = float(np.max(worst_by_plant([PEAK], plants)[PEAK]))
+            peak = np.max(worst_by_plant([PEAK], plants or held_out.nominal)[PEAK])
         found[name] = Beside(
             nominal_rms_um=number(error),
-            **({} if stages is None else _of_plants(errors)),
+            **({} if plants is None else _of_plants(_errors(plants, driven))),
             sensitivity_peak=number(peak),
         )
     return found
+
+
+def _with_controller(loop: Feedback, controller: Any) -> Feedback:
+    return Feedback(controller, loop.plant, loop.actuator, loop.sensor)
 
 
 def _of_plants(errors: np.ndarray) -> dict[str, Any]:

@@ -99,11 +99,6 @@ class Evaluator:
             if CONSTRAINTS[name].source in ("tracking", "extremes")
         ]
 
-    def run_figures(self, loop: Feedback, signals: Signals) -> LoopFigures:
-        """Return the figures of ``limits_on_runs`` on the plant of ``loop``."""
-        tracking, extremes = self._runs(loop, signals, None)
-        return LoopFigures(tracking, extremes, None, None, dt=self._case.study.dt)
-
     def limited(
         self,
         loop: Feedback,

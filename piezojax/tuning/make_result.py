@@ -16,6 +16,7 @@ from ..solve.search_state import SearchState
 from ..study import Case
 from .data import Data
 from .evaluator import Evaluator
+from .held_out import HeldOut
 from .level_stages import levels_of
 from .model_alarms import unchecked
 from .objective import Objective
@@ -34,16 +35,16 @@ def make_result(
     data: Data,
     evaluator: Evaluator,
     before: TrackingFigures,
-    after: Feedback,
+    loops: Mapping[str, HeldOut],
     search: SearchState,
     clock: Clock,
     kept: dict[str, ConstraintOutcome],
     front: list[FrontPoint] | None,
 ) -> Result:
-    """Return the Result of ``search``, whose best gains are those of ``after``.
+    """Return the Result of ``search``.
 
-    ``before`` are the tuning figures of the study's own gains, ``kept`` the outcomes of
-    the limits while tuning.
+    ``before`` are the tuning figures of the study's own gains. ``loops`` are those of
+    ``held_out_loops``, ``kept`` the outcomes of the limits while tuning.
     """
     driven = np.array([trace.driven for trace in data.traces])
     tuned_on = np.arange(len(data.traces)) < data.tuned
@@ -58,12 +59,12 @@ def make_result(
             scores_of(figures, ~driven),
         )
 
-    on_holdout = [evaluator.figures(loop, data.holdout) for loop in (case.loop, after)]
-    holdout_before, unseen_before, coupling_before = split(on_holdout[0])
-    holdout, unseen_after, coupling = split(on_holdout[1])
+    start, best = loops["before"], loops["tuned"]
+    holdout_before, unseen_before, coupling_before = split(_nominal(start))
+    holdout, unseen_after, coupling = split(_nominal(best))
     tuned = driven[: data.tuned]
     names = data.names[: data.tuned]
-    after_scores = _chosen(evaluator.figures(after, data.tuning), names, tuned)
+    after_scores = _chosen(evaluator.figures(best.loop, data.tuning), names, tuned)
     unit = np.asarray(search.unit)
     values = case.space.from_unit(as_array(unit))
     sides = zip(case.space.paths, map(_side, unit), strict=True)
@@ -88,10 +89,10 @@ def make_result(
         holdout_constraints=_outcomes(
             evaluator.limits_on_runs,
             evaluator.limits,
-            evaluator.run_figures(after, data.holdout),
+            best.nominal,
         ),
         front=front,
-        perturbed=_perturbed(case, data, evaluator, case.loop, after),
+        perturbed=_perturbed(start, best, driven, case.study.limits),
         units={trace.name: trace.unit for trace in data.traces},
         gain_units={path: case.unit(path) for path in case.space.paths},
         gain_steps={
@@ -121,18 +122,17 @@ EDGE = 1e-2
 _VERSIONED = ("piezojax", "jax", "jaxlib", "optimistix", "jaxopt", "equinox", "numpy")
 
 
+def _nominal(held_out: HeldOut) -> TrackingFigures:
+    """Return the figures [traces, draws] on the nominal plant."""
+    return jax.tree.map(lambda x: x[0], held_out.nominal.tracking)
+
+
 def _perturbed(
-    case: Case, data: Data, evaluator: Evaluator, before: Feedback, after: Feedback
+    before: HeldOut, after: HeldOut, driven: np.ndarray, limits: Mapping[str, float]
 ) -> Perturbed | None:
-    stages = case.ensemble.stages("holdout") if case.ensemble else None
-    if stages is None:
+    if before.perturbed is None or after.perturbed is None:
         return None
-    driven = np.array([trace.driven for trace in data.traces])
-    figures = [
-        evaluator.limited(loop, data.holdout, stages, stages)
-        for loop in (before, after)
-    ]
-    return Perturbed.of(figures[0], figures[1], driven, case.study.limits)
+    return Perturbed.of(before.perturbed, after.perturbed, driven, limits)
 
 
 def constraint_outcomes(

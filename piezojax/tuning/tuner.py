@@ -18,6 +18,7 @@ from .data import judging, make_data
 from .device_alarms import device_alarms
 from .evaluator import Evaluator
 from .front import trace_front
+from .held_out import held_out_loops
 from .limited_search import search_within_limits
 from .make_objective import make_objective
 from .make_result import constraint_outcomes, make_result
@@ -79,26 +80,28 @@ def _tune(
     )
 
     after = space.put(case.loop, as_array(search.unit))
+    loops = held_out_loops(case, evaluator, data, after)
     try:
         front, kept = None, constraint_outcomes(objective, evaluator, after)
         if table.pareto is not None and strategy and search.status != "interrupted":
             front = trace_front(objective, case, search, strategy, evaluator, progress)
         progress.stage("evaluating on held-out noise")
         data = judging(data, case, after)
+        loops = held_out_loops(case, evaluator, data, after)
         result = make_result(
-            case, data, evaluator, before, after, search, clock, kept, front
+            case, data, evaluator, before, loops, search, clock, kept, front
         )
     except KeyboardInterrupt:
         # Keep the gains; only a second interrupt ends this evaluation too.
         search.status = "interrupted"
         result = make_result(
-            case, data, evaluator, before, after, search, clock, {}, None
+            case, data, evaluator, before, loops, search, clock, {}, None
         )
     try:
         result.sliding_before, result.sliding = (
             sliding_share(loop, data, evaluator.start) for loop in (case.loop, after)
         )
-        result.beside = figures_beside(case, data, evaluator, after, progress)
+        result.beside = figures_beside(case, data, loops, progress)
         note = tip_note(case, after, data, evaluator.start)
         result.warnings += [note] if note else []
     except KeyboardInterrupt:

@@ -19,6 +19,7 @@ from piezojax.study import read
 from piezojax.tuning.beside import figures_beside
 from piezojax.tuning.data import make_data
 from piezojax.tuning.evaluator import Evaluator
+from piezojax.tuning.held_out import held_out_loops
 
 RULE = {"catalog": "p753_feedforward_simc_pi"}
 BESIDE = {
@@ -63,8 +64,8 @@ def written(folder, **changes):
 def found_of(path):
     case = read(path)
     data = make_data(case)
-    evaluator = Evaluator(Clock(), case)
-    return case, data, figures_beside(case, data, evaluator, case.loop, Silent())
+    loops = held_out_loops(case, Evaluator(Clock(), case), data, case.loop)
+    return case, data, figures_beside(case, data, loops, Silent())
 
 
 @pytest.fixture(scope="module")
