@@ -105,7 +105,8 @@ def equivalent_control(
         rise = rise - weight * past
     moved = (rise / dt, *velocities)[: len(velocities)]
     following = derivatives(position + rise, moved, dt)
-    return -sliding(surface, following) / drive(model, surface, dt)
+    # A quotient of gains is computed once in a scan, one of signals in every step.
+    return -(1.0 / drive(model, surface, dt)) * sliding(surface, following)
 
 
 def inverted(model: ARMA, gain: Scalar, v: Scalar, outputs: Iterable[Scalar]) -> Scalar:

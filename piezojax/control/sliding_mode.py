@@ -121,8 +121,9 @@ class SlidingMode(System):
         slope = motion.velocity - (references[0] - references[1]) / dt
         velocities = (slope, *state.velocities)[: order - 1]
         s = sliding(self.surface, derivatives(error, velocities, dt))
-        shortfall = (input.applied - state.outputs[0]) / gain
-        driven = self.law.driven(state.law, shortfall / self.model.moving[0])
+        shortfall = input.applied - state.outputs[0]
+        per_output = 1.0 / (gain * self.model.moving[0])
+        driven = self.law.driven(state.law, per_output * shortfall)
         law, switching = self.law.step(driven, s)
         v = (
             feedforward(self.model, input.next_reference, references)
