@@ -24,6 +24,7 @@ from piezojax.study.schema import AxesTable
 from piezojax.tuning.data import make_data
 from piezojax.tuning.make_result import _residual_notes
 from piezojax.tuning.response_margins import margins_on_response
+from piezojax.tuning.tuner import _model_alarms
 from piezojax.tuning.unexplained import residual_disturbances
 
 RATE, PERIOD = 1000.0, 200
@@ -148,6 +149,20 @@ def test_the_note_on_the_residual_has_the_unit_of_each_axis(case):
     )
     (note,) = _residual_notes(several)
     assert "leaves 0.125 um, 2.5 urad rms of its record unexplained" in note
+
+
+def test_the_alarms_of_a_fit_are_those_of_its_study_only(case):
+    about = case.plant_about.model_copy(
+        update={"unsafe": ["the input is a time"], "error_bound": None}
+    )
+    fitted = dataclasses.replace(case, plant_about=about)
+    stability = stability_reports({"after": case.loop}, case.highest_reference)
+    first, second = _model_alarms(fitted, case.study.limits, stability)
+    assert first == "the input is a time"
+    assert "gives no bound on the error" in second
+    # A plant from a file was accepted when it was loaded.
+    loaded = dataclasses.replace(fitted, fit=None)
+    assert _model_alarms(loaded, case.study.limits, stability) == []
 
 
 def test_a_residual_of_another_model_is_refused(case, tmp_path):

@@ -13,6 +13,7 @@ from oracles import published, transfer
 import piezojax as pj
 from piezojax.analysis.stability import stability_reports
 from piezojax.analysis.stability.conserved import LinearLoop
+from piezojax.analysis.stability.crossings import roots
 from piezojax.analysis.stability.margins import linear_loop, report_of
 from piezojax.catalog import p753
 from piezojax.core.feedback import LoopInput
@@ -326,3 +327,19 @@ def test_curves_of_several_axes_equal_those_of_each_axis():
     each = [np.abs(1.0 / (1.0 + written(f"pid, {n}")(z))) for n in ("integral", "all")]
     np.testing.assert_allclose(curves.each, each, rtol=1e-5)
     np.testing.assert_allclose(curves.largest, np.max(each, axis=0), rtol=1e-5)
+
+
+def test_roots_lie_where_the_function_is_zero():
+    grid = np.linspace(-2.0, 2.0, 8)
+    found = roots(lambda x: x**3 - x, grid, grid**3 - grid)
+    assert sorted(found) == pytest.approx([-1.0, 0.0, 1.0], abs=1e-12)
+    on_the_grid = np.array([0.0, 1.0, 2.0])
+    assert list(roots(lambda x: x - 1.0, on_the_grid, on_the_grid - 1.0)) == [1.0]
+
+
+@pytest.mark.parametrize(("offset", "nearest"), [(1.0, 0.0), (-1.5, 1.0)])
+def test_a_sign_due_to_rounding_gives_the_end_nearest_to_zero(offset, nearest):
+    """The values on the grid change sign, those of the function do not."""
+    grid = np.array([0.0, 1.0])
+    found = roots(lambda x: x + offset, grid, np.array([-1e-17, 1e-17]))
+    assert list(found) == [nearest]

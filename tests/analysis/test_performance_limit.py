@@ -17,6 +17,7 @@ from piezojax.analysis.limit import (
 )
 from piezojax.analysis.limit.limit_report import Curves
 from piezojax.analysis.limit.linear_plant import LinearPlant, linear_plant
+from piezojax.analysis.limit.performance import _shares
 from piezojax.analysis.limit.spectra import (
     ReferencePredictor,
     grid_size,
@@ -96,6 +97,10 @@ def test_curves_and_bandwidth_equal_the_known_spectra(linear):
         2.0 * np.pi * DT
     )
     curves = linear.curves
+    # all lines but those at 0 and at the Nyquist frequency
+    spacing = np.diff(curves.frequency)
+    assert spacing == pytest.approx(curves.frequency[0])
+    assert curves.frequency[-1] + curves.frequency[0] == pytest.approx(RATE / 2.0)
     for i, found in enumerate(linear.references.values()):
         assert found.bandwidth == pytest.approx(line, rel=0.15)
         # The lines of positive and negative frequency add up to the variance.
@@ -128,6 +133,14 @@ def test_errors_and_shares_equal_those_of_the_loop(linear, disturbance):
             assert shares.predicted == pytest.approx(expected, rel=0.05)
             assert found.largest_excess == "predicted"
         assert found.ratio > NEAR
+
+
+def test_shares_that_exceed_the_error_are_those_of_no_linear_loop():
+    found = _shares(1.0, 0.25, 0.36)
+    assert (found.noise, found.unpredicted) == (0.5, 0.6)
+    assert found.predicted == pytest.approx(np.sqrt(0.39))
+    assert _shares(1.0, 0.9, 0.5).predicted == 0.0
+    assert _shares(1.0, 0.9, 0.6) is None
 
 
 def test_a_better_controller_is_closer_to_the_limit(linear, disturbance):

@@ -1,13 +1,16 @@
 """The modules with sampled mutants, and the fast tests of each."""
 
-_MARGINS = ("tests/analysis/test_margins.py",)
+_AXES = ("tests/analysis/test_multi_axis_margins.py",)
+_MARGINS = ("tests/analysis/test_margins.py", *_AXES)
 _LIMIT = (
     "tests/analysis/test_performance_limit.py",
     "tests/analysis/test_wiener.py",
     "tests/analysis/test_verification.py",
 )
+_PLANTS = ("tests/test_plants_of_studies.py",)
 _RESULTS = ("tests/tuning/test_alarms.py", "tests/tuning/test_tuner.py")
-_STUDY = ("tests/test_study.py",)
+_STUDY = ("tests/test_study.py", "tests/test_study_hardware.py")
+_SWEPT = ("tests/sweeping/test_plan.py",)
 _SUMMARIES = ("tests/tuning/test_result.py",)
 
 MODULES = {
@@ -23,9 +26,9 @@ MODULES = {
         "tests/tuning/test_axes.py",
     ),
     "tuning/result.py": (*_SUMMARIES, *_RESULTS),
-    "tuning/make_result.py": (*_RESULTS, "tests/test_plants_of_studies.py"),
-    "tuning/tuner.py": _RESULTS[1:],
-    "study/case.py": (*_STUDY, "tests/tuning/test_beside.py"),
+    "tuning/make_result.py": (*_RESULTS, *_PLANTS),
+    "tuning/tuner.py": (*_PLANTS, "tests/tuning/test_tuner.py"),
+    "study/case.py": (*_STUDY, "tests/tuning/test_beside.py", *_SWEPT),
     "study/parameters.py": _STUDY,
     "study/schema.py": _STUDY,
     "analysis/stroke.py": ("tests/analysis/test_stroke.py",),
@@ -35,9 +38,7 @@ MODULES = {
     "analysis/stability/differentiable.py": (
         "tests/analysis/test_differentiable_margins.py",
     ),
-    "analysis/stability/axes_margins.py": (
-        "tests/analysis/test_multi_axis_margins.py",
-    ),
+    "analysis/stability/axes_margins.py": _AXES,
     "analysis/limit/performance.py": _LIMIT,
     "analysis/limit/spectra.py": _LIMIT,
     "analysis/limit/wiener.py": _LIMIT,
