@@ -22,8 +22,8 @@ MODULES = {
     ),
     "tuning/reach.py": ("tests/tuning/test_reach.py", "-k", "not shipped"),
     "tuning/objective.py": (
-        *("tests/tuning/test_data.py", "tests/tuning/test_robust.py"),
-        "tests/tuning/test_axes.py",
+        *("tests/tuning/test_objective.py", "tests/tuning/test_data.py"),
+        *("tests/tuning/test_robust.py", "tests/tuning/test_tuner.py"),
     ),
     "tuning/result.py": (*_SUMMARIES, *_RESULTS),
     "tuning/make_result.py": (*_RESULTS, *_PLANTS),
