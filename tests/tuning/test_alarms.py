@@ -15,7 +15,7 @@ from piezojax.analysis.stability.assess import AxesStability
 from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
 from piezojax.cli.tune import main
 from piezojax.core.files import write_json
-from piezojax.tuning.alarms import alarms_of
+from piezojax.tuning.alarms import alarms_of, exact_peak
 from piezojax.tuning.result import ConstraintOutcome, Perturbed, Result, Scores
 
 LIMITS = {"sensitivity_peak": 2.0, "delay_margin": 1.0}
@@ -92,6 +92,48 @@ def test_safe_gains_raise_no_alarm():
     # The margins of the search differ from the exact ones by less than 1 %.
     exact = report_of(integrator(0.2)).sensitivity_peak
     assert alarms(stability=reports(0.2), limits={"sensitivity_peak": exact}) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "figure", "worse"),
+    [
+        ("sensitivity_peak", "sensitivity_peak", 1.0),
+        ("delay_margin", "delay_margin_samples", -1.0),
+        ("gain_margin", "gain_margin_dB", -1.0),
+        ("phase_margin", "phase_margin_deg", -1.0),
+        ("disk_margin", "disk_margin", -1.0),
+    ],
+)
+def test_an_exact_margin_may_miss_its_limit_by_one_percent(name, figure, worse):
+    value = getattr(report_of(integrator(0.3)), figure)
+    near, far = (value / (1.0 + worse * miss) for miss in (0.009, 0.011))
+    assert alarms(stability=reports(0.3), limits={name: near}) == []
+    (alarm,) = alarms(stability=reports(0.3), limits={name: far})
+    assert alarm.startswith(f"{name} is ")
+
+
+def test_a_limit_on_the_hold_out_may_be_missed_by_five_percent():
+    for values, count in (([52.4], 0), ([52.5], 0), ([52.6], 1)):
+        found = {"effort": outcome("effort", values, 50.0)}
+        assert len(alarms(changed(holdout_constraints=found))) == count
+
+
+def test_the_exact_peak_is_infinite_for_an_unstable_or_unknown_loop():
+    assert exact_peak(reports(0.3)) == report_of(integrator(0.3)).sensitivity_peak
+    assert exact_peak(reports(2.0)) == np.inf
+    assert exact_peak(StabilityReports()) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("alarms", "heading"),
+    [
+        ([], "a lag"),
+        (["it rings"], "UNSAFE, an alarm: a lag"),
+        (["it rings", "it rails"], "UNSAFE, 2 alarms: a lag"),
+    ],
+)
+def test_the_heading_counts_the_alarms(alarms, heading):
+    assert changed(title="a lag", alarms=alarms).heading == heading
 
 
 @pytest.mark.parametrize(

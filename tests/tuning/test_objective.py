@@ -11,7 +11,7 @@ from piezojax.core.metrics import TrackingFigures
 from piezojax.solve.problem import FAILED_LOSS
 from piezojax.study import Study, build
 from piezojax.tuning.data import make_data
-from piezojax.tuning.objective import Objective
+from piezojax.tuning.objective import Objective, StepTest
 
 STUDY = {
     "title": "integral action on a lag",
@@ -112,6 +112,19 @@ def test_lanes_and_constraints_are_counted(objective):
     found = limited.verdict(jnp.array([0.5])).violations
     # The loop has one plant; the scale was given for PLANTS.
     assert found.shape == (1,)
+
+
+def test_limits_on_steps_use_the_step_test(objective):
+    unit, ends = jnp.array([0.8]), jnp.array([[2.0, 4.0], [4.0, 2.0]])
+    test = StepTest(ends, jnp.array(0.01), 400, 5e-5)
+    limited = dataclasses.replace(objective, step_test=test).with_limits(
+        {"rise_time": 1e-3}
+    )
+    rises = np.asarray(limited.figures(unit).steps.rise_time)
+    assert rises.shape == (1, 2)
+    found = limited.verdict(unit).violations
+    np.testing.assert_allclose(found, np.log(rises.max() / 1e-3), rtol=1e-9)
+    assert objective.figures(unit).steps is None
 
 
 @pytest.mark.parametrize("limits", [{}, {"effort": 1e-3}])
