@@ -17,6 +17,7 @@ from ..core.about import About
 from ..core.arrays import as_array
 from ..core.feedback import Feedback, Observation
 from ..core.paths import declared, get, replace, static_fields
+from ..core.progress import Progress, Silent
 from ..core.serial import from_data, read_about
 from ..core.serial import load as load_system
 from ..core.space import Space
@@ -101,10 +102,16 @@ class Case:
         return "" if self.study.axes and lengths else known.unit
 
 
-def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
+def build(
+    study: Study,
+    path: str | Path,
+    seed: int | None = None,
+    progress: Progress | None = None,
+) -> Case:
     """Build the Case of ``study``; ``seed`` replaces the seed of the study.
 
-    The files that the study names lie beside ``path``. Raises ValueError: one line with
+    The files that the study names lie beside ``path``. ``progress`` receives that of
+    the fit of a plant. Raises ValueError: one line with
     the key, the value and the allowed values.
     """
     path = Path(path)
@@ -112,7 +119,9 @@ def build(study: Study, path: str | Path, seed: int | None = None) -> Case:
         study = study.model_copy(update={"seed": seed})
     trajectories = read_trajectories(study, path.parent)
     study, measured = _with_measured_noise(study, path.parent)
-    plant, about, fit, response, notes_of_plant = _plant(study, path.parent)
+    plant, about, fit, response, notes_of_plant = _plant(
+        study, path.parent, progress or Silent()
+    )
     zero = per_axis(study, lambda axis: as_array(0.0))
     _check_role(plant, zero, "plant", "a voltage to a displacement")
     amplifier = make_amplifier(study)
@@ -222,7 +231,7 @@ _FITTED = "record", "records", "response"
 """Keys of a plant that is fitted in the study."""
 
 
-def _plant(study: Study, folder: Path) -> _Plant:
+def _plant(study: Study, folder: Path, progress: Progress) -> _Plant:
     """Return the plant of ``study``, whose files lie in ``folder``."""
     table = study.plant
     given = [key for key in _FITTED if key in table]
@@ -238,7 +247,7 @@ def _plant(study: Study, folder: Path) -> _Plant:
         model = plant_of_response(table, study, folder)
         notes = [f"plant.response: {model.report.found}", *model.report.notes]
         return _Plant(model.system, model.about, None, model, notes)
-    fit, about, notes = fitted_plant(table, study, folder)
+    fit, about, notes = fitted_plant(table, study, folder, progress)
     return _Plant(on_axes(fit.system, study), about, fit, None, notes)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..core.about import About
 from ..core.arrays import as_array
 from ..core.axes import Packed
+from ..core.progress import Progress
 from ..core.system import System, accepts, rest_output
 from ..identification import (
     Fit,
@@ -28,7 +29,7 @@ from .tables import validated
 
 
 def fitted_plant(
-    table: Mapping[str, Any], study: Study, folder: Path
+    table: Mapping[str, Any], study: Study, folder: Path, progress: Progress
 ) -> tuple[Fit, About, Sequence[str]]:
     """Return the fit of the plant ``table``, its origin, and the notes of its check.
 
@@ -56,6 +57,7 @@ def fitted_plant(
             validate=validate_on,
             test=test,
             options=description.options,
+            progress=progress,
         )
         fit = ranking.best
     else:
@@ -66,6 +68,7 @@ def fitted_plant(
             train=train,
             validate=validate_on,
             options=description.options,
+            progress=progress,
         )
     if not others:
         return fit, fit.about, ()
