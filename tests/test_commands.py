@@ -35,7 +35,7 @@ from piezojax.study import read
 
 COMMANDS = {
     name: importlib.import_module(f"piezojax.cli.{name}").main
-    for name in ("tune", "identify", "validate", "export", "reproduce")
+    for name in ("tune", "identify", "validate", "export", "start", "reproduce")
 }
 PNG = b"\x89PNG\r\n\x1a\n"
 STUDY = {
@@ -169,6 +169,7 @@ REFUSED = {
     "sweep": ["nowhere.csv"],
     "validate": ["nowhere.json", "nowhere.csv"],
     "export": ["nowhere.toml"],
+    "start": ["nowhere.csv", "--yes"],
     "reproduce": ["--table", "9-9"],
 }
 """Arguments that each command refuses."""

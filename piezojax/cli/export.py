@@ -1,9 +1,11 @@
 """``python -m piezojax.export FILE --out DIR``."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from rich.console import Console
 
 from ..core.files import numbered_folder
 from .command import RESULTS, Command, common, print_alarms, run
@@ -78,59 +80,93 @@ def main(
     """
 
     def body(console):
-        from ..core.files import read_model
-        from ..core.serial import load, read_about
-        from ..exporting import device_values, export, export_alarms
-        from ..exporting.exporter import REPORT
-        from ..exporting.judge import ExportReport
-        from ..report.device_table import device_table
-        from ..report.export_tables import print_judgement
-
-        path = next(
-            (source / file for file in SYSTEMS if (source / file).is_file()), source
-        )
-        about = read_about(path)
-        # `export` refuses alarms; its message names the option.
-        system = load(path, accept_unsafe=True)
-        folder = out or numbered_folder(RESULTS / f"{path.stem}_{to}")
-        runs = None
-        if to == "c" and about.study is not None:
-            try:
-                runs = _runs(study, path, about)
-            except ValueError as error:
-                if study is not None:
-                    raise
-                console.print(
-                    f"note: not judged in the simulated loop: {error}; name its study "
-                    "(--study)",
-                    soft_wrap=True,
-                )
-        files = export(
-            system,
-            folder,
+        export_file(
+            source,
+            console,
             to=to,
             name=name,
-            about=about,
-            limits=limits or None,
             precision=precision,
-            seed=seed or 0,
+            study=study,
+            limits=limits or None,
             before=before,
             accept_unsafe=accept_unsafe,
-            runs=runs,
+            out=out,
+            seed=seed or 0,
         )
-        print_alarms(console, export_alarms(system, about))
-        for file in files:
-            console.print(f"{file}", soft_wrap=True)
-        if to == "vendor":
-            console.print(device_table(device_values(system, before)))
-        if runs is not None:
-            print_judgement(
-                read_model(ExportReport, folder / REPORT, "is no report"), console
-            )
-        if to == "c":
-            console.print(f"test: make -C {folder} test", soft_wrap=True)
 
     run(quiet, body)
+
+
+def export_file(
+    source: Path,
+    console: Console,
+    *,
+    to: str = "c",
+    name: str | None = None,
+    precision: str = "double",
+    study: Path | None = None,
+    limits: Sequence[tuple[float, float]] | None = None,
+    before: Path | None = None,
+    accept_unsafe: bool = False,
+    out: Path | None = None,
+    seed: int = 0,
+    runs: "Runs | None" = None,
+) -> None:
+    """Export the System in the file or folder ``source`` and print the result.
+
+    ``runs`` are those of the study in which a controller in C is judged, by default
+    read from its file. The other arguments are the options of the command.
+    """
+    from ..core.files import read_model
+    from ..core.serial import load, read_about
+    from ..exporting import device_values, export, export_alarms
+    from ..exporting.exporter import REPORT
+    from ..exporting.judge import ExportReport
+    from ..report.device_table import device_table
+    from ..report.export_tables import print_judgement
+
+    path = next(
+        (source / file for file in SYSTEMS if (source / file).is_file()), source
+    )
+    about = read_about(path)
+    # `export` refuses alarms; its message names the option.
+    system = load(path, accept_unsafe=True)
+    folder = out or numbered_folder(RESULTS / f"{path.stem}_{to}")
+    if to == "c" and about.study is not None and runs is None:
+        try:
+            runs = _runs(study, path, about)
+        except ValueError as error:
+            if study is not None:
+                raise
+            console.print(
+                f"note: not judged in the simulated loop: {error}; name its study "
+                "(--study)",
+                soft_wrap=True,
+            )
+    files = export(
+        system,
+        folder,
+        to=to,
+        name=name,
+        about=about,
+        limits=limits,
+        precision=precision,
+        seed=seed,
+        before=before,
+        accept_unsafe=accept_unsafe,
+        runs=runs,
+    )
+    print_alarms(console, export_alarms(system, about))
+    for file in files:
+        console.print(f"{file}", soft_wrap=True)
+    if to == "vendor":
+        console.print(device_table(device_values(system, before)))
+    if runs is not None:
+        print_judgement(
+            read_model(ExportReport, folder / REPORT, "is no report"), console
+        )
+    if to == "c":
+        console.print(f"test: make -C {folder} test", soft_wrap=True)
 
 
 def _runs(named: Path | None, file: Path, about: "About") -> "Runs":

@@ -26,35 +26,56 @@ class SampleRange(click.ParamType):
         return slice(start, stop)
 
 
+_COLUMNS = {
+    "time": click.option("--time", help="Time column, by name or number from zero."),
+    "input": click.option(
+        "--input", default="0", show_default=True, help="Input column."
+    ),
+    "output": click.option(
+        "--output", default="1", show_default=True, help="Output column."
+    ),
+    "reference": click.option(
+        "--reference", help="Reference column of a record of a closed loop."
+    ),
+    "dither": click.option(
+        "--dither",
+        help="Column of the voltage added to the command of the controller.",
+    ),
+    "rate": click.option(
+        "--rate", type=float, help="Sampling rate, Hz, without a time column."
+    ),
+    "period": click.option(
+        "--period", type=int, help="Samples per period of a periodic input."
+    ),
+    "resample": click.option(
+        "--resample", type=float, help="Resample the record to this rate, Hz."
+    ),
+}
+
+_RECOGNISED = _COLUMNS | {
+    "time": click.option("--time", help="Time column (default: recognised by name)."),
+    "input": click.option(
+        "--input", help="Input column (default: the only one in V, mV or kV)."
+    ),
+    "output": click.option(
+        "--output", help="Output column (default: the only one in um, nm or mm)."
+    ),
+}
+
+
 def record_columns(function: Callable) -> Callable:
     """Add the options of ``read_record``."""
-    for option in reversed(
-        (
-            click.option("--time", help="Time column, by name or number from zero."),
-            click.option(
-                "--input", default="0", show_default=True, help="Input column."
-            ),
-            click.option(
-                "--output", default="1", show_default=True, help="Output column."
-            ),
-            click.option(
-                "--reference", help="Reference column of a record of a closed loop."
-            ),
-            click.option(
-                "--dither",
-                help="Column of the voltage added to the command of the controller.",
-            ),
-            click.option(
-                "--rate", type=float, help="Sampling rate, Hz, without a time column."
-            ),
-            click.option(
-                "--period", type=int, help="Samples per period of a periodic input."
-            ),
-            click.option(
-                "--resample", type=float, help="Resample the record to this rate, Hz."
-            ),
-        )
-    ):
+    return _with_options(function, _COLUMNS.values())
+
+
+def recognised_columns(function: Callable) -> Callable:
+    """Add the options of ``read_record`` for an open loop, without default columns."""
+    names = ("time", "input", "output", "rate", "resample")
+    return _with_options(function, [_RECOGNISED[name] for name in names])
+
+
+def _with_options(function: Callable, options: Iterable[Callable]) -> Callable:
+    for option in reversed([*options]):
         function = option(function)
     return function
 

@@ -22,6 +22,7 @@ from .terminal import Bar
 if TYPE_CHECKING:
     from ..tuning.baselines import Budget
     from ..tuning.outcome import Outcome
+    from ..tuning.result import Result
 
 
 @click.command(cls=Command)
@@ -61,18 +62,27 @@ def main(
                 raise ValueError("--baselines takes one study, not a comparison")
             _compare(paths, out, seed, console)
         else:
-            _tune(paths[0], out, seed, Budget() if baselines else None, console)
+            budget = Budget() if baselines else None
+            finish(tune_study(paths[0], out, seed, budget, console).result)
 
     run(quiet, body)
 
 
-def _tune(
+def finish(result: "Result") -> None:
+    """End the command if the search of ``result`` was interrupted or has alarms."""
+    if result.status == "interrupted":
+        exit_interrupted()
+    exit_unsafe(result.alarms)
+
+
+def tune_study(
     path: Path,
     out: Path | None,
     seed: int | None,
     baselines: "Budget | None",
     console: Console,
-) -> None:
+) -> "Outcome":
+    """Tune the study at ``path``, write and print the outcome, and return it."""
     from .. import study as studies
     from ..report.baseline_curves import (
         baselines_table,
@@ -104,7 +114,7 @@ def _tune(
         bar.stage(f"reading {path.name}")
         description = studies.load(path)
         with results_folder(out, path.stem) as folder:
-            case = studies.build(description, path, seed=seed)
+            case = studies.build(description, path, seed=seed, progress=bar)
             outcome = tune(case, baselines=baselines, progress=bar)
             bar.finish()
             bar.stage("drawing")
@@ -158,9 +168,7 @@ def _tune(
         f"results in {folder}",
         soft_wrap=True,
     )
-    if result.status == "interrupted":
-        exit_interrupted()
-    exit_unsafe(result.alarms)
+    return outcome
 
 
 def _compare(

@@ -17,7 +17,8 @@ _SYMBOLS = {
     **dict.fromkeys(("amp", "amps", "ampere", "a"), "A"),
 }
 
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Units of a time column, in s."""
 
 
 def unit_of(name: str, column: Column) -> str | None:
@@ -36,9 +37,9 @@ def _ascii(text: str) -> str:
 def seconds_of(name: str, column: Column) -> float:
     """Return the unit of a time column in s; raise ContentError if it is unknown."""
     unit = unit_of(name, column) or "s"
-    if unit not in _SECONDS:
+    if unit not in SECONDS:
         raise ContentError(
             f"time column {name!r} is in {unit!r}, an unknown unit; "
-            f"it must be one of {', '.join(_SECONDS)}"
+            f"it must be one of {', '.join(SECONDS)}"
         )
-    return _SECONDS[unit]
+    return SECONDS[unit]

@@ -1,0 +1,199 @@
+"""``python -m piezojax.start RECORD``: from a record to exported gains."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.console import Console
+
+from ..core.files import numbered_folder, write_text
+from .command import RESULTS, Command, common, print_alarms, run
+from .export import export_file
+from .records import print_columns, recognised_columns
+from .tune import finish, tune_study
+
+if TYPE_CHECKING:
+    from ..identification import Record
+    from ..study.first_study import Plan
+    from ..tuning.outcome import Outcome
+
+STUDY, TUNED, EXPORTED = "study.toml", "tuned", "controller"
+"""Names in the folder of a start: its study, and the folders of gains and of C."""
+
+INTERRUPTED = "interrupted"
+"""Status of a result whose search was interrupted."""
+
+QUESTIONS = {
+    "lower": "lower limit of the voltage [V]",
+    "upper": "upper limit of the voltage [V]",
+    "noise": "rms noise of the sensor [um]",
+    "frequency": "frequency of the slowest reference [Hz]",
+    "track": "references to track, with their frequencies in Hz",
+    "amplitude": "amplitude of the references, half of their range [um]",
+    "offset": "lowest value of the references [um]",
+    "controller": "controller to tune",
+}
+"""What a record cannot tell; the defaults are those of ``planned``."""
+
+
+@click.command(cls=Command)
+@click.argument("record", type=click.Path(path_type=Path))
+@click.option("--lower", type=float, help="Lower limit of the voltage, V.")
+@click.option("--upper", type=float, help="Upper limit of the voltage, V.")
+@click.option("--noise", type=float, help="RMS noise of the sensor, um.")
+@click.option("--frequency", type=float, help="Frequency of the slowest reference, Hz.")
+@click.option("--track", help="References to tune on, as SIN10,PWSW40.")
+@click.option("--amplitude", type=float, help="Half of the range of references, um.")
+@click.option("--offset", type=float, help="Lowest value of the references, um.")
+@click.option("--controller", help="Name of a design, as inversion_pid.")
+@click.option("--model", help="Model to fit; 'all' compares all  [auto]")
+@click.option(
+    "--check",
+    type=click.Path(path_type=Path),
+    help="Second record of the stage, which validates the model.",
+)
+@click.option("--yes", is_flag=True, help="Ask nothing: take defaults and options.")
+@recognised_columns
+@common
+def main(record, model, check, yes, out, seed, quiet, **given):
+    """Start from a RECORD of your stage: write its study, tune it and export the gains.
+
+    Limits, sensor noise and references are asked for, with defaults from the record;
+    each is also an option. The study lies in the new folder and runs alone. Gains with
+    an alarm are not exported. An interrupted start goes on with --out and its folder.
+
+    Exit status 3 means that the gains have an alarm, as for piezojax.tune.
+    """
+
+    def body(console):
+        from ..tuning.result import load_result
+
+        folder = out or numbered_folder(RESULTS / record.stem)
+        study = folder / STUDY
+        if study.is_file():
+            console.print(f"going on in {folder} with its {STUDY}", soft_wrap=True)
+        else:
+            _write_study(study, record, given, model, check, yes, seed, console)
+        tuned, outcome = _finished(folder), None
+        if tuned is None:
+            tuned = numbered_folder(folder / TUNED)
+            try:
+                outcome = tune_study(study, tuned, seed, None, console)
+            except KeyboardInterrupt:
+                console.print(_going_on(record, folder), soft_wrap=True)
+                raise
+        result = outcome.result if outcome else load_result(tuned)
+        if result.status == INTERRUPTED:
+            console.print(_going_on(record, folder), soft_wrap=True)
+            finish(result)
+        if outcome is None:
+            print_alarms(console, result.alarms)
+            console.print(f"tuned before: the gains are in {tuned}", soft_wrap=True)
+        if result.alarms:
+            console.print(
+                f"not exported because of the alarms; change {study}, or record again "
+                "as they say",
+                soft_wrap=True,
+            )
+        else:
+            _export(folder, tuned, outcome, console)
+        finish(result)
+
+    run(quiet, body)
+
+
+def _write_study(
+    study: Path,
+    record: Path,
+    given: dict[str, Any],
+    model: str | None,
+    check: Path | None,
+    yes: bool,
+    seed: int | None,
+    console: Console,
+) -> None:
+    """Ask what the ``record`` cannot tell, and write its first study."""
+    from ..core.files import fresh_folder
+    from ..identification import DEFAULT
+    from ..identification.records.recognise import recognised
+    from ..identification.records.record import read_record
+    from ..study.first_study import first_study, planned
+
+    asked = {name: given[name] for name in QUESTIONS}
+    columns = recognised(
+        record, {name: value for name, value in given.items() if name not in QUESTIONS}
+    )
+    loaded = read_record(record, **columns)
+    print_columns(console, [loaded])
+    in_units = loaded.in_units(("V",), ("um",))
+    plan = planned(in_units, asked) if yes else _asked(in_units, asked)
+    text = first_study(
+        plan,
+        record,
+        columns,
+        1.0 / loaded.dt,
+        folder=study.parent,
+        model=model or DEFAULT,
+        check=check,
+        seed=seed or 0,
+    )
+    fresh_folder(study.parent)
+    write_text(study, text)
+    for name, question in QUESTIONS.items():
+        console.print(f"{question}: {getattr(plan, name)}", soft_wrap=True)
+    console.print(f"wrote {study}", soft_wrap=True)
+
+
+def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
+    """Return the Plan of the answers to the questions that ``given`` leaves open."""
+    from ..study.first_study import planned
+
+    answers = dict(given)
+    for name, question in QUESTIONS.items():
+        if answers[name] is None:
+            default = getattr(planned(record, answers), name)
+            try:
+                answers[name] = click.prompt(question, default=default)
+            except click.Abort:
+                raise ValueError(
+                    f"no answer for the {question}: give it as --{name}, or --yes for "
+                    "all defaults"
+                ) from None
+    return planned(record, answers)
+
+
+def _finished(folder: Path) -> Path | None:
+    """Return the last folder of gains in ``folder`` whose search came to its end."""
+    from ..tuning.result import RESULT_FILE, load_result
+
+    found = [file.parent for file in sorted(folder.glob(f"{TUNED}*/{RESULT_FILE}"))]
+    ended = [each for each in found if load_result(each).status != INTERRUPTED]
+    return ended[-1] if ended else None
+
+
+def _going_on(record: Path, folder: Path) -> str:
+    return f"interrupted; to go on: python -m piezojax.start {record} --out {folder}"
+
+
+def _export(
+    folder: Path, tuned: Path, outcome: "Outcome | None", console: Console
+) -> None:
+    """Export the gains in ``tuned`` as C, unless that was done before."""
+    exported = folder / EXPORTED
+    if exported.is_dir() and any(exported.iterdir()):
+        console.print(f"exported before: {exported}", soft_wrap=True)
+        return
+    from ..tuning.exported_runs import make_runs
+
+    export_file(
+        tuned,
+        console,
+        study=folder / STUDY,
+        out=exported,
+        runs=make_runs(outcome.case) if outcome else None,
+    )
+    console.print(
+        f"done: gains and pictures in {tuned}, C code in {exported}, the study in "
+        f"{folder / STUDY}",
+        soft_wrap=True,
+    )

@@ -1,0 +1,82 @@
+"""Columns of a record by their units, and the noise of its sensor."""
+
+from math import comb
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.conversion import factor
+from .columns import Columns
+from .formats import read_columns
+from .record import Record
+from .sampled import is_clock
+from .units import SECONDS, unit_of
+
+_QUANTITIES = {"input": "V", "output": "um"}
+"""Unit of each role of a column, or one that can be converted to it."""
+
+_NOISE_ORDER = 3
+"""Order of the differences of the output that remove its motion."""
+
+_STRETCHES, _LEAST = 200, 64
+"""Most stretches of a record, of which the quietest show the noise, and least samples
+of each."""
+
+_QUIETEST = 0.1
+"""Share of the stretches that are at most as noisy as the estimate."""
+
+
+def recognised(path: Path, given: dict[str, Any]) -> dict[str, Any]:
+    """Return the columns ``time``, ``input`` and ``output`` of the file at ``path``.
+
+    Columns that are None in ``given`` are recognised: time by its name or unit, input
+    as the only column in V (or mV, kV), output as the only one in um (or nm, mm). Of
+    two signals without such units the first is the input. The other keys of ``given``
+    are returned as they are. Raises ValueError, listing the columns with their units,
+    if a column is not the only one of its kind.
+    """
+    columns = read_columns(path)
+    found = dict(given)
+    clocks = [name for name, column in columns.items() if is_clock(name, column)]
+    if found.get("time") is None and found.get("rate") is None:
+        counts = [n for n in clocks if (unit_of(n, columns[n]) or "s") in SECONDS]
+        found["time"] = next(iter(counts), None)
+    signals = [name for name in columns if name not in (*clocks, found.get("time"))]
+    units = {name: unit_of(name, columns[name]) for name in signals}
+    for role, unit in _QUANTITIES.items():
+        if found.get(role) is not None:
+            continue
+        free = [name for name in signals if name not in found.values()]
+        of_kind = [n for n in free if units[n] and factor(str(units[n]), unit)]
+        if not of_kind and len(signals) == 2 and not any(units.values()):
+            of_kind = [signals[list(_QUANTITIES).index(role)]]
+        if len(of_kind) != 1:
+            raise ValueError(
+                f"{path.name}: {len(of_kind)} columns are in {unit} or a multiple of "
+                f"it; name the {role} with --{role}: there are {_listed(columns)}"
+            )
+        found[role] = of_kind[0]
+    return found
+
+
+def _listed(columns: Columns) -> str:
+    units = {name: unit_of(name, column) for name, column in columns.items()}
+    return ", ".join(f"{n} [{u}]" if u else f"{n} (no unit)" for n, u in units.items())
+
+
+def noise_rms(record: Record) -> float:
+    """Return the rms noise of the only output of ``record``, in its unit.
+
+    White noise is assumed: the third difference of the output removes slow motion and
+    has 20 times the variance of the noise. The estimate is that of the quietest tenth
+    of the record, in which the stage rests or moves slowly; it contains the rounding of
+    a converter. A sensor with a low-pass, or a stage that never moves slowly, makes it
+    false.
+    """
+    moved = np.diff(record.output, _NOISE_ORDER)
+    size = min(max(moved.size // _STRETCHES, _LEAST), moved.size)
+    whole = moved[: moved.size // size * size].reshape(-1, size)
+    scale = np.sqrt(comb(2 * _NOISE_ORDER, _NOISE_ORDER))
+    rms = np.sqrt(np.mean(whole**2, axis=1)) / scale
+    return float(np.quantile(rms, _QUIETEST))

@@ -1,0 +1,329 @@
+"""``piezojax.start``: columns, defaults, the study that it writes, and its course."""
+
+import tomllib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from oracles import excitation, forty_stages
+
+from piezojax.cli import start
+from piezojax.identification import Record, read_record
+from piezojax.identification.records.recognise import noise_rms, recognised
+from piezojax.signals import signal, time_grid
+from piezojax.study import build, load
+from piezojax.study.first_study import Plan, first_study, planned
+from piezojax.tuning.result import Result, Scores
+
+NONE = {"time": None, "input": None, "output": None, "rate": None}
+
+
+def lag_record(samples=3000, noise=0.01):
+    """Return time, voltage and displacement of a lag of 0.1 um/V at 1 kHz."""
+    random = np.random.default_rng(2)
+    time = 1e-3 * np.arange(samples)
+    drive = 40.0 - 30.0 * np.cos(2.0 * np.pi * 2.0 * time * (1.0 + time))
+    drive += 5.0 * np.repeat(random.choice([-1.0, 1.0], samples // 10), 10)
+    drive[-500:] = drive[-500]
+    moved = np.zeros(samples)
+    for k in range(1, samples):
+        moved[k] = 0.8 * moved[k - 1] + 0.02 * drive[k - 1]
+    return time, drive, moved + noise * random.standard_normal(samples)
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory):
+    path = tmp_path_factory.mktemp("bench") / "record.csv"
+    np.savetxt(
+        path,
+        np.c_[lag_record()],
+        delimiter=",",
+        header="time_s,command_V,sensor_um",
+        comments="",
+    )
+    return path
+
+
+def table(tmp_path, header, *rows, name="record.csv"):
+    path = tmp_path / name
+    values = np.arange(12.0).reshape(4, 3)
+    lines = [*rows, *(",".join(map(str, row)) for row in values)]
+    path.write_text("\n".join([header, *lines]), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "found"),
+    [
+        ("time_s,input_V,position_um", (), ("time_s", "input_V", "position_um")),
+        ("position_nm,drive_mV,time_ms", (), ("time_ms", "drive_mV", "position_nm")),
+        (
+            "Time (s),Sensor [um],Drive [V]",
+            (),
+            ("Time (s)", "Drive [V]", "Sensor [um]"),
+        ),
+        ("time,first,second", (), ("time", "first", "second")),
+        ("X,CH1,CH2", ("Sequence,V,um",), (None, "CH1", "CH2")),
+    ],
+)
+def test_columns_are_recognised(tmp_path, header, rows, found):
+    columns = recognised(table(tmp_path, header, *rows), dict(NONE))
+    assert tuple(columns[role] for role in ("time", "input", "output")) == found
+
+
+def test_given_columns_are_kept(tmp_path):
+    path = table(tmp_path, "time_s,a_um,b_um")
+    given = NONE | {"input": "a_um", "rate": 5.0, "resample": 2.0}
+    assert recognised(path, given) == {
+        "time": None,
+        "input": "a_um",
+        "output": "b_um",
+        "rate": 5.0,
+        "resample": 2.0,
+    }
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        (
+            "time_s,command_V,monitor_V",
+            "2 columns are in V or a multiple of it; name the input with --input: "
+            r"there are time_s \[s\], command_V \[V\], monitor_V \[V\]",
+        ),
+        ("time_s,a_V,b", r"0 columns are in um .* --output: .* b \(no unit\)"),
+        ("one,two,three", "0 columns are in V"),
+    ],
+)
+def test_ambiguous_columns_are_refused(tmp_path, header, message):
+    with pytest.raises(ValueError, match=message):
+        recognised(table(tmp_path, header), dict(NONE))
+
+
+@pytest.mark.parametrize("number", [4, 10, 24, 38])
+def test_the_noise_of_a_moving_stage_is_measured(number):
+    stage = forty_stages.stage(number)
+    record = Record(*excitation.record(stage), stage.dt)
+    assert noise_rms(record) == pytest.approx(stage.parameters.noise, rel=0.15)
+
+
+def test_the_noise_of_a_smooth_record_is_that_of_its_converter():
+    time = np.arange(0.0, 1.0, 1e-4)
+    sine = 10.0 * np.sin(2.0 * np.pi * 3.0 * time)
+    assert noise_rms(Record(sine, sine, 1e-4)) < 1e-8
+    rounded = Record(sine, np.round(sine / 0.02) * 0.02, 1e-4)
+    # A constant code has no noise; a changing one has at most that of its steps.
+    assert noise_rms(rounded) < 0.02
+
+
+def test_defaults_lie_within_the_record(record):
+    found = planned(read_record(record, time="time_s", input=1, output=2), {})
+    _, drive, moved = lag_record()
+    assert (found.lower, found.upper) == pytest.approx(
+        (drive.min(), drive.max()), rel=1e-3
+    )
+    assert found.noise == pytest.approx(0.01, rel=0.15)
+    assert (found.frequency, found.track) == (1.0, "SIN1,PWSW4")
+    reference = signal("SIN1", time_grid(2.0, 1e3), found.amplitude, found.offset)
+    middle = 0.5 * (moved.min() + moved.max())
+    assert np.mean([reference.min(), reference.max()]) == pytest.approx(
+        middle, abs=0.01
+    )
+    assert np.ptp(reference) == pytest.approx(0.4 * np.ptp(moved), rel=1e-3)
+
+
+def test_answers_replace_defaults(record):
+    loaded = read_record(record, time="time_s", input=1, output=2)
+    found = planned(loaded, {"frequency": 7.0, "upper": 50.0, "noise": None})
+    assert (found.frequency, found.track) == (7.0, "SIN7,PWSW28")
+    assert found.upper == 50.0
+    with pytest.raises(ValueError, match="the frequency is 0 Hz; it must be above 0"):
+        planned(loaded, {"frequency": 0.0})
+    with pytest.raises(ValueError, match="'pid' is unknown; there are inversion_slid"):
+        planned(loaded, {"controller": "pid"})
+
+
+def test_the_study_holds_the_answers_and_fits_the_record(record, tmp_path):
+    plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2, SCAN4", 1.0, 2.0, "inversion_pid")
+    columns = {"time": "time_s", "input": "command_V", "output": "sensor_um"}
+    text = first_study(plan, record, columns, 1e3, folder=tmp_path, model="lag", seed=4)
+    path = tmp_path / "study.toml"
+    path.write_text(text, encoding="utf-8")
+    study = load(path)
+    assert study.seed == 4
+    assert (study.actuator.lower, study.actuator.upper) == (0.0, 80.0)
+    assert study.references.tune == ("SIN2", "SCAN4")
+    # SCAN4 is tuned on, so it is not unseen.
+    assert study.references.unseen == ("SIN4",)
+    assert (study.references.duration, study.references.settle) == (1.5, 0.5)
+    stages = []
+    progress = SimpleNamespace(
+        stage=lambda text, steps=0: stages.append(text), advance=lambda *_: None
+    )
+    case = build(study, path, progress=progress)
+    assert case.fit.record.source == "record.csv"
+    assert "controller.feedback.integral" in case.space.paths
+    # The fit of the plant reports its progress.
+    assert any(text.startswith("fitting from") for text in stages)
+
+
+@pytest.mark.parametrize("title", ['"quoted" \\ back', "um ä µ"])
+def test_names_of_files_are_quoted(tmp_path, title):
+    plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0)
+    text = first_study(plan, tmp_path / title, {}, 1e3, folder=tmp_path)
+    assert tomllib.loads(text)["plant"]["record"] == title
+
+
+_SCORES = Scores(
+    per_reference_rms_um={},
+    geomean_rms_um=1.0,
+    worst_rms_um=1.0,
+    peak_error_um={},
+    saturated_percent={},
+    peak_voltage_V=1.0,
+)
+
+RESULT = Result(
+    **dict.fromkeys(("study", "title", "method"), "none"),
+    status="converged",
+    **dict.fromkeys(("before", "after", "holdout_before", "holdout"), _SCORES),
+    **dict.fromkeys(("unseen_before", "unseen")),
+    **dict.fromkeys(("evaluations", "compile_s", "wall_s", "seed"), 0),
+    gains={},
+    start={},
+    at_bound=[],
+    warnings=[],
+    history=[],
+    versions={},
+)
+
+
+class Verbs:
+    """Stand-ins of tune and export that record their calls."""
+
+    def __init__(self, **result):
+        self.calls, self.found = [], result
+
+    def tune(self, study, out, seed, baselines, console):
+        self.calls.append(("tune", out.name))
+        if self.found.pop("stopped", False):
+            raise KeyboardInterrupt
+        result = RESULT.model_copy(update=self.found)
+        out.mkdir(parents=True)
+        (out / "result.json").write_text(result.model_dump_json(), encoding="utf-8")
+        return SimpleNamespace(result=result, case=None)
+
+    def export(self, source, console, *, study, out, runs):
+        self.calls.append(("export", source.name))
+        out.mkdir()
+        (out / "controller.c").touch()
+
+
+@pytest.fixture
+def run(monkeypatch, record, tmp_path):
+    """Return a start with stand-ins: exit status, output, calls of the verbs."""
+
+    def started(*options, answers=None, **result):
+        verbs = Verbs(**result)
+        monkeypatch.setattr(start, "tune_study", verbs.tune)
+        monkeypatch.setattr(start, "export_file", verbs.export)
+        monkeypatch.setattr(
+            "piezojax.tuning.exported_runs.make_runs", lambda case: None
+        )
+        out = ["--out", str(tmp_path / "out")]
+        found = CliRunner().invoke(
+            start.main, [str(record), *out, *options], input=answers
+        )
+        return found.exit_code, found.output, verbs.calls
+
+    return started
+
+
+def test_a_start_without_questions_tunes_and_exports(run, tmp_path):
+    status, output, calls = run("--yes", "--upper", "60")
+    assert status == 0, output
+    assert calls == [("tune", "tuned"), ("export", "tuned")]
+    assert "input 'command_V' from" in output
+    assert "upper limit of the voltage [V]: 60.0" in output
+    assert "done: gains and pictures in" in output
+    assert load(tmp_path / "out" / "study.toml").actuator.upper == 60.0
+
+
+def test_answers_are_asked_for_with_defaults(run, tmp_path):
+    answers = "\n80\n\n3\n\n0.5\n\ninversion_pid\n"
+    status, output, _ = run(answers=answers)
+    assert status == 0, output
+    assert "references to track, with their frequencies in Hz [SIN3,PWSW12]:" in output
+    study = load(tmp_path / "out" / "study.toml")
+    assert study.actuator.upper == 80.0
+    assert study.references.tune == ("SIN3", "PWSW12")
+    assert study.references.amplitude == 0.5
+    assert study.controller == {"design": "inversion_pid"}
+
+
+def test_without_an_answer_nothing_is_written(run, tmp_path):
+    status, output, calls = run(answers="1\n")
+    assert status == 1
+    assert "no answer for the upper limit of the voltage [V]: give it as --upper" in (
+        output
+    )
+    assert calls == []
+    assert not (tmp_path / "out").exists()
+
+
+def test_gains_with_an_alarm_are_not_exported(run):
+    status, output, calls = run("--yes", alarms=["it rings"])
+    assert status == 3
+    assert calls == [("tune", "tuned")]
+    assert "not exported because of the alarms" in output
+
+
+def test_an_interrupted_start_goes_on(run, tmp_path):
+    status, output, calls = run("--yes", stopped=True)
+    assert status == 130
+    assert calls == [("tune", "tuned")]
+    assert f"to go on: python -m piezojax.start {tmp_path}"[:40] in output
+    status, output, calls = run("--yes", status="interrupted")
+    assert status == 130
+    assert calls == [("tune", "tuned")]
+    assert "interrupted; to go on: python -m piezojax.start" in output
+    # The interrupted gains are kept; the search begins again beside them.
+    status, output, calls = run("--yes")
+    assert status == 0
+    assert f"going on in {tmp_path / 'out'} with its study.toml" in output
+    assert calls == [("tune", "tuned-2"), ("export", "tuned-2")]
+    status, output, calls = run()
+    assert (status, calls) == (0, [])
+    assert "tuned before: the gains are in" in output
+    assert "exported before:" in output
+
+
+def test_alarms_of_earlier_gains_are_printed_again(run):
+    run("--yes", alarms=["it rings"])
+    status, output, calls = run("--yes")
+    assert (status, calls) == (3, [])
+    assert "ALARM: it rings" in output
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--controller", "pid"), "'pid' is unknown; there are inversion_sliding_mode"),
+        (("--frequency", "-1"), "the frequency is -1 Hz; it must be above 0"),
+        (("--input", "none"), "input column 'none' is missing; there are time_s"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(run, tmp_path, options, message):
+    status, output, calls = run("--yes", *options)
+    assert (status, calls) == (1, [])
+    assert message in output.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_other_results_is_not_touched(run, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "notes.txt").touch()
+    status, output, calls = run("--yes")
+    assert (status, calls) == (1, [])
+    assert "already holds results; name a new folder" in output
