@@ -52,6 +52,11 @@ def test_figures_count_the_window(start):
         np.testing.assert_allclose(getattr(found, name), value, rtol=1e-12, atol=1e-15)
 
 
+def test_a_run_without_samples_saturates_nowhere():
+    metric = Tracking(0)
+    assert metric.result(metric.init()).saturated == 0.0
+
+
 def test_a_run_without_counted_samples_has_nan_figures():
     found = figures(Tracking(SAMPLES), record())
     assert all(np.isnan(found[:4]))
@@ -138,3 +143,5 @@ def test_the_root_has_slope_zero_at_zero():
     assert root(jnp.asarray(9.0)) == 3.0
     assert root(jnp.asarray(0.0)) == jax.grad(root)(0.0) == 0.0
     assert np.isnan(root(jnp.asarray(np.nan)))
+    # A difference of squares may be negative by rounding.
+    assert root(jnp.asarray(-1e-18)) == 0.0

@@ -9,7 +9,12 @@ _LIMIT = (
 )
 _PLANTS = ("tests/test_plants_of_studies.py",)
 _RESULTS = ("tests/tuning/test_alarms.py", "tests/tuning/test_tuner.py")
-_STUDY = ("tests/test_study.py", "tests/test_study_hardware.py")
+_STUDY = (
+    *("tests/test_study.py", "tests/test_study_hardware.py"),
+    "tests/tuning/test_axes.py::test_a_bad_study_is_refused",
+    "tests/tuning/test_robust.py::test_a_bad_study_is_refused",
+    "tests/tuning/test_goals.py::test_impossible_limits_are_refused",
+)
 _SWEPT = ("tests/sweeping/test_plan.py",)
 _SUMMARIES = ("tests/tuning/test_result.py",)
 
@@ -27,7 +32,11 @@ MODULES = {
     ),
     "tuning/result.py": (*_SUMMARIES, *_RESULTS),
     "tuning/make_result.py": (*_RESULTS, *_PLANTS),
-    "tuning/tuner.py": (*_PLANTS, "tests/tuning/test_tuner.py"),
+    "tuning/tuner.py": (
+        *_PLANTS,
+        "tests/tuning/test_structures.py::test_structures_are_one_search_at_a_time",
+        "tests/tuning/test_tuner.py",
+    ),
     "study/case.py": (*_STUDY, "tests/tuning/test_beside.py", *_SWEPT),
     "study/parameters.py": _STUDY,
     "study/schema.py": _STUDY,

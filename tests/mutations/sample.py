@@ -7,8 +7,10 @@ loops without a pass, and others. Each is tested in a copy of the tree; it is ca
 a test fails or takes too long. Survivors are shown as a difference. Exits with 1 if the
 share caught is below the bar.
 
-Mutants of annotations are omitted, and so are operators of another group, which only
-raise errors.
+Omitted are mutants that leave every result of a correct program as it is, or that only
+raise errors: of annotations, of the guards ``strict`` and ``frozen``, of ``jit``, which
+changes the speed alone, orders of texts (``status <= "interrupted"``), and operators of
+another group.
 """
 
 import argparse
@@ -50,6 +52,12 @@ _ALIKE = {
 """Groups within which an operator is replaced, by the kind of mutation."""
 
 
+_GUARDS = ("strict", "frozen")
+"""Keyword arguments that only make a wrong program raise an error."""
+
+Place = tuple[int, int]
+
+
 class Mutant(NamedTuple):
     """``occurrence`` of an operator of Cosmic Ray, and its first line."""
 
@@ -66,11 +74,15 @@ def wanted(operator: str) -> bool:
     return not kind.startswith(("ExceptionReplacer", "NoOp", "Variable", "Keyword"))
 
 
-def annotated(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Return first and last place of every annotation."""
+def without_effect(source: str) -> list[tuple[Place, Place]]:
+    """Return first and last place of annotations, guards and ``jit`` decorators."""
     nodes = []
     for node in ast.walk(ast.parse(source)):
         nodes += [getattr(node, name, None) for name in ("annotation", "returns")]
+        if isinstance(node, ast.keyword) and node.arg in _GUARDS:
+            nodes.append(node.value)
+        if isinstance(node, ast.FunctionDef):
+            nodes += [d for d in node.decorator_list if "jit" in ast.unparse(d)]
     return [
         ((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset))
         for node in nodes
@@ -78,26 +90,64 @@ def annotated(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     ]
 
 
-def mutants(source: str) -> dict[tuple[int, int], list[Mutant]]:
+def of_texts(source: str) -> list[tuple[Place, Place]]:
+    """Return first and last place of comparisons with a text."""
+    return [
+        ((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset))
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Compare)
+        for side in (node.left, *node.comparators)
+        if isinstance(side, ast.Constant) and isinstance(side.value, str)
+    ]
+
+
+def inside(place: Place, spans: list[tuple[Place, Place]]) -> bool:
+    return any(first <= place <= last for first, last in spans)
+
+
+def mutants(source: str) -> dict[Place, list[Mutant]]:
     """Return the mutants of a module by the place that they change."""
-    outside, found = annotated(source), {}
+    outside, texts, found = without_effect(source), of_texts(source), {}
     parsed = get_ast(source)
     for name in filter(wanted, operator_names()):
         operator, occurrence = get_operator(name)(), 0
+        orders = name.rpartition("_")[2] in ("Lt", "LtE", "Gt", "GtE")
         for node in ast_nodes(parsed):
             for start, _ in operator.mutation_positions(node):
-                if not any(first <= start <= last for first, last in outside):
+                if not inside(start, outside) and not (orders and inside(start, texts)):
                     mutant = Mutant(name, occurrence, start[0])
                     found.setdefault(start, []).append(mutant)
                 occurrence += 1
     return found
 
 
-def drawn(source: str, count: int, seed: int) -> list[Mutant]:
-    """Return at most ``count`` mutants, each of another place."""
-    found, chance = mutants(source), random.Random(seed)
-    places = chance.sample(sorted(found), min(count, len(found)))
-    return sorted((chance.choice(found[p]) for p in places), key=lambda m: m.line)
+def mutated_by(source: str, mutant: Mutant) -> str | None:
+    """Return the source of a mutant, or None if it is no Python.
+
+    The ``*`` before keyword-only arguments looks like a product to Cosmic Ray.
+    """
+    operator = get_operator(mutant.operator)()
+    mutated = mutate_code(source, operator, mutant.occurrence)
+    try:
+        ast.parse(mutated)
+    except SyntaxError:
+        return None
+    return mutated
+
+
+def drawn(source: str, count: int, seed: int) -> list[tuple[Mutant, str]]:
+    """Return at most ``count`` mutants with their sources, each of another place."""
+    found, chance, chosen = mutants(source), random.Random(seed), []
+    places = sorted(found)
+    chance.shuffle(places)
+    for place in places:
+        mutant = chance.choice(found[place])
+        mutated = mutated_by(source, mutant)
+        if mutated is not None:
+            chosen.append((mutant, mutated))
+        if len(chosen) == count:
+            break
+    return sorted(chosen, key=lambda each: each[0].line)
 
 
 def tested(copy: Path, tests: tuple[str, ...], caught) -> None:
@@ -147,9 +197,7 @@ def tried(context, copy, file, chosen) -> dict:
     if found != "survived":
         raise SystemExit(f"{file}: its tests fail without a mutation")
     limit = 30.0 + PATIENCE * seconds
-    for mutant in chosen:
-        operator = get_operator(mutant.operator)()
-        mutated = mutate_code(source, operator, mutant.occurrence)
+    for mutant, mutated in chosen:
         place.write_text(mutated, encoding="utf-8")
         try:
             found, seconds = outcome(context, copy, tests, limit)

@@ -197,6 +197,7 @@ def test_shipped_studies_build_and_start_inside_their_bounds(name):
         ({"references__tune": ["Q:SIN5"]}, r"'Q:SIN5' must be an axis"),
         ({"references__tune": ["Z:SIN300"]}, r"Z:SIN300 is not below half the rate"),
         ({"axes": {"names": ["Z", "Z"], "units": ["um", "um"]}}, r"names must differ"),
+        ({"axes": {"names": ["Z", "R"], "units": ["um"] * 3}}, r"and have one unit"),
         ({"axes": {"names": ["Z", "z"], "units": ["um"] * 2}}, r"names are Z, z; "),
         ({"axes": {"names": ["Z", "R"], "units": ["um", "mm"]}}, r"'mm' is unknown"),
         ({"ensemble": {"spread": {"mass": 0.1}}}, r"mass is unknown; p558 varies in"),

@@ -115,6 +115,9 @@ def test_gains_with_a_larger_error_than_the_start_have_a_note(plain):
     (note,) = worse_than_the_start(after, before)
     was, found = 1e3 * after.geomean_rms_um, 1e3 * before.geomean_rms_um
     assert f"{found:.4g} nm against {was:.4g} nm" in note
+    limited = dict.fromkeys(before.saturated_percent, 100.0)
+    railed = before.model_copy(update={"saturated_percent": limited})
+    assert worse_than_the_start(after, railed) == []
     lost = before.model_copy(update={"geomean_rms_um": None})
     assert worse_than_the_start(after, lost) == []  # the alarm is more specific
 
