@@ -12,6 +12,7 @@ from oracles import published, transfer
 
 import piezojax as pj
 from piezojax.analysis.stability import stability_reports
+from piezojax.analysis.stability.assess import worst_margins
 from piezojax.analysis.stability.conserved import LinearLoop
 from piezojax.analysis.stability.crossings import roots
 from piezojax.analysis.stability.margins import linear_loop, report_of
@@ -327,6 +328,19 @@ def test_curves_of_several_axes_equal_those_of_each_axis():
     each = [np.abs(1.0 / (1.0 + written(f"pid, {n}")(z))) for n in ("integral", "all")]
     np.testing.assert_allclose(curves.each, each, rtol=1e-5)
     np.testing.assert_allclose(curves.largest, np.max(each, axis=0), rtol=1e-5)
+
+
+def test_the_worst_margins_are_those_of_all_loops():
+    loops = [
+        LinearLoop(np.array([[a]]), np.ones(1), gain * np.ones(1), 1e-4)
+        for a, gain in ((0.9, 0.4), (0.5, 0.2), (1.2, 0.7), (0.5, 2.0))
+    ]
+    *stable, unstable = map(report_of, loops)
+    found = worst_margins(stable)._asdict()
+    assert found.pop("sensitivity_peak") == max(r.sensitivity_peak for r in stable)
+    for name, value in found.items():
+        assert value == min(getattr(report, name) for report in stable)
+    assert worst_margins([*stable, unstable]) is None
 
 
 def test_roots_lie_where_the_function_is_zero():

@@ -41,7 +41,10 @@ MODULES = {
     "study/parameters.py": _STUDY,
     "study/schema.py": _STUDY,
     "analysis/stroke.py": ("tests/analysis/test_stroke.py",),
-    "analysis/stability/assess.py": _MARGINS,
+    "analysis/stability/assess.py": (
+        *_MARGINS,
+        "tests/analysis/test_operating_point.py",
+    ),
     "analysis/stability/crossings.py": _MARGINS,
     "analysis/stability/margins.py": _MARGINS,
     "analysis/stability/differentiable.py": (
