@@ -145,7 +145,9 @@ def test_answers_replace_defaults(record):
 
 
 def test_the_study_holds_the_answers_and_fits_the_record(record, tmp_path):
-    plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2, SCAN4", 1.0, 2.0, "inversion_pid")
+    plan = Plan(
+        0.0, 80.0, 0.02, 2.0, "SIN2, SCAN4", 1.0, 2.0, controller="inversion_pid"
+    )
     columns = {"time": "time_s", "input": "command_V", "output": "sensor_um"}
     text = first_study(plan, record, columns, 1e3, folder=tmp_path, model="lag", seed=4)
     path = tmp_path / "study.toml"
@@ -247,11 +249,13 @@ def test_a_start_without_questions_tunes_and_exports(run, tmp_path):
     assert "input 'command_V' from" in output
     assert "upper limit of the voltage [V]: 60.0" in output
     assert "done: gains and pictures in" in output
-    assert load(tmp_path / "out" / "study.toml").actuator.upper == 60.0
+    study = load(tmp_path / "out" / "study.toml")
+    assert study.actuator.upper == 60.0
+    assert set(study.limits) == {"sensitivity_peak", "delay_margin"}
 
 
 def test_answers_are_asked_for_with_defaults(run, tmp_path):
-    answers = "\n80\n\n3\n\n0.5\n\ninversion_pid\n"
+    answers = "\n80\n\n3\n\n0.5\n\nyes\ninversion_pid\n"
     status, output, _ = run(answers=answers)
     assert status == 0, output
     assert "references to track, with their frequencies in Hz [SIN3,PWSW12]:" in output
@@ -259,6 +263,7 @@ def test_answers_are_asked_for_with_defaults(run, tmp_path):
     assert study.actuator.upper == 80.0
     assert study.references.tune == ("SIN3", "PWSW12")
     assert study.references.amplitude == 0.5
+    assert study.limits["closed_loop_peak"] == 1.5
     assert study.controller == {"design": "inversion_pid"}
 
 

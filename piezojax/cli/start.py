@@ -31,6 +31,7 @@ QUESTIONS = {
     "track": "references to track, with their frequencies in Hz",
     "amplitude": "amplitude of the references, half of their range [um]",
     "offset": "lowest value of the references [um]",
+    "jumps": "whether references jump, as steps do",
     "controller": "controller to tune",
 }
 """What a record cannot tell; the defaults are those of ``planned``."""
@@ -45,6 +46,11 @@ QUESTIONS = {
 @click.option("--track", help="References to tune on, as SIN10,PWSW40.")
 @click.option("--amplitude", type=float, help="Half of the range of references, um.")
 @click.option("--offset", type=float, help="Lowest value of the references, um.")
+@click.option(
+    "--jumps/--no-jumps",
+    default=None,
+    help="References jump, as steps do: limit the overshoot, at the cost of accuracy.",
+)
 @click.option("--controller", help="Name of a design, as inversion_pid.")
 @click.option("--model", help="Model to fit; 'all' compares all  [auto]")
 @click.option(

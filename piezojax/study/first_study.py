@@ -24,6 +24,9 @@ SAMPLES_A_PERIOD = 1000
 PERIODS = 3
 """Periods of the slowest reference in a run; the first does not count."""
 
+AMPLIFIED = 1.5
+"""Limit of the closed-loop peak if references jump."""
+
 UNSEEN = ("SIN", "SCAN")
 """Kinds of the default references that only evaluate the tuned gains."""
 
@@ -35,7 +38,8 @@ class Plan:
     ``lower`` and ``upper`` are the limits of the voltage, ``noise`` is the rms noise of
     the sensor, ``track`` the references to tune on, as "SIN10,PWSW40", and
     ``frequency`` that of the slowest one. The references cover ``offset`` to ``offset +
-    2 amplitude``. ``controller`` is the name of a design.
+    2 amplitude``. ``jumps`` is whether references jump in use: the loop then may not
+    amplify them by more than ``AMPLIFIED``. ``controller`` is the name of a design.
     """
 
     lower: float
@@ -45,6 +49,7 @@ class Plan:
     track: str
     amplitude: float
     offset: float
+    jumps: bool = False
     controller: str = "inversion_sliding_mode"
 
     def __post_init__(self):
@@ -117,6 +122,7 @@ def first_study(
         "unseen": _toml([name for name in doubled if name not in tracked]),
         "duration": _toml(PERIODS / plan.frequency),
         "settle": _toml(1.0 / plan.frequency),
+        "goals": f"closed_loop_peak = {AMPLIFIED}" if plan.jumps else "",
     }
     return _TEXT.substitute(values)
 
@@ -164,8 +170,10 @@ duration = $duration
 settle = $settle
 
 # By default the sensitivity peak is limited to 2.0 and the delay margin to one sample,
-# for every stage within the error bound of the fitted model. [constraints] may hold
-# further goals, as settling_time = 0.01.
+# for every stage within the error bound of the fitted model. Further goals are limits
+# too, as closed_loop_peak = 1.5 for references that jump, or settling_time = 0.01.
+[constraints]
+$goals
 
 [optimiser]
 method = "gauss_newton"
