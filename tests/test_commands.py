@@ -209,6 +209,8 @@ def arguments_for(command, request):
     if command == "validate":
         record = request.getfixturevalue("record")
         return [write_model(record.parent), record, *COLUMNS]
+    if command == "start":
+        return [request.getfixturevalue("record"), *COLUMNS, "--yes"]
     if command == "export":
         return [write_model(request.getfixturevalue("tmp_path_factory").mktemp("m"))]
     return ["--table", "5-3"]
@@ -249,7 +251,9 @@ def test_validate_writes_a_checked_model(tmp_path):
     record = write_record(tmp_path, late=1)
     model, out = write_model(tmp_path), tmp_path / "out"
     printed = succeeded(call("validate", model, record, *COLUMNS, "--out", out)).stdout
-    assert names(out) == ["model.json", "validation.json", "validation.png"]
+    assert names(out) == [
+        *("model.json", "report.html", "validation.json", "validation.png"),
+    ]
     assert_pictures(out, "validation.png")
     assert "input 'drive_V' from 0 to 39.84 V; output 'sensor_um'" in printed
     assert "% of span" in printed
@@ -724,7 +728,9 @@ def identified(tmp_path_factory):
 
 def test_identify_writes_its_results(identified):
     _, out = identified
-    assert names(out) == ["fit.json", "fit.png", "model.json", "model.residual.npz"]
+    assert names(out) == [
+        *("fit.json", "fit.png", "model.json", "model.residual.npz", "report.html"),
+    ]
     assert_pictures(out, "fit.png")
 
 

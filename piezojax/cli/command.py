@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
@@ -13,6 +13,9 @@ from ..core.files import fresh_folder, numbered_folder
 from ..core.temporaries import claimed
 from .stopping import exit_interrupted, terminable
 from .terminal import console
+
+if TYPE_CHECKING:
+    from ..report.page import Page
 
 UNSAFE = 3
 """Exit status of a command that finished with an alarm."""
@@ -95,6 +98,13 @@ def print_alarms(console: Console, alarms: Sequence[str]) -> None:
     shown = Console(stderr=True, highlight=False) if console.quiet else console
     for alarm in alarms:
         shown.print(Text(f"ALARM: {alarm}", style="bold red"), soft_wrap=True)
+
+
+def print_page(page: "Page", console: Console) -> None:
+    """Print the alarms, tables and sentences of ``page``."""
+    print_alarms(console, page.alarms)
+    for part in page.parts:
+        console.print(part, soft_wrap=isinstance(part, str))
 
 
 def exit_unsafe(alarms: Sequence[str]) -> None:

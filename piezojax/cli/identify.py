@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from .command import Command, common, print_alarms, results_folder, run
+from .command import Command, common, print_page, results_folder, run
 from .identify_response import (
     Amplitudes,
     ResponseOptions,
@@ -198,8 +198,10 @@ def main(
         from ..identification.estimators.estimate import Options
         from ..identification.fit import identify
         from ..identification.records.record import read_record
+        from ..report.fit_page import fit_page
         from ..report.fit_pictures import write_fit
-        from ..report.summary_tables import fit_table, models_table
+        from ..report.page import write_page
+        from ..report.summary_tables import models_table
 
         if model == "help":
             console.print(models_table())
@@ -254,19 +256,10 @@ def main(
             )
             bar.stage("drawing")
             write_fit(fit, folder)
-        print_alarms(console, fit.report.alarms)
-        console.print(fit_table(fit.report))
-        console.print(f"found: {fit.report.found or 'no resonance'}", soft_wrap=True)
-        if fit.held is not None:
-            from ..identification.held_dynamics import bound_text
-
-            text = bound_text(fit.about.error_bound, fit.held.dt)
-            console.print(text, soft_wrap=True)
-        if fit.report.closed_loop:
-            console.print(f"closed loop: {fit.report.closed_loop}", soft_wrap=True)
-        for warning in fit.report.warnings:
-            console.print(f"note: {warning}", soft_wrap=True)
-        console.print(f"{fit.report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
+            page = fit_page(fit)
+            written = write_page(page, folder)
+        print_page(page, console)
+        console.print(f"page: {written}; results in {folder}", soft_wrap=True)
 
     def controller_of(source, rate):
         from ..catalog import CONTROLLERS, at_rate
@@ -300,11 +293,11 @@ def main(
     def compare(console, loaded, options):
         from ..identification.compare import identify_all
         from ..report.model_ranking import (
-            ranking_notes,
-            ranking_table,
+            ranking_page,
             write_ranking,
             write_ranking_so_far,
         )
+        from ..report.page import write_page
 
         with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
             ranking = identify_all(
@@ -320,17 +313,11 @@ def main(
             bar.finish()
             bar.stage("drawing")
             write_ranking(ranking, folder)
-        report = ranking.report
-        print_alarms(console, ranking.best.report.alarms)
-        console.print(ranking_table(report))
-        notes = ranking_notes(report)
-        for note in [
-            *notes,
-            *(f"note: {text}" for text in ranking.best.report.warnings),
-        ]:
-            console.print(note, soft_wrap=True)
-        console.print(f"{report.wall_s:.1f} s; results in {folder}", soft_wrap=True)
-        if report.interrupted:
+            page = ranking_page(ranking)
+            written = write_page(page, folder)
+        print_page(page, console)
+        console.print(f"page: {written}; results in {folder}", soft_wrap=True)
+        if ranking.report.interrupted:
             exit_interrupted()
 
     run(quiet, body)

@@ -72,6 +72,7 @@ def main(record, model, check, yes, out, seed, quiet, **given):
     """
 
     def body(console):
+        from ..report.page import PAGE
         from ..tuning.result import load_result
 
         folder = out or numbered_folder(RESULTS / record.stem)
@@ -103,6 +104,7 @@ def main(record, model, check, yes, out, seed, quiet, **given):
             )
         else:
             _export(folder, tuned, outcome, console)
+        console.print(f"what it found, on a page: {tuned / PAGE}", soft_wrap=True)
         finish(result)
 
     run(quiet, body)

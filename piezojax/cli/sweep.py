@@ -66,7 +66,8 @@ def main(
     simulate_side_by_side()
 
     def body(console: Console) -> None:
-        from ..report.sweep_maps import write_pictures
+        from ..report.page import write_page
+        from ..report.sweep_maps import sweep_page, write_pictures
         from ..sweeping.cluster import dask_client
         from ..sweeping.sweeper import read_swept, run_sweep
 
@@ -87,6 +88,7 @@ def main(
                     bar.finish()
                     bar.stage("drawing")
                     write_pictures(result.path, folder)
+                    write_page(sweep_page(result.path), folder)
         except KeyboardInterrupt:
             if folder is None or not folder.exists():
                 raise
@@ -104,6 +106,7 @@ def main(
 def _report(
     result: "SweepResult", folder: Path, shard: tuple[int, int], console: Console
 ) -> None:
+    from ..report.page import PAGE
     from ..report.sweep_maps import best_table
 
     if result.finished:
@@ -117,7 +120,10 @@ def _report(
             soft_wrap=True,
         )
     if result.finished:
-        console.print(f"results in {folder}, data set {result.path}", soft_wrap=True)
+        console.print(
+            f"page: {folder / PAGE}; results in {folder}, data set {result.path}",
+            soft_wrap=True,
+        )
     else:
         console.print(
             f"shard {shard[0]}/{shard[1]} is complete, {result.chunks} chunks; the "

@@ -12,6 +12,7 @@ from .command import (
     common,
     exit_unsafe,
     print_alarms,
+    print_page,
     results_folder,
     run,
 )
@@ -84,29 +85,13 @@ def tune_study(
 ) -> "Outcome":
     """Tune the study at ``path``, write and print the outcome, and return it."""
     from .. import study as studies
-    from ..report.baseline_curves import (
-        baselines_table,
-        baselines_text,
-        write_baselines,
-    )
+    from ..report.baseline_curves import write_baselines
     from ..report.bode import write_stability
-    from ..report.drive_table import drive_table
     from ..report.fit_pictures import write_fit
-    from ..report.limit_bars import limit_text, write_limit
+    from ..report.limit_bars import write_limit
+    from ..report.page import write_page
     from ..report.response_pictures import write_response
-    from ..report.robustness import constraints_table, front_table
-    from ..report.step_pictures import steps_table
-    from ..report.structure_pictures import structures_table
-    from ..report.summary_tables import (
-        beside_table,
-        following_table,
-        gains_table,
-        perturbed_text,
-        response_table,
-        sliding_text,
-        stability_table,
-        tuning_table,
-    )
+    from ..report.tuning_page import tuning_page
     from ..report.tuning_pictures import write_results
     from ..tuning.tuner import tune
 
@@ -128,46 +113,10 @@ def tune_study(
             write_stability(outcome.stability, folder, outcome.result.heading)
             bar.stage("computing the limit of linear control")
             write_limit(outcome.limit, folder, outcome.result.heading)
-    result = outcome.result
-    print_alarms(console, result.alarms)
-    console.print(tuning_table(result))
-    if result.structures:
-        console.print(structures_table(result.structures))
-    if result.beside:
-        console.print(beside_table(result))
-    console.print(gains_table(result))
-    console.print(stability_table(outcome.stability))
-    if result.on_response:
-        console.print(response_table(result.on_response))
-    if outcome.stability.reports:
-        console.print(following_table(outcome.stability))
-    if outcome.steps[1]:
-        console.print(steps_table(outcome.steps))
-    console.print(drive_table(outcome.drive, description.rate))
-    if (line := sliding_text(result)) is not None:
-        console.print(line, soft_wrap=True)
-    if result.constraints:
-        console.print(constraints_table(result))
-    if result.front and case.study.pareto:
-        console.print(front_table(result.front, case.study.pareto.constraint))
-    console.print(limit_text(outcome.limit), soft_wrap=True)
-    if result.perturbed is not None:
-        console.print(perturbed_text(result.perturbed), soft_wrap=True)
-    if outcome.baselines is not None:
-        console.print(baselines_table(outcome.baselines))
-        console.print(baselines_text(outcome.baselines), soft_wrap=True)
-        for note in outcome.baselines.notes:
-            console.print(f"note: {note}", soft_wrap=True)
-    for name, why in outcome.stability.problems.items():
-        console.print(f"note: no margins {name} tuning: {why}", soft_wrap=True)
-    for warning in result.warnings:
-        console.print(f"note: {warning}", soft_wrap=True)
-    console.print(
-        f"{result.status} after {result.evaluations} evaluations, "
-        f"{result.wall_s:.1f} s ({result.compile_s:.1f} s of it compiling); "
-        f"results in {folder}",
-        soft_wrap=True,
-    )
+            page = tuning_page(outcome)
+            written = write_page(page, folder)
+    print_page(page, console)
+    console.print(f"page: {written}; results in {folder}", soft_wrap=True)
     return outcome
 
 

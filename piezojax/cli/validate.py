@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from .command import Command, common, exit_unsafe, print_alarms, results_folder, run
+from .command import Command, common, exit_unsafe, print_page, results_folder, run
 from .records import SampleRange, print_columns, record_columns
 from .terminal import Bar
 
@@ -38,11 +38,8 @@ def main(model, records, estimate, out, seed, quiet, **columns):
         from ..core.serial import load, read_about
         from ..identification import read_record, validate
         from ..identification.residual_record import load_residual
-        from ..report.model_validation import (
-            input_lines,
-            validation_table,
-            write_validation,
-        )
+        from ..report.model_validation import validation_page, write_validation
+        from ..report.page import write_page
 
         system, about = load(model, accept_unsafe=True), read_about(model)
         residual = load_residual(model, about)
@@ -53,14 +50,10 @@ def main(model, records, estimate, out, seed, quiet, **columns):
             found = validate(system, about, loaded, estimate=estimate)
             bar.stage("drawing")
             write_validation(found, folder, residual)
-        report = found.report
-        print_alarms(console, report.alarms)
-        console.print(validation_table(report))
-        for line in input_lines(report):
-            console.print(line, soft_wrap=True)
-        for note in report.notes:
-            console.print(f"note: {note}", soft_wrap=True)
-        console.print(f"results in {folder}", soft_wrap=True)
-        exit_unsafe(report.alarms)
+            page = validation_page(found)
+            written = write_page(page, folder)
+        print_page(page, console)
+        console.print(f"page: {written}; results in {folder}", soft_wrap=True)
+        exit_unsafe(page.alarms)
 
     run(quiet, body)

@@ -9,20 +9,22 @@ from ..exporting import Value
 
 
 def device_table(values: Sequence[Value]) -> Table:
-    """Return the saved and the exported value of each parameter; changes are bold.
+    """Return the value of each parameter, beside the saved one if there is any.
 
-    A dash stands for a parameter that the saved file lacks.
+    Changes are bold. A dash stands for a parameter that the saved file lacks.
     """
-    table = Table(title="parameters of the device")
+    saved = any(row.saved for row in values)
+    table = Table(title="parameters to type into the device")
     table.add_column("parameter", overflow="fold")
-    for title in ("saved", "exported"):
+    for title in ("saved", "value")[not saved :]:
         table.add_column(title, justify="right", overflow="fold")
     table.add_column("unit", no_wrap=True)
     table.add_column("meaning")
     for row in values:
         style = "bold" if row.saved and not _same(row.saved, row.value) else ""
-        exported = Text(row.value, style=style)
-        table.add_row(row.parameter, row.saved or "-", exported, row.unit, row.meaning)
+        value = Text(row.value, style=style)
+        before = [row.saved or "-"] if saved else []
+        table.add_row(row.parameter, *before, value, row.unit, row.meaning)
     return table
 
 

@@ -32,6 +32,7 @@ from .figures import (
     write,
 )
 from .fit_pictures import FIT_FILE, display_unit, loop_panel, write_fit, write_model
+from .page import Page
 
 RANKING_FILE, TABLE_FILE = "comparison.json", "comparison.csv"
 RANKING_PICTURE = "comparison.png"
@@ -135,6 +136,22 @@ def ranking_table(report: RankingReport) -> Table:
         "BIC above the lowest; * validates significantly worse than the best"
     )
     return table
+
+
+def ranking_page(ranking: ModelRanking) -> Page:
+    """Return the Page of a comparison of models."""
+    report, best = ranking.report, ranking.best
+    return Page(
+        f"models of {best.record.source}",
+        best.report.alarms,
+        [
+            ranking_table(report),
+            *ranking_notes(report),
+            *(f"note: {text}" for text in best.report.warnings),
+            f"fitted in {report.wall_s:.1f} s",
+        ],
+        best.about.origin("Model of a plant"),
+    )
 
 
 def ranking_notes(report: RankingReport) -> list[str]:

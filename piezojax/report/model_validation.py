@@ -21,6 +21,7 @@ from .figures import (
     write,
 )
 from .fit_pictures import MODEL_FILE, display_unit
+from .page import Page
 
 VALIDATION_FILE, VALIDATION_PICTURE = "validation.json", "validation.png"
 
@@ -74,6 +75,21 @@ def validation_figure(found: Validation) -> Figure:
         "shaded: state and zero estimated there, errors not counted",
     )
     return picture
+
+
+def validation_page(found: Validation) -> Page:
+    """Return the Page of a model that was judged on other records."""
+    report = found.report
+    return Page(
+        "model judged on " + ", ".join(check.record for check in report.records),
+        report.alarms,
+        [
+            validation_table(report),
+            *input_lines(report),
+            *(f"note: {note}" for note in report.notes),
+        ],
+        found.about.origin("Model of a plant"),
+    )
 
 
 def validation_table(report: ValidationReport) -> Table:

@@ -278,8 +278,11 @@ def _margins(reports: Sequence[StabilityReport]) -> tuple[str, ...]:
     )
 
 
-def fit_table(report: FitReport) -> Table:
-    """Return the parameters of a fit, with its training and validation errors."""
+def fit_table(report: FitReport, units: Mapping[str, str] | None = None) -> Table:
+    """Return the parameters of a fit, with its training and validation errors.
+
+    ``units`` holds the units of the parameters by path; with it the table has them.
+    """
     errors = "; ".join(
         f"{name} {part.rmse:.3g} {part.unit}, {part.rmse_percent_of_span:.2f} % of span"
         for name, part in (
@@ -292,7 +295,7 @@ def fit_table(report: FitReport) -> Table:
         caption="\n".join([*_scope(report), *_place_of_the_lag(report)]) or None,
         caption_justify="left",
     )
-    return parameter_table(report.parameters, table)
+    return parameter_table(report.parameters, table, units)
 
 
 def parameter_table(

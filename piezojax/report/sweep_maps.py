@@ -18,6 +18,7 @@ from ..sweeping.metric_maps import (
     open_dataset,
 )
 from .figures import AFTER, UNITS, add_title, figure, plot_style, write
+from .page import Page
 from .parallel_coordinates import parallel_coordinates
 from .sweep_scale import COLOUR_MAP, LOST, Parameter, colour_bar, scale_of
 
@@ -171,6 +172,18 @@ def _curve(ax: Axes, panel: MetricMap, axis: Parameter) -> None:
     if isinstance(scale_of(values), LogNorm):
         ax.set_yscale("log")
     ax.set(xlabel=axis.label, ylabel=panel.unit)
+
+
+def sweep_page(path: Path) -> Page:
+    """Return the Page of the data set at ``path``."""
+    with open_dataset(path) as dataset:
+        attributes = dict(dataset.attrs)
+    return Page(
+        str(attributes["title"]),
+        (),
+        [best_table(path)],
+        [f"{name}: {value}" for name, value in attributes.items()],
+    )
 
 
 def best_table(path: Path) -> Table:

@@ -1,0 +1,26 @@
+"""What a fit found, as tables and sentences: printed, and put on a page."""
+
+from ..identification.fit import Fit
+from ..identification.held_dynamics import bound_text
+from .page import Page
+from .summary_tables import fit_table
+
+
+def fit_page(fit: Fit) -> Page:
+    """Return the Page of a fitted model."""
+    report = fit.report
+    held = fit.held and bound_text(fit.about.error_bound, fit.held.dt)
+    parts = [
+        fit_table(report, fit.about.parameter_units),
+        f"found: {report.found or 'no resonance'}",
+        held,
+        report.closed_loop and f"closed loop: {report.closed_loop}",
+        *(f"note: {warning}" for warning in report.warnings),
+        f"fitted in {report.wall_s:.1f} s",
+    ]
+    return Page(
+        f"{report.model} fitted to {fit.record.source}",
+        report.alarms,
+        [part for part in parts if part],
+        fit.about.origin("Model of a plant"),
+    )

@@ -1,0 +1,158 @@
+"""A page with all that a command found: ``report.html``, one file without links.
+
+The page holds the tables and sentences that the command prints, so that both agree, and
+the pictures of its folder. It needs no script, and prints on paper.
+"""
+
+import base64
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+from rich.table import Table
+from rich.text import Text
+
+from ..core.files import write_text
+
+PAGE = "report.html"
+
+PICTURES = {
+    "tracking.png": "References and tracking errors, before and after tuning",
+    "steps.png": "Steps of the reference, before and after tuning",
+    "stability.png": "Open loop, sensitivities and margins",
+    "robustness.png": "Errors and sensitivity peaks on the perturbed plants",
+    "hysteresis.png": "Displacement over voltage, and error over reference",
+    "fit.png": "Record, model and residual, with the error bound",
+    "response.png": "Measured frequency response and its model",
+    "comparison.png": "Errors of the compared models or controllers",
+    "validation.png": "The model on the other records",
+    "limit.png": "Errors beside the limit of linear control",
+    "structures.png": "Errors by the number of notches",
+    "pareto.png": "Error against the limit of a constraint",
+    "convergence.png": "Objective over the evaluations",
+}
+"""Captions of pictures by their files, in the order of the page; others follow."""
+
+_QUOTED = ("study.toml",)
+"""Text files that the page quotes."""
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62em; margin: 2em auto;
+       padding: 0 1em; color: #222; background: #fff; }
+h1 { font-size: 1.5em; } h2 { font-size: 1.1em; margin: 1.8em 0 .4em; }
+table { border-collapse: collapse; margin: 1.2em 0 .4em;
+        font-variant-numeric: tabular-nums; }
+th, td { padding: .15em .8em; text-align: left; white-space: nowrap; }
+th { border-bottom: 2px solid #222; } tr.end td { border-bottom: 1px solid #999; }
+td.right, th.right { text-align: right; }
+.alarm { color: #b00020; font-weight: bold; }
+.tables { overflow-x: auto; } caption { text-align: left; font-weight: bold; }
+figure { margin: 1.5em 0; } img { max-width: 100%; }
+figcaption { font-weight: bold; } pre { white-space: pre-wrap; }
+@media print { body { margin: 0; max-width: none; font-size: 11px; }
+  figure, table { break-inside: avoid; } details { display: none; } }
+"""
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a command tells at its end.
+
+    ``title``, its ``alarms``, and ``parts``: tables and sentences in the order in which
+    they are printed. ``origin`` are lines on how the results were made.
+    """
+
+    title: str
+    alarms: Sequence[str]
+    parts: Sequence[Table | str]
+    origin: Sequence[str] = ()
+
+
+def write_page(page: Page, folder: Path) -> Path:
+    """Write ``page`` with the pictures in ``folder`` to its report.html."""
+    path = folder / PAGE
+    write_text(path, page_html(page, folder))
+    return path
+
+
+def page_html(page: Page, folder: Path) -> str:
+    """Return ``page`` as HTML, with the pictures in ``folder``."""
+    title = escape(page.title)
+    tables = [part for part in page.parts if isinstance(part, Table)]
+    sentences = [part for part in page.parts if not isinstance(part, Table)]
+    alarms = "".join(f'<p class="alarm">ALARM: {escape(a)}</p>\n' for a in page.alarms)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{title}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
+        f"<h1>{title}</h1>\n{alarms}"
+        + "".join(table_html(table) for table in tables)
+        + _section("Notes", _list(sentences))
+        + _section("Pictures", "".join(_figures(folder)))
+        + _section("Files", "".join(_quoted(folder)))
+        + _section("Origin", _list(page.origin))
+        + "</body>\n</html>\n"
+    )
+
+
+def table_html(table: Table) -> str:
+    """Return a printed table as HTML: caption, header, and a row for each row."""
+    sides = ["right" if c.justify == "right" else "left" for c in table.columns]
+    header = [_plain(column.header) for column in table.columns]
+    cells = [[_plain(cell) for cell in column.cells] for column in table.columns]
+    parts = [f"<caption>{_lines(table.title)}</caption>" if table.title else ""]
+    if table.show_header:
+        parts.append(f"<thead><tr>{_cells('th', header, sides)}</tr></thead>")
+    rows = zip(table.rows, zip(*cells, strict=True), strict=True)
+    parts.append("<tbody>")
+    for row, texts in rows:
+        end = ' class="end"' if row.end_section else ""
+        parts.append(f"<tr{end}>{_cells('td', texts, sides)}</tr>")
+    parts.append("</tbody>")
+    below = f"<p>{_lines(table.caption)}</p>\n" if table.caption else ""
+    body = "\n".join(part for part in parts if part)
+    return f'<div class="tables"><table>\n{body}\n</table></div>\n{below}'
+
+
+def _cells(tag: str, texts: Iterable[str], sides: Iterable[str]) -> str:
+    return "".join(
+        f'<{tag} class="{side}">{_lines(text)}</{tag}>'
+        for text, side in zip(texts, sides, strict=True)
+    )
+
+
+def _plain(cell: object) -> str:
+    return cell.plain if isinstance(cell, Text) else str(cell)
+
+
+def _lines(text: object) -> str:
+    return escape(_plain(text)).replace("\n", "<br>")
+
+
+def _section(title: str, body: str) -> str:
+    return f"<h2>{title}</h2>\n{body}" if body else ""
+
+
+def _list(sentences: Iterable[str]) -> str:
+    items = "".join(f"<li>{escape(each)}</li>\n" for each in sentences)
+    return f"<ul>\n{items}</ul>\n" if items else ""
+
+
+def _figures(folder: Path) -> Iterable[str]:
+    known = {path.name: path for path in sorted(folder.glob("*.png"))}
+    rank = {name: place for place, name in enumerate(PICTURES)}
+    for name in sorted(known, key=lambda name: rank.get(name, len(rank))):
+        caption = PICTURES.get(name, name.removesuffix(".png").replace("_", " "))
+        data = base64.b64encode(known[name].read_bytes()).decode("ascii")
+        yield (
+            f'<figure>\n<figcaption>{escape(caption)}</figcaption>\n<img alt="'
+            f'{escape(caption)}" src="data:image/png;base64,{data}">\n</figure>\n'
+        )
+
+
+def _quoted(folder: Path) -> Iterable[str]:
+    for name in _QUOTED:
+        if (folder / name).is_file():
+            text = escape((folder / name).read_text(encoding="utf-8"))
+            yield f"<details><summary>{name}</summary><pre>{text}</pre></details>\n"

@@ -1,0 +1,83 @@
+"""What tuning found, as tables and sentences: printed, and put on a page."""
+
+from rich.table import Table
+
+from ..control import Device
+from ..exporting import device_values
+from ..tuning.outcome import Outcome
+from .baseline_curves import baselines_table, baselines_text
+from .device_table import device_table
+from .drive_table import drive_table
+from .limit_bars import limit_text
+from .page import Page
+from .robustness import constraints_table, front_table
+from .step_pictures import steps_table
+from .structure_pictures import structures_table
+from .summary_tables import (
+    beside_table,
+    following_table,
+    gains_table,
+    perturbed_text,
+    response_table,
+    sliding_text,
+    stability_table,
+    tuning_table,
+)
+
+
+def tuning_page(outcome: Outcome) -> Page:
+    """Return the Page of a tuned study."""
+    result, study = outcome.result, outcome.case.study
+    stability, baselines = outcome.stability, outcome.baselines
+    front = (
+        front_table(result.front, study.pareto.constraint)
+        if result.front and study.pareto
+        else None
+    )
+    parts = [
+        tuning_table(result),
+        result.structures and structures_table(result.structures),
+        result.beside and beside_table(result),
+        gains_table(result),
+        values_to_type(outcome),
+        stability_table(stability),
+        result.on_response and response_table(result.on_response),
+        stability.reports and following_table(stability),
+        outcome.steps[1] and steps_table(outcome.steps),
+        drive_table(outcome.drive, study.rate),
+        sliding_text(result),
+        result.constraints and constraints_table(result),
+        front,
+        limit_text(outcome.limit),
+        result.perturbed and perturbed_text(result.perturbed),
+        baselines and baselines_table(baselines),
+        baselines and baselines_text(baselines),
+        *(f"note: {note}" for note in (baselines.notes if baselines else ())),
+        *(
+            f"note: no margins {name} tuning: {why}"
+            for name, why in stability.problems.items()
+        ),
+        *(f"note: {warning}" for warning in result.warnings),
+        f"{result.status} after {result.evaluations} evaluations, "
+        f"{result.wall_s:.1f} s ({result.compile_s:.1f} s of it compiling)",
+    ]
+    versions = ", ".join(f"{name} {text}" for name, text in result.versions.items())
+    return Page(
+        result.heading,
+        result.alarms,
+        [part for part in parts if part],
+        [
+            *outcome.about.origin("Gains of a tuned controller"),
+            f"Versions: {versions}.",
+        ],
+    )
+
+
+def values_to_type(outcome: Outcome) -> Table | str | None:
+    """Return the values to type into a device, None for another controller."""
+    if not isinstance(outcome.controller, Device):
+        return None
+    try:
+        return device_table(device_values(outcome.controller))
+    except ValueError as error:
+        return f"note: no values to type in: {error}"
