@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import hashlib
+import html
 import importlib
 import io
 import json
@@ -16,6 +17,7 @@ import pytest
 import tomli_w
 from click.testing import CliRunner
 from golden import golden_vectors
+from page_reader import checked
 from rich.console import Console
 from rich.table import Table
 
@@ -254,6 +256,7 @@ def test_validate_writes_a_checked_model(tmp_path):
     assert names(out) == [
         *("model.json", "report.html", "validation.json", "validation.png"),
     ]
+    assert "bench.csv" in checked(out / "report.html").cells
     assert_pictures(out, "validation.png")
     assert "input 'drive_V' from 0 to 39.84 V; output 'sensor_um'" in printed
     assert "% of span" in printed
@@ -460,6 +463,30 @@ def test_tune_reports_progress_and_ends_with_a_table(tuned):
     assert "results in" in text
     assert "\x1b" not in text  # no colours without a terminal
     assert " ".join(text.split()).endswith(str(out))
+
+
+def test_the_page_of_tuning_holds_the_figures_of_its_result(tuned):
+    printed, out = tuned
+    found, result = checked(out / "report.html"), pj.load_result(out)
+    for path, value in result.gains.items():
+        row = found.cells.index(path.removeprefix("controller."))
+        before, after, unit = found.cells[row + 1 : row + 4]
+        assert float(before) == pytest.approx(result.start[path], rel=1e-3)
+        assert float(after) == pytest.approx(value, rel=1e-3)
+        assert unit == result.gain_units[path]
+    for name, rms in result.holdout.per_reference_rms_um.items():
+        row = found.cells.index(name)
+        assert float(found.cells[row + 2]) == pytest.approx(1e3 * rms, abs=0.006)
+    report = json.loads((out / "stability.json").read_text(encoding="utf-8"))["after"]
+    worst = max(branch["sensitivity_peak"] for branch in report.values())
+    row = found.cells.index("tuned", found.cells.index("Ms"))
+    assert float(found.cells[row + 1]) == pytest.approx(worst, abs=0.006)
+    text = html.unescape((out / "report.html").read_text(encoding="utf-8"))
+    notes = [x for x in printed.stdout.splitlines() if x.startswith(("note:", "limit"))]
+    assert all(note in text for note in notes)
+    assert notes != []
+    assert "SHA-256 of study.toml" in text
+    assert "jaxlib" in text
 
 
 def test_tuned_gains_are_the_start_of_another_search(tuned, tmp_path):
@@ -731,6 +758,15 @@ def test_identify_writes_its_results(identified):
     assert names(out) == [
         *("fit.json", "fit.png", "model.json", "model.residual.npz", "report.html"),
     ]
+    found = checked(out / "report.html")
+    fit = json.loads((out / "fit.json").read_text(encoding="utf-8"))
+    assert f"validation {fit['validation']['rmse']:.3g} um" in " ".join(found.captions)
+    for path, parameter in fit["parameters"].items():
+        row = found.cells.index(path)
+        assert float(found.cells[row + 1]) == pytest.approx(
+            parameter["value"], rel=1e-4
+        )
+    assert "um/V" in found.cells
     assert_pictures(out, "fit.png")
 
 

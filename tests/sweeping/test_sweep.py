@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from click.testing import CliRunner
+from page_reader import checked
 from swept_studies import GRID
 
 import piezojax as pj
@@ -313,6 +314,8 @@ def test_command_writes_data_set_and_pictures(write, tmp_path, table):
         content = (tmp_path / "a" / f"{name}.png").read_bytes()
         assert content.startswith(b"\x89PNG")
         assert len(content) > 10_000
+    title = str(opened(tmp_path / "a").attrs["title"])
+    assert checked(tmp_path / "a" / "report.html").headings[0] == title
     assert opened(tmp_path / "a").attrs["study"] == "study"
 
 
