@@ -37,7 +37,15 @@ from piezojax.study import read
 
 COMMANDS = {
     name: importlib.import_module(f"piezojax.cli.{name}").main
-    for name in ("tune", "identify", "validate", "export", "start", "reproduce")
+    for name in (
+        "tune",
+        "identify",
+        "validate",
+        "export",
+        "start",
+        "excite",
+        "reproduce",
+    )
 }
 PNG = b"\x89PNG\r\n\x1a\n"
 STUDY = {
@@ -172,6 +180,7 @@ REFUSED = {
     "validate": ["nowhere.json", "nowhere.csv"],
     "export": ["nowhere.toml"],
     "start": ["nowhere.csv", "--yes"],
+    "excite": ["--lower", "0", "--upper", "1", "--rate", "0"],
     "reproduce": ["--table", "9-9"],
 }
 """Arguments that each command refuses."""
@@ -213,6 +222,8 @@ def arguments_for(command, request):
         return [write_model(record.parent), record, *COLUMNS]
     if command == "start":
         return [request.getfixturevalue("record"), *COLUMNS, "--yes"]
+    if command == "excite":
+        return ["--lower", "0", "--upper", "1", "--rate", "1000"]
     if command == "export":
         return [write_model(request.getfixturevalue("tmp_path_factory").mktemp("m"))]
     return ["--table", "5-3"]

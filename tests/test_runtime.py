@@ -194,7 +194,7 @@ def test_used_names_load_their_packages():
 
 
 @pytest.mark.parametrize(
-    "command", ["tune", "identify", "export", "start", "sweep", "reproduce"]
+    "command", ["tune", "identify", "export", "start", "excite", "sweep", "reproduce"]
 )
 def test_help_does_not_wait_for_jax(command):
     modules = imported_by(

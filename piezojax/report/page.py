@@ -27,6 +27,7 @@ PICTURES = {
     "response.png": "Measured frequency response and its model",
     "comparison.png": "Errors of the compared models or controllers",
     "validation.png": "The model on the other records",
+    "excitation.png": "Voltages to record",
     "limit.png": "Errors beside the limit of linear control",
     "structures.png": "Errors by the number of notches",
     "pareto.png": "Error against the limit of a constraint",

@@ -84,7 +84,8 @@ def _error_alarm(
         yield (
             f"the record excites nothing at {at:.4g} Hz, where the loop still acts; a "
             f"resonance that the model lacks could {result}: record a chirp of small "
-            "amplitude or a response up to half the rate, or tune for a lower bandwidth"
+            "amplitude up to half the rate (python -m piezojax.excite writes a record) "
+            "or a response, or tune for a lower bandwidth"
         )
 
 

@@ -3,9 +3,10 @@
     python tests/benchmarks/one_sitting.py [--stages 0:40:2] [--json FILE]
 
 The record of each stage of tests/oracles is written in one of four dialects of files.
-``start`` gets that file and ``--yes``, nothing else. Its gains then run on the stage as
-in promise.py, whose figures and bar the table has; the bar on the ratio is 1.5, on 18
-of 20 stages. Each start has 300 s.
+``start`` gets that file and ``--yes``, nothing else. The voltages are those of the
+oracles, or with ``--excite`` those of ``piezojax.excite``. Its gains then run on the
+stage as in promise.py, whose figures and bar the table has; the bar on the ratio is
+1.5, on 18 of 20 stages. Each start has 300 s.
 """
 
 import argparse
@@ -25,6 +26,8 @@ from rich.console import Console
 from rich.table import Table
 
 import piezojax as pj
+from piezojax.signals.excitation import Generator
+from piezojax.signals.excitation import excitation as excited_by
 from piezojax.tuning.result import load_result
 
 RATIO, KEPT, SECONDS = 1.5, 0.9, 300.0
@@ -66,9 +69,18 @@ def archive(columns, folder):
 DIALECTS = (comma, semicolon, units_below, archive)
 
 
-def started(stage, dialect, folder):
+def excited(stage):
+    """Return the voltages of ``piezojax.excite`` and the readings of the stage."""
+    p = stage.parameters
+    generator = Generator(p.lower, p.upper, p.rate, p.slew)
+    voltages = excited_by(generator)[1]
+    first = stage.reset(voltages[0], 0)
+    return voltages, np.concatenate([[first], stage.respond(voltages[:-1])[0]])
+
+
+def started(stage, dialect, folder, record_of):
     """Return the exit status of a start, its output, and the seconds."""
-    voltages, readings = excitation.record(stage)
+    voltages, readings = record_of(stage)
     columns = np.c_[stage.dt * np.arange(len(voltages)), voltages, readings]
     record, begun = dialect(columns, folder), time.perf_counter()
     command = [sys.executable, "-m", "piezojax.start", record, "--yes"]
@@ -79,13 +91,13 @@ def started(stage, dialect, folder):
     return done.returncode, done.stdout + done.stderr, seconds
 
 
-def line_of(number, dialect):
+def line_of(number, dialect, record_of):
     """Return the line of a stage: exit status, figures and alarms."""
     stage = forty_stages.stage(number)
     line = {"name": stage.parameters.name, "dialect": dialect.__name__}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        status, output, seconds = started(stage, dialect, folder)
+        status, output, seconds = started(stage, dialect, folder, record_of)
         line |= {"status": status, "wall_s": seconds, "alarms": []}
         if status not in (0, 3):
             return line | {"refused": output.splitlines()[-1]}
@@ -157,14 +169,16 @@ def summary(lines):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--stages", default="0:40:2", metavar="FIRST:STOP:STEP")
+    parser.add_argument("--excite", action="store_true", help="piezojax.excite records")
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     console = Console(width=None if sys.stdout.isatty() else 120)
     numbers = range(*(int(number) for number in chosen.stages.split(":")))
+    record_of = excited if chosen.excite else excitation.record
     lines = []
     for number in numbers:
         dialect = DIALECTS[number // 2 % len(DIALECTS)]
-        line = line_of(number, dialect)
+        line = line_of(number, dialect, record_of)
         lines.append(line)
         ratio = f", {line['ratio']:.2f}" if "ratio" in line else ""
         console.print(

@@ -159,7 +159,8 @@ def _poor_excitation(
                 f"{name} is not exciting enough: its {count} "
                 f"{'frequency' if count == 1 else 'frequencies'} in the training part "
                 f"determine {2 * count} parameters of linear dynamics, and the model "
-                f"has {order}; a multisine, a chirp or noise would suffice"
+                f"has {order}; a multisine, a chirp or noise would suffice "
+                "(python -m piezojax.excite writes one)"
             )
         elif count <= 1 and hysteresis:
             yield (

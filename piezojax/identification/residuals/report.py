@@ -202,7 +202,8 @@ def _coverage_warnings(report: ResidualReport, dt: float) -> Iterator[str]:
         yield (
             f"the record excites nothing above {bound.highest:.3g} Hz: a "
             "resonance above it stays unseen, and gains tuned on this model are not "
-            f"validated there; record a chirp or noise up to {0.2 / dt:.3g} Hz"
+            f"validated there; record a chirp or noise up to {0.2 / dt:.3g} Hz "
+            "(python -m piezojax.excite writes one)"
         )
 
 

@@ -1,0 +1,78 @@
+"""``python -m piezojax.excite --lower V --upper V --rate HZ``: what to record."""
+
+import click
+
+from .command import Command, common, print_page, results_folder, run
+
+RECORD = "record.csv"
+"""File of a whole record."""
+
+
+@click.command(cls=Command)
+@click.option("--lower", type=float, required=True, help="Lower limit, V.")
+@click.option("--upper", type=float, required=True, help="Upper limit, V.")
+@click.option("--rate", type=float, required=True, help="Rate of the generator, Hz.")
+@click.option("--slew", type=float, help="Largest slew rate of the amplifier, V/s.")
+@click.option(
+    "--slowest",
+    type=float,
+    default=5.0,
+    show_default=True,
+    help="Frequency of the cycles over the whole range, Hz.",
+)
+@click.option(
+    "--highest", type=float, help="Highest frequency, Hz (default: 0.4 of the rate)."
+)
+@click.option(
+    "--hold",
+    type=float,
+    default=0.25,
+    show_default=True,
+    help="Time for which a level is held, s; creep longer than that stays unknown.",
+)
+@click.option(
+    "--points",
+    type=click.IntRange(min=1),
+    help="Points of the buffer of the generator: write parts of at most so many, "
+    "instead of one record.",
+)
+@common
+def main(points, out, seed, quiet, **limits):
+    """Write the voltages to record for a model of hysteresis, creep and dynamics.
+
+    The record rests first, and has all parts twice: identify fits one half and
+    validates on the other. With --points, as for the 1024 points of an NV200 at a
+    --rate of 20000, the parts come in files of their own, at a lower rate where they
+    need it; record each, and give the records to identify together.
+    """
+
+    def body(console):
+        from ..core.files import write_text
+        from ..report.excitation_pictures import excitation_page, write_excitation
+        from ..report.page import write_page
+        from ..signals.excitation import Generator, Part, buffered, excitation
+
+        known = {name: value for name, value in limits.items() if value is not None}
+        generator = Generator(**known)
+        if points is None:
+            parts, whole = excitation(generator, seed or 0)
+            files = {RECORD: Part("record", whole, generator.rate, "")}
+        else:
+            parts = buffered(generator, points, seed or 0)
+            files = {f"{part.name}.csv": part for part in parts}
+        with results_folder(out, "excitation") as folder:
+            for name, part in files.items():
+                write_text(folder / name, csv_of(part))
+            write_excitation(parts, folder)
+            page = excitation_page(parts, files)
+            written = write_page(page, folder)
+        print_page(page, console)
+        console.print(f"page: {written}; results in {folder}", soft_wrap=True)
+
+    run(quiet, body)
+
+
+def csv_of(part) -> str:
+    """Return the voltages of a part with their instants, as CSV."""
+    rows = (f"{k / part.rate:.9g},{u:.6f}" for k, u in enumerate(part.voltages))
+    return "\n".join(["time_s,voltage_V", *rows]) + "\n"

@@ -1,0 +1,232 @@
+"""Voltages to record: for the hysteresis, the creep and the dynamics of a stage.
+
+All parts begin and end at the middle of the range. A record of them in turn, twice with
+other random numbers, lets a model be fitted to the first half and validated on the
+second.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+
+SMALL = 0.02
+"""Amplitude of the multisine, as a share of the range, if the slew rate allows it."""
+
+LINES = 80
+"""Frequencies of the multisine."""
+
+PHASES = 50
+"""Draws of the phases of the multisine; the one with the lowest crest is used."""
+
+EDGE = 0.02
+"""Duration of a move between levels, s, if the slew rate allows it."""
+
+COARSEST = 50
+"""Least samples in a cycle over the whole range."""
+
+ROUNDED = 16
+"""Samples by which rounding may lengthen a part at a lower rate."""
+
+LADDER = ((1.0, 1.0, 2, 1.0), (2.5, 0.6, 6, 0.15), (7.0, 0.2, 4, 1.0))
+"""Frequency (times ``slowest``), height (share of the range), number of cycles, and
+share of the height of the last cycle, of the groups of cycles: over the whole range,
+nested loops that shrink, and small loops."""
+
+
+@dataclass(frozen=True)
+class Generator:
+    """What a generator and its amplifier can do.
+
+    ``lower`` and ``upper`` are the limits of the voltage, V, ``rate`` is the sampling
+    rate, Hz, and ``slew`` the largest slew rate, V/s. The cycles over the whole range
+    have the frequency ``slowest`` (Hz), or less if ``slew`` needs it; the multisine
+    reaches ``highest`` (Hz), and a level is held for ``hold`` (s). Raises ValueError
+    for limits in the wrong order, numbers that are not above 0, and frequencies that
+    the rate does not allow.
+    """
+
+    lower: float
+    upper: float
+    rate: float
+    slew: float = np.inf
+    slowest: float = 5.0
+    highest: float | None = None
+    hold: float = 0.25
+
+    def __post_init__(self):
+        if self.highest is None:
+            object.__setattr__(self, "highest", 0.4 * self.rate)
+        if not self.lower < self.upper:
+            raise ValueError(
+                f"lower is {self.lower:g} V and upper {self.upper:g} V; lower must be "
+                "below upper"
+            )
+        for field in fields(self)[2:]:
+            value = getattr(self, field.name)
+            if not value > 0.0:
+                raise ValueError(f"{field.name} is {value:g}; it must be above 0")
+        if self.top > 0.5 * self.rate:
+            raise ValueError(
+                f"highest is {self.top:g} Hz; it must be at most half the rate, "
+                f"{0.5 * self.rate:g} Hz"
+            )
+        if self.slowest > 0.05 * self.top:
+            raise ValueError(
+                f"slowest is {self.slowest:g} Hz; it must be at most a twentieth of "
+                f"highest, {self.top:g} Hz"
+            )
+
+    @property
+    def top(self) -> float:
+        """Highest frequency of the multisine, Hz."""
+        return float(self.highest or 0.0)
+
+    @property
+    def span(self) -> float:
+        """Range of the voltage, V."""
+        return self.upper - self.lower
+
+    @property
+    def middle(self) -> float:
+        """Middle of the range, V."""
+        return 0.5 * (self.lower + self.upper)
+
+    def time(self, duration: float) -> np.ndarray:
+        """Return the instants of a part of ``duration``, s."""
+        return np.arange(max(round(duration * self.rate), 1)) / self.rate
+
+    def move(self, start: float, stop: float) -> np.ndarray:
+        """Return a smooth move between two levels within the slew rate, V."""
+        height = stop - start
+        duration = max(EDGE, 0.5 * np.pi * abs(height) / self.slew)
+        share = self.time(duration) / duration
+        return start + 0.5 * height * (1.0 - np.cos(np.pi * share))
+
+
+class Part(NamedTuple):
+    """A part of a record: ``voltages`` [samples] in V at ``rate`` (Hz).
+
+    ``tells`` is what a model can be fitted to it for.
+    """
+
+    name: str
+    voltages: np.ndarray
+    rate: float
+    tells: str
+
+    @property
+    def steepest(self) -> float:
+        """Largest slew rate, V/s; that between the last and the first sample counts."""
+        steps = np.diff(self.voltages, append=self.voltages[0])
+        return float(self.rate * np.abs(steps).max())
+
+
+def ladder(generator: Generator, random: np.random.Generator) -> Part:
+    """Return cycles over the whole range, nested loops that shrink, and small loops."""
+    level, parts = generator.middle, []
+    for times, share, count, last in LADDER:
+        height = share * generator.span
+        base = generator.lower + random.uniform(0.2, 0.8) * (generator.span - height)
+        # The slope of a cycle is greatest in the first, the largest one.
+        fastest = generator.slew / (np.pi * height)
+        frequency = min(times * generator.slowest, fastest)
+        turns = frequency * generator.time(count / frequency)
+        shrink = last ** (np.floor(turns) / max(count - 1, 1))
+        cycle = 0.5 * height * shrink * (1.0 - np.cos(2.0 * np.pi * turns))
+        # Shrinking loops lie inside each other, with a common lower end.
+        parts += [generator.move(level, base), base + cycle]
+        level = base
+    parts.append(generator.move(level, generator.middle))
+    tells = "hysteresis: loops over the whole range, nested and small loops"
+    return Part("ladder", np.concatenate(parts), generator.rate, tells)
+
+
+def holds(generator: Generator, random: np.random.Generator) -> Part:
+    """Return moves to a high and to a low level, which are held, and back."""
+    high, low = (
+        generator.lower + generator.span * random.uniform(*ends)
+        for ends in ((0.75, 0.95), (0.05, 0.25))
+    )
+    rest = np.ones(generator.time(generator.hold).size)
+    level, parts = generator.middle, []
+    for following in (high, low, generator.middle):
+        parts += [generator.move(level, following), following * rest]
+        level = following
+    tells = f"creep, up to {generator.hold:g} s"
+    return Part("holds", np.concatenate(parts), generator.rate, tells)
+
+
+def multisine(generator: Generator, random: np.random.Generator) -> Part:
+    """Return a periodic multisine of low crest about the middle of the range.
+
+    Its frequencies lie between twice ``slowest`` and ``highest``, in even steps of
+    their logarithm, on lines of a period of 2 / ``slowest``.
+    """
+    count = generator.time(2.0 / generator.slowest).size
+    line = generator.rate / count
+    wanted = np.geomspace(2.0 * generator.slowest, generator.top, LINES)
+    lines = np.unique(np.floor(wanted / line + 1e-9).astype(int))
+    best: np.ndarray = np.zeros(0)
+    for _ in range(PHASES):
+        spectrum = np.zeros(count // 2 + 1, complex)
+        spectrum[lines] = np.exp(2j * np.pi * random.uniform(size=lines.size))
+        drawn = np.fft.irfft(spectrum, count)
+        drawn = drawn / np.abs(drawn).max()
+        if not best.size or np.std(drawn) > np.std(best):
+            best = drawn
+    steepest = generator.rate * np.abs(np.diff(best, append=best[0])).max()
+    amplitude = min(SMALL * generator.span, generator.slew / steepest)
+    ends = line * lines[0], line * lines[-1]
+    tells = f"modes, lags and delay from {ends[0]:g} to {ends[1]:g} Hz"
+    voltages = generator.middle + amplitude * best
+    return Part("multisine", voltages, generator.rate, tells)
+
+
+PARTS: tuple[Callable[[Generator, np.random.Generator], Part], ...] = (
+    *(ladder, holds, multisine),
+)
+"""The parts in the order of a record."""
+
+
+def excitation(generator: Generator, seed: int = 0) -> tuple[list[Part], np.ndarray]:
+    """Return the parts to record, and the voltages [samples] of a whole record, V.
+
+    The record rests at the middle of the range first, and has all parts twice, the
+    second time with other random numbers. The parts are those of the first time.
+    """
+    halves = [
+        [part(generator, np.random.default_rng([seed, half])) for part in PARTS]
+        for half in (0, 1)
+    ]
+    rest = np.full(generator.time(0.1).size, generator.middle)
+    whole = [rest, *(part.voltages for half in halves for part in half)]
+    return halves[0], np.concatenate(whole)
+
+
+def buffered(generator: Generator, points: int, seed: int = 0) -> list[Part]:
+    """Return the parts, each in at most ``points`` samples.
+
+    Ladder and holds have a lower rate, the rate of ``generator`` over a whole number.
+    The multisine keeps the rate and has a shorter period, so that its lowest frequency
+    is higher. Raises ValueError for a buffer too short for that.
+    """
+    found = []
+    for part in PARTS:
+        whole = part(generator, np.random.default_rng([seed, 0]))
+        if part is multisine:
+            least = max(generator.slowest, 2.0 * generator.rate / points)
+            own = replace(generator, slowest=least)
+        else:
+            # The moves and the rounding of each part take a few samples more.
+            every = ceil(whole.voltages.size / max(points - 2 * ROUNDED, 1))
+            if generator.rate / every < COARSEST * generator.slowest:
+                raise ValueError(
+                    f"{points} points are too few for the {whole.name}: a cycle would "
+                    f"have fewer than {COARSEST} samples"
+                )
+            own = replace(generator, rate=generator.rate / every, highest=None)
+        found.append(part(own, np.random.default_rng([seed, 0])))
+    return found
