@@ -32,6 +32,7 @@ from piezojax.study import (
     shipped,
 )
 from piezojax.study.ensemble_table import EnsembleTable
+from piezojax.study.parameters import _reaching
 
 SHIPPED = sorted(path.stem for path in shipped().parent.glob("*.toml"))
 
@@ -1084,3 +1085,18 @@ def test_messages_without_type_checks(outcomes, name):
 def test_shipped_accepts_a_name_and_no_path():
     with pytest.raises(ValueError, match="is unknown; there are "):
         shipped("../pyproject")
+
+
+@pytest.mark.parametrize(
+    ("start", "lower", "upper"),
+    [(5.0, 1.0, 10.0), (200.0, 1.0, 2000.0), (0.01, 0.001, 10.0), (-1.0, 1.0, 10.0)],
+)
+def test_declared_bounds_reach_a_decade_beyond_a_start_outside(start, lower, upper):
+    found = _reaching(Range(1.0, 10.0, "log"), start)
+    assert (found.lower, found.upper) == pytest.approx((lower, upper))
+    assert _reaching(Range(1.0, 10.0), start) == Range(1.0, 10.0)
+
+
+def test_half_a_second_settles_by_default(study):
+    changes = {"references/settle": GONE, "references/duration": 1.0}
+    assert load(study(changes)).references.settle == 0.5

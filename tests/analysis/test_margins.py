@@ -275,6 +275,15 @@ def test_a_conditionally_stable_loop_can_lose_too_much_gain():
     assert report.gain_margin == pytest.approx(4.4)
 
 
+@pytest.mark.parametrize("gain", [0.3, 1.4])
+def test_growth_of_the_gain_by_less_than_two_is_no_loss(gain):
+    """The same plant: for a gain of 1.4 the factor 2.2 / 1.4 lies between 1 and 2."""
+    one = np.ones(1)
+    report = report_of(LinearLoop(np.array([[1.2]]), one, gain * one, DT))
+    assert report.gain_margin == pytest.approx(2.2 / gain)
+    assert report.gain_reduction_margin == pytest.approx(0.2 / gain)
+
+
 def test_curves_equal_the_responses_of_the_equations():
     loop, oracle = loop_of("pid, all"), written("pid, all")
     reports = stability_reports({"after": loop}, 3.0)
@@ -309,6 +318,21 @@ def test_the_default_reference_is_the_middle():
     )
     assert default == middle
     assert default != other
+
+
+def test_every_loop_of_several_axes_is_reported():
+    def loop(*names):
+        return pj.Feedback(
+            pj.PerAxis(tuple(pid(name) for name in names)),
+            pj.PerAxis(tuple(around(pid("all")).plant for _ in names)),
+            pj.PerAxis(tuple(around(pid("all")).actuator for _ in names)),
+            pj.PerAxis(tuple(pj.hardware.Sensor(0.0) for _ in names)),
+        )
+
+    both = {"before": loop("integral", "all"), "after": loop("all", "all")}
+    reports = stability_reports(both, (3.0, 3.0), DT, ("X", "Y"))
+    assert list(reports.axes) == ["before", "after"]
+    assert reports.problems == {}
 
 
 def test_curves_of_several_axes_equal_those_of_each_axis():

@@ -68,6 +68,21 @@ def test_coupled_axes():
     np.testing.assert_allclose(found.highest, corners.max(axis=0), rtol=1e-12)
 
 
+class Parabola(System):
+    """A static map whose output is largest within the limits."""
+
+    def init(self, input=None):
+        return ()
+
+    def step(self, state, input):
+        return state, input * (100.0 - input)
+
+
+def test_an_extreme_between_the_limits_belongs_to_the_stroke():
+    found = bounds(stroke_of(Parabola(), LOW, HIGH))
+    assert found == pytest.approx([-2400.0, 2500.0], abs=0.2)
+
+
 class Shared(System):
     """Two axes that share one supply: each moves less when both are driven."""
 

@@ -14,6 +14,7 @@ _STUDY = (
     "tests/tuning/test_axes.py::test_a_bad_study_is_refused",
     "tests/tuning/test_robust.py::test_a_bad_study_is_refused",
     "tests/tuning/test_goals.py::test_impossible_limits_are_refused",
+    "tests/tuning/test_goals.py::test_several_axes_have_no_bandwidth",
 )
 _SWEPT = ("tests/sweeping/test_plan.py",)
 _SUMMARIES = ("tests/tuning/test_result.py",)
