@@ -17,7 +17,7 @@ from piezojax.analysis.limit import (
 )
 from piezojax.analysis.limit.limit_report import Curves
 from piezojax.analysis.limit.linear_plant import LinearPlant, linear_plant
-from piezojax.analysis.limit.performance import _shares
+from piezojax.analysis.limit.performance import _last_above, _shares
 from piezojax.analysis.limit.spectra import (
     ReferencePredictor,
     grid_size,
@@ -89,6 +89,12 @@ def test_the_limit_equals_the_scalar_riccati_equation(linear):
         # The drawn disturbance differs from its model: a spectrum has 45 segments.
         assert found.limit == pytest.approx(known, rel=0.06)
         assert found.limit <= found.one_controller <= 1.03 * known
+    # The best S is that of the Kalman predictor of the disturbance,
+    # (z - MEMORY) / (z - MEMORY + gain), whose peak lies at z = -1.
+    variance = riccati(NOISE**2)
+    gain = MEMORY * variance / (variance + NOISE**2)
+    expected = (1.0 + MEMORY) / (1.0 + MEMORY - gain)
+    assert linear.sensitivity_peak == pytest.approx(expected, rel=0.1)
 
 
 def test_curves_and_bandwidth_equal_the_known_spectra(linear):
@@ -253,6 +259,31 @@ def test_spectra_sum_to_the_variance():
     expected = np.abs(1.0 / (1.0 - 0.6 * w)) ** 2
     shape = found[1] / (9.0 * expected)
     assert np.abs(shape.reshape(64, -1).mean(axis=1) - 1.0).max() < 0.15
+
+
+@pytest.mark.parametrize("last", [1, 5, 7])
+def test_the_bandwidth_is_the_highest_line_above_the_noise(last):
+    spectrum = np.zeros(16)
+    spectrum[[0, last, 16 - last]] = 2.0
+    assert _last_above(spectrum, 1.0) == last
+    assert _last_above(spectrum, 2.0) == 0
+
+
+@pytest.mark.parametrize(("samples", "windows"), [(100, 1), (149, 1), (150, 2)])
+def test_windows_overlap_by_half_within_the_record(samples, windows):
+    assert windowed(np.ones(samples), 100, 256).shape == (windows, 129)
+
+
+def test_the_predicted_part_has_the_mean_of_the_signals():
+    time = np.arange(4_000) * DT
+    moving = np.stack([references_of.signal("SW30", jnp.asarray(time))])
+    known = ReferencePredictor(moving, 1_000, 100)
+    signals = (0.5 * moving + 7.0)[:, None]
+    found = known.predicted(signals)
+    assert found.shape == moving.shape
+    counted = known.window(found)
+    assert counted.mean() == pytest.approx(known.window(signals).mean(), rel=1e-12)
+    np.testing.assert_allclose(counted, known.window(signals)[:, 0], atol=1e-3)
 
 
 def test_only_a_linear_filter_of_the_reference_is_predicted():
