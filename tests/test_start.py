@@ -8,11 +8,13 @@ import pytest
 from click.testing import CliRunner
 from oracles import excitation, forty_stages
 
+from piezojax import About, save
 from piezojax.cli import start
+from piezojax.control import PID
 from piezojax.identification import Record, read_record
 from piezojax.identification.records.recognise import noise_rms, recognised
 from piezojax.signals import signal, time_grid
-from piezojax.study import build, load
+from piezojax.study import build, load, sha256_of
 from piezojax.study.first_study import Plan, first_study, planned
 from piezojax.tuning.result import Result, Scores
 
@@ -214,12 +216,14 @@ class Verbs:
         result = RESULT.model_copy(update=self.found)
         out.mkdir(parents=True)
         (out / "result.json").write_text(result.model_dump_json(), encoding="utf-8")
+        about = About(study_sha256=sha256_of(load(study)))
+        save(PID(0.1, 1.0, dt=1e-3), out / "gains.toml", about)
         return SimpleNamespace(result=result, case=None)
 
     def export(self, source, console, *, study, out, runs):
         self.calls.append(("export", source.name))
         out.mkdir()
-        (out / "controller.c").touch()
+        (out / "Makefile").touch()
 
 
 @pytest.fixture
@@ -302,6 +306,36 @@ def test_an_interrupted_start_goes_on(run, tmp_path):
     assert (status, calls) == (0, [])
     assert "tuned before: the gains are in" in output
     assert "exported before:" in output
+
+
+def test_a_changed_study_is_tuned_again(run, tmp_path):
+    run("--yes")
+    path = tmp_path / "out" / "study.toml"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("steps = 40", "steps = 41"), encoding="utf-8")
+    status, _, calls = run()
+    assert (status, calls) == (0, [("tune", "tuned-2"), ("export", "tuned-2")])
+    assert (tmp_path / "out" / "controller-2" / "Makefile").is_file()
+    # the first answers again: their gains are there
+    path.write_text(text, encoding="utf-8")
+    status, output, calls = run()
+    assert (status, calls) == (0, [])
+    assert f"the gains are in {tmp_path / 'out' / 'tuned'}\n" in output
+
+
+def test_answers_to_a_study_that_is_written_are_refused(run, tmp_path, record):
+    run("--yes")
+    status, output, calls = run("--upper", "50", "--seed", "3")
+    assert (status, calls) == (1, [])
+    assert "was written before and does not follow --upper, --seed: edit it, or" in (
+        output
+    )
+    other = tmp_path / "other.csv"
+    other.write_bytes(record.read_bytes())
+    out = ["--out", str(tmp_path / "out")]
+    printed = CliRunner().invoke(start.main, [str(other), *out])
+    assert printed.exit_code == 1
+    assert f"does not follow {other}: edit it" in printed.output
 
 
 def test_alarms_of_earlier_gains_are_printed_again(run):

@@ -78,14 +78,16 @@ def main(record, model, check, yes, out, seed, quiet, **given):
         folder = out or numbered_folder(RESULTS / record.stem)
         study = folder / STUDY
         if study.is_file():
+            others = {"model": model, "check": check, "seed": seed}
+            _check_same(study, record, given | others)
             console.print(f"going on in {folder} with its {STUDY}", soft_wrap=True)
         else:
             _write_study(study, record, given, model, check, yes, seed, console)
-        tuned, outcome = _finished(folder), None
+        tuned, outcome = _finished(study), None
         if tuned is None:
             tuned = numbered_folder(folder / TUNED)
             try:
-                outcome = tune_study(study, tuned, seed, None, console)
+                outcome = tune_study(study, tuned, None, None, console)
             except KeyboardInterrupt:
                 console.print(_going_on(record, folder), soft_wrap=True)
                 raise
@@ -170,13 +172,40 @@ def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
     return planned(record, answers)
 
 
-def _finished(folder: Path) -> Path | None:
-    """Return the last folder of gains in ``folder`` whose search came to its end."""
-    from ..tuning.result import RESULT_FILE, load_result
+def _check_same(study: Path, record: Path, given: dict[str, Any]) -> None:
+    """Raise ValueError if the ``study`` has another record, or options are given."""
+    from ..study import load
+    from ..study.first_study import seen_from
 
-    found = [file.parent for file in sorted(folder.glob(f"{TUNED}*/{RESULT_FILE}"))]
-    ended = [each for each in found if load_result(each).status != INTERRUPTED]
-    return ended[-1] if ended else None
+    known = load(study).plant["record"]
+    known = known if isinstance(known, list) else [known]
+    named = [f"--{name}" for name, value in given.items() if value is not None]
+    if seen_from(study.parent, record) not in known:
+        named = [str(record)]
+    if named:
+        raise ValueError(
+            f"{study} was written before and does not follow {', '.join(named)}: edit "
+            "it, or start in a new folder"
+        )
+
+
+def _finished(study: Path) -> Path | None:
+    """Return the last folder of gains beside ``study`` that a whole search made of it.
+
+    Gains of the study before a change do not count.
+    """
+    from ..core.serial import read_about
+    from ..study import load, sha256_of
+    from ..tuning.result import GAINS_FILE, RESULT_FILE, load_result
+
+    wanted, found = sha256_of(load(study)), []
+    for file in study.parent.glob(f"{TUNED}*/{RESULT_FILE}"):
+        folder = file.parent
+        if load_result(folder).status == INTERRUPTED:
+            continue
+        if read_about(folder / GAINS_FILE).study_sha256 == wanted:
+            found.append(folder)
+    return max(found, key=lambda folder: folder.stat().st_mtime, default=None)
 
 
 def _going_on(record: Path, folder: Path) -> str:
@@ -187,12 +216,14 @@ def _export(
     folder: Path, tuned: Path, outcome: "Outcome | None", console: Console
 ) -> None:
     """Export the gains in ``tuned`` as C, unless that was done before."""
-    exported = folder / EXPORTED
-    if exported.is_dir() and any(exported.iterdir()):
-        console.print(f"exported before: {exported}", soft_wrap=True)
-        return
     from ..tuning.exported_runs import make_runs
 
+    # The gains in tuned-2 go to controller-2.
+    exported = folder / tuned.name.replace(TUNED, EXPORTED, 1)
+    if (exported / "Makefile").is_file():
+        console.print(f"exported before: {exported}", soft_wrap=True)
+        return
+    exported = numbered_folder(exported)
     export_file(
         tuned,
         console,

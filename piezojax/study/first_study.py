@@ -107,10 +107,10 @@ def first_study(
     doubled = [f"{kind}{2.0 * plan.frequency:g}" for kind in UNSEEN]
     keys = {"rate": "record_rate"}
     plant = {
-        "record": _from(folder, record),
+        "record": seen_from(folder, record),
         "model": model,
         **{keys.get(k, k): v for k, v in columns.items() if v is not None},
-        **({"check": _from(folder, check)} if check else {}),
+        **({"check": seen_from(folder, check)} if check else {}),
     }
     values = {
         **{field.name: _toml(getattr(plan, field.name)) for field in fields(plan)},
@@ -191,7 +191,7 @@ def _toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _from(folder: Path, file: Path) -> str:
+def seen_from(folder: Path, file: Path) -> str:
     """Return the path of ``file`` as seen from ``folder``, if there is one."""
     try:
         return Path(os.path.relpath(file, folder)).as_posix()
