@@ -275,6 +275,14 @@ def test_a_conditionally_stable_loop_can_lose_too_much_gain():
     assert report.gain_margin == pytest.approx(4.4)
 
 
+def test_a_pole_on_the_unit_circle_is_not_stable():
+    """y(k+1) = u under u = -y oscillates for ever, with its pole at -1."""
+    one = np.ones(1)
+    report = report_of(LinearLoop(np.zeros((1, 1)), one, one, DT))
+    assert not report.stable
+    assert report.poles == (-1.0,)
+
+
 @pytest.mark.parametrize("gain", [0.3, 1.4])
 def test_growth_of_the_gain_by_less_than_two_is_no_loss(gain):
     """The same plant: for a gain of 1.4 the factor 2.2 / 1.4 lies between 1 and 2."""
