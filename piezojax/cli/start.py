@@ -1,7 +1,8 @@
 """``python -m piezojax.start RECORD``: from a record to exported gains."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 from rich.console import Console
@@ -23,35 +24,52 @@ STUDY, TUNED, EXPORTED = "study.toml", "tuned", "controller"
 INTERRUPTED = "interrupted"
 """Status of a result whose search was interrupted."""
 
+
+class Question(NamedTuple):
+    """What a record cannot tell: the ``text`` of a question, and the end of its help.
+
+    The answer is of the type ``kind``.
+    """
+
+    text: str
+    kind: type = float
+    more: str = ""
+
+
 QUESTIONS = {
-    "lower": "lower limit of the voltage [V]",
-    "upper": "upper limit of the voltage [V]",
-    "noise": "rms noise of the sensor [um]",
-    "frequency": "frequency of the slowest reference [Hz]",
-    "track": "references to track, with their frequencies in Hz",
-    "amplitude": "amplitude of the references, half of their range [um]",
-    "offset": "lowest value of the references [um]",
-    "jumps": "whether references jump, as steps do",
-    "controller": "controller to tune",
+    "lower": Question("lower limit of the voltage [V]"),
+    "upper": Question("upper limit of the voltage [V]"),
+    "noise": Question("rms noise of the sensor [um]"),
+    "frequency": Question("frequency of the slowest reference [Hz]"),
+    "track": Question(
+        "references to track, with their frequencies in Hz", str, ", as SIN10,PWSW40"
+    ),
+    "amplitude": Question("amplitude of the references, half of their range [um]"),
+    "offset": Question("lowest value of the references [um]"),
+    "jumps": Question(
+        "whether references jump, as steps do",
+        bool,
+        "; limits the overshoot, at the cost of accuracy",
+    ),
+    "controller": Question("controller to tune", str, ", as inversion_pid"),
 }
-"""What a record cannot tell; the defaults are those of ``planned``."""
+"""The questions by option; the defaults are those of ``planned``."""
+
+
+def questions(function: Callable) -> Callable:
+    """Add an option for each of the ``QUESTIONS``."""
+    for name, question in reversed(QUESTIONS.items()):
+        option = f"--{name}/--no-{name}" if question.kind is bool else f"--{name}"
+        text = f"{question.text[0].upper()}{question.text[1:]}{question.more}."
+        function = click.option(option, type=question.kind, default=None, help=text)(
+            function
+        )
+    return function
 
 
 @click.command(cls=Command)
 @click.argument("record", type=click.Path(path_type=Path))
-@click.option("--lower", type=float, help="Lower limit of the voltage, V.")
-@click.option("--upper", type=float, help="Upper limit of the voltage, V.")
-@click.option("--noise", type=float, help="RMS noise of the sensor, um.")
-@click.option("--frequency", type=float, help="Frequency of the slowest reference, Hz.")
-@click.option("--track", help="References to tune on, as SIN10,PWSW40.")
-@click.option("--amplitude", type=float, help="Half of the range of references, um.")
-@click.option("--offset", type=float, help="Lowest value of the references, um.")
-@click.option(
-    "--jumps/--no-jumps",
-    default=None,
-    help="References jump, as steps do: limit the overshoot, at the cost of accuracy.",
-)
-@click.option("--controller", help="Name of a design, as inversion_pid.")
+@questions
 @click.option("--model", help="Model to fit; 'all' compares all  [auto]")
 @click.option(
     "--check",
@@ -150,7 +168,7 @@ def _write_study(
     fresh_folder(study.parent)
     write_text(study, text)
     for name, question in QUESTIONS.items():
-        console.print(f"{question}: {getattr(plan, name)}", soft_wrap=True)
+        console.print(f"{question.text}: {getattr(plan, name)}", soft_wrap=True)
     console.print(f"wrote {study}", soft_wrap=True)
 
 
@@ -163,11 +181,11 @@ def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
         if answers[name] is None:
             default = getattr(planned(record, answers), name)
             try:
-                answers[name] = click.prompt(question, default=default)
+                answers[name] = click.prompt(question.text, default=default)
             except click.Abort:
                 raise ValueError(
-                    f"no answer for the {question}: give it as --{name}, or --yes for "
-                    "all defaults"
+                    f"no answer for the {question.text}: give it as --{name}, or "
+                    "--yes for all defaults"
                 ) from None
     return planned(record, answers)
 
