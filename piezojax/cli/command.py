@@ -107,6 +107,14 @@ def print_page(page: "Page", console: Console) -> None:
         console.print(part, soft_wrap=isinstance(part, str))
 
 
+def print_results(page: "Page", folder: Path, console: Console) -> None:
+    """Print ``page``, and where it and its results lie: in ``folder``."""
+    from ..report.page import PAGE
+
+    print_page(page, console)
+    console.print(f"page: {folder / PAGE}; results in {folder}", soft_wrap=True)
+
+
 def exit_unsafe(alarms: Sequence[str]) -> None:
     """End the command with the status ``UNSAFE`` if there are any ``alarms``."""
     if alarms:

@@ -2,7 +2,7 @@
 
 import click
 
-from .command import Command, common, print_page, results_folder, run
+from .command import Command, common, print_results, results_folder, run
 
 RECORD = "record.csv"
 """File of a whole record."""
@@ -65,9 +65,8 @@ def main(points, out, seed, quiet, **limits):
                 write_text(folder / name, csv_of(part))
             write_excitation(parts, folder)
             page = excitation_page(parts, files)
-            written = write_page(page, folder)
-        print_page(page, console)
-        console.print(f"page: {written}; results in {folder}", soft_wrap=True)
+            write_page(page, folder)
+        print_results(page, folder, console)
 
     run(quiet, body)
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from .command import Command, common, print_page, results_folder, run
+from .command import Command, common, print_results, results_folder, run
 from .identify_response import (
     Amplitudes,
     ResponseOptions,
@@ -257,9 +257,8 @@ def main(
             bar.stage("drawing")
             write_fit(fit, folder)
             page = fit_page(fit)
-            written = write_page(page, folder)
-        print_page(page, console)
-        console.print(f"page: {written}; results in {folder}", soft_wrap=True)
+            write_page(page, folder)
+        print_results(page, folder, console)
 
     def controller_of(source, rate):
         from ..catalog import CONTROLLERS, at_rate
@@ -314,9 +313,8 @@ def main(
             bar.stage("drawing")
             write_ranking(ranking, folder)
             page = ranking_page(ranking)
-            written = write_page(page, folder)
-        print_page(page, console)
-        console.print(f"page: {written}; results in {folder}", soft_wrap=True)
+            write_page(page, folder)
+        print_results(page, folder, console)
         if ranking.report.interrupted:
             exit_interrupted()
 

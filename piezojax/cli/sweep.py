@@ -10,12 +10,13 @@ from rich.console import Console
 
 from ..core.files import numbered_folder
 from ..core.runtime import simulate_side_by_side
-from .command import RESULTS, Command, common, run
+from .command import RESULTS, Command, common, print_page, run
 from .stopping import exit_interrupted
 from .terminal import Bar
 
 # The bodies import JAX and its users, so that --help does not wait for them.
 if TYPE_CHECKING:
+    from ..report.page import Page
     from ..sweeping.sweeper import SweepResult
 
 
@@ -74,7 +75,7 @@ def main(
         if shard != (1, 1) and out is None:
             raise ValueError("--shard needs --out, the folder that all shards share")
         path = _study_path(study)
-        folder = out
+        folder, page = out, None
         try:
             with Bar(console) as bar:
                 bar.stage(f"reading {path.name}")
@@ -88,7 +89,8 @@ def main(
                     bar.finish()
                     bar.stage("drawing")
                     write_pictures(result.path, folder)
-                    write_page(sweep_page(result.path), folder)
+                    page = sweep_page(result.path)
+                    write_page(page, folder)
         except KeyboardInterrupt:
             if folder is None or not folder.exists():
                 raise
@@ -98,19 +100,22 @@ def main(
                 err=True,
             )
             exit_interrupted()
-        _report(result, folder, shard, console)
+        _report(result, page, folder, shard, console)
 
     run(quiet, body)
 
 
 def _report(
-    result: "SweepResult", folder: Path, shard: tuple[int, int], console: Console
+    result: "SweepResult",
+    page: "Page | None",
+    folder: Path,
+    shard: tuple[int, int],
+    console: Console,
 ) -> None:
     from ..report.page import PAGE
-    from ..report.sweep_maps import best_table
 
-    if result.finished:
-        console.print(best_table(result.path))
+    if page is not None:
+        print_page(page, console)
     if result.simulated:
         rate = result.lane_steps / result.core_s
         console.print(

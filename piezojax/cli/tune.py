@@ -12,7 +12,7 @@ from .command import (
     common,
     exit_unsafe,
     print_alarms,
-    print_page,
+    print_results,
     results_folder,
     run,
 )
@@ -114,9 +114,8 @@ def tune_study(
             bar.stage("computing the limit of linear control")
             write_limit(outcome.limit, folder, outcome.result.heading)
             page = tuning_page(outcome)
-            written = write_page(page, folder)
-    print_page(page, console)
-    console.print(f"page: {written}; results in {folder}", soft_wrap=True)
+            write_page(page, folder)
+    print_results(page, folder, console)
     return outcome
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from .command import Command, common, exit_unsafe, print_page, results_folder, run
+from .command import Command, common, exit_unsafe, print_results, results_folder, run
 from .records import SampleRange, print_columns, record_columns
 from .terminal import Bar
 
@@ -51,9 +51,8 @@ def main(model, records, estimate, out, seed, quiet, **columns):
             bar.stage("drawing")
             write_validation(found, folder, residual)
             page = validation_page(found)
-            written = write_page(page, folder)
-        print_page(page, console)
-        console.print(f"page: {written}; results in {folder}", soft_wrap=True)
+            write_page(page, folder)
+        print_results(page, folder, console)
         exit_unsafe(page.alarms)
 
     run(quiet, body)

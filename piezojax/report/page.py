@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..core.files import write_text
+from ..tuning.result import STUDY_FILE
 
 PAGE = "report.html"
 
@@ -34,9 +35,6 @@ PICTURES = {
     "convergence.png": "Objective over the evaluations",
 }
 """Captions of pictures by their files, in the order of the page; others follow."""
-
-_QUOTED = ("study.toml",)
-"""Text files that the page quotes."""
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62em; margin: 2em auto;
@@ -91,7 +89,7 @@ def page_html(page: Page, folder: Path) -> str:
         + "".join(table_html(table) for table in tables)
         + _section("Notes", _list(sentences))
         + _section("Pictures", "".join(_figures(folder)))
-        + _section("Files", "".join(_quoted(folder)))
+        + _section("Files", _quoted_study(folder))
         + _section("Origin", _list(page.origin))
         + "</body>\n</html>\n"
     )
@@ -152,8 +150,9 @@ def _figures(folder: Path) -> Iterable[str]:
         )
 
 
-def _quoted(folder: Path) -> Iterable[str]:
-    for name in _QUOTED:
-        if (folder / name).is_file():
-            text = escape((folder / name).read_text(encoding="utf-8"))
-            yield f"<details><summary>{name}</summary><pre>{text}</pre></details>\n"
+def _quoted_study(folder: Path) -> str:
+    path = folder / STUDY_FILE
+    if not path.is_file():
+        return ""
+    text = escape(path.read_text(encoding="utf-8"))
+    return f"<details><summary>{path.name}</summary><pre>{text}</pre></details>\n"
