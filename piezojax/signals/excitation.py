@@ -57,8 +57,6 @@ class Generator:
     hold: float = 0.25
 
     def __post_init__(self):
-        if self.highest is None:
-            object.__setattr__(self, "highest", 0.4 * self.rate)
         if not self.lower < self.upper:
             raise ValueError(
                 f"lower is {self.lower:g} V and upper {self.upper:g} V; lower must be "
@@ -66,7 +64,7 @@ class Generator:
             )
         for field in fields(self)[2:]:
             value = getattr(self, field.name)
-            if not value > 0.0:
+            if value is not None and not value > 0.0:
                 raise ValueError(f"{field.name} is {value:g}; it must be above 0")
         if self.top > 0.5 * self.rate:
             raise ValueError(
@@ -81,8 +79,8 @@ class Generator:
 
     @property
     def top(self) -> float:
-        """Highest frequency of the multisine, Hz."""
-        return float(self.highest or 0.0)
+        """Highest frequency of the multisine, Hz: ``highest``, or 0.4 of the rate."""
+        return 0.4 * self.rate if self.highest is None else self.highest
 
     @property
     def span(self) -> float:
@@ -120,8 +118,12 @@ class Part(NamedTuple):
     @property
     def steepest(self) -> float:
         """Largest slew rate, V/s; that between the last and the first sample counts."""
-        steps = np.diff(self.voltages, append=self.voltages[0])
-        return float(self.rate * np.abs(steps).max())
+        return _steepest(self.voltages, self.rate)
+
+
+def _steepest(signal: np.ndarray, rate: float) -> float:
+    """Return the largest slope of a periodic ``signal``, per s."""
+    return float(rate * np.abs(np.diff(signal, append=signal[0])).max())
 
 
 def ladder(generator: Generator, random: np.random.Generator) -> Part:
@@ -177,8 +179,8 @@ def multisine(generator: Generator, random: np.random.Generator) -> Part:
         drawn = drawn / np.abs(drawn).max()
         if not best.size or np.std(drawn) > np.std(best):
             best = drawn
-    steepest = generator.rate * np.abs(np.diff(best, append=best[0])).max()
-    amplitude = min(SMALL * generator.span, generator.slew / steepest)
+    fastest = generator.slew / _steepest(best, generator.rate)
+    amplitude = min(SMALL * generator.span, fastest)
     ends = line * lines[0], line * lines[-1]
     tells = f"modes, lags and delay from {ends[0]:g} to {ends[1]:g} Hz"
     voltages = generator.middle + amplitude * best
