@@ -111,8 +111,8 @@ def build(
     """Build the Case of ``study``; ``seed`` replaces the seed of the study.
 
     The files that the study names lie beside ``path``. ``progress`` receives that of
-    the fit of a plant. Raises ValueError: one line with
-    the key, the value and the allowed values.
+    the fit of a plant. Raises ValueError: one line with the key, the value and the
+    allowed values.
     """
     path = Path(path)
     if seed is not None:

@@ -199,8 +199,8 @@ def seen_from(folder: Path, file: Path) -> str:
         return file.absolute().as_posix()
 
 
-def _rounded(value: float, digits: int = 4) -> float:
-    return float(f"{value:.{digits}g}")
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")
 
 
 def _round_below(value: float) -> float:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from ..analysis.constraints import LoopFigures, worst_by_plant
-from ..core.feedback import Feedback
 from ..core.progress import Progress
 from ..study import Case
 from .alarms import PEAK
@@ -28,7 +27,7 @@ def figures_beside(
     driven = np.array([trace.driven for trace in data.traces])
     own = loops["before"]
     others = {
-        name: replace(own, loop=_with_controller(own.loop, controller))
+        name: replace(own, loop=replace(own.loop, controller=controller))
         for name, controller in case.beside.items()
     }
     found = {}
@@ -45,10 +44,6 @@ def figures_beside(
             sensitivity_peak=number(peak),
         )
     return found
-
-
-def _with_controller(loop: Feedback, controller: Any) -> Feedback:
-    return Feedback(controller, loop.plant, loop.actuator, loop.sensor)
 
 
 def _of_plants(errors: np.ndarray) -> dict[str, Any]:
