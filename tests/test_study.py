@@ -19,6 +19,7 @@ from piezojax.catalog import CONTROLLERS, p753
 from piezojax.control import PID, DisturbanceObserverControl
 from piezojax.core.parameter import declarations
 from piezojax.core.paths import get, parameters
+from piezojax.core.serial import to_data
 from piezojax.core.space import Range
 from piezojax.dynamics import FirstOrderLag
 from piezojax.hysteresis import ShapedColemanHodgdon
@@ -915,6 +916,37 @@ def test_a_design_that_does_not_fit_the_plant(refusal):
         "controller.design: the plant has a pole of modulus 1; a design needs a plant "
         "that comes to rest, with all poles below 1"
     )
+
+
+def test_a_controller_contains_a_design(study, refusal):
+    limited = {"type": "LimitedReference", "slew": 1e3, "dt": 5e-5}
+    designed = {
+        "controller": limited | {"controller": {"design": "inversion_pid"}},
+        "parameters": GONE,
+        "tune": ["controller.controller.feedback.*"],
+    }
+    case = read(study(designed))
+    alone = designed | {
+        "controller": {"design": "inversion_pid"},
+        "tune": ["controller.feedback.*"],
+    }
+    assert to_data(case.loop.controller) == limited | {
+        "controller": to_data(read(study(alone)).loop.controller)
+    }
+    of_catalog = {"controller": limited | {"controller": {"catalog": "p753_pid"}}}
+    known = read(study(designed | of_catalog | {"tune": ["controller.controller.*"]}))
+    assert type(known.loop.controller.controller).__name__ == "PID"
+    for part, message in (
+        ({"design": "lqr"}, "controller.controller.design: 'lqr' is unknown"),
+        ({"design": "lqr", "catalog": "a"}, "controller.controller has the keys"),
+        (
+            {"catalog": "p753_pd"},
+            "controller.controller.catalog: 'p753_pd' is unknown",
+        ),
+    ):
+        assert refusal({"controller": limited | {"controller": part}}).startswith(
+            message
+        )
 
 
 @pytest.fixture

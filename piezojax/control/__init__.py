@@ -26,6 +26,7 @@ from .iterative_learning import Trials as Trials
 from .iterative_learning import learn as learn
 from .kalman import KalmanFilter as KalmanFilter
 from .learning_control import LearningControl as LearningControl
+from .limited_reference import LimitedReference as LimitedReference
 from .mixed_sensitivity import first_order_weight as first_order_weight
 from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
 from .model_reference import ModelReferenceSlidingMode as ModelReferenceSlidingMode

@@ -51,8 +51,8 @@ def _value_to_data(value: Any) -> Any:
 def from_data(data: Any, where: str = "system") -> System:
     """Return the System that ``data`` from ``to_data`` describes.
 
-    ``where`` is the name of ``data`` in errors. Raises ValueError, naming the key, the
-    value and the allowed values.
+    ``where`` is the name of ``data`` in errors. Parts may be Systems already. Raises
+    ValueError, naming the key, the value and the allowed values.
     """
     known = kinds()
     allowed = ", ".join(known)
@@ -103,7 +103,7 @@ def _value_from_data(value: Any, kind: Any, where: str) -> Any:
             _value_from_data(v, item, f"{where}.{i}") for i, v in enumerate(value)
         )
     if isinstance(kind, type) and issubclass(kind, System):
-        system = from_data(value, where)
+        system = value if isinstance(value, System) else from_data(value, where)
         if not isinstance(system, kind):
             raise ValueError(
                 f"{where} is of type {type(system).__name__}; "

@@ -1,7 +1,7 @@
 """Case of a study: read its files, fit its plant, build its loop and search space."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..catalog import CONTROLLERS, PLANTS, at_rate
+from ..catalog import CONTROLLERS, PLANTS
 from ..control.design import DESIGNS
 from ..control.design_model import NoInverseError
 from ..core.about import About
@@ -18,8 +18,6 @@ from ..core.arrays import as_array
 from ..core.feedback import Feedback, Observation
 from ..core.paths import declared, get, replace, static_fields
 from ..core.progress import Progress, Silent
-from ..core.serial import from_data, read_about
-from ..core.serial import load as load_system
 from ..core.space import Space
 from ..core.system import System, accepts
 from ..identification import Fit
@@ -33,6 +31,7 @@ from .origin import check_origin
 from .parameters import check_value, search_space
 from .references import reference_signals
 from .schema import Study, load
+from .sources import about_file, source_error, system_of
 from .tables import one_of
 from .trajectories import read_trajectories
 
@@ -133,8 +132,8 @@ def build(
             return _designed(study, name, plant, fit, design_notes.append)
 
         folder, rate = path.parent, study.rate
-        found = _from_source(table, where, folder, CONTROLLERS, rate, design)
-        check_origin(_about_file(table, folder), study, f"{where}.file")
+        found = system_of(table, where, folder, CONTROLLERS, rate, design)
+        check_origin(about_file(table, folder), study, f"{where}.file")
         observation = Observation(zero, zero, zero, zero)
         _check_role(found, observation, where, "an Observation to a command")
         return found
@@ -236,13 +235,13 @@ def _plant(study: Study, folder: Path, progress: Progress) -> _Plant:
     table = study.plant
     given = [key for key in _FITTED if key in table]
     if not given:
-        plant = _from_source(table, "plant", folder, PLANTS, study.rate)
-        about = _about_file(table, folder)
+        plant = system_of(table, "plant", folder, PLANTS, study.rate)
+        about = about_file(table, folder)
         check_origin(about, study, "plant.file")
         return _Plant(on_axes(plant, study), about)
     sources = ("catalog", "file", "type")
     if len(given) > 1 or set(table) & set(sources):
-        raise _source_error(table, "plant", (*sources, "record", "response"))
+        raise source_error(table, "plant", (*sources, "record", "response"))
     if given == ["response"]:
         model = plant_of_response(table, study, folder)
         notes = [f"plant.response: {model.report.found}", *model.report.notes]
@@ -261,16 +260,11 @@ def _saved_residual(study: Study, folder: Path, about: About) -> ResidualRecord 
         raise ValueError(f"plant.file: {error}") from None
 
 
-def _about_file(table: Mapping[str, Any], folder: Path) -> About:
-    """Return the origin of the file of a table, empty for another source."""
-    return read_about(folder / str(table["file"])) if "file" in table else About()
-
-
 def _swept_plants(study: Study, zero: Any) -> dict[str, System]:
     plants = {}
     for name in study.sweep.plants if study.sweep else ():
         where = f"sweep.plants.{name}"
-        plant = _from_source({"catalog": name}, where, Path(), PLANTS, study.rate)
+        plant = system_of({"catalog": name}, where, Path(), PLANTS, study.rate)
         _check_role(plant, zero, where, "a voltage to a displacement")
         _check_rates(study, plant, where)
         plants[name] = plant
@@ -350,64 +344,3 @@ def _check_rates(study: Study, system: System, name: str) -> None:
             raise ValueError(
                 f"rate is {study.rate:g} Hz, but {name} was made for {1.0 / dt:g} Hz"
             )
-
-
-def _source_error(
-    table: Mapping[str, Any], where: str, allowed: Iterable[str]
-) -> ValueError:
-    return ValueError(
-        f"{where} has the keys {', '.join(table) or 'none'}; "
-        f"it must have exactly one of {', '.join(allowed)}"
-    )
-
-
-def _from_source(
-    table: dict[str, Any],
-    where: str,
-    folder: Path,
-    catalog: Mapping[str, Callable[..., System]],
-    rate: float,
-    design: Callable[[str], System] | None = None,
-) -> System:
-    """Build the System of a table with one source: catalog, file, type or design.
-
-    Only a controller has a design. Raises ValueError for a table with no source,
-    several sources, or other keys.
-    """
-    sources = {
-        "catalog": lambda: at_rate(catalog, one_of(table["catalog"], catalog), rate),
-        "file": lambda: _from_file(table, where, folder),
-        "type": lambda: from_data(table, where),
-    }
-    if design is not None:
-        sources["design"] = lambda: design(table["design"])
-    given = [source for source in sources if source in table]
-    known = {*sources, _ACCEPT} if "file" in table else set(sources)
-    extra = set() if "type" in table else set(table) - known
-    if len(given) != 1 or extra:
-        fitted = ["record", "response"] if where == "plant" else []
-        allowed = (*sources, *fitted)
-        raise _source_error(table, where, allowed)
-    try:
-        return sources[given[0]]()
-    except ValueError as error:
-        prefix = "" if str(error).startswith(where) else f"{where}.{given[0]}: "
-        raise ValueError(f"{prefix}{error}") from None
-
-
-_ACCEPT = "accept_unsafe"
-"""Key beside ``file`` that accepts a System written with an alarm."""
-
-
-def _from_file(table: dict[str, Any], where: str, folder: Path) -> System:
-    """Load the System of ``table["file"]``.
-
-    Raises ValueError for a file written with an alarm, unless the table accepts it.
-    """
-    path, accept = folder / str(table["file"]), table.get(_ACCEPT, False)
-    if not isinstance(accept, bool):
-        raise ValueError(f"{where}.{_ACCEPT} is {accept!r}; it must be true or false")
-    if not accept:
-        remedy = f"set {where}.{_ACCEPT} = true to use it anyway"
-        read_about(path).require_safe(path.name, remedy)
-    return load_system(path, accept_unsafe=True)

@@ -81,8 +81,7 @@ def place_of(case: Case) -> str:
     table, controller = case.study.structures, case.loop.controller
     behind = table.behind if table else None
     if behind is None:
-        has_feedback = isinstance(getattr(controller, "feedback", None), System)
-        behind = "controller.feedback" if has_feedback else "controller"
+        behind = _feedback_of(controller)
     where = f"structures.behind: {behind}"
     if behind.split(".")[0] != "controller":
         raise ValueError(f"{where} must begin with 'controller'")
@@ -109,6 +108,19 @@ def place_of(case: Case) -> str:
             "tune these under [parameters]"
         )
     return behind
+
+
+def _feedback_of(controller: System) -> str:
+    """Return the path of the feedback in ``controller``, without one its own path.
+
+    Around a controller with feedback there may be another, as a LimitedReference.
+    """
+    part, path = controller, "controller"
+    while isinstance(inner := getattr(part, "controller", None), System):
+        part, path = inner, f"{path}.controller"
+    if isinstance(getattr(part, "feedback", None), System):
+        return f"{path}.feedback"
+    return "controller"
 
 
 def moved(path: str, place: str) -> str:
