@@ -14,7 +14,8 @@ from ..core.rollout import simulate
 SMALL = 0.1
 """Height of the small steps, as a share of that of the large ones."""
 
-NAMES = ("small step up", "small step down", "large step up", "large step down")
+LARGE = ("large step up", "large step down")
+NAMES = ("small step up", "small step down", *LARGE)
 
 BAND, FINE = 0.02, 0.001
 """Settling bands around the reference, as shares of the height."""

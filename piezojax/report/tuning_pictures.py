@@ -74,9 +74,8 @@ def write_results(outcome: Outcome, folder: Path) -> None:
 
 def write_numbers(outcome: Outcome, folder: Path) -> None:
     """Write result.json, gains.toml and study.toml into ``folder``."""
-    both = {"drive": outcome.drive, "steps": outcome.steps}
-    found = {f"{name}_before": before for name, (before, _) in both.items()}
-    found |= {name: after for name, (_, after) in both.items()}
+    before, after = outcome.drive
+    found = {"drive_before": before, "drive": after}
     result = outcome.result.model_copy(update=found)
     write_text(folder / RESULT_FILE, result.model_dump_json(indent=2) + "\n")
     save(outcome.controller, folder / GAINS_FILE, outcome.about)

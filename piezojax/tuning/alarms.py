@@ -7,8 +7,10 @@ import numpy as np
 
 from ..analysis.constraints import CONSTRAINTS
 from ..analysis.stability import StabilityReport, StabilityReports
+from ..analysis.step_response import LARGE
 from .objective import RAILED
 from .result import ConstraintOutcome, Perturbed, Result, Scores
+from .step_tests import StepResult
 
 PEAK = "sensitivity_peak"
 
@@ -22,6 +24,10 @@ differs from that of tuning."""
 
 AMPLIFIED = 2.0
 """Largest |y/r| without a note."""
+
+OVERSHOOT = 1.0
+"""Largest overshoot of a step over the range of the references without an alarm, as a
+share of its height: farther away the model was never tried, or the stage ends."""
 
 _TIGHTEN = (
     "begin with gains of a stable loop, lower the bounds of the gains, or raise "
@@ -52,6 +58,7 @@ def alarms_of(
         *_stability_alarms(stability, limits),
         *_limit_alarms(others, result.perturbed),
         *_holdout_alarms(result.holdout_constraints),
+        *_step_alarms(result.steps),
         *_plant_alarms(result.perturbed),
         *model,
     ]
@@ -218,6 +225,29 @@ def _missed(name: str, value: float | None, limit: float, where: str) -> str:
     return (
         f"{name} is {shown} on {where}, {side} its limit {limit:g}{unit}: {_TIGHTEN}, "
         f"or change constraints.{name}"
+    )
+
+
+def _step_alarms(steps: Mapping[str, StepResult]) -> Iterable[str]:
+    """Yield an alarm if the overshoot of a large step exceeds ``OVERSHOOT``."""
+    large = {name: step for name, step in steps.items() if name in LARGE}
+    sizes = {
+        name: np.inf if step.overshoot is None else step.overshoot
+        for name, step in large.items()
+    }
+    name = max(sizes, key=sizes.__getitem__, default=None)
+    if name is None or sizes[name] <= OVERSHOOT:
+        return
+    step = large[name]
+    reached = (
+        f"overshoots by {100.0 * sizes[name]:.3g} %"
+        if np.isfinite(sizes[name])
+        else "diverges"
+    )
+    yield (
+        f"a step of the reference from {step.before_um:.4g} to {step.after_um:.4g} um "
+        f"{reached}: put the controller into a LimitedReference, which follows jumps "
+        "as ramps, or limit constraints.closed_loop_peak"
     )
 
 

@@ -45,8 +45,8 @@ class Outcome:
     ``before`` and ``after`` are the loops with the gains of the study and with the
     tuned gains; ``holdout`` are the held-out signals. ``baselines`` is None unless a
     budget for them was given. ``stability`` is that of both loops at the highest
-    reference. ``limit``, ``coupling``, ``drive`` and ``steps`` are computed when they
-    are first read, so that many studies can be tuned without them.
+    reference. ``limit``, ``coupling`` and ``drive`` are computed when they are first
+    read, so that many studies can be tuned without them.
     """
 
     result: Result

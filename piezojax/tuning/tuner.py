@@ -115,14 +115,15 @@ def _tune(
         *recorded_range_alarms(case, data),
         *device_alarms(after.controller),
     ]
+    outcome = Outcome(result, case.loop, after, case, data.holdout, None, stability)
+    result.steps_before, result.steps = outcome.steps
     result.alarms = alarms_of(result, stability, limits, of_model)
     result.wall_s = clock.wall_s()
-    comparison = (
-        compare_baselines(objective, case, data, search, baselines, progress)
-        if baselines and search.status != "interrupted"
-        else None
-    )
-    return Outcome(result, case.loop, after, case, data.holdout, comparison, stability)
+    if baselines and search.status != "interrupted":
+        outcome.baselines = compare_baselines(
+            objective, case, data, search, baselines, progress
+        )
+    return outcome
 
 
 def _model_alarms(

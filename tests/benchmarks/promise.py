@@ -54,6 +54,9 @@ above FAR times the promise."""
 RAILED = 0.02
 """Share of samples at a voltage limit above which a run counts as saturated."""
 
+SLEW = 2.0
+"""Limit of the slew of the reference, relative to that of the fastest sine."""
+
 ROUTINE = (
     "this residual is a disturbance of the loop",
     "never checked on a second record",
@@ -90,7 +93,7 @@ def setup(stage, design, kind="careful"):
         "title": p.name,
         "rate": p.rate,
         "seed": 18,
-        "tune": ["controller.feedback.*"],
+        "tune": ["controller.controller.feedback.*"],
         "plant": {
             "record": "record.csv",
             "model": MODEL,
@@ -100,7 +103,12 @@ def setup(stage, design, kind="careful"):
         },
         "actuator": {"lower": p.lower, "upper": p.upper},
         "sensor": {"noise_rms": p.noise},
-        "controller": {"design": design},
+        "controller": {
+            "type": "LimitedReference",
+            "slew": SLEW * 2.0 * np.pi * 40.0 * 0.2 * p.stroke,
+            "dt": stage.dt,
+            "controller": {"design": design},
+        },
         "references": {
             "tune": ["SIN10", "PWSW40"],
             "unseen": ["SIN20", "SCAN10"],

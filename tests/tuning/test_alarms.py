@@ -17,6 +17,7 @@ from piezojax.cli.tune import main
 from piezojax.core.files import write_json
 from piezojax.tuning.alarms import alarms_of, exact_peak
 from piezojax.tuning.result import ConstraintOutcome, Perturbed, Result, Scores
+from piezojax.tuning.step_tests import StepResult
 
 LIMITS = {"sensitivity_peak": 2.0, "delay_margin": 1.0}
 
@@ -110,6 +111,42 @@ def test_an_exact_margin_may_miss_its_limit_by_one_percent(name, figure, worse):
     assert alarms(stability=reports(0.3), limits={name: near}) == []
     (alarm,) = alarms(stability=reports(0.3), limits={name: far})
     assert alarm.startswith(f"{name} is ")
+
+
+def step(overshoot):
+    figures = ("rise_time", "settling_time", "settling_time_fine")
+    return StepResult(
+        before_um=1.0,
+        after_um=5.0,
+        overshoot=overshoot,
+        **dict.fromkeys([f"{name}_s" for name in (*figures, "settling_time_noise")]),
+        steady_state_error=0.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("large", "reached"),
+    [
+        (1.0, None),
+        (1.01, "overshoots by 101 %"),
+        (3.29, "overshoots by 329 %"),
+        (None, "diverges"),
+    ],
+)
+def test_a_step_that_rings_raises_an_alarm(large, reached):
+    # A small step may overshoot by far: the slope of the hysteresis changes there.
+    small = {f"small step {way}": step(4.0) for way in ("up", "down")}
+    found = alarms(
+        changed(
+            steps=small | {"large step up": step(0.5), "large step down": step(large)}
+        )
+    )
+    if reached is None:
+        assert found == []
+        return
+    (alarm,) = found
+    assert alarm.startswith(f"a step of the reference from 1 to 5 um {reached}: put ")
+    assert "LimitedReference" in alarm
 
 
 def test_a_limit_on_the_hold_out_may_be_missed_by_five_percent():
