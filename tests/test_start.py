@@ -1,5 +1,6 @@
 """``piezojax.start``: columns, defaults, the study that it writes, and its course."""
 
+import re
 import tomllib
 from types import SimpleNamespace
 
@@ -15,7 +16,7 @@ from piezojax.identification import Record, read_record
 from piezojax.identification.records.recognise import noise_rms, recognised
 from piezojax.signals import signal, time_grid
 from piezojax.study import build, load, sha256_of
-from piezojax.study.first_study import Plan, first_study, planned
+from piezojax.study.first_study import Plan, doubts, first_study, planned
 from piezojax.tuning.result import Result, Scores
 
 NONE = {"time": None, "input": None, "output": None, "rate": None}
@@ -140,16 +141,63 @@ def test_answers_replace_defaults(record):
     found = planned(loaded, {"frequency": 7.0, "upper": 50.0, "noise": None})
     assert (found.frequency, found.track) == (7.0, "SIN7,PWSW28")
     assert found.upper == 50.0
-    with pytest.raises(ValueError, match="the frequency is 0 Hz; it must be above 0"):
-        planned(loaded, {"frequency": 0.0})
-    with pytest.raises(ValueError, match="'pid' is unknown; there are inversion_slid"):
-        planned(loaded, {"controller": "pid"})
+    fastest = 0.5 * found.amplitude * 2.0 * np.pi * 28.0
+    assert found.slew > fastest
+    assert planned(loaded, {"slew": 3.0}).slew == 3.0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"frequency": 0.0}, "frequency is 0 Hz; it must be above 0"),
+        ({"amplitude": -1.0}, "amplitude is -1 um; it must be above 0"),
+        ({"slew": 0.0}, "slew is 0 um/s; it must be above 0"),
+        ({"noise": -0.1}, "noise is -0.1 um; it must be at least 0"),
+        ({"noise": np.nan}, "noise is nan; it must be a number"),
+        (
+            {"lower": 5.0, "upper": 5.0},
+            "lower is 5 V and upper 5 V; lower must be below upper",
+        ),
+        ({"track": " ,"}, "track names no reference, as SIN10,PWSW40"),
+        ({"track": "SIN"}, "track: SIN has no frequency; SIN10 has 10 Hz"),
+        ({"track": "SINE10"}, "signal 'SINE10' is unknown; it must be one of SIN"),
+        ({"controller": "pid"}, "'pid' is unknown; there are inversion_slid"),
+        (
+            {"amplitude": 4.0, "offset": 1.0},
+            r"the references cover 1 to 9 um \(offset to offset \+ 2 amplitude\), the "
+            "record .* um: change amplitude or offset, or record the whole range",
+        ),
+    ],
+)
+def test_impossible_answers_are_refused(record, given, message):
+    loaded = read_record(record, time="time_s", input=1, output=2)
+    with pytest.raises(ValueError, match=message):
+        planned(loaded, given)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, None),
+        ({"upper": 76.0}, None),
+        ({"upper": 90.0}, "the voltage may reach .* to 90 V, but the record covers"),
+        ({"lower": -9.0}, "outside it the model extrapolates"),
+        ({"noise": 1.0}, "a noise of 1 um rms is .* % of the recorded span: is it in"),
+        ({"noise": 0.0}, "the record shows a noise of about 0.0.* um rms, more than"),
+    ],
+)
+def test_answers_that_the_record_contradicts_are_doubted(record, given, message):
+    loaded = read_record(record, time="time_s", input=1, output=2)
+    found = doubts(planned(loaded, given), loaded)
+    if message is None:
+        assert found == []
+    else:
+        (doubt,) = found
+        assert re.search(message, doubt)
 
 
 def test_the_study_holds_the_answers_and_fits_the_record(record, tmp_path):
-    plan = Plan(
-        0.0, 80.0, 0.02, 2.0, "SIN2, SCAN4", 1.0, 2.0, controller="inversion_pid"
-    )
+    plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2, SCAN4", 1.0, 2.0, 50.0, "inversion_pid")
     columns = {"time": "time_s", "input": "command_V", "output": "sensor_um"}
     text = first_study(plan, record, columns, 1e3, folder=tmp_path, model="lag", seed=4)
     path = tmp_path / "study.toml"
@@ -167,14 +215,15 @@ def test_the_study_holds_the_answers_and_fits_the_record(record, tmp_path):
     )
     case = build(study, path, progress=progress)
     assert case.fit.record.source == "record.csv"
-    assert "controller.feedback.integral" in case.space.paths
+    assert "controller.controller.feedback.integral" in case.space.paths
+    assert case.loop.controller.slew == 50.0
     # The fit of the plant reports its progress.
     assert any(text.startswith("fitting from") for text in stages)
 
 
 @pytest.mark.parametrize("title", ['"quoted" \\ back', "um ä µ"])
 def test_names_of_files_are_quoted(tmp_path, title):
-    plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0)
+    plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0, 50.0)
     text = first_study(plan, tmp_path / title, {}, 1e3, folder=tmp_path)
     assert tomllib.loads(text)["plant"]["record"] == title
 
@@ -259,7 +308,7 @@ def test_a_start_without_questions_tunes_and_exports(run, tmp_path):
 
 
 def test_answers_are_asked_for_with_defaults(run, tmp_path):
-    answers = "\n80\n\n3\n\n0.5\n\nyes\ninversion_pid\n"
+    answers = "\n80\n\n3\n\n0.5\n\n70\ninversion_pid\n"
     status, output, _ = run(answers=answers)
     assert status == 0, output
     assert "references to track, with their frequencies in Hz [SIN3,PWSW12]:" in output
@@ -267,8 +316,22 @@ def test_answers_are_asked_for_with_defaults(run, tmp_path):
     assert study.actuator.upper == 80.0
     assert study.references.tune == ("SIN3", "PWSW12")
     assert study.references.amplitude == 0.5
-    assert study.limits["closed_loop_peak"] == 1.5
-    assert study.controller == {"design": "inversion_pid"}
+    assert study.controller == {
+        "type": "LimitedReference",
+        "slew": 70.0,
+        "dt": 1e-3,
+        "controller": {"design": "inversion_pid"},
+    }
+
+
+def test_a_question_is_asked_again_after_a_refused_answer(run, tmp_path):
+    answers = "\n0\n80\n\n3\nSIN\n\n0.5\n\n\n\n"
+    status, output, _ = run(answers=answers)
+    assert status == 0, output
+    assert "upper 0 V; lower must be below upper\nupper limit of" in output
+    assert "track: SIN has no frequency; SIN10 has 10 Hz\nreferences to" in output
+    study = load(tmp_path / "out" / "study.toml")
+    assert (study.actuator.upper, study.references.tune[0]) == (80.0, "SIN3")
 
 
 def test_without_an_answer_nothing_is_written(run, tmp_path):
@@ -349,7 +412,8 @@ def test_alarms_of_earlier_gains_are_printed_again(run):
     ("options", "message"),
     [
         (("--controller", "pid"), "'pid' is unknown; there are inversion_sliding_mode"),
-        (("--frequency", "-1"), "the frequency is -1 Hz; it must be above 0"),
+        (("--frequency", "-1"), "frequency is -1 Hz; it must be above 0"),
+        (("--lower", "9", "--upper", "3"), "lower is 9 V and upper 3 V; lower must"),
         (("--input", "none"), "input column 'none' is missing; there are time_s"),
     ],
 )

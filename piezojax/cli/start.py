@@ -46,10 +46,8 @@ QUESTIONS = {
     ),
     "amplitude": Question("amplitude of the references, half of their range [um]"),
     "offset": Question("lowest value of the references [um]"),
-    "jumps": Question(
-        "whether references jump, as steps do",
-        bool,
-        "; limits the overshoot, at the cost of accuracy",
+    "slew": Question(
+        "fastest slew that the controller follows; jumps become ramps [um/s]"
     ),
     "controller": Question("controller to tune", str, ", as inversion_pid"),
 }
@@ -59,11 +57,10 @@ QUESTIONS = {
 def questions(function: Callable) -> Callable:
     """Add an option for each of the ``QUESTIONS``."""
     for name, question in reversed(QUESTIONS.items()):
-        option = f"--{name}/--no-{name}" if question.kind is bool else f"--{name}"
         text = f"{question.text[0].upper()}{question.text[1:]}{question.more}."
-        function = click.option(option, type=question.kind, default=None, help=text)(
-            function
-        )
+        function = click.option(
+            f"--{name}", type=question.kind, default=None, help=text
+        )(function)
     return function
 
 
@@ -145,7 +142,7 @@ def _write_study(
     from ..identification import DEFAULT
     from ..identification.records.recognise import recognised
     from ..identification.records.record import read_record
-    from ..study.first_study import first_study, planned
+    from ..study.first_study import doubts, first_study, planned
 
     asked = {name: given[name] for name in QUESTIONS}
     columns = recognised(
@@ -169,25 +166,34 @@ def _write_study(
     write_text(study, text)
     for name, question in QUESTIONS.items():
         console.print(f"{question.text}: {getattr(plan, name)}", soft_wrap=True)
+    for doubt in doubts(plan, in_units):
+        console.print(f"note: {doubt}", soft_wrap=True)
     console.print(f"wrote {study}", soft_wrap=True)
 
 
 def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
-    """Return the Plan of the answers to the questions that ``given`` leaves open."""
+    """Return the Plan of the answers to the questions that ``given`` leaves open.
+
+    A question is asked again after an answer that is refused.
+    """
     from ..study.first_study import planned
 
-    answers = dict(given)
+    plan, answers = planned(record, given), dict(given)
     for name, question in QUESTIONS.items():
-        if answers[name] is None:
-            default = getattr(planned(record, answers), name)
+        while answers[name] is None:
             try:
-                answers[name] = click.prompt(question.text, default=default)
+                answer = click.prompt(question.text, default=getattr(plan, name))
             except click.Abort:
                 raise ValueError(
                     f"no answer for the {question.text}: give it as --{name}, or "
                     "--yes for all defaults"
                 ) from None
-    return planned(record, answers)
+            try:
+                plan = planned(record, answers | {name: answer})
+                answers[name] = answer
+            except ValueError as error:
+                click.echo(f"{error}")
+    return plan
 
 
 def _check_same(study: Path, record: Path, given: dict[str, Any]) -> None:

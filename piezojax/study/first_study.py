@@ -2,7 +2,7 @@
 
 import json
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -12,6 +12,8 @@ import numpy as np
 from ..control.design import DESIGNS
 from ..identification import DEFAULT, Record
 from ..identification.records.recognise import noise_rms
+from ..signals import signal, time_grid
+from ..signals.waveforms import parse
 from .tables import one_of
 
 SHARE = 0.2
@@ -24,8 +26,17 @@ SAMPLES_A_PERIOD = 1000
 PERIODS = 3
 """Periods of the slowest reference in a run; the first does not count."""
 
-AMPLIFIED = 1.5
-"""Limit of the closed-loop peak if references jump."""
+FASTER = 2.0
+"""Default limit of the slew, relative to the fastest reference."""
+
+BEYOND = 0.1
+"""Share of a recorded range by which references or limits may exceed it."""
+
+NOISY = 0.05
+"""Share of the recorded span above which a noise of the sensor is doubtful."""
+
+_CONSTANT = ("STEP", "CONST")
+"""References without a frequency."""
 
 UNSEEN = ("SIN", "SCAN")
 """Kinds of the default references that only evaluate the tuned gains."""
@@ -38,8 +49,9 @@ class Plan:
     ``lower`` and ``upper`` are the limits of the voltage, ``noise`` is the rms noise of
     the sensor, ``track`` the references to tune on, as "SIN10,PWSW40", and
     ``frequency`` that of the slowest one. The references cover ``offset`` to ``offset +
-    2 amplitude``. ``jumps`` is whether references jump in use: the loop then may not
-    amplify them by more than ``AMPLIFIED``. ``controller`` is the name of a design.
+    2 amplitude``. The controller follows at most ``slew``, um/s: faster references, as
+    jumps, reach it as ramps. ``controller`` is the name of a design. Raises ValueError
+    for values that no stage can have, and for unknown references or designs.
     """
 
     lower: float
@@ -49,15 +61,43 @@ class Plan:
     track: str
     amplitude: float
     offset: float
-    jumps: bool = False
+    slew: float
     controller: str = "inversion_sliding_mode"
 
     def __post_init__(self):
         one_of(self.controller, DESIGNS)
-        if self.frequency <= 0.0:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.type is float and not np.isfinite(value):
+                raise ValueError(f"{field.name} is {value}; it must be a number")
+        for name, unit in (("frequency", "Hz"), ("amplitude", "um"), ("slew", "um/s")):
+            if getattr(self, name) <= 0.0:
+                raise ValueError(
+                    f"{name} is {getattr(self, name):g} {unit}; it must be above 0"
+                )
+        if self.noise < 0.0:
+            raise ValueError(f"noise is {self.noise:g} um; it must be at least 0")
+        if self.lower >= self.upper:
             raise ValueError(
-                f"the frequency is {self.frequency:g} Hz; it must be above 0"
+                f"lower is {self.lower:g} V and upper {self.upper:g} V; lower must be "
+                "below upper"
             )
+        if not self.tracked:
+            raise ValueError("track names no reference, as SIN10,PWSW40")
+        for name in self.tracked:
+            if parse(name)[1] is None and name not in _CONSTANT:
+                raise ValueError(f"track: {name} has no frequency; {name}10 has 10 Hz")
+
+    @property
+    def tracked(self) -> list[str]:
+        """Names of the references to tune on."""
+        return [name.strip() for name in self.track.split(",") if name.strip()]
+
+    @property
+    def unseen(self) -> list[str]:
+        """Names of the references that only evaluate the tuned gains."""
+        doubled = (f"{kind}{2.0 * self.frequency:g}" for kind in UNSEEN)
+        return [name for name in doubled if name not in self.tracked]
 
 
 def planned(record: Record, given: dict[str, Any]) -> Plan:
@@ -66,7 +106,9 @@ def planned(record: Record, given: dict[str, Any]) -> Plan:
     Values of ``given`` that are not None replace the suggested ones. The limits are the
     recorded voltages, the noise is that of ``noise_rms``, and the references lie in the
     middle of the recorded displacements. The slowest has at least ``SAMPLES_A_PERIOD``
-    samples in a period.
+    samples in a period. The slew is ``FASTER`` times that of the fastest reference.
+
+    Raises ValueError as ``Plan``, and for references outside the record.
     """
     known = {name: value for name, value in given.items() if value is not None}
     low, high = record.output.min(), record.output.max()
@@ -82,8 +124,54 @@ def planned(record: Record, given: dict[str, Any]) -> Plan:
         "track": f"SIN{frequency:g},PWSW{4.0 * frequency:g}",
         "amplitude": amplitude,
         "offset": _rounded(0.5 * (low + high) - amplitude),
+        "slew": 1.0,
     }
-    return Plan(**(suggested | known))
+    plan = Plan(**(suggested | known))
+    if "slew" not in known:
+        plan = replace(plan, slew=_rounded(FASTER * _fastest(plan, record.dt)))
+    least, most = plan.offset, plan.offset + 2.0 * plan.amplitude
+    beyond = BEYOND * (high - low)
+    if least < low - beyond or most > high + beyond:
+        raise ValueError(
+            f"the references cover {least:.4g} to {most:.4g} um (offset to offset + 2 "
+            f"amplitude), the record {low:.4g} to {high:.4g} um: change amplitude or "
+            "offset, or record the whole range"
+        )
+    return plan
+
+
+def _fastest(plan: Plan, dt: float) -> float:
+    """Return the largest slew of the references of ``plan``, um/s; ``dt`` in s."""
+    time = time_grid(PERIODS / plan.frequency, 1.0 / dt)
+    return max(
+        float(np.abs(np.diff(signal(name, time, plan.amplitude, plan.offset))).max())
+        / dt
+        for name in (*plan.tracked, *plan.unseen)
+    )
+
+
+def doubts(plan: Plan, record: Record) -> list[str]:
+    """Return sentences on answers of ``plan`` that its ``record`` contradicts."""
+    low, high = float(record.input.min()), float(record.input.max())
+    found = []
+    beyond = BEYOND * (high - low)
+    if plan.lower < low - beyond or plan.upper > high + beyond:
+        found.append(
+            f"the voltage may reach {plan.lower:g} to {plan.upper:g} V, but the record "
+            f"covers {low:.4g} to {high:.4g} V: outside it the model extrapolates"
+        )
+    measured, span = noise_rms(record), float(np.ptp(record.output))
+    if plan.noise > NOISY * span:
+        found.append(
+            f"a noise of {plan.noise:g} um rms is {100.0 * plan.noise / span:.3g} % of "
+            "the recorded span: is it in um, and the rms value?"
+        )
+    elif plan.noise < 0.1 * measured:
+        found.append(
+            f"the record shows a noise of about {measured:.2g} um rms, more than the "
+            f"{plan.noise:g} um given: the gains may amplify it"
+        )
+    return found
 
 
 def first_study(
@@ -103,8 +191,6 @@ def first_study(
     options of ``read_record``; ``rate`` is the sampling rate of the loop, Hz, and
     ``model`` the model to fit.
     """
-    tracked = [name.strip() for name in plan.track.split(",") if name.strip()]
-    doubled = [f"{kind}{2.0 * plan.frequency:g}" for kind in UNSEEN]
     keys = {"rate": "record_rate"}
     plant = {
         "record": seen_from(folder, record),
@@ -118,11 +204,11 @@ def first_study(
         "rate": _toml(rate),
         "seed": _toml(seed),
         "plant": "\n".join(f"{key} = {_toml(value)}" for key, value in plant.items()),
-        "tune": _toml(tracked),
-        "unseen": _toml([name for name in doubled if name not in tracked]),
+        "dt": _toml(1.0 / rate),
+        "tune": _toml(plan.tracked),
+        "unseen": _toml(plan.unseen),
         "duration": _toml(PERIODS / plan.frequency),
         "settle": _toml(1.0 / plan.frequency),
-        "goals": f"closed_loop_peak = {AMPLIFIED}" if plan.jumps else "",
     }
     return _TEXT.substitute(values)
 
@@ -138,7 +224,7 @@ seed = $seed
 
 # Parameters to tune, with the bounds that the controller declares. [parameters] may
 # give other bounds.
-tune = ["controller.feedback.*"]
+tune = ["controller.controller.feedback.*"]
 
 # The model is fitted to the first half of the record and validated on the second. A
 # second record, as check = "other.csv", shows whether the model still holds.
@@ -154,8 +240,15 @@ upper = $upper
 [sensor]
 noise_rms = $noise
 
-# The loop starts from this design and is tuned from there.
+# The controller follows references up to this slew, um/s. Faster ones, as jumps, reach
+# it as ramps: the feedforward would excite the modes of the stage. dt is 1 / rate.
 [controller]
+type = "LimitedReference"
+slew = $slew
+dt = $dt
+
+# The loop starts from this design and is tuned from there.
+[controller.controller]
 design = $controller
 
 # References cover offset to offset + 2 amplitude. SIN is a sine, PWSW periods of a sine
@@ -171,9 +264,8 @@ settle = $settle
 
 # By default the sensitivity peak is limited to 2.0 and the delay margin to one sample,
 # for every stage within the error bound of the fitted model. Further goals are limits
-# too, as closed_loop_peak = 1.5 for references that jump, or settling_time = 0.01.
+# too, as settling_time = 0.01, or closed_loop_peak = 1.5 if the slew is not limited.
 [constraints]
-$goals
 
 [optimiser]
 method = "gauss_newton"
