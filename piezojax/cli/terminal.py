@@ -21,6 +21,8 @@ from .stopping import SIGNALS, handled, remember
 NOTE_EVERY = 30.0
 """Least time between two notes without a terminal, s."""
 
+_STOPPING = "stopping; Ctrl-C again stops at once"
+
 PIPED = 200
 """Width of tables without a terminal, unless COLUMNS is set: no column is cut."""
 
@@ -66,10 +68,11 @@ class Bar:
         if self._interrupted:
             raise KeyboardInterrupt
         self._interrupted = True
+        if not self._live and not self._console.quiet:
+            # Unlike print, this may run inside another print.
+            os.write(sys.stderr.fileno(), f"{_STOPPING}\n".encode())
         if self._task is not None:
-            self._progress.update(
-                self._task, note="stopping; Ctrl-C again stops at once"
-            )
+            self._progress.update(self._task, note=_STOPPING)
 
     def finish(self) -> None:
         """Ignore the first Ctrl-C or SIGTERM from here on, while results are written.

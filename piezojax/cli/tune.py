@@ -100,6 +100,9 @@ def tune_study(
         description = studies.load(path)
         with results_folder(out, path.stem) as folder:
             case = studies.build(description, path, seed=seed, progress=bar)
+            if case.fit is not None:
+                # At once: the search of gains that will have them takes minutes.
+                print_alarms(console, case.fit.report.alarms)
             outcome = tune(case, baselines=baselines, progress=bar)
             bar.finish()
             bar.stage("drawing")

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
@@ -23,6 +24,8 @@ _COLUMNS = {
 """Columns of the table: title with unit, and the factor from s or a share to it."""
 
 _ROOM = 4.0  # length of the picture, in settling times
+_HEIGHTS = 3.0  # most overshoot that is drawn, in heights of the step
+_MARGIN = 0.1  # room above and below, in heights of the step
 
 
 def steps_table(steps: Loops) -> Table:
@@ -47,7 +50,8 @@ def _worse(steps: Sequence[StepResult], name: str, factor: float) -> str:
     values = [getattr(step, name) for step in steps]
     if any(value is None for value in values):
         return "never"
-    return f"{factor * max(values):.3g}"
+    worst = factor * max(values)
+    return f"{worst:.3g}" if worst < 1e3 else f"{worst:.0f}"
 
 
 def steps_figure(runs: Loops, steps: Loops, title: str) -> Figure:
@@ -68,13 +72,19 @@ def steps_figure(runs: Loops, steps: Loops, title: str) -> Figure:
             level = after + share * (after - before)
             ax.axhline(level, color=REFERENCE, lw=0.7, ls=":")
         ax.axhline(after, color=REFERENCE, lw=0.9, ls="--")
-        room = 0.5 * abs(after - before)
+        height = abs(after - before)
+        drawn = np.r_[run.ends, runs[0][name].displacement, runs[1][name].displacement]
+        bottom, top = np.nanmin(drawn), np.nanmax(drawn)
+        most = _HEIGHTS * height
         ax.set(
             title=f"{name}\n",
             xlabel="time since the step (ms)",
             ylabel="displacement (µm)",
             xlim=(0.0, 1e3 * min(length, shown)),
-            ylim=(min(before, after) - room, max(before, after) + room),
+            ylim=(
+                max(bottom, min(run.ends) - most) - _MARGIN * height,
+                min(top, max(run.ends) + most) + _MARGIN * height,
+            ),
         )
         legend_above(ax)
     add_title(picture, f"{title}: steps, with the time to stay within 2 %")

@@ -259,8 +259,12 @@ def following_table(stability: StabilityReports) -> Table:
             for field in ("bandwidth_Hz", "bandwidth_1dB_Hz")
         )
         peak = max(one.closed_loop_peak for one in each if one is not None)
-        table.add_row(shown, f"{least:.4g} Hz", f"{inner:.4g} Hz", f"{peak:.3f}")
+        table.add_row(shown, _band(least), _band(inner), f"{peak:.3f}")
     return table
+
+
+def _band(highest: float) -> str:
+    return f"{highest:.4g} Hz" if math.isfinite(highest) else "above Nyquist"
 
 
 _UNSTABLE = ("unstable", "-", "-", "-")

@@ -4,6 +4,7 @@ from rich.table import Table
 
 from ..control import Device
 from ..exporting import device_values
+from ..identification import Fit
 from ..tuning.outcome import Outcome
 from .baseline_curves import baselines_table, baselines_text
 from .device_table import device_table
@@ -36,6 +37,7 @@ def tuning_page(outcome: Outcome) -> Page:
     )
     parts = [
         tuning_table(result),
+        _fitted(outcome.case.fit),
         result.structures and structures_table(result.structures),
         result.beside and beside_table(result),
         gains_table(result),
@@ -70,6 +72,19 @@ def tuning_page(outcome: Outcome) -> Page:
             *outcome.about.origin("Gains of a tuned controller"),
             f"Versions: {versions}.",
         ],
+    )
+
+
+def _fitted(fit: Fit | None) -> str | None:
+    """Return a sentence on the fit of the plant, None for a plant of another source."""
+    if fit is None:
+        return None
+    report, part = fit.report, fit.report.validation
+    return (
+        f"plant: {report.model} fitted to {fit.record.source}, free-run error on the "
+        f"validation part {part.rmse:.3g} {part.unit} rms, "
+        f"{part.rmse_percent_of_span:.2g} % of its span; "
+        f"found: {report.found or 'no resonance'}"
     )
 
 
