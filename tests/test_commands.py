@@ -746,6 +746,7 @@ def test_a_real_ctrl_c(tmp_path):
         finally:
             process.kill()
     assert complaint == ""
+    assert "stopping; Ctrl-C again stops at once\n" in printed
     assert process.returncode == 130
     assert "interrupted after" in " ".join(printed.split())
     assert_interrupted(out)

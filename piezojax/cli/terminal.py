@@ -3,7 +3,7 @@
 import os
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from types import FrameType
 
 from rich.console import Console
@@ -69,8 +69,9 @@ class Bar:
             raise KeyboardInterrupt
         self._interrupted = True
         if not self._live and not self._console.quiet:
-            # Unlike print, this may run inside another print.
-            os.write(sys.stderr.fileno(), f"{_STOPPING}\n".encode())
+            # A handler may run inside another print, so it cannot print itself.
+            with suppress(OSError):
+                os.write(self._console.file.fileno(), f"{_STOPPING}\n".encode())
         if self._task is not None:
             self._progress.update(self._task, note=_STOPPING)
 

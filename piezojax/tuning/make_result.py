@@ -116,6 +116,9 @@ def make_result(
     )
 
 
+WORSE = 1e-3
+"""Relative excess over the error of the start that does not count."""
+
 EDGE = 1e-2
 """Distance, as a share of the range, within which a gain is at a bound."""
 
@@ -239,7 +242,7 @@ def worse_than_the_start(before: Scores, after: Scores) -> list[str]:
     if not (before.stable and after.stable):
         return []
     was, found = before.geomean_rms_um, after.geomean_rms_um
-    if was is None or found is None or found <= was:
+    if was is None or found is None or found <= was * (1.0 + WORSE):
         return []
     return [
         f"the tuned gains track worse than the start, {1e3 * found:.4g} nm against "

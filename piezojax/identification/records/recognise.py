@@ -19,12 +19,17 @@ _QUANTITIES = {"input": "V", "output": "um"}
 _NOISE_ORDER = 3
 """Order of the differences of the output that remove its motion."""
 
-_STRETCHES, _LEAST = 200, 64
+_STRETCHES, _LEAST = 100, 64
 """Most stretches of a record, of which the quietest show the noise, and least samples
 of each."""
 
-_QUIETEST = 0.1
-"""Share of the stretches that are at most as noisy as the estimate."""
+_QUIETEST, _DEVIATE = 0.05, -1.6449
+"""Share of the quietest stretches, and the deviate of the normal distribution below
+which that share lies."""
+
+_CORRELATED = 2.31
+"""Samples of the third difference of white noise for one degree of freedom of its
+variance: 1 + 2 (15^2 + 6^2 + 1) / 20^2, by its autocovariances 20, -15, 6 and -1."""
 
 
 def recognised(path: Path, given: dict[str, Any]) -> dict[str, Any]:
@@ -69,14 +74,16 @@ def noise_rms(record: Record) -> float:
     """Return the rms noise of the only output of ``record``, in its unit.
 
     White noise is assumed: the third difference of the output removes slow motion and
-    has 20 times the variance of the noise. The estimate is that of the quietest tenth
-    of the record, in which the stage rests or moves slowly; it contains the rounding of
-    a converter. A sensor with a low-pass, or a stage that never moves slowly, makes it
-    false.
+    has 20 times the variance of the noise. The estimate is that of the quietest part
+    of the record, in which the stage rests or moves slowly, corrected for the choice of
+    the quietest (Wilson-Hilferty). It contains the rounding of a converter. A sensor
+    with a low-pass, or a stage that never moves slowly, makes it false.
     """
     moved = np.diff(record.output, _NOISE_ORDER)
     size = min(max(moved.size // _STRETCHES, _LEAST), moved.size)
     whole = moved[: moved.size // size * size].reshape(-1, size)
     scale = np.sqrt(comb(2 * _NOISE_ORDER, _NOISE_ORDER))
     rms = np.sqrt(np.mean(whole**2, axis=1)) / scale
-    return float(np.quantile(rms, _QUIETEST))
+    spread = 2.0 / 9.0 * _CORRELATED / size
+    quietest = (1.0 - spread + _DEVIATE * np.sqrt(spread)) ** 1.5
+    return float(np.quantile(rms, _QUIETEST) / quietest)
