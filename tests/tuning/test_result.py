@@ -7,6 +7,8 @@ import pytest
 
 from piezojax.analysis.constraints import LoopFigures
 from piezojax.core.metrics import TrackingFigures
+from piezojax.tuning.held_out import HeldOut
+from piezojax.tuning.make_result import _perturbed
 from piezojax.tuning.result import ConstraintOutcome, Perturbed
 
 
@@ -75,6 +77,23 @@ def test_a_summary_of_plants():
     assert found.geomeans_um == [pytest.approx(2.0), None, pytest.approx(4.0)]
     assert found.geomeans_before_um == [pytest.approx(6.0), pytest.approx(1.0), None]
     assert found.geomean_before_rms_um is None
+
+
+def held_out(perturbed):
+    """Return a HeldOut with these figures on perturbed plants, and nothing else."""
+    found = object.__new__(HeldOut)
+    vars(found)["perturbed"] = perturbed
+    return found
+
+
+def test_only_figures_before_and_after_give_a_summary():
+    before, after = (held_out(figures(x)) for x in (BEFORE, AFTER))
+    found = _perturbed(before, after, DRIVEN, {})
+    expected = Perturbed.of(figures(BEFORE), figures(AFTER), DRIVEN, {})
+    assert found.model_dump_json() == expected.model_dump_json()
+    none = held_out(None)
+    for pair in ((before, none), (none, after), (none, none)):
+        assert _perturbed(*pair, DRIVEN, {}) is None
 
 
 def test_plants_lost_before_and_after_are_counted_separately():

@@ -14,6 +14,8 @@ from piezojax.core.paths import get, parameters
 from piezojax.signals import waveforms as signals
 from piezojax.solve.optimisers import METHODS
 from piezojax.study import Study, build
+from piezojax.tuning import tuner
+from piezojax.tuning.baselines import Budget
 from piezojax.tuning.make_result import worse_than_the_start
 from piezojax.tuning.result import Result, load_result
 
@@ -380,6 +382,23 @@ def test_ctrl_c_before_the_first_step(stage):
     else:
         # The best of the points that were screened is already better.
         assert found.result.after.geomean_rms_um < found.result.before.geomean_rms_um
+
+
+def test_an_interrupted_search_has_no_front_and_no_baselines(monkeypatch):
+    called = []
+    for name in ("trace_front", "compare_baselines"):
+        monkeypatch.setattr(tuner, name, lambda *_, name=name: called.append(name))
+    limited = {
+        "constraints": {"sensitivity_peak": 2.0},
+        "pareto": {"constraint": "sensitivity_peak", "limits": [1.5, 1.8]},
+    }
+    for stop, expected in ((1, []), (None, ["trace_front", "compare_baselines"])):
+        called.clear()
+        recorder = Recorder(stop_after=stop)
+        found = pj.tune(case_of(limited), baselines=Budget(), progress=recorder)
+        assert called == expected
+        assert found.result.front is None
+        assert found.baselines is None
 
 
 # Saturation
