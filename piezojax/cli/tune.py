@@ -1,5 +1,6 @@
 """``python -m piezojax.tune [STUDY.toml ...] --out DIR``."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,10 +34,16 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Also tune by Ziegler-Nichols, a relay, CMA-ES and Nelder-Mead (minutes).",
 )
+@click.option(
+    "--schema",
+    is_flag=True,
+    help="Print the JSON schema of a study, for editors, and end.",
+)
 @common
 def main(
     study: tuple[Path, ...],
     baselines: bool,
+    schema: bool,
     out: Path | None,
     seed: int | None,
     quiet: bool,
@@ -57,6 +64,9 @@ def main(
         from .. import study as studies
         from ..tuning.baselines import Budget
 
+        if schema:
+            click.echo(json.dumps(studies.study_schema(), indent=2))
+            return
         paths = [study_path(name) for name in study] or [studies.shipped()]
         if len(paths) > 1 or studies.is_comparison_study(paths[0]):
             if baselines:

@@ -13,6 +13,7 @@ from .comparison_study import load_comparison_study as load_comparison_study
 from .comparison_study import read_compared as read_compared
 from .ensemble import Ensemble as Ensemble
 from .ensemble import Stage as Stage
+from .json_schema import study_schema as study_schema
 from .schema import Study as Study
 from .schema import as_toml as as_toml
 from .schema import load as load

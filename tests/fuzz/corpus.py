@@ -80,7 +80,8 @@ def _pick(random: np.random.Generator, items: Any) -> Any:
 
 
 @cache
-def _study_trees() -> dict[str, dict[str, Any]]:
+def study_trees() -> dict[str, dict[str, Any]]:
+    """Return the shipped studies as tables, by name."""
     folder = studies.shipped().parent
     trees = {
         path.stem: tomllib.loads(path.read_text(encoding="utf-8"))
@@ -103,12 +104,12 @@ def _model_trees() -> dict[str, dict[str, Any]]:
 
 
 def _study_case(random: np.random.Generator) -> Case:
-    name = _pick(random, sorted(_study_trees()))
-    tree = _mutated(copy.deepcopy(_study_trees()[name]), random)
+    name = _pick(random, sorted(study_trees()))
+    tree = mutated(copy.deepcopy(study_trees()[name]), random)
     try:
         text = tomli_w.dumps(tree)
     except (TypeError, ValueError, AttributeError, RecursionError):
-        text = tomli_w.dumps(_study_trees()[name])
+        text = tomli_w.dumps(study_trees()[name])
     content = text.encode("utf-8", "replace")
     if random.random() < 0.2:
         content = _spoilt(content, random)
@@ -117,7 +118,7 @@ def _study_case(random: np.random.Generator) -> Case:
 
 def _model_case(random: np.random.Generator) -> Case:
     name = _pick(random, sorted(_model_trees()))
-    tree = _mutated(copy.deepcopy(_model_trees()[name]), random)
+    tree = mutated(copy.deepcopy(_model_trees()[name]), random)
     content = json.dumps(tree, default=str).encode("utf-8", "replace")
     if random.random() < 0.2:
         content = _spoilt(content, random)
@@ -137,7 +138,8 @@ def _places(tree: Any) -> list[tuple[Any, Any]]:
     return found
 
 
-def _mutated(tree: dict[str, Any], random: np.random.Generator) -> dict[str, Any]:
+def mutated(tree: dict[str, Any], random: np.random.Generator) -> dict[str, Any]:
+    """Return ``tree`` after one to three mutations, which change it."""
     for _ in range(int(random.integers(1, 4))):
         places = _places(tree)
         if not places:

@@ -1,0 +1,99 @@
+"""The JSON schema of a study, judged by the package jsonschema."""
+
+import copy
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from fuzz import corpus
+from jsonschema import Draft202012Validator
+
+from piezojax.cli.tune import main
+from piezojax.study import Study, study_schema
+
+SCHEMA = study_schema()
+JUDGE = Draft202012Validator(SCHEMA)
+STUDIES = {k: v for k, v in corpus.study_trees().items() if "controllers" not in v}
+BASE = STUDIES["p753_dob"]
+
+
+def changed(**changes):
+    """Return the study p753_dob with other values at places such as plant__type."""
+    data = copy.deepcopy(BASE)
+    for place, value in changes.items():
+        *tables, key = place.split("__")
+        table = data
+        for name in tables:
+            table = table.setdefault(name, {})
+        table[key] = value
+    return data
+
+
+def test_the_command_prints_a_schema():
+    found = CliRunner().invoke(main, ["--schema"])
+    assert found.exit_code == 0
+    printed = json.loads(found.output)
+    Draft202012Validator.check_schema(printed)
+    assert printed == json.loads(json.dumps(SCHEMA))
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_shipped_studies_are_valid(name):
+    JUDGE.validate(STUDIES[name])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rate": -1.0},
+        {"rates": 1.0},
+        {"references__tune": []},
+        {"actuator__lowest": 0.0},
+        {"optimiser__method": "newton"},
+        {"optimiser__steps": 0},
+        {"constraints__phase_margin": 180.0},
+        {"constraints__sensitivity_peak": 1.0},
+        {"constraints__ringing": 1.0},
+        {"controller": {"design": "lqr"}},
+        {"controller": {"catalog": "p753"}},
+        {"plant": {"type": "Affin"}},
+        {"pareto": {"constraint": "speed", "limits": [1.0, 2.0]}},
+    ],
+)
+def test_mistakes_are_found(changes):
+    assert not JUDGE.is_valid(changed(**changes))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"constraints__phase_margin": 179.0},
+        {"constraints__sensitivity_peak": "off"},
+        {"controller": {"design": "inversion_pid"}},
+        {"controller": {"type": "PID", "proportional": 1.0, "dt": 5e-5}},
+        {"controller": {"file": "gains.toml", "accept_unsafe": True}},
+        {"plant": {"record": "a.csv", "model": "auto"}},
+        {"references__amplitude": [1.0, 2.0]},
+    ],
+)
+def test_what_a_study_may_have_is_valid(changes):
+    JUDGE.validate(changed(**changes))
+
+
+def test_no_study_that_loads_is_marked():
+    """Of mutated studies, those that pydantic accepts are valid.
+
+    The sources of plant and controllers are read later.
+    """
+    random, accepted = np.random.default_rng(21), 0
+    for _ in range(300):
+        data = corpus.mutated(copy.deepcopy(BASE), random)
+        try:
+            Study.model_validate(data)
+        except ValueError:
+            continue
+        accepted += 1
+        errors = {error.path[0]: error for error in JUDGE.iter_errors(data)}
+        assert errors.keys() <= {"plant", "controller", "beside"}, errors
+    assert accepted > 30
