@@ -324,11 +324,13 @@ def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     out = tmp_path / "c"
     printed = succeeded(call("export", tuned[1], "--out", out)).stdout
     made = ["Makefile", "controller.c", "controller.h", "test_controller.c"]
-    assert names(out) == sorted([*made, "vectors.csv", "report.json"])
+    assert names(out) == sorted([*made, "vectors.csv", "report.json", "report.html"])
     assert "cost of float" in printed
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert report["written"] == "double"
     assert list(report["references"]) == ["SIN50", "SW50"]
+    page = checked(out / "report.html")
+    assert f"{report['references']['SIN50']['rms']['double']:.4g} nm" in page.cells
     assert abs(report["references"]["SIN50"]["percent"]["float"]) < 1.0
     assert f"make -C {out} test" in printed
     text = (out / "controller.c").read_text(encoding="utf-8")
@@ -388,7 +390,9 @@ def test_export_compares_the_file_of_a_device(tmp_path):
         "controller.ini",
         "controller_parameters.csv",
         f"{saved.name}.backup",
+        "report.html",
     ]
+    assert "70.000" in checked(out / "report.html").cells
     assert re.search(r"ki +│ +55.5 │ +70.000 │ 1/s +│ integral gain", printed)
     failed(call(*command), f"--out {out} already holds results")
     failed(call(*command[:-1], tmp_path / "y", "--before", path), "no section headers")
@@ -651,7 +655,9 @@ def test_reproduce_keeps_finished_tables(made_up, tmp_path, monkeypatch):
     result = call("reproduce", *tables, "--out", tmp_path / "out")
     assert result.exit_code == 143
     assert made_up == ["5-3"]
-    assert names(tmp_path / "out") == ["cells.csv", "cells.png", "summary.json"]
+    assert names(tmp_path / "out") == [
+        *("cells.csv", "cells.png", "report.html", "summary.json"),
+    ]
     assert list(json.loads((tmp_path / "out" / "summary.json").read_text())) == ["5-3"]
     assert "interrupted" in result.stdout
 
@@ -879,7 +885,8 @@ def test_reproduce_writes_its_results(made_up, tmp_path):
     out = tmp_path / "out"
     result = succeeded(call("reproduce", "--table", "5-5", "--out", out))
     assert made_up == ["5-5"]
-    assert names(out) == ["cells.csv", "cells.png", "summary.json"]
+    assert names(out) == ["cells.csv", "cells.png", "report.html", "summary.json"]
+    assert "dob" in checked(out / "report.html").cells
     assert_pictures(out, "cells.png")
     with (out / "cells.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -8,10 +8,12 @@ import click
 from rich.console import Console
 
 from ..core.files import numbered_folder
-from .command import RESULTS, Command, common, print_alarms, run
+from .command import RESULTS, Command, common, print_results, run
 from .tune import study_path
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from ..core.about import About
     from ..exporting.compiled_loop import Runs
 
@@ -123,7 +125,8 @@ def export_file(
     from ..exporting.exporter import REPORT
     from ..exporting.judge import ExportReport
     from ..report.device_table import device_table
-    from ..report.export_tables import print_judgement
+    from ..report.export_tables import judgement
+    from ..report.page import Page, write_page
 
     path = next(
         (source / file for file in SYSTEMS if (source / file).is_file()), source
@@ -156,17 +159,21 @@ def export_file(
         accept_unsafe=accept_unsafe,
         runs=runs,
     )
-    print_alarms(console, export_alarms(system, about))
-    for file in files:
-        console.print(f"{file}", soft_wrap=True)
+    parts: "list[Table | str]" = [f"{file}" for file in files]
     if to == "vendor":
-        console.print(device_table(device_values(system, before)))
+        parts.append(device_table(device_values(system, before)))
     if runs is not None:
-        print_judgement(
-            read_model(ExportReport, folder / REPORT, "is no report"), console
-        )
+        parts += judgement(read_model(ExportReport, folder / REPORT, "is no report"))
     if to == "c":
-        console.print(f"test: make -C {folder} test", soft_wrap=True)
+        parts.append(f"test: make -C {folder} test")
+    page = Page(
+        f"{type(system).__name__} of {path.name}, exported as {to}",
+        export_alarms(system, about),
+        parts,
+        about.origin("A System"),
+    )
+    write_page(page, folder)
+    print_results(page, folder, console)
 
 
 def _runs(named: Path | None, file: Path, about: "About") -> "Runs":

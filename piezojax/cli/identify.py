@@ -277,17 +277,18 @@ def main(
     def measure(console, loaded):
         from ..core.files import write_json
         from ..identification.device_scale import device_scale
+        from ..report.page import Page, write_page
         from ..report.summary_tables import scale_table
 
         if len(loaded) > 1:
             raise ValueError("--controller takes one RECORD")
         found = device_scale(controller, loaded[0], dict(gains))
+        notes = [f"note: {note}" for note in found.notes]
+        page = Page(f"gains of a {found.device}", (), [scale_table(found), *notes])
         with results_folder(out, records[0].stem) as folder:
             write_json(folder / "scale.json", found.model_dump())
-        console.print(scale_table(found))
-        for note in found.notes:
-            console.print(f"note: {note}", soft_wrap=True)
-        console.print(f"results in {folder}", soft_wrap=True)
+            write_page(page, folder)
+        print_results(page, folder, console)
 
     def compare(console, loaded, options):
         from ..identification.compare import identify_all

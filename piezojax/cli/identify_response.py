@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 from rich.console import Console
 
-from .command import results_folder
+from .command import print_results, results_folder
 from .records import print_columns
 from .terminal import Bar
 
@@ -72,9 +72,9 @@ def fit_responses(
     """Read or measure the responses, fit their modes, write and print the results."""
     from ..identification.response_levels import compare_levels
     from ..identification.response_model import identify_response
+    from ..report.page import write_page
     from ..report.response_pictures import write_levels, write_measured, write_response
-    from ..report.response_tables import levels_table, measurement_table
-    from ..report.summary_tables import parameter_table
+    from ..report.response_tables import response_page
 
     if options.method is None:
         found, rate = _read(records, columns, options)
@@ -104,29 +104,13 @@ def fit_responses(
             write_response(models[0], folder)
         else:
             write_levels(levels, folder)
-    for _, measured in found:
-        if measured is not None:
-            console.print(measurement_table(measured))
-    chosen = models[0]
-    if levels is not None:
-        console.print(levels_table(levels))
-        for note in levels.report.notes:
-            console.print(f"note: {note}", soft_wrap=True)
-        chosen = levels.chosen
-        console.print(
-            f"model.json is the model of response {levels.report.chosen + 1}; its "
-            "error bound holds for all",
-            soft_wrap=True,
+        page = response_page(
+            models[0] if levels is None else levels.chosen,
+            levels,
+            [measured for _, measured in found],
         )
-    report = chosen.report
-    title = f"{report.lines} lines: median error {100.0 * report.error:.2g} %"
-    units = chosen.about.parameter_units
-    console.print(parameter_table(report.parameters, title, units))
-    console.print(f"found: {report.found}", soft_wrap=True)
-    notes = [*(report.measured.notes if report.measured else []), *report.notes]
-    for note in notes:
-        console.print(f"note: {note}", soft_wrap=True)
-    console.print(f"results in {folder}", soft_wrap=True)
+        write_page(page, folder)
+    print_results(page, folder, console)
 
 
 Found = list[tuple["FrequencyResponse", "Measurement | None"]]

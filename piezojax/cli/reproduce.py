@@ -1,11 +1,12 @@
 """``python -m piezojax.reproduce [--table T ... | --calibrate] --out DIR``."""
 
 import json
+from typing import Any
 
 import click
 
 from ..core.files import write_text
-from .command import Command, common, results_folder, run
+from .command import Command, common, print_results, results_folder, run
 from .stopping import exit_interrupted
 from .terminal import Bar
 
@@ -42,6 +43,7 @@ def main(tables, calibrate, out, seed, quiet):
 
     # JAX and its users are imported here, so that --help does not wait for them.
     def body(console):
+        from ..report.page import Page, write_page
         from ..report.summary_tables import reproduction_table
         from ..report.table_pictures import write_picture, write_rates
         from ..reproduction import reproduce
@@ -82,13 +84,16 @@ def main(tables, calibrate, out, seed, quiet):
             if cells:
                 bar.stage("drawing")
                 write_picture(cells, folder)
-        for table, entry in summarise(cells).items():
-            console.print(
+            parts: list[Any] = [
                 reproduction_table(table, [c for c in cells if c.table == table], entry)
-            )
-        console.print(f"results in {folder}", soft_wrap=True)
+                for table, entry in summarise(cells).items()
+            ]
+            if interrupted:
+                parts.append("interrupted: these are the tables finished so far")
+            page = Page("tables of the thesis, printed and simulated", (), parts)
+            write_page(page, folder)
+        print_results(page, folder, console)
         if interrupted:
-            console.print("interrupted: these are the tables finished so far")
             exit_interrupted()
 
     def calibration(console):
@@ -97,6 +102,7 @@ def main(tables, calibrate, out, seed, quiet):
             held_out_table,
             write_calibration,
         )
+        from ..report.page import Page, write_page
         from ..reproduction.calibration import EXPERIMENTS, calibrate
         from ..reproduction.calibration_report import (
             calibration_report,
@@ -115,9 +121,15 @@ def main(tables, calibrate, out, seed, quiet):
                 write_text(folder / "calibration.json", text + "\n")
             bar.finish()
             write_calibration(fits, plain, folder)
-        for name, both in fits.items():
-            console.print(calibration_table(name, both, plain[name]))
-        console.print(held_out_table(held_out_ratios(fits)))
-        console.print(f"results in {folder}", soft_wrap=True)
+            parts = [
+                *(
+                    calibration_table(name, both, plain[name])
+                    for name, both in fits.items()
+                ),
+                held_out_table(held_out_ratios(fits)),
+            ]
+            page = Page("stage calibrated on tables of the thesis", (), parts)
+            write_page(page, folder)
+        print_results(page, folder, console)
 
     run(quiet, calibration if calibrate else body)

@@ -136,12 +136,8 @@ def _compare(
     paths: Sequence[Path], out: Path | None, seed: int | None, console: Console
 ) -> None:
     from .. import study as studies
-    from ..report.comparison_map import (
-        comparison_table,
-        perturbed_table,
-        perturbed_text,
-        write_comparison,
-    )
+    from ..report.comparison_map import comparison_page, write_comparison
+    from ..report.page import write_page
     from ..report.tuning_pictures import write_numbers
     from ..tuning.comparison import compare
 
@@ -159,25 +155,12 @@ def _compare(
             bar.finish()
             bar.stage("drawing")
             write_comparison(comparison, folder)
-    alarms = [
-        f"{row.study}: {alarm}" for row in comparison.rows for alarm in row.alarms
-    ]
-    print_alarms(console, alarms)
-    console.print(comparison_table(comparison))
-    if (perturbed := perturbed_table(comparison)) is not None:
-        console.print(perturbed)
-        console.print(perturbed_text(comparison), soft_wrap=True)
-    for row in comparison.rows:
-        for note in row.notes:
-            console.print(f"note: {row.study}: {note}", soft_wrap=True)
-    console.print(
-        f"{comparison.status}: {len(comparison.rows)} of {len(entries)} studies, "
-        f"{comparison.wall_s:.0f} s; results in {folder}",
-        soft_wrap=True,
-    )
+            page = comparison_page(comparison, len(entries))
+            write_page(page, folder)
+    print_results(page, folder, console)
     if comparison.status == "interrupted":
         exit_interrupted()
-    exit_unsafe(alarms)
+    exit_unsafe(page.alarms)
 
 
 def study_path(study: Path) -> Path:

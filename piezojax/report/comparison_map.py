@@ -13,6 +13,7 @@ from rich.text import Text
 from ..core.files import write_text
 from ..tuning.comparison import COMPARISON_FILE, ComparisonResult, TunedStudy
 from .figures import AFTER, BEFORE, MEASURED, figure, plot_style, write
+from .page import Page
 
 MARKERS = "osD^vPX*<>hp"
 SERIES_COLOURS = (
@@ -26,6 +27,20 @@ SERIES_COLOURS = (
     "#4a4a4a",
 )
 _COLUMNS = 4
+
+
+def comparison_page(comparison: ComparisonResult, studies: int) -> Page:
+    """Return the Page of ``comparison``, of so many ``studies`` when complete."""
+    perturbed = perturbed_table(comparison)
+    parts = [
+        comparison_table(comparison),
+        *((perturbed, perturbed_text(comparison)) if perturbed is not None else ()),
+        *(f"note: {row.study}: {n}" for row in comparison.rows for n in row.notes),
+        f"{comparison.status}: {len(comparison.rows)} of {studies} studies, "
+        f"{comparison.wall_s:.0f} s",
+    ]
+    alarms = [f"{row.study}: {a}" for row in comparison.rows for a in row.alarms]
+    return Page(comparison.title, alarms, parts)
 
 
 def comparison_table(comparison: ComparisonResult) -> Table:

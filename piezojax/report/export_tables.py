@@ -1,17 +1,14 @@
 """Table of an exported controller in the simulated loop."""
 
-from rich.console import Console
 from rich.table import Table
 
 from ..exporting.judge import ExportReport
 
 
-def print_judgement(report: ExportReport, console: Console) -> None:
-    """Print errors by reference and precision, the cost of a step, and warnings."""
+def judgement(report: ExportReport) -> list[Table | str]:
+    """Return errors by reference and precision, the cost of a step, and warnings."""
     if report.not_judged is not None:
-        text = f"note: not judged in the simulated loop: {report.not_judged}"
-        console.print(text, soft_wrap=True)
-        return
+        return [f"note: not judged in the simulated loop: {report.not_judged}"]
     table = Table(title=f"compiled in the simulated loop; written: {report.written}")
     table.add_column("rms error")
     for precision in report.forms:
@@ -28,14 +25,13 @@ def print_judgement(report: ExportReport, console: Console) -> None:
                 for each in others
             ),
         )
-    console.print(table)
-    for precision, form in report.forms.items():
-        console.print(
+    return [
+        table,
+        *(
             f"{precision}: {form.operations} operations and {form.ns:.0f} ns a step, "
-            f"{form.state_bytes} bytes of state",
-            soft_wrap=True,
-        )
-    if report.why is not None:
-        console.print(f"note: {report.written}, because {report.why}", soft_wrap=True)
-    for warning in report.warnings:
-        console.print(f"WARNING: {warning}", style="bold", soft_wrap=True)
+            f"{form.state_bytes} bytes of state"
+            for precision, form in report.forms.items()
+        ),
+        *([f"note: {report.written}, because {report.why}"] if report.why else []),
+        *(f"WARNING: {warning}" for warning in report.warnings),
+    ]

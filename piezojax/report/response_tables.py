@@ -1,10 +1,48 @@
 """Tables of measured frequency responses, and of their change with amplitude."""
 
+from collections.abc import Iterable
+
 from rich.table import Table
 
 from ..identification.measured_response import Measurement
 from ..identification.response_levels import ResponseLevels
+from ..identification.response_model import ResponseModel
+from .page import Page
 from .response_pictures import level_labels
+from .summary_tables import parameter_table
+
+
+def response_page(
+    model: ResponseModel,
+    levels: ResponseLevels | None,
+    measured: Iterable[Measurement | None],
+) -> Page:
+    """Return the Page of ``model``, which ``levels`` chose if there are several.
+
+    ``measured`` are the responses that were measured on records, None for files.
+    """
+    report = model.report
+    parts: list[Table | str] = [measurement_table(m) for m in measured if m is not None]
+    if levels is not None:
+        parts += [
+            levels_table(levels),
+            *(f"note: {note}" for note in levels.report.notes),
+            f"model.json is the model of response {levels.report.chosen + 1}; its "
+            "error bound holds for all",
+        ]
+    title = f"{report.lines} lines: median error {100.0 * report.error:.2g} %"
+    notes = [*(report.measured.notes if report.measured else []), *report.notes]
+    parts += [
+        parameter_table(report.parameters, title, model.about.parameter_units),
+        f"found: {report.found}",
+        *(f"note: {note}" for note in notes),
+    ]
+    return Page(
+        f"modes fitted to {model.response.source}",
+        model.about.unsafe,
+        parts,
+        model.about.origin("Model of a plant"),
+    )
 
 
 def measurement_table(found: Measurement) -> Table:
