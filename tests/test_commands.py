@@ -329,7 +329,10 @@ def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert report["written"] == "double"
     assert list(report["references"]) == ["SIN50", "SW50"]
-    page = checked(out / "report.html")
+    page, result = checked(out / "report.html"), pj.load_result(tuned[1])
+    for name, cost in report["references"].items():
+        promised = 1e3 * result.holdout.per_reference_rms_um[name]
+        assert cost["rms"]["double"] == pytest.approx(promised, rel=1e-6)
     assert f"{report['references']['SIN50']['rms']['double']:.4g} nm" in page.cells
     assert abs(report["references"]["SIN50"]["percent"]["float"]) < 1.0
     assert f"make -C {out} test" in printed

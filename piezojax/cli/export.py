@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ..core.about import About
+    from ..core.system import System
     from ..exporting.compiled_loop import Runs
 
 SYSTEMS = ("gains.toml", "model.json")
@@ -137,7 +138,7 @@ def export_file(
     folder = out or numbered_folder(RESULTS / f"{path.stem}_{to}")
     if to == "c" and about.study is not None and runs is None:
         try:
-            runs = _runs(study, path, about)
+            runs = _runs(study, path, about, system)
         except ValueError as error:
             if study is not None:
                 raise
@@ -176,8 +177,10 @@ def export_file(
     print_results(page, folder, console)
 
 
-def _runs(named: Path | None, file: Path, about: "About") -> "Runs":
-    """Return the runs of the study at ``named`` for a controller with ``about``.
+def _runs(
+    named: Path | None, file: Path, about: "About", controller: "System"
+) -> "Runs":
+    """Return the runs of the study at ``named`` for ``controller`` with ``about``.
 
     ``named`` defaults to the study.toml beside the ``file`` of the controller. Raises
     ValueError if study and controller have different sampling rates, and for a
@@ -197,4 +200,4 @@ def _runs(named: Path | None, file: Path, about: "About") -> "Runs":
     known = None if named else about.study_sha256
     if known and studies.sha256_of(case.study) != known:
         raise ValueError(f"{path} is not the study of {file}: its SHA-256 differs")
-    return make_runs(case)
+    return make_runs(case, controller)

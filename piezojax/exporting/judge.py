@@ -29,9 +29,10 @@ class FormFigures(BaseModel):
 class ReferenceCost(BaseModel):
     """Tracking errors under a reference by precision, in ``unit`` (nm or nrad).
 
-    ``rms`` is the RMS error. ``cost`` is its increase over the RMS error in double, and
-    ``percent`` that increase in percent of it. ``difference`` is the RMS difference
-    from the displacements in double; in an unstable loop it is large in any precision.
+    ``rms`` is the RMS error of the worst run. ``cost`` is its increase over that in
+    double, and ``percent`` that increase in percent of it. ``difference`` is the RMS
+    difference from the displacements in double; in an unstable loop it is large in any
+    precision.
     """
 
     unit: str
@@ -131,5 +132,8 @@ def _counted(signals: np.ndarray, runs: Runs, trace: RunTrace) -> np.ndarray:
 
 
 def _rms(errors: Any) -> float:
-    """Return the RMS of ``errors`` (um or urad) in nm or nrad."""
-    return 1e3 * float(np.sqrt(np.mean(np.square(errors))))
+    """Return the RMS of ``errors`` [runs, samples] (um or urad) in nm or nrad.
+
+    As in the result of tuning it is that of the worst run.
+    """
+    return 1e3 * float(np.sqrt(np.mean(np.square(errors), axis=1).max()))

@@ -14,7 +14,9 @@ from .figures import AFTER, BEFORE, add_title, figure, plain_tick_labels
 
 def constraints_table(result: Result) -> Table:
     """Return the limits, the values reached, and the held-out plants that keep them."""
-    table = Table(title="limits")
+    table = Table(
+        title="limits on the worst plant of the search, or within the model's error"
+    )
     table.add_column("limit")
     for name in ("set", "tuned", "state", "held-out plants"):
         table.add_column(name, justify="right", no_wrap=True)

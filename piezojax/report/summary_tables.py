@@ -188,7 +188,9 @@ def _typed(value: float, step: float | None) -> str:
 
 def stability_table(stability: StabilityReports) -> Table:
     """Return the margins of each loop, on the worse branch of a hysteresis."""
-    table = Table(title="stability for small motions, worse branch of the hysteresis")
+    table = Table(
+        title="margins for small motions, nominal plant, worse branch of hysteresis"
+    )
     table.add_column("loop")
     for title in ("Ms", "gain margin", "phase margin", "delay margin"):
         table.add_column(title, justify="right")

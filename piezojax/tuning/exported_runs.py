@@ -1,5 +1,7 @@
 """Runs of a study on which its exported controller is tested."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,19 +9,22 @@ import numpy as np
 
 from ..core.arrays import as_signal
 from ..core.feedback import Feedback
-from ..core.system import rest_output
+from ..core.system import System, rest_output
 from ..exporting.compiled_loop import Runs, RunTrace
 from ..exporting.slots import Interface
 from ..study import Case
-from .data import make_data
+from .data import judging, make_data
 
 
-def make_runs(case: Case) -> Runs:
-    """Return the hold-out of ``case`` as runs of a compiled controller.
+def make_runs(case: Case, controller: System) -> Runs:
+    """Return the hold-out of ``case`` as runs of the compiled ``controller``.
 
-    A run is a reference with one draw of the noise.
+    A run is a reference with one draw of the noise. The residual of the plant acts
+    where it harms the loop with ``controller`` most, as in the result of tuning.
     """
-    data, loop, study = make_data(case), case.loop, case.study
+    study = case.study
+    loop = dataclasses.replace(case.loop, controller=controller)
+    data = judging(make_data(case), case, loop)
     signals = data.holdout
     count, draws, samples = signals.noise.shape[:3]
     shape = count * draws, samples, study.axis_count
