@@ -1,3 +1,6 @@
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -118,6 +121,18 @@ def test_range(kind, limits, second):
     np.testing.assert_allclose(
         (values.min(), values.max()), limits, rtol=0.0, atol=0.01
     )
+
+
+def test_the_docs_list_all_references_with_their_ranges():
+    text = Path(__file__).parents[1].joinpath("docs/files.md").read_text("utf-8")
+    rows = dict(re.findall(r"^\| `([A-Z]+)` \| ([^|]+) \|", text, re.MULTILINE))
+    assert rows.keys() == signals.SIGNALS.keys()
+    time = signals.time_grid(4.0, 5e3)
+    for kind, shown in rows.items():
+        values = signals.SIGNALS[kind](time, frequency=10.0, amplitude=1.0)
+        ends = [float(number) for number in shown.split(" to ")]
+        low, high = ends[0], ends[-1]
+        assert (values.min(), values.max()) == pytest.approx((low, high), abs=0.1)
 
 
 def test_multisine_peaks_near_its_amplitude(second):

@@ -50,7 +50,7 @@ def record(tmp_path_factory):
 
 def table(tmp_path, header, *rows, name="record.csv"):
     path = tmp_path / name
-    values = np.arange(12.0).reshape(4, 3)
+    values = np.arange(40.0).reshape(4, 10)[:, : header.count(",") + 1]
     lines = [*rows, *(",".join(map(str, row)) for row in values)]
     path.write_text("\n".join([header, *lines]), encoding="utf-8")
     return path
@@ -66,6 +66,8 @@ def table(tmp_path, header, *rows, name="record.csv"):
             (),
             ("Time (s)", "Drive [V]", "Sensor [um]"),
         ),
+        ("t,drive_V,sensor_um", (), ("t", "drive_V", "sensor_um")),
+        ("t (ms),T,z_um,drive_V", (), ("t (ms)", "drive_V", "z_um")),
         ("time,first,second", (), ("time", "first", "second")),
         ("X,CH1,CH2", ("Sequence,V,um",), (None, "CH1", "CH2")),
     ],

@@ -14,8 +14,11 @@ from .units import seconds_of, unit_of
 Key = str | int
 """Name of a column, or its number from zero."""
 
-IS_TIME = re.compile(r"time\b|time_|x[-_ ](axis|value)\b", re.IGNORECASE)
-"""Pattern of the names of time columns."""
+IS_TIME = re.compile(
+    r"time\b|time_|x[-_ ](axis|value)\b|(?-i:t)(_[mun]?s)?(\s*[\[(].*)?$",
+    re.IGNORECASE,
+)
+"""Pattern of the names of time columns; t is time, T may be a temperature."""
 
 COUNTED = ("s", "ms", "us", "ns", "sequence")
 """Units, in lower case, of columns that count time or samples."""
