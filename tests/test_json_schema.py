@@ -18,6 +18,36 @@ STUDIES = {k: v for k, v in corpus.study_trees().items() if "controllers" not in
 BASE = STUDIES["p753_dob"]
 
 
+DEFAULTS = {
+    "Actuator": {"delay": 0.0, "computation": 0.0},
+    "DisturbanceTable": {"drift_rms": 0.0},
+    "EnsembleTable": {
+        **{"tune": 0, "margins": 64, "holdout": 50},
+        **{"aggregate": "mean", "tail": 0.25},
+    },
+    "NoiseFile": {"scale": 1.0, "play": "spectrum"},
+    "ObjectiveTable": {
+        **{"aggregate": "geometric_mean", "coupling_weight": 1.0, "noise_draws": 1},
+        **{"effort_weight": 0.0, "slew_weight": 0.0},
+    },
+    "OptimiserTable": {
+        **{"method": "gauss_newton", "starts": 8, "candidates": 64, "steps": 60},
+        "tolerance": 1e-4,
+    },
+    "ParetoTable": {"steps": 30},
+    "References": {"amplitude": 5.0, "offset": 0.0, "duration": 1.0, "settle": 0.5},
+    "SensorTable": {"delay": 0.0, "noise_rms": 0.0},
+    "StructuresTable": {"worth": 0.1},
+    "Study": {"seed": 0, "holdout_draws": 1},
+    "SweepTable": {
+        "method": "grid",
+        "metrics": ["rms_error", "peak_error", "rms_effort", "saturated"],
+    },
+    "TrajectoryTable": {"scale": 1.0, "start": 0.0, "offset": 0.0},
+}
+"""What a study means that leaves a key out."""
+
+
 def changed(**changes):
     """Return the study p753_dob with other values at places such as plant__type."""
     data = copy.deepcopy(BASE)
@@ -36,6 +66,18 @@ def test_the_command_prints_a_schema():
     printed = json.loads(found.output)
     Draft202012Validator.check_schema(printed)
     assert printed == json.loads(json.dumps(SCHEMA))
+
+
+def test_a_study_that_leaves_a_key_out_keeps_its_meaning():
+    found = {}
+    for name, table in (*SCHEMA["$defs"].items(), ("Study", SCHEMA)):
+        values = {
+            key: each["default"]
+            for key, each in table["properties"].items()
+            if each.get("default") not in (None, []) and "$ref" not in each
+        }
+        found |= {name: values} if values else {}
+    assert found == DEFAULTS
 
 
 @pytest.mark.parametrize("name", STUDIES)

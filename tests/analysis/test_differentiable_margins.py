@@ -10,6 +10,7 @@ import pytest
 import piezojax as pj
 from piezojax.analysis.stability import (
     OperatingPoint,
+    broken_loop,
     sensitivity,
     sensitivity_peak,
     stability_report,
@@ -19,6 +20,7 @@ from piezojax.analysis.stability.differentiable import (
     BANDS,
     UNLIMITED_DELAY,
     UNLIMITED_GAIN,
+    _axes_impulse,
     bandwidth_of,
     closed_loop_peak_of,
     delay_margin_of,
@@ -31,8 +33,9 @@ from piezojax.analysis.stability.differentiable import (
     sensitivities,
 )
 from piezojax.analysis.stability.margins import report_of
-from piezojax.catalog import p558_control, p753, p753_stage
+from piezojax.catalog import p558, p558_control, p753, p753_stage
 from piezojax.core.paths import replace
+from piezojax.dynamics import linearise
 
 INTEGRAL = "controller.integral"
 BRANCHES = ("ascending", "descending")
@@ -325,3 +328,16 @@ def test_figures_of_three_axes_equal_the_exact_report(three_axes):
         # Without scaling of the axes the bound is smaller than the structured one.
         assert disk_margin_of(S) < report.disk_margin * (1.0 + 5e-3)
         assert disk_margin_of(S) > 0.8 * report.disk_margin
+
+
+@pytest.mark.parametrize("samples", [2, 3, 5, 6, 10, 17, 18, 50])
+def test_the_impulse_of_several_axes_has_every_sample(samples):
+    broken = broken_loop(p558_control.loop(p558_control.multi_axis()), (5.0, 5.0, 5.0))
+    model = linearise(broken, broken.start.voltage, broken.init(), p558.DT)
+    closed, state = np.asarray(model.A - model.B @ model.C), np.asarray(model.B)
+    expected = [np.eye(3)]
+    for _ in range(samples - 1):
+        expected.append(-np.asarray(model.C) @ state)
+        state = closed @ state
+    found = _axes_impulse(broken, samples, p558.DT)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)

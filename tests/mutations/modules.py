@@ -41,7 +41,7 @@ MODULES = {
     "study/case.py": (*_STUDY, "tests/tuning/test_beside.py", *_SWEPT),
     "study/sources.py": _STUDY,
     "study/parameters.py": _STUDY,
-    "study/schema.py": _STUDY,
+    "study/schema.py": (*_STUDY, "tests/test_json_schema.py"),
     "analysis/stroke.py": ("tests/analysis/test_stroke.py",),
     "analysis/stability/assess.py": (
         *_MARGINS,
