@@ -828,6 +828,15 @@ def test_a_controller_made_for_another_rate(refusal, rate):
     )
 
 
+@pytest.mark.parametrize(("error", "accepted"), [(5e-10, True), (2e-9, False)])
+def test_a_sample_time_may_be_rounded_to_nine_digits(study, refusal, error, accepted):
+    lag = {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5 * (1.0 + error)}
+    if accepted:
+        assert read(study({"plant": lag})).loop.plant.dt == lag["dt"]
+    else:
+        assert "was made for 20000 Hz" in refusal({"plant": lag})
+
+
 def test_a_plant_made_for_another_rate(refusal):
     message = refusal({"plant/dt": 1e-3})
     assert message.startswith("rate is 20000 Hz, but the controller or plant was made ")

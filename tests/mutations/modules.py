@@ -38,7 +38,10 @@ MODULES = {
         "tests/tuning/test_structures.py::test_structures_are_one_search_at_a_time",
         "tests/tuning/test_tuner.py",
     ),
-    "study/case.py": (*_STUDY, "tests/tuning/test_beside.py", *_SWEPT),
+    "study/case.py": (
+        *(*_STUDY, "tests/test_measured_noise.py"),
+        *("tests/tuning/test_beside.py", *_SWEPT),
+    ),
     "study/sources.py": _STUDY,
     "study/parameters.py": _STUDY,
     "study/schema.py": (*_STUDY, "tests/test_json_schema.py"),
