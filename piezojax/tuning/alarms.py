@@ -246,8 +246,8 @@ def _step_alarms(steps: Mapping[str, StepResult]) -> Iterable[str]:
     )
     yield (
         f"a step of the reference from {step.before_um:.4g} to {step.after_um:.4g} um "
-        f"{reached}: put the controller into a LimitedReference, which follows jumps "
-        "as ramps, or limit constraints.closed_loop_peak"
+        f"{reached}: limit the slew of the reference (LimitedReference), lower the "
+        "limit if there is one, or limit constraints.closed_loop_peak"
     )
 
 

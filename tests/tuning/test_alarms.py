@@ -145,7 +145,7 @@ def test_a_step_that_rings_raises_an_alarm(large, reached):
         assert found == []
         return
     (alarm,) = found
-    assert alarm.startswith(f"a step of the reference from 1 to 5 um {reached}: put ")
+    assert alarm.startswith(f"a step of the reference from 1 to 5 um {reached}: limit ")
     assert "LimitedReference" in alarm
 
 

@@ -114,7 +114,7 @@ def test_a_row_for_each_controller_and_rate(compared):
 def test_rows_equal_the_results_of_the_studies(compared):
     _, out, data = compared
     assert {entry.name for entry in out.iterdir()} == {
-        *("comparison.json", "comparison.png"),
+        *("comparison.json", "comparison.png", "report.html"),
         *(row["study"] for row in data["rows"]),
     }
     for row in data["rows"]:
