@@ -1,11 +1,11 @@
-"""``python -m piezojax.excite --lower V --upper V --rate HZ``: what to record."""
+"""``python -m piezojax.excite --lower V --upper V --rate HZ``: voltages to record."""
 
 import click
 
 from .command import Command, common, print_results, results_folder, run
 
 RECORD = "record.csv"
-"""File of a whole record."""
+"""Name of the file of a whole record."""
 
 
 @click.command(cls=Command)
@@ -28,22 +28,22 @@ RECORD = "record.csv"
     type=float,
     default=0.25,
     show_default=True,
-    help="Time for which a level is held, s; creep longer than that stays unknown.",
+    help="Time for which a level is held, s; slower creep stays unknown.",
 )
 @click.option(
     "--points",
     type=click.IntRange(min=1),
-    help="Points of the buffer of the generator: write parts of at most so many, "
-    "instead of one record.",
+    help="Size of the generator's buffer: write a file for each part, with at most "
+    "this number of points, instead of one record.",
 )
 @common
 def main(points, out, seed, quiet, **limits):
-    """Write the voltages to record for a model of hysteresis, creep and dynamics.
+    """Write voltages to record for a model of hysteresis, creep and dynamics.
 
-    The record rests first, and has all parts twice: identify fits one half and
-    validates on the other. With --points, as for the 1024 points of an NV200 at a
-    --rate of 20000, the parts come in files of their own, at a lower rate where they
-    need it; record each, and give the records to identify together.
+    The record begins with a rest and contains all parts twice: identify fits the first
+    half and validates on the second. --points writes each part to its own file, at a
+    lower rate if the part is too long; an NV200 has 1024 points at a --rate of 20000.
+    Record each part, and give all records to identify together.
     """
 
     def body(console):
@@ -72,6 +72,6 @@ def main(points, out, seed, quiet, **limits):
 
 
 def csv_of(part) -> str:
-    """Return the voltages of a part with their instants, as CSV."""
+    """Return the times and voltages of a part as CSV."""
     rows = (f"{k / part.rate:.9g},{u:.6f}" for k, u in enumerate(part.voltages))
     return "\n".join(["time_s,voltage_V", *rows]) + "\n"

@@ -19,16 +19,17 @@ if TYPE_CHECKING:
     from ..tuning.outcome import Outcome
 
 STUDY, TUNED, EXPORTED = "study.toml", "tuned", "controller"
-"""Names in the folder of a start: its study, and the folders of gains and of C."""
+"""Names in the results folder: the study, the folders of gains and of C code."""
 
 INTERRUPTED = "interrupted"
 """Status of a result whose search was interrupted."""
 
 
 class Question(NamedTuple):
-    """What a record cannot tell: the ``text`` of a question, and the end of its help.
+    """Question about a value that a record does not contain.
 
-    The answer is of the type ``kind``.
+    ``text`` is the question, ``kind`` the type of the answer, and ``more`` the end of
+    the help text.
     """
 
     text: str
@@ -51,11 +52,11 @@ QUESTIONS = {
     ),
     "controller": Question("controller to tune", str, ", as inversion_pid"),
 }
-"""The questions by option; the defaults are those of ``planned``."""
+"""The questions by the name of their option; ``planned`` gives the defaults."""
 
 
 def questions(function: Callable) -> Callable:
-    """Add an option for each of the ``QUESTIONS``."""
+    """Add an option for each question of ``QUESTIONS``."""
     for name, question in reversed(QUESTIONS.items()):
         text = f"{question.text[0].upper()}{question.text[1:]}{question.more}."
         function = click.option(
@@ -73,15 +74,16 @@ def questions(function: Callable) -> Callable:
     type=click.Path(path_type=Path),
     help="Second record of the stage, which validates the model.",
 )
-@click.option("--yes", is_flag=True, help="Ask nothing: take defaults and options.")
+@click.option("--yes", is_flag=True, help="Ask nothing; use the options and defaults.")
 @recognised_columns
 @common
 def main(record, model, check, yes, out, seed, quiet, **given):
-    """Start from a RECORD of your stage: write its study, tune it and export the gains.
+    """Tune a controller from a RECORD of your stage, and export its gains.
 
-    Limits, sensor noise and references are asked for, with defaults from the record;
-    each is also an option. The study lies in the new folder and runs alone. Gains with
-    an alarm are not exported. An interrupted start goes on with --out and its folder.
+    The command asks for limits, sensor noise and references; the defaults come from
+    the record, and each answer is also an option. It writes a study to the new folder,
+    which piezojax.tune can tune again. It does not export gains with an alarm. To go on
+    after an interruption, give the same folder as --out.
 
     Exit status 3 means that the gains have an alarm, as for piezojax.tune.
     """
@@ -115,13 +117,13 @@ def main(record, model, check, yes, out, seed, quiet, **given):
             console.print(f"tuned before: the gains are in {tuned}", soft_wrap=True)
         if result.alarms:
             console.print(
-                f"not exported because of the alarms; change {study}, or record again "
-                "as they say",
+                "not exported because of the alarms; follow their advice: change "
+                f"{study}, or make a new record",
                 soft_wrap=True,
             )
         else:
             _export(folder, tuned, outcome, console)
-        console.print(f"what it found, on a page: {tuned / PAGE}", soft_wrap=True)
+        console.print(f"page with the results: {tuned / PAGE}", soft_wrap=True)
         finish(result)
 
     run(quiet, body)
@@ -137,7 +139,7 @@ def _write_study(
     seed: int | None,
     console: Console,
 ) -> None:
-    """Ask what the ``record`` cannot tell, and write its first study."""
+    """Ask the ``QUESTIONS`` and write the first ``study`` of the ``record``."""
     from ..core.files import fresh_folder
     from ..identification import DEFAULT
     from ..identification.records.recognise import recognised
@@ -172,9 +174,10 @@ def _write_study(
 
 
 def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
-    """Return the Plan of the answers to the questions that ``given`` leaves open.
+    """Ask the questions that ``given`` does not answer, and return the Plan.
 
-    A question is asked again after an answer that is refused.
+    A question is repeated after an invalid answer. Raises ValueError, naming the
+    option, if the input ends before all are answered.
     """
     from ..study.first_study import planned
 
@@ -197,7 +200,7 @@ def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
 
 
 def _check_same(study: Path, record: Path, given: dict[str, Any]) -> None:
-    """Raise ValueError if the ``study`` has another record, or options are given."""
+    """Raise ValueError if ``study`` has another record, or ``given`` has an option."""
     from ..study import load
     from ..study.first_study import seen_from
 
@@ -214,9 +217,9 @@ def _check_same(study: Path, record: Path, given: dict[str, Any]) -> None:
 
 
 def _finished(study: Path) -> Path | None:
-    """Return the last folder of gains beside ``study`` that a whole search made of it.
+    """Return the newest folder of gains of a finished search on ``study``, or None.
 
-    Gains of the study before a change do not count.
+    Gains of an earlier version of the study do not count.
     """
     from ..core.serial import read_about
     from ..study import load, sha256_of
@@ -239,7 +242,7 @@ def _going_on(record: Path, folder: Path) -> str:
 def _export(
     folder: Path, tuned: Path, outcome: "Outcome | None", console: Console
 ) -> None:
-    """Export the gains in ``tuned`` as C, unless that was done before."""
+    """Export the gains in ``tuned`` as C, unless they are exported already."""
     from ..tuning.exported_runs import make_runs
 
     # The gains in tuned-2 go to controller-2.

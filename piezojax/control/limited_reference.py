@@ -1,4 +1,4 @@
-"""Controller whose reference has a limited slew, so that a jump becomes a ramp."""
+"""Controller with a limited slew of its reference: a jump becomes a ramp."""
 
 from typing import NamedTuple
 
@@ -18,12 +18,12 @@ class LimitedReferenceState(NamedTuple):
 
 
 class LimitedReference(System):
-    """``controller`` with a reference that changes by at most ``slew`` per second.
+    """A ``controller`` whose reference changes by at most ``slew`` per second.
 
-    A feedforward excites the modes of a stage if the reference jumps. The controller
-    sees jumps as ramps, and references slower than ``slew`` as they are. Errors of a
-    loop count from the reference before this limit. One axis; input an Observation,
-    output that of ``controller``.
+    If a reference jumps, a feedforward excites the modes of the stage. The controller
+    therefore sees a jump as a ramp; references slower than ``slew`` pass unchanged. The
+    tracking error of a loop still refers to the reference without this limit. For one
+    axis. The input is an Observation, the output that of ``controller``.
     """
 
     controller: System

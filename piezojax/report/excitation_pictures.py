@@ -15,28 +15,28 @@ PICTURE = "excitation.png"
 
 
 def excitation_page(parts: Sequence[Part], files: Mapping[str, Part]) -> Page:
-    """Return the Page of ``parts``, and of the ``files`` that hold them, by name."""
+    """Return the Page of ``parts``, with the sizes of the ``files`` by name."""
     sizes = [
         f"{name}: {part.voltages.size} samples at {part.rate:.6g} Hz, "
         f"{part.voltages.size / part.rate:.3g} s"
         for name, part in files.items()
     ]
     notes = [
-        "record voltage and displacement at the rate of the control loop, from the "
-        "first sample on, with the stage at rest before",
-        "the excitation must not hit the limits of the stage: begin with a small part "
-        "of the range on a new stage",
+        "start with the stage at rest; record voltage and displacement at the rate of "
+        "the control loop, from the first sample on",
+        "the stage must not reach its mechanical limits: on a new stage, begin with a "
+        "small part of the range",
     ]
     return Page("voltages to record", (), [excitation_table(parts), *sizes, *notes])
 
 
 def excitation_table(parts: Iterable[Part]) -> Table:
-    """Return a row for each part: its length, range and slew rate, and its use."""
+    """Return a table of the parts: length, range, slew rate and use of each."""
     table = Table(title="parts of the record")
     table.add_column("part")
     for name in ("samples", "rate, Hz", "s", "lowest, V", "highest, V", "slew, V/s"):
         table.add_column(name, justify="right")
-    table.add_column("tells")
+    table.add_column("identifies")
     for part in parts:
         count = part.voltages.size
         table.add_row(
@@ -59,7 +59,7 @@ def write_excitation(parts: Sequence[Part], folder: Path) -> None:
 
 
 def excitation_figure(parts: Sequence[Part]) -> Figure:
-    """Return a panel for each part: its voltages over time."""
+    """Return a figure with a panel for each part: its voltages over time."""
     picture = figure(9.0, 2.0 * len(parts))
     for ax, part in zip(np.ravel(picture.subplots(len(parts), 1)), parts, strict=True):
         time = np.arange(part.voltages.size) / part.rate

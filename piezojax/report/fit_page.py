@@ -1,4 +1,4 @@
-"""What a fit found, as tables and sentences: printed, and put on a page."""
+"""Results of a fit as tables and sentences, printed and in report.html."""
 
 from ..identification.fit import Fit
 from ..identification.held_dynamics import bound_text

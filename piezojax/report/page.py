@@ -1,7 +1,7 @@
-"""A page with all that a command found: ``report.html``, one file without links.
+"""Page with the results of a command: ``report.html``, one file without links.
 
-The page holds the tables and sentences that the command prints, so that both agree, and
-the pictures of its folder. It needs no script, and prints on paper.
+The page contains the tables and sentences that the command prints, and the pictures in
+its folder. It needs no script and can be printed on paper.
 """
 
 import base64
@@ -34,7 +34,7 @@ PICTURES = {
     "pareto.png": "Error against the limit of a constraint",
     "convergence.png": "Objective over the evaluations",
 }
-"""Captions of pictures by their files, in the order of the page; others follow."""
+"""Captions of the pictures by file, in the order of the page; others follow."""
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62em; margin: 2em auto;
@@ -56,10 +56,10 @@ figcaption { font-weight: bold; } pre { white-space: pre-wrap; }
 
 @dataclass(frozen=True)
 class Page:
-    """What a command tells at its end.
+    """Results of a command, to be printed and written to report.html.
 
-    ``title``, its ``alarms``, and ``parts``: tables and sentences in the order in which
-    they are printed. ``origin`` are lines on how the results were made.
+    ``parts`` are tables and sentences in the order in which they are printed.
+    ``origin`` are lines on how the results were made.
     """
 
     title: str
@@ -69,7 +69,7 @@ class Page:
 
 
 def write_page(page: Page, folder: Path) -> Path:
-    """Write ``page`` with the pictures in ``folder`` to its report.html."""
+    """Write ``page`` and the pictures in ``folder`` to report.html in that folder."""
     path = folder / PAGE
     write_text(path, page_html(page, folder))
     return path
@@ -96,7 +96,7 @@ def page_html(page: Page, folder: Path) -> str:
 
 
 def table_html(table: Table) -> str:
-    """Return a printed table as HTML: caption, header, and a row for each row."""
+    """Return a printed table as HTML, with its title, header, rows and caption."""
     sides = ["right" if c.justify == "right" else "left" for c in table.columns]
     header = [_plain(column.header) for column in table.columns]
     cells = [[_plain(cell) for cell in column.cells] for column in table.columns]

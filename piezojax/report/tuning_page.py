@@ -1,4 +1,4 @@
-"""What tuning found, as tables and sentences: printed, and put on a page."""
+"""Results of tuning as tables and sentences, printed and in report.html."""
 
 from rich.table import Table
 
@@ -76,7 +76,7 @@ def tuning_page(outcome: Outcome) -> Page:
 
 
 def _fitted(fit: Fit | None) -> str | None:
-    """Return a sentence on the fit of the plant, None for a plant of another source."""
+    """Return a sentence on the fit of the plant, or None if no model was fitted."""
     if fit is None:
         return None
     report, part = fit.report, fit.report.validation
@@ -89,7 +89,7 @@ def _fitted(fit: Fit | None) -> str | None:
 
 
 def values_to_type(outcome: Outcome) -> Table | str | None:
-    """Return the values to type into a device, None for another controller."""
+    """Return the values to type in; None if the controller is not a Device."""
     if not isinstance(outcome.controller, Device):
         return None
     try:

@@ -1,7 +1,7 @@
-"""Voltages to record: for the hysteresis, the creep and the dynamics of a stage.
+"""Voltages that excite the hysteresis, the creep and the dynamics of a stage.
 
-All parts begin and end at the middle of the range. A record of them in turn, twice with
-other random numbers, lets a model be fitted to the first half and validated on the
+All parts begin and end at the middle of the range. A record contains all parts twice,
+with different random numbers: a model is fitted to the first half and validated on the
 second.
 """
 
@@ -16,36 +16,36 @@ SMALL = 0.02
 """Amplitude of the multisine, as a share of the range, if the slew rate allows it."""
 
 LINES = 80
-"""Frequencies of the multisine."""
+"""Most frequencies of the multisine."""
 
 PHASES = 50
-"""Draws of the phases of the multisine; the one with the lowest crest is used."""
+"""Random sets of phases; the multisine uses that with the lowest crest factor."""
 
 EDGE = 0.02
 """Duration of a move between levels, s, if the slew rate allows it."""
 
 COARSEST = 50
-"""Least samples in a cycle over the whole range."""
+"""Smallest number of samples in a cycle over the whole range."""
 
 ROUNDED = 16
 """Samples by which rounding may lengthen a part at a lower rate."""
 
 LADDER = ((1.0, 1.0, 2, 1.0), (2.5, 0.6, 6, 0.15), (7.0, 0.2, 4, 1.0))
-"""Frequency (times ``slowest``), height (share of the range), number of cycles, and
-share of the height of the last cycle, of the groups of cycles: over the whole range,
-nested loops that shrink, and small loops."""
+"""Groups of cycles: over the whole range, nested loops that shrink, and small loops.
+Of each: frequency (times ``slowest``), height (share of the range), number of cycles,
+and height of the last cycle (share of the first)."""
 
 
 @dataclass(frozen=True)
 class Generator:
-    """What a generator and its amplifier can do.
+    """Limits of a signal generator and its amplifier, and settings of the excitation.
 
     ``lower`` and ``upper`` are the limits of the voltage, V, ``rate`` is the sampling
     rate, Hz, and ``slew`` the largest slew rate, V/s. The cycles over the whole range
-    have the frequency ``slowest`` (Hz), or less if ``slew`` needs it; the multisine
-    reaches ``highest`` (Hz), and a level is held for ``hold`` (s). Raises ValueError
-    for limits in the wrong order, numbers that are not above 0, and frequencies that
-    the rate does not allow.
+    have the frequency ``slowest`` (Hz), or a lower one if ``slew`` requires it. The
+    multisine reaches ``highest`` (Hz), and each level is held for ``hold`` (s). Raises
+    ValueError for limits in the wrong order, other numbers that are not above 0, and
+    frequencies that the rate does not allow.
     """
 
     lower: float
@@ -107,7 +107,7 @@ class Generator:
 class Part(NamedTuple):
     """A part of a record: ``voltages`` [samples] in V at ``rate`` (Hz).
 
-    ``tells`` is what a model can be fitted to it for.
+    ``tells`` names the effects that a model can learn from it.
     """
 
     name: str
@@ -117,7 +117,7 @@ class Part(NamedTuple):
 
     @property
     def steepest(self) -> float:
-        """Largest slew rate, V/s; that between the last and the first sample counts."""
+        """Largest slew rate of the part, V/s, also if it is repeated."""
         return _steepest(self.voltages, self.rate)
 
 
@@ -132,7 +132,7 @@ def ladder(generator: Generator, random: np.random.Generator) -> Part:
     for times, share, count, last in LADDER:
         height = share * generator.span
         base = generator.lower + random.uniform(0.2, 0.8) * (generator.span - height)
-        # The slope of a cycle is greatest in the first, the largest one.
+        # The first cycle is the largest and has the greatest slope.
         fastest = generator.slew / (np.pi * height)
         frequency = min(times * generator.slowest, fastest)
         turns = frequency * generator.time(count / frequency)
@@ -147,7 +147,7 @@ def ladder(generator: Generator, random: np.random.Generator) -> Part:
 
 
 def holds(generator: Generator, random: np.random.Generator) -> Part:
-    """Return moves to a high and to a low level, which are held, and back."""
+    """Return holds of a high level, a low level and the middle, and moves between."""
     high, low = (
         generator.lower + generator.span * random.uniform(*ends)
         for ends in ((0.75, 0.95), (0.05, 0.25))
@@ -162,10 +162,10 @@ def holds(generator: Generator, random: np.random.Generator) -> Part:
 
 
 def multisine(generator: Generator, random: np.random.Generator) -> Part:
-    """Return a periodic multisine of low crest about the middle of the range.
+    """Return a multisine of low crest factor around the middle of the range.
 
-    Its frequencies lie between twice ``slowest`` and ``highest``, in even steps of
-    their logarithm, on lines of a period of 2 / ``slowest``.
+    Its frequencies lie between twice ``slowest`` and ``highest``, logarithmically
+    spaced, at multiples of ``slowest`` / 2. It is one period long.
     """
     count = generator.time(2.0 / generator.slowest).size
     line = generator.rate / count
@@ -196,8 +196,8 @@ PARTS: tuple[Callable[[Generator, np.random.Generator], Part], ...] = (
 def excitation(generator: Generator, seed: int = 0) -> tuple[list[Part], np.ndarray]:
     """Return the parts to record, and the voltages [samples] of a whole record, V.
 
-    The record rests at the middle of the range first, and has all parts twice, the
-    second time with other random numbers. The parts are those of the first time.
+    The record first rests at the middle of the range. It contains all parts twice, with
+    different random numbers; the returned parts are those of its first half.
     """
     halves = [
         [part(generator, np.random.default_rng([seed, half])) for part in PARTS]
@@ -211,9 +211,10 @@ def excitation(generator: Generator, seed: int = 0) -> tuple[list[Part], np.ndar
 def buffered(generator: Generator, points: int, seed: int = 0) -> list[Part]:
     """Return the parts, each in at most ``points`` samples.
 
-    Ladder and holds have a lower rate, the rate of ``generator`` over a whole number.
-    The multisine keeps the rate and has a shorter period, so that its lowest frequency
-    is higher. Raises ValueError for a buffer too short for that.
+    If the ladder or the holds are too long, their rate is that of ``generator`` divided
+    by a whole number. If the multisine is too long, its period becomes shorter and its
+    lowest frequency higher, at the same rate. Raises ValueError if the buffer is too
+    short for that.
     """
     found = []
     for part in PARTS:

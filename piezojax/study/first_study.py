@@ -1,4 +1,4 @@
-"""First study of a stage: its record, and what the record cannot tell."""
+"""First study of a stage, from its record and the answers of its user."""
 
 import json
 import os
@@ -21,19 +21,19 @@ SHARE = 0.2
 of it."""
 
 SAMPLES_A_PERIOD = 1000
-"""Least samples in a period of the slowest default reference."""
+"""Smallest number of samples in a period of the slowest default reference."""
 
 PERIODS = 3
 """Periods of the slowest reference in a run; the first does not count."""
 
 FASTER = 2.0
-"""Default limit of the slew, relative to the fastest reference."""
+"""Default limit of the slew, relative to the largest slew of the references."""
 
 BEYOND = 0.1
-"""Share of a recorded range by which references or limits may exceed it."""
+"""Share of the recorded range by which references or limits may exceed it."""
 
 NOISY = 0.05
-"""Share of the recorded span above which a noise of the sensor is doubtful."""
+"""Share of the recorded span above which the given noise is doubtful."""
 
 _CONSTANT = ("STEP", "CONST")
 """References without a frequency."""
@@ -44,14 +44,15 @@ UNSEEN = ("SIN", "SCAN")
 
 @dataclass(frozen=True)
 class Plan:
-    """What a first study needs beside a record, in V, um and Hz.
+    """Values that a first study needs besides a record, in V, um and Hz.
 
     ``lower`` and ``upper`` are the limits of the voltage, ``noise`` is the rms noise of
-    the sensor, ``track`` the references to tune on, as "SIN10,PWSW40", and
-    ``frequency`` that of the slowest one. The references cover ``offset`` to ``offset +
-    2 amplitude``. The controller follows at most ``slew``, um/s: faster references, as
-    jumps, reach it as ramps. ``controller`` is the name of a design. Raises ValueError
-    for values that no stage can have, and for unknown references or designs.
+    the sensor, ``track`` names the references to tune on, as "SIN10,PWSW40", and
+    ``frequency`` is that of the slowest one. The references cover ``offset`` to
+    ``offset + 2 amplitude``. The controller follows at most the slew ``slew``, um/s: it
+    sees faster references, such as jumps, as ramps. ``controller`` is the name of a
+    design. Raises ValueError for values that no stage can have, and for unknown
+    references or designs.
     """
 
     lower: float
@@ -104,11 +105,12 @@ def planned(record: Record, given: dict[str, Any]) -> Plan:
     """Return the Plan that ``record``, in V and um, suggests.
 
     Values of ``given`` that are not None replace the suggested ones. The limits are the
-    recorded voltages, the noise is that of ``noise_rms``, and the references lie in the
-    middle of the recorded displacements. The slowest has at least ``SAMPLES_A_PERIOD``
-    samples in a period. The slew is ``FASTER`` times that of the fastest reference.
+    lowest and highest recorded voltage, the noise comes from ``noise_rms``, and the
+    references lie around the middle of the recorded displacements. The slowest has at
+    least ``SAMPLES_A_PERIOD`` samples in a period. The limit of the slew is ``FASTER``
+    times the largest slew of the references.
 
-    Raises ValueError as ``Plan``, and for references outside the record.
+    Raises ValueError as ``Plan`` does, and for references outside the record.
     """
     known = {name: value for name, value in given.items() if value is not None}
     low, high = record.output.min(), record.output.max()
@@ -151,7 +153,7 @@ def _fastest(plan: Plan, dt: float) -> float:
 
 
 def doubts(plan: Plan, record: Record) -> list[str]:
-    """Return sentences on answers of ``plan`` that its ``record`` contradicts."""
+    """Return a sentence on each answer of ``plan`` that ``record`` contradicts."""
     low, high = float(record.input.min()), float(record.input.max())
     found = []
     beyond = BEYOND * (high - low)
@@ -185,11 +187,12 @@ def first_study(
     check: Path | None = None,
     seed: int = 0,
 ) -> str:
-    """Return the text of a study of ``plan``, with comments, to be put in ``folder``.
+    """Return the text of a study of ``plan``, with comments.
 
-    ``record`` and ``check``, if any, are files of records with these ``columns``, the
-    options of ``read_record``; ``rate`` is the sampling rate of the loop, Hz, and
-    ``model`` the model to fit.
+    The paths in it are relative to ``folder``, where the study is to be written.
+    ``record`` and the optional ``check`` are files of records, and ``columns`` are the
+    options of ``read_record`` for both; ``rate`` is the sampling rate of the loop, Hz,
+    and ``model`` the model to fit.
     """
     keys = {"rate": "record_rate"}
     plant = {
@@ -231,7 +234,7 @@ tune = ["controller.controller.feedback.*"]
 [plant]
 $plant
 
-# Limits of the voltage. A voltage that the record lacks is outside the model.
+# Limits of the voltage. Outside the recorded voltages the model extrapolates.
 [actuator]
 lower = $lower
 upper = $upper
@@ -240,20 +243,21 @@ upper = $upper
 [sensor]
 noise_rms = $noise
 
-# The controller follows references up to this slew, um/s. Faster ones, as jumps, reach
-# it as ramps: the feedforward would excite the modes of the stage. dt is 1 / rate.
+# The controller follows references up to this slew, um/s. It sees faster ones, such as
+# jumps, as ramps, because a jump excites the modes of the stage through the
+# feedforward. dt is 1 / rate.
 [controller]
 type = "LimitedReference"
 slew = $slew
 dt = $dt
 
-# The loop starts from this design and is tuned from there.
+# This design gives the controller and its gains before tuning.
 [controller.controller]
 design = $controller
 
 # References cover offset to offset + 2 amplitude. SIN is a sine, PWSW periods of a sine
 # at 100, 100, 50 and 15 % of the amplitude, SCAN a triangle with rounded turns; the
-# number is the frequency. The unseen ones only evaluate the tuned gains.
+# number is the frequency, Hz. The unseen ones only evaluate the tuned gains.
 [references]
 tune = $tune
 unseen = $unseen
@@ -263,8 +267,9 @@ duration = $duration
 settle = $settle
 
 # By default the sensitivity peak is limited to 2.0 and the delay margin to one sample,
-# for every stage within the error bound of the fitted model. Further goals are limits
-# too, as settling_time = 0.01, or closed_loop_peak = 1.5 if the slew is not limited.
+# for every stage within the error bound of the fitted model. Write further goals as
+# limits here: settling_time = 0.01, or, if the slew is not limited, closed_loop_peak =
+# 1.5.
 [constraints]
 
 [optimiser]
@@ -276,7 +281,7 @@ steps = 40
 
 
 def _toml(value: Any) -> str:
-    """Return ``value``, text, numbers or a list of them, as TOML."""
+    """Return ``value`` (a text, a number or a list of them) as TOML."""
     if isinstance(value, float):
         return repr(float(value))
     # A JSON string without escaped slashes is a basic string of TOML.
@@ -284,7 +289,7 @@ def _toml(value: Any) -> str:
 
 
 def seen_from(folder: Path, file: Path) -> str:
-    """Return the path of ``file`` as seen from ``folder``, if there is one."""
+    """Return the path of ``file`` relative to ``folder``, or absolute without one."""
     try:
         return Path(os.path.relpath(file, folder)).as_posix()
     except ValueError:  # on another drive

@@ -12,11 +12,11 @@ from ..core.system import System
 from .tables import one_of
 
 _NESTED = {"catalog", "design"}
-"""Sources of a table within a table with a type."""
+"""Sources that a table within a table with a type may have."""
 
 
 def about_file(table: Mapping[str, Any], folder: Path) -> About:
-    """Return the origin of the file of a table, empty for another source."""
+    """Return the origin of the file of ``table``; an empty About for another source."""
     return read_about(folder / str(table["file"])) if "file" in table else About()
 
 
@@ -40,9 +40,9 @@ def system_of(
 ) -> System:
     """Build the System of a table with one source: catalog, file, type or design.
 
-    Only a controller has a design. A table with a type may hold tables with a catalog
-    or a design, as a LimitedReference around a design. Raises ValueError for a table
-    with no source, several sources, or other keys.
+    Only a controller has a ``design``. A table with a type may contain tables with a
+    catalog or a design: a LimitedReference may contain the design that it limits.
+    Raises ValueError for a table with no source, several sources, or other keys.
     """
 
     def nested(part: dict[str, Any], where: str) -> System:
@@ -72,7 +72,7 @@ def system_of(
 def _with_parts(
     data: Any, where: str, build: Callable[[dict[str, Any], str], System]
 ) -> Any:
-    """Return ``data`` with each nested table of a catalog or design built."""
+    """Return ``data``; nested tables with a catalog or design become Systems."""
     if isinstance(data, list):
         return [_with_parts(x, f"{where}.{i}", build) for i, x in enumerate(data)]
     if not isinstance(data, Mapping):

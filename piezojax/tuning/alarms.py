@@ -15,19 +15,19 @@ from .step_tests import StepResult
 PEAK = "sensitivity_peak"
 
 EXACT = 1e-2
-"""Relative error of the margins in the search; exact margins may miss a limit by as
-much."""
+"""Relative error of the margins in the search, by which exact margins may violate a
+limit without an alarm."""
 
 HELD_OUT = 0.05
-"""Relative excess over a limit in the hold-out that does not count, because its noise
-differs from that of tuning."""
+"""Relative violation of a limit in the hold-out without an alarm: the noise differs
+from that of tuning."""
 
 AMPLIFIED = 2.0
-"""Largest |y/r| without a note."""
+"""Largest peak of |y/r| without a note."""
 
 OVERSHOOT = 1.0
-"""Largest overshoot of a step over the range of the references without an alarm, as a
-share of its height: farther away the model was never tried, or the stage ends."""
+"""Largest overshoot of a large step without an alarm, as a share of its height. A
+larger one leaves the range in which the model was tested, or that of the stage."""
 
 _TIGHTEN = (
     "begin with gains of a stable loop, lower the bounds of the gains, or raise "
@@ -43,8 +43,8 @@ def alarms_of(
 ) -> list[str]:
     """Return the alarms of a tuned study, the most serious first.
 
-    ``stability`` holds the exact margins of the loop "after" tuning, ``limits`` are
-    those of the study, ``model`` the alarms of the fit of its plant.
+    ``stability`` contains the exact margins of the loop "after" tuning, ``limits`` are
+    those of the study, and ``model`` are the alarms of the fit of its plant.
     """
     scores = {
         "tuning": result.after,
@@ -65,7 +65,7 @@ def alarms_of(
 
 
 def peak_notes(stability: StabilityReports) -> list[str]:
-    """Return a note if the largest |y/r| of the tuned loop exceeds ``AMPLIFIED``."""
+    """Return a note if the peak of |y/r| of the tuned loop exceeds ``AMPLIFIED``."""
     reports = stability.reports.get("after", {}).values()
     found = [report.following for report in reports if report.following is not None]
     worst = max(found, key=lambda one: one.closed_loop_peak, default=None)
@@ -246,8 +246,8 @@ def _step_alarms(steps: Mapping[str, StepResult]) -> Iterable[str]:
     )
     yield (
         f"a step of the reference from {step.before_um:.4g} to {step.after_um:.4g} um "
-        f"{reached}: limit the slew of the reference (LimitedReference), lower the "
-        "limit if there is one, or limit constraints.closed_loop_peak"
+        f"{reached}: limit the slew of the reference (LimitedReference) or lower its "
+        "slew, or limit constraints.closed_loop_peak"
     )
 
 

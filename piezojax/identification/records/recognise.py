@@ -14,14 +14,14 @@ from .sampled import is_clock
 from .units import SECONDS, unit_of
 
 _QUANTITIES = {"input": "V", "output": "um"}
-"""Unit of each role of a column, or one that can be converted to it."""
+"""Unit of each role; a column in a convertible unit qualifies as well."""
 
 _NOISE_ORDER = 3
 """Order of the differences of the output that remove its motion."""
 
 _STRETCHES, _LEAST = 100, 64
-"""Most stretches of a record, of which the quietest show the noise, and least samples
-of each."""
+"""Number of stretches of a long record, of which the quietest show the noise, and
+smallest number of samples in each."""
 
 _QUIETEST, _DEVIATE = 0.05, -1.6449
 """Share of the quietest stretches, and the deviate of the normal distribution below
@@ -37,9 +37,9 @@ def recognised(path: Path, given: dict[str, Any]) -> dict[str, Any]:
 
     Columns that are None in ``given`` are recognised: time by its name or unit, input
     as the only column in V (or mV, kV), output as the only one in um (or nm, mm). Of
-    two signals without such units the first is the input. The other keys of ``given``
-    are returned as they are. Raises ValueError, listing the columns with their units,
-    if a column is not the only one of its kind.
+    two signals without units the first is the input. The other keys of ``given`` are
+    returned unchanged. Raises ValueError, listing the columns with their units, if no
+    column or several qualify as input or output.
     """
     columns = read_columns(path)
     found = dict(given)
@@ -74,10 +74,11 @@ def noise_rms(record: Record) -> float:
     """Return the rms noise of the only output of ``record``, in its unit.
 
     White noise is assumed: the third difference of the output removes slow motion and
-    has 20 times the variance of the noise. The estimate is that of the quietest part
-    of the record, in which the stage rests or moves slowly, corrected for the choice of
-    the quietest (Wilson-Hilferty). It contains the rounding of a converter. A sensor
-    with a low-pass, or a stage that never moves slowly, makes it false.
+    has 20 times the variance of the noise. The estimate comes from the quietest part of
+    the record, in which the stage rests or moves slowly. The bias from choosing the
+    quietest part is corrected (Wilson-Hilferty). The noise includes the rounding of a
+    converter. The estimate is wrong for a sensor with a low-pass, and for a stage that
+    never moves slowly.
     """
     moved = np.diff(record.output, _NOISE_ORDER)
     size = min(max(moved.size // _STRETCHES, _LEAST), moved.size)
