@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 from fuzz import corpus
 from jsonschema import Draft202012Validator
+from study_tables import with_values
 
 from piezojax.cli.tune import main
 from piezojax.study import Study, study_schema
@@ -48,18 +49,6 @@ DEFAULTS = {
 """What a study means that leaves a key out."""
 
 
-def changed(**changes):
-    """Return the study p753_dob with other values at places such as plant__type."""
-    data = copy.deepcopy(BASE)
-    for place, value in changes.items():
-        *tables, key = place.split("__")
-        table = data
-        for name in tables:
-            table = table.setdefault(name, {})
-        table[key] = value
-    return data
-
-
 def test_the_command_prints_a_schema():
     found = CliRunner().invoke(main, ["--schema"])
     assert found.exit_code == 0
@@ -90,13 +79,13 @@ def test_shipped_studies_are_valid(name):
     [
         {"rate": -1.0},
         {"rates": 1.0},
-        {"references__tune": []},
-        {"actuator__lowest": 0.0},
-        {"optimiser__method": "newton"},
-        {"optimiser__steps": 0},
-        {"constraints__phase_margin": 180.0},
-        {"constraints__sensitivity_peak": 1.0},
-        {"constraints__ringing": 1.0},
+        {"references/tune": []},
+        {"actuator/lowest": 0.0},
+        {"optimiser/method": "newton"},
+        {"optimiser/steps": 0},
+        {"constraints/phase_margin": 180.0},
+        {"constraints/sensitivity_peak": 1.0},
+        {"constraints/ringing": 1.0},
         {"controller": {"design": "lqr"}},
         {"controller": {"catalog": "p753"}},
         {"plant": {"type": "Affin"}},
@@ -104,23 +93,23 @@ def test_shipped_studies_are_valid(name):
     ],
 )
 def test_mistakes_are_found(changes):
-    assert not JUDGE.is_valid(changed(**changes))
+    assert not JUDGE.is_valid(with_values(BASE, changes))
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"constraints__phase_margin": 179.0},
-        {"constraints__sensitivity_peak": "off"},
+        {"constraints/phase_margin": 179.0},
+        {"constraints/sensitivity_peak": "off"},
         {"controller": {"design": "inversion_pid"}},
         {"controller": {"type": "PID", "proportional": 1.0, "dt": 5e-5}},
         {"controller": {"file": "gains.toml", "accept_unsafe": True}},
         {"plant": {"record": "a.csv", "model": "auto"}},
-        {"references__amplitude": [1.0, 2.0]},
+        {"references/amplitude": [1.0, 2.0]},
     ],
 )
 def test_what_a_study_may_have_is_valid(changes):
-    JUDGE.validate(changed(**changes))
+    JUDGE.validate(with_values(BASE, changes))
 
 
 def test_no_study_that_loads_is_marked():

@@ -276,7 +276,7 @@ class Verbs:
         (out / "result.json").write_text(result.model_dump_json(), encoding="utf-8")
         about = About(study_sha256=sha256_of(load(study)))
         save(PID(0.1, 1.0, dt=1e-3), out / "gains.toml", about)
-        return SimpleNamespace(result=result, case=None, controller=None)
+        return SimpleNamespace(result=result, case=None, holdout=None)
 
     def export(self, source, console, *, study, out, runs):
         self.calls.append(("export", source.name))
@@ -293,7 +293,7 @@ def run(monkeypatch, record, tmp_path):
         monkeypatch.setattr(start, "tune_study", verbs.tune)
         monkeypatch.setattr(start, "export_file", verbs.export)
         monkeypatch.setattr(
-            "piezojax.tuning.exported_runs.make_runs", lambda case, controller: None
+            "piezojax.tuning.exported_runs.make_runs", lambda case, holdout: None
         )
         out = ["--out", str(tmp_path / "out")]
         found = CliRunner().invoke(

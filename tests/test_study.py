@@ -1,6 +1,5 @@
 """Study files: valid ones are built, errors are named in one line."""
 
-import copy
 import json
 import re
 import subprocess
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import tomli_w
 from stand_ins import fit_of
+from study_tables import GONE, with_values
 
 from piezojax import About, save
 from piezojax.catalog import CONTROLLERS, p753
@@ -59,30 +59,14 @@ BASE = {
     "objective": {"aggregate": "geometric_mean"},
     "optimiser": {"method": "bfgs", "starts": 2, "candidates": 4, "steps": 6},
 }
-GONE = object()
 UNSAFE = About(unsafe=["Ms 3 is above 2"])
-
-
-def changed(changes):
-    """Return BASE with ``{"table/key": value}`` replaced, or removed if GONE."""
-    data = copy.deepcopy(BASE)
-    for place, value in changes.items():
-        *tables, key = place.split("/")
-        table = data
-        for name in tables:
-            table = table[name]
-        if value is GONE:
-            del table[key]
-        else:
-            table[key] = value
-    return data
 
 
 @pytest.fixture
 def study(tmp_path):
     def written(changes):
         path = tmp_path / "stage.toml"
-        path.write_text(tomli_w.dumps(changed(changes)), encoding="utf-8")
+        path.write_text(tomli_w.dumps(with_values(BASE, changes)), encoding="utf-8")
         return path
 
     return written
@@ -1103,7 +1087,7 @@ def outcomes(tmp_path_factory):
     paths = []
     for i, (changes, _) in enumerate(UNSAID.values()):
         path = folder / f"{i}.toml"
-        path.write_text(tomli_w.dumps(changed(changes)), encoding="utf-8")
+        path.write_text(tomli_w.dumps(with_values(BASE, changes)), encoding="utf-8")
         paths.append(str(path))
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, *paths],

@@ -187,7 +187,7 @@ def _runs(
     study.toml that is not that of the controller.
     """
     from .. import study as studies
-    from ..tuning.exported_runs import make_runs
+    from ..tuning.exported_runs import holdout_of, make_runs
     from ..tuning.result import STUDY_FILE
 
     path = study_path(named or file.with_name(STUDY_FILE))
@@ -200,4 +200,4 @@ def _runs(
     known = None if named else about.study_sha256
     if known and studies.sha256_of(case.study) != known:
         raise ValueError(f"{path} is not the study of {file}: its SHA-256 differs")
-    return make_runs(case, controller)
+    return make_runs(case, holdout_of(case, controller))

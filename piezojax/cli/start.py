@@ -256,7 +256,7 @@ def _export(
         console,
         study=folder / STUDY,
         out=exported,
-        runs=make_runs(outcome.case, outcome.controller) if outcome else None,
+        runs=make_runs(outcome.case, outcome.holdout) if outcome else None,
     )
     console.print(
         f"done: gains and pictures in {tuned}, C code in {exported}, the study in "

@@ -126,7 +126,7 @@ def planned(record: Record, given: dict[str, Any]) -> Plan:
         "track": f"SIN{frequency:g},PWSW{4.0 * frequency:g}",
         "amplitude": amplitude,
         "offset": _rounded(0.5 * (low + high) - amplitude),
-        "slew": 1.0,
+        "slew": 1.0,  # until the references are known
     }
     plan = Plan(**(suggested | known))
     if "slew" not in known:

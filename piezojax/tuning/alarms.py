@@ -230,20 +230,16 @@ def _missed(name: str, value: float | None, limit: float, where: str) -> str:
 
 def _step_alarms(steps: Mapping[str, StepResult]) -> Iterable[str]:
     """Yield an alarm if the overshoot of a large step exceeds ``OVERSHOOT``."""
-    large = {name: step for name, step in steps.items() if name in LARGE}
-    sizes = {
-        name: np.inf if step.overshoot is None else step.overshoot
-        for name, step in large.items()
-    }
-    name = max(sizes, key=sizes.__getitem__, default=None)
-    if name is None or sizes[name] <= OVERSHOOT:
+
+    def overshoot(step: StepResult) -> float:
+        return np.inf if step.overshoot is None else step.overshoot
+
+    large = (step for name, step in steps.items() if name in LARGE)
+    step = max(large, key=overshoot, default=None)
+    if step is None or (worst := overshoot(step)) <= OVERSHOOT:
         return
-    step = large[name]
-    reached = (
-        f"overshoots by {100.0 * sizes[name]:.3g} %"
-        if np.isfinite(sizes[name])
-        else "diverges"
-    )
+    known = np.isfinite(worst)
+    reached = f"overshoots by {100.0 * worst:.3g} %" if known else "diverges"
     yield (
         f"a step of the reference from {step.before_um:.4g} to {step.after_um:.4g} um "
         f"{reached}: limit the slew of the reference (LimitedReference) or lower its "

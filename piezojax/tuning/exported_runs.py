@@ -14,18 +14,26 @@ from ..exporting.compiled_loop import Runs, RunTrace
 from ..exporting.slots import Interface
 from ..study import Case
 from .data import judging, make_data
+from .runs import Signals
+from .traces import traces_of
 
 
-def make_runs(case: Case, controller: System) -> Runs:
-    """Return the hold-out of ``case`` as runs of the compiled ``controller``.
+def holdout_of(case: Case, controller: System) -> Signals:
+    """Return the hold-out of ``case`` for its loop with ``controller``.
 
-    A run is a reference with one draw of the noise. The residual of the plant acts
-    where it harms the loop with ``controller`` most, as in the result of tuning.
+    As in the result of tuning, the residual of the plant acts where it harms that loop
+    most.
     """
-    study = case.study
     loop = dataclasses.replace(case.loop, controller=controller)
-    data = judging(make_data(case), case, loop)
-    signals = data.holdout
+    return judging(make_data(case), case, loop).holdout
+
+
+def make_runs(case: Case, signals: Signals) -> Runs:
+    """Return the hold-out ``signals`` of ``case`` as runs of a compiled controller.
+
+    A run is a reference with one draw of the noise.
+    """
+    loop, study = case.loop, case.study
     count, draws, samples = signals.noise.shape[:3]
     shape = count * draws, samples, study.axis_count
 
@@ -62,7 +70,7 @@ def make_runs(case: Case, controller: System) -> Runs:
                 slice(each.run * draws, (each.run + 1) * draws),
                 each.axis,
             )
-            for each in data.traces
+            for each in traces_of(study)
         ),
         study.settled,
     )

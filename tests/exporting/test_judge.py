@@ -23,7 +23,7 @@ from piezojax.exporting.compiled_loop import CompiledLoop, Runs, RunTrace
 from piezojax.exporting.judge import ExportReport, judge
 from piezojax.exporting.slots import Interface
 from piezojax.tuning.data import make_data
-from piezojax.tuning.exported_runs import make_runs
+from piezojax.tuning.exported_runs import holdout_of, make_runs
 from piezojax.tuning.runs import evaluate
 
 pytestmark = pytest.mark.skipif(
@@ -198,7 +198,7 @@ def test_the_compiled_loop_equals_the_simulation(name):
     data, loop = make_data(case), case.loop
     if case.study.axes is None:
         loop = dataclasses.replace(loop, controller=CONTROLLERS["p753_pid"]())
-    runs = make_runs(case, loop.controller)
+    runs = make_runs(case, holdout_of(case, loop.controller))
     found = evaluate(lambda x: x, loop, data.holdout, runs.settle).rms_error
     wanted = 1e3 * np.max(found, axis=1)
     start = jax.tree.map(lambda x: x[0], pj.Observation(*runs_start(runs, case)))

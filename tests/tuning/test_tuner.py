@@ -1,12 +1,12 @@
 """Tuning of a small study, also with diverging loops and interrupts."""
 
-import copy
 import json
 import math
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from study_tables import with_values
 
 import piezojax as pj
 from piezojax.catalog import p753
@@ -52,14 +52,8 @@ SCORE_KEYS = {"per_reference_rms_um", "geomean_rms_um", "worst_rms_um"}
 
 
 def case_of(changes, seed=None):
-    data = copy.deepcopy(BASE)
-    for place, value in changes.items():
-        *tables, key = place.split("/")
-        table = data
-        for name in tables:
-            table = table.setdefault(name, {})
-        table[key] = value
-    return build(Study.model_validate(data), "small.toml", seed=seed)
+    study = Study.model_validate(with_values(BASE, changes))
+    return build(study, "small.toml", seed=seed)
 
 
 class Recorder:
