@@ -65,7 +65,7 @@ SOURCE = """\
 #include <math.h>
 
 {defaults} {{
-    {name}_parameters parameters;
+    {name}_parameters parameters = {{0}};
 {set}
     {name}_prepare(&parameters);
     return parameters;

@@ -6,7 +6,9 @@ Each controller and plant of the catalogue, or with --models each model that
 ``identify`` fits, is exported as C; ``make test`` replays its golden vectors, 20 000
 samples of a simulation with noise and saturation. The table has the number of lines of
 the source, and the largest difference as a share of the largest output, or the reason
-why the System is refused. Exits with 1 if a test fails.
+why the System is refused. gcc, clang, cppcheck and an emulated Cortex-M4 check each
+source too, where they are installed; what they complain of is printed. Exits with 1 if
+a test fails.
 """
 
 import argparse
@@ -30,15 +32,22 @@ from piezojax.exporting import NotScalarError
 from piezojax.exporting.c_export import write_c
 from piezojax.exporting.slots import Interface
 
+# The tests are not installed.
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from c_tools import TOOLS, missing
+
 SAMPLES = 20_000
 
 LIMITS = {"p753": (-20.0, 120.0), "p558": (-50.0, 50.0), "mirror": (-5.0, 5.0)}
 RANGES = {"p753": (0.0, 10.0), "p558": (-9.0, 9.0), "mirror": (-1.0, 1.0)}
 """Limits of the voltage and of the references by the stage in a name."""
 
+CHECKS = {name: check for name, (_, check) in TOOLS.items() if not missing(name)}
+"""The checks that this machine has, by the name of their tool."""
+
 
 def tested(make, name, precision):
-    """Return lines and relative difference of an export, and whether it passes."""
+    """Return lines and relative difference of an export, and complaints by tool."""
     stage, axes = name.partition("_")[0], 1 if name.startswith("p753") else 3
     about = pj.About(judged=["not here"], reference_ranges=[RANGES[stage]] * axes)
     limits = [LIMITS[stage]] * axes
@@ -66,14 +75,16 @@ def tested_model(make, _, precision):
 
 
 def replayed(out, name):
-    """Return lines and difference of the export in ``out``, and whether it passes."""
+    """Return lines and difference of the export in ``out``, and complaints by tool."""
     done = subprocess.run(
         ["make", "-s", "test"], cwd=out, capture_output=True, text=True
     )
     found = re.findall(r"difference (\S+), largest value (\S+),", done.stdout)
     shares = [float(a) / float(b.rstrip(",")) for a, b in found]
     lines = (out / f"{name}.c").read_text().count("\n")
-    return lines, max(shares, default=float("nan")), done.returncode == 0
+    complaints = {"make test": done.stdout + done.stderr if done.returncode else ""}
+    complaints |= {tool: check(out, name) for tool, check in CHECKS.items()}
+    return lines, max(shares, default=float("nan")), complaints
 
 
 def main():
@@ -86,20 +97,26 @@ def main():
     systems = MODELS if chosen.models else CONTROLLERS | PLANTS
     console = Console(width=None if sys.stdout.isatty() else 120)
     table = Table(title=f"exports in {precision}")
-    for head in ("System", "lines", "difference", "test"):
+    for head in ("System", "lines", "difference", "make test", *CHECKS):
         table.add_column(head, justify="left" if head == "System" else "right")
     passed = failed = 0
     for name, make in systems.items():
         try:
-            lines, share, right = test(make, name, precision)
+            lines, share, complaints = test(make, name, precision)
         except NotScalarError as error:
             table.add_row(name, "", "", f"refused: {error}")
             continue
-        passed, failed = passed + right, failed + (not right)
-        verdict = "passed" if right else "FAILED"
-        table.add_row(name, str(lines), f"{share:.1e}", verdict)
+        wrong = any(complaints.values())
+        passed, failed = passed + (not wrong), failed + wrong
+        verdicts = ("FAILED" if text else "passed" for text in complaints.values())
+        table.add_row(name, str(lines), f"{share:.1e}", *verdicts)
+        for tool, text in complaints.items():
+            if text:
+                console.print(f"{name}, {tool}: {text}", markup=False)
     console.print(table)
     console.print(f"{passed} passed, {failed} failed")
+    for tool in TOOLS.keys() - CHECKS.keys():
+        console.print(f"not run, for lack of {', '.join(missing(tool))}: {tool}")
     return int(failed > 0)
 
 

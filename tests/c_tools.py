@@ -1,0 +1,90 @@
+"""Checks of an exported folder by compilers, by an analyser, and on a Cortex-M4.
+
+Each check runs programs of the system and returns their complaint, or "". The ARM check
+runs the test program of the folder in an emulator of the processor, without an
+operating system: files are read through the debugger's interface (semihosting).
+"""
+
+import shutil
+import subprocess
+
+WARNINGS = "-std=c99 -O2 -Wall -Wextra -pedantic -Werror -ffp-contract=off".split()
+"""Flags of the exported Makefile."""
+
+CORTEX = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16".split()
+
+START = """\
+extern void _start(void);
+static void reset(void) {
+    *(volatile unsigned *)0xE000ED88 |= 0xFu << 20; /* switch the FPU on */
+    _start();
+}
+__attribute__((section(".vectors"), used)) static void (*const vectors[])(void) = {
+    (void (*)(void))0x20400000, reset}; /* end of the stack, first instruction */
+"""
+
+PLACES = "-Wl,--section-start=.vectors=0,-Ttext-segment=0x1000,-Tdata=0x20000000"
+"""Code at the start of the memory, where this processor begins, data in its RAM."""
+
+BOARD = (
+    "qemu-system-arm -M mps2-an386 -cpu cortex-m4 -display none -serial null "
+    "-monitor none -semihosting-config enable=on,target=native,arg=test,"
+    "arg=vectors.csv -kernel test"
+).split()
+
+
+def complaint(command, folder):
+    """Run a command in ``folder``; return its text if it fails or prints a warning."""
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=600
+    )
+    text = done.stdout + done.stderr
+    return text or str(done.returncode) if done.returncode else done.stderr
+
+
+def compiled_by(compiler):
+    """Return a check that compiles and replays the golden vectors."""
+
+    def check(folder, name):
+        sources = [f"test_{name}.c", f"{name}.c"]
+        build = [compiler, *WARNINGS, "-o", "test", *sources, "-lm"]
+        return complaint(build, folder) or complaint(
+            ["./test", "vectors.csv"], folder
+        )
+
+    return check
+
+
+def analysed(folder, name):
+    """Analyse the source with cppcheck."""
+    return complaint(
+        [
+            *("cppcheck", "--std=c99", "--enable=warning,style,performance"),
+            *("--quiet", "--error-exitcode=1", f"{name}.c"),
+        ],
+        folder,
+    )
+
+
+def on_cortex(folder, name):
+    """Replay the golden vectors on an emulated Cortex-M4, double in software."""
+    (folder / "start.c").write_text(START)
+    sources = [f"test_{name}.c", f"{name}.c", "start.c"]
+    build = ["arm-none-eabi-gcc", *CORTEX, *WARNINGS, "--specs=rdimon.specs", PLACES]
+    return complaint([*build, "-o", "test", *sources, "-lm"], folder) or complaint(
+        BOARD, folder
+    )
+
+
+TOOLS = {
+    "gcc": (["gcc"], compiled_by("gcc")),
+    "clang": (["clang"], compiled_by("clang")),
+    "cppcheck": (["cppcheck"], analysed),
+    "cortex-m4": (["arm-none-eabi-gcc", "qemu-system-arm"], on_cortex),
+}
+"""Programs that a check needs, and the check, by name."""
+
+
+def missing(tool):
+    """Return the programs of ``tool`` that this machine lacks."""
+    return [program for program in TOOLS[tool][0] if shutil.which(program) is None]
