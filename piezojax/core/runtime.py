@@ -6,9 +6,15 @@ import warnings
 from importlib.metadata import version
 from typing import Any
 
-# An unknown internal option aborts the process. Each is therefore set only for the
-# jaxlib versions known to accept it: from the version given here up to _BEFORE.
-_CPU_FLAGS = {
+Version = tuple[int, ...]
+
+_LATEST: Version = (0, 12, 1)
+"""First version of jaxlib on which the flags have not been tried."""
+
+# An unknown flag aborts the process, and releases remove flags without notice, even
+# patch releases. Each is therefore set only for the versions of jaxlib that are known
+# to accept it: from the first version given here up to the second, exclusive.
+_CPU_FLAGS: dict[str, tuple[str, Version, Version]] = {
     # Without this option a scan with a carry above about 1 kB runs kernel by kernel,
     # which costs microseconds per step; with it the loop is one function. It is added
     # to extra options that the user gives.
@@ -16,16 +22,25 @@ _CPU_FLAGS = {
         "--xla_backend_extra_options="
         "xla_cpu_small_while_loop_byte_threshold=1000000000",
         (0, 9, 2),
+        _LATEST,
     ),
-    "xla_cpu_prefer_vector_width": ("--xla_cpu_prefer_vector_width=512", (0, 9, 2)),
+    "xla_cpu_prefer_vector_width": (
+        "--xla_cpu_prefer_vector_width=512",
+        (0, 9, 2),
+        _LATEST,
+    ),
     "xla_cpu_copy_insertion_use_region_analysis": (
         "--xla_cpu_copy_insertion_use_region_analysis=true",
         (0, 9, 2),
+        _LATEST,
     ),
     # The newer code generator takes up to twice the compile time; loops are not faster.
-    "xla_cpu_use_fusion_emitters": ("--xla_cpu_use_fusion_emitters=false", (0, 10)),
+    "xla_cpu_use_fusion_emitters": (
+        "--xla_cpu_use_fusion_emitters=false",
+        (0, 10),
+        (0, 11, 1),
+    ),
 }
-_BEFORE = (0, 13)
 
 CACHE_VARIABLE = "PIEZOJAX_COMPILATION_CACHE"
 
@@ -51,11 +66,11 @@ def _backend_is_running() -> bool:
         return False
 
 
-def _missing_flags(current: str, jaxlib: tuple[int, ...]) -> list[str]:
+def _missing_flags(current: str, jaxlib: Version) -> list[str]:
     return [
         flag
-        for name, (flag, since) in _CPU_FLAGS.items()
-        if name not in current and since <= jaxlib < _BEFORE
+        for name, (flag, since, before) in _CPU_FLAGS.items()
+        if name not in current and since <= jaxlib < before
     ]
 
 
@@ -102,7 +117,7 @@ def simulate_side_by_side() -> bool:
 _side_by_side: list[bool] = []
 
 
-def _use_cache(folder: str, jaxlib: tuple[int, ...]) -> None:
+def _use_cache(folder: str, jaxlib: Version) -> None:
     # Code compiled by another version or for another CPU has crashed when loaded: the
     # name of the folder contains both.
     import hashlib
