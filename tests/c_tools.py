@@ -8,10 +8,13 @@ operating system: files are read through the debugger's interface (semihosting).
 import shutil
 import subprocess
 
-WARNINGS = "-std=c99 -O2 -Wall -Wextra -pedantic -Werror -ffp-contract=off".split()
+WARNINGS = (
+    *("-std=c99", "-O2", "-Wall", "-Wextra", "-pedantic", "-Werror"),
+    "-ffp-contract=off",
+)
 """Flags of the exported Makefile."""
 
-CORTEX = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16".split()
+CORTEX = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
 
 START = """\
 extern void _start(void);
@@ -27,10 +30,11 @@ PLACES = "-Wl,--section-start=.vectors=0,-Ttext-segment=0x1000,-Tdata=0x20000000
 """Code at the start of the memory, where this processor begins, data in its RAM."""
 
 BOARD = (
-    "qemu-system-arm -M mps2-an386 -cpu cortex-m4 -display none -serial null "
-    "-monitor none -semihosting-config enable=on,target=native,arg=test,"
-    "arg=vectors.csv -kernel test"
-).split()
+    *("qemu-system-arm", "-M", "mps2-an386", "-cpu", "cortex-m4", "-kernel", "test"),
+    *("-display", "none", "-serial", "null", "-monitor", "none"),
+    "-semihosting-config",
+    "enable=on,target=native,arg=test,arg=vectors.csv",
+)
 
 
 def complaint(command, folder):
@@ -48,9 +52,7 @@ def compiled_by(compiler):
     def check(folder, name):
         sources = [f"test_{name}.c", f"{name}.c"]
         build = [compiler, *WARNINGS, "-o", "test", *sources, "-lm"]
-        return complaint(build, folder) or complaint(
-            ["./test", "vectors.csv"], folder
-        )
+        return complaint(build, folder) or complaint(["./test", "vectors.csv"], folder)
 
     return check
 

@@ -1,4 +1,4 @@
-"""The vendor's own library loads an exported NV200 file into a device and reads it back.
+"""The vendor's own library loads an NV200 file into a device and reads it back.
 
 The library needs Python 3.12; its device is emulated as the manual describes: a command
 alone asks for values, a command with values sets them.
