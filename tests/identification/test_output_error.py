@@ -10,6 +10,7 @@ from piezojax.catalog import p753
 from piezojax.core.paths import replace
 from piezojax.identification import free_run
 from piezojax.identification.chain import structure
+from piezojax.identification.estimators import output_error
 from piezojax.identification.estimators.approach import run_after, start_columns
 from piezojax.identification.estimators.output_error import (
     at_starts,
@@ -140,3 +141,19 @@ def test_hysteresis_creep_lag_and_delay_are_recovered():
         found = fit.report.parameters[path]
         assert found.value == pytest.approx(truth[path], rel=accuracy), path
         assert abs(found.value - truth[path]) < 4.0 * found.standard_error, path
+
+
+def test_all_passes_of_a_fit_are_one_program(monkeypatch):
+    record = p753_record(200, 1)
+    shape = structure(MODEL, record)
+    shape = shape._replace(starts=shape.starts[:2], whitening=(1.0, -0.5))
+    program, shapes = output_error._normal_equations, set()
+
+    def counted(problem, free):
+        shapes.add(free.shape)
+        return program(problem, free)
+
+    monkeypatch.setattr(output_error, "_normal_equations", counted)
+    found = output_error.output_error(shape, [record], slice(0, 200), steps=2)
+    output_error.values_and_errors(found)
+    assert len(shapes) == 1

@@ -315,6 +315,8 @@ def output_error(
     if noise_model:
         idle = jnp.zeros(NOISE_ORDER + 1)  # of the final size, to compile once
         problem = eqx.tree_at(lambda p: p.whitening, problem, idle)
+    # One start is added below: all passes have the same width, to compile once.
+    width = min(PARALLEL_STARTS, len(starts) + int(whitened))
     progress.stage(f"compiling the fit of {starts.shape[1]} parameters")
     rough = min(steps, ROUGH_STEPS) if whitened or several else steps
     units, losses, finished = _inside(starts), np.zeros(len(starts)), False
@@ -326,7 +328,7 @@ def output_error(
             problem = at_starts(problem, found)
         last = not left and not whitened
         units, losses, finished = _descended(
-            problem, _inside(units), steps if last else rough, progress
+            problem, _inside(units), width, steps if last else rough, progress
         )
     before = np.inf
     for _ in range(NOISE_PASSES if noise_model else int(whitened)):
@@ -341,7 +343,9 @@ def output_error(
             again = units.copy()
             again[:, dynamics] = starts[0, dynamics]
             units = np.concatenate([again, units])[: len(units) + 1]
-        units, losses, finished = _descended(problem, _inside(units), steps, progress)
+        units, losses, finished = _descended(
+            problem, _inside(units), width, steps, progress
+        )
         if abs(before - losses[0]) <= NOISE_SETTLED * losses[0]:
             break
         before = losses[0]
@@ -353,13 +357,13 @@ def _inside(units: np.ndarray) -> np.ndarray:
 
 
 def _descended(
-    problem: Problem, starts: np.ndarray, steps: int, progress: Progress
+    problem: Problem, starts: np.ndarray, width: int, steps: int, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return the best points, their losses, and whether the best ended by itself.
+    """Return at most ``width`` best points, their losses, and if the best has ended.
 
-    Raises ValueError when no start leads to a finite simulation.
+    ``width`` starts descend together. Raises ValueError when no start leads to a finite
+    simulation.
     """
-    width = min(PARALLEL_STARTS, len(starts))
     evaluate = trials_with_models(lambda free: _normal_equations(problem, free), width)
     descents = [
         Descent(start, TRUST_REGION, tolerance=TOLERANCE)
