@@ -37,11 +37,18 @@ BOARD = (
 )
 
 
+LIMIT = 120.0
+"""Seconds after which a tool is stopped: cppcheck does not end on the longest steps."""
+
+
 def complaint(command, folder):
     """Run a command in ``folder``; return its text if it fails or prints a warning."""
-    done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=600
-    )
+    try:
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=LIMIT
+        )
+    except subprocess.TimeoutExpired:
+        return f"{command[0]} did not end within {LIMIT:g} s"
     text = done.stdout + done.stderr
     return text or str(done.returncode) if done.returncode else done.stderr
 
