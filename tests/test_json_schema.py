@@ -2,6 +2,8 @@
 
 import copy
 import json
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,20 @@ from jsonschema import Draft202012Validator
 from study_tables import with_values
 
 from piezojax.cli.tune import main
-from piezojax.study import Study, study_schema
+from piezojax.study import (
+    Study,
+    build,
+    ensemble_table,
+    file_tables,
+    plant_tables,
+    schema,
+    stage_tables,
+    structure_table,
+    study_schema,
+    sweep_table,
+)
+
+DOCS = Path(__file__).parents[1] / "docs"
 
 SCHEMA = study_schema()
 JUDGE = Draft202012Validator(SCHEMA)
@@ -40,6 +55,11 @@ DEFAULTS = {
     "SensorTable": {"delay": 0.0, "noise_rms": 0.0},
     "StructuresTable": {"worth": 0.1},
     "Study": {"seed": 0, "holdout_draws": 1},
+    "RecordPlant": {
+        **{"model": "auto", "input": 0, "output": 1},
+        **{"order": 4, "window": 20, "oversample": 8, "steps": 200},
+    },
+    "ResponsePlant": {"held": False, "unit": "um/V"},
     "SweepTable": {
         "method": "grid",
         "metrics": ["rms_error", "peak_error", "rms_effort", "saturated"],
@@ -89,6 +109,11 @@ def test_shipped_studies_are_valid(name):
         {"controller": {"design": "lqr"}},
         {"controller": {"catalog": "p753"}},
         {"plant": {"type": "Affin"}},
+        {"plant": {"record": "a.csv", "modle": "auto"}},
+        {"plant": {"record": []}},
+        {"plant": {"model": "auto"}},
+        {"plant": {"response": "a.csv", "held": "yes"}},
+        {"sweep": {"metrics": ["rms"]}},
         {"pareto": {"constraint": "speed", "limits": [1.0, 2.0]}},
     ],
 )
@@ -105,11 +130,64 @@ def test_mistakes_are_found(changes):
         {"controller": {"type": "PID", "proportional": 1.0, "dt": 5e-5}},
         {"controller": {"file": "gains.toml", "accept_unsafe": True}},
         {"plant": {"record": "a.csv", "model": "auto"}},
+        {"plant": {"records": ["a.csv", "b.csv"], "check": "c.csv"}},
+        {"plant": {"response": "a.csv", "held": True}},
+        {"plant": {"type": "FirstOrderLag", "gain": 1.0, "order": "its own"}},
         {"references/amplitude": [1.0, 2.0]},
     ],
 )
 def test_what_a_study_may_have_is_valid(changes):
     JUDGE.validate(with_values(BASE, changes))
+
+
+def keys_of(schema):
+    """Yield the keys of each table, with the name of the table."""
+    for name, table in (*schema["$defs"].items(), ("Study", schema)):
+        for key, each in table["properties"].items():
+            yield f"{name}.{key}", each
+    for name, each in schema["properties"]["constraints"]["properties"].items():
+        yield f"constraints.{name}", each
+
+
+def test_every_key_has_a_description():
+    """A key of one table may have the description of that table."""
+    keys = dict(keys_of(SCHEMA))
+    assert {"Study.rate", "References.tune", "constraints.effort"} < keys.keys()
+    keys |= SCHEMA["$defs"]
+    bare = [key for key, each in keys.items() if not each.get("description")]
+    assert [key for key in bare if "$ref" not in keys[key]] == []
+
+
+def test_a_description_ends_with_the_unit():
+    keys = dict(keys_of(SCHEMA))
+    assert keys["Study.rate"]["unit"] == "Hz"
+    assert keys["constraints.settling_time"]["unit"] == "s"
+    for each in keys.values():
+        if "unit" in each:
+            assert each["description"].endswith(f". Unit: {each['unit']}.")
+
+
+@pytest.mark.parametrize("name", [*SCHEMA["$defs"], "Study"])
+def test_examples_are_valid(name):
+    """The example of each table is read, by pydantic and by the schema."""
+    (example,) = SCHEMA["$defs"].get(name, SCHEMA)["examples"]
+    table = {"$ref": f"#/$defs/{name}", "$defs": SCHEMA["$defs"]}
+    Draft202012Validator(SCHEMA if name == "Study" else table).validate(example)
+    tables = (schema, file_tables, plant_tables, stage_tables, sweep_table)
+    tables += (ensemble_table, structure_table)
+    (kind,) = {vars(each)[name] for each in tables if name in vars(each)}
+    kind.model_validate(example)
+
+
+def test_the_example_of_a_study_is_built():
+    case = build(Study.model_validate(SCHEMA["examples"][0]), "example.toml")
+    assert case.space.paths
+
+
+def test_the_page_is_that_of_the_schema():
+    """``python docs/study_reference.py`` writes the page."""
+    module = runpy.run_path(str(DOCS / "study_reference.py"))
+    assert (DOCS / "study.md").read_text(encoding="utf-8") == module["page"]()
 
 
 def test_no_study_that_loads_is_marked():

@@ -69,7 +69,7 @@ class Constraint(NamedTuple):
     first axis, from the field ``source`` of the LoopFigures and dt in s. A limit must
     lie above ``above`` and below ``below``. ``default`` is the limit if a study gives
     none. ``one_axis`` is True if the figure is known for one axis only. ``bands`` is
-    the number of values for each plant and branch.
+    the number of values for each plant and branch. ``meaning`` describes the figure.
     """
 
     unit: str
@@ -81,6 +81,7 @@ class Constraint(NamedTuple):
     default: float | None = None
     one_axis: bool = False
     bands: int = 1
+    meaning: str = "Figure of another package"
 
     def check(self, name: str, limit: Any) -> None:
         """Raise ValueError unless ``limit`` is a number in its bounds, or ``OFF``."""
@@ -196,9 +197,16 @@ CONSTRAINTS: dict[str, Constraint] = {
         above=1.0,
         default=2.0,
         bands=BANDS,
+        meaning="Largest |S|",
     ),
     "disk_margin": Constraint(
-        "1", "at least", "margins", _margin("disk_margin"), below=2.0
+        "1",
+        "at least",
+        "margins",
+        _margin("disk_margin"),
+        below=2.0,
+        meaning="Size of the simultaneous changes of gain and phase that keep the loop "
+        "stable",
     ),
     "delay_margin": Constraint(
         "samples",
@@ -206,34 +214,82 @@ CONSTRAINTS: dict[str, Constraint] = {
         "margins",
         _margin("delay_margin"),
         default=1.0,
+        meaning="Smallest delay that makes the loop unstable",
     ),
     "peak_voltage": Constraint(
-        "V", "at most", "tracking", lambda figures, dt: _largest(figures.peak_voltage)
+        "V",
+        "at most",
+        "tracking",
+        lambda figures, dt: _largest(figures.peak_voltage),
+        meaning="Largest voltage of the runs",
     ),
     "peak_slew": Constraint(
-        "V/s", "at most", "extremes", lambda found, dt: _largest(found.peak_slew) / dt
+        "V/s",
+        "at most",
+        "extremes",
+        lambda found, dt: _largest(found.peak_slew) / dt,
+        meaning="Largest rate of the voltage in the runs",
     ),
     "effort": Constraint(
-        "V rms", "at most", "tracking", lambda figures, dt: _largest(figures.rms_effort)
+        "V rms",
+        "at most",
+        "tracking",
+        lambda figures, dt: _largest(figures.rms_effort),
+        meaning="Largest rms voltage of the runs",
     ),
     "overshoot": Constraint(
-        "1", "at most", "extremes", lambda found, dt: _largest(found.overshoot)
+        "1",
+        "at most",
+        "extremes",
+        lambda found, dt: _largest(found.overshoot),
+        meaning="Largest displacement beyond the reference, as a share of its range",
     ),
-    "gain_margin": Constraint("dB", "at least", "margins", _margin("gain_margin")),
+    "gain_margin": Constraint(
+        "dB",
+        "at least",
+        "margins",
+        _margin("gain_margin"),
+        meaning="Smallest gain factor above 1 that makes the loop unstable",
+    ),
     "phase_margin": Constraint(
-        "deg", "at least", "margins", _margin("phase_margin"), below=180.0
+        "deg",
+        "at least",
+        "margins",
+        _margin("phase_margin"),
+        below=180.0,
+        meaning="Smallest phase lag or lead that makes the loop unstable",
     ),
     "bandwidth": Constraint(
-        "Hz", "at least", "margins", _margin("bandwidth"), one_axis=True
+        "Hz",
+        "at least",
+        "margins",
+        _margin("bandwidth"),
+        one_axis=True,
+        meaning="Lowest frequency at which |y/r| falls below -3 dB",
     ),
     "closed_loop_peak": Constraint(
-        "1", "at most", "margins", _margin("closed_loop_peak"), one_axis=True
+        "1",
+        "at most",
+        "margins",
+        _margin("closed_loop_peak"),
+        one_axis=True,
+        meaning="Maximum of |y/r|",
     ),
     "rise_time": Constraint(
-        "s", "at most", "steps", lambda found, dt: found.rise_time, one_axis=True
+        "s",
+        "at most",
+        "steps",
+        lambda found, dt: found.rise_time,
+        one_axis=True,
+        meaning="Time from 10 to 90 % of a step",
     ),
     "settling_time": Constraint(
-        "s", "at most", "steps", lambda found, dt: found.settling_time, one_axis=True
+        "s",
+        "at most",
+        "steps",
+        lambda found, dt: found.settling_time,
+        one_axis=True,
+        meaning="Time after which a step stays within 2 % of the reference",
     ),
     "steady_state_error": Constraint(
         "1",
@@ -241,6 +297,7 @@ CONSTRAINTS: dict[str, Constraint] = {
         "steps",
         lambda found, dt: found.steady_state_error,
         one_axis=True,
+        meaning="Mean error in the last tenth of a step, as a share of its height",
     ),
 }
 """Constraints by their name in a study; each holds for every plant and reference of the

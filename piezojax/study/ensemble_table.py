@@ -5,35 +5,47 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from .tables import Finite, Positive, Table
+from .tables import Finite, Positive, Table, example
 
 
 class EnsembleTable(Table):
     """Random stages: relative deviations, ranges and standard errors of parameters.
 
-    ``spread`` holds the largest relative deviations; values are drawn uniformly on both
-    sides of the nominal one. ``range`` holds intervals, from which values are drawn
-    uniformly. The keys of both are deviations of the catalogued plant or paths
-    (``plant.hysteresis.a``, ``sensor.noise.noise_rms``). ``standard_errors`` names a
-    ``fit.json``, whose parameters are drawn from normal distributions around their
-    values.
-
-    The objective includes the nominal stage and ``tune`` drawn stages. Margins are
-    limited on the nominal stage and on ``margins`` drawn ones, the first of which are
-    those of ``tune``: a search uses the worst, and all are checked at its end. The
-    tuned gains are evaluated on ``holdout`` other stages. ``aggregate`` combines the
-    objectives of the stages: their mean, the worst, or the mean of the worst share
-    ``tail`` (CVaR).
+    The keys of ``spread`` and ``range`` are deviations of the catalogued plant or paths
+    (``plant.hysteresis.a``, ``sensor.noise.noise_rms``).
     """
 
+    model_config = example(
+        {
+            "tune": 3,
+            "holdout": 200,
+            "spread": {"gain": 0.2, "sensor.noise.noise_rms": 0.3},
+            "range": {"mode_frequency": [2000.0, 6000.0]},
+        }
+    )
+
     spread: dict[str, Positive] = Field(default_factory=dict)
+    """Largest relative deviations; values are drawn uniformly on both sides of the
+    nominal one."""
     range: dict[str, tuple[Finite, Finite]] = Field(default_factory=dict)
+    """Intervals, in the unit of the parameter, from which values are drawn
+    uniformly."""
     standard_errors: Path | None = None
+    """A ``fit.json`` of identify, whose parameters are drawn from normal distributions
+    around their values."""
     tune: Annotated[int, Field(strict=True, ge=0, le=64)] = 0
+    """Number of drawn stages in the objective, in addition to the nominal one."""
     margins: Annotated[int, Field(strict=True, ge=0, le=1024)] = 64
+    """Number of drawn stages on which margins are limited, in addition to the nominal
+    one; the first of them are those of ``tune``. A search uses the worst, and all are
+    checked at its end."""
     holdout: Annotated[int, Field(strict=True, ge=1, le=1024)] = 50
+    """Number of other stages on which the tuned gains are evaluated."""
     aggregate: Literal["mean", "worst", "cvar"] = "mean"
+    """Objective of several stages: the mean of theirs, the worst, or the mean of the
+    worst share ``tail`` (CVaR)."""
     tail: Annotated[float, Field(gt=0.0, le=1.0)] = 0.25
+    """Share of the stages in ``cvar``."""
 
     @property
     def ranges(self) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from ..signals import waveforms
-from .tables import ByAxis, Finite, NotNegative, Positive, Table
+from .tables import ByAxis, Finite, NotNegative, Positive, Table, example, in_unit
 
 NAME = re.compile(r"[A-Za-z_][\w-]*")
 """Pattern of the name of a trajectory; files are named after it."""
@@ -16,36 +16,37 @@ ColumnKey = str | Annotated[int, Field(ge=0, strict=True)]
 
 
 class SignalFile(Table):
-    """Columns of a file in one of the formats of records.
-
-    ``column`` is a name or a number from zero; it may be left out if the file has one
-    column besides ``time``. On a stage with several axes, ``axes`` gives the column of
-    each axis instead. The sample time comes from the column ``time``, from ``rate``
-    (Hz) or from the file. ``unit`` applies to columns whose unit is given neither by
-    the file nor by their name. The values are multiplied by ``scale``.
-    """
+    """Columns of a file in one of the formats of records."""
 
     file: Path
+    """File, relative to the study."""
     column: ColumnKey | None = None
+    """Column, a name or a number from zero; needed if the file has several columns
+    besides ``time``, on a stage with one axis."""
     axes: dict[str, ColumnKey] = Field(default_factory=dict)
+    """Column of each axis, by the name of the axis, on a stage with several axes."""
     time: ColumnKey | None = None
-    rate: Positive | None = None
+    """Column of the time, unless ``rate`` or the file gives the sample time."""
+    rate: Annotated[Positive | None, in_unit("Hz")] = None
+    """Sampling rate, without a column of the time."""
     unit: str | None = None
+    """Unit of columns whose unit is given neither by the file nor by their name."""
     scale: Finite = 1.0
+    """Factor of the values, not 0."""
 
 
 class NoiseFile(SignalFile):
-    """Measured noise or vibration in a file.
+    """Measured noise or vibration in a file."""
 
-    ``play`` "spectrum" draws random noise with the spectrum of the record; "record"
-    plays stretches of the record itself, from its first half in tuning and from its
-    second half in the hold-out. With ``frequency``, a column in Hz, the file holds a
-    spectrum itself: ``unit`` is then that of a one-sided density, such as um/sqrt(Hz)
-    or um^2/Hz.
-    """
+    model_config = example({"file": "noise.csv", "time": "time_s", "column": "z_nm"})
 
     play: Literal["spectrum", "record"] = "spectrum"
-    frequency: ColumnKey | None = None
+    """``spectrum`` draws random noise with the spectrum of the record; ``record`` plays
+    sections of the record itself, of its first half in tuning and of its second half in
+    the hold-out."""
+    frequency: Annotated[ColumnKey | None, in_unit("Hz")] = None
+    """Column of the frequency: the file is then a one-sided spectrum, and ``unit`` that
+    of a density such as um/sqrt(Hz) or um^2/Hz."""
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> "NoiseFile":
@@ -59,16 +60,20 @@ class NoiseFile(SignalFile):
 
 
 class TrajectoryTable(SignalFile):
-    """Trajectory in a file, as a reference.
+    """Trajectory in a file, as a reference."""
 
-    The reference begins ``start`` s after the beginning of the file. ``offset`` is
-    added to the values, in the unit of the axis. If the file ends before the reference,
-    its last value is held (``then = "hold"``) or it begins again (``"repeat"``).
-    """
+    model_config = example(
+        {"file": "trajectory.csv", "time": "time_s", "column": "z_um", "start": 2.0}
+    )
 
-    start: NotNegative = 0.0
-    offset: ByAxis[Finite] = 0.0
+    start: Annotated[NotNegative, in_unit("s")] = 0.0
+    """Time in the file at which the reference begins, from the beginning of the
+    file."""
+    offset: Annotated[ByAxis[Finite], in_unit("um or urad")] = 0.0
+    """Value added to the trajectory."""
     then: Literal["hold", "repeat"] | None = None
+    """Continuation of a file that ends before the reference: its last value, or from
+    its beginning. Without this key such a file is an error."""
 
     @model_validator(mode="after")
     def _scaled(self) -> "TrajectoryTable":

@@ -9,9 +9,15 @@ from ..catalog import CONTROLLERS, PLANTS
 from ..control.design import DESIGNS
 from ..core.registry import kinds
 from ..solve.optimisers import GAUSS_NEWTON, METHODS
+from .plant_tables import RecordPlant, ResponsePlant
 from .schema import Study
+from .sweep_table import METRICS
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
+
+UNIT = " Unit: {}."
+"""End of the description of a key with a unit, for editors. The unit also stands under
+``unit``, a keyword that validators ignore."""
 
 
 def study_schema() -> dict[str, Any]:
@@ -23,25 +29,59 @@ def study_schema() -> dict[str, Any]:
     """
     schema = Study.model_json_schema()
     properties, tables = schema["properties"], schema["$defs"]
-    properties["plant"] |= _sources(PLANTS)
+    tables |= {
+        kind.__name__: kind.model_json_schema() for kind in (RecordPlant, ResponsePlant)
+    }
+    _several_names(tables["RecordPlant"])
+    properties["plant"] |= {
+        "anyOf": [
+            _source(PLANTS),
+            {"$ref": "#/$defs/RecordPlant"},
+            {"$ref": "#/$defs/ResponsePlant"},
+        ]
+    }
     for table in (properties, tables["BesideTable"]["properties"]):
-        table["controller"] |= _sources(CONTROLLERS, design=DESIGNS)
+        table["controller"] |= _source(CONTROLLERS, design=DESIGNS)
     properties["constraints"] = {
         "type": "object",
-        "description": "Limits by the names of their figures.",
+        "description": properties["constraints"]["description"],
         "properties": {name: _limit(name) for name in CONSTRAINTS},
         "additionalProperties": False,
+        "examples": [{"sensitivity_peak": 1.6, "settling_time": 0.005}],
     }
     _choice(tables["ParetoTable"], "constraint", CONSTRAINTS)
     _choice(tables["OptimiserTable"], "method", (*METHODS, GAUSS_NEWTON))
+    tables["SweepTable"]["properties"]["metrics"]["items"]["enum"] = list(METRICS)
+    for table in (schema, *tables.values()):
+        for each in table["properties"].values():
+            if "unit" in each:
+                each["description"] += UNIT.format(each["unit"])
     return {"$schema": DRAFT} | schema
 
 
-def _sources(catalog: Iterable[str], **named: Iterable[str]) -> dict[str, Any]:
+def _source(catalog: Iterable[str], **named: Iterable[str]) -> dict[str, Any]:
     """Return the schema of a table with one source."""
     names = {"catalog": catalog, "type": kinds(), **named}
     enums = {key: {"enum": sorted(each)} for key, each in names.items()}
-    return {"properties": {"file": {"type": "string"}, **enums}}
+    sources = {"file": {"type": "string"}, **enums}
+    return {
+        "properties": sources,
+        "anyOf": [{"required": [source]} for source in sources],
+    }
+
+
+def _several_names(record: dict[str, Any]) -> None:
+    """Let a plant name its records as ``records`` too, and a single file as a text."""
+    properties = record["properties"]
+    for key in ("record", "check"):
+        files = properties[key]
+        types = {name: files.pop(name) for name in ("type", "items")}
+        if "minItems" in files:
+            types["minItems"] = files.pop("minItems")
+        properties[key] = {"anyOf": [types["items"], types]} | files
+    properties["records"] = properties["record"]
+    del record["required"]
+    record["anyOf"] = [{"required": ["record"]}, {"required": ["records"]}]
 
 
 def _limit(name: str) -> dict[str, Any]:
@@ -52,7 +92,8 @@ def _limit(name: str) -> dict[str, Any]:
         number["exclusiveMaximum"] = kind.below
     found = {
         "anyOf": [number, {"const": OFF}],
-        "description": f"{kind.sense}, in {kind.unit}",
+        "description": f"{kind.meaning}, {kind.sense}.{UNIT.format(kind.unit)}",
+        "unit": kind.unit,
     }
     return found if kind.default is None else found | {"default": kind.default}
 

@@ -7,7 +7,7 @@ from pydantic import AliasChoices, Field, field_validator, model_validator
 
 from ..identification import DEFAULT, METHODS, chain
 from ..identification.estimators.estimate import Options
-from .tables import Positive, Table
+from .tables import Positive, Table, example, in_unit
 
 ALL = "all"
 """Value of ``model`` that fits every model the records support."""
@@ -18,51 +18,82 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 
 
 class ResponsePlant(Table):
-    """A plant fitted to a frequency response, for the rate of the study.
+    """A plant fitted to a frequency response, for the rate of the study."""
 
-    ``response`` is the file, ``unit`` that of the response, output over input. ``held``
-    is true for a response measured through converters at the rate of the study.
-    """
+    model_config = example({"response": "sweep.csv", "unit": "nm/V"})
 
     response: Path
+    """File with the frequency response, relative to the study."""
     held: bool = False
+    """Whether the response was measured through converters at the rate of the
+    study."""
     unit: str = "um/V"
+    """Unit of the response, output over input."""
 
 
 class RecordPlant(Table):
     """A plant fitted to records, with the options of ``identify``.
 
-    ``record``, or ``records``, is a file or a list of files of one stage. ``time``,
-    ``input`` and ``output`` are columns, by name or number; several inputs and outputs
-    are lists. ``record_rate`` is the sampling rate of the records, Hz, ``resample`` the
-    rate to which they are interpolated, and ``period`` the samples in a period of a
-    periodic input. ``train``, ``validate`` and ``test`` are pairs: the first sample and
-    the sample after the last. ``among`` and ``test`` need the model "all". ``order``,
-    ``window``, ``oversample`` and ``steps`` are those of ``identify``. ``check`` are
-    other records of the stage, with the same columns, on which the fitted plant is
-    validated.
+    Columns are names or numbers from zero. A span of samples is a pair: the first
+    sample and the sample after the last.
     """
+
+    model_config = example(
+        {
+            "record": "record.csv",
+            "model": "coleman_hodgdon+lag",
+            "time": "time_s",
+            "input": "input_V",
+            "output": "displacement_um",
+            "train": [0, 12000],
+        }
+    )
 
     record: tuple[Path, ...] = Field(
         min_length=1, validation_alias=AliasChoices("record", "records")
     )
+    """File of a record, or several of one stage, relative to the study; ``records`` is
+    the same key."""
     model: str = DEFAULT
+    """Model of ``identify``: a chain of parts joined by ``+``, or ``all`` for the best
+    of all that the records support."""
     method: str | None = None
+    """Method of the fit; without this key the first that can fit the model."""
     among: tuple[str, ...] | None = None
+    """Hysteresis models to try, with the model ``all``."""
     time: Column | None = None
+    """Column of the time."""
     input: Column | tuple[Column, ...] = 0
+    """Column of the voltage, or a list for several axes."""
     output: Column | tuple[Column, ...] = 1
-    record_rate: Positive | None = None
-    resample: Positive | None = None
-    period: Annotated[int, Field(strict=True, ge=2)] | None = None
-    train: Span | None = None
-    validate_on: Span | None = Field(default=None, alias="validate")
-    test: Span | None = None
+    """Column of the displacement, or a list for several axes."""
+    record_rate: Annotated[Positive | None, in_unit("Hz")] = None
+    """Sampling rate of the records, without a column of the time."""
+    resample: Annotated[Positive | None, in_unit("Hz")] = None
+    """Rate to which the records are interpolated."""
+    period: Annotated[
+        Annotated[int, Field(strict=True, ge=2)] | None, in_unit("samples")
+    ] = None
+    """Period of a periodic input."""
+    train: Annotated[Span | None, in_unit("samples")] = None
+    """Span to fit; without this key the first half."""
+    validate_on: Annotated[Span | None, in_unit("samples")] = Field(
+        default=None, alias="validate"
+    )
+    """Span to validate the fit; without this key the rest."""
+    test: Annotated[Span | None, in_unit("samples")] = None
+    """Span for the error of the chosen model, with the model ``all``."""
     order: Count = Options.order
-    window: Count = Options.window
+    """Number of states of a linear or neural model."""
+    window: Annotated[Count, in_unit("samples")] = Options.window
+    """Past and future samples in the Hankel-Toeplitz regression."""
     oversample: Count = Options.oversample
+    """Simulated samples per sample of a periodic record, for ``bouc_wen``."""
     steps: Count = Options.steps
+    """Largest number of optimiser steps."""
     check: tuple[Path, ...] = ()
+    """Other records of the stage with the same columns, or one, on which the fitted
+    plant is validated."""
 
     @field_validator("record", "check", mode="before")
     @classmethod

@@ -25,6 +25,8 @@ from .tables import (
     Positive,
     RangeTable,
     Table,
+    example,
+    in_unit,
     one_of,
     unknown_key,
     validated,
@@ -40,8 +42,13 @@ MEMORY_GB = 16.0
 class AxesTable(Table):
     """Names and units of the axes of a multi-axis stage."""
 
+    model_config = example({"names": ["x", "y"], "units": ["um", "um"]})
+
     names: tuple[str, ...] = Field(min_length=2)
+    """Names of the axes, of letters, digits and _; they differ in more than upper and
+    lower case."""
     units: tuple[str, ...]
+    """Unit of each axis, um or urad."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "AxesTable":
@@ -63,22 +70,34 @@ class AxesTable(Table):
 
 
 class References(Table):
-    """References of the runs, by the names of their signals or trajectories.
+    """References of the runs, by the names of their signals or trajectories."""
 
-    ``tune`` are the references of the objective; ``unseen`` are used only to evaluate
-    the tuned gains. ``amplitude`` and ``offset`` are in the unit of the axis (um on a
-    stage with one axis), ``duration`` and ``settle`` in s. Errors before ``settle`` are
-    ignored. ``files`` are trajectories in files, by name; they have an offset of their
-    own and no amplitude.
-    """
+    model_config = example(
+        {
+            "tune": ["SIN10", "SW50"],
+            "unseen": ["SIN20"],
+            "amplitude": 5.0,
+            "duration": 0.5,
+            "settle": 0.25,
+        }
+    )
 
     tune: tuple[str, ...] = Field(min_length=1)
+    """References of the objective: signals such as ``SIN10``, or names of ``files``. On
+    several axes the driven axes precede the signal, as in ``x:SIN10``."""
     unseen: tuple[str, ...] = ()
-    amplitude: ByAxis[Positive] = 5.0
-    offset: ByAxis[Finite] = 0.0
-    duration: Positive = 1.0
-    settle: NotNegative = 0.5
+    """Other references, used only to evaluate the tuned gains."""
+    amplitude: Annotated[ByAxis[Positive], in_unit("um or urad")] = 5.0
+    """Amplitude of the signals."""
+    offset: Annotated[ByAxis[Finite], in_unit("um or urad")] = 0.0
+    """Offset of the signals."""
+    duration: Annotated[Positive, in_unit("s")] = 1.0
+    """Duration of each run, at least 2 samples."""
+    settle: Annotated[NotNegative, in_unit("s")] = 0.5
+    """Time after which errors count, below ``duration``."""
     files: dict[str, TrajectoryTable] = Field(default_factory=dict)
+    """Trajectories in files, by name; they have an offset of their own and no
+    amplitude."""
 
     @field_validator("tune", "unseen")
     @classmethod
@@ -106,20 +125,31 @@ class References(Table):
 
 
 class TunedTable(RangeTable):
-    """Range of a tuned parameter; ``start`` replaces the value in the controller."""
+    """Range of a tuned parameter, in the unit of the parameter.
+
+    The declaration of the parameter supplies bounds and a scale that are left out.
+    """
+
+    model_config = example({"lower": 1.0, "upper": 1e4, "scale": "log"})
 
     start: Finite | None = None
+    """Start of the search; without this key the value in the controller."""
 
 
 class BesideTable(Table):
-    """Controller that is not tuned, to compare the tuned one with.
+    """Controller that is not tuned, to compare the tuned one with."""
 
-    ``controller`` is a table like that of the study. ``gains`` are values by path in
-    it.
-    """
+    model_config = example(
+        {
+            "controller": {"catalog": "p753_disturbance_observer"},
+            "gains": {"cutoff": 1066.0},
+        }
+    )
 
     controller: dict[str, Any]
+    """Controller, as in ``[controller]``."""
     gains: dict[str, Finite] = Field(default_factory=dict)
+    """Values of parameters by their path in the controller, in the unit of each."""
 
     @field_validator("gains", mode="before")
     @classmethod
@@ -128,14 +158,18 @@ class BesideTable(Table):
 
 
 class ParetoTable(Table):
-    """Pareto front: the study is solved for each of ``limits`` of one constraint.
+    """Pareto front: the study is solved for each limit of one constraint."""
 
-    ``steps`` is the largest number of optimiser steps at each limit.
-    """
+    model_config = example(
+        {"constraint": "sensitivity_peak", "limits": [2.0, 1.8, 1.6, 1.4]}
+    )
 
     constraint: str
+    """Name of one of the limits in ``[constraints]``."""
     limits: tuple[Positive, ...] = Field(min_length=2)
+    """Limits, in the unit of the constraint."""
     steps: Annotated[int, Field(strict=True, ge=1, le=10000)] = 30
+    """Largest number of optimiser steps at each limit."""
 
     @field_validator("constraint")
     @classmethod
@@ -144,28 +178,40 @@ class ParetoTable(Table):
 
 
 class ObjectiveTable(Table):
-    """Objective of the tuning; see piezojax.tuning.objective.Objective."""
+    """Objective of the tuning: rms tracking errors, relative to those before tuning."""
+
+    model_config = example({"aggregate": "worst", "noise_draws": 4})
 
     aggregate: Literal["geometric_mean", "mean_square", "worst"] = "geometric_mean"
+    """Objective of several references: the geometric mean of their errors, the mean of
+    the squares, or a smooth maximum."""
     coupling_weight: NotNegative = 1.0
+    """Weight of the errors of axes at rest, on several axes."""
     effort_weight: NotNegative = 0.0
+    """Weight of the rms voltage, as a share of the voltage range."""
     slew_weight: NotNegative = 0.0
+    """Weight of the rms change of the voltage from sample to sample, as a share of the
+    voltage range."""
     noise_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
+    """Draws of the noise for each reference."""
 
 
 class OptimiserTable(Table):
-    """Optimiser of the objective.
+    """Optimiser of the objective."""
 
-    First, ``candidates`` points of the box are simulated. The best of them and the
-    start of the study form the ``starts``. From each start the optimiser takes at most
-    ``steps`` steps.
-    """
+    model_config = example({"starts": 4, "candidates": 64, "steps": 40})
 
     method: str = "gauss_newton"
+    """Optimiser; ``levenberg_marquardt`` needs the aggregate ``mean_square``, and
+    ``mean`` in an ensemble."""
     starts: Annotated[int, Field(strict=True, ge=1, le=256)] = 8
+    """Number of starting points: the start of the study and the best candidates."""
     candidates: Annotated[int, Field(strict=True, ge=0, le=65536)] = 64
+    """Number of points of the box that are simulated first."""
     steps: Annotated[int, Field(strict=True, ge=1, le=10000)] = 60
+    """Largest number of steps from each start."""
     tolerance: Positive = 1e-4
+    """Relative change of the point and the objective below which a search ends."""
 
     @field_validator("method")
     @classmethod
@@ -174,36 +220,65 @@ class OptimiserTable(Table):
 
 
 class Study(Table):
-    """A study; the README and tuning/ contain examples.
+    """A study: a stage, its controller, references, and parameters to tune."""
 
-    ``rate`` is the sampling rate, Hz. ``tune`` names parameters to tune: paths in the
-    loop, or patterns such as ``controller.feedback.*``. ``parameters`` names further
-    ones and overrides declared bounds, scales and starts. ``beside`` names controllers
-    to which the tuned one is compared. ``structures`` lists numbers of notches to
-    compare; the result has as many as are worth their parameters.
-    """
+    model_config = example(
+        {
+            "title": "PID of the P-753 at 20 kHz",
+            "rate": 20e3,
+            "plant": {"catalog": "p753_stage"},
+            "actuator": {"lower": -20.0, "upper": 120.0},
+            "sensor": {"noise_rms": 0.002},
+            "controller": {"catalog": "p753_pid"},
+            "references": {"tune": ["SIN10", "SW10"], "unseen": ["SIN20"]},
+            "tune": ["controller.*"],
+        }
+    )
 
     title: str
-    rate: Positive
+    """Title of the results."""
+    rate: Annotated[Positive, in_unit("Hz")]
+    """Sampling rate."""
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
+    """Seed of all random draws."""
     axes: AxesTable | None = None
+    """Axes of a stage with several."""
     plant: dict[str, Any]
+    """Plant, from voltage (V) to displacement (um, urad)."""
     actuator: Actuator
+    """Drive of the stage."""
     sensor: SensorTable = SensorTable()
+    """Sensor of the displacement."""
     controller: dict[str, Any]
+    """Controller, with the gains before tuning."""
     references: References
+    """References of the runs."""
     tune: tuple[str, ...] = ()
+    """Parameters to tune within declared bounds: paths in the loop, or patterns such as
+    ``controller.feedback.*``."""
     parameters: dict[str, TunedTable] = Field(default_factory=dict)
+    """Parameters to tune, by path, and their ranges. At least one parameter must be
+    named here or in ``tune``."""
     objective: ObjectiveTable = ObjectiveTable()
+    """Objective of the tuning."""
     optimiser: OptimiserTable = OptimiserTable()
+    """Optimiser of the objective."""
     disturbance: DisturbanceTable = DisturbanceTable()
+    """Disturbances of the stage."""
     ensemble: EnsembleTable | None = None
+    """Perturbed stages."""
     constraints: dict[str, Any] = Field(default_factory=dict)
+    """Limits on figures of the loop, by name."""
     pareto: ParetoTable | None = None
+    """Pareto front."""
     holdout_draws: Annotated[int, Field(strict=True, ge=1, le=64)] = 1
+    """Draws of the noise of the hold-out, for each reference."""
     beside: dict[str, BesideTable] = Field(default_factory=dict)
+    """Controllers that are not tuned, by name, to compare the tuned one with."""
     sweep: SweepTable | None = None
+    """Points and metrics of ``python -m piezojax.sweep``."""
     structures: StructuresTable | None = None
+    """Numbers of notches to compare."""
 
     @field_validator("parameters", mode="before")
     @classmethod

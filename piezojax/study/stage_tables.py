@@ -6,27 +6,31 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from .file_tables import NoiseFile
-from .tables import ByAxis, Finite, NotNegative, Positive, Table
+from .tables import ByAxis, Finite, NotNegative, Positive, Table, example, in_unit
 
 Bandwidth = Annotated[float, Field(ge=1e-3, le=1e9, allow_inf_nan=False, strict=True)]
 Order = Annotated[int, Field(strict=True, ge=1, le=4)]
 
+SIGNAL = "V, um or urad"
+"""Unit of the signal behind the electronics."""
+
 
 class ElectronicsTable(Table):
-    """Electronics between the controller and the stage; each entry may be left out.
+    """Electronics between the controller and the stage; each entry may be left out."""
 
-    The step of the converter is ``resolution``, or its ``range`` divided by 2 to the
-    power of ``bits``; ``resolution`` and ``range`` are in the unit of the signal.
-    ``bandwidth`` (Hz) and ``order`` (1 to 4) are those of a Butterworth low-pass,
-    ``delay`` is in s.
-    """
-
-    resolution: ByAxis[Positive] | None = None
+    resolution: Annotated[ByAxis[Positive] | None, in_unit(SIGNAL)] = None
+    """Step of the converter, unless ``bits`` gives it."""
     bits: Annotated[int, Field(strict=True, ge=1, le=32)] | None = None
-    range: ByAxis[Positive] | None = None
-    bandwidth: ByAxis[Bandwidth] | None = None
+    """Bits of the converter: its step is ``range`` divided by 2 to the power of
+    ``bits``."""
+    range: Annotated[ByAxis[Positive] | None, in_unit(SIGNAL)] = None
+    """Range of the converter, with ``bits``."""
+    bandwidth: Annotated[ByAxis[Bandwidth] | None, in_unit("Hz")] = None
+    """Bandwidth of a Butterworth low-pass."""
     order: Order | None = None
-    delay: ByAxis[NotNegative] = 0.0
+    """Order of that low-pass; without this key 1."""
+    delay: Annotated[ByAxis[NotNegative], in_unit("s")] = 0.0
+    """Delay."""
 
     @model_validator(mode="after")
     def _converter(self) -> "ElectronicsTable":
@@ -44,23 +48,27 @@ def _needs(table: Table, key: str, other: str) -> None:
 
 
 class Actuator(ElectronicsTable):
-    """Drive: its limits ``lower`` and ``upper``, V, and the rest of its amplifier.
+    """Drive: the limits of its voltage, and its amplifier.
 
-    ``slew_rate`` is in V/s. ``current_limit`` (A) and ``capacitance`` of the stage (F)
-    limit the slew rate too. ``computation`` is the time from the sample of the sensor
-    to the change of the voltage, in samples. Without ``range`` the bits divide the
-    interval from ``lower`` to ``upper``.
-
-    The controller knows the voltage after the limits, the slew rate and the converter,
-    but not the amplifier's bandwidth and delay behind them.
+    Without ``range`` the bits divide the interval from ``lower`` to ``upper``. The
+    controller knows the voltage after the limits, the slew rate and the converter, but
+    not the amplifier's bandwidth and delay behind them.
     """
 
-    lower: ByAxis[Finite]
-    upper: ByAxis[Finite]
-    slew_rate: ByAxis[Positive] | None = None
-    current_limit: ByAxis[Positive] | None = None
-    capacitance: ByAxis[Positive] | None = None
-    computation: NotNegative = 0.0
+    model_config = example({"lower": -20.0, "upper": 120.0, "bits": 16})
+
+    lower: Annotated[ByAxis[Finite], in_unit("V")]
+    """Lower limit of the voltage."""
+    upper: Annotated[ByAxis[Finite], in_unit("V")]
+    """Upper limit of the voltage, above ``lower``."""
+    slew_rate: Annotated[ByAxis[Positive] | None, in_unit("V/s")] = None
+    """Largest rate of the voltage."""
+    current_limit: Annotated[ByAxis[Positive] | None, in_unit("A")] = None
+    """Largest current; with ``capacitance`` it limits the slew rate too."""
+    capacitance: Annotated[ByAxis[Positive] | None, in_unit("F")] = None
+    """Capacitance of the stage."""
+    computation: Annotated[NotNegative, in_unit("samples")] = 0.0
+    """Time from the sample of the sensor to the change of the voltage."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "Actuator":
@@ -82,18 +90,21 @@ class Actuator(ElectronicsTable):
 
 
 class SensorTable(ElectronicsTable):
-    """Noise of the sensor, um, and the properties of its electronics.
+    """Noise of the sensor, and its electronics."""
 
-    ``noise_rms`` is white up to half the rate and is added behind the bandwidth and the
-    delay; ``measured_noise`` replaces it by the noise of a file. ``anti_aliasing``
-    (Hz), of order ``anti_aliasing_order``, filters the displacement and the noise
-    before the converter.
-    """
+    model_config = example(
+        {"noise_rms": 0.002, "bandwidth": 1700.0, "bits": 16, "range": 12.0}
+    )
 
-    noise_rms: ByAxis[NotNegative] = 0.0
+    noise_rms: Annotated[ByAxis[NotNegative], in_unit("um or urad")] = 0.0
+    """Rms noise, white up to half the rate, added behind the bandwidth and the
+    delay."""
     measured_noise: NoiseFile | None = None
-    anti_aliasing: ByAxis[Bandwidth] | None = None
+    """Measured noise instead of ``noise_rms``."""
+    anti_aliasing: Annotated[ByAxis[Bandwidth] | None, in_unit("Hz")] = None
+    """Bandwidth of a low-pass of displacement and noise before the converter."""
     anti_aliasing_order: Order | None = None
+    """Order of that low-pass; without this key 1."""
 
     @model_validator(mode="after")
     def _measured(self) -> "SensorTable":
@@ -108,13 +119,15 @@ class SensorTable(ElectronicsTable):
 
 
 class DisturbanceTable(Table):
-    """Disturbances of the stage.
+    """Disturbances of the stage."""
 
-    ``drift_rms`` is the rms value of a random walk after one second, um. ``output`` is
-    a measured vibration that is added to the displacement, in the unit of each axis;
-    ``input`` is measured noise that is added to the voltage of the actuator, V.
-    """
+    model_config = example({"drift_rms": 0.005})
 
-    drift_rms: ByAxis[NotNegative] = 0.0
+    drift_rms: Annotated[ByAxis[NotNegative], in_unit("um or urad")] = 0.0
+    """Rms value of a random walk of the displacement after one second."""
     output: NoiseFile | None = None
+    """Measured vibration, added to the displacement; in um or urad, or a unit that is
+    converted to it."""
     input: NoiseFile | None = None
+    """Measured noise, added to the voltage of the actuator; in V, or a unit that is
+    converted to it."""

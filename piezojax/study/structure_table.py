@@ -4,27 +4,27 @@ from typing import Annotated
 
 from pydantic import Field, field_validator
 
-from .tables import Table
+from .tables import Table, example
 
 MOST_NOTCHES = 4
 """Largest number of notches of a structure."""
 
 
 class StructuresTable(Table):
-    """Structures of the controller that are tuned alike: numbers of ``notches``.
+    """Structures of the controller that are tuned alike: numbers of notches."""
 
-    The notches filter the command of the part ``behind``, a path such as
-    ``controller.feedback``. By default it is the feedback of the controller, or the
-    controller if it has no such part. A notch is worth its parameters if it lowers the
-    error on the hold-out by more than the share ``worth``, and by more than two
-    standard errors.
-    """
+    model_config = example({"notches": [0, 1, 2], "behind": "controller.feedback"})
 
     notches: tuple[Annotated[int, Field(strict=True, ge=0, le=MOST_NOTCHES)], ...] = (
         Field(min_length=2)
     )
+    """Numbers of notches to compare."""
     behind: str | None = None
+    """Path of the part whose command the notches filter; by default the feedback of the
+    controller, or the controller if it has no such part."""
     worth: Annotated[float, Field(gt=0.0, lt=1.0, strict=True)] = 0.1
+    """Least relative decrease of the error on the hold-out, and more than two standard
+    errors, for which a further notch is kept."""
 
     @field_validator("notches")
     @classmethod

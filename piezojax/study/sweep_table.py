@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from ..core.metrics import TrackingFigures
-from .tables import Finite, RangeTable, Table, one_of
+from .tables import Finite, RangeTable, Table, example, one_of
 
 SENSITIVITY = "sensitivity_peak"
 METRICS = (*TrackingFigures._fields, SENSITIVITY)
@@ -19,14 +19,17 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 
 
 class SweptTable(RangeTable):
-    """Range of a swept parameter, or its ``values``.
+    """Range of a swept parameter, or its values, in the unit of the parameter.
 
-    In a grid, ``count`` points are evenly spaced on the scale. Random samples need no
-    count.
+    The declaration of the parameter supplies bounds and a scale that are left out.
     """
 
+    model_config = example({"lower": 1.0, "upper": 200.0, "count": 31, "scale": "log"})
+
     count: Annotated[int, Field(strict=True, ge=2)] | None = None
+    """Number of points of a grid, evenly spaced on the scale."""
     values: tuple[Finite, ...] | None = None
+    """Increasing values of a grid, instead of bounds and a count."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "SweptTable":
@@ -41,26 +44,41 @@ class SweptTable(RangeTable):
 
 
 class SweepTable(Table):
-    """Points of a sweep, and the recorded metrics.
+    """Points of a sweep, and the recorded metrics."""
 
-    ``method`` "grid" simulates every combination of the parameters; "latin_hypercube"
-    and "sobol" draw ``samples`` points of their box. Without ``parameters`` the box is
-    that of the tuned parameters. ``plants`` are names in the catalogue, by default the
-    plant of the study. ``references`` are among those of the study, by default all of
-    them. ``every`` records each N-th sample of displacement and voltage. ``chunk`` is
-    the number of points that are simulated and stored at a time.
-    """
+    model_config = example(
+        {
+            "method": "sobol",
+            "samples": 256,
+            "metrics": ["rms_error", "sensitivity_peak"],
+            "parameters": {
+                "controller.cutoff": {"lower": 100.0, "upper": 2e4, "scale": "log"}
+            },
+        }
+    )
 
     method: Literal["grid", "latin_hypercube", "sobol"] = "grid"
+    """``grid`` simulates every combination of the parameters; the others draw
+    ``samples`` points of their box."""
     samples: Count | None = None
+    """Number of drawn points; not for a grid."""
     parameters: dict[str, SweptTable] = Field(default_factory=dict)
+    """Swept parameters by path; without them the box is that of the tuned
+    parameters."""
     plants: tuple[str, ...] = ()
+    """Catalogued plants; without them the plant of the study."""
     references: tuple[str, ...] = ()
+    """References of the study; without them all of its references."""
     metrics: tuple[str, ...] = Field(
         default=("rms_error", "peak_error", "rms_effort", "saturated"), min_length=1
     )
+    """Recorded metrics: figures of a run, and the peak ``sensitivity_peak`` of
+    |1/(1+L)|."""
     every: Count | None = None
+    """Record each N-th sample of displacement and voltage; without this key none."""
     chunk: Count | None = None
+    """Number of points that are simulated and stored at a time; without this key it is
+    chosen from the length of a run."""
 
     @field_validator("metrics")
     @classmethod

@@ -18,9 +18,24 @@ Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 
 
 class Table(BaseModel):
-    """A table of a study; unknown keys are errors."""
+    """A table of a study; unknown keys are errors.
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    The docstring below a field is its description in the schema of a study.
+    """
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, use_attribute_docstrings=True
+    )
+
+
+def in_unit(name: str) -> Any:
+    """Return an annotation of a field with its unit, for the schema of a study."""
+    return Field(json_schema_extra={"unit": name})
+
+
+def example(table: dict[str, Any]) -> ConfigDict:
+    """Return the configuration of a Table with an example, for its schema."""
+    return ConfigDict(json_schema_extra={"examples": [table]})
 
 
 class RangeTable(Table):
@@ -30,8 +45,11 @@ class RangeTable(Table):
     """
 
     lower: Finite | None = None
+    """Lower bound."""
     upper: Finite | None = None
+    """Upper bound."""
     scale: Scale | None = None
+    """Scale of the search, or of the spacing of points."""
 
     def range(self, declared: Parameter | None, where: str) -> Range:
         """Return the Range, with missing keys taken from ``declared``.
