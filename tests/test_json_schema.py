@@ -2,8 +2,6 @@
 
 import copy
 import json
-import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,8 +23,6 @@ from piezojax.study import (
     study_schema,
     sweep_table,
 )
-
-DOCS = Path(__file__).parents[1] / "docs"
 
 SCHEMA = study_schema()
 JUDGE = Draft202012Validator(SCHEMA)
@@ -182,12 +178,6 @@ def test_examples_are_valid(name):
 def test_the_example_of_a_study_is_built():
     case = build(Study.model_validate(SCHEMA["examples"][0]), "example.toml")
     assert case.space.paths
-
-
-def test_the_page_is_that_of_the_schema():
-    """``python docs/study_reference.py`` writes the page."""
-    module = runpy.run_path(str(DOCS / "study_reference.py"))
-    assert (DOCS / "study.md").read_text(encoding="utf-8") == module["page"]()
 
 
 def test_no_study_that_loads_is_marked():

@@ -1,17 +1,23 @@
-"""Write docs/study.md, the reference of study files, from the schema of a study."""
+"""Write the reference of study files and that of the commands.
 
+The first is written from the schema of a study, the second from the commands.
+"""
+
+import inspect
 import json
 import re
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import click
 import tomli_w
 
 from piezojax.study import study_schema
 from piezojax.study.json_schema import UNIT
 
-PAGE = Path(__file__).with_name("study.md")
+DOCS = Path(__file__).parent
 
 INTRODUCTION = """\
 # Study reference
@@ -20,7 +26,7 @@ A study is a TOML file with the keys and tables below; other keys are errors. `t
 has whole studies, and [goals](goals.md), [robust gains](robust.md) and the other how-to
 pages explain them. An editor [completes and checks](goals.md#a-study-in-an-editor) a
 study with the JSON schema that `python -m piezojax.tune --schema` prints;
-`python docs/study_reference.py` writes this page from the same schema.
+`python docs/write_reference.py` writes this page from the same schema.
 
 - A key is required unless a default is given. With the default "none" it may be left
   out.
@@ -65,8 +71,8 @@ HEADINGS = {
 }
 
 
-def page() -> str:
-    """Return the text of the page."""
+def study_page() -> str:
+    """Return the reference of study files."""
     schema = study_schema()
     properties = schema["properties"]
     own = {key: each for key, each in properties.items() if not _is_table(each)}
@@ -257,5 +263,85 @@ def _on_one_line(found: re.Match[str]) -> str:
     return f"[{' '.join(found[1].split())}]"
 
 
+COMMANDS = (
+    *("excite", "start", "identify", "validate", "tune", "export", "sweep"),
+    "reproduce",
+)
+
+VALUES = {
+    "boolean": "",
+    "<float float>": "two numbers",
+    "path": "path",
+    "text": "text",
+    "float": "number",
+    "float range": "number",
+    "integer": "whole number",
+    "integer range": "whole number",
+}
+"""Values of options by the name of their type; other names say what to type."""
+
+COMMANDS_INTRODUCTION = """\
+# Commands
+
+`--help` prints the text and the options of each command;
+`python docs/write_reference.py` writes this page from them. A command ends with one of
+these statuses:
+
+| status | meaning |
+|---|---|
+| 0 | finished; gains may be used |
+| 1 | refused or failed, with one line that says why |
+| 3 | finished with an alarm: the results are written and say why they are unsafe |
+| 130 | interrupted; tuning keeps the best gains |
+"""
+
+
+def commands_page() -> str:
+    """Return the reference of the commands."""
+    return "\n".join([COMMANDS_INTRODUCTION, *map(_command, COMMANDS)])
+
+
+def _command(name: str) -> str:
+    main = import_module(f"piezojax.cli.{name}").main
+    info = main.to_info_dict(click.Context(main))
+    options = [each for each in info["params"] if each["param_type_name"] == "option"]
+    arguments = [each for each in info["params"] if each not in options]
+    given = " ".join(_argument(each) for each in arguments)
+    parts = [
+        f"## `python -m piezojax.{name}`\n",
+        f"```text\npython -m piezojax.{name} {given} [OPTIONS]\n```\n".replace(
+            "  ", " "
+        ),
+        _prose(inspect.cleandoc(info["help"]), "\n\n") + "\n",
+        "| option | value | default | meaning |",
+        "|---|---|---|---|",
+        *(_option(each) for each in options if each["name"] != "_click_default_help"),
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _argument(each: dict[str, Any]) -> str:
+    name = each["name"].upper() + ("..." if each["nargs"] == -1 else "")
+    return name if each["required"] else f"[{name}]"
+
+
+def _option(each: dict[str, Any]) -> str:
+    """Return the row of an option."""
+    kind, default = each["type"], each["default"]
+    name = kind["name"]
+    value = _names(kind["choices"]) if "choices" in kind else VALUES.get(name, name)
+    if each["required"]:
+        shown = "required"
+    elif default in (None, ()) or each["is_flag"]:
+        shown = ""
+    else:
+        shown = f"`{default}`"
+    names = ", ".join(f"`{name}`" for name in each["opts"] + each["secondary_opts"])
+    return f"| {names} | {value} | {shown} | {_prose(each['help'])} |"
+
+
+PAGES = {"study.md": study_page, "reference/commands.md": commands_page}
+
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    for name, page in PAGES.items():
+        (DOCS / name).write_text(page(), encoding="utf-8")
