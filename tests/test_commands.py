@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import hashlib
 import html
-import importlib
 import io
 import json
 import re
@@ -12,14 +11,20 @@ import signal
 import subprocess
 import sys
 
-import numpy as np
 import pytest
-import tomli_w
-from click.testing import CliRunner
 from golden import golden_vectors
 from page_reader import checked
 from rich.console import Console
 from rich.table import Table
+from small_runs import (
+    COLUMNS,
+    call,
+    main_of,
+    succeeded,
+    write_model,
+    write_record,
+    write_study,
+)
 
 import piezojax as pj
 from piezojax.analysis.stability import OperatingPoint
@@ -35,45 +40,10 @@ from piezojax.reproduction.cell import Cell
 from piezojax.reproduction.rates import FIGURE, RateError
 from piezojax.study import read
 
-COMMANDS = {
-    name: importlib.import_module(f"piezojax.cli.{name}").main
-    for name in (
-        "tune",
-        "identify",
-        "validate",
-        "export",
-        "start",
-        "excite",
-        "reproduce",
-    )
-}
+COMMANDS = (
+    *("tune", "identify", "validate", "export", "start", "excite", "reproduce"),
+)
 PNG = b"\x89PNG\r\n\x1a\n"
-STUDY = {
-    "title": "a PID on a lag",
-    "rate": 20_000.0,
-    "seed": 3,
-    "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
-    "actuator": {"lower": -20.0, "upper": 120.0},
-    "sensor": {"noise_rms": 0.012},
-    "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
-    "controller": {"catalog": "p753_pid"},
-    "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
-    "parameters": {
-        "controller.proportional": {"lower": 0.1, "upper": 5.0, "scale": "log"},
-        "controller.integral": {"lower": 100.0, "upper": 2e4, "scale": "log"},
-    },
-    "optimiser": {"starts": 2, "candidates": 4, "steps": 5},
-}
-
-
-def call(command, *arguments):
-    return CliRunner().invoke(COMMANDS[command], [str(a) for a in arguments])
-
-
-def succeeded(result):
-    assert result.exit_code == 0, result.output
-    assert result.stderr == ""
-    return result
 
 
 def failed(result, message, code=1):
@@ -98,12 +68,6 @@ def assert_pictures(folder, *pictures):
         assert len(content) > 5_000
 
 
-def write_study(folder, name="small.toml", **tables):
-    path = folder / name
-    path.write_text(tomli_w.dumps(STUDY | tables), encoding="utf-8")
-    return path
-
-
 @pytest.fixture
 def study(tmp_path):
     return write_study(tmp_path)
@@ -112,37 +76,6 @@ def study(tmp_path):
 @pytest.fixture
 def record(tmp_path):
     return write_record(tmp_path)
-
-
-def write_record(folder, late=0):
-    """Write a record of a lag without hysteresis: 300 samples, two amplitudes.
-
-    The output follows the input ``late`` samples later.
-    """
-    steps = np.arange(300)
-    drive = np.where(steps < 150, 20.0, 10.0) * (1.0 - np.cos(2 * np.pi * steps / 25))
-    lagged = np.convolve(drive, 0.5 ** np.arange(1, 12))
-    lagged = np.concatenate([np.zeros(late), lagged])[: steps.size]
-    path = folder / "bench.csv"
-    rows = zip(1e-3 * steps, drive, 0.12 * lagged + 4.0, strict=True)
-    path.write_text(
-        "time_s,drive_V,sensor_um\n"
-        + "".join(f"{t:.4f},{u:.6f},{y:.6f}\n" for t, u, y in rows)
-    )
-    return path
-
-
-def write_model(folder, gain=0.06):
-    """Write the model of that record, a sample later, without the sensor's zero."""
-    system = pj.series(
-        dynamics=pj.dynamics.ARMA([0.5], [gain]), calibration=pj.Affine(1.0, 0.0)
-    )
-    path = folder / "model.json"
-    pj.save(system, path, pj.About(record="first.csv", rate_Hz=1e3))
-    return path
-
-
-COLUMNS = ("--time", "time_s", "--input", "drive_V", "--output", "sensor_um")
 
 
 # All commands
@@ -165,7 +98,7 @@ def test_help_names_the_choices():
 
 def test_defaults_are_those_of_the_functions():
     """The commands repeat them, so that --help does not import the functions."""
-    defaults = {option.name: option.default for option in COMMANDS["identify"].params}
+    defaults = {option.name: option.default for option in main_of("identify").params}
     assert defaults["model"] == DEFAULT
     for field in dataclasses.fields(Options):
         if field.default is not None:

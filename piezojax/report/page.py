@@ -50,7 +50,7 @@ td.right, th.right { text-align: right; }
 figure { margin: 1.5em 0; } img { max-width: 100%; }
 figcaption { font-weight: bold; } pre { white-space: pre-wrap; }
 @media print { body { margin: 0; max-width: none; font-size: 11px; }
-  figure, table { break-inside: avoid; } details { display: none; } }
+  .tables { overflow: visible; } figure, table { break-inside: avoid; } }
 """
 
 
@@ -155,4 +155,4 @@ def _quoted_study(folder: Path) -> str:
     if not path.is_file():
         return ""
     text = escape(path.read_text(encoding="utf-8"))
-    return f"<details><summary>{path.name}</summary><pre>{text}</pre></details>\n"
+    return f"<details open><summary>{path.name}</summary><pre>{text}</pre></details>\n"
