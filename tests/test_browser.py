@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import re
 import shutil
 import unicodedata
 
@@ -18,6 +19,7 @@ if CHROMIUM is None or DRIVER is None:
     pytest.skip("chromium and chromedriver are not installed", allow_module_level=True)
 NEEDS = "pip install -e '.[browser]'"
 webdriver = pytest.importorskip("selenium.webdriver", reason=NEEDS)
+WebDriverWait = pytest.importorskip("selenium.webdriver.support.ui").WebDriverWait
 pypdf = pytest.importorskip("pypdf", reason=NEEDS)
 
 FLAGS = (
@@ -104,7 +106,8 @@ def texts(browser, selector):
 
 
 def test_a_page_stands_alone(page, folders):
-    assert page.get_log("browser") == []
+    logged = page.get_log("browser")
+    assert [entry for entry in logged if entry["level"] != "INFO"] == []
     own, *others = requested(page)
     assert own == page.current_url
     assert [url for url in others if not url.startswith("data:")] == []
@@ -156,3 +159,98 @@ def test_the_tables_hold_the_figures_of_the_result(browser, folders):
     for name, rms in result.holdout.per_reference_rms_um.items():
         row = cells.index(name)
         assert float(cells[row + 2]) == pytest.approx(1e3 * rms, abs=0.006)
+
+
+# Interactive figures
+
+
+@pytest.fixture
+def tuned(browser, folders):
+    """Return the browser with the page of tune, its figures drawn."""
+    browser.get((folders["tune"] / "report.html").as_uri())
+    drawn = "return [...document.querySelectorAll('.live')].every(e => e.firstChild)"
+    WebDriverWait(browser, 10).until(lambda b: b.execute_script(drawn))
+    return browser
+
+
+def displayed(browser):
+    """Return the numbers of the displayed interactive figures and of the images."""
+    script = """
+        const shown = e => getComputedStyle(e).display !== 'none' && e.offsetHeight > 0
+        return ['.live', '.live + img', 'img'].map(
+            s => [...document.querySelectorAll(s)].filter(shown).length)
+    """
+    return browser.execute_script(script)
+
+
+FRAME = """
+    const panel = Bokeh.documents[0].roots()[0].children[arguments[0]][0]
+    const view = Bokeh.index.find_one(panel)
+    view.el.scrollIntoView({block: "center"})
+    const inner = view.frame.bbox, outer = view.el.getBoundingClientRect()
+    return [outer.left + inner.left, outer.top + inner.top, inner.width, inner.height]
+"""
+RANGE = """
+    const range = Bokeh.documents[0].roots()[0].children[arguments[0]][0].x_range
+    return [range.start, range.end]
+"""
+READINGS = """
+    const text = root => [...root.querySelectorAll('div:not(:has(div))')]
+        .map(e => e.textContent).join('')
+    const found = node => [...node.querySelectorAll('*')].flatMap(e => [
+        ...(e.matches('.bk-Tooltip') ? [text(e.shadowRoot)] : []),
+        ...(e.shadowRoot ? found(e.shadowRoot) : [])])
+    return found(document)
+"""
+
+
+def at(browser, panel, across, down, kind="mouseMoved", **more):
+    """Send a movement or a button of the mouse to a place in a panel of tracking."""
+    left, top, width, height = browser.execute_script(FRAME, panel)
+    place = {"x": left + across * width, "y": top + down * height}
+    event = {"type": kind, **place, **more}
+    browser.execute_cdp_cmd("Input.dispatchMouseEvent", event)
+
+
+def test_curves_are_interactive_on_a_screen_and_pictures_on_paper(tuned, folders):
+    live, beside, images = displayed(tuned)
+    curves = ("tracking", "steps", "stability", "hysteresis", "convergence")
+    assert live == len(curves)
+    assert beside == 0
+    assert images > 0  # of other pictures
+    tuned.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    assert displayed(tuned) == [0, live, live + images]
+    tuned.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+    tuned.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+    tuned.refresh()
+    assert displayed(tuned) == [0, live, live + images]
+    tuned.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+
+
+def test_a_curve_can_be_read(tuned, folders):
+    for step in (0.5, 0.501):
+        at(tuned, 1, step, 0.5)
+    WebDriverWait(tuned, 5).until(lambda b: len(b.execute_script(READINGS)) == 2)
+    before, after = tuned.execute_script(READINGS)
+    result = pj.load_result(folders["tune"])
+    rms = 1e3 * result.holdout.per_reference_rms_um["SIN50"]
+    assert before.startswith("before, ")
+    name, peak = f"tuned, {rms:.4g} nm rms", 1e3 * result.holdout.peak_error_um["SIN50"]
+    found = re.fullmatch(rf"{name}:\s*(\S+) nm at (\S+) s", after.strip())
+    assert abs(float(found[1])) <= peak
+    assert float(found[2]) == pytest.approx(0.035, abs=1e-3)  # between 0.02 and 0.05 s
+
+
+def test_a_rectangle_is_enlarged_in_all_panels_of_a_row(tuned):
+    whole = tuned.execute_script(RANGE, 0)
+    button = {"button": "left", "buttons": 1, "clickCount": 1}
+    at(tuned, 1, 0.4, 0.3)
+    at(tuned, 1, 0.4, 0.3, "mousePressed", **button)
+    at(tuned, 1, 0.5, 0.5, **button)
+    at(tuned, 1, 0.6, 0.7, **button)
+    at(tuned, 1, 0.6, 0.7, "mouseReleased", **button)
+    width = whole[1] - whole[0]
+    expected = [whole[0] + share * width for share in (0.4, 0.6)]
+    for panel in (0, 1):
+        found = tuned.execute_script(RANGE, panel)
+        assert found == pytest.approx(expected, abs=0.01 * width)

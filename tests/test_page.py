@@ -4,6 +4,7 @@ from page_reader import Reader
 from rich.table import Table
 from rich.text import Text
 
+from piezojax.report.live_figures import LiveFigures
 from piezojax.report.page import Page, page_html, table_html
 
 
@@ -25,7 +26,7 @@ def test_a_table_is_that_of_the_terminal():
 def test_alarms_come_first_and_texts_are_quoted(tmp_path):
     (tmp_path / "study.toml").write_text('title = "a < b"', encoding="utf-8")
     page = Page("gains <of> a stage", ["it rings & rails"], ["a note"], ["seed 3"])
-    text = page_html(page, tmp_path)
+    text = page_html(page, tmp_path, LiveFigures())
     assert '<h1>gains &lt;of&gt; a stage</h1>\n<p class="alarm">ALARM: it' in text
     found = Reader(text)
     assert found.alarms == ["ALARM: it rings & rails"]

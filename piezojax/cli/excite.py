@@ -63,9 +63,9 @@ def main(points, out, seed, quiet, **limits):
         with results_folder(out, "excitation") as folder:
             for name, part in files.items():
                 write_text(folder / name, csv_of(part))
-            write_excitation(parts, folder)
+            pictures = write_excitation(parts, folder)
             page = excitation_page(parts, files)
-            write_page(page, folder)
+            write_page(page, folder, pictures)
         print_results(page, folder, console)
 
     run(quiet, body)

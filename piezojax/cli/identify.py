@@ -255,9 +255,9 @@ def main(
                 progress=bar,
             )
             bar.stage("drawing")
-            write_fit(fit, folder)
+            pictures = write_fit(fit, folder)
             page = fit_page(fit)
-            write_page(page, folder)
+            write_page(page, folder, pictures)
         print_results(page, folder, console)
 
     def controller_of(source, rate):
@@ -312,9 +312,9 @@ def main(
             )
             bar.finish()
             bar.stage("drawing")
-            write_ranking(ranking, folder)
+            pictures = write_ranking(ranking, folder)
             page = ranking_page(ranking)
-            write_page(page, folder)
+            write_page(page, folder, pictures)
         print_results(page, folder, console)
         if ranking.report.interrupted:
             exit_interrupted()

@@ -101,15 +101,15 @@ def fit_responses(
         bar.stage("drawing")
         levels = compare_levels(models) if len(models) > 1 else None
         if levels is None:
-            write_response(models[0], folder)
+            pictures = write_response(models[0], folder)
         else:
-            write_levels(levels, folder)
+            pictures = write_levels(levels, folder)
         page = response_page(
             models[0] if levels is None else levels.chosen,
             levels,
             [measured for _, measured in found],
         )
-        write_page(page, folder)
+        write_page(page, folder, pictures)
     print_results(page, folder, console)
 
 

@@ -88,9 +88,9 @@ def main(
                 if result.finished:
                     bar.finish()
                     bar.stage("drawing")
-                    write_pictures(result.path, folder)
+                    pictures = write_pictures(result.path, folder)
                     page = sweep_page(result.path)
-                    write_page(page, folder)
+                    write_page(page, folder, pictures)
         except KeyboardInterrupt:
             if folder is None or not folder.exists():
                 raise

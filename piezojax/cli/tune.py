@@ -118,16 +118,17 @@ def tune_study(
             bar.stage("drawing")
             if outcome.baselines is not None:
                 write_baselines(outcome.baselines, folder)
-            write_results(outcome, folder)
+            heading = outcome.result.heading
+            pictures = write_results(outcome, folder)
             if case.fit is not None:
-                write_fit(case.fit, folder)
+                pictures |= write_fit(case.fit, folder)
             if case.response is not None:
-                write_response(case.response, folder)
-            write_stability(outcome.stability, folder, outcome.result.heading)
+                pictures |= write_response(case.response, folder)
+            pictures |= write_stability(outcome.stability, folder, heading)
             bar.stage("computing the limit of linear control")
-            write_limit(outcome.limit, folder, outcome.result.heading)
+            write_limit(outcome.limit, folder, heading)
             page = tuning_page(outcome)
-            write_page(page, folder)
+            write_page(page, folder, pictures)
     print_results(page, folder, console)
     return outcome
 

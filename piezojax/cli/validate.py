@@ -49,9 +49,9 @@ def main(model, records, estimate, out, seed, quiet, **columns):
             bar.stage("judging the model")
             found = validate(system, about, loaded, estimate=estimate)
             bar.stage("drawing")
-            write_validation(found, folder, residual)
+            pictures = write_validation(found, folder, residual)
             page = validation_page(found)
-            write_page(page, folder)
+            write_page(page, folder, pictures)
         print_results(page, folder, console)
         exit_unsafe(page.alarms)
 

@@ -16,6 +16,7 @@ from .figures import (
     LOOP_COLOURS,
     MEASURED,
     REFERENCE,
+    Pictures,
     add_title,
     figure,
     plot_style,
@@ -29,15 +30,20 @@ _DECADES = 4.5  # frequency range drawn, below the Nyquist frequency
 _HALF_SIDE = 2.5  # half the side of the Nyquist plot
 
 
-def write_stability(stability: StabilityReports, folder: Path, title: str = "") -> None:
-    """Write stability.json and stability.png into ``folder``."""
+def write_stability(
+    stability: StabilityReports, folder: Path, title: str = ""
+) -> Pictures:
+    """Write stability.json and stability.png into ``folder``, return the picture."""
     write_json(folder / STABILITY_FILE, stability.as_dict())
+    drawn: Pictures = {}
     with plot_style():
         if stability.loops:
-            write(stability_figure(stability, title), folder / STABILITY_PICTURE)
+            picture = stability_figure(stability, title)
+            drawn = write(picture, folder / STABILITY_PICTURE)
         if stability.axes:
             picture = axes_figure(stability.axes, stability.axis_names, title)
-            write(picture, folder / STABILITY_PICTURE)
+            drawn = write(picture, folder / STABILITY_PICTURE)
+    return drawn
 
 
 def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
@@ -48,6 +54,8 @@ def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
     """
     picture = figure(9.0, 6.6)
     (gain, nyquist), (phase, sensitivity) = picture.subplots(2, 2)
+    for panel in (phase, sensitivity):
+        panel.sharex(gain)
     for name in stability.loops:
         branches = stability.curves(name, _DECADES)
         for branch, curves in branches.items():
@@ -63,7 +71,7 @@ def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
             degrees = np.degrees(np.unwrap(np.angle(L)))
             # Whole turns are subtracted so that the phase starts between -360° and 0°.
             degrees -= 360.0 * np.ceil(degrees[0] / 360.0 - 1e-6)
-            phase.semilogx(hertz, degrees, **style)
+            phase.semilogx(hertz, degrees, label=label, **style)
             nyquist.plot(np.real(L), np.imag(L), label=label, **style)
             _sensitivities(sensitivity, curves, report, label, style)
     gain.axhline(1.0, color=REFERENCE, lw=0.8)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from ..signals.excitation import Part
-from .figures import AFTER, figure, plot_style, write
+from .figures import AFTER, Pictures, figure, plot_style, write
 from .page import Page
 
 PICTURE = "excitation.png"
@@ -52,10 +52,10 @@ def excitation_table(parts: Iterable[Part]) -> Table:
     return table
 
 
-def write_excitation(parts: Sequence[Part], folder: Path) -> None:
-    """Draw the voltages of ``parts`` to excitation.png."""
+def write_excitation(parts: Sequence[Part], folder: Path) -> Pictures:
+    """Draw the voltages of ``parts`` to excitation.png, and return the picture."""
     with plot_style():
-        write(excitation_figure(parts), folder / PICTURE)
+        return write(excitation_figure(parts), folder / PICTURE)
 
 
 def excitation_figure(parts: Sequence[Part]) -> Figure:

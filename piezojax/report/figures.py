@@ -19,6 +19,9 @@ REFERENCE, BEFORE, AFTER, MEASURED = "#222222", "#c9753d", "#1f6f8b", "#8a8a8a"
 LOOP_COLOURS = {"before": BEFORE, "after": AFTER}
 """Colours of a loop by its name."""
 
+Pictures = dict[str, Figure]
+"""Figures by the name of their file."""
+
 UNITS = {"um": ("µm", "nm"), "urad": ("µrad", "nrad")}
 """A unit as written in pictures, and the unit a thousand times smaller."""
 
@@ -75,8 +78,9 @@ def plot_style():
     return mpl.rc_context(STYLE)
 
 
-def write(picture: Figure, path: Path) -> None:
-    """Write ``picture`` as PNG; a failure leaves no partial file."""
+def write(picture: Figure, path: Path) -> Pictures:
+    """Write ``picture`` as PNG and return it; a failure leaves no partial file."""
     buffer = io.BytesIO()
     picture.savefig(buffer, format="png")
     write_bytes(path, buffer.getvalue())
+    return {path.name: picture}

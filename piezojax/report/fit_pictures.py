@@ -15,6 +15,7 @@ from .figures import (
     AFTER,
     BEFORE,
     MEASURED,
+    Pictures,
     add_title,
     figure,
     legend_above,
@@ -29,15 +30,16 @@ SHOWN = 400
 MODEL_FILE, FIT_FILE, PICTURE_FILE = "model.json", "fit.json", "fit.png"
 
 
-def write_fit(fit: Fit, folder: Path) -> None:
-    """Write model.json, fit.json and the pictures into ``folder``."""
+def write_fit(fit: Fit, folder: Path) -> Pictures:
+    """Write model.json, fit.json and the returned pictures into ``folder``."""
     write_model(fit, folder)
     with plot_style():
         single = fit.simulations[0].shape[1] == 1
         picture = fit_figure(fit) if single else outputs_figure(fit)
-        write(picture, folder / PICTURE_FILE)
+        drawn = write(picture, folder / PICTURE_FILE)
         if fit.linear is not None:
-            _write_linear(fit.linear, fit.record, folder)
+            drawn |= _write_linear(fit.linear, fit.record, folder)
+    return drawn
 
 
 def write_model(fit: Fit, folder: Path) -> None:
@@ -48,10 +50,11 @@ def write_model(fit: Fit, folder: Path) -> None:
     write_text(folder / FIT_FILE, text + "\n")
 
 
-def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> None:
+def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> Pictures:
+    drawn: Pictures = {}
     for number, (title, values) in enumerate(linear.singular_values.items()):
         picture = singular_values_figure(values, linear.order, title)
-        write(picture, folder / f"singular_values_{number}.png")
+        drawn |= write(picture, folder / f"singular_values_{number}.png")
     if linear.measured is not None:
         names = [
             [f"{side} {i}" for i in range(count)]
@@ -64,7 +67,8 @@ def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> None:
         picture = response_figure(
             linear.measured, linear.fitted(), names[0], names[1], unit
         )
-        write(picture, folder / "response.png")
+        drawn |= write(picture, folder / "response.png")
+    return drawn
 
 
 def outputs_figure(fit: Fit) -> Figure:

@@ -25,6 +25,7 @@ from .figures import (
     BEFORE,
     MEASURED,
     REFERENCE,
+    Pictures,
     add_title,
     figure,
     plain_tick_labels,
@@ -45,19 +46,21 @@ SHOWN = 3
 SHADES = (AFTER, BEFORE, REFERENCE)
 
 
-def write_ranking(ranking: ModelRanking, folder: Path) -> None:
+def write_ranking(ranking: ModelRanking, folder: Path) -> Pictures:
     """Write the ranking, the files of the best fit, and the other models.
 
-    The other models are in the folders that their rows name, under models/.
+    The other models are in the folders that their rows name, under models/. Returns
+    the pictures.
     """
-    write_fit(ranking.best, folder)
+    drawn = write_fit(ranking.best, folder)
     _write_table(ranking, ranking.report, folder)
     with plot_style():
-        write(ranking_figure(ranking), folder / RANKING_PICTURE)
+        drawn |= write(ranking_figure(ranking), folder / RANKING_PICTURE)
     # write_ranking_so_far put the best model among the others.
     shutil.rmtree(folder / _place(ranking.report.best), ignore_errors=True)
     with suppress(OSError):  # the folder holds other models, or is missing
         (folder / _MODELS).rmdir()
+    return drawn
 
 
 def write_ranking_so_far(ranking: ModelRanking, folder: Path) -> None:

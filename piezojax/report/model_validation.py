@@ -14,6 +14,7 @@ from .figures import (
     AFTER,
     BEFORE,
     MEASURED,
+    Pictures,
     add_title,
     figure,
     legend_above,
@@ -33,8 +34,8 @@ WORDS = {"amplitude": "input range in a stretch", "rate": "input slope"}
 
 def write_validation(
     found: Validation, folder: Path, residual: ResidualRecord | None = None
-) -> None:
-    """Write model.json with the verdict, validation.json and the picture.
+) -> Pictures:
+    """Write model.json with the verdict, validation.json and the returned picture.
 
     ``residual`` is that of the model over its own record.
     """
@@ -44,7 +45,7 @@ def write_validation(
     text = found.report.model_dump_json(indent=2)
     write_text(folder / VALIDATION_FILE, text + "\n")
     with plot_style():
-        write(validation_figure(found), folder / VALIDATION_PICTURE)
+        return write(validation_figure(found), folder / VALIDATION_PICTURE)
 
 
 def validation_figure(found: Validation) -> Figure:

@@ -1,20 +1,24 @@
 """Page with the results of a command: ``report.html``, one file without links.
 
 The page contains the tables and sentences that the command prints, and the pictures in
-its folder. It needs no script and can be printed on paper.
+its folder. Pictures of curves are interactive on a screen with scripts.
 """
 
 import base64
-from collections.abc import Iterable, Sequence
+import io
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
+from PIL import Image
 from rich.table import Table
 from rich.text import Text
 
 from ..core.files import write_text
 from ..tuning.result import STUDY_FILE
+from .figures import Pictures
+from .live_figures import LiveFigures, live_figures
 
 PAGE = "report.html"
 
@@ -49,8 +53,12 @@ td.right, th.right { text-align: right; }
 .tables { overflow-x: auto; } caption { text-align: left; font-weight: bold; }
 figure { margin: 1.5em 0; } img { max-width: 100%; }
 figcaption { font-weight: bold; } pre { white-space: pre-wrap; }
+.note { display: none; }
+@media screen { .live:not(:empty) + img { display: none; }
+  body:has(.live:not(:empty)) .note { display: block; } }
 @media print { body { margin: 0; max-width: none; font-size: 11px; }
-  .tables { overflow: visible; } figure, table { break-inside: avoid; } }
+  .live { display: none; } .tables { overflow: visible; }
+  figure, table { break-inside: avoid; } }
 """
 
 
@@ -68,15 +76,18 @@ class Page:
     origin: Sequence[str] = ()
 
 
-def write_page(page: Page, folder: Path) -> Path:
-    """Write ``page`` and the pictures in ``folder`` to report.html in that folder."""
+def write_page(page: Page, folder: Path, pictures: Pictures | None = None) -> Path:
+    """Write ``page`` and the pictures in ``folder`` to report.html in that folder.
+
+    Those of the ``pictures`` that consist of curves are interactive.
+    """
     path = folder / PAGE
-    write_text(path, page_html(page, folder))
+    write_text(path, page_html(page, folder, live_figures(pictures or {})))
     return path
 
 
-def page_html(page: Page, folder: Path) -> str:
-    """Return ``page`` as HTML, with the pictures in ``folder``."""
+def page_html(page: Page, folder: Path, live: LiveFigures) -> str:
+    """Return ``page`` as HTML, with the pictures in ``folder`` and ``live`` ones."""
     title = escape(page.title)
     tables = [part for part in page.parts if isinstance(part, Table)]
     sentences = [part for part in page.parts if not isinstance(part, Table)]
@@ -88,10 +99,10 @@ def page_html(page: Page, folder: Path) -> str:
         f"<h1>{title}</h1>\n{alarms}"
         + "".join(table_html(table) for table in tables)
         + _section("Notes", _list(sentences))
-        + _section("Pictures", "".join(_figures(folder)))
+        + _section("Pictures", _note(live) + "".join(_figures(folder, live.figures)))
         + _section("Files", _quoted_study(folder))
         + _section("Origin", _list(page.origin))
-        + "</body>\n</html>\n"
+        + f"{live.scripts}</body>\n</html>\n"
     )
 
 
@@ -138,16 +149,31 @@ def _list(sentences: Iterable[str]) -> str:
     return f"<ul>\n{items}</ul>\n" if items else ""
 
 
-def _figures(folder: Path) -> Iterable[str]:
+def _note(live: LiveFigures) -> str:
+    return f'<p class="note">{live.note}</p>\n' if live.note else ""
+
+
+def _figures(folder: Path, live: Mapping[str, str]) -> Iterable[str]:
     known = {path.name: path for path in sorted(folder.glob("*.png"))}
     rank = {name: place for place, name in enumerate(PICTURES)}
     for name in sorted(known, key=lambda name: rank.get(name, len(rank))):
         caption = PICTURES.get(name, name.removesuffix(".png").replace("_", " "))
-        data = base64.b64encode(known[name].read_bytes()).decode("ascii")
+        data = base64.b64encode(_small(known[name])).decode("ascii")
         yield (
-            f'<figure>\n<figcaption>{escape(caption)}</figcaption>\n<img alt="'
-            f'{escape(caption)}" src="data:image/png;base64,{data}">\n</figure>\n'
+            f"<figure>\n<figcaption>{escape(caption)}</figcaption>\n"
+            f'{live.get(name, "")}<img alt="{escape(caption)}" '
+            f'src="data:image/png;base64,{data}">\n</figure>\n'
         )
+
+
+def _small(path: Path) -> bytes:
+    """Return a picture with at most 256 colours: a third of its bytes, or less."""
+    small = io.BytesIO()
+    with Image.open(path) as picture:
+        picture.convert("RGB").quantize(method=Image.Quantize.FASTOCTREE).save(
+            small, "png", optimize=True
+        )
+    return small.getvalue()
 
 
 def _quoted_study(folder: Path) -> str:

@@ -20,6 +20,7 @@ from .figures import (
     BEFORE,
     MEASURED,
     REFERENCE,
+    Pictures,
     add_title,
     figure,
     legend_above,
@@ -37,35 +38,45 @@ LEVELS_FOLDER = "levels"
 """Folder with the files of each amplitude, numbered from 1."""
 
 
-def write_measured(response: FrequencyResponse, folder: Path) -> None:
-    """Write response.csv and response.png of a response without a model."""
+def write_measured(response: FrequencyResponse, folder: Path) -> Pictures:
+    """Write response.csv and response.png of a response without a model.
+
+    Returns the picture.
+    """
     save_response(response, folder / TABLE_FILE)
     with plot_style():
-        write(measured_figure(response, None, response.source), folder / PICTURE_FILE)
+        picture = measured_figure(response, None, response.source)
+        return write(picture, folder / PICTURE_FILE)
 
 
-def write_response(found: ResponseModel, folder: Path) -> None:
-    """Write model.json, response.json, response.csv and response.png to ``folder``."""
+def write_response(found: ResponseModel, folder: Path) -> Pictures:
+    """Write model.json, response.json, response.csv and response.png to ``folder``.
+
+    Returns the picture.
+    """
     save(found.system, folder / MODEL_FILE, found.about)
     text = found.report.model_dump_json(indent=2)
     write_text(folder / REPORT_FILE, text + "\n")
     save_response(found.response, folder / TABLE_FILE)
     with plot_style():
         picture = measured_figure(found.response, found.fit, found.report.found)
-        write(picture, folder / PICTURE_FILE)
+        return write(picture, folder / PICTURE_FILE)
 
 
-def write_levels(found: ResponseLevels, folder: Path) -> None:
-    """Write the chosen model, the files of each amplitude, and their comparison."""
+def write_levels(found: ResponseLevels, folder: Path) -> Pictures:
+    """Write the chosen model, the files of each amplitude, and their comparison.
+
+    Returns the pictures of the chosen model and of the comparison.
+    """
     for number, model in enumerate(found.models, 1):
         inner = folder / LEVELS_FOLDER / str(number)
         inner.mkdir(parents=True)
         write_response(model, inner)
-    write_response(found.chosen, folder)
+    drawn = write_response(found.chosen, folder)
     text = found.report.model_dump_json(indent=2)
     write_text(folder / LEVELS_FILE, text + "\n")
     with plot_style():
-        write(levels_figure(found), folder / LEVELS_PICTURE)
+        return drawn | write(levels_figure(found), folder / LEVELS_PICTURE)
 
 
 def measured_figure(

@@ -17,7 +17,7 @@ from ..sweeping.metric_maps import (
     metrics_in,
     open_dataset,
 )
-from .figures import AFTER, UNITS, add_title, figure, plot_style, write
+from .figures import AFTER, UNITS, Pictures, add_title, figure, plot_style, write
 from .page import Page
 from .parallel_coordinates import parallel_coordinates
 from .sweep_scale import COLOUR_MAP, LOST, Parameter, colour_bar, scale_of
@@ -28,11 +28,16 @@ if TYPE_CHECKING:
 MOST_PANELS = 12
 
 
-def write_pictures(path: Path, folder: Path) -> None:
-    """Write a picture of each metric of the data set ``path`` into ``folder``."""
+def write_pictures(path: Path, folder: Path) -> Pictures:
+    """Write a picture of each metric of the data set ``path`` into ``folder``.
+
+    Returns the pictures.
+    """
+    drawn: Pictures = {}
     with open_dataset(path) as dataset, plot_style():
         for name in metrics_in(dataset):
-            write(metric_figure(dataset, name), folder / f"{name}.png")
+            drawn |= write(metric_figure(dataset, name), folder / f"{name}.png")
+    return drawn
 
 
 def metric_figure(dataset: "Dataset", name: str) -> Figure:

@@ -21,6 +21,7 @@ from .figures import (
     BEFORE,
     REFERENCE,
     UNITS,
+    Pictures,
     add_title,
     figure,
     legend_above,
@@ -35,12 +36,13 @@ _MOST_TRACES = 3  # in the tracking picture
 _PERIODS = 4.0  # of the reference, drawn from the end of the run
 
 
-def write_results(outcome: Outcome, folder: Path) -> None:
+def write_results(outcome: Outcome, folder: Path) -> Pictures:
     """Write result.json, gains.toml, study.toml and the pictures into ``folder``.
 
     A stage with several axes also has pictures of their coupling, and of the contours
-    if the study has any.
+    if the study has any. Returns the pictures.
     """
+    drawn: Pictures = {}
     write_numbers(outcome, folder)
     study, result = outcome.case.study, outcome.result
     shown = _drawn_traces(outcome)
@@ -69,7 +71,8 @@ def write_results(outcome: Outcome, folder: Path) -> None:
         }
         for name, picture in pictures.items():
             if picture:
-                write(picture, folder / f"{name}.png")
+                drawn |= write(picture, folder / f"{name}.png")
+    return drawn
 
 
 def write_numbers(outcome: Outcome, folder: Path) -> None:
@@ -142,6 +145,7 @@ def tracking_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
     axes = picture.subplots(len(logs), 2, squeeze=False)
     for (trace, (before, after)), (left, right) in zip(logs.items(), axes, strict=True):
         unit, small = UNITS[trace.unit]
+        right.sharex(left)
         time = np.arange(before.reference.size) * dt
         shown = time >= _drawn_from(study, trace)
         for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):

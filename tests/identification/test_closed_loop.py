@@ -41,6 +41,7 @@ from piezojax.identification.residuals.bound import relative_error
 from piezojax.identification.residuals.correlation import autocorrelation
 from piezojax.identification.residuals.input_feedback import SHARE, feedback_share
 from piezojax.report import fit_pictures
+from piezojax.report.fit_pictures import write_model
 
 REST = 50
 FAST = oracle.CONTROLLERS["fast PID"]
@@ -335,7 +336,9 @@ def test_joint_warns_where_noise_drives_the_input(monkeypatch, reference, noisy)
 def test_the_command_fits_a_loop(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # The pictures of a fit have tests of their own.
-    monkeypatch.setattr(fit_pictures, "write_fit", fit_pictures.write_model)
+    monkeypatch.setattr(
+        fit_pictures, "write_fit", lambda fit, folder: write_model(fit, folder) or {}
+    )
     record, _ = loop("fast PID", SAMPLES, 4, reference=0.15)
     columns = [record.time, record.input, record.output, 1e3 * record.reference]
     head = "time_s,drive_V,sensor_um,reference_nm"
