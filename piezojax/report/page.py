@@ -46,9 +46,9 @@ body { font: 15px/1.5 system-ui, sans-serif; max-width: 62em; margin: 2em auto;
 h1 { font-size: 1.5em; } h2 { font-size: 1.1em; margin: 1.8em 0 .4em; }
 table { border-collapse: collapse; margin: 1.2em 0 .4em;
         font-variant-numeric: tabular-nums; }
-th, td { padding: .15em .8em; text-align: left; white-space: nowrap; }
+th, td { padding: .15em .8em; text-align: left; vertical-align: top; }
 th { border-bottom: 2px solid #222; } tr.end td { border-bottom: 1px solid #999; }
-td.right, th.right { text-align: right; }
+td.right, th.right { text-align: right; white-space: nowrap; }
 .alarm { color: #b00020; font-weight: bold; }
 .tables { overflow-x: auto; } caption { text-align: left; font-weight: bold; }
 figure { margin: 1.5em 0; } img { max-width: 100%; }
