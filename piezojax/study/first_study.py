@@ -26,7 +26,7 @@ SAMPLES_A_PERIOD = 1000
 PERIODS = 3
 """Periods of the slowest reference in a run; the first does not count."""
 
-FASTER = 2.0
+FASTER = 1.2
 """Default limit of the slew, relative to the largest slew of the references."""
 
 BEYOND = 0.1

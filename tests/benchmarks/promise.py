@@ -54,7 +54,7 @@ above FAR times the promise."""
 RAILED = 0.02
 """Share of samples at a voltage limit above which a run counts as saturated."""
 
-SLEW = 2.0
+SLEW = 1.2
 """Limit of the slew of the reference, relative to that of the fastest sine."""
 
 ROUTINE = (
