@@ -1,4 +1,4 @@
-"""Checks of an exported folder by compilers, by an analyser, and on a Cortex-M4.
+"""Checks of an exported folder by clang, by cppcheck, and on a Cortex-M4.
 
 Each check runs programs of the system and returns their complaint, or "". The ARM check
 runs the test program of the folder in an emulator of the processor, without an
@@ -7,14 +7,6 @@ operating system: files are read through the debugger's interface (semihosting).
 
 import shutil
 import subprocess
-
-WARNINGS = (
-    *("-std=c99", "-O2", "-Wall", "-Wextra", "-pedantic", "-Werror"),
-    "-ffp-contract=off",
-)
-"""Flags of the exported Makefile."""
-
-CORTEX = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
 
 START = """\
 extern void _start(void);
@@ -26,14 +18,19 @@ __attribute__((section(".vectors"), used)) static void (*const vectors[])(void) 
     (void (*)(void))0x20400000, reset}; /* end of the stack, first instruction */
 """
 
-PLACES = "-Wl,--section-start=.vectors=0,-Ttext-segment=0x1000,-Tdata=0x20000000"
-"""Code at the start of the memory, where this processor begins, data in its RAM."""
+CORTEX = (
+    "arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 "
+    "--specs=rdimon.specs "
+    "-Wl,--section-start=.vectors=0,-Ttext-segment=0x1000,-Tdata=0x20000000 start.c"
+)
+"""Compiler for the processor: code at the start of its memory, data in its RAM."""
 
 BOARD = (
-    *("qemu-system-arm", "-M", "mps2-an386", "-cpu", "cortex-m4", "-kernel", "test"),
+    *("qemu-system-arm", "-M", "mps2-an386", "-cpu", "cortex-m4"),
     *("-display", "none", "-serial", "null", "-monitor", "none"),
     "-semihosting-config",
     "enable=on,target=native,arg=test,arg=vectors.csv",
+    "-kernel",
 )
 
 
@@ -53,15 +50,14 @@ def complaint(command, folder):
     return text or str(done.returncode) if done.returncode else done.stderr
 
 
-def compiled_by(compiler):
-    """Return a check that compiles and replays the golden vectors."""
+def built(compiler, target, folder):
+    """Make ``target`` anew with ``compiler`` and the flags of the exported Makefile."""
+    return complaint(["make", "-Bs", f"CC={compiler}", target], folder)
 
-    def check(folder, name):
-        sources = [f"test_{name}.c", f"{name}.c"]
-        build = [compiler, *WARNINGS, "-o", "test", *sources, "-lm"]
-        return complaint(build, folder) or complaint(["./test", "vectors.csv"], folder)
 
-    return check
+def by_clang(folder, name):
+    """Compile with clang and replay the golden vectors."""
+    return built("clang", "test", folder)
 
 
 def analysed(folder, name):
@@ -78,18 +74,14 @@ def analysed(folder, name):
 def on_cortex(folder, name):
     """Replay the golden vectors on an emulated Cortex-M4, double in software."""
     (folder / "start.c").write_text(START)
-    sources = [f"test_{name}.c", f"{name}.c", "start.c"]
-    build = ["arm-none-eabi-gcc", *CORTEX, *WARNINGS, "--specs=rdimon.specs", PLACES]
-    return complaint([*build, "-o", "test", *sources, "-lm"], folder) or complaint(
-        BOARD, folder
-    )
+    program = f"test_{name}"
+    return built(CORTEX, program, folder) or complaint([*BOARD, program], folder)
 
 
 TOOLS = {
-    "gcc": (["gcc"], compiled_by("gcc")),
-    "clang": (["clang"], compiled_by("clang")),
+    "clang": (["clang", "make"], by_clang),
     "cppcheck": (["cppcheck"], analysed),
-    "cortex-m4": (["arm-none-eabi-gcc", "qemu-system-arm"], on_cortex),
+    "cortex-m4": (["arm-none-eabi-gcc", "qemu-system-arm", "make"], on_cortex),
 }
 """Programs that a check needs, and the check, by name."""
 

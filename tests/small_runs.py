@@ -5,18 +5,12 @@ import importlib
 import numpy as np
 import tomli_w
 from click.testing import CliRunner
+from study_tables import PID_ON_LAG
 
 import piezojax as pj
 
-STUDY = {
-    "title": "a PID on a lag",
-    "rate": 20_000.0,
-    "seed": 3,
-    "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
-    "actuator": {"lower": -20.0, "upper": 120.0},
-    "sensor": {"noise_rms": 0.012},
+STUDY = PID_ON_LAG | {
     "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
-    "controller": {"catalog": "p753_pid"},
     "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
     "parameters": {
         "controller.proportional": {"lower": 0.1, "upper": 5.0, "scale": "log"},

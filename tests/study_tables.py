@@ -1,6 +1,17 @@
-"""Studies as tables, with some of their values changed."""
+"""Studies as tables: a small one, and copies with some of their values changed."""
 
 import copy
+
+PID_ON_LAG = {
+    "title": "a PID on a lag",
+    "rate": 20_000.0,
+    "seed": 3,
+    "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
+    "actuator": {"lower": -20.0, "upper": 120.0},
+    "sensor": {"noise_rms": 0.012},
+    "controller": {"catalog": "p753_pid"},
+}
+"""Loop of a study that compiles quickly; it lacks references and parameters."""
 
 GONE = object()
 """Value that removes its key."""

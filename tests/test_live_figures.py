@@ -8,7 +8,7 @@ from page_reader import LARGEST, Reader
 from piezojax.report import live_figures as module
 from piezojax.report.figures import AFTER, BEFORE
 from piezojax.report.live_figures import live_figures
-from piezojax.report.live_panel import live_panel
+from piezojax.report.live_panel import curves, live_panel
 from piezojax.report.page import Page, page_html, write_page
 from piezojax.report.thinned_curves import GAP, kept_samples
 
@@ -24,7 +24,7 @@ def panel_of(columns=1000, **axis):
     ax.axhline(1.5, color="k")
     ax.axvspan(0.2, 0.4, color="#eef4f6")
     ax.set(xlim=(0.0, 1.0), ylim=(1.0, 3.0), **axis)
-    return ax, live_panel(ax, LABELS, 300.0, columns)
+    return ax, live_panel(ax, LABELS, 300.0, curves(ax, columns))
 
 
 def test_a_panel_has_the_curves_of_its_picture():
@@ -92,7 +92,8 @@ def test_panels_that_share_an_axis_move_together():
     right.sharey(left)
     below.set(xlabel="time (s)")
     left.set(ylabel="y (V)")
-    grid = module._grid(picture, 1000)
+    samples, _ = module._thinned(picture.axes)
+    grid = module._grid(picture, samples)
     panels = {(row, column): panel for panel, row, column in grid.children}
     assert panels[0, 0].x_range is panels[1, 0].x_range
     assert panels[0, 0].x_range is not panels[0, 1].x_range

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import tomli_w
 from stand_ins import fit_of
-from study_tables import GONE, with_values
+from study_tables import GONE, PID_ON_LAG, with_values
 
 from piezojax import About, save
 from piezojax.catalog import CONTROLLERS, p753
@@ -37,14 +37,7 @@ from piezojax.study.parameters import _reaching
 
 SHIPPED = sorted(path.stem for path in shipped().parent.glob("*.toml"))
 
-BASE = {
-    "title": "a PID on a lag",
-    "rate": 20_000.0,
-    "seed": 3,
-    "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
-    "actuator": {"lower": -20.0, "upper": 120.0},
-    "sensor": {"noise_rms": 0.012},
-    "controller": {"catalog": "p753_pid"},
+BASE = PID_ON_LAG | {
     "references": {
         "tune": ["SIN50", "SW50"],
         "unseen": ["TRI50"],

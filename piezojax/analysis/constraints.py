@@ -301,15 +301,14 @@ CONSTRAINTS: dict[str, Constraint] = {
     ),
 }
 """Constraints by their name in a study; each holds for every plant and reference of the
-objective. The margins, the bandwidth (-3 dB) and the peak of y/r are those of the loop,
+objective. The margins, the bandwidth and the peak of y/r are those of the loop,
 linearised at the highest reference on both branches of the hysteresis; for a fitted
 plant the sensitivity peak and the delay margin are the worst within the error bound of
 its model. On several axes the sensitivity peak is the largest singular value of S, and
 the disk margin is a lower bound of that of all axes at once. The gain, phase and delay
 margins are those of the worst axis with the others closed. The times and the
-steady-state error, a share of the height, are those of the worst of four steps without
-noise (``step_response``). The others are the largest values in the runs; ``overshoot``
-is a share of the range of the reference."""
+steady-state error are those of the worst of four steps without noise
+(``step_response``)."""
 
 
 def limits_of(written: Mapping[str, Any]) -> dict[str, float]:

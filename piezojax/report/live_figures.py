@@ -1,6 +1,6 @@
 """Pictures as interactive figures, with readout and zoom, by Bokeh."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,7 @@ from matplotlib.cbook import GrouperView
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 
-from .live_panel import curves, has_curves_only, live_panel
+from .live_panel import Curves, curves, has_curves_only, live_panel
 
 if TYPE_CHECKING:
     from bokeh.models import LayoutDOM
@@ -58,9 +58,10 @@ def live_figures(pictures: Mapping[str, Figure]) -> LiveFigures:
     from bokeh.embed import components
     from bokeh.resources import Resources
 
-    columns = _columns(drawn.values())
+    panels = [ax for picture in drawn.values() for ax in picture.axes]
+    samples, columns = _thinned(panels)
     script, roots = components(
-        {name: _grid(picture, columns) for name, picture in drawn.items()},
+        {name: _grid(picture, samples) for name, picture in drawn.items()},
         wrap_plot_info=False,
     )
     figures = {
@@ -73,23 +74,24 @@ def live_figures(pictures: Mapping[str, Figure]) -> LiveFigures:
     return LiveFigures(figures, f"{inline}\n{script}\n", NOTE.format(columns))
 
 
-def _columns(pictures: Iterable[Figure]) -> int:
-    """Return the number of columns with which all curves keep ``BUDGET``."""
-    columns, panels = COLUMNS, [ax for picture in pictures for ax in picture.axes]
-    while columns > 1:
-        if sum(x.size for ax in panels for x, _ in curves(ax, columns)) <= BUDGET:
-            break
+def _thinned(panels: Sequence[Axes]) -> tuple[dict[Axes, Curves], int]:
+    """Return the curves of ``panels``, which keep ``BUDGET``, and their columns."""
+    columns = COLUMNS
+    while True:
+        found = {ax: curves(ax, columns) for ax in panels}
+        count = sum(x.size for lines in found.values() for x, _ in lines)
+        if count <= BUDGET or columns == 1:
+            return found, columns
         columns //= 2
-    return columns
 
 
-def _grid(picture: Figure, columns: int) -> "LayoutDOM":
+def _grid(picture: Figure, samples: Mapping[Axes, Curves]) -> "LayoutDOM":
     """Return the panels of ``picture``; those that share an axis move together."""
     from bokeh.layouts import gridplot
 
     places = {ax: spec for ax in picture.axes if (spec := ax.get_subplotspec())}
     panels = {
-        ax: live_panel(ax, _labels(ax, places), _height(spec, picture), columns)
+        ax: live_panel(ax, _labels(ax, places), _height(spec, picture), samples[ax])
         for ax, spec in places.items()
     }
     for ax, panel in panels.items():

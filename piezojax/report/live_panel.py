@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from bokeh.models import GlyphRenderer
     from bokeh.plotting import figure as LivePanel  # noqa: N812
 
+Curves = list[tuple[np.ndarray, np.ndarray]]
+"""x and y of each line of a panel."""
+
 _DASHES = {"-": "solid", "--": "dashed", "-.": "dashdot", ":": "dotted"}
 _MARKERS = {".": "circle", "o": "circle", "+": "cross", "d": "diamond", "s": "square"}
 _SIDES: tuple[Any, ...] = ("right", "left", "above", "below")  # of the pointer
@@ -53,12 +56,12 @@ def has_curves_only(ax: Axes) -> bool:
 
 
 def live_panel(
-    ax: Axes, labels: tuple[str, str], height: float, columns: int
+    ax: Axes, labels: tuple[str, str], height: float, samples: Curves
 ) -> "LivePanel":
     """Return ``ax`` as a panel with a ``height`` in pixels.
 
     Colours, scales, ranges and legend are those of ``ax``; ``labels`` are those of its
-    x and y axis. The curves consist of the ``kept_samples``.
+    x and y axis. ``samples`` are those of its ``curves``.
     """
     from bokeh.models import BoxAnnotation, HoverTool, Legend
     from bokeh.plotting import figure
@@ -68,8 +71,8 @@ def live_panel(
     for patch in ax.patches:
         panel.add_layout(BoxAnnotation(**_shade(patch, ax)))
     drawn = [
-        (line, _draw(panel, line, *samples))
-        for line, samples in zip(ax.lines, curves(ax, columns), strict=True)
+        (line, _draw(panel, line, x, y))
+        for line, (x, y) in zip(ax.lines, samples, strict=True)
     ]
     named = [(line, parts) for line, parts in drawn if _label(line)]
     for (line, parts), side in zip(named or drawn, cycle(_SIDES), strict=False):
@@ -100,7 +103,7 @@ def _frame(ax: Axes, labels: tuple[str, str]) -> dict[str, Any]:
     return frame
 
 
-def curves(ax: Axes, columns: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def curves(ax: Axes, columns: int) -> Curves:
     """Return x and y of the ``kept_samples`` of each line of ``ax``, NaN at gaps."""
     return [_samples(line, ax, columns) for line in ax.lines]
 

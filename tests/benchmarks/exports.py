@@ -6,7 +6,7 @@ Each controller and plant of the catalogue, or with --models each model that
 ``identify`` fits, is exported as C; ``make test`` replays its golden vectors, 20 000
 samples of a simulation with noise and saturation. The table has the number of lines of
 the source, and the largest difference as a share of the largest output, or the reason
-why the System is refused. gcc, clang, cppcheck and an emulated Cortex-M4 check each
+why the System is refused. clang, cppcheck and an emulated Cortex-M4 check each
 source too, where they are installed; what they complain of is printed. Exits with 1 if
 a test fails.
 """

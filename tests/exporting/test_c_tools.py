@@ -21,10 +21,7 @@ EXPORTS = {
 }
 
 
-OTHERS = [tool for tool in TOOLS if tool != "gcc"]
-
-
-@pytest.fixture(scope="module", params=OTHERS)
+@pytest.fixture(scope="module", params=TOOLS)
 def tool(request):
     """Return the name of an installed tool."""
     if missing(request.param):

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from vendor_devices import JENA, RANGE
 
 import piezojax as pj
 from piezojax.control import E727, NV200, PyRPL, Servo, Stabilizer
@@ -21,13 +22,6 @@ ABOUT = pj.About(
     seed=3,
     judged=["tuned loop: sensitivity peak 1.5"],
     plants=["gain +- 10 %"],
-)
-RANGE = {"avmin": -20.0, "avmax": 130.0, "posmin": 0.0, "posmax": 80.0}
-JENA = NV200(
-    *(0.0204, 70.00049, 3e-3),
-    **RANGE,
-    **{"scale": 0.9, "pcf_x": 0.5634, "poslpf": 1234.5678, "sr": 8e-7, "poslpon": 1},
-    **{"notchf": 811.4, "notchb": 399.6, "notchon": 1, "setlpf": 700.2},
 )
 SPAN = {"scale": 2.5, "lower": -20.0, "upper": 130.0}
 PI = E727(

@@ -7,9 +7,9 @@ alone asks for values, a command with values sets them.
 import asyncio
 
 import pytest
+from vendor_devices import JENA
 
 import piezojax as pj
-from piezojax.control import NV200
 
 pytest.importorskip("nv200", reason="the library nv200 needs Python 3.12 or 3.13")
 
@@ -17,13 +17,6 @@ from nv200.nv200_device import NV200Device
 from nv200.shared_types import TransportProtocolInfo, TransportType
 from nv200.transport_protocol import TransportProtocol
 from nv200.utils import DeviceParamFile
-
-JENA = NV200(
-    *(0.0204, 70.00049, 3e-3),
-    **{"avmin": -20.0, "avmax": 130.0, "posmin": 0.0, "posmax": 80.0, "scale": 0.9},
-    **{"pcf_x": 0.5634, "poslpf": 1234.5678, "sr": 8e-7, "poslpon": 1},
-    **{"notchf": 811.4, "notchb": 399.6, "notchon": 1, "setlpf": 700.2},
-)
 
 
 class Memory(TransportProtocol):

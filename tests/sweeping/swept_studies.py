@@ -1,5 +1,7 @@
 """A study that compiles and runs quickly, and a grid of its parameters."""
 
+from study_tables import PID_ON_LAG
+
 PARAMETERS = {
     "controller.proportional": {"lower": 0.1, "upper": 5.0, "scale": "log"},
     "controller.integral": {"lower": 100.0, "upper": 2e4, "scale": "log"},
@@ -20,20 +22,17 @@ GRID = {
 
 def study_of(sweep, **changes):
     """Return a study of a PID on a lag, which compiles quickly and runs in 1 ms."""
-    study = {
-        "title": "a PID on a lag",
-        "rate": 20_000.0,
-        "seed": 3,
-        "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
-        "actuator": {"lower": -20.0, "upper": 120.0},
-        "sensor": {"noise_rms": 0.012},
-        "controller": {"catalog": "p753_pid"},
-        "references": {
-            "tune": ["SIN50"],
-            "unseen": ["SW50"],
-            "duration": 0.02,
-            "settle": 0.005,
-        },
-        "parameters": PARAMETERS,
-    } | changes
+    study = (
+        PID_ON_LAG
+        | {
+            "references": {
+                "tune": ["SIN50"],
+                "unseen": ["SW50"],
+                "duration": 0.02,
+                "settle": 0.005,
+            },
+            "parameters": PARAMETERS,
+        }
+        | changes
+    )
     return study | ({} if sweep is None else {"sweep": sweep})

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from study_tables import PID_ON_LAG
 
 import piezojax as pj
 from piezojax.cli.terminal import console
@@ -130,15 +131,8 @@ def test_the_ratio_is_that_of_the_times_to_the_same_loss():
     assert with_ratios(entry(loss=None), ours).reached_s == 2.0
 
 
-STUDY = {
-    "title": "a PID on a lag",
-    "rate": 20_000.0,
-    "seed": 3,
-    "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
-    "actuator": {"lower": -20.0, "upper": 120.0},
-    "sensor": {"noise_rms": 0.012},
+STUDY = PID_ON_LAG | {
     "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
-    "controller": {"catalog": "p753_pid"},
     "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
     "parameters": {
         "controller.proportional": {"lower": 0.1, "upper": 100.0, "scale": "log"},

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from study_tables import PID_ON_LAG
 
 import piezojax as pj
 from piezojax import (
@@ -187,15 +188,8 @@ def test_the_better_half_continues():
     assert standing.losses[0] <= min(s.losses.min() for s in seen)
 
 
-STUDY = {
-    "title": "a PID on a lag",
-    "rate": 20_000.0,
-    "seed": 3,
-    "plant": {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5},
-    "actuator": {"lower": -20.0, "upper": 120.0},
-    "sensor": {"noise_rms": 0.012},
+STUDY = PID_ON_LAG | {
     "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
-    "controller": {"catalog": "p753_pid"},
     "references": {"tune": ["SIN50", "SW50"], "duration": 0.05, "settle": 0.02},
     "parameters": {
         "controller.proportional": {"lower": 0.1, "upper": 50.0, "scale": "log"},

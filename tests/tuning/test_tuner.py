@@ -6,7 +6,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from study_tables import with_values
+from study_tables import PID_ON_LAG, with_values
 
 import piezojax as pj
 from piezojax.catalog import p753
@@ -20,18 +20,10 @@ from piezojax.tuning.make_result import worse_than_the_start
 from piezojax.tuning.result import Result, load_result
 
 # A PID on a lag compiles in a few seconds, and the tests do not depend on the loop.
-LAG = {"type": "FirstOrderLag", "time_constant": 1e-3, "dt": 5e-5}
 WIDE = {"lower": -1e300, "upper": 1e300}
 PROPORTIONAL, INTEGRAL = "controller.proportional", "controller.integral"
-BASE = {
-    "title": "a PID on a lag",
-    "rate": 20_000.0,
-    "seed": 3,
-    "plant": LAG,
-    "actuator": {"lower": -20.0, "upper": 120.0},
-    "sensor": {"noise_rms": 0.012},
+BASE = PID_ON_LAG | {
     "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
-    "controller": {"catalog": "p753_pid"},
     "references": {
         "tune": ["SIN50", "SW50"],
         "duration": 0.05,
