@@ -8,9 +8,9 @@ a test fails or takes too long. Survivors are shown as a difference. Exits with 
 share caught is below the bar.
 
 Omitted are mutants that leave every result of a correct program as it is, or that only
-raise errors: of annotations, of the guards ``strict`` and ``frozen``, of ``jit``, which
-changes the speed alone, orders of texts (``status <= "interrupted"``), and operators of
-another group.
+raise errors: of annotations, of the guards ``strict`` and ``frozen``, of ``overload``,
+of ``jit``, which changes the speed alone, orders of texts
+(``status <= "interrupted"``), and operators of another group.
 """
 
 import argparse
@@ -55,6 +55,9 @@ _ALIKE = {
 _GUARDS = ("strict", "frozen")
 """Keyword arguments that only make a wrong program raise an error."""
 
+_WITHOUT_EFFECT = ("jit", "overload")
+"""What is part of the names of decorators that change no result."""
+
 Place = tuple[int, int]
 
 
@@ -75,14 +78,19 @@ def wanted(operator: str) -> bool:
 
 
 def without_effect(source: str) -> list[tuple[Place, Place]]:
-    """Return first and last place of annotations, guards and ``jit`` decorators."""
+    """Return first and last place of annotations, guards, ``jit`` and ``overload``."""
     nodes = []
     for node in ast.walk(ast.parse(source)):
         nodes += [getattr(node, name, None) for name in ("annotation", "returns")]
         if isinstance(node, ast.keyword) and node.arg in _GUARDS:
             nodes.append(node.value)
         if isinstance(node, ast.FunctionDef):
-            nodes += [d for d in node.decorator_list if "jit" in ast.unparse(d)]
+            decorators = {ast.unparse(d): d for d in node.decorator_list}
+            nodes += [
+                decorator
+                for text, decorator in decorators.items()
+                if any(plain in text for plain in _WITHOUT_EFFECT)
+            ]
     return [
         ((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset))
         for node in nodes
