@@ -158,6 +158,14 @@ def test_a_loop_with_gain_below_1_has_no_delay_margin():
     assert delay_margin_of(found) == UNLIMITED_DELAY
 
 
+def test_a_gain_margin_at_the_nyquist_frequency():
+    """L = k / (z - a): its pole a - k leaves the unit circle at -1, where L is real."""
+    a, k = 0.5, 0.6
+    z = np.exp(1j * np.linspace(0.0, np.pi, 2001))
+    found = gain_margin_of(one_axis(1.0 / (1.0 + k / (z - a))))
+    assert found == pytest.approx(20.0 * np.log10((1.0 + a) / k), rel=1e-9)
+
+
 def test_a_loop_without_gain_has_the_largest_margins():
     found = one_axis(jnp.ones(64, complex))
     assert gain_margin_of(found) == UNLIMITED_GAIN

@@ -14,7 +14,7 @@ import piezojax as pj
 from piezojax.analysis.stability import stability_reports
 from piezojax.analysis.stability.assess import worst_margins
 from piezojax.analysis.stability.conserved import LinearLoop
-from piezojax.analysis.stability.crossings import roots
+from piezojax.analysis.stability.crossings import angle_grid, roots
 from piezojax.analysis.stability.margins import linear_loop, report_of
 from piezojax.catalog import p753
 from piezojax.core.feedback import LoopInput
@@ -389,3 +389,60 @@ def test_a_sign_due_to_rounding_gives_the_end_nearest_to_zero(offset, nearest):
     grid = np.array([0.0, 1.0])
     found = roots(lambda x: x + offset, grid, np.array([-1e-17, 1e-17]))
     assert list(found) == [nearest]
+
+
+def test_branches_that_differ_by_rounding_share_their_curves():
+    loop = around(pid("all"))
+    weights = np.array([1e-7 * SLOPE])
+    play = pj.hysteresis.PrandtlIshlinskii((SLOPE,), (1.0,), weights)
+    plant = pj.series(slope=play, dynamics=pj.dynamics.ARMA(A, B))
+    loop = pj.Feedback(loop.controller, plant, loop.actuator, loop.sensor)
+    reports = stability_reports({"after": loop}, 3.0)
+    up, down = (report.gain_margin for report in reports.reports["after"].values())
+    assert 1e-9 < abs(up / down - 1.0) < 1e-6
+    assert list(reports.curves("after", 3.0)) == ["ascending"]
+
+
+def test_the_worse_branch_of_several_axes_is_reported():
+    """Plays of negative weight: the stage moves more on the descending branch."""
+    one = around(pid("hard"))
+    play = pj.hysteresis.PrandtlIshlinskii((SLOPE,), (1.0,), (-0.2 * SLOPE,))
+    plant = pj.series(slope=play, dynamics=pj.dynamics.ARMA(A, B))
+    parts = (one.controller, plant, one.actuator, one.sensor)
+    loop = pj.Feedback(*(pj.PerAxis((part, part)) for part in parts))
+    (found,) = stability_reports(
+        {"after": loop}, (3.0, 3.0), DT, ("X", "Y")
+    ).axes.values()
+    expected = pj.stability_report(around(pid("hard")))
+    assert found.report.disk_margin == pytest.approx(expected.disk_margin, rel=1e-6)
+
+
+def test_phase_lead_at_both_crossovers():
+    """L = -k / A(z) of a mode: the phase margin lies on the side of the lead."""
+    radius, angle = 0.99, 0.3
+    a = np.array([1.0, -2.0 * radius * np.cos(angle), radius**2])
+    k = 1.5 * (1.0 - radius) * 2.0 * np.sin(angle)
+    companion = np.array([[-a[1], -a[2]], [1.0, 0.0]])
+    loop = LinearLoop(companion, np.array([1.0, 0.0]), np.array([0.0, -k]), DT)
+    omega = np.linspace(0.0, np.pi, 2_000_001)
+    L = -k / np.polyval(a, np.exp(1j * omega))
+    crossovers = np.flatnonzero(np.diff(np.abs(L) > 1.0))
+    phases = np.angle(L[crossovers])
+    assert len(phases) == 2
+    assert phases.min() > 0.2
+    report = report_of(loop)
+    expected = 180.0 - np.degrees(phases.max())
+    assert report.phase_margin_deg == pytest.approx(expected, abs=1e-2)
+    samples = ((np.pi + phases) / omega[crossovers]).min()
+    assert report.delay_margin_samples == pytest.approx(samples, rel=1e-4)
+
+
+@pytest.mark.parametrize("damping", [1e-2, 1e-7])
+def test_the_grid_is_dense_within_the_width_of_a_resonance(damping):
+    place = 0.3137
+    pole = np.exp(complex(-damping, place))
+    A = np.array([[pole.real, pole.imag], [-pole.imag, pole.real]])
+    loop = LinearLoop(A, np.array([1.0, 0.0]), np.array([0.0, 0.0]), DT)
+    distance = np.abs(angle_grid(loop) - place)
+    assert (distance < damping).sum() > 20
+    assert distance.min() < 1e-9

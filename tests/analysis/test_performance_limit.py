@@ -147,6 +147,9 @@ def test_shares_that_exceed_the_error_are_those_of_no_linear_loop():
     assert found.predicted == pytest.approx(np.sqrt(0.39))
     assert _shares(1.0, 0.9, 0.5).predicted == 0.0
     assert _shares(1.0, 0.9, 0.6) is None
+    # The test does not depend on the unit of the error.
+    assert _shares(1e-4, 0.9e-4, 0.6e-4) is None
+    assert _shares(1e4, 0.25e4, 0.36e4).noise == pytest.approx(50.0)
 
 
 def test_a_better_controller_is_closer_to_the_limit(linear, disturbance):

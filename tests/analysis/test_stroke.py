@@ -129,6 +129,37 @@ def test_a_stage_without_rest_has_no_bounds():
     assert bounds(stroke_of(integrator, LOW, HIGH)) == [-np.inf, np.inf]
 
 
+class Relative(System):
+    """Two axes that measure their motion from the place where they start."""
+
+    def init(self, input=None):
+        return input
+
+    def step(self, state, input):
+        load = 1.0 + sum(jnp.abs(x) for x in input)
+        return state, tuple((x - x0) / load for x, x0 in zip(input, state, strict=True))
+
+
+def test_an_axis_is_driven_alone_from_both_of_its_limits():
+    found = stroke_of(Relative(), (-1.0, -1.0), (1.0, 1.0))
+    np.testing.assert_allclose(found.highest, 1.0)
+    np.testing.assert_allclose(found.lowest, -1.0)
+
+
+class Runaway(System):
+    """A stage without displacement above 100 V."""
+
+    def init(self, input=None):
+        return ()
+
+    def step(self, state, input):
+        return state, jnp.where(input > 100.0, jnp.inf, input)
+
+
+def test_an_axis_that_is_infinite_at_one_end_has_no_bounds():
+    assert bounds(stroke_of(Runaway(), LOW, HIGH)) == [-np.inf, np.inf]
+
+
 def test_one_axis_without_bounds_does_not_affect_the_other():
     lost = PerAxis((Affine(2.0), ARMA((1.0,), (1.0,))))
     found = stroke_of(lost, (-1.0, -1.0), (1.0, 1.0))

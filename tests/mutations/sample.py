@@ -79,29 +79,29 @@ def wanted(operator: str) -> bool:
 
 def without_effect(source: str) -> list[tuple[Place, Place]]:
     """Return first and last place of annotations, guards, ``jit`` and ``overload``."""
-    nodes = []
+    nodes, spans = [], []
     for node in ast.walk(ast.parse(source)):
         nodes += [getattr(node, name, None) for name in ("annotation", "returns")]
         if isinstance(node, ast.keyword) and node.arg in _GUARDS:
             nodes.append(node.value)
-        if isinstance(node, ast.FunctionDef):
-            decorators = {ast.unparse(d): d for d in node.decorator_list}
-            nodes += [
-                decorator
-                for text, decorator in decorators.items()
-                if any(plain in text for plain in _WITHOUT_EFFECT)
-            ]
-    return [
-        ((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset))
-        for node in nodes
-        if isinstance(node, ast.expr)
-    ]
+        for decorator in getattr(node, "decorator_list", ()):
+            if any(plain in ast.unparse(decorator) for plain in _WITHOUT_EFFECT):
+                spans.append(((decorator.lineno, 0), span(decorator)[1]))  # from the @
+    return spans + [span(node) for node in nodes if isinstance(node, ast.expr)]
+
+
+def span(node: ast.expr) -> tuple[Place, Place]:
+    """Return first and last place of an expression."""
+    return (
+        (node.lineno, node.col_offset),
+        (node.end_lineno or node.lineno, node.end_col_offset or node.col_offset),
+    )
 
 
 def of_texts(source: str) -> list[tuple[Place, Place]]:
     """Return first and last place of comparisons with a text."""
     return [
-        ((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset))
+        span(node)
         for node in ast.walk(ast.parse(source))
         if isinstance(node, ast.Compare)
         for side in (node.left, *node.comparators)

@@ -13,6 +13,7 @@ import piezojax as pj
 from piezojax.analysis.stability import StabilityReports, axes_report_of, report_of
 from piezojax.analysis.stability.assess import AxesStability
 from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
+from piezojax.analysis.stability.following import Following
 from piezojax.cli.tune import main
 from piezojax.core.files import write_json
 from piezojax.tuning.alarms import alarms_of, exact_peak
@@ -228,6 +229,21 @@ def test_exact_margins_beyond_a_limit_raise_an_alarm(stability, message):
     unlimited = alarms(stability=stability, limits={})
     assert [alarm for alarm in unlimited if "unstable" not in alarm] == []
     assert bool(unlimited) == ("unstable" in message)
+
+
+@pytest.mark.parametrize(
+    ("name", "limit", "held"),
+    [
+        *(("bandwidth", 300.0, True), ("bandwidth", 500.0, False)),
+        *(("closed_loop_peak", 1.3, True), ("closed_loop_peak", 1.1, False)),
+    ],
+)
+def test_following_the_reference_is_checked_exactly(name, limit, held):
+    followed = Following(400.0, 200.0, 1.2, 350.0)
+    report = replace(report_of(integrator(0.1)), following=followed)
+    stability = StabilityReports(reports={"after": {"ascending": report}})
+    found = alarms(stability=stability, limits={name: limit})
+    assert [alarm.partition(" ")[0] for alarm in found] == [name] * (not held)
 
 
 def test_lower_limits_are_violated_from_below():

@@ -186,8 +186,8 @@ def balancing(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     tiny = 1e-30 * (1.0 + off.sum(axis=(-2, -1)))
     for _ in range(_SWEEPS):
         for axis in range(size):
-            row = np.sum(off[:, axis] / d, axis=-1) * d[:, axis]
-            column = np.sum(off[:, :, axis] * d, axis=-1) / d[:, axis]
+            row = np.sum(off[:, axis] / d, axis=1) * d[:, axis]
+            column = np.sum(off[:, :, axis] * d, axis=1) / d[:, axis]
             d[:, axis] *= np.sqrt((column + tiny) / (row + tiny))
         d /= d[:, -1:]
     d = np.sqrt(d)

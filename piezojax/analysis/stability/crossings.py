@@ -33,7 +33,7 @@ def angle_grid(
     poles = poles[np.abs(poles) > 1e-6]
     logs = np.log(poles.astype(complex))
     rates = np.abs(logs)[np.abs(logs) > 1e-9]
-    slowest = min(1e-2, rates.min(initial=1.0)) * 1e-3
+    slowest = 1e-3 * rates.min(initial=1e-2)
     count = int(per_decade * np.log10(np.pi / slowest))
     around = np.abs(np.imag(logs))[:, None] + np.abs(np.real(logs))[:, None] * _AROUND
     near = np.unique(around[(around > slowest) & (around < np.pi)])

@@ -328,8 +328,9 @@ def _phase_margins(
             "delay_margin_s": math.inf,
             "delay_margin_samples": math.inf,
         }
-    lag = np.mod(np.angle(loop.response(places)) + np.pi, 2.0 * np.pi)
-    either = np.minimum(lag, 2.0 * np.pi - lag)
+    angles = np.angle(loop.response(places))
+    lag = np.mod(angles + np.pi, 2.0 * np.pi)
+    either = np.pi - np.abs(angles)
     worst = int(np.argmin(either))
     samples = float((lag / places).min())
     return {
