@@ -772,6 +772,14 @@ def test_a_reference_at_half_the_rate(refusal):
     )
 
 
+def test_a_reference_at_half_the_rate_beside_a_recorded_one(refusal, tmp_path):
+    (tmp_path / "scan.csv").write_text("z\n" + "1.0\n2.0\n" * 1000)
+    recorded = {"files": {"scan": {"file": "scan.csv", "rate": 2e4}}}
+    names = {"tune": ["scan", "SIN50"], "unseen": ["SIN10000"]}
+    message = refusal({f"references/{k}": v for k, v in (recorded | names).items()})
+    assert "the frequency of SIN10000 is not below half the rate" in message
+
+
 def test_a_front_has_at_least_two_limits(study, refusal):
     front = {"constraint": "effort", "limits": [20.0, 30.0]}
     limit = {"constraints": {"effort": 30.0}}
