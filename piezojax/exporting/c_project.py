@@ -18,6 +18,7 @@ from .c_bodies import Fields, StepBodies, init_body, step_bodies
 from .c_source import PRECISIONS
 from .c_templates import HEADER, PREPARED_TYPE, SOURCE
 from .driven import Driven
+from .rolled import ROLLED, constant_array
 from .slots import PREPARED, Interface, Slot, expressions, slots, type_of
 
 
@@ -221,9 +222,19 @@ class CProject:
         return str(int(value))
 
     def _defaults(self) -> str:
-        places = expressions(self.parameters, "parameters.")
-        numbers = [self._number(v) for values in self.values for v in values]
-        lines = [f"    {a} = {b};" for a, b in zip(places, numbers, strict=True)]
+        lines = []
+        for slot, values in zip(self.parameters, self.values, strict=True):
+            numbers = [self._number(value) for value in values]
+            if len(numbers) < ROLLED:
+                places = expressions([slot], "parameters.")
+                lines += [
+                    f"    {a} = {b};" for a, b in zip(places, numbers, strict=True)
+                ]
+                continue
+            values = f"{type_of(slot.dtype, self.precision)} values"
+            lines += ["    {", *constant_array(values, numbers, " " * 8)]
+            lines += [f"        for (int i = 0; i < {slot.size}; i++)"]
+            lines += [f"            parameters.{slot.name}[i] = values[i];", "    }"]
         return "\n".join(lines or ["    parameters.unused = 0;"])
 
     def _checks(self) -> str:

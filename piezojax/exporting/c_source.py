@@ -1,5 +1,6 @@
 """C99 source of the operations of a graph."""
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
@@ -8,6 +9,7 @@ import jax
 import numpy as np
 
 from .graph import CARRY, CONSTANT, INPUT, READ, RESULT, Block, Graph, Node
+from .rolled import ROLLED, Piece, constant_array, pieces
 
 INFIX = {
     "add": "+", "sub": "-", "mul": "*", "div": "/",
@@ -144,20 +146,98 @@ class _Writer:
 
     def block(self, block: Block, indent: str) -> Iterator[str]:
         source = ""
-        for number in block.order:
-            if number < 0:
-                yield from self._loop(-1 - number, indent)
+        for alike, group in itertools.groupby(self._computed(block), self._alike):
+            numbers = list(group)
+            if alike is None:
+                for number in numbers:
+                    yield from self._loop(-1 - number, indent)
                 continue
-            node = self.graph.nodes[number]
-            if number not in self.needed or number in self.held:
-                continue
-            if node.operation in NOTHING:
-                continue
+            node = self.graph.nodes[numbers[0]]
             if node.source and node.source != source:
                 source = node.source
                 yield f"{indent}/* {source} */"
-            text = self._operation(node)
-            yield f"{indent}const {self._type(node)} {self._name(number)} = {text};"
+            yield from self._statements(numbers, indent)
+
+    def _computed(self, block: Block) -> Iterator[int]:
+        """Yield the loops of a block, and the nodes that it computes."""
+        for number in block.order:
+            if number < 0:
+                yield number
+                continue
+            operation = self.graph.nodes[number].operation
+            skipped = operation in NOTHING or number in self.held
+            if number in self.needed and not skipped:
+                yield number
+
+    def _alike(self, number: int) -> tuple | None:
+        """Return what is equal for the operations of an array; None for a loop."""
+        if number < 0:
+            return None
+        node = self.graph.nodes[number]
+        kinds = tuple(self.graph.nodes[n].kind for n in node.operands)
+        return node._replace(operands=()), kinds
+
+    def _statements(self, numbers: Sequence[int], indent: str) -> list[str]:
+        """Return the statements of equal operations, in loops if these are shorter."""
+        if len(numbers) < ROLLED:
+            return [self._single(number, indent) for number in numbers]
+        name = f"a{len(self.variables)}"
+        self.variables |= {number: f"{name}[{i}]" for i, number in enumerate(numbers)}
+        tables, rows = self._tabulated(numbers, name, indent)
+        found = list(pieces(rows))
+        if 2 * len(found) <= len(numbers):
+            return [*tables, *self._array(numbers, name, found, indent)]
+        # The long pieces alone.
+        for number in numbers:
+            del self.variables[number]
+        lines = []
+        for first, end, _ in found:
+            lines += self._statements(numbers[first:end], indent)
+        return lines
+
+    def _single(self, number: int, indent: str) -> str:
+        node = self.graph.nodes[number]
+        text = self._operation(node, [self.expression(n) for n in node.operands])
+        return f"{indent}const {self._type(node)} {self._name(number)} = {text};"
+
+    def _array(
+        self, numbers: Sequence[int], name: str, found: Sequence[Piece], indent: str
+    ) -> Iterator[str]:
+        node = self.graph.nodes[numbers[0]]
+        yield f"{indent}{self._type(node)} {name}[{len(numbers)}];"
+        for first, end, operands in found:
+            text = self._operation(node, operands)
+            if end == first + 1:
+                yield f"{indent}{name}[{first}] = {text};"
+                continue
+            yield f"{indent}for (int i = {first}; i < {end}; i++)"
+            yield f"{indent}    {name}[i] = {text};"
+
+    def _tabulated(
+        self, numbers: Sequence[int], name: str, indent: str
+    ) -> tuple[list[str], list[tuple[str, ...]]]:
+        """Return tables of the operands that are changing constants, and all operands.
+
+        The expressions of such operands are elements of the tables.
+        """
+        nodes, tables, columns = self.graph.nodes, [], []
+        operands = [nodes[number].operands for number in numbers]
+        for place, column in enumerate(zip(*operands, strict=True)):
+            texts = [self.expression(number) for number in column]
+            alone = [
+                i
+                for i, number in enumerate(column)
+                if nodes[number].operation == CONSTANT
+                and number not in column[max(i - 1, 0) : i] + column[i + 1 : i + 2]
+            ]
+            if alone:
+                table = f"{name}_{place}"
+                declaration = f"{self._type(nodes[column[alone[0]]])} {table}"
+                tables += constant_array(declaration, [texts[i] for i in alone], indent)
+                for index, i in enumerate(alone):
+                    texts[i] = f"{table}[{index}]"
+            columns.append(texts)
+        return tables, list(zip(*columns, strict=True))
 
     def _loop(self, number: int, indent: str) -> Iterator[str]:
         loop, nodes = self.graph.loops[number], self.graph.nodes
@@ -187,8 +267,9 @@ class _Writer:
             yield f"{inner}{name} = n{loop.carried[p]};"
         yield f"{indent}}}"
 
-    def _operation(self, node: Node) -> str:
-        a, b, c = ([self.expression(n) for n in node.operands] + ["", ""])[:3]
+    def _operation(self, node: Node, operands: Sequence[str]) -> str:
+        """Return the expression of a node with the expressions of its operands."""
+        a, b, c = [*operands, "", ""][:3]
         name = node.operation
         kinds = [self.graph.nodes[n].kind for n in node.operands]
         if name == READ:
