@@ -22,6 +22,8 @@ def outcome(name, values, limit):
         ([1.2, 1.9], 2.0, True, False, 2, 1.9),
         ([1.2, 1.97], 2.0, True, True, 2, 1.97),
         ([1.2, 2.001], 2.0, True, True, 2, 2.001),
+        ([1.2, 1.93], 2.0, True, False, 2, 1.93),
+        ([1.2, 2.003], 2.0, False, False, 1, 2.003),
         ([1.2, 2.01], 2.0, False, False, 1, 2.01),
         ([1.2, math.nan], 2.0, False, False, 1, None),
         ([0.5, 0.02], 2.0, True, False, 2, 0.5),
@@ -77,6 +79,10 @@ def test_a_summary_of_plants():
     assert found.geomeans_um == [pytest.approx(2.0), None, pytest.approx(4.0)]
     assert found.geomeans_before_um == [pytest.approx(6.0), pytest.approx(1.0), None]
     assert found.geomean_before_rms_um is None
+    stable = Perturbed.of(figures(BEFORE[:2]), figures(AFTER[:2]), DRIVEN, {})
+    assert stable.geomean_before_rms_um == pytest.approx(3.5)
+    without = stable.model_copy(update={"geomeans_before_um": []})
+    assert without.geomean_before_rms_um is None
 
 
 def held_out(perturbed):
