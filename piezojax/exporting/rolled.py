@@ -5,11 +5,8 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-ROLLED = 16
-"""Smallest number of consecutive equal operations whose results form an array."""
-
-REPEATED = 8
-"""Smallest number of elements that a loop computes."""
+ROLLED = 8
+"""Smallest number of consecutive equal operations that a loop computes."""
 
 _ELEMENT = re.compile(r"(.+)\[(\d+)\]")
 
@@ -36,7 +33,7 @@ def pieces(rows: Sequence[Sequence[str]]) -> Iterator[Piece]:
     while first < len(rows):
         end, steps = _piece(rows, first)
         operands = tuple(rows[first])
-        if end - first < REPEATED:
+        if end - first < ROLLED:
             end = first + 1
         else:
             each = zip(operands, steps, strict=True)

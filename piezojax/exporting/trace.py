@@ -67,6 +67,9 @@ ALIASES = {"add_any": "add"}
 LONG = 256
 """Smallest size of a real input that remains an array in C."""
 
+REPEATED = 8
+"""Smallest number of repetitions of a scan that remains a loop in C."""
+
 MOST = 15_000
 """Largest number of nodes of a graph; C compilers take minutes for more."""
 
@@ -223,48 +226,79 @@ class _Tracer:
         return found
 
     def scan(self, params: Any, operands: list[Numbers]) -> list[Numbers]:
-        """Return the results of a scan, which is unrolled."""
+        """Return the results of a scan, which is unrolled.
+
+        A scan that only repeats, without rows in or out, remains a loop in C.
+        """
         consts, count = params["num_consts"], params["num_carry"]
         shared, carry = operands[:consts], operands[consts : consts + count]
         rows = operands[consts + count :]
-        order = range(params["length"])
+        closed, length = params["jaxpr"], params["length"]
+        if not rows and len(closed.jaxpr.outvars) == count and length >= REPEATED:
+            return self._repeated(closed, shared, carry, length)
+        order = range(length)
         collected: list[list[Numbers]] = []
         for i in reversed(order) if params["reverse"] else order:
-            found = self.evaluate(
-                params["jaxpr"], [*shared, *carry, *(x[i] for x in rows)]
-            )
+            found = self.evaluate(closed, [*shared, *carry, *(x[i] for x in rows)])
             carry = found[:count]
             collected.append(found[count:])
         if params["reverse"]:
             collected.reverse()
         return [*carry, *(np.stack(each) for each in zip(*collected, strict=True))]
 
+    def _repeated(
+        self, closed: Any, shared: list[Numbers], carry: list[Numbers], length: int
+    ) -> list[Numbers]:
+        """Return the carry after ``length`` evaluations, which a loop in C counts."""
+        one, end = (self.arrays.constants(np.asarray(n)) for n in (1, length))
+
+        def condition(inside: list[Numbers]) -> Numbers:
+            return self.arrays.elementwise("lt", [inside[0], end], "boolean")
+
+        def body(inside: list[Numbers]) -> list[Numbers]:
+            following = self.arrays.elementwise("add", [inside[0], one], "integer")
+            return [following, *self.evaluate(closed, [*shared, *inside[1:]])]
+
+        start = self.arrays.constants(np.asarray(0))
+        return self._looped(condition, body, [start, *carry])[1:]
+
     def while_loop(self, params: Any, operands: list[Numbers]) -> list[Numbers]:
         """Return the results of a while loop, which remains a loop in C."""
         heads, bodies = params["cond_nconsts"], params["body_nconsts"]
         of_head, of_body = operands[:heads], operands[heads : heads + bodies]
-        first = operands[heads + bodies :]
+
+        def condition(inside: list[Numbers]) -> Numbers:
+            return self.evaluate(params["cond_jaxpr"], [*of_head, *inside])[0]
+
+        def body(inside: list[Numbers]) -> list[Numbers]:
+            return self.evaluate(params["body_jaxpr"], [*of_body, *inside])
+
+        return self._looped(condition, body, operands[heads + bodies :])
+
+    def _looped(
+        self,
+        condition: Callable[[list[Numbers]], Numbers],
+        body: Callable[[list[Numbers]], list[Numbers]],
+        first: list[Numbers],
+    ) -> list[Numbers]:
+        """Return the values after a loop that starts with the values ``first``.
+
+        ``condition`` and ``body`` receive the values at the start of an iteration.
+        """
         graph = self.graph
         before, mark = _flat(first), len(graph.nodes)
         level = graph.level + 1
-        head, body = Block(level), Block(level)
-        with graph.inside(head):
+        inner, outer = Block(level), Block(level)
+        with graph.inside(outer):
             carried = [
                 graph.add(CARRY, (), graph.nodes[number].kind, (mark, place))
                 for place, number in enumerate(before)
             ]
             inside = _like(first, carried)
-            (condition,) = self.evaluate(params["cond_jaxpr"], [*of_head, *inside])
-            with graph.inside(body):
-                last = self.evaluate(params["body_jaxpr"], [*of_body, *inside])
-        loop = Loop(
-            tuple(before),
-            tuple(carried),
-            head,
-            int(condition),
-            body,
-            tuple(_flat(last)),
-        )
+            holds = int(condition(inside))
+            with graph.inside(inner):
+                last = _flat(body(inside))
+        loop = Loop(tuple(before), tuple(carried), outer, holds, inner, tuple(last))
         return _like(first, graph.add_loop(loop))
 
 

@@ -3,7 +3,6 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from ..core.arrays import Scalar, State
 from ..core.system import System
@@ -18,9 +17,8 @@ def load_to(system: System, state: Any, input: Scalar) -> State:
     """
     start = state.input
 
-    def part(state, share):
-        return system.step(state, start + share * (input - start))[0], None
+    def part(number, state):
+        return system.step(state, start + number / PARTS * (input - start))[0]
 
-    shares = jnp.arange(1, PARTS + 1) / PARTS
-    state, _ = jax.lax.scan(part, state, shares)
+    state = jax.lax.fori_loop(1, PARTS + 1, part, state)
     return state._replace(input=input)  # exact, so that a step at rest has no change

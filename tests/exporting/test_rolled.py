@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import piezojax as pj
 from piezojax.core.system import System
-from piezojax.exporting.rolled import REPEATED, pieces
+from piezojax.exporting.rolled import ROLLED, pieces
 
 
 def elements(piece):
@@ -49,14 +49,14 @@ def test_pieces_hold_every_element_once_and_in_order(left, right):
     assert [row for piece in found for row in elements(piece)] == rows
     ends = [0, *(piece.end for piece in found)]
     assert [piece.first for piece in found] == ends[:-1]
-    assert all(p.end - p.first == 1 or p.end - p.first >= REPEATED for p in found)
+    assert all(p.end - p.first == 1 or p.end - p.first >= ROLLED for p in found)
 
 
 @pytest.mark.parametrize("step", [-2, 0, 1, 24])
-@pytest.mark.parametrize("count", [REPEATED - 1, REPEATED, 100])
+@pytest.mark.parametrize("count", [ROLLED - 1, ROLLED, 100])
 def test_a_regular_array_is_one_loop(step, count):
     rows = [["u", f"x[{300 + step * i}]"] for i in range(count)]
-    assert len(list(pieces(rows))) == (1 if count >= REPEATED else count)
+    assert len(list(pieces(rows))) == (1 if count >= ROLLED else count)
 
 
 LINE = 40
@@ -107,3 +107,36 @@ def test_a_short_step_has_no_arrays(tmp_path):
     about = pj.About(judged=["fine"], reference_ranges=[(0.0, 10.0)])
     pj.export(pj.catalog.p753.pid(), tmp_path / "c", about=about, limits=[(0.0, 9.0)])
     assert "for (int" not in (tmp_path / "c" / "controller.c").read_text()
+
+
+class Substepped(System):
+    """A nonlinear lag with ``count`` steps a sample, which start and end together."""
+
+    gain: jax.Array
+    count: int
+
+    def init(self, input=0.0):
+        return jnp.asarray(input), jnp.asarray(0.0)
+
+    def step(self, state, input):
+        def part(number, state):
+            x, y = state
+            return 0.5 * (x + jnp.tanh(input) / (number + 1)), y + 1e-3 * self.gain * x
+
+        x, y = jax.lax.fori_loop(0, self.count, part, state)
+        return (x, 0.9 * y), x + y
+
+
+@pytest.mark.skipif(
+    shutil.which("cc") is None or shutil.which("make") is None,
+    reason="there is no C compiler",
+)
+@pytest.mark.parametrize(("count", "loops"), [(7, 0), (8, 1), (40, 1)])
+def test_repetitions_remain_a_loop(count, loops, tmp_path):
+    about = pj.About(judged=["fine"], reference_ranges=[(0.0, 10.0)])
+    pj.export(Substepped(jnp.asarray(0.3), count), tmp_path / "c", about=about)
+    assert (tmp_path / "c" / "plant.c").read_text().count("for (;;) {") == loops
+    done = subprocess.run(
+        ["make", "-s", "test"], cwd=tmp_path / "c", capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
