@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -170,6 +171,11 @@ def test_answers_replace_defaults(record):
         ({"track": " ,"}, "track names no reference, as SIN10,PWSW40"),
         ({"track": "SIN"}, "track: SIN has no frequency; SIN10 has 10 Hz"),
         ({"track": "SINE10"}, "signal 'SINE10' is unknown; it must be one of SIN"),
+        ({"scale": -1.0}, "scale is -1 V/um; it must be at least 0"),
+        (
+            {"lowest": 3.0, "highest": 2.0},
+            "lowest is 3 um and highest 2 um; lowest must be below highest",
+        ),
         ({"controller": "pid"}, "'pid' is unknown; there are inversion_slid"),
         (
             {"amplitude": 4.0, "offset": 1.0},
@@ -230,6 +236,54 @@ def test_the_study_holds_the_answers_and_fits_the_record(record, tmp_path):
     assert any(text.startswith("fitting from") for text in stages)
 
 
+DEVICE_PLAN = Plan(
+    0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0, 50.0, "nv200", 5.0, -1.0, 9.0
+)
+
+
+@pytest.mark.parametrize(
+    ("device", "parameter"), [("nv200", "ki"), ("e727", "integral_time")]
+)
+def test_the_study_of_a_device_runs_at_its_rate(record, tmp_path, device, parameter):
+    plan = replace(DEVICE_PLAN, controller=device)
+    columns = {"time": "time_s", "input": "command_V", "output": "sensor_um"}
+    text = first_study(plan, record, columns, 1e3, folder=tmp_path, model="lag")
+    path = tmp_path / "study.toml"
+    path.write_text(text, encoding="utf-8")
+    case = build(load(path), path)
+    assert case.study.rate == 20_000.0
+    assert len(case.fit.record.input) == pytest.approx(3000 * 20, rel=1e-3)
+    controller = case.loop.controller
+    assert (type(controller).__name__.lower(), controller.scale) == (device, 5.0)
+    assert f"controller.{parameter}" in case.space.paths
+    ranges = case.space.ranges()
+    (notch,) = (path for path in ranges if "notchf" in path or "frequency" in path)
+    start = float(getattr(controller, notch.rpartition(".")[2]))
+    found = ranges[notch].lower, ranges[notch].upper
+    assert found == pytest.approx((start / 1.5, 1.5 * start), abs=1.0)
+    if device == "nv200":
+        assert (controller.posmin, controller.posmax) == (-1.0, 9.0)
+        # 50 um/s of 10 um are 0.5 % a millisecond.
+        assert controller.sr == pytest.approx(0.5)
+
+
+def test_a_record_at_the_rate_of_the_device_is_not_interpolated(tmp_path):
+    text = first_study(DEVICE_PLAN, tmp_path / "r.csv", {}, 2e4, folder=tmp_path)
+    assert "resample" not in tomllib.loads(text)["plant"]
+    text = first_study(DEVICE_PLAN, tmp_path / "r.csv", {}, 16e3, folder=tmp_path)
+    assert tomllib.loads(text)["plant"]["resample"] == 2e4
+
+
+def test_a_device_without_a_scale_is_doubted_or_refused(record, tmp_path):
+    loaded = read_record(record, time="time_s", input=1, output=2)
+    (doubt,) = doubts(planned(loaded, {"controller": "nv200"}), loaded)
+    assert "--controller nv200, with a record of error and voltage" in doubt
+    assert doubts(planned(loaded, {"controller": "nv200", "scale": 2.0}), loaded) == []
+    plan = replace(DEVICE_PLAN, controller="e727", scale=0.0)
+    with pytest.raises(ValueError, match="the E-727 needs the scale of its gains"):
+        first_study(plan, tmp_path / "r.csv", {}, 2e4, folder=tmp_path)
+
+
 @pytest.mark.parametrize("title", ['"quoted" \\ back', "um ä µ"])
 def test_names_of_files_are_quoted(tmp_path, title):
     plan = Plan(0.0, 80.0, 0.02, 2.0, "SIN2", 1.0, 2.0, 50.0)
@@ -278,8 +332,8 @@ class Verbs:
         save(PID(0.1, 1.0, dt=1e-3), out / "gains.toml", about)
         return SimpleNamespace(result=result, case=None, holdout=None)
 
-    def export(self, source, console, *, study, out, runs):
-        self.calls.append(("export", source.name))
+    def export(self, source, console, *, to, study, out, runs):
+        self.calls.append(("export", source.name, to))
         out.mkdir()
         (out / "Makefile").touch()
 
@@ -307,13 +361,29 @@ def run(monkeypatch, record, tmp_path):
 def test_a_start_without_questions_tunes_and_exports(run, tmp_path):
     status, output, calls = run("--yes", "--upper", "60")
     assert status == 0, output
-    assert calls == [("tune", "tuned"), ("export", "tuned")]
+    assert calls == [("tune", "tuned"), ("export", "tuned", "c")]
     assert "input 'command_V' from" in output
     assert "upper limit of the voltage [V]: 60.0" in output
     assert "done: gains and pictures in" in output
     study = load(tmp_path / "out" / "study.toml")
     assert study.actuator.upper == 60.0
     assert set(study.limits) == {"sensitivity_peak", "delay_margin"}
+
+
+def test_the_questions_of_a_device_are_asked_for_it_alone(run, tmp_path):
+    answers = 8 * "\n" + "nv200\n2.5\n\n12\n"
+    status, output, calls = run(answers=answers)
+    assert status == 0, output
+    assert calls == [("tune", "tuned"), ("export", "tuned", "vendor")]
+    assert f"values in {tmp_path / 'out' / 'controller'}" in output
+    table = load(tmp_path / "out" / "study.toml").controller
+    assert (table["design"], table["scale"], table["range"][1]) == ("nv200", 2.5, 12.0)
+
+
+def test_other_controllers_have_no_questions_of_devices(run):
+    status, output, _ = run("--yes")
+    assert status == 0, output
+    assert "scale of the gains" not in output
 
 
 def test_answers_are_asked_for_with_defaults(run, tmp_path):
@@ -373,7 +443,7 @@ def test_an_interrupted_start_goes_on(run, tmp_path):
     status, output, calls = run("--yes")
     assert status == 0
     assert f"going on in {tmp_path / 'out'} with its study.toml" in output
-    assert calls == [("tune", "tuned-2"), ("export", "tuned-2")]
+    assert calls == [("tune", "tuned-2"), ("export", "tuned-2", "c")]
     status, output, calls = run()
     assert (status, calls) == (0, [])
     assert "tuned before: the gains are in" in output
@@ -386,7 +456,7 @@ def test_a_changed_study_is_tuned_again(run, tmp_path):
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace("steps = 40", "steps = 41"), encoding="utf-8")
     status, _, calls = run()
-    assert (status, calls) == (0, [("tune", "tuned-2"), ("export", "tuned-2")])
+    assert (status, calls) == (0, [("tune", "tuned-2"), ("export", "tuned-2", "c")])
     assert (tmp_path / "out" / "controller-2" / "Makefile").is_file()
     # the first answers again: their gains are there
     path.write_text(text, encoding="utf-8")

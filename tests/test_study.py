@@ -780,6 +780,57 @@ def test_a_reference_at_half_the_rate_beside_a_recorded_one(refusal, tmp_path):
     assert "the frequency of SIN10000 is not below half the rate" in message
 
 
+@pytest.mark.parametrize(
+    ("controller", "message"),
+    [
+        (
+            {"design": "nv200", "scal": 1.0},
+            "nv200 has no setting 'scal'; its settings are scale, slew, range",
+        ),
+        (
+            {"design": "inversion_pid", "scale": 1.0},
+            "inversion_pid has no setting 'scale'; it has none",
+        ),
+        ({"design": "e727"}, "e727 needs the setting 'scale'"),
+        (
+            {"design": "nv200", "scale": "big"},
+            "the setting 'scale' is 'big': Input should be a valid number",
+        ),
+        ({"design": "nv200", "range": [1.0]}, "the setting 'range' is [1.0]: "),
+        ({"design": "nv201"}, "'nv201' is unknown; there are inversion_sliding"),
+    ],
+)
+def test_settings_of_designs(refusal, controller, message):
+    found = refusal({"controller": controller, "parameters": GONE, "tune": ["x"]})
+    assert found.startswith("controller.design: ")
+    assert message in found
+
+
+def test_a_parameter_within_a_factor_of_its_start(study):
+    path = "controller.integral"
+    start = float(read(study({})).loop.controller.integral)
+
+    def bounds(table):
+        found = read(study({"parameters": {path: table}})).space.ranges()[path]
+        return found.lower, found.upper
+
+    assert bounds({"within": 3.0}) == pytest.approx((start / 3.0, 3.0 * start))
+    assert bounds({"within": 2.0, "start": 8.0}) == pytest.approx((4.0, 16.0))
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"within": 1.0}, "within is 1.0: Input should be greater than 1"),
+        ({"within": 2.0, "upper": 9.0}, "within stands for lower and upper"),
+        ({"within": 2.0, "start": 0.0}, "within needs a start above 0; the start is 0"),
+    ],
+)
+def test_bad_factors(refusal, table, message):
+    found = refusal({"parameters": {"controller.integral": table}})
+    assert message in found
+
+
 def test_a_front_has_at_least_two_limits(study, refusal):
     front = {"constraint": "effort", "limits": [20.0, 30.0]}
     limit = {"constraints": {"effort": 30.0}}

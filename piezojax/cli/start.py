@@ -50,9 +50,15 @@ QUESTIONS = {
     "slew": Question(
         "fastest slew that the controller follows; jumps become ramps [um/s]"
     ),
-    "controller": Question("controller to tune", str, ", as inversion_pid"),
+    "controller": Question("controller to tune", str, ", as inversion_pid or nv200"),
+    "scale": Question("scale of the gains of the device, 0 if unknown [V/um]"),
+    "lowest": Question("lowest position of the device's range [um]"),
+    "highest": Question("highest position of the device's range [um]"),
 }
 """The questions by the name of their option; ``planned`` gives the defaults."""
+
+OF_DEVICES = ("scale", "lowest", "highest")
+"""Questions that only the design of a device needs."""
 
 
 def questions(function: Callable) -> Callable:
@@ -167,7 +173,8 @@ def _write_study(
     fresh_folder(study.parent)
     write_text(study, text)
     for name, question in QUESTIONS.items():
-        console.print(f"{question.text}: {getattr(plan, name)}", soft_wrap=True)
+        if _concerns(name, plan):
+            console.print(f"{question.text}: {getattr(plan, name)}", soft_wrap=True)
     for doubt in doubts(plan, in_units):
         console.print(f"note: {doubt}", soft_wrap=True)
     console.print(f"wrote {study}", soft_wrap=True)
@@ -183,7 +190,7 @@ def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
 
     plan, answers = planned(record, given), dict(given)
     for name, question in QUESTIONS.items():
-        while answers[name] is None:
+        while answers[name] is None and _concerns(name, plan):
             try:
                 answer = click.prompt(question.text, default=getattr(plan, name))
             except click.Abort:
@@ -197,6 +204,13 @@ def _asked(record: "Record", given: dict[str, Any]) -> "Plan":
             except ValueError as error:
                 click.echo(f"{error}")
     return plan
+
+
+def _concerns(name: str, plan: "Plan") -> bool:
+    """Return whether a question matters for the controller of ``plan``."""
+    from ..study.first_study import DEVICES
+
+    return name not in OF_DEVICES or plan.controller in DEVICES
 
 
 def _check_same(study: Path, record: Path, given: dict[str, Any]) -> None:
@@ -242,24 +256,33 @@ def _going_on(record: Path, folder: Path) -> str:
 def _export(
     folder: Path, tuned: Path, outcome: "Outcome | None", console: Console
 ) -> None:
-    """Export the gains in ``tuned`` as C, unless they are exported already."""
+    """Export the gains in ``tuned``, unless they are exported already.
+
+    Those of a device become its own file, all others C code.
+    """
+    from ..study import load
+    from ..study.first_study import DEVICES
     from ..tuning.exported_runs import make_runs
 
+    device = load(folder / STUDY).controller.get("design") in DEVICES
     # The gains in tuned-2 go to controller-2.
     exported = folder / tuned.name.replace(TUNED, EXPORTED, 1)
-    if (exported / "Makefile").is_file():
+    if exported.is_dir() and any(exported.iterdir()):
         console.print(f"exported before: {exported}", soft_wrap=True)
         return
     exported = numbered_folder(exported)
     export_file(
         tuned,
         console,
+        to="vendor" if device else "c",
         study=folder / STUDY,
         out=exported,
-        runs=make_runs(outcome.case, outcome.holdout) if outcome else None,
+        runs=None
+        if device or outcome is None
+        else make_runs(outcome.case, outcome.holdout),
     )
     console.print(
-        f"done: gains and pictures in {tuned}, C code in {exported}, the study in "
-        f"{folder / STUDY}",
+        f"done: gains and pictures in {tuned}, {'values' if device else 'C code'} in "
+        f"{exported}, the study in {folder / STUDY}",
         soft_wrap=True,
     )

@@ -118,8 +118,11 @@ def _balance(model: StateSpace) -> _Balance:
             f"the model has a pole at radius {radius:.6g}; only a stable model, with "
             "all poles inside the unit circle, can be balanced"
         )
-    controllable = _root(linalg.solve_discrete_lyapunov(A, B @ B.T))
-    observable = _root(linalg.solve_discrete_lyapunov(A.T, C.T @ C))
+    # The default of scipy for few states solves one large, ill-conditioned equation.
+    controllable, observable = (
+        _root(linalg.solve_discrete_lyapunov(a, q, method="bilinear"))
+        for a, q in ((A, B @ B.T), (A.T, C.T @ C))
+    )
     left, hankel, right = np.linalg.svd(observable.T @ controllable)
     connected = int(np.sum(hankel > len(A) * np.finfo(float).eps * hankel[0]))
     return _Balance(hankel, observable @ left, controllable @ right.T, connected)

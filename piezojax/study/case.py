@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..catalog import CONTROLLERS, PLANTS
-from ..control.design import DESIGNS
 from ..control.design_model import NoInverseError
 from ..core.about import About
 from ..core.arrays import as_array
@@ -23,6 +22,7 @@ from ..core.system import System, accepts
 from ..identification import Fit
 from ..identification.residual_record import ResidualRecord, load_residual
 from ..identification.response_model import ResponseModel
+from .designs import design_of
 from .ensemble import Ensemble, Stage, ensemble_of
 from .fitted_plant import fitted_plant, on_axes, plant_of_response
 from .make_hardware import driven, make_actuator, make_amplifier, make_sensor, per_axis
@@ -32,7 +32,6 @@ from .parameters import check_value, search_space
 from .references import reference_signals
 from .schema import Study, load
 from .sources import about_file, source_error, system_of
-from .tables import one_of
 from .trajectories import read_trajectories
 
 
@@ -128,8 +127,8 @@ def build(
     design_notes: list[str] = []
 
     def controller_of(table: dict[str, Any], where: str) -> System:
-        def design(name: str) -> System:
-            return _designed(study, name, plant, fit, design_notes.append)
+        def design(table: dict[str, Any]) -> System:
+            return _designed(study, table, plant, fit, design_notes.append)
 
         folder, rate = path.parent, study.rate
         found = system_of(table, where, folder, CONTROLLERS, rate, design)
@@ -290,18 +289,18 @@ def _with_gains(
 
 def _designed(
     study: Study,
-    name: str,
+    table: dict[str, Any],
     plant: System,
     fit: Fit | None,
     note: Callable[[str], None],
 ) -> System:
-    """Return the controller of a design.
+    """Return the controller of the design in ``table``, with the settings beside it.
 
     A fitted hysteresis without an inverse between the limits of the actuator may have
     one over the range of its record, beyond which it extrapolates. The voltage then
     stays within the record, and ``note`` is called with a sentence on this.
     """
-    design = DESIGNS[one_of(name, DESIGNS)]
+    design = design_of(table)
     if study.axes is not None:
         raise ValueError(
             f"designs are for one axis; the study has {study.axis_count}: give the "

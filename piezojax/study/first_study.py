@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ..control.design import DESIGNS
+from ..control.devices.servo_loop import FIXED_DT
 from ..identification import DEFAULT, Record
 from ..identification.records.recognise import noise_rms
 from ..signals import signal, time_grid
 from ..signals.waveforms import parse
+from .designs import ALL_DESIGNS
 from .tables import one_of
 
 SHARE = 0.2
@@ -35,6 +36,22 @@ BEYOND = 0.1
 NOISY = 0.05
 """Share of the recorded span above which the given noise is doubtful."""
 
+DEVICES: dict[str, dict[str, float | None]] = {
+    "nv200": {"kp": None, "ki": None, "pcf_x": None, "notchf": 1.5, "notchb": 4.0},
+    "e727": {
+        **dict.fromkeys(("proportional", "integral_time")),
+        **dict.fromkeys(("notch_rejection_1", "notch_bandwidth_1")),
+        "notch_frequency_1": 1.5,
+    },
+}
+"""Parameters to tune of each design of a device; a factor limits the deviation from the
+value of the design."""
+
+_MEASURE = (
+    "measure it (python -m piezojax.identify LOOP --controller {}, with a record of "
+    "error and voltage, docs/devices.md) and give it as --scale"
+)
+
 _CONSTANT = ("STEP", "CONST")
 """References without a frequency."""
 
@@ -51,8 +68,9 @@ class Plan:
     ``frequency`` is that of the slowest one. The references cover ``offset`` to
     ``offset + 2 amplitude``. The controller follows at most the slew ``slew``, um/s: it
     sees faster references, such as jumps, as ramps. ``controller`` is the name of a
-    design. Raises ValueError for values that no stage can have, and for unknown
-    references or designs.
+    design. For a device, ``scale`` is that of its gains (V/um; 0 stands for the assumed
+    one), and its range are the positions ``lowest`` to ``highest``. Raises ValueError
+    for values that no stage can have, and for unknown references or designs.
     """
 
     lower: float
@@ -64,9 +82,12 @@ class Plan:
     offset: float
     slew: float
     controller: str = "inversion_sliding_mode"
+    scale: float = 0.0
+    lowest: float = 0.0
+    highest: float = 1.0
 
     def __post_init__(self):
-        one_of(self.controller, DESIGNS)
+        one_of(self.controller, ALL_DESIGNS)
         for field in fields(self):
             value = getattr(self, field.name)
             if field.type is float and not np.isfinite(value):
@@ -76,13 +97,18 @@ class Plan:
                 raise ValueError(
                     f"{name} is {getattr(self, name):g} {unit}; it must be above 0"
                 )
-        if self.noise < 0.0:
-            raise ValueError(f"noise is {self.noise:g} um; it must be at least 0")
-        if self.lower >= self.upper:
-            raise ValueError(
-                f"lower is {self.lower:g} V and upper {self.upper:g} V; lower must be "
-                "below upper"
-            )
+        for name, unit in (("noise", "um"), ("scale", "V/um")):
+            if getattr(self, name) < 0.0:
+                raise ValueError(
+                    f"{name} is {getattr(self, name):g} {unit}; it must be at least 0"
+                )
+        for low, high, unit in (("lower", "upper", "V"), ("lowest", "highest", "um")):
+            ends = getattr(self, low), getattr(self, high)
+            if ends[0] >= ends[1]:
+                raise ValueError(
+                    f"{low} is {ends[0]:g} {unit} and {high} {ends[1]:g} {unit}; {low} "
+                    f"must be below {high}"
+                )
         if not self.tracked:
             raise ValueError("track names no reference, as SIN10,PWSW40")
         for name in self.tracked:
@@ -127,6 +153,8 @@ def planned(record: Record, given: dict[str, Any]) -> Plan:
         "amplitude": amplitude,
         "offset": _rounded(0.5 * (low + high) - amplitude),
         "slew": 1.0,  # until the references are known
+        "lowest": _rounded(float(low)),
+        "highest": _rounded(float(high)),
     }
     plan = Plan(**(suggested | known))
     if "slew" not in known:
@@ -173,6 +201,11 @@ def doubts(plan: Plan, record: Record) -> list[str]:
             f"the record shows a noise of about {measured:.2g} um rms, more than the "
             f"{plan.noise:g} um given: the gains may amplify it"
         )
+    if plan.controller in DEVICES and plan.scale == 0.0:
+        found.append(
+            "the scale of the gains of the device is unknown: it is assumed, and the "
+            f"gains will have an alarm: {_MEASURE.format(plan.controller)}"
+        )
     return found
 
 
@@ -191,10 +224,20 @@ def first_study(
 
     The paths in it are relative to ``folder``, where the study is to be written.
     ``record`` and the optional ``check`` are files of records, and ``columns`` are the
-    options of ``read_record`` for both; ``rate`` is the sampling rate of the loop, Hz,
-    and ``model`` the model to fit.
+    options of ``read_record`` for both; ``rate`` is that of the record, Hz, and
+    ``model`` the model to fit. The loop has the rate of the record, or that of the
+    device, to which the record is then interpolated. Raises ValueError for an E-727
+    without the scale of its gains.
     """
+    if plan.controller == "e727" and plan.scale == 0.0:
+        raise ValueError(
+            f"the E-727 needs the scale of its gains: {_MEASURE.format('e727')}"
+        )
     keys = {"rate": "record_rate"}
+    device = plan.controller in DEVICES
+    if device and not np.isclose(rate * FIXED_DT, 1.0, rtol=1e-9):
+        rate = 1.0 / FIXED_DT
+        columns = columns | {"resample": rate}
     plant = {
         "record": seen_from(folder, record),
         "model": model,
@@ -207,7 +250,8 @@ def first_study(
         "rate": _toml(rate),
         "seed": _toml(seed),
         "plant": "\n".join(f"{key} = {_toml(value)}" for key, value in plant.items()),
-        "dt": _toml(1.0 / rate),
+        "controller": _controller(plan, 1.0 / rate),
+        "parameters": _parameters(plan.controller),
         "tune": _toml(plan.tracked),
         "unseen": _toml(plan.unseen),
         "duration": _toml(PERIODS / plan.frequency),
@@ -222,13 +266,10 @@ _TEXT = Template("""\
 #     python -m piezojax.tune study.toml
 # Units: um, V, s, Hz.
 title = $title
-rate = $rate # of the loop and of the record
+rate = $rate # of the loop
 seed = $seed
 
-# Parameters to tune, with the bounds that the controller declares. [parameters] may
-# give other bounds.
-tune = ["controller.controller.feedback.*"]
-
+$parameters
 # The model is fitted to the first half of the record and validated on the second. A
 # second record, as check = "other.csv", shows whether the model still holds.
 [plant]
@@ -243,18 +284,7 @@ upper = $upper
 [sensor]
 noise_rms = $noise
 
-# The controller follows references up to this slew, um/s. It sees faster ones, such as
-# jumps, as ramps, because a jump excites the modes of the stage through the
-# feedforward. dt is 1 / rate.
-[controller]
-type = "LimitedReference"
-slew = $slew
-dt = $dt
-
-# This design gives the controller and its gains before tuning.
-[controller.controller]
-design = $controller
-
+$controller
 # References cover offset to offset + 2 amplitude. SIN is a sine, PWSW periods of a sine
 # at 100, 100, 50 and 15 % of the amplitude, SCAN a triangle with rounded turns; the
 # number is the frequency, Hz. The unseen ones only evaluate the tuned gains.
@@ -278,6 +308,68 @@ starts = 2
 candidates = 32
 steps = 40
 """)
+
+
+_LIMITED = Template("""\
+# The controller follows references up to this slew, um/s. It sees faster ones, such as
+# jumps, as ramps, because a jump excites the modes of the stage through the
+# feedforward. dt is 1 / rate.
+[controller]
+type = "LimitedReference"
+slew = $slew
+dt = $dt
+
+# This design gives the controller and its gains before tuning.
+[controller.controller]
+design = $controller
+""")
+
+_DEVICE = Template("""\
+# This design gives the parameters of the device before tuning: a slow integral and a
+# notch at the strongest mode. scale, V/um, is the command for a gain of 1 and an error
+# of 1 um: measure it, as docs/devices.md describes. The device follows setpoints up to
+# the slew, um/s, because a jump excites the modes of the stage.
+[controller]
+design = $controller
+scale = $scale
+slew = $slew
+""")
+
+
+_TUNE = """\
+# Parameters to tune, with the bounds that the controller declares. [parameters] may
+# give other bounds.
+tune = {}
+"""
+
+_WITHIN = """
+# These parameters stay within a factor of the values of the design.
+[parameters]
+"""
+
+
+def _parameters(controller: str) -> str:
+    """Return the keys that name the parameters to tune as TOML."""
+    if controller not in DEVICES:
+        return _TUNE.format(_toml(["controller.controller.feedback.*"]))
+    factors = {f"controller.{k}": factor for k, factor in DEVICES[controller].items()}
+    free = [path for path, factor in factors.items() if factor is None]
+    rows = [
+        f'"{p}" = {{ within = {x} }}\n' for p, x in factors.items() if x is not None
+    ]
+    return _TUNE.format(_toml(free)) + _WITHIN + "".join(rows)
+
+
+def _controller(plan: Plan, dt: float) -> str:
+    """Return the tables of the controller as TOML; ``dt`` in s."""
+    names = ("controller", "slew", "scale")
+    values = {name: _toml(getattr(plan, name)) for name in names}
+    if plan.controller not in DEVICES:
+        return _LIMITED.substitute(values, dt=_toml(dt))
+    text = _DEVICE.substitute(values)
+    if plan.controller == "nv200":
+        text += f"range = {_toml([plan.lowest, plan.highest])} # of the positions, um\n"
+    return text
 
 
 def _toml(value: Any) -> str:

@@ -6,9 +6,9 @@ from typing import Any
 
 from ..analysis.constraints import CONSTRAINTS, OFF
 from ..catalog import CONTROLLERS, PLANTS
-from ..control.design import DESIGNS
 from ..core.registry import kinds
 from ..solve.optimisers import GAUSS_NEWTON, METHODS
+from .designs import ALL_DESIGNS
 from .plant_tables import RecordPlant, ResponsePlant
 from .schema import Study
 from .sweep_table import METRICS
@@ -41,7 +41,7 @@ def study_schema() -> dict[str, Any]:
         ]
     }
     for table in (properties, tables["BesideTable"]["properties"]):
-        table["controller"] |= _source(CONTROLLERS, design=DESIGNS)
+        table["controller"] |= _source(CONTROLLERS, design=ALL_DESIGNS)
     properties["constraints"] = {
         "type": "object",
         "description": properties["constraints"]["description"],

@@ -54,12 +54,7 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
     for pattern in study.tune:
         for path in _tuned_paths(loop, pattern):
             tables.setdefault(path, TunedTable())
-    ranges = {
-        path: dataclasses.replace(
-            table.range(declared(loop, path), f"parameters.{path}"), start=table.start
-        )
-        for path, table in tables.items()
-    }
+    ranges = {path: _range(loop, path, table) for path, table in tables.items()}
     for path in tables.keys() - study.parameters.keys():
         ranges[path] = _reaching(ranges[path], float(get(loop, path)))
     switched_off = [
@@ -77,6 +72,13 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
         for path in sorted(switched_off)
     )
     return ranges, notes
+
+
+def _range(loop: Feedback, path: str, table: TunedTable) -> Range:
+    where, start = f"parameters.{path}", table.start
+    if table.within is not None:
+        table = table.bounded(float(get(loop, path)) if start is None else start, where)
+    return dataclasses.replace(table.range(declared(loop, path), where), start=start)
 
 
 def _reaching(bounds: Range, start: float) -> Range:

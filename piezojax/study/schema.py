@@ -134,6 +134,29 @@ class TunedTable(RangeTable):
 
     start: Finite | None = None
     """Start of the search; without this key the value in the controller."""
+    within: Annotated[float, Field(gt=1.0, allow_inf_nan=False)] | None = None
+    """Factor by which the parameter may differ from its start, instead of bounds: a
+    design computes the start for a plant that is not known before."""
+
+    @model_validator(mode="after")
+    def _one_pair_of_bounds(self) -> "TunedTable":
+        if self.within is not None and (self.lower, self.upper) != (None, None):
+            raise ValueError("within stands for lower and upper: give one of both")
+        return self
+
+    def bounded(self, value: float, where: str) -> "TunedTable":
+        """Return the table with the bounds of ``within`` around ``value``, if given.
+
+        Raises ValueError, beginning with ``where``, for a value that is not positive.
+        """
+        if self.within is None:
+            return self
+        if value <= 0.0:
+            raise ValueError(
+                f"{where}.within needs a start above 0; the start is {value:g}"
+            )
+        ends = {"lower": value / self.within, "upper": value * self.within}
+        return self.model_copy(update=ends)
 
 
 class BesideTable(Table):

@@ -36,12 +36,13 @@ def system_of(
     folder: Path,
     catalog: Mapping[str, Callable[..., System]],
     rate: float,
-    design: Callable[[str], System] | None = None,
+    design: Callable[[dict[str, Any]], System] | None = None,
 ) -> System:
     """Build the System of a table with one source: catalog, file, type or design.
 
-    Only a controller has a ``design``. A table with a type may contain tables with a
-    catalog or a design: a LimitedReference may contain the design that it limits.
+    Only a controller has a ``design``, which receives the table. A table with a type
+    may contain tables with a catalog or a design: a LimitedReference may contain the
+    design that it limits.
     Raises ValueError for a table with no source, several sources, or other keys.
     """
 
@@ -54,10 +55,11 @@ def system_of(
         "type": lambda: from_data(_with_parts(table, where, nested), where),
     }
     if design is not None:
-        sources["design"] = lambda: design(table["design"])
+        sources["design"] = lambda: design(table)
     given = [source for source in sources if source in table]
     known = {*sources, _ACCEPT} if "file" in table else set(sources)
-    extra = set() if "type" in table else set(table) - known
+    free = table.keys() & {"type", "design"}  # these check their other keys
+    extra = set() if free else set(table) - known
     if len(given) != 1 or extra:
         fitted = ["record", "response"] if where == "plant" else []
         allowed = (*sources, *fitted)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..analysis.plant_modes import PlantMode, plant_modes
 from ..core.paths import get, replace
 from ..core.progress import Progress
 from ..core.recipe import Resonance
+from ..dynamics.plant_modes import PlantMode, plant_modes
 from ..study import Case
 from ..study.with_notches import NOTCH, OFF, moved, place_of, with_notches
 from .alarms import HELD_OUT, PEAK, exact_peak

@@ -11,13 +11,13 @@ import tomli_w
 from scipy import signal
 
 import piezojax as pj
-from piezojax.analysis.plant_modes import plant_modes
 from piezojax.control import FilteredCommand
 from piezojax.core.error_bound import ErrorBound
 from piezojax.core.paths import get, get_part
 from piezojax.core.progress import Silent
 from piezojax.core.recipe import Resonance
 from piezojax.dynamics import Modes
+from piezojax.dynamics.plant_modes import plant_modes
 from piezojax.report.structure_pictures import structures_figure, structures_table
 from piezojax.study import Study, build
 from piezojax.study.with_notches import with_notches

@@ -1,5 +1,6 @@
 """Controllers of vendors and a generic servo, with parameters as typed in."""
 
+from .device_designs import DEVICE_DESIGNS as DEVICE_DESIGNS
 from .e727 import E727 as E727
 from .nv200 import NV200 as NV200
 from .pyrpl import PyRPL as PyRPL

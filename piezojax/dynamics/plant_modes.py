@@ -10,7 +10,8 @@ from scipy import linalg
 from ..core.arrays import Scalar, ScalarLike, as_array
 from ..core.feedback import holding_input
 from ..core.system import System
-from ..dynamics import StateSpace, linearise
+from .linearise import linearise
+from .state_space import StateSpace
 
 LIGHT = 0.2
 """Damping ratio below which a pair of poles is a mode; filters have larger ones."""
