@@ -457,7 +457,7 @@ def test_a_cut_off_below_nyquist_is_accepted(study):
             "parameters/controller.integral/scael",
             "log",
             "parameters.controller.integral.scael is unknown; allowed are lower, "
-            "upper, scale, start; did you mean 'scale'?",
+            "upper, scale, start, within; did you mean 'scale'?",
         ),
         (
             "objective/effort",
