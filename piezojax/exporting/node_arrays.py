@@ -183,6 +183,26 @@ class NodeArrays:
         batches = [left.shape[axis] for axis in left_batch]
         return self.reduced("add", products, [3]).reshape([*batches, *rows, *columns])
 
+    def triangular(self, matrix: Numbers, right: Numbers, params: Any) -> Numbers:
+        """Return X of A X = B, or of X A = B, for a triangular ``matrix`` A."""
+        if matrix.ndim != 2:
+            raise NotScalarError("it solves several systems of equations at once")
+        lower, left = params["lower"], params["left_side"]
+        if params["transpose_a"] == left:  # of both or of none
+            matrix, lower = matrix.T, not lower
+        rows = right if left else right.T
+        found: dict[int, Numbers] = {}
+        for i in range(len(matrix)) if lower else reversed(range(len(matrix))):
+            total = rows[i]
+            for j, known in found.items():
+                product = self.elementwise("mul", [matrix[i, j], known], "real")
+                total = self.elementwise("sub", [total, product], "real")
+            if not params["unit_diagonal"]:
+                total = self.elementwise("div", [total, matrix[i, i]], "real")
+            found[i] = total
+        solved = np.stack([found[i] for i in range(len(matrix))])
+        return solved if left else solved.T
+
     def kind(self, numbers: Numbers) -> Kind:
         """Return the kind of the first of ``numbers``, "real" if there are none."""
         return (

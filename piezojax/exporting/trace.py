@@ -167,6 +167,11 @@ class _Tracer:
         if name in FOLDS:
             axes = params.get("axes", range(operands[0].ndim))
             return [self.arrays.reduced(FOLDS[name], operands[0], axes)]
+        if name == "custom_linear_solve":
+            return self.linear_solve(params, operands)
+        if name == "triangular_solve":
+            matrix, right = operands
+            return [self.arrays.triangular(matrix, right, params)]
         if name == "dot_general":
             left, right = operands
             return [self.arrays.product(left, right, params["dimension_numbers"])]
@@ -202,6 +207,13 @@ class _Tracer:
         if any(((each < 0) | (each >= len(self.graph.nodes))).any() for each in found):
             raise NotScalarError(f"its {name} reads outside the array")
         return found
+
+    def linear_solve(self, params: Any, operands: list[Numbers]) -> list[Numbers]:
+        """Return the solution of linear equations whose matrix is factorised."""
+        lengths, jaxprs = params["const_lengths"], params["jaxprs"]
+        before = lengths.matvec + lengths.vecmat
+        consts = operands[before : before + lengths.solve]
+        return self.evaluate(jaxprs.solve, [*consts, *operands[sum(lengths) :]])
 
     def cond(self, branches: Any, operands: list[Numbers]) -> list[Numbers]:
         """Return the results of the branch that the first operand selects."""

@@ -1,5 +1,6 @@
 """Controllers and plants as C: compiled, run, and compared with the simulation."""
 
+import itertools
 import shutil
 import subprocess
 from typing import Any
@@ -15,6 +16,7 @@ import piezojax as pj
 from piezojax.catalog import CONTROLLERS, PLANTS
 from piezojax.core.parameter import parameter
 from piezojax.core.serial import to_data
+from piezojax.core.system import System
 from piezojax.exporting import Driven, NotScalarError, Seen, trace
 from piezojax.exporting.c_source import DOUBLE, statements
 from piezojax.exporting.graph import CONSTANT, INPUT
@@ -65,6 +67,47 @@ def test_a_controller_equals_its_simulation(name, samples, tmp_path):
     status, text = made(tmp_path / "c")
     assert status == 0, text
     assert "passed" in text
+
+
+class Equations(System):
+    """A static map that solves triangular equations, from both sides."""
+
+    matrix: jax.Array
+
+    def init(self, input=0.0):
+        return jnp.full(3, input)
+
+    def step(self, state, input):
+        state = jnp.stack([input, *state[:-1]])
+        total = jnp.zeros(())
+        for left, lower, transposed, unit in itertools.product((True, False), repeat=4):
+            solved = jax.lax.linalg.triangular_solve(
+                self.matrix,
+                state[:, None] if left else state[None],
+                left_side=left,
+                lower=lower,
+                transpose_a=transposed,
+                unit_diagonal=unit,
+            )
+            total = total + solved.ravel() @ jnp.asarray([1.0, -2.0, 3.0])
+        return state, total
+
+
+@compiled
+def test_triangular_equations_are_solved_in_every_step(tmp_path):
+    matrix = np.array([[2.0, 0.3, -0.4], [0.5, 1.5, 0.2], [-0.3, 0.7, 1.2]])
+    pj.export(Equations(jnp.asarray(matrix)), tmp_path / "c", about=ABOUT)
+    status, text = made(tmp_path / "c")
+    assert status == 0, text
+
+
+@compiled
+def test_a_linear_model_starts_at_rest_for_the_exported_parameters(tmp_path):
+    A = 0.98 * np.array([[np.cos(0.1), np.sin(0.1)], [-np.sin(0.1), np.cos(0.1)]])
+    model = pj.dynamics.StateSpace(A, [[0.01], [0.02]], [[1.0, 0.5]], [[0.0]], 5e-5)
+    pj.export(pj.core.axes.Packed(model), tmp_path / "c", about=ABOUT)
+    status, text = made(tmp_path / "c")
+    assert status == 0, text
 
 
 @compiled
