@@ -1,12 +1,14 @@
 """Test of ``piezojax.start --yes`` on stages that share no code with piezojax.
 
-    python tests/benchmarks/one_sitting.py [--stages 0:40:2] [--json FILE]
+    python tests/benchmarks/one_sitting.py [--stages 0:40:2] [--device NAME] [--excite]
 
 The record of each stage of tests/oracles is written in one of four dialects of files.
 ``start`` gets that file and ``--yes``, nothing else. The voltages are those of the
 oracles, or with ``--excite`` those of ``piezojax.excite``. Its gains then run on the
 stage as in promise.py, whose figures and bar the table has; the bar on the ratio is
-1.5, on 18 of 20 stages. Each start has 300 s.
+1.5, on 18 of 20 stages. Each start has 300 s. With ``--device nv200`` or ``e727`` the
+values of that device are tuned, with a scale of 9.3 V/um, on the stages whose record
+has its rate.
 """
 
 import argparse
@@ -26,6 +28,8 @@ from rich.console import Console
 from rich.table import Table
 
 import piezojax as pj
+from piezojax.control.devices import DEVICE_DESIGNS
+from piezojax.control.devices.servo_loop import FIXED_DT
 from piezojax.signals.excitation import Generator
 from piezojax.signals.excitation import excitation as excited_by
 from piezojax.tuning.result import load_result
@@ -78,12 +82,12 @@ def excited(stage):
     return voltages, np.concatenate([[first], stage.respond(voltages[:-1])[0]])
 
 
-def started(stage, dialect, folder, record_of):
+def started(stage, dialect, folder, record_of, options):
     """Return the exit status of a start, its output, and the seconds."""
     voltages, readings = record_of(stage)
     columns = np.c_[stage.dt * np.arange(len(voltages)), voltages, readings]
     record, begun = dialect(columns, folder), time.perf_counter()
-    command = [sys.executable, "-m", "piezojax.start", record, "--yes"]
+    command = [sys.executable, "-m", "piezojax.start", record, "--yes", *options]
     done = subprocess.run(
         [*command, "--out", folder / "out"], capture_output=True, text=True, check=False
     )
@@ -91,13 +95,13 @@ def started(stage, dialect, folder, record_of):
     return done.returncode, done.stdout + done.stderr, seconds
 
 
-def line_of(number, dialect, record_of):
+def line_of(number, dialect, record_of, options=()):
     """Return the line of a stage: exit status, figures and alarms."""
     stage = forty_stages.stage(number)
     line = {"name": stage.parameters.name, "dialect": dialect.__name__}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        status, output, seconds = started(stage, dialect, folder, record_of)
+        status, output, seconds = started(stage, dialect, folder, record_of, options)
         line |= {"status": status, "wall_s": seconds, "alarms": []}
         if status not in (0, 3):
             return line | {"refused": output.splitlines()[-1]}
@@ -105,8 +109,8 @@ def line_of(number, dialect, record_of):
         result = load_result(tuned)
         controller = pj.load(tuned / "gains.toml", accept_unsafe=True)
         study = tomllib.loads((folder / "out" / "study.toml").read_text("utf-8"))
-        exported = folder / "out" / "controller" / "controller.c"
-        line["exported"] = exported.is_file()
+        exported = folder / "out" / "controller"
+        line["exported"] = exported.is_dir() and any(exported.glob("controller.*"))
     setup = promise.Setup(stage, {}, study)
     outcome = SimpleNamespace(controller=controller, result=result)
     figures = promise.judged(outcome, setup)
@@ -121,6 +125,10 @@ def line_of(number, dialect, record_of):
         "lost": any(f["lost"] for f in figures.values()),
         "railed": max(f["railed"] for f in figures.values()) > promise.RAILED,
     }
+
+
+def has_device_rate(number):
+    return forty_stages.parameters(number).rate * FIXED_DT == 1.0
 
 
 def word_of(line):
@@ -170,15 +178,19 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--stages", default="0:40:2", metavar="FIRST:STOP:STEP")
     parser.add_argument("--excite", action="store_true", help="piezojax.excite records")
+    parser.add_argument("--device", choices=DEVICE_DESIGNS)
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     console = Console(width=None if sys.stdout.isatty() else 120)
     numbers = range(*(int(number) for number in chosen.stages.split(":")))
     record_of = excited if chosen.excite else excitation.record
-    lines = []
+    options, lines = [], []
+    if chosen.device:
+        options = ["--controller", chosen.device, "--scale", "9.3"]
+        numbers = [n for n in numbers if has_device_rate(n)]
     for number in numbers:
         dialect = DIALECTS[number // 2 % len(DIALECTS)]
-        line = line_of(number, dialect, record_of)
+        line = line_of(number, dialect, record_of, options)
         lines.append(line)
         ratio = f", {line['ratio']:.2f}" if "ratio" in line else ""
         console.print(
