@@ -72,6 +72,11 @@ def test_the_tolerance_defines_saturation():
     assert figures(Tracking(tolerance=0.01), run).saturated > 0.5
 
 
+def test_a_run_of_one_sample_saturates_entirely():
+    run = jax.tree.map(lambda x: x[:1], record())
+    assert figures(Tracking(tolerance=0.0), run).saturated == 1.0
+
+
 def test_saturation_counts_at_both_limits():
     run = record()
     mirrored = run._replace(command=-run.command, voltage=-run.voltage)

@@ -9,8 +9,9 @@ share caught is below the bar.
 
 Omitted are mutants that leave every result of a correct program as it is, or that only
 raise errors: of annotations, of the guards ``strict`` and ``frozen``, of ``overload``,
-of ``jit``, which changes the speed alone, orders of texts
-(``status <= "interrupted"``), and operators of another group.
+of ``jit`` and ``static``, which change the speed alone, of the examples in the
+documentation of a table, orders of texts (``status <= "interrupted"``), and operators
+of another group.
 """
 
 import argparse
@@ -52,8 +53,8 @@ _ALIKE = {
 """Groups within which an operator is replaced, by the kind of mutation."""
 
 
-_GUARDS = ("strict", "frozen")
-"""Keyword arguments that only make a wrong program raise an error."""
+_GUARDS = ("strict", "frozen", "static")
+"""Keyword arguments that make a wrong program raise an error, or change its speed."""
 
 _WITHOUT_EFFECT = ("jit", "overload")
 """What is part of the names of decorators that change no result."""
@@ -78,12 +79,14 @@ def wanted(operator: str) -> bool:
 
 
 def without_effect(source: str) -> list[tuple[Place, Place]]:
-    """Return first and last place of annotations, guards, ``jit`` and ``overload``."""
+    """Return first and last place of what changes no result of a correct program."""
     nodes, spans = [], []
     for node in ast.walk(ast.parse(source)):
         nodes += [getattr(node, name, None) for name in ("annotation", "returns")]
         if isinstance(node, ast.keyword) and node.arg in _GUARDS:
             nodes.append(node.value)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "example":
+            nodes.append(node)
         for decorator in getattr(node, "decorator_list", ()):
             if any(plain in ast.unparse(decorator) for plain in _WITHOUT_EFFECT):
                 spans.append(((decorator.lineno, 0), span(decorator)[1]))  # from the @
