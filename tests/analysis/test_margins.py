@@ -14,7 +14,7 @@ import piezojax as pj
 from piezojax.analysis.stability import stability_reports
 from piezojax.analysis.stability.assess import worst_margins
 from piezojax.analysis.stability.conserved import LinearLoop
-from piezojax.analysis.stability.crossings import angle_grid, roots
+from piezojax.analysis.stability.crossings import angle_grid, peak, roots
 from piezojax.analysis.stability.margins import linear_loop, report_of
 from piezojax.catalog import p753
 from piezojax.core.feedback import LoopInput
@@ -446,3 +446,17 @@ def test_the_grid_is_dense_within_the_width_of_a_resonance(damping):
     distance = np.abs(angle_grid(loop) - place)
     assert (distance < damping).sum() > 20
     assert distance.min() < 1e-9
+
+
+def test_a_peak_between_two_points_of_the_grid_is_found():
+    """Twenty wide maxima, and a narrow one that the grid shows at 0.64 of its height."""
+    grid = np.linspace(0.0, 1.0, 1001)
+    centres, narrow = np.linspace(0.03, 0.97, 20), 0.5004
+
+    def bumps(x):
+        wide = 0.4 * np.exp(-(((x[:, None] - centres) / 0.01) ** 2)).sum(axis=1)
+        return wide + np.exp(-np.log(2.0) * ((x - narrow) / 0.0005) ** 2)
+
+    value, place = peak(bumps, grid, bumps(grid))
+    assert place == pytest.approx(narrow, abs=1e-6)
+    assert value == pytest.approx(float(bumps(np.array([narrow]))[0]), rel=1e-6)

@@ -73,6 +73,10 @@ def test_the_stroke_of_a_fitted_model_points_to_its_record():
     ("references", "message"),
     [
         ({"tune": ["CONST1"], "amplitude": 75.0}, r"references.unseen: TRI10 spans"),
+        (
+            {"tune": ["CONST1"], "unseen": ["STEP1", "TRI10"], "amplitude": 75.0},
+            r"references.unseen: TRI10 spans",
+        ),
         ({"offset": 30.0}, r"SIN10 spans 30 to 130 um.*references.offset, now 30"),
         ({"offset": -95.0}, r"references.tune: CONST1 spans -45 to -45 um"),
     ],
