@@ -247,7 +247,8 @@ DEVICE_PLAN = Plan(
 def test_the_study_of_a_device_runs_at_its_rate(record, tmp_path, device, parameter):
     plan = replace(DEVICE_PLAN, controller=device)
     columns = {"time": "time_s", "input": "command_V", "output": "sensor_um"}
-    text = first_study(plan, record, columns, 1e3, folder=tmp_path, model="lag")
+    columns["resample"] = 2e4
+    text = first_study(plan, record, columns, 2e4, folder=tmp_path, model="lag")
     path = tmp_path / "study.toml"
     path.write_text(text, encoding="utf-8")
     case = build(load(path), path)
@@ -267,11 +268,10 @@ def test_the_study_of_a_device_runs_at_its_rate(record, tmp_path, device, parame
         assert controller.sr == pytest.approx(0.5)
 
 
-def test_a_record_at_the_rate_of_the_device_is_not_interpolated(tmp_path):
-    text = first_study(DEVICE_PLAN, tmp_path / "r.csv", {}, 2e4, folder=tmp_path)
-    assert "resample" not in tomllib.loads(text)["plant"]
-    text = first_study(DEVICE_PLAN, tmp_path / "r.csv", {}, 16e3, folder=tmp_path)
-    assert tomllib.loads(text)["plant"]["resample"] == 2e4
+def test_a_record_at_another_rate_than_the_device_is_refused(tmp_path):
+    message = "the record has 16000 Hz, the device 20000 Hz: record at that rate"
+    with pytest.raises(ValueError, match=message):
+        first_study(DEVICE_PLAN, tmp_path / "r.csv", {}, 16e3, folder=tmp_path)
 
 
 def test_a_device_without_a_scale_is_doubted_or_refused(record, tmp_path):
@@ -372,7 +372,7 @@ def test_a_start_without_questions_tunes_and_exports(run, tmp_path):
 
 def test_the_questions_of_a_device_are_asked_for_it_alone(run, tmp_path):
     answers = 8 * "\n" + "nv200\n2.5\n\n12\n"
-    status, output, calls = run(answers=answers)
+    status, output, calls = run("--resample", "20000", answers=answers)
     assert status == 0, output
     assert calls == [("tune", "tuned"), ("export", "tuned", "vendor")]
     assert f"values in {tmp_path / 'out' / 'controller'}" in output

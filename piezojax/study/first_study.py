@@ -224,10 +224,9 @@ def first_study(
 
     The paths in it are relative to ``folder``, where the study is to be written.
     ``record`` and the optional ``check`` are files of records, and ``columns`` are the
-    options of ``read_record`` for both; ``rate`` is that of the record, Hz, and
-    ``model`` the model to fit. The loop has the rate of the record, or that of the
-    device, to which the record is then interpolated. Raises ValueError for an E-727
-    without the scale of its gains.
+    options of ``read_record`` for both; ``rate`` is the sampling rate of the loop, Hz,
+    and ``model`` the model to fit. Raises ValueError for a device at another rate than
+    its own, and for an E-727 without the scale of its gains.
     """
     if plan.controller == "e727" and plan.scale == 0.0:
         raise ValueError(
@@ -236,8 +235,11 @@ def first_study(
     keys = {"rate": "record_rate"}
     device = plan.controller in DEVICES
     if device and not np.isclose(rate * FIXED_DT, 1.0, rtol=1e-9):
-        rate = 1.0 / FIXED_DT
-        columns = columns | {"resample": rate}
+        raise ValueError(
+            f"the record has {rate:g} Hz, the device {1.0 / FIXED_DT:g} Hz: record at "
+            "that rate, because the interpolation by --resample would look like a "
+            "resonance above half the rate of the record"
+        )
     plant = {
         "record": seen_from(folder, record),
         "model": model,
