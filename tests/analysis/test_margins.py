@@ -449,7 +449,7 @@ def test_the_grid_is_dense_within_the_width_of_a_resonance(damping):
 
 
 def test_a_peak_between_two_points_of_the_grid_is_found():
-    """Twenty wide maxima, and a narrow one that the grid shows at 0.64 of its height."""
+    """Twenty wide maxima, and a narrow one of which the grid shows 64 %."""
     grid = np.linspace(0.0, 1.0, 1001)
     centres, narrow = np.linspace(0.03, 0.97, 20), 0.5004
 
