@@ -136,7 +136,9 @@ def export_file(
     # `export` refuses alarms; its message names the option.
     system = load(path, accept_unsafe=True)
     folder = out or numbered_folder(RESULTS / f"{path.stem}_{to}")
-    if to == "c" and about.study is not None and runs is None:
+    if to != "c":
+        runs = None  # only C code is run in them
+    elif about.study is not None and runs is None:
         try:
             runs = _runs(study, path, about, system)
         except ValueError as error:

@@ -277,9 +277,7 @@ def _export(
         to="vendor" if device else "c",
         study=folder / STUDY,
         out=exported,
-        runs=None
-        if device or outcome is None
-        else make_runs(outcome.case, outcome.holdout),
+        runs=make_runs(outcome.case, outcome.holdout) if outcome else None,
     )
     console.print(
         f"done: gains and pictures in {tuned}, {'values' if device else 'C code'} in "

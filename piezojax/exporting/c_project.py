@@ -231,8 +231,8 @@ class CProject:
                     f"    {a} = {b};" for a, b in zip(places, numbers, strict=True)
                 ]
                 continue
-            values = f"{type_of(slot.dtype, self.precision)} values"
-            lines += ["    {", *constant_array(values, numbers, " " * 8)]
+            table = f"{type_of(slot.dtype, self.precision)} values"
+            lines += ["    {", *constant_array(table, numbers, " " * 8)]
             lines += [f"        for (int i = 0; i < {slot.size}; i++)"]
             lines += [f"            parameters.{slot.name}[i] = values[i];", "    }"]
         return "\n".join(lines or ["    parameters.unused = 0;"])

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 ROLLED = 8
-"""Smallest number of consecutive equal operations that a loop computes."""
+"""Smallest number of equal operations, or repetitions of a scan, in a loop of C."""
 
 _ELEMENT = re.compile(r"(.+)\[(\d+)\]")
 

@@ -18,6 +18,7 @@ from jax.extend import core as jex
 from .graph import CARRY, INPUT, Block, Graph, Loop
 from .memory import Memory, NotScalarError, Numbers
 from .node_arrays import NodeArrays, kind_of
+from .rolled import ROLLED
 
 ELEMENTWISE = {
     "abs", "acos", "add", "and", "asin", "atan", "atan2", "ceil", "clamp",
@@ -66,9 +67,6 @@ ALIASES = {"add_any": "add"}
 
 LONG = 256
 """Smallest size of a real input that remains an array in C."""
-
-REPEATED = 8
-"""Smallest number of repetitions of a scan that remains a loop in C."""
 
 MOST = 15_000
 """Largest number of nodes of a graph; C compilers take minutes for more."""
@@ -246,7 +244,7 @@ class _Tracer:
         shared, carry = operands[:consts], operands[consts : consts + count]
         rows = operands[consts + count :]
         closed, length = params["jaxpr"], params["length"]
-        if not rows and len(closed.jaxpr.outvars) == count and length >= REPEATED:
+        if not rows and len(closed.jaxpr.outvars) == count and length >= ROLLED:
             return self._repeated(closed, shared, carry, length)
         order = range(length)
         collected: list[list[Numbers]] = []

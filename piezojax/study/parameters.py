@@ -76,8 +76,7 @@ def _ranges(study: Study, loop: Feedback) -> tuple[dict[str, Range], tuple[str, 
 
 def _range(loop: Feedback, path: str, table: TunedTable) -> Range:
     where, start = f"parameters.{path}", table.start
-    if table.within is not None:
-        table = table.bounded(float(get(loop, path)) if start is None else start, where)
+    table = table.bounded(float(get(loop, path)) if start is None else start, where)
     return dataclasses.replace(table.range(declared(loop, path), where), start=start)
 
 

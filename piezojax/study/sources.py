@@ -42,8 +42,8 @@ def system_of(
 
     Only a controller has a ``design``, which receives the table. A table with a type
     may contain tables with a catalog or a design: a LimitedReference may contain the
-    design that it limits.
-    Raises ValueError for a table with no source, several sources, or other keys.
+    design that it limits. Raises ValueError for a table with no source, several
+    sources, or other keys.
     """
 
     def nested(part: dict[str, Any], where: str) -> System:

@@ -131,9 +131,9 @@ class Perturbed(BaseModel):
     @property
     def geomean_before_rms_um(self) -> float | None:
         """Median of ``geomeans_before_um``; None if a loop is unstable."""
-        means: list[Any] = self.geomeans_before_um
-        usable = means and not self.unstable_before
-        return float(np.median(means)) if usable else None
+        known = [mean for mean in self.geomeans_before_um if mean is not None]
+        usable = known and not self.unstable_before
+        return float(np.median(known)) if usable else None
 
     @classmethod
     def of(

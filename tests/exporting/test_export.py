@@ -1,7 +1,6 @@
 """Controllers and plants as C: compiled, run, and compared with the simulation."""
 
 import itertools
-import shutil
 import subprocess
 from typing import Any
 
@@ -10,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exported_folders import compiled, made
 from golden import golden_vectors
 
 import piezojax as pj
@@ -33,20 +33,6 @@ ABOUT = pj.About(
     actuator=ACTUATOR,
     reference_ranges=[(0.0, 10.0)],
 )
-
-compiled = pytest.mark.skipif(
-    shutil.which("cc") is None or shutil.which("make") is None,
-    reason="there is no C compiler",
-)
-
-
-def made(folder):
-    """Run ``make test`` in a folder; return its exit status and output."""
-    done = subprocess.run(
-        ["make", "-s", "test"], cwd=folder, capture_output=True, text=True
-    )
-    return done.returncode, done.stdout + done.stderr
-
 
 # Compiled
 

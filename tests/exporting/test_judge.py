@@ -1,7 +1,6 @@
 """Exported controllers in the simulated loop: costs of float and compensated sums."""
 
 import dataclasses
-import shutil
 import subprocess
 from collections.abc import Callable
 
@@ -10,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exported_folders import compiled
 
 import piezojax as pj
 from piezojax import study as studies
@@ -26,10 +26,7 @@ from piezojax.tuning.data import make_data
 from piezojax.tuning.exported_runs import holdout_of, make_runs
 from piezojax.tuning.runs import evaluate
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("cc") is None or shutil.which("make") is None,
-    reason="there is no C compiler",
-)
+pytestmark = compiled
 
 SAMPLES, STEP, SLOW = 40_000, 2e-3, 5e-4
 """Number of samples, step of the reference (um), and gain of the integral (V/um)."""

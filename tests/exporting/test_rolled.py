@@ -1,13 +1,12 @@
 """Loops of exported C against the elements that they stand for."""
 
 import re
-import shutil
-import subprocess
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exported_folders import compiled, made
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -79,10 +78,7 @@ class Windowed(System):
         return state, jnp.sum(blocks.T @ blocks[:, 0]) + jnp.max(window)
 
 
-@pytest.mark.skipif(
-    shutil.which("cc") is None or shutil.which("make") is None,
-    reason="there is no C compiler",
-)
+@compiled
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_arrays_are_computed_in_loops(precision, tmp_path):
     about = pj.About(judged=["fine"], reference_ranges=[(0.0, 10.0)])
@@ -97,10 +93,8 @@ def test_arrays_are_computed_in_loops(precision, tmp_path):
     dtype = {"double": np.float64, "float": np.float32}[precision]
     found = np.array([x.strip(" \nf") for x in values.split(",")], dtype)
     np.testing.assert_array_equal(found, FACTORS.astype(dtype))
-    done = subprocess.run(
-        ["make", "-s", "test"], cwd=tmp_path / "c", capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    status, text = made(tmp_path / "c")
+    assert status == 0, text
 
 
 def test_a_short_step_has_no_arrays(tmp_path):
@@ -127,16 +121,11 @@ class Substepped(System):
         return (x, 0.9 * y), x + y
 
 
-@pytest.mark.skipif(
-    shutil.which("cc") is None or shutil.which("make") is None,
-    reason="there is no C compiler",
-)
+@compiled
 @pytest.mark.parametrize(("count", "loops"), [(7, 0), (8, 1), (40, 1)])
 def test_repetitions_remain_a_loop(count, loops, tmp_path):
     about = pj.About(judged=["fine"], reference_ranges=[(0.0, 10.0)])
     pj.export(Substepped(jnp.asarray(0.3), count), tmp_path / "c", about=about)
     assert (tmp_path / "c" / "plant.c").read_text().count("for (;;) {") == loops
-    done = subprocess.run(
-        ["make", "-s", "test"], cwd=tmp_path / "c", capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    status, text = made(tmp_path / "c")
+    assert status == 0, text

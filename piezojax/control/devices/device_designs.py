@@ -5,6 +5,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from ...core.parameter import declarations
 from ...core.system import Affine, System, rest_output
 from ...dynamics.plant_modes import plant_modes
 from ..design_model import CROSSOVER, DesignModel, design_model
@@ -14,9 +15,6 @@ from .servo_loop import NO_SLEW
 
 D = TypeVar("D", bound=System)
 Limits = tuple[float, float]
-
-GAINS = 1e-3, 1e4
-"""Smallest gain of an NV200 above 0, and the largest."""
 
 
 class Start(NamedTuple):
@@ -54,8 +52,8 @@ def nv200(
 
     def device(start: Start) -> NV200:
         return NV200(
-            kp=float(np.clip(start.proportional / volts, *GAINS)),
-            ki=float(np.clip(start.integral / volts, *GAINS)),
+            kp=_within_range("kp", start.proportional / volts),
+            ki=_within_range("ki", start.integral / volts),
             avmin=limits[0],
             avmax=limits[1],
             posmin=lowest,
@@ -69,6 +67,13 @@ def nv200(
         )
 
     return _designed(model, plant, device)
+
+
+def _within_range(name: str, gain: float) -> float:
+    """Return ``gain``, moved into the declared range of a gain of the NV200."""
+    declared = dict(declarations(NV200))[name].typical
+    assert declared is not None
+    return float(np.clip(gain, *declared))
 
 
 def e727(
