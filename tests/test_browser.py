@@ -12,7 +12,11 @@ from page_reader import LARGEST
 from small_runs import COLUMNS, STUDY, call, succeeded, write_record, write_study
 
 import piezojax as pj
+from piezojax.core.paths import replace
 from piezojax.report.page import Page, write_page
+from piezojax.study import read
+from piezojax.tuning.data import make_data
+from piezojax.tuning.runs import evaluate
 
 CHROMIUM, DRIVER = (shutil.which(name) for name in ("chromium", "chromedriver"))
 if CHROMIUM is None or DRIVER is None:
@@ -43,7 +47,7 @@ def folders(tmp_path_factory):
     study, swept = write_study(here), write_study(here, "swept.toml", sweep=SWEEP)
     parts = ("--train", "0:200", "--validate", "220:300", "--model", "coleman_hodgdon")
     record = write_record(here)
-    succeeded(call("tune", study, "--out", out["tune"]))
+    succeeded(call("tune", study, "--sliders", "--out", out["tune"]))
     succeeded(call("identify", record, *COLUMNS, *parts, "--out", out["identify"]))
     succeeded(call("sweep", swept, "--out", out["sweep"]))
     succeeded(call("export", out["tune"], "--out", out["export"]))
@@ -215,15 +219,15 @@ def at(browser, panel, across, down, kind="mouseMoved", **more):
 def test_curves_are_interactive_on_a_screen_and_pictures_on_paper(tuned, folders):
     live, beside, images = displayed(tuned)
     curves = ("tracking", "steps", "stability", "hysteresis", "convergence")
-    assert live == len(curves)
+    assert live == len(curves) + 1  # the sliders
     assert beside == 0
     assert images > 0  # of other pictures
     tuned.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
-    assert displayed(tuned) == [0, live, live + images]
+    assert displayed(tuned) == [0, len(curves), len(curves) + images]
     tuned.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
     tuned.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     tuned.refresh()
-    assert displayed(tuned) == [0, live, live + images]
+    assert displayed(tuned) == [0, len(curves), len(curves) + images]
     tuned.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
 
 
@@ -254,3 +258,69 @@ def test_a_rectangle_is_enlarged_in_all_panels_of_a_row(tuned):
     for panel in (0, 1):
         found = tuned.execute_script(RANGE, panel)
         assert found == pytest.approx(expected, abs=0.01 * width)
+
+
+# Sliders
+
+MOVE = """
+    const models = [...Bokeh.documents[0]._all_models.values()]
+    const sliders = models.filter(model => model.type == "Slider")
+    sliders.forEach((slider, index) => { slider.value = arguments[0][index] })
+    const formats = sliders.map(slider => slider.format.compute(slider.value))
+    const line = models.filter(model => model.name == "gains of the sliders")[0]
+    return [formats, [...line.data_source.data.displacement]]
+"""
+
+
+def figures_of(browser):
+    """Return tuned, moved and unit of each figure of the table of the sliders."""
+    rows = browser.execute_script(
+        """
+        const found = node => [...node.querySelectorAll('*')].flatMap(
+            e => [...(e.matches('tr') ? [e] : []),
+                  ...(e.shadowRoot ? found(e.shadowRoot) : [])])
+        const inside = document.querySelector('.note .live')
+        return found(inside).map(row => [...row.children].map(e => e.textContent))
+        """
+    )
+    return {row[0]: row[1:] for row in rows[1:]}
+
+
+def test_sliders_start_at_the_tuned_gains(tuned, folders):
+    result = pj.load_result(folders["tune"])
+    found = figures_of(tuned)
+    for name, rms in result.holdout.per_reference_rms_um.items():
+        shown, moved, unit, _ = found[f"rms error under {name}"]
+        assert shown == moved
+        assert float(shown) == pytest.approx(1e3 * rms, rel=1e-3)
+        assert unit == "nm"
+    stability = json.loads((folders["tune"] / "stability.json").read_text())
+    exact = max(b["sensitivity_peak"] for b in stability["after"].values())
+    assert float(found["sensitivity peak"][0]) == pytest.approx(exact, rel=1e-2)
+
+
+def test_moved_sliders_show_what_their_gains_give(tuned, folders):
+    formats, step = tuned.execute_script(MOVE, [0.25, 0.5])
+    gains = [float(text.split()[0]) for text in formats]
+    result = pj.load_result(folders["tune"])
+    assert [text.split(" ", 1)[1] for text in formats] == [*result.gain_units.values()]
+    case = read(folders["tune"].parent / "small.toml")
+    loop = replace(case.loop, dict(zip(case.space.paths, gains, strict=True)))
+    found = figures_of(tuned)
+    signals = make_data(case).holdout
+    errors = evaluate(lambda loop: loop, loop, signals, case.study.settled).rms_error
+    for name, rms in zip(("SIN50", "SW50"), errors, strict=True):
+        shown, moved, _, doubt = found[f"rms error under {name}"]
+        share = float(doubt.removesuffix(" %")) / 100.0
+        assert share < 0.02
+        assert float(moved) == pytest.approx(1e3 * float(rms[0]), rel=2 * share + 1e-3)
+        assert shown != moved
+    report = pj.stability_report(loop, case.highest_reference)
+    for name, value in (
+        ("sensitivity peak", report.sensitivity_peak),
+        ("gain margin", report.gain_margin_dB),
+        ("phase margin", report.phase_margin_deg),
+        ("delay margin", report.delay_margin_samples),
+    ):
+        assert float(found[name][1]) == pytest.approx(value, rel=1e-2), name
+    assert len(step) > 100

@@ -11,7 +11,7 @@ from ..core.files import numbered_folder, write_text
 from .command import RESULTS, Command, common, print_alarms, run
 from .export import export_file
 from .records import print_columns, recognised_columns
-from .tune import finish, tune_study
+from .tune import finish, sliders_option, tune_study
 
 if TYPE_CHECKING:
     from ..identification import Record
@@ -81,9 +81,10 @@ def questions(function: Callable) -> Callable:
     help="Second record of the stage, which validates the model.",
 )
 @click.option("--yes", is_flag=True, help="Ask nothing; use the options and defaults.")
+@sliders_option
 @recognised_columns
 @common
-def main(record, model, check, yes, out, seed, quiet, **given):
+def main(record, model, check, yes, sliders, out, seed, quiet, **given):
     """Tune a controller from a RECORD of your stage, and export its gains.
 
     The command asks for limits, sensor noise and references; the defaults come from
@@ -110,7 +111,7 @@ def main(record, model, check, yes, out, seed, quiet, **given):
         if tuned is None:
             tuned = numbered_folder(folder / TUNED)
             try:
-                outcome = tune_study(study, tuned, None, None, console)
+                outcome = tune_study(study, tuned, None, None, console, sliders=sliders)
             except KeyboardInterrupt:
                 console.print(_going_on(record, folder), soft_wrap=True)
                 raise

@@ -27,6 +27,13 @@ if TYPE_CHECKING:
     from ..tuning.result import Result
 
 
+sliders_option = click.option(
+    "--sliders/--no-sliders",
+    default=True,
+    help="Let the page show what gains near the tuned ones would give (seconds).",
+)
+
+
 @click.command(cls=Command)
 @click.argument("study", nargs=-1, type=click.Path(path_type=Path))
 @click.option(
@@ -34,6 +41,7 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Also tune by Ziegler-Nichols, a relay, CMA-ES and Nelder-Mead (minutes).",
 )
+@sliders_option
 @click.option(
     "--schema",
     is_flag=True,
@@ -43,6 +51,7 @@ if TYPE_CHECKING:
 def main(
     study: tuple[Path, ...],
     baselines: bool,
+    sliders: bool,
     schema: bool,
     out: Path | None,
     seed: int | None,
@@ -74,7 +83,8 @@ def main(
             _compare(paths, out, seed, console)
         else:
             budget = Budget() if baselines else None
-            finish(tune_study(paths[0], out, seed, budget, console).result)
+            outcome = tune_study(paths[0], out, seed, budget, console, sliders=sliders)
+            finish(outcome.result)
 
     run(quiet, body)
 
@@ -92,17 +102,21 @@ def tune_study(
     seed: int | None,
     baselines: "Budget | None",
     console: Console,
+    *,
+    sliders: bool,
 ) -> "Outcome":
     """Tune the study at ``path``, write and print the outcome, and return it."""
     from .. import study as studies
     from ..report.baseline_curves import write_baselines
     from ..report.bode import write_stability
     from ..report.fit_pictures import write_fit
+    from ..report.gain_sliders import gain_sliders
     from ..report.limit_bars import write_limit
     from ..report.page import write_page
     from ..report.response_pictures import write_response
     from ..report.tuning_page import tuning_page
     from ..report.tuning_pictures import write_results
+    from ..tuning.gain_surrogate import gain_surrogate
     from ..tuning.tuner import tune
 
     with Bar(console) as bar:
@@ -127,8 +141,9 @@ def tune_study(
             pictures |= write_stability(outcome.stability, folder, heading)
             bar.stage("computing the limit of linear control")
             write_limit(outcome.limit, folder, heading)
-            page = tuning_page(outcome)
-            write_page(page, folder, pictures)
+            surrogate = gain_surrogate(outcome, bar) if sliders else None
+            page = tuning_page(outcome, surrogate)
+            write_page(page, folder, pictures, gain_sliders(surrogate, outcome))
     print_results(page, folder, console)
     return outcome
 

@@ -13,6 +13,7 @@ from matplotlib.gridspec import SubplotSpec
 from .live_panel import Curves, curves, has_curves_only, live_panel
 
 if TYPE_CHECKING:
+    from bokeh.model import Model
     from bokeh.models import LayoutDOM
 
 COLUMNS = 1000
@@ -42,35 +43,38 @@ class LiveFigures:
     note: str = ""
 
 
-def live_figures(pictures: Mapping[str, Figure]) -> LiveFigures:
+def live_figures(
+    pictures: Mapping[str, Figure], widgets: "dict[str, Model] | None" = None
+) -> LiveFigures:
     """Return those of ``pictures`` that consist of curves as interactive figures.
 
     Their curves are the samples of the picture, thinned so that all of them together
-    keep ``BUDGET``. The scripts contain Bokeh; they need no network.
+    keep ``BUDGET``. ``widgets`` are added as they are. The scripts contain Bokeh; they
+    need no network.
     """
+    widgets = widgets or {}
     drawn = {
         name: picture
         for name, picture in pictures.items()
         if picture.axes and all(map(has_curves_only, picture.axes))
     }
-    if not drawn:
+    if not (drawn or widgets):
         return LiveFigures()
     from bokeh.embed import components
-    from bokeh.resources import Resources
+    from bokeh.resources import Component, Resources
 
     panels = [ax for picture in drawn.values() for ax in picture.axes]
     samples, columns = _thinned(panels)
-    script, roots = components(
-        {name: _grid(picture, samples) for name, picture in drawn.items()},
-        wrap_plot_info=False,
-    )
+    shown: dict[str, "Model"] = {
+        name: _grid(picture, samples) for name, picture in drawn.items()
+    }
+    script, roots = components(shown | widgets, wrap_plot_info=False)
     figures = {
         name: f'<div class="live" id="{root.elementid}" data-root-id="{root.id}"></div>'
         for name, root in roots.items()
     }
-    inline = Resources(
-        mode="inline", components=["bokeh"], log_level="warn"
-    ).render_js()
+    parts: list[Component] = ["bokeh", "bokeh-widgets"] if widgets else ["bokeh"]
+    inline = Resources(mode="inline", components=parts, log_level="warn").render_js()
     return LiveFigures(figures, f"{inline}\n{script}\n", NOTE.format(columns))
 
 

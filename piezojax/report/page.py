@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from PIL import Image
 from rich.table import Table
@@ -20,7 +21,11 @@ from ..tuning.result import STUDY_FILE
 from .figures import Pictures
 from .live_figures import LiveFigures, live_figures
 
+if TYPE_CHECKING:
+    from bokeh.models import UIElement
+
 PAGE = "report.html"
+SLIDERS = "Other gains"
 
 PICTURES = {
     "tracking.png": "References and tracking errors, before and after tuning",
@@ -76,13 +81,20 @@ class Page:
     origin: Sequence[str] = ()
 
 
-def write_page(page: Page, folder: Path, pictures: Pictures | None = None) -> Path:
+def write_page(
+    page: Page,
+    folder: Path,
+    pictures: Pictures | None = None,
+    sliders: "UIElement | None" = None,
+) -> Path:
     """Write ``page`` and the pictures in ``folder`` to report.html in that folder.
 
-    Those of the ``pictures`` that consist of curves are interactive.
+    Those of the ``pictures`` that consist of curves are interactive. ``sliders`` are
+    shown on a screen only.
     """
     path = folder / PAGE
-    write_text(path, page_html(page, folder, live_figures(pictures or {})))
+    live = live_figures(pictures or {}, {SLIDERS: sliders} if sliders else None)
+    write_text(path, page_html(page, folder, live))
     return path
 
 
@@ -98,6 +110,7 @@ def page_html(page: Page, folder: Path, live: LiveFigures) -> str:
         f"<title>{title}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
         f"<h1>{title}</h1>\n{alarms}"
         + "".join(table_html(table) for table in tables)
+        + _sliders(live)
         + _section("Notes", _list(sentences))
         + _section("Pictures", _note(live) + "".join(_figures(folder, live.figures)))
         + _section("Files", _quoted_study(folder))
@@ -151,6 +164,14 @@ def _list(sentences: Iterable[str]) -> str:
 
 def _note(live: LiveFigures) -> str:
     return f'<p class="note">{live.note}</p>\n' if live.note else ""
+
+
+def _sliders(live: LiveFigures) -> str:
+    found = live.figures.get(SLIDERS)
+    if not found:
+        return ""
+    title = f"<figcaption>{SLIDERS}</figcaption>"
+    return f'<figure class="note">\n{title}\n{found}</figure>\n'
 
 
 def _figures(folder: Path, live: Mapping[str, str]) -> Iterable[str]:

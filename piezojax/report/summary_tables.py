@@ -1,7 +1,7 @@
 """Tables that the commands print."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
 
 from rich.table import Table
@@ -163,23 +163,29 @@ def gains_table(result: Result) -> Table:
     of a device have all digits that are typed in.
     """
     # The common start of the paths is in the title: long paths would crowd the numbers.
-    parents = zip(*(path.split(".")[:-1] for path in result.gains), strict=False)
-    common = takewhile(lambda names: len(set(names)) == 1, parents)
-    shared = ".".join(names[0] for names in common)
+    shared, names = short_names(result.gains)
     table = Table(title=f"gains of {shared}" if shared else "gains")
     table.add_column("parameter")
     table.add_column("before", justify="right", no_wrap=True)
     table.add_column("tuned", justify="right", no_wrap=True)
     table.add_column("unit", no_wrap=True)
-    for path, value in result.gains.items():
-        name, unit = path.removeprefix(f"{shared}."), result.gain_units.get(path)
-        step = result.gain_steps.get(path)
-        before, after = (_typed(x, step) for x in (result.start[path], value))
+    for name, (path, value) in zip(names, result.gains.items(), strict=True):
+        unit, step = result.gain_units.get(path), result.gain_steps.get(path)
+        before, after = (typed(x, step) for x in (result.start[path], value))
         table.add_row(name, before, after, unit or "-")
     return table
 
 
-def _typed(value: float, step: float | None) -> str:
+def short_names(paths: Iterable[str]) -> tuple[str, list[str]]:
+    """Return the common start of ``paths``, "" if there is none, and the rests."""
+    paths = list(paths)
+    parents = zip(*(path.split(".")[:-1] for path in paths), strict=False)
+    common = takewhile(lambda names: len(set(names)) == 1, parents)
+    shared = ".".join(names[0] for names in common)
+    return shared, [path.removeprefix(f"{shared}.") for path in paths]
+
+
+def typed(value: float, step: float | None) -> str:
     """Return a gain in four digits, or in all digits that are typed into a device."""
     if step is None:
         return f"{value:.4g}"

@@ -5,6 +5,7 @@ from rich.table import Table
 from ..control import Device
 from ..exporting import device_values
 from ..identification import Fit
+from ..tuning.gain_surrogate import GainSurrogate
 from ..tuning.outcome import Outcome
 from .baseline_curves import baselines_table, baselines_text
 from .device_table import device_table
@@ -26,8 +27,11 @@ from .summary_tables import (
 )
 
 
-def tuning_page(outcome: Outcome) -> Page:
-    """Return the Page of a tuned study."""
+def tuning_page(outcome: Outcome, surrogate: GainSurrogate | str | None = None) -> Page:
+    """Return the Page of a tuned study.
+
+    ``surrogate`` is that of its sliders, or why there are none.
+    """
     result, study = outcome.result, outcome.case.study
     stability, baselines = outcome.stability, outcome.baselines
     front = (
@@ -60,6 +64,7 @@ def tuning_page(outcome: Outcome) -> Page:
             for name, why in stability.problems.items()
         ),
         *(f"note: {warning}" for warning in result.warnings),
+        isinstance(surrogate, str) and f"note: no sliders of gains: {surrogate}",
         f"{result.status} after {result.evaluations} evaluations, "
         f"{result.wall_s:.1f} s ({result.compile_s:.1f} s of it compiling)",
     ]
