@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...core.plain import shown
 from .preamble import split
 
 SEPARATORS = (";", "\t", ",", None)
@@ -178,5 +179,5 @@ def _column(cells: Sequence[str], unit: str | None, decimal: str) -> Column:
             for i, cell in enumerate(cells)
             if cell and not _numeric(cell, decimal)
         )
-        fault = f"sample {sample}: {cell!r} is not a number"
+        fault = f"sample {sample}: {shown(cell)} is not a number"
         return Column(np.full(len(cells), np.nan), unit, fault=fault)
