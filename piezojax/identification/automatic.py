@@ -27,8 +27,12 @@ CREEP = "exponential_creep"
 CLEARLY = 0.8
 """Ratio to the error of the first model below which another one is chosen."""
 
-LEAST, SAMPLES = 1000, 4000
-"""Fewest samples from which a hysteresis is chosen, and fewest that a trial uses."""
+LEAST, SAMPLES, MOST = 1000, 4000, 100_000
+"""Fewest samples from which a hysteresis is chosen; fewest and most of a trial."""
+
+VARIATION = 0.95
+"""Share of the total variation of the input that a lower rate must keep. A hysteresis
+follows every motion: without the fast ones its state is another one."""
 
 RESOLVED = 8.0
 """Least number of samples in a period of the fastest resonance in a trial."""
@@ -47,8 +51,8 @@ def automatic(
 
     The hysteresis is the first of ``HYSTERESES``, unless another one has a clearly
     smaller error (``CLEARLY``) after short fits to ``record`` and those ``beside`` it.
-    The fits use a lower sampling rate if it resolves the resonances. With ``dynamics``,
-    which are held, the chain has no other dynamics.
+    The fits use a lower sampling rate if it resolves the resonances and the input.
+    With ``dynamics``, which are held, the chain has no other dynamics.
     """
     hysteresis = hysteresis_for([record, *beside], progress, dynamics)
     return _chain_of(hysteresis, record, dynamics)
@@ -89,18 +93,33 @@ def _slowing(record: Record) -> int:
     if modes:
         fastest = max(mode.frequency for mode in modes)
         every = min(every, int(1.0 / (RESOLVED * fastest * record.dt)))
+    whole = _variation(record)
+    while every > max(1, record.samples // MOST):
+        if _variation(_slowed(record, every)) > VARIATION * whole:
+            break
+        every //= 2
     return max(1, every)
 
 
+def _variation(record: Record) -> float:
+    """Return the total variation of the input of ``record``."""
+    return float(np.sum(np.abs(np.diff(record.input))))
+
+
 def _slowed(record: Record, every: int) -> Record:
-    """Return ``record`` at a rate lower by the factor ``every``."""
+    """Return ``record`` at a rate lower by the factor ``every``.
+
+    A model delays the output by one sample. At the lower rate this must remain one
+    sample of the record: the input is taken ``every`` - 1 samples later.
+    """
     import scipy.signal  # takes long to import
 
     if every < 2:
         return record
+    later = np.append(record.input[every - 1 :], [record.input[-1]] * (every - 1))
     input, output = (
         scipy.signal.decimate(signal, every, ftype="fir")
-        for signal in (record.input, record.output)
+        for signal in (later, record.output)
     )
     return Record(input, output, every * record.dt, source=record.source)
 
