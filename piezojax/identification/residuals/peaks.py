@@ -3,7 +3,7 @@
 import numpy as np
 from pydantic import BaseModel
 
-from .bound import RelativeError
+from .bound import CONFIDENCE, RelativeError
 
 LEAST = 1.0
 """Least relative error of a peak: the error equals the gain of the model."""
@@ -13,6 +13,12 @@ SHARP = 3.0
 
 VISIBLE = 0.01
 """Least amplitude of a peak, as a share of the model's gain at the lowest line."""
+
+ALIKE = 0.5
+"""Ratio of the lower ends of two lines above which both are of the top of a peak."""
+
+ENOUGH = 4
+"""Least number of lines on a side of a peak."""
 
 MOST = 3
 """Largest number of peaks in a report."""
@@ -26,28 +32,45 @@ class Peak(BaseModel):
 
 
 def unmodelled_peaks(found: RelativeError) -> list[Peak]:
-    """Return the resonances that the model lacks, the highest first.
+    """Return the resonances that the model lacks, the surest first.
 
     A peak counts if the lower end of its interval is above ``LEAST``, a line on its
-    flanks is sure (at the top leakage widens the interval), and it exceeds the median
-    within an octave by the factor ``SHARP``.
+    flanks is sure (at the top leakage widens the interval), and it exceeds the errors
+    on both sides within an octave by the factor ``SHARP``.
     """
     frequency, error = found.frequency, found.error
     amplitude = found.lower * found.gain / max(found.gain[0], np.finfo(float).tiny)
     sure = found.sure & (found.lower > LEAST)
     kept: list[int] = []
-    for i in np.argsort(error)[::-1]:
+    peaks: list[Peak] = []
+    for i in np.argsort(found.lower, kind="stable")[::-1]:
         ratio = frequency / frequency[i]
         around = (ratio > 0.5) & (ratio < 2.0)
         near = (ratio > 0.8) & (ratio < 1.25)
-        outside = error[around & ~near]
+        sides = around & (ratio <= 0.8), around & (ratio >= 1.25)
+        levels = [_level(found, side) for side in sides if side.sum() >= ENOUGH]
         large = found.lower[i] > LEAST and amplitude[i] > VISIBLE
-        if not large or not sure[near].any() or outside.size < 4:
+        if not large or not sure[near].any() or not levels:
             continue
         taken = any(0.8 < frequency[i] / frequency[j] < 1.25 for j in kept)
-        if not taken and error[i] > SHARP * np.median(outside):
+        if not taken and error[i] > SHARP * max(levels):
             kept.append(int(i))
-    return [
-        Peak(frequency_Hz=float(frequency[i]), times_gain=float(error[i]))
-        for i in kept[:MOST]
-    ]
+            sure_too = near & (found.lower > ALIKE * found.lower[i])
+            top = int(np.argmax(np.where(sure_too, error, 0.0)))
+            peaks.append(
+                Peak(frequency_Hz=float(frequency[top]), times_gain=float(error[top]))
+            )
+    return peaks[:MOST]
+
+
+def _level(found: RelativeError, side: np.ndarray) -> float:
+    """Return the median error of the lines of ``side`` with the least noise.
+
+    Between the lines of a multisine the error is noise, which would hide a peak. The
+    mean power of the noise is subtracted.
+    """
+    lines = np.flatnonzero(side)
+    clear = lines[np.argsort(found.margin[lines], kind="stable")]
+    clear = clear[: max(ENOUGH, lines.size // 4)]
+    noise = 2.0 * (found.margin[clear] / CONFIDENCE) ** 2
+    return float(np.median(np.sqrt(np.maximum(found.error[clear] ** 2 - noise, 0.0))))
