@@ -37,21 +37,18 @@ def feedback_share(input: np.ndarray, output: np.ndarray) -> float:
     be due to chance, for a record shorter than STRETCH, and for an input that its own
     past determines.
     """
-    alone = helped = 0.0
-    more = freedom = 0
+    likelihood, more, count = 0.0, 0, 0
     for start in range(0, min(input.size, MOST * STRETCH) - STRETCH + 1, STRETCH):
         part = slice(start, start + STRETCH)
         own, both, rows = _left(input[part], output[part])
         if own <= PREDICTABLE * np.var(input[part]) * rows:
             continue
-        alone, helped, more = alone + own, helped + both, more + LAGS
-        freedom += rows - OWN - LAGS - 1
-    if not more:
+        # Each stretch by its own variance: one with a large error would outweigh all.
+        likelihood += rows * np.log(own / max(both, np.finfo(float).tiny))
+        more, count = more + LAGS, count + rows
+    if not more or scipy.stats.chi2.sf(likelihood, more) > PROBABILITY:
         return 0.0
-    ratio = (alone - helped) / more / max(helped / freedom, 1e-300)
-    if scipy.stats.f.sf(ratio, more, freedom) > PROBABILITY:
-        return 0.0
-    return float(1.0 - helped / alone - more / (more + freedom))
+    return float(1.0 - np.exp((more - likelihood) / count))
 
 
 def _left(input: np.ndarray, output: np.ndarray) -> tuple[float, float, int]:
