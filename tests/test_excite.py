@@ -68,6 +68,23 @@ def test_the_multisine_has_its_lines_and_no_other_frequency():
     assert np.abs(moved).max() / np.std(moved) < 3.3
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_the_multisine_begins_and_ends_near_the_middle(seed):
+    moved = drawn(multisine, seed=seed).voltages - 50.0
+    # It may cross the middle anywhere between two samples.
+    assert abs(moved[0]) < 0.5 * np.abs(np.diff(moved)).max()
+    assert abs(moved[-1]) < 1.5 * np.abs(np.diff(moved)).max()
+
+
+def test_the_lines_of_the_multisine_are_closer_than_a_resonance_is_wide():
+    part = drawn(multisine, Generator(-20.0, 120.0, 20_000.0))
+    spectrum = np.abs(np.fft.rfft(part.voltages - 50.0))
+    lines = np.fft.rfftfreq(part.voltages.size, 5e-5)[spectrum > 1e-3]
+    apart = np.diff(lines) / lines[:-1]
+    # 2 % between the half-power frequencies of a damping of 1 %
+    assert np.max(apart[lines[:-1] > 300.0]) < 0.02
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     lower=st.floats(-100.0, 50.0),

@@ -15,8 +15,8 @@ import numpy as np
 SMALL = 0.02
 """Amplitude of the multisine, as a share of the range, if the slew rate allows it."""
 
-LINES = 80
-"""Most frequencies of the multisine."""
+LINES = 600
+"""Most frequencies of the multisine: 1 % apart, so that none misses a resonance."""
 
 PHASES = 50
 """Random sets of phases; the multisine uses that with the lowest crest factor."""
@@ -165,7 +165,8 @@ def multisine(generator: Generator, random: np.random.Generator) -> Part:
     """Return a multisine of low crest factor around the middle of the range.
 
     Its frequencies lie between twice ``slowest`` and ``highest``, logarithmically
-    spaced, at multiples of ``slowest`` / 2. It is one period long.
+    spaced, at multiples of ``slowest`` / 2. It is one period long, and begins where it
+    is nearest to the middle.
     """
     count = generator.time(2.0 / generator.slowest).size
     line = generator.rate / count
@@ -179,6 +180,7 @@ def multisine(generator: Generator, random: np.random.Generator) -> Part:
         drawn = drawn / np.abs(drawn).max()
         if not best.size or np.std(drawn) > np.std(best):
             best = drawn
+    best = np.roll(best, -int(np.argmin(np.abs(best))))
     fastest = generator.slew / _steepest(best, generator.rate)
     amplitude = min(SMALL * generator.span, fastest)
     ends = line * lines[0], line * lines[-1]

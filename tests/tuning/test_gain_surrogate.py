@@ -17,7 +17,12 @@ from piezojax.tuning.near_gains import BATCH, MARGINS, NearGains, Simulated
 from piezojax.tuning.outcome import Outcome
 
 TABLES = PID_ON_LAG | {
-    "references": {"tune": ["SIN50"], "unseen": ["SW50"], "duration": 0.04, "settle": 0.01},
+    "references": {
+        "tune": ["SIN50"],
+        "unseen": ["SW50"],
+        "duration": 0.04,
+        "settle": 0.01,
+    },
     "constraints": {"sensitivity_peak": "off", "delay_margin": "off"},
     "parameters": {
         "controller.proportional": {"lower": 0.1, "upper": 5.0, "scale": "log"},
