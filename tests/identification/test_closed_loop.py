@@ -201,6 +201,13 @@ def test_open_loops_with_hysteresis_are_not_taken_for_feedback():
     assert feedback_share(ramp, np.sin(ramp)) == 0.0
 
 
+def test_one_uneven_stretch_is_not_taken_for_feedback():
+    sizes = np.repeat([1e-3] * 9 + [1.0], 1000)
+    for seed in range(12):
+        input, output = np.random.default_rng([5, seed]).standard_normal((2, 10_000))
+        assert feedback_share(sizes * input, output) == 0.0
+
+
 def test_the_columns_of_a_noisy_loop_are_plausible():
     record, _ = loop("PI with notch", 4000, 2)
     assert plausibility_warnings(record) == []

@@ -14,6 +14,7 @@ from piezojax.identification.plausibility import plausibility_warnings
 from piezojax.identification.records.record import rises_evenly
 from piezojax.identification.residuals.bound import (
     ABSORBED,
+    RelativeError,
     error_bound,
     relative_error,
 )
@@ -21,6 +22,7 @@ from piezojax.identification.residuals.correlation import (
     autocorrelation,
     cross_correlation,
 )
+from piezojax.identification.residuals.peaks import unmodelled_peaks
 from piezojax.identification.residuals.report import residual_report
 
 RATE = 10e3
@@ -117,6 +119,34 @@ def test_a_missing_mode_is_named_by_frequency_and_size(seed):
     (warning,) = warnings
     assert "leaves a peak at 7" in warning
     assert "fit a model with a mode" in warning
+
+
+def between_lines(peak, level=1.0, noise=30.0, seed=0):
+    """Return the errors of a model whose multisine has every tenth line.
+
+    The error is ``level``, and ``peak`` more at 1000 Hz. The other lines are noise.
+    """
+    frequency = np.arange(100.0, 4000.0, 5.0)
+    excited = np.arange(frequency.size) % 10 == 0
+    margin = np.where(excited, 0.3, noise)
+    draw = np.random.default_rng(seed).standard_normal((2, frequency.size)) / 2.3
+    true = level + peak / np.abs(1.0 - (frequency / 1000.0) ** 2 + 0.02j) / 50.0
+    error = np.abs(np.where(excited, true, 0.0) + margin * (draw[0] + 1j * draw[1]))
+    return RelativeError(frequency, error, margin, np.full(frequency.size, 0.01), 5.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_peak_is_found_between_lines_of_noise(seed):
+    peaks = unmodelled_peaks(between_lines(20.0, seed=seed))
+    assert peaks[0].frequency_Hz == pytest.approx(1000.0, abs=1.0)
+    assert peaks[0].times_gain == pytest.approx(21.0, rel=0.05)
+    assert len(peaks) == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("level", [0.1, 3.0])
+def test_lines_of_noise_are_no_peak(level, seed):
+    assert unmodelled_peaks(between_lines(0.0, level, seed=seed)) == []
 
 
 def test_a_mode_at_the_wrong_frequency_is_named():

@@ -14,8 +14,14 @@ SHARP = 3.0
 VISIBLE = 0.01
 """Least amplitude of a peak, as a share of the model's gain at the lowest line."""
 
-ALIKE = 0.5
-"""Ratio of the lower ends of two lines above which both are of the top of a peak."""
+FLANK = 0.5
+"""Least error of a sure line near a peak, as a share of that of the peak."""
+
+TOP = 0.9
+"""Ratio of the lower ends of two lines above which either may be the top of a peak."""
+
+CLEAR = 3.0
+"""Noise of a line with little noise, as a multiple of the least noise beside it."""
 
 ENOUGH = 4
 """Least number of lines on a side of a peak."""
@@ -35,8 +41,8 @@ def unmodelled_peaks(found: RelativeError) -> list[Peak]:
     """Return the resonances that the model lacks, the surest first.
 
     A peak counts if the lower end of its interval is above ``LEAST``, a line on its
-    flanks is sure (at the top leakage widens the interval), and it exceeds the errors
-    on both sides within an octave by the factor ``SHARP``.
+    flanks is sure and has a similar error (at the top leakage widens the interval), and
+    it exceeds the errors on both sides within an octave by the factor ``SHARP``.
     """
     frequency, error = found.frequency, found.error
     amplitude = found.lower * found.gain / max(found.gain[0], np.finfo(float).tiny)
@@ -50,13 +56,14 @@ def unmodelled_peaks(found: RelativeError) -> list[Peak]:
         sides = around & (ratio <= 0.8), around & (ratio >= 1.25)
         levels = [_level(found, side) for side in sides if side.sum() >= ENOUGH]
         large = found.lower[i] > LEAST and amplitude[i] > VISIBLE
-        if not large or not sure[near].any() or not levels:
+        flank = sure[near] & (error[near] >= FLANK * error[i])
+        if not large or not flank.any() or not levels:
             continue
         taken = any(0.8 < frequency[i] / frequency[j] < 1.25 for j in kept)
         if not taken and error[i] > SHARP * max(levels):
             kept.append(int(i))
-            sure_too = near & (found.lower > ALIKE * found.lower[i])
-            top = int(np.argmax(np.where(sure_too, error, 0.0)))
+            highest = near & (found.lower > TOP * found.lower[i])
+            top = int(np.argmax(np.where(highest, error, 0.0)))
             peaks.append(
                 Peak(frequency_Hz=float(frequency[top]), times_gain=float(error[top]))
             )
@@ -64,13 +71,11 @@ def unmodelled_peaks(found: RelativeError) -> list[Peak]:
 
 
 def _level(found: RelativeError, side: np.ndarray) -> float:
-    """Return the median error of the lines of ``side`` with the least noise.
+    """Return the median error of the lines of ``side`` with little noise.
 
     Between the lines of a multisine the error is noise, which would hide a peak. The
     mean power of the noise is subtracted.
     """
-    lines = np.flatnonzero(side)
-    clear = lines[np.argsort(found.margin[lines], kind="stable")]
-    clear = clear[: max(ENOUGH, lines.size // 4)]
+    clear = side & (found.margin <= CLEAR * found.margin[side].min())
     noise = 2.0 * (found.margin[clear] / CONFIDENCE) ** 2
     return float(np.median(np.sqrt(np.maximum(found.error[clear] ** 2 - noise, 0.0))))
