@@ -32,6 +32,7 @@ SENTENCE = (
 )
 
 _SETTLING_TIMES = 5.0  # of the tuned gains that are shown
+_LEAST = 0.02  # of the run that is shown
 
 _MOVED = files("piezojax.report") / "gain_sliders.js"
 _VALUE = """
@@ -64,7 +65,6 @@ def gain_sliders(
     from bokeh.models import ColumnDataSource, CustomJS, Div
 
     style: dict[str, Any] = {"sizing_mode": "stretch_width", "stylesheets": [_STYLE]}
-
     own = surrogate.tuned
     step = {"time": 1e3 * surrogate.times, "displacement": surrogate.at(own).step}
     shown = ColumnDataSource(step)
@@ -131,7 +131,8 @@ def _shown_until(tuned: "ColumnDataSource") -> float:
     """Return the time (ms) until which the step is shown: some settling times."""
     time, step = (np.asarray(tuned.data[name]) for name in ("time", "displacement"))
     away = np.abs(step - step[-1]) > BAND * np.ptp(step)
-    return float(min(_SETTLING_TIMES * max(time[away], default=time[-1]), time[-1]))
+    until = _SETTLING_TIMES * max(time[away], default=0.0)
+    return float(np.clip(until, _LEAST * time[-1], time[-1]))
 
 
 def _sliders(surrogate: GainSurrogate, outcome: Outcome) -> "list[Slider]":

@@ -103,7 +103,7 @@ def gain_surrogate(
     """Return the surrogate of the tuned loop of ``outcome``, or why there is none.
 
     Its figures are those of ``simulate_near``; the first of the gain sets are left out
-    of the interpolation and test it.
+    of the interpolation and test it. ``Ctrl-C`` ends the simulation.
     """
     if outcome.case.study.axes is not None:
         return "they are for one axis only"
@@ -111,7 +111,10 @@ def gain_surrogate(
     if count > MOST_GAINS:
         return f"{count} gains are tuned, and they are for {MOST_GAINS} at most"
     (progress or Silent()).stage("simulating gains near the tuned ones")
-    near = simulate_near(outcome)
+    try:
+        near = simulate_near(outcome)
+    except KeyboardInterrupt:
+        return "interrupted"
     if near is None:
         return (
             "gains very near the tuned ones diverge, stay at a voltage limit, or have "

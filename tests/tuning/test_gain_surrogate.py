@@ -160,6 +160,15 @@ def test_no_surrogate_is_made_at_the_edge_of_stability():
     assert "a sensitivity peak above 5" in found
 
 
+def test_an_interrupt_ends_the_simulation_alone(outcome, monkeypatch):
+    def interrupted(outcome):
+        raise KeyboardInterrupt
+
+    module = "piezojax.tuning.gain_surrogate.simulate_near"
+    monkeypatch.setattr(module, interrupted)
+    assert gain_surrogate(outcome) == "interrupted"
+
+
 def test_axes_and_many_gains_have_no_surrogate(outcome):
     several = SimpleNamespace(study=SimpleNamespace(axes="x, y"))
     axes = outcome_of(case=several)
