@@ -321,7 +321,8 @@ class Verbs:
     def __init__(self, **result):
         self.calls, self.found = [], result
 
-    def tune(self, study, out, seed, baselines, console):
+    def tune(self, study, out, seed, baselines, console, *, sliders):
+        assert sliders  # the default of the command
         self.calls.append(("tune", out.name))
         if self.found.pop("stopped", False):
             raise KeyboardInterrupt
