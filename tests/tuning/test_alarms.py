@@ -353,7 +353,7 @@ STUDY = {
 def test_the_command_ends_with_the_alarm(tmp_path):
     study, out = tmp_path / "study.toml", tmp_path / "out"
     study.write_text(tomli_w.dumps(STUDY), encoding="utf-8")
-    ended = CliRunner().invoke(main, [str(study), "--out", str(out)])
+    ended = CliRunner().invoke(main, ["--no-sliders", str(study), "--out", str(out)])
     assert ended.exit_code == 3
     printed = [
         line for line in ended.output.splitlines() if "sensitivity_peak is" in line
