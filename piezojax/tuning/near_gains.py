@@ -1,5 +1,6 @@
 """Simulations of a tuned loop with gains near the tuned ones."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats.qmc
 
-from ..analysis.stability import differentiable
+from ..analysis.constraints import CONSTRAINTS, margin_figures
+from ..analysis.stability.differentiable import UNLIMITED_DELAY, UNLIMITED_GAIN
 from ..analysis.stability.operating_point import OperatingPoint
 from ..analysis.step_response import NAMES, step_ends
 from ..core.arrays import as_array
@@ -41,26 +43,27 @@ STEP = NAMES[0]
 
 
 class Margin(NamedTuple):
-    """A margin: its function of S, that of the worst branch, unit, and "no limit"."""
+    """A margin of ``CONSTRAINTS``, and its value if nothing limits it."""
 
-    of: Callable
-    worst: Callable
-    unit: str
+    constraint: str
     unlimited: float
+
+    @property
+    def unit(self) -> str:
+        """Unit of the margin."""
+        return CONSTRAINTS[self.constraint].unit
+
+    def worst(self, values: jax.Array) -> jax.Array:
+        """Return the worst of ``values``, those of branches or of bands too."""
+        at_most = CONSTRAINTS[self.constraint].sense == "at most"
+        return jnp.max(values) if at_most else jnp.min(values)
 
 
 MARGINS = {
-    "sensitivity peak": Margin(differentiable.peak_of, jnp.max, "", math.inf),
-    "gain margin": Margin(
-        differentiable.gain_margin_of, jnp.min, "dB", differentiable.UNLIMITED_GAIN
-    ),
-    "phase margin": Margin(differentiable.phase_margin_of, jnp.min, "deg", 180.0),
-    "delay margin": Margin(
-        differentiable.delay_margin_of,
-        jnp.min,
-        "samples",
-        differentiable.UNLIMITED_DELAY,
-    ),
+    "sensitivity peak": Margin("sensitivity_peak", math.inf),
+    "gain margin": Margin("gain_margin", UNLIMITED_GAIN),
+    "phase margin": Margin("phase_margin", 180.0),
+    "delay margin": Margin("delay_margin", UNLIMITED_DELAY),
 }
 """Margins of a gain set by name."""
 
@@ -72,9 +75,8 @@ class Simulated(NamedTuple):
 
     ``errors`` [sets, references, values] are the tracking errors (um) of all draws,
     scaled so that their norm is their rms. ``step`` [sets, samples] is a displacement
-    (um). ``margins``
-    [sets, margins] are those of ``MARGINS``. ``stable`` is False for a set that
-    diverges, stays at a voltage limit, or has a sensitivity peak above
+    (um). ``margins`` [sets, margins] are those of ``MARGINS``. ``stable`` is False for
+    a set that diverges, stays at a voltage limit, or has a sensitivity peak above
     ``LARGEST_PEAK``.
     """
 
@@ -170,6 +172,7 @@ def _program(outcome: Outcome) -> tuple[Callable, np.ndarray]:
     step = np.where(np.arange(samples) > kept[0], after, before)
     signals = _with_run(signals, as_array(step), outcome)
     point = OperatingPoint(case.highest_reference, dt=study.dt)
+    names = [margin.constraint for margin in MARGINS.values()]
 
     def one(unit: jax.Array) -> tuple[jax.Array, ...]:
         around = space.put(loop, unit)
@@ -177,10 +180,8 @@ def _program(outcome: Outcome) -> tuple[Callable, np.ndarray]:
             lambda loop: loop, around, signals, start, every=every
         )
         assert errors is not None
-        sensitivities = differentiable.sensitivities(around, point)
-        margins = jnp.stack(
-            [each.worst(jax.vmap(each.of)(sensitivities)) for each in MARGINS.values()]
-        )
+        of = margin_figures(names, around, point, None)
+        margins = jnp.stack([m.worst(of[m.constraint]) for m in MARGINS.values()])
         tracking = errors[:-1].reshape(len(errors) - 1, -1)
         rms = jnp.sqrt(jnp.mean(figures.rms_error[:-1] ** 2, axis=1))
         size = jnp.linalg.norm(tracking, axis=1)
@@ -204,10 +205,5 @@ def _with_run(signals: Signals, reference: jax.Array, outcome: Outcome) -> Signa
     )
     references = jnp.concatenate([signals.references, reference[None]])
     (holding,) = holding_inputs(own_stage(outcome.after), references[:, 0])
-    return Signals(
-        references,
-        noise.noise,
-        noise.disturbance,
-        noise.input_disturbance,
-        holding=holding,
-    )
+    more = {"references": references, "holding": holding, "traces": ()}
+    return dataclasses.replace(signals, **more, **noise._asdict())

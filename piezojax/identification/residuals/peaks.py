@@ -49,18 +49,16 @@ def unmodelled_peaks(found: RelativeError) -> list[Peak]:
     sure = found.sure & (found.lower > LEAST)
     kept: list[int] = []
     peaks: list[Peak] = []
-    for i in np.argsort(found.lower, kind="stable")[::-1]:
+    large = np.flatnonzero((found.lower > LEAST) & (amplitude > VISIBLE))
+    for i in large[np.argsort(found.lower[large], kind="stable")[::-1]]:
         ratio = frequency / frequency[i]
-        around = (ratio > 0.5) & (ratio < 2.0)
         near = (ratio > 0.8) & (ratio < 1.25)
-        sides = around & (ratio <= 0.8), around & (ratio >= 1.25)
-        levels = [_level(found, side) for side in sides if side.sum() >= ENOUGH]
-        large = found.lower[i] > LEAST and amplitude[i] > VISIBLE
         flank = sure[near] & (error[near] >= FLANK * error[i])
-        if not large or not flank.any() or not levels:
+        if near[kept].any() or not flank.any():
             continue
-        taken = any(0.8 < frequency[i] / frequency[j] < 1.25 for j in kept)
-        if not taken and error[i] > SHARP * max(levels):
+        sides = (ratio > 0.5) & (ratio <= 0.8), (ratio >= 1.25) & (ratio < 2.0)
+        levels = [_level(found, side) for side in sides if side.sum() >= ENOUGH]
+        if levels and error[i] > SHARP * max(levels):
             kept.append(int(i))
             highest = near & (found.lower > TOP * found.lower[i])
             top = int(np.argmax(np.where(highest, error, 0.0)))
