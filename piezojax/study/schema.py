@@ -35,8 +35,8 @@ from .tables import (
 _OWN_LISTS = ("tune", "unseen", "files")
 """Keys whose lists are not values by axis."""
 
-MEMORY_GB = 16.0
-"""Largest memory of the signals of a study, GB."""
+MEMORY_GB = 4.0
+"""Largest memory of the signals of a study, GB. Tuning takes several times as much."""
 
 
 class AxesTable(Table):
