@@ -115,6 +115,8 @@ REFUSED = {
     "start": ["nowhere.csv", "--yes"],
     "excite": ["--lower", "0", "--upper", "1", "--rate", "0"],
     "reproduce": ["--table", "9-9"],
+    "trial": ["nowhere", "--stage", "127.0.0.1:1"],
+    "emulate": ["nowhere.toml"],
 }
 """Arguments that each command refuses."""
 
@@ -621,6 +623,15 @@ def test_a_folder_in_use_is_refused(study, tmp_path):
     with results_folder(tmp_path / "out", "tune"):
         result = call("tune", study, "--out", tmp_path / "out")
     failed(result, "out is in use by a running command")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_bar_of_a_moving_stage_ends_at_once(number):
+    with (
+        Bar(console(quiet=True), at_once=True),
+        pytest.raises(KeyboardInterrupt),
+    ):
+        signal.raise_signal(number)
 
 
 def test_ctrl_c_twice_acts_at_once():

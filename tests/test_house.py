@@ -10,15 +10,15 @@ import piezojax
 
 SUBPACKAGES = (
     *("core", "signals", "dynamics", "hysteresis", "hardware", "control", "analysis"),
-    *("exporting", "solve", "identification", "catalog", "study", "tuning", "sweeping"),
-    *("reproduction", "report", "cli"),
+    *("exporting", "solve", "identification", "catalog", "study", "stages", "tuning"),
+    *("sweeping", "reproduction", "report", "cli"),
 )
 """Subpackages from the lowest up: each may import those before it, so that ``cli``
 alone imports ``report``."""
 
 ENTRIES = (
     *("__init__", "tune", "identify", "validate", "sweep", "reproduce"),
-    *("export", "start", "excite"),
+    *("export", "start", "excite", "emulate", "trial"),
 )
 """Modules at the top: they may import any subpackage; no subpackage imports them."""
 

@@ -32,11 +32,11 @@ class Bar:
 
     While it runs, the first Ctrl-C or SIGTERM waits for the next report of progress,
     because an exception inside JAX's compiler can be lost or crash it; the second acts
-    at once.
+    at once. With ``at_once`` the first does too: a stage that moves must not wait.
     """
 
-    def __init__(self, console: Console):
-        self._console = console
+    def __init__(self, console: Console, at_once: bool = False):
+        self._console, self._at_once = console, at_once
         self._live = console.is_terminal
         self._progress = Progress(
             SpinnerColumn(),
@@ -65,7 +65,7 @@ class Bar:
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         remember(number)
-        if self._interrupted:
+        if self._interrupted or (self._at_once and not self._finishing):
             raise KeyboardInterrupt
         self._interrupted = True
         if not self._live and not self._console.quiet:

@@ -19,6 +19,7 @@ from .feedforward import FeedforwardFeedback as FeedforwardFeedback
 from .feedforward import InverseFeedforward as InverseFeedforward
 from .filtered import Filtered as Filtered
 from .filtered_command import FilteredCommand as FilteredCommand
+from .guard import Guard as Guard
 from .inversion import InverseGain as InverseGain
 from .inversion import InversionControl as InversionControl
 from .iterative_learning import LearningLaw as LearningLaw

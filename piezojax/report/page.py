@@ -38,6 +38,7 @@ PICTURES = {
     "comparison.png": "Errors of the compared models or controllers",
     "validation.png": "The model on the other records",
     "excitation.png": "Voltages to record",
+    "trial.png": "References, readings and errors on the stage",
     "limit.png": "Errors beside the limit of linear control",
     "structures.png": "Errors by the number of notches",
     "pareto.png": "Error against the limit of a constraint",

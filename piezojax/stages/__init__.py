@@ -1,0 +1,16 @@
+"""Stages that can be asked to run: an emulated one, and others over a socket."""
+
+from .connect import stage_of as stage_of
+from .emulated import EmulatedStage as EmulatedStage
+from .emulated import Limits as Limits
+from .faults import Fault as Fault
+from .protocol import LostError as LostError
+from .protocol import Stage as Stage
+from .protocol import StageError as StageError
+from .protocol import StoppedError as StoppedError
+from .remote import RemoteStage as RemoteStage
+from .server import StageServer as StageServer
+from .try_gains import Motion as Motion
+from .try_gains import TrialReport as TrialReport
+from .try_gains import TriedRun as TriedRun
+from .try_gains import trial as trial

@@ -1,0 +1,32 @@
+"""Stage by its name: an address, or a function of a lab's own module."""
+
+import importlib
+
+from .protocol import Stage
+from .remote import RemoteStage
+
+
+def stage_of(name: str) -> Stage:
+    """Return the stage at ``name``: "host:port", or "module:function".
+
+    The function has no argument and returns a Stage. Raises ValueError for another
+    name, a module or function that is missing, or one that does not return a stage.
+    """
+    place, _, what = name.rpartition(":")
+    if not (place and what):
+        raise ValueError(
+            f"--stage is {name!r}; give host:port, as 127.0.0.1:5025, or "
+            "module:function of your own stage"
+        )
+    if what.isdigit():
+        return RemoteStage(name)
+    try:
+        found = getattr(importlib.import_module(place), what)()
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"--stage {name}: {error}") from None
+    if not isinstance(found, Stage):
+        raise ValueError(
+            f"--stage {name} returns a {type(found).__name__}, which is no stage: it "
+            "needs dt, run, apply, gains and safe"
+        )
+    return found

@@ -1,0 +1,237 @@
+"""Trial of tuned gains on a stage: a small motion first, then the references."""
+
+import contextlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import BaseModel
+
+from ..core.files import atomic_replacement, write_text
+from ..core.progress import Progress, Silent
+from ..identification import Record
+from .protocol import Gains, LostError, Stage, StageError, StoppedError
+
+TRIAL_FILE = "trial.json"
+
+SMALL = (0.1, 0.3)
+"""Shares of the first reference with which a trial begins."""
+
+NEAR, FAR = 1.3, 2.0
+"""Ratios of the measured to the promised error above which there is a note, and above
+which the gains are not kept."""
+
+Verdict = Literal["running", "kept", "restored", "stopped", "lost"]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Reference of a trial: ``reference`` (um) and the error ``promised`` (um rms).
+
+    Samples before ``start`` do not count. ``noise`` is the rms noise of the sensor, um:
+    it is part of the measured error, but not of the promised one.
+    """
+
+    name: str
+    reference: Float[np.ndarray, " samples"]
+    promised: float
+    start: int = 0
+    noise: float = 0.0
+
+
+class TriedRun(BaseModel):
+    """Run of a trial with a ``share`` of a reference.
+
+    ``measured_um`` is the rms of reference minus reading, ``error_um`` the same without
+    as much noise as the sensor may have in so many samples (three standard deviations),
+    and ``peak_um`` the largest; None if the run was stopped, for the reason
+    ``stopped``. ``file`` holds the samples.
+    """
+
+    reference: str
+    share: float
+    promised_um: float
+    measured_um: float | None = None
+    error_um: float | None = None
+    peak_um: float | None = None
+    voltage_V: tuple[float, float] | None = None  # noqa: N815
+    stopped: str = ""
+    file: str = ""
+
+    @property
+    def ratio(self) -> float:
+        """Error relative to the promised one; infinite for a run that was stopped."""
+        if self.error_um is None:
+            return math.inf
+        return self.error_um / self.promised_um
+
+
+class TrialReport(BaseModel):
+    """Report of a trial, the content of ``trial.json``.
+
+    ``gains`` are those tried, ``before`` all gains of the stage before the trial.
+    ``verdict`` is "kept", "restored" (the gains from before are set again), "stopped"
+    (the guard or the user stopped a run: the safe gains are set), or "lost" (no
+    connection). While the trial runs it is "running".
+    """
+
+    stage: str
+    gains: dict[str, float]
+    before: dict[str, float]
+    runs: list[TriedRun] = []
+    verdict: Verdict = "running"
+    alarms: list[str] = []
+    notes: list[str] = []
+
+
+def trial(
+    stage: Stage,
+    gains: Gains,
+    motions: Sequence[Motion],
+    folder: Path,
+    *,
+    name: str = "stage",
+    progress: Progress | None = None,
+) -> TrialReport:
+    """Try ``gains`` on ``stage``, and keep them if they keep what was promised.
+
+    The gains of the stage are saved first. The first of ``motions`` begins with small
+    shares of its reference. The trial ends at the first run that is stopped, or whose
+    error exceeds FAR times the promised one; then the gains from before, or the safe
+    ones of the stage, are set. ``folder`` receives the samples of every run, and after
+    each step the report.
+
+    Raises ValueError if there is no motion or the stage lacks one of the gains.
+    """
+    if not motions:
+        raise ValueError("a trial needs at least one reference")
+    progress = progress or Silent()
+    report = TrialReport(stage=name, gains=dict(gains), before=stage.gains())
+    missing = [path for path in gains if path not in report.before]
+    if missing:
+        raise ValueError(
+            f"the stage has no gain {missing[0]}; it has {', '.join(report.before)}"
+        )
+    _write(report, folder)
+    first = [(motions[0], share) for share in SMALL]
+    planned = first + [(motion, 1.0) for motion in motions]
+    progress.stage("trying the gains on the stage", len(planned))
+    try:
+        for number, (motion, share) in enumerate(planned, start=1):
+            file = folder / f"run_{number:02d}.npz"
+            run = _tried(stage, gains, motion, share, file)
+            report.runs.append(run)
+            _write(report, folder)
+            if run.stopped or run.ratio > FAR:
+                break
+            progress.advance(
+                run.ratio, f"{_named(run)}: {run.ratio:.2f} of the promised error"
+            )
+        _judge(stage, report)
+    except BaseException as error:
+        _abandon(stage, report, error)
+        if not isinstance(error, StageError):
+            _write(report, folder)
+            raise
+    _write(report, folder)
+    return report
+
+
+def _tried(
+    stage: Stage, gains: Gains, motion: Motion, share: float, file: Path
+) -> TriedRun:
+    """Run a ``share`` of a motion; write its samples into ``file``."""
+    begin = motion.reference[0]
+    reference = begin + share * (motion.reference - begin)
+    run = TriedRun(
+        reference=motion.name, share=share, promised_um=motion.promised, file=file.name
+    )
+    try:
+        record = stage.run(reference, gains)
+    except StoppedError as stop:
+        _save(file, stop.reference, stop.measured, stop.voltage)
+        return run.model_copy(update={"stopped": stop.reason})
+    _save(file, reference, record.output, record.input)
+    return run.model_copy(update=_figures(record, reference, motion))
+
+
+def _figures(record: Record, reference: np.ndarray, motion: Motion) -> dict:
+    error = (reference - record.output)[motion.start :]
+    measured = float(np.sqrt(np.mean(error**2)))
+    voltage = record.input
+    noise = motion.noise**2 * (1.0 + 3.0 * math.sqrt(2.0 / error.size))
+    return {
+        "measured_um": measured,
+        "error_um": math.sqrt(max(measured**2 - noise, 0.0)),
+        "peak_um": float(np.abs(error).max()),
+        "voltage_V": (float(voltage.min()), float(voltage.max())),
+    }
+
+
+def _judge(stage: Stage, report: TrialReport) -> None:
+    """Keep the gains, or restore those from before, by the runs of ``report``."""
+    last = report.runs[-1]
+    if last.stopped:
+        stage.safe()
+        report.verdict = "stopped"
+        report.alarms.append(
+            f"{_named(last)}: {last.stopped}; the safe gains of the stage are set"
+        )
+    elif last.ratio > FAR:
+        stage.apply(report.before)
+        report.verdict = "restored"
+        report.alarms.append(
+            f"{_named(last)}: the error is {last.error_um:.3g} um, {last.ratio:.3g} "
+            f"times the promised {last.promised_um:.3g} um; the gains from before are "
+            "set again. The model does not describe this stage: record it with these "
+            "runs, identify it again and tune"
+        )
+    else:
+        report.verdict = "kept"
+        report.notes += [
+            f"{_named(run)}: the error is {run.ratio:.3g} times the promised one"
+            for run in report.runs
+            if run.ratio > NEAR
+        ]
+
+
+def _abandon(stage: Stage, report: TrialReport, error: BaseException) -> None:
+    """Make ``stage`` safe after ``error``, if it can be reached."""
+    report.verdict = "stopped"
+    with contextlib.suppress(LostError):
+        if not isinstance(error, LostError):
+            stage.safe()
+            report.alarms.append(
+                f"{_cause(error)}; the safe gains of the stage are set"
+            )
+            return
+    report.verdict = "lost"
+    report.alarms.append(
+        f"{_cause(error)}: nothing is known of the stage since; its own guard has to "
+        "make it safe. Look at it before the next run"
+    )
+
+
+def _cause(error: BaseException) -> str:
+    return str(error) or type(error).__name__
+
+
+def _named(run: TriedRun) -> str:
+    return f"{run.reference} at {100.0 * run.share:g} %"
+
+
+def _save(
+    file: Path, reference: np.ndarray, measured: np.ndarray, voltage: np.ndarray
+) -> None:
+    with atomic_replacement(file) as temporary, temporary.open("wb") as stream:
+        np.savez(
+            stream, reference_um=reference, measured_um=measured, voltage_V=voltage
+        )
+
+
+def _write(report: TrialReport, folder: Path) -> None:
+    write_text(folder / TRIAL_FILE, report.model_dump_json(indent=2) + "\n")
