@@ -67,6 +67,9 @@ EXTRA = {
     "active damping": lambda: control.ActiveDamping(
         p753.pid(), SecondOrderLowPass(2000.0, 0.3, DT), 0.4
     ),
+    "guarded pid": lambda: control.Guard(
+        p753.pid(), -20.0, 120.0, 1e5, 5.0, 0.0, 20, 2.0, DT
+    ),
     "repetitive, short": lambda: control.RepetitiveControl(
         p753.sliding_mode(), FirstOrderLag(4 * DT, DT), 0.2, 3
     ),
