@@ -33,6 +33,9 @@ LONGEST_HOLD = 0.5
 
 ASKED = "it was asked to stop"
 
+RETREATING = len(REASONS)
+"""Reason of a guard that retreats without a fault of its own."""
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -191,9 +194,7 @@ class EmulatedStage:
         for first in range(0, len(padded), BLOCK):
             here = slice(first, first + BLOCK)
             for fault in faults:
-                if fault.kind == "plant" and fault.begin in range(
-                    *here.indices(1 << 62)
-                ):
+                if fault.kind == "plant" and first <= fault.begin < here.stop:
                     self._loop = eqx.tree_at(
                         lambda loop: loop.plant, self._loop, fault.plant
                     )
@@ -237,13 +238,11 @@ class EmulatedStage:
         """Set the safe gains, and move to the safe voltage behind a stopped guard."""
         controller = replace(self.controller, _arrays(self.safe_gains))
         self._loop = eqx.tree_at(
-            lambda loop: (loop.controller, loop.plant),
-            self._loop,
-            (self._guarded(controller), self._loop.plant),
+            lambda loop: loop.controller, self._loop, self._guarded(controller)
         )
         stopped = self._restarted(state)
         guard = stopped.controller._replace(
-            reason=jnp.asarray(len(REASONS), jnp.int32), command=state.voltage
+            reason=jnp.asarray(RETREATING, jnp.int32), command=state.voltage
         )
         self._state = stopped._replace(controller=guard)
         way = abs(float(state.voltage) - self.limits.retreat)
