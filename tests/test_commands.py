@@ -116,6 +116,7 @@ REFUSED = {
     "excite": ["--lower", "0", "--upper", "1", "--rate", "0"],
     "reproduce": ["--table", "9-9"],
     "trial": ["nowhere", "--stage", "127.0.0.1:1"],
+    "watch": ["nowhere", "--stage", "127.0.0.1:1"],
     "emulate": ["nowhere.toml"],
 }
 """Arguments that each command refuses."""

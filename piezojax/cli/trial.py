@@ -5,19 +5,13 @@ from pathlib import Path
 import click
 
 from .command import Command, common, exit_unsafe, print_results, results_folder, run
+from .on_stage import connected, stage_option, tuned_gains
 from .terminal import Bar
 
 
 @click.command(cls=Command)
 @click.argument("results", type=click.Path(path_type=Path))
-@click.option(
-    "--stage",
-    "name",
-    required=True,
-    metavar="NAME",
-    help="Stage: host:port, as printed by python -m piezojax.emulate, or "
-    "module:function of your own stage.",
-)
+@stage_option
 @common
 def main(results, name, out, seed, quiet):
     """Try the gains in the folder RESULTS of tune on a stage.
@@ -30,37 +24,18 @@ def main(results, name, out, seed, quiet):
     del seed  # nothing is random
 
     def body(console):
-        from ..core.serial import load
         from ..report.page import write_page
         from ..report.trial_report import trial_page, write_trial
-        from ..stages import RemoteStage, stage_of, trial
-        from ..stages.of_study import motions_of
-        from ..stages.protocol import StageError
-        from ..study import load as load_study
-        from ..tuning.result import GAINS_FILE, STUDY_FILE, load_result
+        from ..stages import trial
 
-        result = load_result(results)
-        load(results / GAINS_FILE)  # refuses gains with an alarm
-        promised = dict(result.holdout.per_reference_rms_um)
-        if result.unseen is not None:
-            promised |= result.unseen.per_reference_rms_um
-        motions = motions_of(load_study(results / STUDY_FILE), results, promised)
-        gains = {
-            path.removeprefix("controller."): value
-            for path, value in result.gains.items()
-        }
+        result, gains, motions = tuned_gains(results)
         with (
             Bar(console, at_once=True) as bar,
             results_folder(out, f"{results.name}_trial") as folder,
         ):
             bar.stage("connecting to the stage")
-            try:
-                stage = stage_of(name)
+            with connected(name) as stage:
                 found = trial(stage, gains, motions, folder, name=name, progress=bar)
-            except StageError as error:
-                raise ValueError(str(error)) from None
-            if isinstance(stage, RemoteStage) and found.verdict != "lost":
-                stage.close()
             bar.finish()
             bar.stage("drawing")
             pictures = write_trial(found, folder, motions, stage.dt)

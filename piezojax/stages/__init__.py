@@ -1,5 +1,10 @@
 """Stages that can be asked to run: an emulated one, and others over a socket."""
 
+from .changes import Baseline as Baseline
+from .changes import Judgement as Judgement
+from .changes import RunFeatures as RunFeatures
+from .changes import WatchReport as WatchReport
+from .changes import watch as watch
 from .connect import stage_of as stage_of
 from .emulated import EmulatedStage as EmulatedStage
 from .emulated import Limits as Limits

@@ -18,6 +18,9 @@ from .protocol import Gains, LostError, Stage, StageError, StoppedError
 
 TRIAL_FILE = "trial.json"
 
+COLUMNS = "reference_um", "measured_um", "voltage_V"
+"""Arrays in the file of a run."""
+
 SMALL = (0.1, 0.3)
 """Shares of the first reference with which a trial begins."""
 
@@ -153,9 +156,9 @@ def _tried(
     try:
         record = stage.run(reference, gains)
     except StoppedError as stop:
-        _save(file, stop.reference, stop.measured, stop.voltage)
+        save_samples(file, stop.reference, stop.measured, stop.voltage)
         return run.model_copy(update={"stopped": stop.reason})
-    _save(file, reference, record.output, record.input)
+    save_samples(file, reference, record.output, record.input)
     return run.model_copy(update=_figures(record, reference, motion))
 
 
@@ -224,13 +227,13 @@ def _named(run: TriedRun) -> str:
     return f"{run.reference} at {100.0 * run.share:g} %"
 
 
-def _save(
+def save_samples(
     file: Path, reference: np.ndarray, measured: np.ndarray, voltage: np.ndarray
 ) -> None:
+    """Write the samples of a run, um and V, into ``file``."""
     with atomic_replacement(file) as temporary, temporary.open("wb") as stream:
-        np.savez(
-            stream, reference_um=reference, measured_um=measured, voltage_V=voltage
-        )
+        columns = reference, measured, voltage
+        np.savez(stream, **dict(zip(COLUMNS, columns, strict=True)))
 
 
 def _write(report: TrialReport, folder: Path) -> None:

@@ -111,3 +111,31 @@ def test_a_model_replaces_the_plant(tuned, tmp_path):
     assert (
         float(pj.simulate(one.plant, np.array([4.0]), one.plant.init(0.0))[1][0]) == 1
     )
+
+
+def watched(folder, address, *arguments):
+    return call("watch", folder / "results", "--stage", address, *arguments)
+
+
+def test_watch_compares_a_stage_with_its_baseline(tuned, tmp_path):
+    with emulated(tuned) as (_, address):
+        first = watched(tuned, address, "--runs", "12", "--out", tmp_path / "first")
+        assert "these runs are a baseline" in succeeded(first).stdout
+        options = "--baseline", tmp_path / "first", "--false-alarms", "0.001"
+        same = watched(tuned, address, *options, "--out", tmp_path / "same")
+        assert "0 of 3 runs differ from the baseline" in succeeded(same).stdout
+    with emulated(tuned, gain=0.9) as (_, address):
+        found = watched(tuned, address, *options, "--out", tmp_path / "other")
+    assert found.exit_code == 3
+    assert "3 of 3 runs differ from the baseline" in found.stdout
+    assert "ALARM: run_01.npz: the stage has changed: its gain by -1" in found.stdout
+    for name in ("first", "same", "other"):
+        assert (tmp_path / name / "watch.png").stat().st_size > 20_000
+        assert "watch.png" not in (tmp_path / name / "watch.json").read_text()
+
+
+def test_watch_names_the_references(tuned, tmp_path):
+    with emulated(tuned) as (_, address):
+        result = watched(tuned, address, "--reference", "SIN5", "--out", tmp_path / "x")
+    assert result.exit_code == 1
+    assert "SIN50" in result.stderr

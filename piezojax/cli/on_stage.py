@@ -1,0 +1,63 @@
+"""Common parts of the commands that move a stage."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from ..stages import Motion, Stage
+    from ..tuning.result import Result
+
+stage_option: Callable = click.option(
+    "--stage",
+    "name",
+    required=True,
+    metavar="NAME",
+    help="Stage: host:port, as printed by python -m piezojax.emulate, or "
+    "module:function of your own stage.",
+)
+
+
+def tuned_gains(
+    results: Path,
+) -> "tuple[Result, dict[str, float], list[Motion]]":
+    """Return result, gains and motions of a folder of ``tune``.
+
+    The paths of the gains begin in the controller. Raises ValueError for gains with an
+    alarm, and for a folder without them.
+    """
+    from ..core.serial import load
+    from ..stages.of_study import motions_of
+    from ..study import load as load_study
+    from ..tuning.result import GAINS_FILE, STUDY_FILE, load_result
+
+    result = load_result(results)
+    load(results / GAINS_FILE)  # refuses gains with an alarm
+    promised = dict(result.holdout.per_reference_rms_um)
+    if result.unseen is not None:
+        promised |= result.unseen.per_reference_rms_um
+    gains = {
+        path.removeprefix("controller."): value for path, value in result.gains.items()
+    }
+    motions = motions_of(load_study(results / STUDY_FILE), results, promised)
+    return result, gains, motions
+
+
+@contextmanager
+def connected(name: str) -> "Iterator[Stage]":
+    """Yield the stage ``name``; say goodbye to it if nothing fails.
+
+    Raises ValueError, one line, for a StageError.
+    """
+    from ..stages import RemoteStage, StageError, stage_of
+
+    try:
+        stage = stage_of(name)
+        yield stage
+        if isinstance(stage, RemoteStage):
+            stage.close()
+    except StageError as error:
+        raise ValueError(str(error)) from None

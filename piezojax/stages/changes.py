@@ -1,0 +1,295 @@
+"""Watch: whether a stage still moves as it did when its gains were set."""
+
+import contextlib
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import BaseModel
+from scipy import stats
+
+from ..core.files import write_text
+from ..core.progress import Progress, Silent
+from ..identification import Record
+from .protocol import Gains, LostError, Stage, StoppedError
+from .try_gains import COLUMNS, Motion, save_samples
+
+WATCH_FILE = "watch.json"
+
+FALSE_ALARMS = 0.01
+"""Default share of the runs of an unchanged stage that count as changed."""
+
+BASELINE = 12
+"""Default number of runs with which later ones are compared."""
+
+FEATURES = 4
+"""Number of features of a run."""
+
+Samples = Float[np.ndarray, "runs samples"]
+
+
+class RunFeatures(BaseModel):
+    """Features of a run, relative to the means of the baseline.
+
+    ``gain_percent`` and ``lag_us`` are the changes of the gain and of the lag of the
+    stage (us): those of its reading less those of its voltage. ``log_error`` and
+    ``log_rest`` are the decimal logarithms of the rms tracking error (um) and of the
+    rms voltage (V) that a change of scale, lag and zero and a drift do not explain.
+    """
+
+    gain_percent: float
+    lag_us: float
+    log_error: float
+    log_rest: float
+
+
+class Judgement(BaseModel):
+    """Comparison of a run with the baseline.
+
+    ``distance`` is Hotelling's T^2 of the features. It exceeds ``threshold`` in the
+    stated share of the runs of an unchanged stage. ``stopped`` is the reason why the
+    guard stopped the run, which has no features then.
+    """
+
+    file: str = ""
+    features: RunFeatures | None = None
+    distance: float | None = None
+    threshold: float | None = None
+    stopped: str = ""
+
+    @property
+    def moved(self) -> bool:
+        """Whether the stage has changed."""
+        known = self.distance is not None and self.threshold is not None
+        return not known or self.distance > self.threshold
+
+
+class WatchReport(BaseModel):
+    """Report of a watch, the content of ``watch.json``.
+
+    ``baseline`` are the features of the runs with which ``runs`` are compared.
+    """
+
+    stage: str
+    reference: str
+    gains: dict[str, float]
+    false_alarms: float
+    baseline: list[RunFeatures]
+    runs: list[Judgement] = []
+    alarms: list[str] = []
+
+
+class Baseline:
+    """Runs of an unchanged stage: ``records`` of one reference with the same gains.
+
+    Samples before ``start`` do not count. Raises ValueError for fewer than
+    ``FEATURES`` + 2 records, or records of different references.
+    """
+
+    def __init__(self, records: Sequence[Record], start: int = 0):
+        if len(records) < FEATURES + 2:
+            raise ValueError(
+                f"a baseline needs at least {FEATURES + 2} runs, not {len(records)}"
+            )
+        self._start, self._dt = start, records[0].dt
+        self._reference = records[0].reference
+        for record in records:
+            self._check(record)
+        self._voltages, self._readings = (
+            np.array([getattr(record, side)[start:] for record in records])
+            for side in ("input", "output")
+        )
+        self.features = [
+            self._features(record, np.delete(self._voltages, row, axis=0))
+            for row, record in enumerate(records)
+        ]
+
+    def judge(self, record: Record, false_alarms: float = FALSE_ALARMS) -> Judgement:
+        """Compare ``record`` with the baseline.
+
+        The likelihood ratio test of the mean of normal features with unknown covariance
+        is Hotelling's: for n runs and p features, T^2 n / (n + 1) follows
+        p (n - 1) / (n - p) F(p, n - p) (Anderson, An Introduction to Multivariate
+        Statistical Analysis, 3rd ed., 5.3). Raises ValueError for a record of another
+        reference.
+        """
+        self._check(record)
+        found = self._features(record, self._voltages)
+        rows = np.array([list(each.model_dump().values()) for each in self.features])
+        new = np.array(list(found.model_dump().values()))
+        count, size = rows.shape
+        away = new - rows.mean(axis=0)
+        covariance = np.cov(rows, rowvar=False)
+        distance = count / (count + 1) * away @ np.linalg.solve(covariance, away)
+        quantile = stats.f.isf(false_alarms, size, count - size)
+        return Judgement(
+            features=found,
+            distance=float(distance),
+            threshold=float(size * (count - 1) / (count - size) * quantile),
+        )
+
+    def _check(self, record: Record) -> None:
+        if record.reference is None or not np.array_equal(
+            record.reference, self._reference
+        ):
+            raise ValueError("a run can only be compared with runs of its reference")
+
+    def _features(self, record: Record, others: Samples) -> RunFeatures:
+        """Return the features of ``record``; its rest is relative to ``others``.
+
+        The rest of a run of the baseline is relative to the mean of the other runs,
+        because that of a later run contains the noise of the mean too.
+        """
+        voltage, reading = record.input[self._start :], record.output[self._start :]
+        assert record.reference is not None
+        error = record.reference[self._start :] - reading
+        of_voltage, _ = _explained(voltage, self._voltages.mean(axis=0), self._dt)
+        of_reading, _ = _explained(reading, self._readings.mean(axis=0), self._dt)
+        _, rest = _explained(voltage, others.mean(axis=0), self._dt)
+        gain = (1.0 + of_reading[0]) / (1.0 + of_voltage[0]) - 1.0
+        advance = of_reading[1] - of_voltage[1]
+        return RunFeatures(
+            gain_percent=100.0 * float(gain),
+            lag_us=-1e6 * float(advance),
+            log_error=math.log10(np.sqrt(np.mean(error**2))),
+            log_rest=math.log10(np.sqrt(np.mean(rest**2))),
+        )
+
+
+def _explained(
+    signal: Float[np.ndarray, " samples"],
+    mean: Float[np.ndarray, " samples"],
+    dt: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the changes of scale and advance (s) of ``signal`` from ``mean``.
+
+    The second result is the rest, without zero and constant drift.
+    """
+    columns = [
+        mean - mean.mean(),
+        np.gradient(mean, dt),
+        np.ones_like(mean),
+        np.linspace(-1.0, 1.0, len(mean)),
+    ]
+    matrix = np.column_stack(columns)
+    away = signal - mean
+    changes = np.linalg.lstsq(matrix, away, rcond=None)[0]
+    return changes[:2], away - matrix @ changes
+
+
+def read_runs(folder: Path, dt: float) -> list[Record]:
+    """Return the runs that ``watch`` left in ``folder``; ``dt`` in s.
+
+    Raises ValueError if there are none.
+    """
+    records = []
+    for file in sorted(folder.glob("run_*.npz")):
+        with np.load(file, allow_pickle=False) as samples:
+            reference, measured, voltage = (samples[key] for key in COLUMNS)
+        records.append(
+            Record(voltage, measured, dt, source=file.name, reference=reference)
+        )
+    if not records:
+        raise ValueError(f"{folder} holds no runs of a watch")
+    return records
+
+
+def watch(
+    stage: Stage,
+    gains: Gains,
+    motion: Motion,
+    folder: Path,
+    *,
+    baseline: Path | None = None,
+    runs: int = 3,
+    false_alarms: float = FALSE_ALARMS,
+    name: str = "stage",
+    progress: Progress | None = None,
+) -> WatchReport:
+    """Run ``motion`` on ``stage`` and judge whether the stage has changed.
+
+    The runs are compared with those in the folder ``baseline``; without one, ``runs``
+    of them are recorded into ``folder``, after one that does not count. ``folder``
+    receives the samples of every run and the report. The stage keeps ``gains``; it is
+    made safe after a fault. Raises ValueError for a ``baseline`` of another reference
+    or with too few runs.
+    """
+    known = None
+    if baseline is not None:
+        known = Baseline(read_runs(baseline, stage.dt), motion.start)
+    elif runs < FEATURES + 2:
+        raise ValueError(
+            f"a baseline needs at least {FEATURES + 2} runs, not {runs}; give more "
+            "runs, or the folder of a baseline"
+        )
+    try:
+        records, judged = _runs(
+            stage, gains, motion, folder, known, runs, false_alarms, progress
+        )
+    except BaseException:
+        with contextlib.suppress(LostError):
+            stage.safe()
+        raise
+    if known is None and len(records) == runs:
+        known = Baseline(records, motion.start)
+    report = WatchReport(
+        stage=name,
+        reference=motion.name,
+        gains=dict(gains),
+        false_alarms=false_alarms,
+        baseline=known.features if known else [],
+        runs=judged,
+        alarms=[sentence for each in judged if (sentence := _alarm(each))],
+    )
+    write_text(folder / WATCH_FILE, report.model_dump_json(indent=2) + "\n")
+    return report
+
+
+def _runs(
+    stage: Stage,
+    gains: Gains,
+    motion: Motion,
+    folder: Path,
+    known: Baseline | None,
+    runs: int,
+    false_alarms: float,
+    progress: Progress | None,
+) -> tuple[list[Record], list[Judgement]]:
+    """Run ``motion``, and judge each run by ``known``; end at a run that is stopped."""
+    progress = progress or Silent()
+    progress.stage("running the reference on the stage", runs)
+    records, judged = [], []
+    file = folder / "first.npz"
+    try:
+        if known is None:  # the first motion differs from those that follow it
+            stage.run(motion.reference, gains)
+        for number in range(1, runs + 1):
+            file = folder / f"run_{number:02d}.npz"
+            record = stage.run(motion.reference, gains)
+            save_samples(file, motion.reference, record.output, record.input)
+            records.append(record)
+            if known is not None:
+                found = known.judge(record, false_alarms)
+                judged.append(found.model_copy(update={"file": file.name}))
+            progress.advance(float(number), f"run {number} of {runs}")
+    except StoppedError as stop:
+        save_samples(file, stop.reference, stop.measured, stop.voltage)
+        judged.append(Judgement(file=file.name, stopped=stop.reason))
+    return records, judged
+
+
+def _alarm(judged: Judgement) -> str:
+    """Return the sentence on a run of a stage that has changed, or ""."""
+    if judged.stopped:
+        return f"{judged.file}: the run was stopped: {judged.stopped}"
+    if not judged.moved or judged.features is None:
+        return ""
+    features = judged.features
+    return (
+        f"{judged.file}: the stage has changed: its gain by "
+        f"{features.gain_percent:+.2g} %, its lag by {features.lag_us:+.2g} us "
+        f"(T^2 {judged.distance:.3g}, threshold {judged.threshold:.3g}); record it "
+        "again, identify and tune"
+    )
