@@ -80,14 +80,24 @@ def test_columns_are_recognised(tmp_path, header, rows, found):
 
 def test_given_columns_are_kept(tmp_path):
     path = table(tmp_path, "time_s,a_um,b_um")
-    given = NONE | {"input": "a_um", "rate": 5.0, "resample": 2.0}
+    given = NONE | {"input": "a_um", "rate": 0.1, "resample": 2.0}
     assert recognised(path, given) == {
         "time": None,
         "input": "a_um",
         "output": "b_um",
-        "rate": 5.0,
+        "rate": 0.1,
         "resample": 2.0,
     }
+
+
+@pytest.mark.parametrize("unit", ["time_s", "t (ms)"])
+def test_a_rate_that_contradicts_the_times_is_refused(tmp_path, unit):
+    path = table(tmp_path, f"{unit},drive_V,sensor_um")  # a step of 10
+    own = 0.1 if unit == "time_s" else 100.0
+    message = f"--rate is 5 Hz, but the column '{unit}' has {own:g} Hz"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        recognised(path, NONE | {"rate": 5.0})
+    assert recognised(path, NONE | {"rate": 1.005 * own})["time"] is None
 
 
 @pytest.mark.parametrize(

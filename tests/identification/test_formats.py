@@ -100,6 +100,13 @@ def test_a_comma_before_a_blank_separates():
     assert_columns(columns, {"t": [0.5, 1.5], "u": [1.0, 2.0]})
 
 
+def test_blanks_in_names_separate_nothing_beside_tabs():
+    header = "Time (s)\tAO0 Piezo (V)\tAI3 CapSensor (um)"
+    found = parsed(f"{header}\n0.0\t1.5\t2\n0.1\t2.5\t3\n")
+    assert list(found) == header.split("\t")
+    assert found["AO0 Piezo (V)"].values.tolist() == [1.5, 2.5]
+
+
 def test_thousands_separators_are_not_decimals():
     columns = parsed("t;u\n0,5;1,5\n1,5;1.234\n2,5;2,5\n")
     assert columns["t"].fault is None

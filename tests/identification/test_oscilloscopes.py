@@ -8,6 +8,7 @@ import pytest
 from scipy.io import savemat
 
 from piezojax import read_record
+from piezojax.identification.records.formats import read_columns
 
 DT = 2e-5
 COUNT = 60
@@ -263,6 +264,19 @@ def test_a_bad_rate_is_refused(tmp_path, scalars, message):
 
 
 # LabVIEW
+
+
+def test_a_table_that_only_begins_like_a_measurement_file(tmp_path):
+    path = tmp_path / "record.csv"
+    lines = [
+        *("LabVIEW Measurement", "Operator,A. Weber", "Sample Rate,20000 S/s", ""),
+        *("Piezo (V),Sensor (um)", "0.5,1.0", "0.6,1.25"),
+    ]
+    path.write_text("\n".join(lines), encoding="utf-8")
+    found = read_columns(path)
+    assert list(found) == ["Piezo (V)", "Sensor (um)"]
+    assert found["Sensor (um)"].values.tolist() == [1.0, 1.25]
+    assert found["Piezo (V)"].dt == 5e-5
 
 
 def labview(x_columns):

@@ -2,6 +2,7 @@
 
 import codecs
 import csv
+from collections import Counter
 from collections.abc import Sequence
 from itertools import product
 from typing import NamedTuple
@@ -136,7 +137,10 @@ def _dialect(lines: Sequence[str]) -> tuple[str | None, str]:
         ]
         # An empty cell is a missing number, no evidence for or against a dialect.
         full = sum(False not in row for row in rows)
-        return full, sum(row.count(True) for row in rows), sum(map(len, rows))
+        numbers = sum(row.count(True) for row in rows)
+        # Blanks in a header of names separate no columns.
+        alike = max(Counter(map(len, rows)).values())
+        return full, numbers, alike, sum(map(len, rows))
 
     return max(product(SEPARATORS, DECIMALS), key=score)
 

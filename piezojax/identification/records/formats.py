@@ -55,7 +55,7 @@ def read_columns(path: Path) -> Columns:
 
 def _delimited(file: BinaryIO) -> Columns:
     text = decoded(file.read())
-    if text.startswith(_LVM_HEAD):
+    if text.startswith(_LVM_HEAD) and _LVM_END in text:
         return _lvm_columns(text)
     return parsed(text)
 
@@ -143,7 +143,7 @@ def _tdms(file: BinaryIO) -> Columns:
     )
 
 
-_LVM_HEAD = "LabVIEW Measurement"
+_LVM_HEAD, _LVM_END = "LabVIEW Measurement", "***End_of_Header***"
 
 
 def _lvm(file: BinaryIO) -> Columns:

@@ -18,7 +18,9 @@ _STEP = re.compile(
 _RATE = re.compile(r"(sampl(e|ing) (rate|frequency)|fs)$")
 _START = re.compile(r"(start|t0)$")
 _SCALE = re.compile(r"(vertical scale|v(olts)?/div|ymult|yincrement)$")
-_NUMBER = re.compile(r"([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([munk]?)(s|hz)?$", re.I)
+_NUMBER = re.compile(
+    r"([-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([munk]?)(s|hz|sa?/s)?$", re.I
+)
 _PREFIX = {"": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9, "k": 1e3}
 _UNITS = re.compile(
     r"\W*(sequence|s(ec(ond)?s?)?|[munk]?(v(olts?)?|a(mp(ere)?s?)?|s|m|rad|hz))\W*$",

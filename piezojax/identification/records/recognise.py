@@ -7,14 +7,17 @@ from typing import Any
 import numpy as np
 
 from ...core.conversion import factor
-from .columns import Columns
+from .columns import Column, Columns
 from .formats import read_columns
 from .record import Record
 from .sampled import is_clock
-from .units import SECONDS, unit_of
+from .units import SECONDS, seconds_of, unit_of
 
 _QUANTITIES = {"input": "V", "output": "um"}
 """Unit of each role; a column in a convertible unit qualifies as well."""
+
+CONTRADICTED = 0.01
+"""Relative difference of two rates above which one of them is wrong."""
 
 _NOISE_ORDER = 3
 """Order of the differences of the output that remove its motion."""
@@ -39,13 +42,17 @@ def recognised(path: Path, given: dict[str, Any]) -> dict[str, Any]:
     as the only column in V (or mV, kV), output as the only one in um (or nm, mm). Of
     two signals without units the first is the input. The other keys of ``given`` are
     returned unchanged. Raises ValueError, listing the columns with their units, if no
-    column or several qualify as input or output.
+    column or several qualify as input or output, and if the ``rate`` in ``given`` is
+    not that of a column of time.
     """
     columns = read_columns(path)
     found = dict(given)
     clocks = [name for name, column in columns.items() if is_clock(name, column)]
-    if found.get("time") is None and found.get("rate") is None:
-        counts = [n for n in clocks if (unit_of(n, columns[n]) or "s") in SECONDS]
+    counts = [n for n in clocks if (unit_of(n, columns[n]) or "s") in SECONDS]
+    if found.get("rate") is not None:
+        for name in counts:
+            _check_rate(path, name, columns[name], found["rate"])
+    elif found.get("time") is None:
         found["time"] = next(iter(counts), None)
     signals = [name for name in columns if name not in (*clocks, found.get("time"))]
     units = {name: unit_of(name, columns[name]) for name in signals}
@@ -63,6 +70,19 @@ def recognised(path: Path, given: dict[str, Any]) -> dict[str, Any]:
             )
         found[role] = of_kind[0]
     return found
+
+
+def _check_rate(path: Path, name: str, column: Column, rate: float) -> None:
+    """Raise ValueError if the column of time ``name`` has another rate, Hz."""
+    time = column.values * seconds_of(name, column)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        own = (time.size - 1) / (time[-1] - time[0]) if time.size else np.nan
+    if np.isfinite(own) and own > 0.0 and abs(own / rate - 1.0) > CONTRADICTED:
+        raise ValueError(
+            f"{path.name}: --rate is {rate:g} Hz, but the column {name!r} has "
+            f"{own:.6g} Hz: leave out --rate, or remove the column if it is wrong; "
+            "--resample changes the rate"
+        )
 
 
 def _listed(columns: Columns) -> str:
