@@ -150,7 +150,8 @@ def _peak_warnings(peaks: Iterable[Peak]) -> Iterator[str]:
         yield (
             f"the model leaves a peak at {peak.frequency_Hz:.4g} Hz, "
             f"{peak.times_gain:.3g} times its own gain there: a resonance is missing "
-            "or wrong; fit a model with a mode (--model ...+mode+lag) before tuning"
+            "or wrong; before tuning, fit a model with a mode (--model ...+mode+lag), "
+            "or if it has one, its modes alone (identify --response, then --dynamics)"
         )
 
 
