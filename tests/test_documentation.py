@@ -10,18 +10,13 @@ import subprocess
 import sys
 import tomllib
 from importlib import import_module
-from pathlib import Path
 
 import click
 import pytest
+from shown_commands import DOCS, FENCED, OWN_FILE, PAGES, ROOT, scripts_in
 
 from piezojax.study import shipped
 
-ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")])
-
-FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"(`+)((?:(?!\n\n).)+?)\1", re.DOTALL)
 LINK = re.compile(r"\]\(\s*([^)\s]+)\s*\)")
 HEADING = re.compile(r"^#+ +(.*?)\s*$", re.MULTILINE)
@@ -105,13 +100,6 @@ def test_generated_pages_are_those_of_the_code(page):
 
 
 COMMAND = re.compile(r"python -m piezojax\.(\w+)(.*)")
-OWN_FILE = re.compile(r"(?:docs|notebooks|piezojax|tests|tuning)/[\w./-]*\w")
-
-
-def scripts_in(text):
-    """Return the lines of the scripts of a page, with continued lines joined."""
-    scripts = (code for _, kind, code in FENCED.findall(text) if kind == "sh")
-    return [line for code in scripts for line in code.replace("\\\n", " ").splitlines()]
 
 
 def quoted_in(text):
