@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .arrays import Signal, State, as_array, as_signal
 from .parameter import PartUnits
-from .system import System, rest_output
+from .system import System, at_rest, resolve, rest_output
 
 
 class Observation(NamedTuple):
@@ -95,16 +95,17 @@ class Feedback(System):
         reference = as_signal(input)
         if holding is None:
             holding = holding_input(self.plant, reference)
-        voltage = rest_output(self.actuator, as_signal(holding))
-        displacement = rest_output(self.plant, voltage)
+        actuator = resolve(self.actuator)
+        voltage = rest_output(actuator, as_signal(holding))
+        plant, displacement = at_rest(self.plant, voltage)
         quiet = (displacement, jax.tree.map(jnp.zeros_like, displacement))
-        measured = rest_output(self.sensor, quiet)
+        sensor, measured = at_rest(self.sensor, quiet)
         observation = Observation(reference, reference, measured, voltage)
         return LoopState(
-            controller=self.controller.init(observation),
-            actuator=self.actuator.init(voltage),
-            plant=self.plant.init(voltage),
-            sensor=self.sensor.init(quiet),
+            controller=resolve(self.controller).init(observation),
+            actuator=actuator.init(voltage),
+            plant=plant,
+            sensor=sensor,
             reference=reference,
             displacement=displacement,
             voltage=voltage,

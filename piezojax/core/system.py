@@ -97,9 +97,16 @@ class Learned(eqx.Module):
     """
 
 
+def at_rest(system: System, input: Any) -> tuple[State, Any]:
+    """Return state and output of ``system`` at rest under the constant ``input``."""
+    system = resolve(system)
+    state = system.init(input)
+    return state, system.step(state, input)[1]
+
+
 def rest_output(system: System, input: Any) -> Any:
     """Return the output of ``system`` at rest under the constant ``input``."""
-    return system.step(system.init(input), input)[1]
+    return at_rest(system, input)[1]
 
 
 def accepts(system: System, example: Any) -> bool:

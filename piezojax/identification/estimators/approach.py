@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from ...core.arrays import State
 from ...core.rollout import simulate
-from ...core.system import Series, System
+from ...core.system import Series, System, resolve
 from ...hysteresis.model import hystereses
 from ...solve.multi_start import in_batches
 
@@ -70,6 +70,7 @@ def run_after(
     the first input. A plant maps u(k) to y(k+1), as in ``free_run``. A plant of scalar
     signals takes [samples] and [turns], and returns [samples].
     """
+    system = resolve(system)  # once for the motion and the run
     return _run_from(system, inputs, _state_after(system, inputs[0], levels))
 
 
@@ -104,6 +105,7 @@ def linear_responses(
     ``levels`` determines its state. One with at most ``few`` states is treated as
     linear, because its memory fades nearly linearly along the path of the input.
     """
+    system = resolve(system)  # once for all motions and runs
     state = _state_after(system, inputs[0], levels)
     flat, unravel = ravel_pytree(_linear_states(system, state, few))
     rests = [

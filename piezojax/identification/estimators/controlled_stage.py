@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from ...core.arrays import Scalar, State, as_array
 from ...core.feedback import Observation
 from ...core.rollout import simulate
-from ...core.system import System, rest_output
+from ...core.system import System, at_rest, resolve
 from ...hysteresis.model import input_before
 from ..records.record import Record
 
@@ -37,11 +37,10 @@ class ControlledStage(System):
 
     def init(self, input: Float[Array, " 3"]) -> ControlledState:  # pyright: ignore
         before = input_before(self.plant, self.voltage)
-        measured = rest_output(self.plant, before)
+        plant, measured = at_rest(self.plant, before)
         seen = Observation(input[0], input[0], measured, self.voltage)
-        return ControlledState(
-            self.controller.init(seen), self.plant.init(before), measured, self.voltage
-        )
+        controller = resolve(self.controller).init(seen)
+        return ControlledState(controller, plant, measured, self.voltage)
 
     def step(self, state: ControlledState, input: Float[Array, " 3"]):
         seen = Observation(input[0], input[1], state.measured, state.command)

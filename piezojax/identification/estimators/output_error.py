@@ -13,7 +13,7 @@ from ...core.arrays import ScalarLike, as_array
 from ...core.progress import Progress, Silent
 from ...core.rollout import simulate
 from ...core.space import INSIDE, Space, squash, unsquash
-from ...core.system import System, rest_output
+from ...core.system import System, at_rest, resolve
 from ...hysteresis.model import input_before
 from ...solve.gauss_newton import (
     TRUST_REGION,
@@ -189,8 +189,9 @@ def free_run(
     A plant maps u(k) to y(k+1), as in the loop; the first output is that at rest under
     ``before``, the input in force when the record begins.
     """
-    _, outputs = simulate(system, input, system.init(before))
-    first = rest_output(system, before)
+    system = resolve(system)  # once for the start and the run
+    state, first = at_rest(system, before)
+    _, outputs = simulate(system, input, state)
     return jnp.concatenate([first[None], outputs[:-1]])
 
 
