@@ -5,8 +5,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
-import jax
-
 
 class Clock:
     """Wall time since construction; ``compile_s`` (s) is the part spent compiling."""
@@ -16,12 +14,16 @@ class Clock:
         self._cpu = time.process_time()
         self.compile_s = 0.0
 
-    def compiled(self, function: Callable, *arguments: Any) -> Callable:
-        """Compile ``function`` for ``arguments``; add the time to ``compile_s``."""
+    def compiled(self, program: Any, *arguments: Any) -> Callable:
+        """Compile ``program`` for ``arguments``; add the time to ``compile_s``.
+
+        ``program`` is a function after ``jax.jit`` or ``eqx.filter_jit``. One of a
+        module is compiled once for all arguments of the same structure and shapes.
+        """
         start = time.perf_counter()
-        program = jax.jit(function).lower(*arguments).compile()
+        executable = program.lower(*arguments).compile()
         self.compile_s += time.perf_counter() - start
-        return program
+        return executable
 
     def wait_for(self, program: Future) -> None:
         """Wait for a program compiled by another thread; add to ``compile_s``."""

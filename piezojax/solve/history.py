@@ -49,9 +49,10 @@ def batch_loss(problem, units: jax.Array, clock: Clock) -> Callable:
 
     It is compiled for as many points as ``units`` has.
     """
-    program = clock.compiled(
-        lambda problem, units: jax.vmap(lambda unit: problem.loss(unit))(units),
-        problem,
-        units,
-    )
+    program = clock.compiled(_losses, problem, units)
     return lambda units: program(problem, units)
+
+
+@jax.jit
+def _losses(problem, units: jax.Array) -> jax.Array:
+    return jax.vmap(lambda unit: problem.loss(unit))(units)

@@ -1,7 +1,8 @@
 """Lockstep descent: an optimiser of ``optimisers.METHODS`` from all starts at once."""
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +15,19 @@ from .augmented_lagrangian import with_zero_multipliers
 from .clock import Clock
 from .gradient import with_finite_gradient
 from .multi_start import BatchedDescents, Patience, in_batches
-from .optimisers import METHODS
+from .optimisers import METHODS, Optimiser
 from .problem import Problem, Verdict
 
 STALLED = Patience(20, gain=1e-3)
 """Patience with the best start: a gain of 1e-3 in 20 steps."""
+
+
+class _Settings(NamedTuple):
+    """Name and tolerance of the optimiser, and whether gradients are forward-mode."""
+
+    method: str
+    tolerance: float
+    forward: bool
 
 
 class LockstepDescent:
@@ -46,8 +55,7 @@ class LockstepDescent:
     ):
         self._problem = with_zero_multipliers(problem)
         self._size, self._clock, self._at_once = size, clock, at_once
-        self._method, self._tolerance = METHODS[method], tolerance
-        self._forward = forward
+        self._settings = _Settings(method, tolerance, forward)
         self._programs: dict[int, tuple[Any, Any]] = {}
         self._screening: Callable[..., Any] | None = None
         self._width = 0
@@ -66,7 +74,7 @@ class LockstepDescent:
         if self._screening is None:
             self._width = min(self._at_once, len(units))
             self._screening = self._clock.compiled(
-                lambda p, units: jax.vmap(lambda u: p.value_and_verdict(u))(units),
+                _screened,
                 self._problem,
                 as_array(units[: self._width]),
             )
@@ -82,41 +90,14 @@ class LockstepDescent:
         progress.stage("compiling the gradient")
         if starts in self._programs:
             return
-
-        def optimiser(problem, multipliers):
-            problem = problem.with_multipliers(multipliers)
-            # A lambda, because JAX would hash a bound method, and arrays have no hash.
-            loss = with_finite_gradient(
-                lambda unit: problem.loss(unit), forward=self._forward
-            )
-            return self._method(
-                loss, lambda unit: problem.residuals(unit), self._tolerance
-            )
-
-        def begin(problem, units, multipliers):
-            return jax.vmap(lambda u, m: optimiser(problem, m).start(u))(
-                units, multipliers
-            )
-
-        def advance(problem, carry, multipliers):
-            def advance_one(carry, multipliers):
-                solver = optimiser(problem, multipliers)
-                carry = solver.step(carry)
-                view = solver.view(carry)
-                if problem.limits:
-                    return carry, view, problem.verdict(view.unit)
-                return carry, view, Verdict(view.loss, jnp.zeros(0))
-
-            return jax.vmap(advance_one)(carry, multipliers)
-
-        problem = self._problem
+        problem, settings = self._problem, self._settings
         units = jnp.full((starts, self._size), 0.5)
         multipliers = jnp.zeros((starts, self.constraints))
-        carry = jax.eval_shape(begin, problem, units, multipliers)
+        carry = _begun.eval_shape(settings, problem, units, multipliers)
         compiled = self._clock.compiled
         self._programs[starts] = (
-            compiled(begin, problem, units, multipliers),
-            compiled(advance, problem, carry, multipliers),
+            compiled(_begun, settings, problem, units, multipliers),
+            compiled(_advanced, settings, problem, carry, multipliers),
         )
 
     def begin(
@@ -131,3 +112,38 @@ class LockstepDescent:
             len(units),
         )
         return descents, 0
+
+
+@jax.jit
+def _screened(problem: Any, units: Array) -> tuple[Array, Verdict]:
+    return jax.vmap(lambda unit: problem.value_and_verdict(unit))(units)
+
+
+def _optimiser(settings: _Settings, problem: Any, multipliers: Array) -> Optimiser:
+    problem = problem.with_multipliers(multipliers)
+    # A lambda, because JAX would hash a bound method, and arrays have no hash.
+    loss = with_finite_gradient(
+        lambda unit: problem.loss(unit), forward=settings.forward
+    )
+    make = METHODS[settings.method]
+    return make(loss, lambda unit: problem.residuals(unit), settings.tolerance)
+
+
+@partial(jax.jit, static_argnums=0)
+def _begun(settings: _Settings, problem: Any, units: Array, multipliers: Array) -> Any:
+    return jax.vmap(lambda u, m: _optimiser(settings, problem, m).start(u))(
+        units, multipliers
+    )
+
+
+@partial(jax.jit, static_argnums=0)
+def _advanced(settings: _Settings, problem: Any, carry: Any, multipliers: Array) -> Any:
+    def advance_one(carry, multipliers):
+        solver = _optimiser(settings, problem, multipliers)
+        carry = solver.step(carry)
+        view = solver.view(carry)
+        if problem.limits:
+            return carry, view, problem.verdict(view.unit)
+        return carry, view, Verdict(view.loss, jnp.zeros(0))
+
+    return jax.vmap(advance_one)(carry, multipliers)

@@ -1,5 +1,6 @@
 """Gauss-Newton model of a problem from a sample of its errors."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -34,6 +35,7 @@ class Derivatives(NamedTuple):
     added: Float[Array, "n constraints"]
 
 
+@partial(jax.jit, static_argnums=2)
 def derivatives_at(problem, unit: Float[Array, " n"], every: int) -> Derivatives:
     """Return value and derivatives at ``unit``, all in one forward pass."""
 
@@ -67,6 +69,7 @@ def local_model(unit: np.ndarray, here: Derivatives) -> LocalModel | None:
     return model if model.finite and here.loss < FAILED_LOSS else None
 
 
+@partial(jax.jit, static_argnums=2)
 def errors_at(problem, units: Float[Array, "points n"], every: int) -> Errors:
     """Return the Errors of ``problem`` at ``units`` [points, n], without weights."""
     at = lambda unit: problem.errors(unit, every)._replace(weights=None)  # noqa: E731

@@ -70,15 +70,9 @@ class SuccessiveHalving:
         # The derivatives compile in the background, while the box is screened.
         self._pool = ThreadPoolExecutor(1)
         self._derivatives = self._pool.submit(
-            lambda: (
-                jax.jit(lambda p, unit: derivatives_at(p, unit, every))
-                .lower(problem, units[0])
-                .compile()
-            )
+            lambda: derivatives_at.lower(problem, units[0], every).compile()
         )
-        self._errors = clock.compiled(
-            lambda p, units: errors_at(p, units, every), problem, units
-        )
+        self._errors = clock.compiled(errors_at, problem, units, every)
 
     @property
     def constraints(self) -> int:

@@ -1,12 +1,12 @@
 """Evaluation of loops on signals and stages, compiled once per shape and structure."""
 
-from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ..analysis.constraints import (
     CONSTRAINTS,
@@ -21,6 +21,7 @@ from ..analysis.step_response import StepFigures, step_ends
 from ..core.arrays import as_array
 from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, Extremes, TrackingFigures
+from ..core.rollout import Metric
 from ..solve.clock import Clock
 from ..solve.multi_start import in_batches
 from ..study import Case, Stage
@@ -73,12 +74,6 @@ class Evaluator:
         # A program takes no more plants than the study draws.
         drawn = study.ensemble.holdout if study.ensemble else 1
         self._most = max(1, drawn, _count(self.margin_stages))
-        self._programs: dict[Hashable, Callable] = {}
-
-    def _compiled(self, key: Hashable, function: Callable, *arguments: Any) -> Callable:
-        if key not in self._programs:
-            self._programs[key] = self._clock.compiled(function, *arguments)
-        return self._programs[key]
 
     def figures(self, loop: Feedback, signals: Signals) -> TrackingFigures:
         """Return the figures [references, draws] of ``loop``."""
@@ -119,45 +114,23 @@ class Evaluator:
         self, loop: Feedback, signals: Signals, stages: Stage | None
     ) -> tuple[TrackingFigures, ExtremeFigures | None]:
         beside = Extremes() if uses(self.limits, "extremes") else None
-
-        def runs(loop, stages, signals):
-            dynamic, static = eqx.partition(stages, eqx.is_array)
-
-            def one(part):
-                stage = eqx.combine(part, static)
-                around, own = stage.around(loop), signals.on(stage)
-                return evaluate(lambda x: x, around, own, self.start, beside)
-
-            return jax.lax.map(one, dynamic)
-
         stages = held(own_stage(loop) if stages is None else stages, signals.begins)
         width = min(RUN_BLOCK, self._most)
-        found = self._on_each("runs", runs, width, loop, stages, signals)
+        found = self._on_each(
+            _runs_on, width, stages, loop, signals, self.start, beside
+        )
         return found if beside else (found, None)
 
-    def _on_each(
-        self,
-        name: str,
-        function: Callable,
-        width: int,
-        loop: Feedback,
-        stages: Stage,
-        signals: Signals | None = None,
-    ) -> Any:
-        """Return ``function(loop, stages, signals)`` for any number of stacked stages.
+    def _on_each(self, program: Any, width: int, stages: Stage, *arguments: Any) -> Any:
+        """Return ``program(stages, *arguments)`` for any number of stacked stages.
 
         The compiled program evaluates ``width`` stages at a time.
         """
         dynamic, static = eqx.partition(stages, eqx.is_array)
-        shapes = None if signals is None else signals.noise.shape
-        key = name, shapes, jax.tree.structure((loop, stages))
-
-        def block(loop, dynamic, signals):
-            return function(loop, eqx.combine(dynamic, static), signals)
 
         def found(batch):
-            program = self._compiled(key, block, loop, batch, signals)
-            return program(loop, batch, signals)
+            every = eqx.combine(batch, static), *arguments
+            return self._clock.compiled(program, *every)(*every)
 
         return jax.tree.map(jnp.asarray, in_batches(found, dynamic, width))
 
@@ -185,36 +158,54 @@ class Evaluator:
         """Return the margins on each of ``stages``, or None if no limit needs them."""
         if not uses(self.limits, "margins"):
             return None
-        study = self._case.study
-        point = OperatingPoint(self._case.highest_reference, dt=study.dt)
-
-        def margins(loop, stages, _):
-            return margins_on(
-                self.limits,
-                lambda stage: stage.around(loop) if stage else loop,
-                stages,
-                point,
-                self.model_error,
-            )
-
+        study, highest = self._case.study, as_array(self._case.highest_reference)
         stages = own_stage(loop) if stages is None else stages
         width = 1 if study.axes else min(MARGIN_BLOCK, self._most)
-        return self._on_each("margins", margins, width, loop, stages)
+        arguments = loop, tuple(self.limits), highest, study.dt, self.model_error
+        return self._on_each(_margins_on, width, stages, *arguments)
 
     def _steps(self, loop: Feedback, stages: Stage | None) -> StepFigures | None:
         """Return the figures of steps on ``stages``, or None if no limit needs them."""
         test = self.step_test
         if test is None or not uses(self.limits, "steps"):
             return None
-
-        def steps(loop, stages, _):
-            return test.figures_on(
-                lambda stage: stage.around(loop) if stage else loop, stages
-            )
-
         stages = own_stage(loop) if stages is None else stages
         width = min(RUN_BLOCK, self._most)
-        return self._on_each("steps", steps, width, loop, stages)
+        return self._on_each(_steps_on, width, stages, loop, test)
+
+
+@eqx.filter_jit
+def _runs_on(
+    stages: Stage, loop: Feedback, signals: Signals, start: int, beside: Metric | None
+) -> Any:
+    dynamic, static = eqx.partition(stages, eqx.is_array)
+
+    def one(part):
+        stage = eqx.combine(part, static)
+        around, own = stage.around(loop), signals.on(stage)
+        return evaluate(lambda x: x, around, own, start, beside)
+
+    return jax.lax.map(one, dynamic)
+
+
+@eqx.filter_jit
+def _margins_on(
+    stages: Stage,
+    loop: Feedback,
+    limits: tuple[str, ...],
+    highest: Array,
+    dt: float,
+    model_error: Array | None,
+) -> MarginFigures:
+    point = OperatingPoint(highest, dt=dt)
+    return margins_on(
+        limits, lambda stage: stage.around(loop), stages, point, model_error
+    )
+
+
+@eqx.filter_jit
+def _steps_on(stages: Stage, loop: Feedback, test: StepTest) -> StepFigures:
+    return test.figures_on(lambda stage: stage.around(loop), stages)
 
 
 def step_test_of(case: Case) -> StepTest | None:

@@ -99,7 +99,7 @@ def ultimate_by_gain(
 
     low, high = (10.0**decade * span / step for decade in _DECADES)
     gains = np.geomspace(low, high, GAINS)
-    program = clock.compiled(swings, loop, as_array(gains))
+    program = clock.compiled(jax.jit(swings), loop, as_array(gains))
     for _ in range(1 + NARROWINGS):
         wild = np.asarray(program(loop, as_array(gains)))
         first = int(np.argmax(wild))
@@ -111,7 +111,7 @@ def ultimate_by_gain(
             )
         low, high = gains[first - 1], gains[first]
         gains = np.geomspace(low, high, GAINS)
-    run = clock.compiled(displacement, loop, as_array(high))
+    run = clock.compiled(jax.jit(displacement), loop, as_array(high))
     last = np.asarray(run(loop, as_array(high)))[samples // 4 :]
     return Ultimate(float(high), period_of(np.diff(last), dt))
 
@@ -152,7 +152,7 @@ def ultimate_by_relay(
 
     drawn = as_array(noise)
     relay = Relay(height, hysteresis)
-    program = clock.compiled(run, loop, relay, drawn)
+    program = clock.compiled(jax.jit(run), loop, relay, drawn)
     measured, voltage = (np.asarray(x) for x in program(loop, relay, drawn))
     half = noise.size // 2
     amplitude, period = cycle_of(measured[half:], voltage[half:], dt)
