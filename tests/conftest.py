@@ -46,6 +46,25 @@ def optimised():
     jax.config.update("jax_disable_most_optimizations", True)
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Write pictures of one pixel and pages without curves.
+
+    Drawing takes most of the time of a command on a small study; this is for tests of
+    commands that read neither pictures nor curves.
+    """
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    from piezojax.report import page
+
+    def save(self, file, **_):
+        Image.new("RGB", (1, 1)).save(file, "png")
+
+    monkeypatch.setattr(Figure, "savefig", save)
+    monkeypatch.setattr(page, "live_figures", lambda *_: page.LiveFigures())
+
+
 # Tracing creates many small objects; few of them are garbage.
 gc.set_threshold(100_000, 20, 20)
 

@@ -452,6 +452,7 @@ def test_tuned_gains_are_the_start_of_another_search(tuned, tmp_path):
     )
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_quiet_and_seed_without_a_folder(study, monkeypatch):
     monkeypatch.chdir(study.parent)
     used = study.parent / "results" / "small"
@@ -534,6 +535,7 @@ def test_ctrl_c_waits_for_the_next_progress_report():
         bar.stage("judging")  # Ctrl-C acted once, so the gains can be evaluated
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_ctrl_c_during_the_evaluation_loses_nothing(study, tmp_path, monkeypatch):
     stage = Bar.stage
 
@@ -863,6 +865,7 @@ def test_calibration_takes_no_tables(tmp_path):
     failed(result, "--calibrate chooses its own tables; leave --table out")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_quiet_reproduce_prints_nothing(made_up, tmp_path):
     result = call("reproduce", "--quiet", "--out", tmp_path / "out")
     assert succeeded(result).output == ""
