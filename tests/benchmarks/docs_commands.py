@@ -36,6 +36,7 @@ from piezojax.signals.excitation import Generator, excitation
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from shown_commands import DOCS, OWN_FILE, PAGES, ROOT, blocks_in, scripts_in
+from small_runs import write_study
 
 LONGEST = 7200.0
 """Time after which a command is stopped, s."""
@@ -62,6 +63,15 @@ BRIEF = {"starts": 1, "candidates": 4, "steps": 2}
 FEW = {"margins": 16, "holdout": 8}
 ALARMS = 0, 3
 """Statuses of a search that is too short for its limits."""
+
+ON_STAGE = (
+    "python -m piezojax.emulate study.toml --port 5025 --speed 0 > stage.log & "
+    "stage=$!; until grep -q 'stage at' stage.log; do sleep 1; done; "
+    "{}; status=$?; kill $stage; exit $status"
+)
+"""A command with the stage of the page behind it."""
+
+TRIED = "python -m piezojax.{} results/study --stage 127.0.0.1:5025{}"
 
 SPECIAL = {
     "pip install . && python -m piezojax.tune": Special("run by CI", None),
@@ -110,6 +120,20 @@ SPECIAL = {
         )
         for name in ("sliding_mode", "disturbance_observer")
     },
+    **{
+        command: Special("with an emulated stage", ON_STAGE.format(command))
+        for command in (
+            TRIED.format("trial", ""),
+            TRIED.format("watch", " --out baseline"),
+            TRIED.format("watch", " --baseline baseline"),
+        )
+    },
+    "python -m piezojax.emulate study.toml --port 5025 --gain 1.2 --delay 1": Special(
+        "runs until it is stopped",
+        "timeout 60 python -m piezojax.emulate study.toml --port 5025 --gain 1.2 "
+        "--delay 1",
+        statuses=(124,),
+    ),
     "python tests/benchmarks/structures.py --seed 21": Special(
         "shortened: 30 stages",
         "python tests/benchmarks/structures.py --seed 21 --plants 0:1",
@@ -277,8 +301,14 @@ def sweeps(folder, page):
     shutil.copy(ROOT / "tuning/sweep_p753.toml", folder / "study.toml")
 
 
+def trial(folder, page):
+    study = write_study(folder, "study.toml")
+    shell(f"python -m piezojax.tune {study.name} --out results/study", folder)
+
+
 INPUTS = {
-    make.__name__: make for make in (start, devices, identification, export, sweeps)
+    make.__name__: make
+    for make in (start, devices, identification, export, sweeps, trial)
 }
 """Functions by the name of a page that make its inputs in a folder, from its text."""
 
