@@ -1,6 +1,6 @@
 """Common parts of the commands that move a stage."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ stage_option: Callable = click.option(
 
 def tuned_gains(
     results: Path,
-) -> "tuple[Result, dict[str, float], list[Motion]]":
+) -> "tuple[Result, dict[str, float], Sequence[Motion]]":
     """Return result, gains and motions of a folder of ``tune``.
 
     The paths of the gains begin in the controller. Raises ValueError for gains with an

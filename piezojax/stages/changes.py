@@ -62,8 +62,9 @@ class Judgement(BaseModel):
     @property
     def moved(self) -> bool:
         """Whether the stage has changed."""
-        known = self.distance is not None and self.threshold is not None
-        return not known or self.distance > self.threshold
+        if self.distance is None or self.threshold is None:
+            return True
+        return self.distance > self.threshold
 
 
 class WatchReport(BaseModel):
@@ -131,9 +132,8 @@ class Baseline:
         )
 
     def _check(self, record: Record) -> None:
-        if record.reference is None or not np.array_equal(
-            record.reference, self._reference
-        ):
+        found, known = record.reference, self._reference
+        if found is None or known is None or not np.array_equal(found, known):
             raise ValueError("a run can only be compared with runs of its reference")
 
     def _features(self, record: Record, others: Samples) -> RunFeatures:

@@ -1,5 +1,6 @@
 """Evaluation of loops on signals and stages, compiled once per shape and structure."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -198,14 +199,16 @@ def _margins_on(
     model_error: Array | None,
 ) -> MarginFigures:
     point = OperatingPoint(highest, dt=dt)
-    return margins_on(
-        limits, lambda stage: stage.around(loop), stages, point, model_error
-    )
+    return margins_on(limits, _around(loop), stages, point, model_error)
 
 
 @eqx.filter_jit
 def _steps_on(stages: Stage, loop: Feedback, test: StepTest) -> StepFigures:
-    return test.figures_on(lambda stage: stage.around(loop), stages)
+    return test.figures_on(_around(loop), stages)
+
+
+def _around(loop: Feedback) -> Callable[[Stage | None], Feedback]:
+    return lambda stage: stage.around(loop) if stage else loop
 
 
 def step_test_of(case: Case) -> StepTest | None:
