@@ -1,5 +1,6 @@
 """Stage in another process, reached through a socket."""
 
+import contextlib
 import json
 import socket
 import threading
@@ -62,8 +63,11 @@ class RemoteStage:
             _exchange(connection, self._timeout, {"do": "safe"})
 
     def close(self) -> None:
-        """End the connection; the stage keeps its gains and its position."""
-        with self._connection:
+        """End the connection; the stage keeps its gains and its position.
+
+        Nothing happens if the connection is lost.
+        """
+        with self._connection, contextlib.suppress(LostError):
             self._ask(do="bye")
 
     def _connect(self) -> socket.socket:

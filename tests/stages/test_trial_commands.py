@@ -10,7 +10,7 @@ from small_runs import call, succeeded, write_study
 
 import piezojax as pj
 from piezojax.core.serial import save
-from piezojax.stages import StageServer
+from piezojax.stages import RemoteStage, StageServer
 from piezojax.stages.of_study import emulated_stage
 
 
@@ -75,6 +75,21 @@ def test_a_guard_that_gives_up_ends_with_an_alarm(tuned, tmp_path):
         assert one.voltage == pytest.approx(0.0, abs=1e-9)
     assert result.exit_code == 3
     assert "the tracking error is too large" in result.stdout
+
+
+def test_a_lost_connection_ends_with_an_alarm(tuned, tmp_path, monkeypatch):
+    def lost(self, reference, gains):
+        self._connection.close()
+        return self.gains()
+
+    monkeypatch.setattr(RemoteStage, "run", lost)
+    with emulated(tuned) as (_, address):
+        result = tried(tuned, address, tmp_path / "out")
+    assert result.exit_code == 3
+    assert "Look at it before the next run" in result.stdout
+    assert (
+        json.loads((tmp_path / "out" / "trial.json").read_text())["verdict"] == "lost"
+    )
 
 
 def test_a_stage_that_is_not_there_is_said(tuned, tmp_path):
