@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from ..stages import Motion, TrialReport, TriedRun
+from ..stages.run_files import load_samples
 from .figures import (
     AFTER,
     BEFORE,
@@ -51,8 +52,7 @@ def _trial_figure(
     picture = figure(9.0, 2.2 * len(shown) + 0.8)
     panels = picture.subplots(len(shown), 2, squeeze=False)
     for (motion, error), run in zip(panels, shown, strict=True):
-        with np.load(folder / run.file) as samples:
-            reference, measured = samples["reference_um"], samples["measured_um"]
+        reference, measured, _ = load_samples(folder / run.file)
         time = dt * np.arange(len(reference))
         motion.plot(time, reference, color=REFERENCE, lw=0.8, label="reference")
         motion.plot(time, measured, color=AFTER, lw=0.9, label="reading")

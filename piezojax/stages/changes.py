@@ -14,15 +14,13 @@ from ..core.files import write_text
 from ..core.progress import Progress, Silent
 from ..identification import Record
 from .protocol import Gains, LostError, Stage, StoppedError
-from .try_gains import COLUMNS, Motion, save_samples
+from .run_files import load_samples, run_file, run_files, save_samples
+from .try_gains import Motion
 
 WATCH_FILE = "watch.json"
 
 FALSE_ALARMS = 0.01
 """Default share of the runs of an unchanged stage that count as changed."""
-
-BASELINE = 12
-"""Default number of runs with which later ones are compared."""
 
 FEATURES = 4
 """Number of features of a run."""
@@ -185,9 +183,8 @@ def read_runs(folder: Path, dt: float) -> list[Record]:
     Raises ValueError if there are none.
     """
     records = []
-    for file in sorted(folder.glob("run_*.npz")):
-        with np.load(file, allow_pickle=False) as samples:
-            reference, measured, voltage = (samples[key] for key in COLUMNS)
+    for file in run_files(folder):
+        reference, measured, voltage = load_samples(file)
         records.append(
             Record(voltage, measured, dt, source=file.name, reference=reference)
         )
@@ -266,7 +263,7 @@ def _runs(
         if known is None:  # the first motion differs from those that follow it
             stage.run(motion.reference, gains)
         for number in range(1, runs + 1):
-            file = folder / f"run_{number:02d}.npz"
+            file = run_file(folder, number)
             record = stage.run(motion.reference, gains)
             save_samples(file, motion.reference, record.output, record.input)
             records.append(record)

@@ -84,15 +84,14 @@ class EmulatedStage:
         self._walk, self._seen = 0.0, self.clock()
         self._check(self.safe_gains)
         controller = replace(self.controller, _arrays(self.safe_gains))
-        loop = Feedback(
+        self._loop = Feedback(
             self._guarded(controller),
             self.plant,
             self.actuator,
             FailingSensor(self.sensor),
         )
-        self._loop = loop
-        state = resolve(loop).init(0.0, as_array(self.limits.retreat))
-        self._state = self._restarted(state)
+        self._state = self._loop.init(0.0, as_array(self.limits.retreat))
+        self._restart()
 
     def run(self, reference: Float[np.ndarray, " samples"], gains: Gains) -> Record:
         """Follow ``reference`` (um) with ``gains``, as ``Stage.run`` describes."""
@@ -102,7 +101,7 @@ class EmulatedStage:
         with self._one_at_a_time:
             self.apply(gains)
             faults, self.faults = tuple(self.faults), ()
-            here = float(self._reading())
+            here = float(self._state.controller.measured)
             self._follow(_approach(here, reference[0], self.dt), ())
             # At sample k the loop is told the reference at k + 1.
             found = self._follow(np.append(reference[1:], reference[-1]), faults)
@@ -120,11 +119,7 @@ class EmulatedStage:
             self._check(gains)
             self._stop.clear()
             self._wait()
-            controller = replace(self._controller, _arrays(gains))
-            self._loop = eqx.tree_at(
-                lambda loop: loop.controller, self._loop, self._guarded(controller)
-            )
-            self._state = self._restarted(self._state)
+            self._set(replace(self._controller, _arrays(gains)))
 
     def gains(self) -> dict[str, float]:
         """Return the scalar parameters of the controller by path."""
@@ -138,7 +133,7 @@ class EmulatedStage:
         """Stop a run under way, set the safe gains and move to the safe voltage."""
         self._stop.set()
         with self._one_at_a_time:
-            self._retreat(self._state)
+            self._retreat()
             self._stop.clear()
 
     @property
@@ -162,17 +157,22 @@ class EmulatedStage:
             get(self.controller, path)
             check_value(self.controller, path, value, f"gains.{path}")
 
-    def _reading(self) -> Any:
-        return self._state.controller.measured
+    def _set(self, controller: System) -> None:
+        """Put ``controller`` behind the guard, and start it where the stage is now."""
+        self._loop = eqx.tree_at(
+            lambda loop: loop.controller, self._loop, self._guarded(controller)
+        )
+        self._restart()
 
-    def _restarted(self, state: LoopState) -> LoopState:
-        """Return ``state`` with a controller at rest, where the stage is now."""
+    def _restart(self) -> None:
+        """Start the controller at rest, where the stage is now."""
+        state = self._state
         here = jnp.where(
             jnp.isfinite(state.displacement), state.displacement, as_array(0.0)
         )
         observation = Observation(here, here, here, state.voltage)
-        controller = resolve(self._loop).controller.init(observation)
-        return state._replace(controller=controller, reference=here)
+        controller = resolve(self._loop.controller).init(observation)
+        self._state = state._replace(controller=controller, reference=here)
 
     def _wait(self) -> None:
         """Hold the position for the time since the last run."""
@@ -202,7 +202,7 @@ class EmulatedStage:
             reason = int(self._state.controller.reason)
             if reason or self._stop.is_set():
                 found = _joined(blocks, samples)
-                self._retreat(self._state)
+                self._retreat()
                 raise StoppedError(
                     REASONS[reason] or ASKED,
                     found.reference,
@@ -234,21 +234,16 @@ class EmulatedStage:
             blocks.append(found)
         return _joined(blocks, samples)
 
-    def _retreat(self, state: LoopState) -> None:
+    def _retreat(self) -> None:
         """Set the safe gains, and move to the safe voltage behind a stopped guard."""
-        controller = replace(self.controller, _arrays(self.safe_gains))
-        self._loop = eqx.tree_at(
-            lambda loop: loop.controller, self._loop, self._guarded(controller)
-        )
-        stopped = self._restarted(state)
-        guard = stopped.controller._replace(
-            reason=jnp.asarray(RETREATING, jnp.int32), command=state.voltage
-        )
-        self._state = stopped._replace(controller=guard)
-        way = abs(float(state.voltage) - self.limits.retreat)
+        self._set(replace(self.controller, _arrays(self.safe_gains)))
+        reason = jnp.asarray(RETREATING, jnp.int32)
+        stopped = self._state.controller._replace(reason=reason)
+        self._state = self._state._replace(controller=stopped)
+        way = abs(self.voltage - self.limits.retreat)
         samples = int(way / (self.limits.slew * self.dt)) + 1
         samples += -samples % BLOCK
-        self._advance(np.full(samples, float(stopped.reference)), np.zeros(samples))
+        self._advance(np.full(samples, float(self._state.reference)), np.zeros(samples))
         self._seen = self.clock()
 
 

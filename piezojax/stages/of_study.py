@@ -44,7 +44,9 @@ def emulated_stage(
     """
     case = read(study)
     _check_axes(case.study)
-    lower, upper = _limits(case.study)
+    (lower,), (upper,) = map(
+        case.study.by_axis, (case.study.actuator.lower, case.study.actuator.upper)
+    )
     found = _plant(case, plant, gain, delay)
     reach = float(np.ptp(case.references)) or 1.0
     limits = Limits(
@@ -93,13 +95,6 @@ def _check_axes(study: Study) -> None:
             f"the study has {study.axis_count} axes; a stage on which gains are tried "
             "has one"
         )
-
-
-def _limits(study: Study) -> tuple[float, float]:
-    (lower,), (upper,) = map(
-        study.by_axis, (study.actuator.lower, study.actuator.upper)
-    )
-    return lower, upper
 
 
 def _plant(case: Case, file: str | Path | None, gain: float, delay: float) -> System:

@@ -11,15 +11,13 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel
 
-from ..core.files import atomic_replacement, write_text
+from ..core.files import write_text
 from ..core.progress import Progress, Silent
 from ..identification import Record
 from .protocol import Gains, LostError, Stage, StageError, StoppedError
+from .run_files import run_file, save_samples
 
 TRIAL_FILE = "trial.json"
-
-COLUMNS = "reference_um", "measured_um", "voltage_V"
-"""Arrays in the file of a run."""
 
 SMALL = (0.1, 0.3)
 """Shares of the first reference with which a trial begins."""
@@ -125,7 +123,7 @@ def trial(
     progress.stage("trying the gains on the stage", len(planned))
     try:
         for number, (motion, share) in enumerate(planned, start=1):
-            file = folder / f"run_{number:02d}.npz"
+            file = run_file(folder, number)
             run = _tried(stage, gains, motion, share, file)
             report.runs.append(run)
             _write(report, folder)
@@ -225,15 +223,6 @@ def _cause(error: BaseException) -> str:
 
 def _named(run: TriedRun) -> str:
     return f"{run.reference} at {100.0 * run.share:g} %"
-
-
-def save_samples(
-    file: Path, reference: np.ndarray, measured: np.ndarray, voltage: np.ndarray
-) -> None:
-    """Write the samples of a run, um and V, into ``file``."""
-    with atomic_replacement(file) as temporary, temporary.open("wb") as stream:
-        columns = reference, measured, voltage
-        np.savez(stream, **dict(zip(COLUMNS, columns, strict=True)))
 
 
 def _write(report: TrialReport, folder: Path) -> None:
