@@ -21,6 +21,7 @@ from .estimators.estimate import FittedParameter, LinearDetail, Options
 from .estimators.projection import excited_columns
 from .estimators.resonances import LinearDynamics
 from .held_dynamics import HeldDynamics, combined_bound
+from .known_plant import KnownPlant
 from .methods import method_for
 from .plausibility import assumed_units, plausibility_warnings
 from .records.checks import record_warnings
@@ -86,7 +87,8 @@ class Fit:
 
     The outputs are in the units of the records. ``system`` stores the input at which
     the first record begins. ``count`` is the number of fitted parameters. ``held`` are
-    the dynamics that were not fitted, if any.
+    the dynamics that were not fitted, ``known`` the plant that was fitted again, if
+    any.
     """
 
     system: System
@@ -98,6 +100,7 @@ class Fit:
     linear: LinearDetail | None = None
     count: int = 0
     held: HeldDynamics | None = None
+    known: KnownPlant | None = None
 
     @property
     def plant(self) -> System:
@@ -157,6 +160,8 @@ class Fit:
             },
             unsafe=self.report.alarms,
         )
+        if self.known is not None:
+            return self.known.widened(about)
         if self.held is None:
             return about
         held, bound = self.held, about.error_bound
@@ -311,6 +316,7 @@ def identify(
         estimate.linear,
         estimate.parameter_count(),
         held,
+        options.known,
     )
 
 

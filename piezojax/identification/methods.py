@@ -39,20 +39,38 @@ AMBIGUOUS = 0.01
 """Spread of a parameter among equally good fits, as a share of its range, above which
 to warn."""
 
+FITTED_AGAIN = (
+    "free run from the measured input, near the known plant; biased towards -1 / "
+    "controller where noise makes up most of the input"
+)
+"""How a plant that is known is fitted to records of a closed loop."""
+
 Records = Sequence[Record]
 
 
 def _by_output_error(
     model: str, records: Records, train: slice, options: Options, progress: Progress
 ) -> Estimate:
-    if is_closed(records, options):
+    # A stage whose plant is known was moved before the record.
+    several = len(records) > 1 or options.known is not None
+    if options.known is None and is_closed(records, options):
         found = loop_fit(model, records, train, options, progress)
     else:
-        shape = structure(model, training_record(records, train), options.dynamics)
+        text = ""
+        if options.known is not None:
+            shape = options.known.structure(records, train)
+            text = is_closed(records, options) * FITTED_AGAIN
+        else:
+            shape = structure(model, training_record(records, train), options.dynamics)
         optimum = output_error(
-            shape, records, train, steps=options.steps, progress=progress
+            shape,
+            records,
+            train,
+            steps=options.steps,
+            progress=progress,
+            own_starts=several,
         )
-        found = LoopFit(optimum, optimum.system, shape, "", [])
+        found = LoopFit(optimum, optimum.system, shape, text, [])
     system, optimum, shape = found.system, found.optimum, found.shape
     named = {
         name.removeprefix(found.inside): FittedParameter(
@@ -68,8 +86,8 @@ def _by_output_error(
             name: one.model_copy(update={"standard_error": None})
             for name, one in named.items()
         }
-    runs, zeros = free_runs(system, records, train)
-    if len(records) > 1:
+    runs, zeros = free_runs(system, records, train, own_starts=several)
+    if several:
         named |= {
             f"zero of {record.source or i}": FittedParameter(
                 value=zero, standard_error=None

@@ -1,7 +1,7 @@
 """Options and results common to all methods of identification."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel
@@ -9,6 +9,9 @@ from pydantic import BaseModel
 from ...core.system import System
 from ...dynamics import StateSpace
 from ..held_dynamics import HeldDynamics
+
+if TYPE_CHECKING:
+    from ..known_plant import KnownPlant
 from .frequency import EmpiricalResponse
 
 
@@ -39,7 +42,7 @@ class Options:
     steps of a descent. ``dynamics`` are held fixed in the fit of a chain.
     ``closed_loop`` is one of ``closed_loop.APPROACHES`` to a record of a closed loop,
     by default chosen from the record; ``controller`` is the controller that closed it,
-    for ``indirect``.
+    for ``indirect``. ``known`` is a plant that is fitted again.
     """
 
     order: int = 4
@@ -49,6 +52,7 @@ class Options:
     dynamics: HeldDynamics | None = None
     closed_loop: str | None = None
     controller: System | None = None
+    known: "KnownPlant | None" = None
 
 
 class LinearDetail(NamedTuple):

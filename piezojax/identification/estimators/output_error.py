@@ -98,6 +98,7 @@ class Problem(eqx.Module):
     plain: Float[Array, ""]
     whitening: Float[Array, " taps"]
     share: Float[Array, ""]
+    prior: Float[Array, "2 known"]
 
     def errors(self, unit: Float[Array, " n"]) -> Float[Array, "records samples"]:
         """Return the errors of the free run of every record."""
@@ -135,6 +136,9 @@ class Problem(eqx.Module):
         counted = [self.plain * self.weights * error, unlikely]
         if self.whitening.size:
             counted.append(self.share * self.weights * self.whitened(error))
+        if self.prior.size:
+            known, weights = self.prior
+            counted.append(weights * (unit - known))
         return jnp.concatenate([part.ravel() for part in counted])
 
     def whitened(
@@ -236,6 +240,7 @@ def problem_of(
         as_array(1.0),
         as_array(structure.whitening),
         as_array(0.0),
+        as_array(np.stack(structure.prior) if structure.prior else np.zeros((2, 0))),
     )
 
 
@@ -258,14 +263,18 @@ def starts_of(
 
 
 def free_runs(
-    system: System, records: Sequence[Record], train: slice
+    system: System,
+    records: Sequence[Record],
+    train: slice,
+    *,
+    own_starts: bool = False,
 ) -> tuple[tuple[np.ndarray, ...], list[float]]:
     """Return the free run [samples, 1] of each of ``records``, and their zeros.
 
     A single record begins at rest and has no zero of its own; the starts of several
-    records are estimated on their samples ``train``.
+    records, or with ``own_starts``, are estimated on their samples ``train``.
     """
-    if len(records) > 1:
+    if own_starts or len(records) > 1:
         _, runs, zeros = starts_of(system, records, train)
         return tuple(runs), zeros
     run = eqx.filter_jit(from_rest)
@@ -291,6 +300,7 @@ def output_error(
     progress: Progress | None = None,
     noise_model: bool = False,
     drives: Sequence[np.ndarray] | None = None,
+    own_starts: bool = False,
 ) -> Optimum:
     """Fit ``structure`` to ``records`` by the mean square of the free-run error.
 
@@ -298,7 +308,8 @@ def output_error(
     structure; after a few steps only the best continue, up to ``steps`` steps. The
     error counts over the samples ``train`` of each record; the model sees the input
     alone, from the first sample on. With several records the state before each and the
-    zero of each take the place of the structure's ``own`` parameters.
+    zero of each take the place of the structure's ``own`` parameters; so does that of a
+    single one with ``own_starts``.
 
     With a ``noise_model`` the error is that of the prediction by the model and an
     autoregressive model of its errors, which are fitted alternately (Ljung, System
@@ -308,7 +319,7 @@ def output_error(
     simulation.
     """
     progress = progress or Silent()
-    several = len(records) > 1
+    several = own_starts or len(records) > 1
     if several:
         structure = structure.without(structure.own)
     problem = problem_of(structure, records, train, drives)

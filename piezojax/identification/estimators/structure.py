@@ -9,6 +9,17 @@ from ...core.space import Space, space_of
 from ...core.system import System
 
 
+class Prior(NamedTuple):
+    """Normal prior of the parameters of a structure, in the unit box.
+
+    ``known`` [n] are the most likely values; ``weights`` [n] are those of the
+    differences from them beside the errors of the output, in its unit.
+    """
+
+    known: np.ndarray
+    weights: np.ndarray
+
+
 class Structure(NamedTuple):
     """A model to fit: its System, the box of its parameters, starts in the box.
 
@@ -16,7 +27,7 @@ class Structure(NamedTuple):
     differ from record to record. ``dynamics`` holds the paths of linear dynamics.
     ``whitening`` holds the coefficients of a filter that turns the errors into white
     noise; if it has any, the filtered errors count as much as the errors themselves,
-    which are largest at low frequencies.
+    which are largest at low frequencies. ``prior`` is that of the parameters, if any.
     """
 
     system: System
@@ -25,6 +36,7 @@ class Structure(NamedTuple):
     own: tuple[str, ...] = ()
     dynamics: tuple[str, ...] = ()
     whitening: tuple[float, ...] = ()
+    prior: Prior | None = None
 
     @property
     def order(self) -> int:
@@ -36,4 +48,6 @@ class Structure(NamedTuple):
         ranges = self.space.ranges()
         kept = {path: bounds for path, bounds in ranges.items() if path not in paths}
         columns = [path in kept for path in ranges]
-        return self._replace(space=space_of(kept), starts=self.starts[:, columns])
+        prior = self.prior and Prior(*(each[columns] for each in self.prior))
+        starts = self.starts[:, columns]
+        return self._replace(space=space_of(kept), starts=starts, prior=prior)

@@ -1,0 +1,157 @@
+"""A plant that is known already, fitted again to new records of the same stage.
+
+The fit is the most likely one a posteriori: every parameter has a normal prior around
+its known value. Where short records say nothing, as about voltages beyond their range,
+the known value stays.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..core.about import About
+from ..core.paths import declared, get, parameters, replace
+from ..core.registry import parts as known_parts
+from ..core.space import INSIDE, Range, Space, space_of
+from ..core.system import Affine, Series, System
+from ..dynamics import FractionalDelay
+from .chain import OFFSET, by_evidence, dynamics_of
+from .estimators.structure import Prior, Structure
+from .records.record import Record
+
+CHANGED = 0.3
+"""Standard deviation of a parameter since it was fitted, as a share of its value."""
+
+LATE, MORE = 1.0, 5
+"""Standard deviation and largest increase of a delay since it was fitted, in
+samples."""
+
+FACTOR, REACH = 3.0, 4.0
+"""Factor between a known value and its bounds; distance of the bounds from a value that
+is smaller than its standard deviation, in these deviations."""
+
+UNEXPLAINED, INDEPENDENT = 0.01, 25
+"""Error of a model, as a share of the range of the output, and number of independent
+samples of that error: a change by one standard deviation must explain as much."""
+
+GAIN, DELAY = "calibration.gain", "delay"
+
+
+@dataclass(frozen=True)
+class KnownPlant:
+    """A ``system`` and its origin ``about``, which names its fitted parameters.
+
+    Raises ValueError for a plant without fitted parameters.
+    """
+
+    system: System
+    about: About
+
+    def __post_init__(self):
+        if not self.about.standard_errors:
+            raise ValueError(
+                "the plant has no fitted parameters that could be fitted again: "
+                "identify it from a record first"
+            )
+
+    @property
+    def model(self) -> str:
+        """Names of its parts, as in ``identify``."""
+        names: dict[type, str] = {kind: name for name, kind in known_parts().items()}
+        parts = self.system.parts if isinstance(self.system, Series) else (self.system,)
+        return "+".join(names[type(part)] for part in parts if type(part) in names)
+
+    def structure(self, records: Sequence[Record], train: slice) -> Structure:
+        """Return the plant as a structure to fit to the samples ``train`` of records.
+
+        It starts from the known values, and also from the resonances that the records
+        show. A gain and a delay are fitted beside its own parameters.
+        """
+        best, *_ = by_evidence(records, train)
+        system = _with_delay(self.system, best.dt)
+        deviations = self._deviations(system, best.dt)
+        ranges = {path: _range(system, path, s) for path, s in deviations.items()}
+        space = space_of(ranges)
+        known = _point(system, space)
+        explained = UNEXPLAINED * max(record.span for record in records)
+        widths = np.asarray(space.upper - space.lower)
+        weights = widths / np.array(list(deviations.values()))
+        prior = Prior(known, explained / math.sqrt(INDEPENDENT) * weights)
+        shown = [mode.frequency for mode in dynamics_of(best).modes]
+        starts = [known, _point(_at_resonances(system, ranges, shown), space)]
+        own = tuple(
+            path for path in ranges if path == OFFSET or path.endswith("rest_input")
+        )
+        return Structure(system, space, np.stack(starts), own, prior=prior)
+
+    def widened(self, about: About) -> About:
+        """Return the origin ``about`` of a new fit, with the known ranges of inputs."""
+        pairs = zip(about.input_ranges, self.about.input_ranges, strict=True)
+        ranges = [(min(a[0], b[0]), max(a[1], b[1])) for a, b in pairs]
+        return about.model_copy(update={"input_ranges": ranges})
+
+    def _deviations(self, system: System, dt: float) -> dict[str, float]:
+        """Return the standard deviations of the parameters of ``system`` by path."""
+        there = parameters(system)
+        errors = {GAIN: 0.0, **self.about.standard_errors}
+        found = {
+            path: math.hypot(error, CHANGED * float(get(system, path)))
+            for path, error in errors.items()
+            if path in there
+        }
+        late = {path: LATE * dt for path in there if path.startswith(f"{DELAY}.")}
+        return found | late
+
+
+def _with_delay(system: System, dt: float) -> System:
+    """Return ``system`` with a delay that may be longer than the known one."""
+    if not isinstance(system, Series):
+        return system
+    names, parts = list(system.names), list(system.parts)
+    if DELAY not in names:
+        place = len(parts) - isinstance(parts[-1], Affine)
+        names.insert(place, DELAY)
+        parts.insert(place, FractionalDelay(0.0, dt, MORE))
+    place = names.index(DELAY)
+    delay = parts[place]
+    if isinstance(delay, FractionalDelay):
+        longest = math.ceil(float(delay.delay) / dt) + MORE
+        parts[place] = dataclasses.replace(delay, longest=max(delay.longest, longest))
+    return Series(tuple(parts), tuple(names))
+
+
+def _range(system: System, path: str, deviation: float) -> Range:
+    """Return the bounds of a parameter; a known value keeps its sign."""
+    value, limits = float(get(system, path)), declared(system, path)
+    if abs(value) > deviation and not path.startswith(f"{DELAY}."):
+        low, high = sorted((value / FACTOR, value * FACTOR))
+    else:
+        low, high = value - REACH * deviation, value + REACH * deviation
+    if limits is not None:
+        margin = 1e-3 * (high - low)
+        low = max(low, limits.least, limits.above + margin)
+        high = min(high, limits.most, limits.below - margin)
+    return Range(low, high)
+
+
+def _point(system: System, space: Space) -> np.ndarray:
+    """Return the parameters of ``system`` as a point inside the unit box."""
+    values = np.array([float(get(system, path)) for path in space.paths])
+    return np.clip(np.asarray(space.to_unit(values)), INSIDE, 1.0 - INSIDE)
+
+
+def _at_resonances(
+    system: System, ranges: Mapping[str, Range], shown: Sequence[float]
+) -> System:
+    """Return ``system`` with its modes at the nearest frequencies ``shown``, Hz."""
+    moved = {}
+    for path, bounds in ranges.items():
+        limits = declared(system, path)
+        near = [each for each in shown if bounds.lower < each < bounds.upper]
+        if near and limits is not None and limits.unit == "Hz":
+            known = float(get(system, path))
+            moved[path] = min(near, key=lambda each: abs(each - known))
+    return replace(system, moved)

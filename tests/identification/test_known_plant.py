@@ -1,0 +1,181 @@
+"""A known plant fitted again: its prior, its delay, and what short records change."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import jacfwd
+
+import piezojax as pj
+from piezojax.core.paths import get, parameters, replace
+from piezojax.dynamics import FirstOrderLag, FractionalDelay, Mode
+from piezojax.hysteresis import PrandtlIshlinskii
+from piezojax.identification import Record, identify
+from piezojax.identification.estimators.estimate import Options
+from piezojax.identification.estimators.output_error import free_run, problem_of
+from piezojax.identification.known_plant import CHANGED, KnownPlant
+
+DT = 1e-4
+ERRORS = {
+    "hysteresis.polynomial.0": 1e-5,
+    "hysteresis.weights.0": 1e-5,
+    "dynamics.frequency": 0.1,
+    "dynamics.damping": 1e-4,
+}
+
+
+def plant(gain=1.0, frequency=800.0, damping=0.03, delay=None):
+    hysteresis = PrandtlIshlinskii((0.06,), (12.0,), (0.02,))
+    parts = {"hysteresis": hysteresis, "dynamics": Mode(frequency, damping, DT)}
+    if delay is not None:
+        parts["delay"] = FractionalDelay(delay * DT, DT, 5)
+    return pj.series(**parts, calibration=pj.Affine(gain, 0.3))
+
+
+def known(errors=ERRORS, system=None):
+    about = pj.About(standard_errors=errors, input_ranges=[(0.0, 100.0)])
+    return KnownPlant(system or plant(), about)
+
+
+def small_steps(level, seed=1, samples=1500):
+    random = np.random.default_rng(seed)
+    steps = np.repeat(random.uniform(0.0, 6.0, samples), random.choice([5, 12, 40], 1))
+    return level + np.r_[np.zeros(100), steps][:samples]
+
+
+def record(system, level, seed=1, noise=2e-3):
+    drive = small_steps(level, seed)
+    output = np.asarray(free_run(system, jnp.asarray(drive), float(drive[0])))
+    random = np.random.default_rng(seed + 100)
+    return Record(drive, output + noise * random.standard_normal(len(drive)), DT)
+
+
+def fitted(system, levels=(30.0, 45.0)):
+    records = [record(system, level, seed) for seed, level in enumerate(levels, 1)]
+    start = known()
+    return identify(records, start.model, options=Options(known=start))
+
+
+def test_a_changed_stage_is_found_from_small_steps():
+    fit = fitted(plant(gain=1.2, frequency=660.0, damping=0.02, delay=1.5))
+    found = {path: one.value for path, one in fit.report.parameters.items()}
+    assert found["dynamics.frequency"] == pytest.approx(660.0, rel=0.01)
+    assert found["dynamics.damping"] == pytest.approx(0.02, rel=0.1)
+    assert found["delay.delay"] / DT == pytest.approx(1.5, abs=0.1)
+    assert fit.report.validation.rmse < 3e-3
+    # The product of both gains is that of the stage for small motions.
+    gain = found["calibration.gain"] * found["hysteresis.polynomial.0"]
+    assert gain == pytest.approx(1.2 * 0.06, rel=0.03)
+
+
+def test_an_unchanged_stage_keeps_its_parameters():
+    fit = fitted(plant())
+    start = known()
+    for path in ERRORS:
+        value = float(get(start.system, path))
+        assert float(get(fit.plant, path)) == pytest.approx(value, rel=0.05)
+
+
+def test_what_records_do_not_show_keeps_its_value():
+    """Motions below the threshold of a play say nothing about its weight."""
+    fit = fitted(plant(gain=1.2))
+    assert float(get(fit.plant, "hysteresis.weights.0")) == pytest.approx(0.02, rel=0.1)
+
+
+def test_a_single_record_may_begin_anywhere():
+    fit = fitted(plant(gain=1.2), levels=(50.0,))
+    assert fit.report.train.rmse < 3e-3
+    assert fit.report.validation.rmse < 3e-3
+
+
+def test_the_bias_by_feedback_is_said():
+    start, one = known(), record(plant(), 30.0)
+    closed = Record(one.input, one.output, DT, reference=one.output)
+    options = Options(known=start, steps=1)
+    report = identify(closed, start.model, options=options).report
+    assert report.closed_loop.startswith("free run from the measured input, near")
+
+
+def test_one_standard_deviation_costs_a_hundredth_of_the_range():
+    start = known()
+    one = record(plant(), 30.0)
+    shape = start.structure([one], slice(0, 1500))
+    shape = shape.without(shape.own)
+    problem = problem_of(shape, [one], slice(0, 1500))
+    paths = problem.space.paths
+    at = paths.index("calibration.gain")
+    assert shape.prior is not None
+    moved = shape.prior.known.copy()
+    width = float(problem.space.upper[at] - problem.space.lower[at])
+    moved[at] += CHANGED / width
+    extra = np.asarray(problem.residuals(jnp.asarray(moved)))[-len(paths) :]
+    assert extra[at] == pytest.approx(0.01 * one.span / np.sqrt(25), rel=1e-6)
+    assert np.count_nonzero(extra) == 1
+
+
+def test_the_jacobian_contains_the_prior():
+    start = known()
+    one = record(plant(), 30.0)
+    shape = start.structure([one], slice(0, 1500)).without(("hysteresis.rest_input",))
+    problem = problem_of(shape, [one], slice(0, 1500))
+    point = jnp.asarray(shape.starts[0] + 0.01)
+    step = 1e-6
+    found = np.asarray(jacfwd(problem.residuals)(point))
+    for column in range(len(point)):
+        change = step * np.eye(len(point))[column]
+        up, down = (problem.residuals(point + s * change) for s in (1, -1))
+        expected = np.asarray(up - down) / (2.0 * step)
+        np.testing.assert_allclose(found[:, column], expected, rtol=1e-4, atol=1e-6)
+
+
+def test_the_bounds_keep_the_sign_of_a_known_value():
+    shape = known(ERRORS | {"calibration.offset": 1.0}).structure(
+        [record(plant(), 30.0)], slice(0, 1500)
+    )
+    ranges = shape.space.ranges()
+    assert ranges["dynamics.frequency"].lower == pytest.approx(800.0 / 3.0)
+    assert ranges["dynamics.frequency"].upper == pytest.approx(2400.0)
+    assert ranges["calibration.offset"].lower < 0.0 < ranges["calibration.offset"].upper
+    assert ranges["delay.delay"].lower == 0.0
+    assert "calibration.offset" in shape.own
+
+
+@pytest.mark.parametrize("delay", [None, 2.0, 4.9])
+def test_a_delay_may_grow(delay):
+    start = known(system=plant(delay=delay))
+    shape = start.structure([record(plant(), 30.0)], slice(0, 1500))
+    before = delay or 0.0
+    assert shape.space.ranges()["delay.delay"].upper >= (before + 3.9) * DT
+    largest = shape.space.ranges()["delay.delay"].upper
+    replace(shape.system, {"delay.delay": largest})  # within the longest delay
+    assert float(get(shape.system, "delay.delay")) == pytest.approx(before * DT)
+
+
+def test_the_search_also_starts_at_the_resonance_of_the_record():
+    changed = record(plant(frequency=600.0), 30.0)
+    shape = known().structure([changed], slice(0, 1500))
+    place = shape.space.paths.index("dynamics.frequency")
+    values = [
+        np.asarray(shape.space.from_unit(jnp.asarray(start)))[place]
+        for start in shape.starts
+    ]
+    assert values == pytest.approx([800.0, 600.0], rel=0.02)
+
+
+def test_the_range_of_the_known_record_remains():
+    fit = fitted(plant())
+    assert fit.about.input_ranges == [(0.0, 100.0)]
+
+
+def test_a_plant_without_fitted_parameters_is_refused():
+    with pytest.raises(ValueError, match=r"no fitted parameters .*identify it"):
+        known(errors={})
+
+
+def test_the_model_is_named_by_its_parts():
+    system = pj.series(
+        hysteresis=PrandtlIshlinskii((0.06,), (12.0,), (0.02,)),
+        lag=FirstOrderLag(1e-3, DT),
+        calibration=pj.Affine(),
+    )
+    assert known(system=system).model == "prandtl_ishlinskii+lag"
+    assert "calibration.gain" in parameters(system)
