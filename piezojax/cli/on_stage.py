@@ -42,6 +42,7 @@ def tuned_gains(
     gains = {
         path.removeprefix("controller."): value for path, value in result.gains.items()
     }
+    promised = {name: error for name, error in promised.items() if error is not None}
     motions = motions_of(load_study(results / STUDY_FILE), results, promised)
     return result, gains, motions
 
@@ -54,10 +55,15 @@ def connected(name: str) -> "Iterator[Stage]":
     """
     from ..stages import RemoteStage, StageError, stage_of
 
+    stage = None
     try:
         stage = stage_of(name)
         yield stage
         if isinstance(stage, RemoteStage):
             stage.close()
-    except StageError as error:
-        raise ValueError(str(error)) from None
+    except BaseException as error:
+        if isinstance(stage, RemoteStage):
+            stage.abandon()
+        if isinstance(error, StageError):
+            raise ValueError(str(error)) from None
+        raise

@@ -39,7 +39,11 @@ def main(results, name, out, seed, quiet):
             bar.finish()
             bar.stage("drawing")
             pictures = write_trial(found, folder, motions, stage.dt)
-            page = trial_page(found, result.title)
+            units = {
+                path.removeprefix("controller."): unit
+                for path, unit in result.gain_units.items()
+            }
+            page = trial_page(found, result.title, units)
             write_page(page, folder, pictures)
         print_results(page, folder, console)
         exit_unsafe(page.alarms)

@@ -1,6 +1,6 @@
 """Picture and tables of a trial of gains on a stage."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -72,17 +72,19 @@ def _trial_figure(
 def _title(run: TriedRun) -> str:
     if run.error_um is None:
         return f"Stopped: {run.stopped}"
-    return f"Error: {_nm(run.error_um)} rms, promised {_nm(run.promised_um)}"
+    return (
+        f"Error: {nanometres(run.error_um)} rms, promised {nanometres(run.promised_um)}"
+    )
 
 
-def trial_page(report: TrialReport, title: str) -> Page:
-    """Return the Page of a trial of the gains of ``title``."""
+def trial_page(report: TrialReport, title: str, units: Mapping[str, str]) -> Page:
+    """Return the Page of a trial of the gains of ``title``, which have ``units``."""
     return Page(
         f"{title}: trial on {report.stage}",
         report.alarms,
         [
             runs_table(report.runs),
-            gains_table(report),
+            stage_gains_table(report.before, report.gains, "tried", units),
             f"verdict: the gains are {_VERDICTS[report.verdict]}",
             *(f"note: {note}" for note in report.notes),
         ],
@@ -116,24 +118,32 @@ def runs_table(runs: Sequence[TriedRun]) -> Table:
         table.add_row(
             run.reference,
             f"{100.0 * run.share:g} %",
-            *map(_nm, figures),
+            *map(nanometres, figures),
             ratio,
-            _nm(run.peak_um),
+            nanometres(run.peak_um),
             voltage,
         )
     return table
 
 
-def gains_table(report: TrialReport) -> Table:
-    """Return the gains before the trial and those tried."""
+def stage_gains_table(
+    before: Mapping[str, float],
+    gains: Mapping[str, float],
+    name: str,
+    units: Mapping[str, str],
+) -> Table:
+    """Return the gains of a stage ``before``, and ``gains`` in a column ``name``."""
     table = Table(title="gains of the stage")
     table.add_column("gain", overflow="fold")
-    for name in ("before", "tried"):
-        table.add_column(name, justify="right")
-    for path, value in report.gains.items():
-        table.add_row(path, f"{report.before[path]:.5g}", f"{value:.5g}")
+    for column in ("before", name):
+        table.add_column(column, justify="right")
+    table.add_column("unit")
+    for path, value in gains.items():
+        unit = units.get(path, "")
+        table.add_row(path, f"{before[path]:.5g}", f"{value:.5g}", unit)
     return table
 
 
-def _nm(value_um: float | None) -> str:
+def nanometres(value_um: float | None) -> str:
+    """Return a length in nm, "-" if it is not known."""
     return "-" if value_um is None else f"{1e3 * value_um:.3g} nm"

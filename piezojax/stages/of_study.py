@@ -1,6 +1,6 @@
 """Emulated stage and motions of a study."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -70,11 +70,11 @@ def emulated_stage(
 
 
 def motions_of(
-    study: Study, folder: Path, promised: dict[str, float | None]
+    study: Study, folder: Path, promised: Mapping[str, float | None]
 ) -> Sequence[Motion]:
     """Return the references of ``study`` with their ``promised`` errors (um).
 
-    References without a promise are left out. The files that the study names lie in
+    Only those named in ``promised`` are returned. The files that the study names lie in
     ``folder``. Raises ValueError for several axes and a reference file that is missing.
     """
     _check_axes(study)
@@ -83,9 +83,9 @@ def motions_of(
     noise = study.by_axis(study.sensor.noise_rms)[0]
     rows = zip((*table.tune, *table.unseen), signals, strict=True)
     return [
-        Motion(name, signal, error, study.settled, noise)
+        Motion(name, signal, promised[name], study.settled, noise)
         for name, signal in rows
-        if (error := promised.get(name)) is not None
+        if name in promised
     ]
 
 

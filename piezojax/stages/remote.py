@@ -70,6 +70,10 @@ class RemoteStage:
         with self._connection, contextlib.suppress(LostError):
             self._ask(do="bye")
 
+    def abandon(self) -> None:
+        """End the connection without a goodbye: the stage becomes safe by itself."""
+        self._connection.close()
+
     def _connect(self) -> socket.socket:
         try:
             return socket.create_connection(self._place, self._timeout)

@@ -31,15 +31,16 @@ Verdict = Literal["running", "kept", "restored", "stopped", "lost"]
 
 @dataclass(frozen=True)
 class Motion:
-    """Reference of a trial: ``reference`` (um) and the error ``promised`` (um rms).
+    """Reference of a run: ``reference`` (um) and the error ``promised`` (um rms).
 
     Samples before ``start`` do not count. ``noise`` is the rms noise of the sensor, um:
-    it is part of the measured error, but not of the promised one.
+    it is part of the measured error, but not of the promised one. ``promised`` is None
+    if nothing is.
     """
 
     name: str
     reference: Float[np.ndarray, " samples"]
-    promised: float
+    promised: float | None
     start: int = 0
     noise: float = 0.0
 
@@ -55,7 +56,7 @@ class TriedRun(BaseModel):
 
     reference: str
     share: float
-    promised_um: float
+    promised_um: float | None = None
     measured_um: float | None = None
     error_um: float | None = None
     peak_um: float | None = None
@@ -65,8 +66,9 @@ class TriedRun(BaseModel):
 
     @property
     def ratio(self) -> float:
-        """Error relative to the promised one; infinite for a run that was stopped."""
-        if self.error_um is None:
+        """Error relative to the promised one; infinite for a run that was stopped, and
+        without a promise."""
+        if self.error_um is None or self.promised_um is None:
             return math.inf
         return self.error_um / self.promised_um
 
@@ -124,7 +126,7 @@ def trial(
     try:
         for number, (motion, share) in enumerate(planned, start=1):
             file = run_file(folder, number)
-            run = _tried(stage, gains, motion, share, file)
+            run = tried(stage, gains, motion, share, file)
             report.runs.append(run)
             _write(report, folder)
             if run.stopped or run.ratio > FAR:
@@ -134,7 +136,8 @@ def trial(
             )
         _judge(stage, report)
     except BaseException as error:
-        _abandon(stage, report, error)
+        report.verdict, alarm = abandoned(stage, error)
+        report.alarms.append(alarm)
         if not isinstance(error, StageError):
             _write(report, folder)
             raise
@@ -142,10 +145,14 @@ def trial(
     return report
 
 
-def _tried(
+def tried(
     stage: Stage, gains: Gains, motion: Motion, share: float, file: Path
 ) -> TriedRun:
-    """Run a ``share`` of a motion; write its samples into ``file``."""
+    """Run a ``share`` of ``motion`` with ``gains``; write its samples into ``file``.
+
+    A run that is stopped has the reason, and no error. Raises as ``Stage.run`` does in
+    other cases.
+    """
     begin = motion.reference[0]
     reference = begin + share * (motion.reference - begin)
     run = TriedRun(
@@ -200,18 +207,15 @@ def _judge(stage: Stage, report: TrialReport) -> None:
         ]
 
 
-def _abandon(stage: Stage, report: TrialReport, error: BaseException) -> None:
-    """Make ``stage`` safe after ``error``, if it can be reached."""
-    report.verdict = "stopped"
+def abandoned(
+    stage: Stage, error: BaseException
+) -> tuple[Literal["stopped", "lost"], str]:
+    """Make ``stage`` safe after ``error``, if it can be reached; return the alarm."""
     with contextlib.suppress(LostError):
         if not isinstance(error, LostError):
             stage.safe()
-            report.alarms.append(
-                f"{_cause(error)}; the safe gains of the stage are set"
-            )
-            return
-    report.verdict = "lost"
-    report.alarms.append(
+            return "stopped", f"{_cause(error)}; the safe gains of the stage are set"
+    return "lost", (
         f"{_cause(error)}: nothing is known of the stage since; its own guard has to "
         "make it safe. Look at it before the next run"
     )
