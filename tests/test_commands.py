@@ -117,6 +117,7 @@ REFUSED = {
     "reproduce": ["--table", "9-9"],
     "trial": ["nowhere", "--stage", "127.0.0.1:1"],
     "watch": ["nowhere", "--stage", "127.0.0.1:1"],
+    "retune": ["nowhere.toml", "--stage", "127.0.0.1:1"],
     "emulate": ["nowhere.toml"],
 }
 """Arguments that each command refuses."""

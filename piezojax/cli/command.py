@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from ..core.files import fresh_folder, numbered_folder
-from ..core.temporaries import claimed
+from ..core.temporaries import claimed, is_claimed, remove_stale
 from .stopping import exit_interrupted, terminable
 from .terminal import console
 
@@ -57,14 +57,24 @@ class Command(click.Command):
 
 
 @contextmanager
-def results_folder(out: Path | None, name: str) -> Iterator[Path]:
+def results_folder(
+    out: Path | None, name: str, going_on: str | None = None
+) -> Iterator[Path]:
     """Yield an empty folder for results: ``out``, or a numbered one named ``name``.
 
-    No other command takes the folder while this one runs. The folder is removed if the
-    work fails while it is empty. Raises ValueError if ``out`` is in use or cannot be
+    A folder ``out`` that holds the file ``going_on`` is taken as it is. No other
+    command takes the folder while this one runs. The folder is removed if the work
+    fails while it is empty. Raises ValueError if ``out`` is in use or cannot be
     written.
     """
     with ExitStack() as stack:
+        if out is not None and going_on and (out / going_on).is_file():
+            if is_claimed(out):
+                raise ValueError(f"--out {out} is in use by a running command")
+            stack.enter_context(claimed(out))
+            remove_stale(out)
+            yield out
+            return
         folder = fresh_folder(out or numbered_folder(RESULTS / name))
         while not stack.enter_context(claimed(folder)):  # another command was faster
             stack.close()

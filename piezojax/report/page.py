@@ -39,6 +39,7 @@ PICTURES = {
     "validation.png": "The model on the other records",
     "excitation.png": "Voltages to record",
     "trial.png": "References, readings and errors on the stage",
+    "retune.png": "Errors by attempt, and the first and the best run on the stage",
     "watch.png": "The stage in each run, beside the baseline",
     "limit.png": "Errors beside the limit of linear control",
     "structures.png": "Errors by the number of notches",

@@ -7,4 +7,6 @@ from .coupling import coupling_matrix as coupling_matrix
 from .outcome import Outcome as Outcome
 from .result import Result as Result
 from .result import load_result as load_result
+from .retuning import RetuneReport as RetuneReport
+from .retuning import retune as retune
 from .tuner import tune as tune

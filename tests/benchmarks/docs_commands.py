@@ -72,6 +72,7 @@ ON_STAGE = (
 """A command with the stage of the page behind it."""
 
 TRIED = "python -m piezojax.{} results/study --stage 127.0.0.1:5025{}"
+RETUNED = "python -m piezojax.retune study.toml --stage 127.0.0.1:5025 --runs 10"
 
 SPECIAL = {
     "pip install . && python -m piezojax.tune": Special("run by CI", None),
@@ -128,6 +129,7 @@ SPECIAL = {
             TRIED.format("watch", " --baseline baseline"),
         )
     },
+    RETUNED: Special("with an emulated stage", ON_STAGE.format(RETUNED)),
     "python -m piezojax.emulate study.toml --port 5025 --gain 1.2 --delay 1": Special(
         "runs until it is stopped",
         "timeout 60 python -m piezojax.emulate study.toml --port 5025 --gain 1.2 "

@@ -1,0 +1,167 @@
+"""Pictures and tables of a retuning on a stage."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from ..stages import TriedRun
+from ..stages.run_files import load_samples
+from ..tuning.retuning import PROBE, Attempt, RetuneReport
+from .figures import (
+    AFTER,
+    BEFORE,
+    REFERENCE,
+    Pictures,
+    add_title,
+    figure,
+    legend_above,
+    plot_style,
+    write,
+)
+from .page import Page
+from .trial_report import nanometres, stage_gains_table
+
+RETUNE_PICTURE = "retune.png"
+
+FIRST = "first run"
+
+
+def write_retuning(report: RetuneReport, folder: Path, dt: float) -> Pictures:
+    """Write the picture of the runs in ``folder``; ``dt`` is their sample time, s.
+
+    There is none if no reference was followed to its end.
+    """
+    if report.best is None:
+        return {}
+    with plot_style():
+        return write(_figure(report, folder, dt), folder / RETUNE_PICTURE)
+
+
+def _figure(report: RetuneReport, folder: Path, dt: float) -> Figure:
+    runs = _first_and_best(report)
+    picture = figure(9.0, 0.8 + 2.2 * (1 + len(runs)))
+    (attempts, drive), *panels = picture.subplots(1 + len(runs), 2)
+    _draw_attempts(attempts, report)
+    for (title, run), (motion, error) in zip(runs.items(), panels, strict=True):
+        reference, measured, voltage = load_samples(folder / run.file)
+        time = dt * np.arange(len(reference))
+        motion.plot(time, reference, color=REFERENCE, lw=0.8, label="reference")
+        motion.plot(time, measured, color=AFTER, lw=0.9, label="reading")
+        motion.set(ylabel="µm", xlabel="time (s)", title=f"{run.reference}, {title}\n")
+        legend_above(motion)
+        error.plot(time, 1e3 * (reference - measured), color=BEFORE, lw=0.7)
+        shown = run.stopped or f"{nanometres(run.measured_um)} rms"
+        error.set(ylabel="error (nm)", xlabel="time (s)", title=f"Error: {shown}")
+        colour = BEFORE if title == FIRST else AFTER
+        drive.plot(time, voltage, color=colour, lw=0.8, label=title)
+    drive.set(ylabel="voltage (V)", xlabel="time (s)")
+    legend_above(drive)
+    add_title(picture, f"Retuning on {report.stage}: {_ratio(report)}")
+    return picture
+
+
+def _first_and_best(report: RetuneReport) -> dict[str, TriedRun]:
+    """Return the first run of a reference, and the one with the smallest error."""
+    runs = [run for run in report.runs if run.reference != PROBE]
+    same = [run for run in runs if run.reference == runs[0].reference]
+    measured = [run for run in same[1:] if run.measured_um is not None]
+    found = {FIRST: same[0]}
+    if measured:
+        found["best run"] = min(measured, key=lambda run: run.measured_um or 0.0)
+    return found
+
+
+def _draw_attempts(panel: Axes, report: RetuneReport) -> None:
+    for name, colour in (("predicted_um", REFERENCE), ("measured_um", AFTER)):
+        known = {
+            place: 1e3 * value
+            for place, attempt in enumerate(report.attempts, start=1)
+            if (value := getattr(attempt, name))
+        }
+        if known:
+            style = {"color": colour, "marker": "o", "ms": 4, "lw": 0.8}
+            panel.plot(*zip(*known.items(), strict=True), **style, label=name[:-3])
+    panel.set(yscale="log", ylabel="rms error (nm)", xlabel="attempt")
+    panel.set(xticks=range(1, len(report.attempts) + 1))
+    legend_above(panel)
+
+
+def retune_page(report: RetuneReport, title: str) -> Page:
+    """Return the Page of a retuning of the study ``title``."""
+    parts = [attempts_table(report), _runs_table(report)]
+    if report.best is not None:
+        best = report.attempts[report.best].gains
+        parts.append(stage_gains_table(report.before, best, "best", report.units))
+    return Page(
+        f"{title}: retuning on {report.stage}",
+        report.alarms,
+        [
+            *parts,
+            f"{_ratio(report)}; the stage has {_left(report)}",
+            *(f"note: {note}" for note in report.notes),
+        ],
+    )
+
+
+def _ratio(report: RetuneReport) -> str:
+    if report.best is None:
+        return "no gains followed the references"
+    before = report.attempts[0].measured_um
+    best = nanometres(report.attempts[report.best].measured_um)
+    if before is None:
+        return f"{best} rms after a start that was stopped"
+    return f"{nanometres(before)} to {best} rms, {report.ratio:.3g} times smaller"
+
+
+def _left(report: RetuneReport) -> str:
+    if report.verdict == "lost":
+        return "unknown gains: the connection was lost"
+    if report.verdict == "done" and report.best is not None:
+        return f"the gains of attempt {report.best + 1}"
+    return "its safe gains"
+
+
+def attempts_table(report: RetuneReport) -> Table:
+    """Return the gains that were tried: predicted and measured errors."""
+    table = Table(title="attempts: rms error with noise, mean of the references")
+    table.add_column("attempt", justify="right")
+    for name in ("gains within", "predicted", "measured"):
+        table.add_column(name, justify="right")
+    table.add_column("verdict", overflow="fold")
+    for number, attempt in enumerate(report.attempts, start=1):
+        table.add_row(
+            f"{number}",
+            _within(attempt),
+            nanometres(attempt.predicted_um),
+            nanometres(attempt.measured_um),
+            attempt.verdict + (", set at the end" if number - 1 == report.best else ""),
+        )
+    return table
+
+
+def _within(attempt: Attempt) -> str:
+    if not attempt.model:
+        return "of the stage"
+    return "the study" if attempt.within is None else f"a factor {attempt.within:.3g}"
+
+
+def _runs_table(report: RetuneReport) -> Table:
+    table = Table(title="runs on the stage: rms error with noise")
+    table.add_column("file")
+    table.add_column("reference", overflow="fold")
+    table.add_column("error", justify="right")
+    table.add_column("largest", justify="right")
+    table.add_column("voltage", justify="right")
+    for run in report.runs:
+        voltage = run.voltage_V
+        table.add_row(
+            run.file,
+            run.reference + (f": {run.stopped}" if run.stopped else ""),
+            nanometres(run.measured_um),
+            nanometres(run.peak_um),
+            "-" if voltage is None else f"{voltage[0]:.1f} to {voltage[1]:.1f} V",
+        )
+    return table

@@ -1,0 +1,446 @@
+"""A retuning on a stage: what it improves, what it takes back, and what it leaves."""
+
+import inspect
+import json
+import re
+import threading
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import tomli_w
+from small_runs import call, main_of, succeeded
+from stages.stage_in_tests import DT, SAFE, lag, stage
+
+import piezojax as pj
+from piezojax.core.paths import replace
+from piezojax.core.serial import save
+from piezojax.core.temporaries import claimed
+from piezojax.dynamics import FirstOrderLag
+from piezojax.stages import Fault, LostError, StageServer
+from piezojax.tuning import retuning
+from piezojax.tuning.retuning import RETUNE_FILE, RetuneReport, gains_of, retune
+
+STUDY = {
+    "title": "a PID to retune",
+    "rate": 1.0 / DT,
+    "seed": 3,
+    "plant": {"file": "model.json"},
+    "actuator": {"lower": -10.0, "upper": 110.0},
+    "sensor": {"noise_rms": 1e-3},
+    "controller": {
+        **{"type": "PID", "proportional": 1.0, "integral": 800.0, "dt": DT},
+        "derivative": 0.0,
+    },
+    "references": {
+        **{"tune": ["SIN2"], "unseen": ["SIN4"], "amplitude": 3.0},
+        **{"duration": 1.0, "settle": 0.5},
+    },
+    "parameters": {
+        "controller.proportional": {"lower": 0.1, "upper": 50.0, "scale": "log"},
+        "controller.integral": {"lower": 50.0, "upper": 2e4, "scale": "log"},
+    },
+    "optimiser": {"starts": 1, "candidates": 4, "steps": 15},
+}
+GOOD = {"proportional": 4.0, "integral": 2500.0}
+WORSE = {"proportional": 0.5, "integral": 400.0}
+WILD = {"proportional": 150.0, "integral": 900.0}
+
+
+@pytest.fixture
+def study(tmp_path):
+    return write_study(tmp_path)
+
+
+def write_study(folder, **tables):
+    plant = pj.series(lag=FirstOrderLag(5e-3, DT), calibration=pj.Affine(0.1))
+    about = pj.About(
+        rate_Hz=1.0 / DT,
+        standard_errors={"lag.time_constant": 1e-5, "calibration.gain": 1e-4},
+        input_ranges=[(0.0, 80.0)],
+    )
+    save(plant, folder / "model.json", about)
+    path = folder / "study.toml"
+    path.write_text(tomli_w.dumps(STUDY | tables), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    """Let the searches return the given gains, predictions and alarms in turn."""
+
+    def use(*found):
+        rows = iter(found)
+        studies = []
+
+        def tuned(case, **_):
+            studies.append(case.study)
+            gains, predicted, *alarms = next(rows)
+            if gains is None:
+                raise KeyboardInterrupt
+            controller = replace(case.loop.controller, gains)
+            result = SimpleNamespace(
+                status="converged",
+                alarms=alarms,
+                holdout=SimpleNamespace(per_reference_rms_um={"SIN2": predicted}),
+            )
+            about = pj.About()
+            return SimpleNamespace(
+                result=result, controller=controller, case=case, about=about
+            )
+
+        def fitted(plant, records, file):
+            save(plant.system, file, plant.about)
+
+        monkeypatch.setattr(retuning, "tune", tuned)
+        monkeypatch.setattr(retuning, "_fit_again", fitted)
+        return studies
+
+    return use
+
+
+def read(folder):
+    return RetuneReport.model_validate_json((folder / RETUNE_FILE).read_text())
+
+
+def out(folder):
+    path = folder / "out"
+    path.mkdir(exist_ok=True)
+    return path
+
+
+def failing_at(one, run, act):
+    """Call ``act`` before the run of this number, from 1."""
+    whole, count = one.run, iter(range(1, 100))
+
+    def run_or_fail(reference, gains):
+        if next(count) == run:
+            act()
+        return whole(reference, gains)
+
+    one.run = run_or_fail
+    return one
+
+
+def raising(error):
+    def act():
+        raise error
+
+    return act
+
+
+def test_the_error_on_another_stage_falls(study, tmp_path):
+    """Gain and lag of the stage are not those of the model."""
+    one = stage(plant=lag(0.07), seed=5)
+    report = retune(study, one, out(tmp_path), runs=8)
+    assert report.verdict == "done"
+    assert not report.alarms
+    assert report.ratio > 3.0
+    best = report.attempts[report.best]
+    assert best.model
+    assert one.gains() == pytest.approx(best.gains)
+    kept = pj.load(tmp_path / "out" / "gains.toml")
+    assert gains_of(kept) == pytest.approx(best.gains)
+    # The model is that of this stage by now, and so is the prediction.
+    found = json.loads((tmp_path / "out" / best.model).read_text())
+    gain = found["parts"][-1]["gain"]
+    assert gain == pytest.approx(0.07, rel=0.02)
+    assert best.measured_um == pytest.approx(best.predicted_um, rel=0.3)
+    assert len(report.runs) <= 8
+    assert read(tmp_path / "out") == report
+
+
+def test_better_gains_are_kept_and_others_taken_back(study, tmp_path, scripted):
+    studies = scripted((GOOD, 0.05), (WORSE, 0.01), (WORSE, 0.01), (GOOD, 0.0))
+    one = stage()
+    one.apply({"proportional": 1.0, "integral": 900.0})
+    report = retune(study, one, out(tmp_path), runs=20)
+    assert [attempt.verdict for attempt in report.attempts] == [
+        "measured",
+        "better",
+        "not better",
+        "not better",
+    ]
+    assert report.best == 1
+    assert one.gains() | GOOD == one.gains()
+    assert report.before | {"proportional": 1.0, "integral": 900.0} == report.before
+    assert [run.reference for run in report.runs] == ["small steps", "SIN2"] * 4
+    # The box is around the best gains, and shrinks with every attempt that fails.
+    boxes = [study.parameters["controller.integral"] for study in studies]
+    assert [box.start for box in boxes] == [900.0, 2500.0, 2500.0]
+    factors = [box.upper / box.start for box in boxes]
+    assert factors[0] == pytest.approx(10.0)
+    assert factors[1] > factors[2] > 1.5 - 1e-9
+    measured = report.attempts[0]
+    with np.load(tmp_path / "out" / report.runs[1].file) as samples:
+        error = (samples["reference_um"] - samples["measured_um"])[500:]
+    assert measured.measured_um == pytest.approx(np.sqrt(np.mean(error**2)))
+
+
+def test_the_factor_grows_while_predictions_hold(study, tmp_path, scripted):
+    first = {"proportional": 2.0, "integral": 1500.0}
+    for name, predicted, factor in (("right", 0.18, 25.0), ("wrong", 0.05, 10.0**0.5)):
+        folder = tmp_path / name
+        folder.mkdir()
+        studies = scripted((first, predicted), (GOOD, 0.05))
+        report = retune(study, stage(), folder, runs=6)
+        assert report.attempts[1].verdict == "better"
+        assert report.attempts[1].measured_um == pytest.approx(0.18, rel=0.1)
+        boxes = [study.parameters["controller.proportional"] for study in studies]
+        # A factor of 100 would leave the box of the study, which ends at 50.
+        assert boxes[1].upper / boxes[1].start == pytest.approx(factor)
+
+
+def test_gains_with_an_alarm_are_not_tried(study, tmp_path, scripted):
+    scripted((GOOD, 0.01, "the loop is unstable"))
+    one = stage()
+    before = one.gains()
+    report = retune(study, one, out(tmp_path))
+    assert [run.reference for run in report.runs] == ["small steps", "SIN2"]
+    assert report.attempts[1].verdict == "not tried"
+    assert report.notes == ["model_1.json: not tried: the loop is unstable"]
+    assert one.gains() == before
+
+
+def test_no_expected_improvement_ends_it(study, tmp_path, scripted):
+    scripted((GOOD, 5.0))
+    report = retune(study, stage(), out(tmp_path))
+    assert report.attempts[1].why == "no improvement is expected"
+    assert len(report.runs) == 2
+
+
+def test_gains_that_are_stopped_are_taken_back(study, tmp_path, scripted):
+    scripted((WILD, 0.01), (GOOD, 0.05))
+    one = stage()
+    report = retune(study, one, out(tmp_path), runs=7)
+    assert [attempt.verdict for attempt in report.attempts] == [
+        "measured",
+        "stopped",
+        "better",
+    ]
+    # A run with the gains from before shows that the stage is sound.
+    assert [run.reference for run in report.runs] == [
+        *("small steps", "SIN2", "small steps", "small steps"),
+        *("small steps", "SIN2"),
+    ]
+    assert one.gains() | GOOD == one.gains()
+
+
+def test_a_stage_that_stays_broken_ends_with_the_safe_gains(study, tmp_path, scripted):
+    scripted((GOOD, 0.01))
+
+    def broken():
+        one.faults = [Fault("stuck", 300, 900)]
+        failing_at(one, 1, lambda: setattr(one, "faults", [Fault("stuck", 300, 900)]))
+
+    one = failing_at(stage(), 4, broken)
+    report = retune(study, one, out(tmp_path))
+    assert report.verdict == "stopped"
+    assert report.attempts[1].verdict == "stopped"
+    assert "small steps after a stopped run" in report.alarms[0]
+    assert "the safe gains of the stage are set" in report.alarms[0]
+    assert one.gains() | SAFE == one.gains()
+    assert one.voltage == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_start_that_is_stopped_continues_with_the_safe_gains(
+    study, tmp_path, scripted
+):
+    scripted((GOOD, 0.01))
+    one = stage()
+    one.apply(WILD)
+    report = retune(study, one, out(tmp_path), runs=5)
+    first, second, *_ = report.attempts
+    assert first.verdict == "stopped"
+    assert second.gains | SAFE == second.gains
+    assert report.notes[0].startswith("the gains of the stage were stopped: small")
+    assert report.ratio == np.inf
+    assert one.gains() | GOOD == one.gains()
+
+
+def test_safe_gains_that_are_stopped_end_it(study, tmp_path):
+    one = stage(safe_gains=WILD)
+    report = retune(study, one, out(tmp_path))
+    assert report.verdict == "stopped"
+    assert report.best is None
+    assert report.alarms[0].startswith("small steps with the safe gains: the ")
+    assert len(report.runs) == 2
+
+
+@pytest.mark.parametrize("run", [1, 2, 4])
+@pytest.mark.parametrize(
+    ("error", "verdict"),
+    [
+        (KeyboardInterrupt(), "stopped"),
+        (LostError("the connection to the stage is lost"), "lost"),
+        (RuntimeError("the driver failed"), "stopped"),
+    ],
+)
+def test_every_failure_ends_with_an_alarm(
+    study, tmp_path, scripted, run, error, verdict
+):
+    scripted((GOOD, 0.01))
+    one = failing_at(stage(), run, raising(error))
+    with pytest.raises(type(error)):
+        retune(study, one, out(tmp_path))
+    report = read(tmp_path / "out")
+    assert report.verdict == verdict
+    assert len(report.runs) == run - 1
+    assert report.alarms
+    if verdict == "stopped":
+        assert one.gains() | SAFE == one.gains()
+
+
+def test_an_interrupted_search_makes_the_stage_safe(study, tmp_path, scripted):
+    scripted((None, 0.0))
+    one = stage()
+    with pytest.raises(KeyboardInterrupt):
+        retune(study, one, out(tmp_path))
+    assert one.gains() | SAFE == one.gains()
+    assert read(tmp_path / "out").verdict == "stopped"
+
+
+def test_it_goes_on_where_it_was(study, tmp_path, scripted):
+    scripted((GOOD, 0.05), (None, 0.0))
+    one = stage()
+    before = one.gains()
+    with pytest.raises(KeyboardInterrupt):
+        retune(study, one, out(tmp_path), runs=8)
+    assert one.gains() | SAFE == one.gains()
+    known = read(tmp_path / "out")
+    assert known.best == 1
+    scripted((WORSE, 0.01), (WORSE, 0.01))
+    report = retune(study, one, out(tmp_path), runs=8)
+    assert report.before == before
+    assert report.runs[:4] == known.runs
+    assert report.attempts[:2] == known.attempts
+    assert report.best == 1
+    assert not report.alarms
+    assert one.gains() | GOOD == one.gains()
+    files = [run.file for run in report.runs]
+    assert len(set(files)) == len(files)
+
+
+def test_an_attempt_that_was_killed_counts_as_stopped(study, tmp_path, scripted):
+    scripted((GOOD, 0.05))
+    retune(study, stage(), out(tmp_path), runs=4)
+    content = json.loads((tmp_path / "out" / RETUNE_FILE).read_text())
+    content["attempts"][1] |= {"verdict": "running", "measured_um": None}
+    content |= {"best": 0, "verdict": "running"}
+    (tmp_path / "out" / RETUNE_FILE).write_text(json.dumps(content))
+    report = retune(study, stage(), out(tmp_path), runs=4)
+    assert report.attempts[1].verdict == "stopped"
+    assert report.attempts[1].why == "the command was interrupted"
+    assert report.verdict == "done"
+
+
+def test_the_gains_from_before_are_saved_before_the_first_run(study, tmp_path):
+    one = stage()
+    one.apply({"integral": 650.0})
+
+    def dying():
+        saved = read(tmp_path / "out")
+        assert saved.before["integral"] == 650.0
+        assert saved.verdict == "running"
+        raise SystemExit
+
+    with pytest.raises(SystemExit):
+        retune(study, failing_at(one, 1, dying), out(tmp_path))
+
+
+def test_a_report_of_another_study_is_refused(study, tmp_path, scripted):
+    scripted((GOOD, 5.0))
+    retune(study, stage(), out(tmp_path))
+    write_study(tmp_path, seed=4)
+    with pytest.raises(ValueError, match="is of another study: name a new folder"):
+        retune(study, stage(), out(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"rate": 2e3}, "rate"),
+        ({"actuator": STUDY["actuator"] | {"bandwidth": 300.0}}, "an amplifier"),
+        ({}, "the controller of the study has the gain proportional"),
+    ],
+)
+def test_another_stage_is_refused(tmp_path, tables, message):
+    path = write_study(tmp_path, **tables)
+    one = stage()
+    if "gain" in message:
+        one.gains = lambda: {"speed": 1.0}
+    with pytest.raises(ValueError, match=message):
+        retune(path, one, out(tmp_path))
+    assert not (tmp_path / "out" / RETUNE_FILE).exists()
+
+
+def test_a_stage_at_another_rate_is_refused(study, tmp_path):
+    one = stage()
+    one.dt = 2.0 * DT
+    with pytest.raises(ValueError, match="the stage runs at 500 Hz and the study at 1"):
+        retune(study, one, out(tmp_path))
+
+
+@contextmanager
+def served(one):
+    with StageServer(one) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield server.address
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def commanded(study, address, *more):
+    folder = study.parent / "results"
+    return call("retune", study, "--stage", address, "--out", folder, *more)
+
+
+def test_the_command_writes_a_page_and_goes_on(study, scripted):
+    scripted((GOOD, 0.05), (None, 0.0))
+    one = stage()
+    with served(one) as address:
+        first = commanded(study, address, "--runs", "8")
+        assert first.exit_code == 130
+        assert one.gains() | SAFE == one.gains()
+        scripted((WORSE, 0.01), (WORSE, 0.01))
+        printed = succeeded(commanded(study, address, "--runs", "8")).stdout
+    assert "524 nm to 107 nm rms, 4.9 times smaller" in printed
+    assert "the stage has the gains of attempt 2" in printed
+    assert re.search(r"integral +│ +500 │ 2500 │ V/\(um s\)", printed)
+    assert one.gains() | GOOD == one.gains()
+    folder = study.parent / "results"
+    assert (folder / "retune.png").stat().st_size > 20_000
+    page = (folder / "report.html").read_text()
+    assert "Errors by attempt, and the first and the best run" in page
+    assert "attempts: rms error with noise" in page
+
+
+def test_the_command_ends_with_the_alarm(study):
+    with served(stage(safe_gains=WILD)) as address:
+        result = commanded(study, address)
+    assert result.exit_code == 3
+    assert "ALARM: small steps with the safe gains: the " in result.stdout
+    assert "no gains followed the references; the stage has its safe gains" in (
+        result.stdout
+    )
+
+
+def test_a_folder_in_use_is_refused(study, scripted):
+    scripted((GOOD, 5.0))
+    one = stage()
+    with served(one) as address:
+        succeeded(commanded(study, address))
+        with claimed(study.parent / "results"):
+            result = commanded(study, address)
+    assert result.exit_code == 1
+    assert "is in use by a running command" in result.stderr
+
+
+def test_the_default_of_the_command_is_that_of_the_function():
+    default = inspect.signature(retune).parameters["runs"].default
+    options = {option.name: option.default for option in main_of("retune").params}
+    assert options["runs"] == default
