@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..core.arrays import ScalarLike, check
+from ..core.plain import shown
 from . import waveforms as signals
 
 Path = Float[Array, "samples 2"]
@@ -129,7 +130,7 @@ def signals_of(name: str) -> tuple[str, str]:
             slow = second or str(Fraction(first) / LINES * 1.0)
             return f"SCAN{first}", f"TRI{slow}"
     raise ValueError(
-        f"contour {name!r} is unknown; it must have the form of one of "
+        f"contour {shown(name)} is unknown; it must have the form of one of "
         f"{', '.join(FORMS)}, with frequencies in Hz above 0"
     )
 

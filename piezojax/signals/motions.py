@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..core.plain import shown
 from . import contours
 from . import waveforms as signals
 
@@ -26,18 +27,19 @@ def parse(name: str, axes: Sequence[str]) -> dict[str, str]:
         on = moved.split("+")
         if not colon or len(on) > 2 or any(axis not in axes for axis in on):
             raise ValueError(
-                f"motion {name!r}: {word!r} must be an axis, one of {', '.join(axes)}, "
+                f"motion {shown(name)}: {shown(word)} must be an axis, one of "
+                f"{', '.join(axes)}, "
                 "and a signal, as in Z:SIN10, or two axes and a contour, as in "
                 "X+Y:CIRCLE5"
             )
         kinds = (kind,) if len(on) == 1 else contours.signals_of(kind)
         for axis, each in zip(on, kinds, strict=True):
             if axis in driven:
-                raise ValueError(f"motion {name!r} drives {axis} twice")
+                raise ValueError(f"motion {shown(name)} drives {axis} twice")
             signals.parse(each)
             driven[axis] = each
     if not driven:
-        raise ValueError(f"motion {name!r} drives no axis")
+        raise ValueError(f"motion {shown(name)} drives no axis")
     return driven
 
 

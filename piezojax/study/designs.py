@@ -9,6 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from ..control.design import DESIGNS
 from ..control.devices import DEVICE_DESIGNS
+from ..core.plain import shown
 from ..core.system import System
 from .tables import one_of
 
@@ -34,7 +35,7 @@ def design_of(table: Mapping[str, Any]) -> Callable[..., System]:
             expected = (
                 f"its settings are {', '.join(known)}" if known else "it has none"
             )
-            raise ValueError(f"{name} has no setting {key!r}; {expected}")
+            raise ValueError(f"{name} has no setting {shown(key)}; {expected}")
         settings[key] = _checked(key, value, known[key].annotation)
     for key, parameter in known.items():
         if parameter.default is parameter.empty and key not in settings:
@@ -47,4 +48,4 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
         return TypeAdapter(kind).validate_python(value, strict=False)
     except ValidationError as error:
         reason = error.errors()[0]["msg"]
-        raise ValueError(f"the setting {key!r} is {value!r}: {reason}") from None
+        raise ValueError(f"the setting {key!r} is {shown(value)}: {reason}") from None

@@ -8,7 +8,7 @@ import tomli_w
 from pydantic import Field, field_validator, model_validator
 
 from ..analysis.constraints import CONSTRAINTS, limits_of
-from ..core.plain import read_plain
+from ..core.plain import read_plain, shown
 from ..core.registry import discover
 from ..signals import motions
 from ..signals import waveforms as signals
@@ -64,7 +64,7 @@ class AxesTable(Table):
         for name in self.names:
             if not name.isidentifier():
                 raise ValueError(
-                    f"axis {name!r}: a name consists of letters, digits and _"
+                    f"axis {shown(name)}: a name consists of letters, digits and _"
                 )
         return self
 

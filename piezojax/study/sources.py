@@ -6,6 +6,7 @@ from typing import Any
 
 from ..catalog import at_rate
 from ..core.about import About
+from ..core.plain import shown
 from ..core.serial import from_data, read_about
 from ..core.serial import load as load_system
 from ..core.system import System
@@ -95,7 +96,9 @@ def _from_file(table: dict[str, Any], where: str, folder: Path) -> System:
     """
     path, accept = folder / str(table["file"]), table.get(_ACCEPT, False)
     if not isinstance(accept, bool):
-        raise ValueError(f"{where}.{_ACCEPT} is {accept!r}; it must be true or false")
+        raise ValueError(
+            f"{where}.{_ACCEPT} is {shown(accept)}; it must be true or false"
+        )
     if not accept:
         remedy = f"set {where}.{_ACCEPT} = true to use it anyway"
         read_about(path).require_safe(path.name, remedy)

@@ -5,6 +5,7 @@ study, a controller or plant of the catalogue, a record in one of the formats) a
 one to four mutations of its keys, values, types, units, nesting, lines or bytes.
 """
 
+import contextlib
 import copy
 import datetime
 import io
@@ -157,9 +158,9 @@ def _another_value(node, key, random):
 def _another_size(node, key, random):
     value = node[key]
     if isinstance(value, int | float) and not isinstance(value, bool):
-        node[key] = (
-            value * 10.0 ** int(random.integers(-12, 13)) * _pick(random, (1, -1))
-        )
+        factor = 10.0 ** int(random.integers(-12, 13)) * _pick(random, (1, -1))
+        with contextlib.suppress(OverflowError):  # an integer beyond every float
+            node[key] = value * factor
     elif isinstance(value, str | list):
         node[key] = value * int(random.integers(0, 4))
 
