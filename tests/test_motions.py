@@ -26,7 +26,10 @@ def test_axes_without_a_signal_rest_at_their_offset():
         ("Z:SIN1 Z:SIN5", r"drives Z twice"),
         ("  ", r"drives no axis"),
         ("Z:WAVE3", r"signal 'WAVE3' is unknown"),
-        *((word, "a{20}") for word in ("a" * 5000, f"Z+Rx:{'a' * 5000}", f"Z:{'a' * 5000}")),
+        *(
+            (word, "a{20}")
+            for word in ("a" * 5000, f"Z+Rx:{'a' * 5000}", f"Z:{'a' * 5000}")
+        ),
     ],
 )
 def test_bad_motions_are_refused(name, message):

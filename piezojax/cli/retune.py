@@ -34,10 +34,10 @@ def main(study, name, runs, out, seed, quiet):
     """Improve the gains of a stage for the references of STUDY, on the stage itself.
 
     The plant of STUDY is fitted to the runs again and again, and the gains are tuned on
-    it, near the best ones so far. Small steps come before the references. Gains with an
-    alarm are not tried; those that are not better are taken back. After a fault, Ctrl-C
-    or a lost connection the stage has its safe gains. To go on after an interruption,
-    give the same folder as --out.
+    it, near the best ones so far. A small motion comes before the references. Gains
+    with an alarm are not tried; those that are not better are taken back. After a
+    fault, Ctrl-C or a lost connection the stage has its safe gains. To go on after an
+    interruption, give the same folder as --out.
     """
 
     def body(console):

@@ -18,7 +18,7 @@ from ..core.registry import parts as known_parts
 from ..core.space import INSIDE, Range, Space, space_of
 from ..core.system import Affine, Series, System
 from ..dynamics import FractionalDelay
-from .chain import OFFSET, by_evidence, dynamics_of
+from .chain import LINEAR, OFFSET, by_evidence, dynamics_of
 from .estimators.structure import Prior, Structure
 from .records.record import Record
 
@@ -64,13 +64,14 @@ class KnownPlant:
         parts = self.system.parts if isinstance(self.system, Series) else (self.system,)
         return "+".join(names[type(part)] for part in parts if type(part) in names)
 
-    def structure(self, records: Sequence[Record], train: slice) -> Structure:
-        """Return the plant as a structure to fit to the samples ``train`` of records.
+    def structure(self, records: Sequence[Record]) -> Structure:
+        """Return the plant as a structure to fit to ``records``.
 
-        It starts from the known values, and also from the resonances that the records
-        show. A gain and a delay are fitted beside its own parameters.
+        It starts from the resonances that the records show, and from the known values.
+        A gain and a delay are fitted beside its own parameters.
         """
-        best, *_ = by_evidence(records, train)
+        whole = slice(0, max(record.samples for record in records))
+        best, *_ = by_evidence(records, whole)
         system = _with_delay(self.system, best.dt)
         deviations = self._deviations(system, best.dt)
         ranges = {path: _range(system, path, s) for path, s in deviations.items()}
@@ -80,12 +81,18 @@ class KnownPlant:
         widths = np.asarray(space.upper - space.lower)
         weights = widths / np.array(list(deviations.values()))
         prior = Prior(known, explained / math.sqrt(INDEPENDENT) * weights)
-        shown = [mode.frequency for mode in dynamics_of(best).modes]
-        starts = [known, _point(_at_resonances(system, ranges, shown), space)]
-        own = tuple(
-            path for path in ranges if path == OFFSET or path.endswith("rest_input")
+        shown = dynamics_of(best)
+        resonances = [mode.frequency for mode in shown.modes]
+        starts = [_point(_at_resonances(system, ranges, resonances), space), known]
+        return Structure(
+            system,
+            space,
+            np.stack(starts),
+            own=tuple(p for p in ranges if p == OFFSET or p.endswith("rest_input")),
+            dynamics=tuple(p for p in ranges if p.split(".")[0] in LINEAR),
+            whitening=shown.whitening if shown.modes else (),
+            prior=prior,
         )
-        return Structure(system, space, np.stack(starts), own, prior=prior)
 
     def widened(self, about: About) -> About:
         """Return the origin ``about`` of a new fit, with the known ranges of inputs."""

@@ -58,7 +58,7 @@ def _by_output_error(
     else:
         text = ""
         if options.known is not None:
-            shape = options.known.structure(records, train)
+            shape = options.known.structure(records)
             text = is_closed(records, options) * FITTED_AGAIN
         else:
             shape = structure(model, training_record(records, train), options.dynamics)

@@ -1,31 +1,39 @@
-"""Small motion that shows the dynamics of a stage: random steps."""
+"""Small motion that shows the dynamics of a stage: sines at many frequencies."""
 
 import numpy as np
 from jaxtyping import Float
 
 SHARE = 0.05
-"""Height of the largest step, as a share of the range of the reference."""
+"""Range of the motion, as a share of the range of the reference."""
 
-HOLDS = 5, 8, 12, 20, 40, 100
-"""Numbers of samples between two steps; short ones excite fast modes."""
+SINES = 60
+"""Number of sines, evenly spaced on a logarithmic scale as far as the lines allow."""
 
-REST = 100
-"""Samples before the first step, which show the noise."""
+HIGHEST = 0.2
+"""Highest frequency, as a share of the sampling rate."""
+
+REST = 0.05
+"""Share of the motion at the beginning that rises smoothly from rest."""
 
 SEED = 22
 
 
 def probe(reference: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
-    """Return small random steps (um) from the first sample of ``reference``.
+    """Return a small motion (um) from the first sample of ``reference``.
 
-    They stay within the range of ``reference`` and have its length. The same reference
-    gives the same steps, so that two runs can be compared.
+    It has the length of ``reference``, stays within its range, and has no jumps, which
+    a feedforward would turn into jumps of the voltage. The amplitude falls with the
+    root of the frequency. The same reference gives the same motion, so that two runs
+    can be compared.
     """
-    random = np.random.default_rng(SEED)
-    samples, begin = len(reference), float(reference[0])
-    low, high = float(np.min(reference)), float(np.max(reference))
-    inward = 1.0 if high - begin >= begin - low else -1.0
-    holds = random.choice(HOLDS, samples)
-    heights = random.uniform(0.0, inward * SHARE * (high - low), samples)
-    steps = np.repeat(heights, holds)[: max(samples - REST, 0)]
-    return begin + np.concatenate([np.zeros(min(REST, samples)), steps])
+    samples = len(reference)
+    begin, low, high = (f(reference) for f in (lambda x: x[0], np.min, np.max))
+    lines = np.unique(np.geomspace(2.0, max(HIGHEST * samples, 3.0), SINES).round())
+    phases = np.random.default_rng(SEED).uniform(0.0, 2.0 * np.pi, len(lines))
+    time = np.arange(samples) / samples
+    sines = np.cos(2.0 * np.pi * lines[:, None] * time + phases[:, None])
+    motion = lines**-0.5 @ sines
+    motion = SHARE * (high - low) * (motion - motion.min()) / np.ptp(motion)
+    inward = motion if high - begin >= begin - low else -motion
+    rise = np.clip(time / REST, 0.0, 1.0)
+    return begin + inward * (0.5 - 0.5 * np.cos(np.pi * rise))

@@ -32,7 +32,7 @@ from .tuner import tune
 
 RETUNE_FILE = "retune.json"
 
-PROBE = "small steps"
+PROBE = "small motion"
 """Name of the small motion in the list of runs."""
 
 RUNS = 10
@@ -40,6 +40,10 @@ RUNS = 10
 
 WITHIN, LEAST, MOST = 10.0, 1.5, 100.0
 """Factor by which a gain may change at first, the smallest and the largest one."""
+
+RINGING = 2.0
+"""Ratio of the rms error in the small motion to that of the motion itself above which
+the loop rings: a sensitivity peak of 2 allows no more."""
 
 NEAR = 1.3
 """Ratio of the measured to the predicted error up to which this factor grows."""
@@ -50,7 +54,7 @@ ENOUGH = 0.95
 PATIENCE = 2
 """Number of attempts in a row without an improvement after which it ends."""
 
-FITTED, SHORTEST = 6, 400
+FITTED, SHORTEST = 4, 400
 """Number of runs to which the plant is fitted, the last ones; fewest samples of a run
 that was stopped."""
 
@@ -111,6 +115,11 @@ class RetuneReport(BaseModel):
         return math.inf if self.best is None else self.attempts[self.best].error
 
     @property
+    def tuned(self) -> bool:
+        """Whether tuned gains were run; the first show what the start hides."""
+        return any(each.model and each.verdict != "not tried" for each in self.attempts)
+
+    @property
     def ratio(self) -> float:
         """Error at the beginning relative to the best one; infinite if a run with these
         gains was stopped."""
@@ -131,8 +140,8 @@ def retune(
 
     The gains of the stage are saved and measured first. Then, in turn, the plant is
     fitted to the last runs, the study is tuned on it near the best gains, and the new
-    gains follow small steps and all references to tune on. Gains with an alarm are not
-    tried. The best gains are set again after others that are not better, and at the
+    gains follow a small motion and all references to tune on. Gains with an alarm are
+    not tried. The best gains are set again after others that are not better, and at the
     end. Any other end leaves the safe gains of the stage.
 
     ``folder`` receives the samples of every run, the models, the best gains and, after
@@ -249,14 +258,18 @@ class _Bench:
         write_text(self.folder / RETUNE_FILE, text)
 
     def measure(self, attempt: Attempt) -> None:
-        """Run small steps and the references with the gains of ``attempt``."""
+        """Run a small motion and the references with the gains of ``attempt``."""
         self.report.attempts.append(attempt)
         errors = []
         for motion in (_small(self.motions[0]), *self.motions):
             found = self.run(attempt.gains, motion)
-            if found.measured_um is None:
-                attempt.verdict = "stopped"
-                attempt.why = f"{motion.name}: {found.stopped}"
+            stopped = found.stopped
+            if motion.name == PROBE and (found.measured_um or 0.0) > RINGING * np.std(
+                motion.reference
+            ):
+                stopped = "the loop rings"
+            if stopped or found.measured_um is None:
+                attempt.verdict, attempt.why = "stopped", f"{motion.name}: {stopped}"
                 return
             errors.append(found.measured_um)
         attempt.measured_um = _mean(errors[1:])
@@ -296,7 +309,7 @@ class _Bench:
 
 
 def _small(motion: Motion) -> Motion:
-    """Return the small steps before ``motion``."""
+    """Return the small motion before ``motion``."""
     return Motion(PROBE, probe(motion.reference), None, motion.start, motion.noise)
 
 
@@ -308,7 +321,7 @@ def _mean(errors: Sequence[float]) -> float:
 def _measure_present(bench: _Bench) -> None:
     """Measure the gains of the stage; if they are stopped, its safe gains.
 
-    Raises _HopelessError if small steps with the safe gains are stopped.
+    Raises _HopelessError if a small motion with the safe gains is stopped.
     """
     report = bench.report
     for kind in ("gains", "safe gains"):
@@ -328,7 +341,10 @@ def _improve(bench: _Bench, plant: KnownPlant, case: Case, path: Path) -> None:
     while bench.enough() and failed < PATIENCE:
         file = bench.folder / f"model_{len(report.attempts)}.json"
         bench.progress.stage("fitting the plant to the runs")
-        _fit_again(plant, bench.records(), file)
+        alarms = _fit_again(plant, bench.records(), file)
+        if alarms:
+            report.notes.append(f"{file.name} describes the runs badly: {alarms[0]}")
+            break
         best = None if report.best is None else report.attempts[report.best].gains
         study = _near(case, file, best, within)
         outcome = tune(build(study, path), progress=bench.progress)
@@ -348,11 +364,14 @@ def _improve(bench: _Bench, plant: KnownPlant, case: Case, path: Path) -> None:
         within = min(max(factor, LEAST), MOST)
 
 
-def _fit_again(plant: KnownPlant, records: Sequence[Record], file: Path) -> None:
-    """Fit ``plant`` to ``records``; write it with its residual into ``file``."""
+def _fit_again(
+    plant: KnownPlant, records: Sequence[Record], file: Path
+) -> Sequence[str]:
+    """Fit ``plant`` to ``records``; write it with its residual; return its alarms."""
     fit = identify(records, plant.model, options=Options(known=plant))
     save(fit.plant, file, about=fit.about)
     save_residual(ResidualRecord.of(fit), file)
+    return fit.report.alarms
 
 
 def _near(
@@ -395,7 +414,7 @@ def _try(bench: _Bench, attempt: Attempt, outcome: Outcome) -> bool:
         attempt.why = "; ".join(outcome.result.alarms)
     elif attempt.predicted_um is None:
         attempt.why = "the prediction is not a number"
-    elif attempt.predicted_um > ENOUGH * report.best_error:
+    elif report.tuned and attempt.predicted_um > ENOUGH * report.best_error:
         attempt.why = "no improvement is expected"
     if attempt.why:
         attempt.verdict = "not tried"

@@ -5,44 +5,23 @@ import json
 import re
 import threading
 from contextlib import contextmanager
+from dataclasses import replace as replace_limits
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import tomli_w
 from small_runs import call, main_of, succeeded
-from stages.stage_in_tests import DT, SAFE, lag, stage
+from stages.stage_in_tests import DT, LIMITS, SAFE, STUDY, lag, stage, write_study
 
 import piezojax as pj
 from piezojax.core.paths import replace
 from piezojax.core.serial import save
 from piezojax.core.temporaries import claimed
-from piezojax.dynamics import FirstOrderLag
+from piezojax.dynamics import FractionalDelay
 from piezojax.stages import Fault, LostError, StageServer
 from piezojax.tuning import retuning
 from piezojax.tuning.retuning import RETUNE_FILE, RetuneReport, gains_of, retune
 
-STUDY = {
-    "title": "a PID to retune",
-    "rate": 1.0 / DT,
-    "seed": 3,
-    "plant": {"file": "model.json"},
-    "actuator": {"lower": -10.0, "upper": 110.0},
-    "sensor": {"noise_rms": 1e-3},
-    "controller": {
-        **{"type": "PID", "proportional": 1.0, "integral": 800.0, "dt": DT},
-        "derivative": 0.0,
-    },
-    "references": {
-        **{"tune": ["SIN2"], "unseen": ["SIN4"], "amplitude": 3.0},
-        **{"duration": 1.0, "settle": 0.5},
-    },
-    "parameters": {
-        "controller.proportional": {"lower": 0.1, "upper": 50.0, "scale": "log"},
-        "controller.integral": {"lower": 50.0, "upper": 2e4, "scale": "log"},
-    },
-    "optimiser": {"starts": 1, "candidates": 4, "steps": 15},
-}
 GOOD = {"proportional": 4.0, "integral": 2500.0}
 WORSE = {"proportional": 0.5, "integral": 400.0}
 WILD = {"proportional": 150.0, "integral": 900.0}
@@ -51,19 +30,6 @@ WILD = {"proportional": 150.0, "integral": 900.0}
 @pytest.fixture
 def study(tmp_path):
     return write_study(tmp_path)
-
-
-def write_study(folder, **tables):
-    plant = pj.series(lag=FirstOrderLag(5e-3, DT), calibration=pj.Affine(0.1))
-    about = pj.About(
-        rate_Hz=1.0 / DT,
-        standard_errors={"lag.time_constant": 1e-5, "calibration.gain": 1e-4},
-        input_ranges=[(0.0, 80.0)],
-    )
-    save(plant, folder / "model.json", about)
-    path = folder / "study.toml"
-    path.write_text(tomli_w.dumps(STUDY | tables), encoding="utf-8")
-    return path
 
 
 @pytest.fixture
@@ -165,7 +131,7 @@ def test_better_gains_are_kept_and_others_taken_back(study, tmp_path, scripted):
     assert report.best == 1
     assert one.gains() | GOOD == one.gains()
     assert report.before | {"proportional": 1.0, "integral": 900.0} == report.before
-    assert [run.reference for run in report.runs] == ["small steps", "SIN2"] * 4
+    assert [run.reference for run in report.runs] == ["small motion", "SIN2"] * 4
     # The box is around the best gains, and shrinks with every attempt that fails.
     boxes = [study.parameters["controller.integral"] for study in studies]
     assert [box.start for box in boxes] == [900.0, 2500.0, 2500.0]
@@ -197,17 +163,19 @@ def test_gains_with_an_alarm_are_not_tried(study, tmp_path, scripted):
     one = stage()
     before = one.gains()
     report = retune(study, one, out(tmp_path))
-    assert [run.reference for run in report.runs] == ["small steps", "SIN2"]
+    assert [run.reference for run in report.runs] == ["small motion", "SIN2"]
     assert report.attempts[1].verdict == "not tried"
     assert report.notes == ["model_1.json: not tried: the loop is unstable"]
     assert one.gains() == before
 
 
 def test_no_expected_improvement_ends_it(study, tmp_path, scripted):
-    scripted((GOOD, 5.0))
+    """The first tuned gains are run in any case: they show what the start hides."""
+    scripted((GOOD, 5.0), (GOOD, 5.0))
     report = retune(study, stage(), out(tmp_path))
-    assert report.attempts[1].why == "no improvement is expected"
-    assert len(report.runs) == 2
+    assert report.attempts[1].verdict == "better"
+    assert report.attempts[2].why == "no improvement is expected"
+    assert len(report.runs) == 4
 
 
 def test_gains_that_are_stopped_are_taken_back(study, tmp_path, scripted):
@@ -221,8 +189,8 @@ def test_gains_that_are_stopped_are_taken_back(study, tmp_path, scripted):
     ]
     # A run with the gains from before shows that the stage is sound.
     assert [run.reference for run in report.runs] == [
-        *("small steps", "SIN2", "small steps", "small steps"),
-        *("small steps", "SIN2"),
+        *("small motion", "SIN2", "small motion", "small motion"),
+        *("small motion", "SIN2"),
     ]
     assert one.gains() | GOOD == one.gains()
 
@@ -238,7 +206,7 @@ def test_a_stage_that_stays_broken_ends_with_the_safe_gains(study, tmp_path, scr
     report = retune(study, one, out(tmp_path))
     assert report.verdict == "stopped"
     assert report.attempts[1].verdict == "stopped"
-    assert "small steps after a stopped run" in report.alarms[0]
+    assert "small motion after a stopped run" in report.alarms[0]
     assert "the safe gains of the stage are set" in report.alarms[0]
     assert one.gains() | SAFE == one.gains()
     assert one.voltage == pytest.approx(0.0, abs=1e-9)
@@ -264,7 +232,7 @@ def test_safe_gains_that_are_stopped_end_it(study, tmp_path):
     report = retune(study, one, out(tmp_path))
     assert report.verdict == "stopped"
     assert report.best is None
-    assert report.alarms[0].startswith("small steps with the safe gains: the ")
+    assert report.alarms[0].startswith("small motion with the safe gains: the ")
     assert len(report.runs) == 2
 
 
@@ -350,7 +318,7 @@ def test_the_gains_from_before_are_saved_before_the_first_run(study, tmp_path):
 
 
 def test_a_report_of_another_study_is_refused(study, tmp_path, scripted):
-    scripted((GOOD, 5.0))
+    scripted((GOOD, 5.0), (GOOD, 5.0))
     retune(study, stage(), out(tmp_path))
     write_study(tmp_path, seed=4)
     with pytest.raises(ValueError, match="is of another study: name a new folder"):
@@ -423,14 +391,14 @@ def test_the_command_ends_with_the_alarm(study):
     with served(stage(safe_gains=WILD)) as address:
         result = commanded(study, address)
     assert result.exit_code == 3
-    assert "ALARM: small steps with the safe gains: the " in result.stdout
+    assert "ALARM: small motion with the safe gains: the " in result.stdout
     assert "no gains followed the references; the stage has its safe gains" in (
         result.stdout
     )
 
 
 def test_a_folder_in_use_is_refused(study, scripted):
-    scripted((GOOD, 5.0))
+    scripted((GOOD, 5.0), (GOOD, 5.0))
     one = stage()
     with served(one) as address:
         succeeded(commanded(study, address))
@@ -444,3 +412,15 @@ def test_the_default_of_the_command_is_that_of_the_function():
     default = inspect.signature(retune).parameters["runs"].default
     options = {option.name: option.default for option in main_of("retune").params}
     assert options["runs"] == default
+
+
+def test_gains_that_ring_do_not_follow_the_references(study, tmp_path, scripted):
+    """The guard does not see it: the error in the small motion is small."""
+    scripted(({"proportional": 30.0, "integral": 900.0}, 0.01), (GOOD, 0.05))
+    wide = {"slew": 1e6, "largest_error": 50.0, "patience": 1000}
+    late = lag() >> FractionalDelay(3.0 * DT, DT, 5)
+    one = stage(plant=late, limits=replace_limits(LIMITS, **wide))
+    report = retune(study, one, out(tmp_path), runs=6)
+    assert report.attempts[1].why == "small motion: the loop rings"
+    assert report.runs[3].reference == "small motion"
+    assert report.attempts[2].verdict == "better"

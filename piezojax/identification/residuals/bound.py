@@ -35,6 +35,9 @@ CERTAIN = 1.0
 """Half-width of the interval of the relative error above which a line counts as not
 excited, unless the error itself is certain."""
 
+CHANCE = 0.01
+"""Probability that a line of a closed loop counts as excited by noise alone."""
+
 AVERAGES = 8
 """Segments without overlap into which a record is divided."""
 
@@ -122,7 +125,12 @@ def _closed_loop_error(
         for one, other, least in ((model, error, 0.0), (input, model, LEAST))
     )
     resolution = 1.0 / (segment * record.dt)
-    kept = np.isin(ratio.frequency, own.frequency[_stands_out(own, resolution)])
+    # Of noise alone, few averages explain a share by chance.
+    chance = 1.0 - CHANCE ** (1.0 / max(own.averages - 1.0, 1.0))
+    excited = _stands_out(own, resolution)
+    if np.any(excited & (own.coherence > chance)):
+        excited &= own.coherence > chance
+    kept = np.isin(ratio.frequency, own.frequency[excited])
     lines = np.isin(own.frequency, ratio.frequency[kept])
     size = np.maximum(np.abs(own.response[lines]), np.finfo(float).tiny)
     margin = CONFIDENCE * np.sqrt(ratio.variance[kept] + own.variance[lines] / size**2)
