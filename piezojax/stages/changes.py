@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel
-from scipy import stats
 
 from ..core.files import write_text
 from ..core.progress import Progress, Silent
@@ -114,6 +113,8 @@ class Baseline:
         Statistical Analysis, 3rd ed., 5.3). Raises ValueError for a record of another
         reference.
         """
+        from scipy import stats  # slow to import
+
         self._check(record)
         found = self._features(record, self._voltages)
         rows = np.array([list(each.model_dump().values()) for each in self.features])
