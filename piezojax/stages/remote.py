@@ -71,7 +71,12 @@ class RemoteStage:
             self._ask(do="bye")
 
     def abandon(self) -> None:
-        """End the connection without a goodbye: the stage becomes safe by itself."""
+        """End the connection without a goodbye: the stage becomes safe by itself.
+
+        A request under way in another thread ends with LostError.
+        """
+        with contextlib.suppress(OSError):  # it is lost already
+            self._connection.shutdown(socket.SHUT_RDWR)
         self._connection.close()
 
     def _connect(self) -> socket.socket:

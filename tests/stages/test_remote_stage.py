@@ -201,3 +201,14 @@ def test_nobody_at_the_address_is_said():
         port = free.getsockname()[1]
     with pytest.raises(LostError, match=f"no stage answers at 127.0.0.1:{port}"):
         stage_of(f"127.0.0.1:{port}")
+
+
+def test_an_abandoned_run_is_lost_and_the_stage_safe():
+    one = stage(speed=1.0)
+    with served(one) as address:
+        remote = RemoteStage(address)
+        threading.Timer(0.6, remote.abandon).start()
+        with pytest.raises(LostError, match="the connection to the stage is lost"):
+            remote.run(np.tile(REFERENCE, 20), {"integral": 700.0})
+        assert wait_for(lambda: is_safe(one))
+        remote.abandon()  # again, without an effect
