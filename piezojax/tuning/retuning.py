@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -291,20 +291,16 @@ class _Bench:
             self.stage.apply(self.report.attempts[self.report.best].gains)
 
     def records(self) -> list[Record]:
-        """Return the last runs as records."""
+        """Return the last runs as records, each until its first missing number."""
         found = []
         for run in self.report.runs[-FITTED:]:
-            reference, measured, voltage = load_samples(self.folder / run.file)
-            if len(measured) >= SHORTEST:
-                found.append(
-                    Record(
-                        voltage,
-                        measured,
-                        self.stage.dt,
-                        source=run.file,
-                        reference=reference,
-                    )
-                )
+            columns = np.stack(load_samples(self.folder / run.file))
+            known = np.cumprod(np.isfinite(columns).all(axis=0)).astype(bool)
+            reference, measured, voltage = columns[:, known]
+            if len(measured) >= SHORTEST and np.ptp(measured) > 0.0 < np.ptp(voltage):
+                dt, source = self.stage.dt, run.file
+                record = Record(voltage, measured, dt, source=source)
+                found.append(replace(record, reference=reference))
         return found
 
 
@@ -341,7 +337,11 @@ def _improve(bench: _Bench, plant: KnownPlant, case: Case, path: Path) -> None:
     while bench.enough() and failed < PATIENCE:
         file = bench.folder / f"model_{len(report.attempts)}.json"
         bench.progress.stage("fitting the plant to the runs")
-        alarms = _fit_again(plant, bench.records(), file)
+        records = bench.records()
+        if not records:
+            report.notes.append("no run is long enough to fit the plant to it")
+            break
+        alarms = _fit_again(plant, records, file)
         if alarms:
             report.notes.append(f"{file.name} describes the runs badly: {alarms[0]}")
             break

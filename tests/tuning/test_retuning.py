@@ -236,6 +236,26 @@ def test_safe_gains_that_are_stopped_end_it(study, tmp_path):
     assert len(report.runs) == 2
 
 
+@pytest.mark.parametrize(
+    ("begin", "fitted"), [(600, [1000, 600, 1000, 1000]), (300, [1000, 1000, 1000])]
+)
+def test_a_run_is_fitted_until_its_first_missing_number(
+    study, tmp_path, scripted, monkeypatch, begin, fitted
+):
+    scripted((GOOD, 0.05))
+    seen = []
+    monkeypatch.setattr(
+        retuning,
+        "_fit_again",
+        lambda plant, records, file: seen.extend(r.samples for r in records) or ["no"],
+    )
+    one = failing_at(
+        stage(), 2, lambda: setattr(one, "faults", [Fault("dropout", begin, 400)])
+    )
+    retune(study, one, out(tmp_path), runs=8)
+    assert seen == fitted
+
+
 @pytest.mark.parametrize("run", [1, 2, 4])
 @pytest.mark.parametrize(
     ("error", "verdict"),
