@@ -42,6 +42,12 @@ def parameters(system: Any, prefix: str = "") -> dict[str, Any]:
     return leaves
 
 
+def scalars(system: Any) -> dict[str, float]:
+    """Return the scalar parameters of ``system`` by path, as numbers."""
+    found = parameters(system).items()
+    return {path: float(value) for path, value in found if value.ndim == 0}
+
+
 def matching(system: Any, pattern: str) -> list[str]:
     """Return the paths of the array leaves that match ``pattern``, in tree order.
 

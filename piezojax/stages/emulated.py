@@ -14,7 +14,7 @@ from jaxtyping import Float
 from ..control.guard import REASONS, Guard
 from ..core.arrays import as_array
 from ..core.feedback import Feedback, LoopInput, LoopSample, LoopState, Observation
-from ..core.paths import get, parameters, replace
+from ..core.paths import get, replace, scalars
 from ..core.rollout import simulate
 from ..core.system import System, resolve
 from ..identification import Record
@@ -123,11 +123,7 @@ class EmulatedStage:
 
     def gains(self) -> dict[str, float]:
         """Return the scalar parameters of the controller by path."""
-        return {
-            path: float(value)
-            for path, value in parameters(self._controller).items()
-            if jnp.ndim(value) == 0
-        }
+        return scalars(self._controller)
 
     def safe(self) -> None:
         """Stop a run under way, set the safe gains and move to the safe voltage."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,10 +10,9 @@ import numpy as np
 from pydantic import BaseModel
 
 from ..core.files import read_model, write_text
-from ..core.paths import parameters
+from ..core.paths import scalars
 from ..core.progress import Progress, Silent
 from ..core.serial import save
-from ..core.system import System
 from ..identification import Record, identify
 from ..identification.estimators.estimate import Options
 from ..identification.known_plant import KnownPlant
@@ -200,18 +199,12 @@ def _check(case: Case, stage: Stage) -> None:
             f"{case.study.rate:.6g} Hz; they must be the same"
         )
     known = stage.gains()
-    for path in gains_of(case.loop.controller):
+    for path in scalars(case.loop.controller):
         if path not in known:
             raise ValueError(
                 f"the controller of the study has the gain {path}, the stage has "
                 f"{', '.join(known)}"
             )
-
-
-def gains_of(controller: System) -> dict[str, float]:
-    """Return the scalar parameters of ``controller`` by path."""
-    found = parameters(controller).items()
-    return {path: float(value) for path, value in found if np.ndim(value) == 0}
 
 
 def _report(
@@ -220,7 +213,7 @@ def _report(
     """Return the report in ``folder`` to go on with, or a new one."""
     file, known = folder / RETUNE_FILE, sha256_of(study)
     if not file.exists():
-        own = gains_of(case.loop.controller)
+        own = scalars(case.loop.controller)
         return RetuneReport(
             stage=name,
             study_sha256=known,
@@ -264,9 +257,8 @@ class _Bench:
         for motion in (_small(self.motions[0]), *self.motions):
             found = self.run(attempt.gains, motion)
             stopped = found.stopped
-            if motion.name == PROBE and (found.measured_um or 0.0) > RINGING * np.std(
-                motion.reference
-            ):
+            if motion.name == PROBE and _rings(found, motion):
+                self.stage.safe()  # the guard has not seen it
                 stopped = "the loop rings"
             if stopped or found.measured_um is None:
                 attempt.verdict, attempt.why = "stopped", f"{motion.name}: {stopped}"
@@ -298,15 +290,19 @@ class _Bench:
             known = np.cumprod(np.isfinite(columns).all(axis=0)).astype(bool)
             reference, measured, voltage = columns[:, known]
             if len(measured) >= SHORTEST and np.ptp(measured) > 0.0 < np.ptp(voltage):
-                dt, source = self.stage.dt, run.file
-                record = Record(voltage, measured, dt, source=source)
-                found.append(replace(record, reference=reference))
+                about = {"source": run.file, "reference": reference}
+                found.append(Record(voltage, measured, self.stage.dt, **about))
         return found
 
 
 def _small(motion: Motion) -> Motion:
     """Return the small motion before ``motion``."""
     return Motion(PROBE, probe(motion.reference), None, motion.start, motion.noise)
+
+
+def _rings(run: TriedRun, motion: Motion) -> bool:
+    """Return whether the error of a ``run`` is too large for its small ``motion``."""
+    return (run.measured_um or 0.0) > RINGING * np.std(motion.reference)
 
 
 def _mean(errors: Sequence[float]) -> float:
@@ -328,7 +324,8 @@ def _measure_present(bench: _Bench) -> None:
             return
         report.notes.append(f"the {kind} of the stage were stopped: {attempt.why}")
     if report.runs[-1].reference == PROBE:
-        raise _HopelessError(f"{PROBE} with the safe gains: {report.runs[-1].stopped}")
+        why = report.attempts[-1].why.removeprefix(f"{PROBE}: ")
+        raise _HopelessError(f"{PROBE} with the safe gains: {why}")
 
 
 def _improve(bench: _Bench, plant: KnownPlant, case: Case, path: Path) -> None:
@@ -351,7 +348,7 @@ def _improve(bench: _Bench, plant: KnownPlant, case: Case, path: Path) -> None:
         if outcome.result.status == "interrupted":
             raise KeyboardInterrupt
         attempt = Attempt(
-            gains=gains_of(outcome.controller),
+            gains=scalars(outcome.controller),
             model=file.name,
             within=None if best is None else within,
             predicted_um=_predicted(outcome),

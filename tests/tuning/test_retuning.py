@@ -14,13 +14,13 @@ from small_runs import call, main_of, succeeded
 from stages.stage_in_tests import DT, LIMITS, SAFE, STUDY, lag, stage, write_study
 
 import piezojax as pj
-from piezojax.core.paths import replace
+from piezojax.core.paths import replace, scalars
 from piezojax.core.serial import save
 from piezojax.core.temporaries import claimed
 from piezojax.dynamics import FractionalDelay
 from piezojax.stages import Fault, LostError, StageServer
 from piezojax.tuning import retuning
-from piezojax.tuning.retuning import RETUNE_FILE, RetuneReport, gains_of, retune
+from piezojax.tuning.retuning import RETUNE_FILE, RetuneReport, retune
 
 GOOD = {"proportional": 4.0, "integral": 2500.0}
 WORSE = {"proportional": 0.5, "integral": 400.0}
@@ -107,7 +107,7 @@ def test_the_error_on_another_stage_falls(study, tmp_path):
     assert best.model
     assert one.gains() == pytest.approx(best.gains)
     kept = pj.load(tmp_path / "out" / "gains.toml")
-    assert gains_of(kept) == pytest.approx(best.gains)
+    assert scalars(kept) == pytest.approx(best.gains)
     # The model is that of this stage by now, and so is the prediction.
     found = json.loads((tmp_path / "out" / best.model).read_text())
     gain = found["parts"][-1]["gain"]
@@ -434,13 +434,39 @@ def test_the_default_of_the_command_is_that_of_the_function():
     assert options["runs"] == default
 
 
-def test_gains_that_ring_do_not_follow_the_references(study, tmp_path, scripted):
-    """The guard does not see it: the error in the small motion is small."""
-    scripted(({"proportional": 30.0, "integral": 900.0}, 0.01), (GOOD, 0.05))
+RINGING = {"proportional": 30.0, "integral": 900.0}
+
+
+def late_stage(**changed):
+    """Return a stage that rings with RINGING, which its guard does not see."""
     wide = {"slew": 1e6, "largest_error": 50.0, "patience": 1000}
     late = lag() >> FractionalDelay(3.0 * DT, DT, 5)
-    one = stage(plant=late, limits=replace_limits(LIMITS, **wide))
-    report = retune(study, one, out(tmp_path), runs=6)
+    return stage(plant=late, limits=replace_limits(LIMITS, **wide), **changed)
+
+
+def test_gains_that_ring_do_not_follow_the_references(study, tmp_path, scripted):
+    """The guard does not see it: the error in the small motion is small."""
+    scripted((RINGING, 0.01), (GOOD, 0.05))
+    report = retune(study, late_stage(), out(tmp_path), runs=6)
     assert report.attempts[1].why == "small motion: the loop rings"
     assert report.runs[3].reference == "small motion"
     assert report.attempts[2].verdict == "better"
+
+
+def test_a_start_that_rings_gives_way_to_the_safe_gains(study, tmp_path, scripted):
+    scripted((GOOD, 5.0, "the loop is unstable"))
+    one = late_stage()
+    one.apply(RINGING)
+    report = retune(study, one, out(tmp_path))
+    first, second, *_ = report.attempts
+    assert first.why == "small motion: the loop rings"
+    assert second.gains | SAFE == second.gains
+    assert one.gains() | SAFE == one.gains()
+
+
+def test_safe_gains_that_ring_end_it(study, tmp_path):
+    report = retune(study, late_stage(safe_gains=RINGING), out(tmp_path))
+    assert report.verdict == "stopped"
+    assert report.alarms[0].startswith(
+        "small motion with the safe gains: the loop rings"
+    )
