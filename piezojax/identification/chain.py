@@ -10,7 +10,7 @@ from ..core.paths import get, replace
 from ..core.recipe import Extent, Recipe, scaled_range
 from ..core.registry import parts as known_parts
 from ..core.space import INSIDE, Range, Space, space_of
-from ..core.system import Affine, Series, series
+from ..core.system import Affine, Series, System, series
 from ..hysteresis.model import Hysteresis
 from .estimators.resonances import LinearDynamics, linear_dynamics
 from .estimators.slew_rate import has_steps
@@ -223,6 +223,11 @@ def _starts(system: Series, space: Space, parts: Mapping[str, Recipe]) -> np.nda
     for combination in product(*choices):
         changes = {path: value for one in combination for path, value in one.items()}
         changed = replace(system, changes)
-        values = as_array([get(changed, path) for path in space.paths])
-        found.append(np.asarray(space.to_unit(values)))
-    return np.clip(np.stack(found), INSIDE, 1.0 - INSIDE)
+        found.append(point_of(changed, space))
+    return np.stack(found)
+
+
+def point_of(system: System, space: Space) -> np.ndarray:
+    """Return the parameters of ``system`` as a point inside the unit box."""
+    values = as_array([get(system, path) for path in space.paths])
+    return np.clip(np.asarray(space.to_unit(values)), INSIDE, 1.0 - INSIDE)

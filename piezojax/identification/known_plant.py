@@ -15,10 +15,10 @@ import numpy as np
 from ..core.about import About
 from ..core.paths import declared, get, parameters, replace
 from ..core.registry import parts as known_parts
-from ..core.space import INSIDE, Range, Space, space_of
+from ..core.space import Range, space_of
 from ..core.system import Affine, Series, System
 from ..dynamics import FractionalDelay
-from .chain import LINEAR, OFFSET, by_evidence, dynamics_of
+from .chain import LINEAR, OFFSET, by_evidence, dynamics_of, point_of
 from .estimators.structure import Prior, Structure
 from .records.record import Record
 
@@ -76,14 +76,14 @@ class KnownPlant:
         deviations = self._deviations(system, best.dt)
         ranges = {path: _range(system, path, s) for path, s in deviations.items()}
         space = space_of(ranges)
-        known = _point(system, space)
+        known = point_of(system, space)
         explained = UNEXPLAINED * max(record.span for record in records)
         widths = np.asarray(space.upper - space.lower)
         weights = widths / np.array(list(deviations.values()))
         prior = Prior(known, explained / math.sqrt(INDEPENDENT) * weights)
         shown = dynamics_of(best)
         resonances = [mode.frequency for mode in shown.modes]
-        starts = [_point(_at_resonances(system, ranges, resonances), space), known]
+        starts = [point_of(_at_resonances(system, ranges, resonances), space), known]
         return Structure(
             system,
             space,
@@ -142,12 +142,6 @@ def _range(system: System, path: str, deviation: float) -> Range:
         low = max(low, limits.least, limits.above + margin)
         high = min(high, limits.most, limits.below - margin)
     return Range(low, high)
-
-
-def _point(system: System, space: Space) -> np.ndarray:
-    """Return the parameters of ``system`` as a point inside the unit box."""
-    values = np.array([float(get(system, path)) for path in space.paths])
-    return np.clip(np.asarray(space.to_unit(values)), INSIDE, 1.0 - INSIDE)
 
 
 def _at_resonances(

@@ -22,7 +22,7 @@ from .figures import (
     write,
 )
 from .page import Page
-from .trial_report import nanometres, stage_gains_table
+from .trial_report import draw_run, nanometres, stage_gains_table
 
 RETUNE_PICTURE = "retune.png"
 
@@ -46,15 +46,12 @@ def _figure(report: RetuneReport, folder: Path, dt: float) -> Figure:
     (attempts, drive), *panels = picture.subplots(1 + len(runs), 2)
     _draw_attempts(attempts, report)
     for (title, run), (motion, error) in zip(runs.items(), panels, strict=True):
-        reference, measured, voltage = load_samples(folder / run.file)
-        time = dt * np.arange(len(reference))
-        motion.plot(time, reference, color=REFERENCE, lw=0.8, label="reference")
-        motion.plot(time, measured, color=AFTER, lw=0.9, label="reading")
-        motion.set(ylabel="µm", xlabel="time (s)", title=f"{run.reference}, {title}\n")
-        legend_above(motion)
-        error.plot(time, 1e3 * (reference - measured), color=BEFORE, lw=0.7)
+        draw_run(motion, error, folder / run.file, dt)
+        motion.set(xlabel="time (s)", title=f"{run.reference}, {title}\n")
         shown = run.stopped or f"{nanometres(run.measured_um)} rms"
-        error.set(ylabel="error (nm)", xlabel="time (s)", title=f"Error: {shown}")
+        error.set(xlabel="time (s)", title=f"Error: {shown}")
+        _, _, voltage = load_samples(folder / run.file)
+        time = dt * np.arange(len(voltage))
         colour = BEFORE if title == FIRST else AFTER
         drive.plot(time, voltage, color=colour, lw=0.8, label=title)
     drive.set(ylabel="voltage (V)", xlabel="time (s)")

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
@@ -52,14 +53,9 @@ def _trial_figure(
     picture = figure(9.0, 2.2 * len(shown) + 0.8)
     panels = picture.subplots(len(shown), 2, squeeze=False)
     for (motion, error), run in zip(panels, shown, strict=True):
-        reference, measured, _ = load_samples(folder / run.file)
-        time = dt * np.arange(len(reference))
-        motion.plot(time, reference, color=REFERENCE, lw=0.8, label="reference")
-        motion.plot(time, measured, color=AFTER, lw=0.9, label="reading")
-        motion.set(ylabel="µm", title=f"{run.reference}, {100.0 * run.share:g} %\n")
-        legend_above(motion)
-        error.plot(time, 1e3 * (reference - measured), color=BEFORE, lw=0.7)
-        error.set(ylabel="error (nm)", title=_title(run))
+        draw_run(motion, error, folder / run.file, dt)
+        motion.set(title=f"{run.reference}, {100.0 * run.share:g} %\n")
+        error.set(title=_title(run))
         error.axvspan(0.0, starts[run.reference], color="#eef4f6", zorder=0)
     for panel in panels[-1]:
         panel.set(xlabel="time (s)")
@@ -67,6 +63,18 @@ def _trial_figure(
         picture, f"Trial on {report.stage}: {report.verdict}\nshaded: not counted"
     )
     return picture
+
+
+def draw_run(motion: Axes, error: Axes, file: Path, dt: float) -> None:
+    """Draw reference and reading of the run in ``file``, and their difference."""
+    reference, measured, _ = load_samples(file)
+    time = dt * np.arange(len(reference))
+    motion.plot(time, reference, color=REFERENCE, lw=0.8, label="reference")
+    motion.plot(time, measured, color=AFTER, lw=0.9, label="reading")
+    motion.set(ylabel="µm")
+    legend_above(motion)
+    error.plot(time, 1e3 * (reference - measured), color=BEFORE, lw=0.7)
+    error.set(ylabel="error (nm)")
 
 
 def _title(run: TriedRun) -> str:

@@ -302,7 +302,7 @@ def _small(motion: Motion) -> Motion:
 
 def _rings(run: TriedRun, motion: Motion) -> bool:
     """Return whether the error of a ``run`` is too large for its small ``motion``."""
-    return (run.measured_um or 0.0) > RINGING * np.std(motion.reference)
+    return (run.measured_um or 0.0) > RINGING * float(np.std(motion.reference))
 
 
 def _mean(errors: Sequence[float]) -> float:

@@ -10,8 +10,8 @@ stops a run, and every run is in the log.
 """
 
 import argparse
-import contextlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -26,7 +26,7 @@ import numpy as np
 
 import piezojax as pj
 from piezojax.dynamics import Mode
-from piezojax.stages import Fault, LostError, RemoteStage, StageServer
+from piezojax.stages import Fault, LostError, RemoteStage
 from piezojax.stages.emulated import EmulatedStage
 from piezojax.stages.run_files import load_samples, run_files
 from piezojax.tuning import RetuneReport, retune
@@ -34,7 +34,7 @@ from piezojax.tuning.retuning import RETUNE_FILE
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from stages.stage_in_tests import DT, LIMITS, SAFE, STUDY, stage, write_study
+from stages.stage_in_tests import DT, LIMITS, SAFE, STUDY, served, stage, write_study
 
 COUNT, EVERY = 200, 5
 EVENTS = "dropout", "stuck", "mode moves", "disconnection", "kill client", "kill stage"
@@ -114,18 +114,6 @@ def wait_until(found):
     return False
 
 
-@contextlib.contextmanager
-def served(one):
-    with StageServer(one) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        try:
-            yield server.address
-        finally:
-            server.shutdown()
-            thread.join()
-
-
 def inside(study, one, folder):
     """Retune in this process; a connection that is lost ends it."""
     try:
@@ -162,18 +150,12 @@ def with_fault(random, number, event, study, folder):
     final = SAFE if report.best is None else report.attempts[report.best].gains
     if verdict != "done":
         final = SAFE
-    if one.gains() | final != pj_gains(one, final):
+    set_now = one.gains()
+    if not all(math.isclose(set_now[path], final[path]) for path in final):
         problems.append("the gains at the end are neither the best nor the safe ones")
     if report.best is not None and report.best_error > report.attempts[0].error:
         problems.append("the error at the end is above that at the beginning")
     return one, verdict, problems, one.begun
-
-
-def pj_gains(one, wanted):
-    """Return the gains of ``one`` with those of ``wanted`` to their last digits."""
-    found = one.gains()
-    near = {k: v for k, v in wanted.items() if np.isclose(found[k], v, rtol=1e-12)}
-    return found | near
 
 
 def with_disconnection(random, number, event, study, folder):

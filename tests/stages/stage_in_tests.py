@@ -1,5 +1,8 @@
 """A fast stage for tests: a lag of 0.1 um/V with a PID controller, at 1 kHz."""
 
+import threading
+from contextlib import contextmanager
+
 import numpy as np
 import tomli_w
 
@@ -8,7 +11,7 @@ from piezojax.control import PID
 from piezojax.core.serial import save
 from piezojax.dynamics import FirstOrderLag
 from piezojax.hardware import Saturation, Sensor
-from piezojax.stages import EmulatedStage, Limits
+from piezojax.stages import EmulatedStage, Limits, StageServer
 
 DT = 1e-3
 LIMITS = Limits(-10.0, 110.0, 5000.0, largest_error=2.0, retreat=0.0)
@@ -68,3 +71,16 @@ def write_study(folder, plant=None, errors=None, **tables):
     path = folder / "study.toml"
     path.write_text(tomli_w.dumps(STUDY | tables), encoding="utf-8")
     return path
+
+
+@contextmanager
+def served(one):
+    """Yield the address at which ``one`` is served."""
+    with StageServer(one) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield server.address
+        finally:
+            server.shutdown()
+            thread.join()

@@ -8,19 +8,18 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import closing, contextmanager
+from contextlib import closing
 
 import numpy as np
 import pytest
 from small_runs import write_study
-from stages.stage_in_tests import DT, LIMITS, REFERENCE, SAFE, stage
+from stages.stage_in_tests import DT, LIMITS, REFERENCE, SAFE, served, stage
 
 from piezojax.stages import (
     Fault,
     LostError,
     RemoteStage,
     Stage,
-    StageServer,
     StoppedError,
     stage_of,
 )
@@ -34,18 +33,6 @@ connection.sendall(json.dumps(request).encode() + b"\\n")
 print("sent", flush=True)
 time.sleep(60.0)
 """
-
-
-@contextmanager
-def served(one):
-    with StageServer(one) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        try:
-            yield server.address
-        finally:
-            server.shutdown()
-            thread.join()
 
 
 def wait_for(condition):

@@ -1,16 +1,16 @@
 """``trial`` and ``emulate`` as commands, against each other."""
 
 import json
-import threading
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from small_runs import call, succeeded, write_study
+from stages.stage_in_tests import served
 
 import piezojax as pj
 from piezojax.core.serial import save
-from piezojax.stages import RemoteStage, StageServer
+from piezojax.stages import RemoteStage
 from piezojax.stages.of_study import emulated_stage
 
 
@@ -25,14 +25,8 @@ def tuned(tmp_path_factory):
 @contextmanager
 def emulated(folder, **deviations):
     one = emulated_stage(folder / "small.toml", speed=0.0, **deviations)
-    with StageServer(one) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        try:
-            yield one, server.address
-        finally:
-            server.shutdown()
-            thread.join()
+    with served(one) as address:
+        yield one, address
 
 
 def tried(folder, address, out):

@@ -3,22 +3,29 @@
 import inspect
 import json
 import re
-import threading
-from contextlib import contextmanager
 from dataclasses import replace as replace_limits
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from small_runs import call, main_of, succeeded
-from stages.stage_in_tests import DT, LIMITS, SAFE, STUDY, lag, stage, write_study
+from stages.stage_in_tests import (
+    DT,
+    LIMITS,
+    SAFE,
+    STUDY,
+    lag,
+    served,
+    stage,
+    write_study,
+)
 
 import piezojax as pj
 from piezojax.core.paths import replace, scalars
 from piezojax.core.serial import save
 from piezojax.core.temporaries import claimed
 from piezojax.dynamics import FractionalDelay
-from piezojax.stages import Fault, LostError, StageServer
+from piezojax.stages import Fault, LostError
 from piezojax.tuning import retuning
 from piezojax.tuning.retuning import RETUNE_FILE, RetuneReport, retune
 
@@ -368,18 +375,6 @@ def test_a_stage_at_another_rate_is_refused(study, tmp_path):
     one.dt = 2.0 * DT
     with pytest.raises(ValueError, match="the stage runs at 500 Hz and the study at 1"):
         retune(study, one, out(tmp_path))
-
-
-@contextmanager
-def served(one):
-    with StageServer(one) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        try:
-            yield server.address
-        finally:
-            server.shutdown()
-            thread.join()
 
 
 def commanded(study, address, *more):

@@ -9,10 +9,10 @@ from pydantic import BaseModel
 from ...core.system import System
 from ...dynamics import StateSpace
 from ..held_dynamics import HeldDynamics
+from .frequency import EmpiricalResponse
 
 if TYPE_CHECKING:
     from ..known_plant import KnownPlant
-from .frequency import EmpiricalResponse
 
 
 class FittedParameter(BaseModel):
