@@ -890,6 +890,30 @@ def test_least_squares_needs_a_squared_objective(refusal, method):
     )
 
 
+def test_least_squares_needs_the_mean_over_the_plants(study, refusal):
+    worst = {"ensemble/spread": {"gain": 0.1}, "ensemble/aggregate": "worst"}
+    squares = {
+        "optimiser/method": "levenberg_marquardt",
+        "objective/aggregate": "mean_square",
+    }
+    assert (
+        "optimiser.method levenberg_marquardt minimises squares; ensemble.aggregate "
+        "is 'worst', it must be 'mean'" in refusal(worst | squares)
+    )
+    assert load(study(worst)).ensemble.aggregate == "worst"
+    assert load(study(squares | {"ensemble/spread": {"gain": 0.1}}))
+
+
+def test_a_sweep_is_over_references_of_the_study(study, refusal):
+    drawn = {"sweep/method": "latin_hypercube", "sweep/samples": 8}
+    known = drawn | {"sweep/references": ["TRI50", "SW50"]}
+    assert [*load(study(known)).sweep.references] == ["TRI50", "SW50"]
+    assert (
+        "sweep.references: SIN7 is not one of the study's references, SIN50, SW50, "
+        "TRI50" in refusal(drawn | {"sweep/references": ["SW50", "SIN7"]})
+    )
+
+
 @pytest.mark.parametrize("where", ["plant", "controller"])
 @pytest.mark.parametrize(
     ("table", "keys"),

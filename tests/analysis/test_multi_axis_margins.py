@@ -27,7 +27,7 @@ from piezojax.analysis.stability import (
     broken_loop,
     report_of,
 )
-from piezojax.analysis.stability.axes_margins import structured_bound
+from piezojax.analysis.stability.axes_margins import balancing, structured_bound
 from piezojax.analysis.stability.conserved import LinearAxes, LinearLoop
 from piezojax.analysis.stability.margins import _matrices, linear_axes
 from piezojax.analysis.stability.operating_point import OperatingPoint
@@ -347,3 +347,14 @@ def test_the_margin_of_all_axes_does_not_depend_on_their_units():
     other = axes_report_of(LinearAxes(A, B * units, C / units[:, None], T))
     assert other.disk_margin == pytest.approx(one.disk_margin, rel=1e-6)
     assert other.sensitivity_peak != pytest.approx(one.sensitivity_peak, rel=1e-2)
+
+
+def test_balancing_finds_the_units_of_a_symmetric_matrix():
+    rng = np.random.default_rng(2)
+    matrices = rng.standard_normal((5, 3, 3)) + 1j * rng.standard_normal((5, 3, 3))
+    matrices += np.swapaxes(matrices, 1, 2)
+    units = np.exp(rng.uniform(-5.0, 5.0, (5, 3)))
+    units /= units[:, -1:]
+    found, balanced = balancing(matrices / units[:, :, None] * units[:, None, :])
+    np.testing.assert_allclose(found, units, rtol=1e-6)
+    np.testing.assert_allclose(balanced, matrices, rtol=1e-6)

@@ -45,6 +45,13 @@ def test_a_factor_is_stable_with_a_stable_inverse():
     outside = response((1.0, -2.0), (1.0, -0.9))
     found = outer_factor(np.abs(outside))
     np.testing.assert_allclose(found, response((2.0, -1.0), (1.0, -0.9)), rtol=1e-10)
+    # A zero on the circle is a line of the grid, where the factor is small, not zero.
+    on = response((1.0, -1.0))
+    found = outer_factor(np.abs(on))
+    np.testing.assert_allclose(
+        found[POINTS // 8 : POINTS // 2], on[POINTS // 8 : POINTS // 2], rtol=1e-2
+    )
+    assert 0.0 < abs(found[0]) < 1e-6
     for wrong in (0.0 * outside, np.inf * np.abs(outside)):
         with pytest.raises(ValueError, match="finite and not zero everywhere"):
             outer_factor(np.abs(wrong))
