@@ -350,6 +350,7 @@ STUDY = {
 }
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_command_ends_with_the_alarm(tmp_path):
     study, out = tmp_path / "study.toml", tmp_path / "out"
     study.write_text(tomli_w.dumps(STUDY), encoding="utf-8")
