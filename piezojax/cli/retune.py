@@ -43,10 +43,9 @@ def main(study, name, runs, out, seed, quiet):
     def body(console):
         from ..report.page import write_page
         from ..report.retune_report import retune_page, write_retuning
-        from ..study import load
-        from ..tuning.retuning import RETUNE_FILE, retune
+        from ..tuning.attempts import RETUNE_FILE
+        from ..tuning.retuning import retune
 
-        title = load(study).title
         with (
             Bar(console, at_once=True) as bar,
             results_folder(out, f"{study.stem}_retune", RETUNE_FILE) as folder,
@@ -59,7 +58,7 @@ def main(study, name, runs, out, seed, quiet):
             bar.finish()
             bar.stage("drawing")
             pictures = write_retuning(found, folder, stage.dt)
-            page = retune_page(found, title)
+            page = retune_page(found)
             write_page(page, folder, pictures)
         print_results(page, folder, console)
         exit_unsafe(page.alarms)

@@ -9,7 +9,8 @@ from rich.table import Table
 
 from ..stages import TriedRun
 from ..stages.run_files import load_samples
-from ..tuning.retuning import PROBE, Attempt, RetuneReport
+from ..tuning.attempts import Attempt, RetuneReport
+from ..tuning.stage_bench import PROBE
 from .figures import (
     AFTER,
     BEFORE,
@@ -86,14 +87,14 @@ def _draw_attempts(panel: Axes, report: RetuneReport) -> None:
     legend_above(panel)
 
 
-def retune_page(report: RetuneReport, title: str) -> Page:
-    """Return the Page of a retuning of the study ``title``."""
+def retune_page(report: RetuneReport) -> Page:
+    """Return the Page of a retuning."""
     parts = [attempts_table(report), _runs_table(report)]
     if report.best is not None:
         best = report.attempts[report.best].gains
         parts.append(stage_gains_table(report.before, best, "best", report.units))
     return Page(
-        f"{title}: retuning on {report.stage}",
+        f"{report.title}: retuning on {report.stage}",
         report.alarms,
         [
             *parts,
@@ -108,6 +109,8 @@ def _ratio(report: RetuneReport) -> str:
         return "no gains followed the references"
     before = report.attempts[0].measured_um
     best = nanometres(report.attempts[report.best].measured_um)
+    if not report.improved:
+        return f"{best} rms, and no better gains were found"
     if before is None:
         return f"{best} rms after a start that was stopped"
     return f"{nanometres(before)} to {best} rms, {report.ratio:.3g} times smaller"

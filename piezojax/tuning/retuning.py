@@ -2,14 +2,10 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
-from pydantic import BaseModel
-
-from ..core.files import read_model, write_text
+from ..core.files import read_model
 from ..core.paths import scalars
 from ..core.progress import Progress, Silent
 from ..core.serial import save
@@ -17,32 +13,23 @@ from ..identification import Record, identify
 from ..identification.estimators.estimate import Options
 from ..identification.known_plant import KnownPlant
 from ..identification.residual_record import ResidualRecord, save_residual
-from ..stages import Motion, Stage, TriedRun
+from ..stages import Stage
 from ..stages.of_study import motions_of
-from ..stages.probe import probe
-from ..stages.run_files import load_samples, run_file
-from ..stages.try_gains import abandoned, tried
+from ..stages.try_gains import abandoned
 from ..study import Case, Study, build, load, sha256_of
 from ..study.parameters import PART
 from ..study.schema import TunedTable
+from .attempts import RETUNE_FILE, Attempt, RetuneReport
 from .outcome import Outcome
 from .result import GAINS_FILE
+from .stage_bench import PROBE, Bench, geometric_mean, small_motion
 from .tuner import tune
-
-RETUNE_FILE = "retune.json"
-
-PROBE = "small motion"
-"""Name of the small motion in the list of runs."""
 
 RUNS = 10
 """Default number of runs on the stage."""
 
 WITHIN, LEAST, MOST = 10.0, 1.5, 100.0
 """Factor by which a gain may change at first, the smallest and the largest one."""
-
-RINGING = 2.0
-"""Ratio of the rms error in the small motion to that of the motion itself above which
-the loop rings: a sensitivity peak of 2 allows no more."""
 
 NEAR = 1.3
 """Ratio of the measured to the predicted error up to which this factor grows."""
@@ -52,77 +39,6 @@ ENOUGH = 0.95
 
 PATIENCE = 2
 """Number of attempts in a row without an improvement after which it ends."""
-
-FITTED, SHORTEST = 4, 400
-"""Number of runs to which the plant is fitted, the last ones; fewest samples of a run
-that was stopped."""
-
-AttemptVerdict = Literal[
-    "running", "measured", "better", "not better", "stopped", "not tried"
-]
-
-
-class Attempt(BaseModel):
-    """Gains of a stage, what was expected of them and what they did.
-
-    ``gains`` are all gains of the controller. ``model`` is the file of the plant on
-    which they were tuned, ``within`` the largest factor between a tuned gain and the
-    best one before; "" and None for gains that were on the stage, and without a best
-    one. ``predicted_um`` and ``measured_um`` are rms errors with the noise of the
-    sensor, geometric means over the references; None if they are not known. ``why`` is
-    the reason for which gains were stopped, or not tried.
-    """
-
-    gains: dict[str, float]
-    model: str = ""
-    within: float | None = None
-    predicted_um: float | None = None
-    measured_um: float | None = None
-    verdict: AttemptVerdict = "running"
-    why: str = ""
-
-    @property
-    def error(self) -> float:
-        """Measured error, um; infinite if it is not known."""
-        return math.inf if self.measured_um is None else self.measured_um
-
-
-class RetuneReport(BaseModel):
-    """Report of a retuning, the content of ``retune.json``.
-
-    ``before`` are all gains of the stage before, ``units`` their units by path. The
-    ``attempts`` begin with gains that were on the stage. ``best`` is the place of those
-    that are set at the end; None if these are the safe gains. ``verdict`` is "done",
-    "stopped" (the user or a fault ended it: the safe gains are set) or "lost" (no
-    connection); "running" until then.
-    """
-
-    stage: str
-    study_sha256: str
-    before: dict[str, float]
-    units: dict[str, str] = {}
-    runs: list[TriedRun] = []
-    attempts: list[Attempt] = []
-    best: int | None = None
-    verdict: Literal["running", "done", "stopped", "lost"] = "running"
-    alarms: list[str] = []
-    notes: list[str] = []
-
-    @property
-    def best_error(self) -> float:
-        """Smallest measured error, um; infinite without one."""
-        return math.inf if self.best is None else self.attempts[self.best].error
-
-    @property
-    def tuned(self) -> bool:
-        """Whether tuned gains were run; the first show what the start hides."""
-        return any(each.model and each.verdict != "not tried" for each in self.attempts)
-
-    @property
-    def ratio(self) -> float:
-        """Error at the beginning relative to the best one; infinite if a run with these
-        gains was stopped."""
-        return self.attempts[0].error / self.best_error if self.attempts else math.nan
 
 
 def retune(
@@ -154,7 +70,7 @@ def retune(
     description = load(path)
     case = build(description, path, seed, progress)
     _check(case, stage)
-    bench = _Bench(
+    bench = Bench(
         stage,
         motions_of(description, path.parent, dict.fromkeys(case.study.references.tune)),
         folder,
@@ -170,6 +86,11 @@ def retune(
         else:
             bench.restore()
         _improve(bench, plant, case, path)
+        if bench.report.best is None:
+            bench.restore()
+            bench.report.alarms.append(
+                "no gains followed the references; the safe gains of the stage are set"
+            )
         bench.report.verdict = "done"
     except BaseException as error:
         bench.report.verdict, alarm = abandoned(stage, error)
@@ -216,6 +137,7 @@ def _report(
         own = scalars(case.loop.controller)
         return RetuneReport(
             stage=name,
+            title=study.title,
             study_sha256=known,
             before=stage.gains(),
             units={path: case.unit(PART + path) for path in own},
@@ -230,87 +152,7 @@ def _report(
     return report
 
 
-@dataclass
-class _Bench:
-    """The stage with its runs: what was run, and what may still be run."""
-
-    stage: Stage
-    motions: Sequence[Motion]
-    folder: Path
-    report: RetuneReport
-    budget: int
-    progress: Progress
-
-    def enough(self) -> bool:
-        """Return whether another attempt can be run."""
-        return len(self.report.runs) + 1 + len(self.motions) <= self.budget
-
-    def write(self) -> None:
-        """Write the report."""
-        text = self.report.model_dump_json(indent=2) + "\n"
-        write_text(self.folder / RETUNE_FILE, text)
-
-    def measure(self, attempt: Attempt) -> None:
-        """Run a small motion and the references with the gains of ``attempt``."""
-        self.report.attempts.append(attempt)
-        errors = []
-        for motion in (_small(self.motions[0]), *self.motions):
-            found = self.run(attempt.gains, motion)
-            stopped = found.stopped
-            if motion.name == PROBE and _rings(found, motion):
-                self.stage.safe()  # the guard has not seen it
-                stopped = "the loop rings"
-            if stopped or found.measured_um is None:
-                attempt.verdict, attempt.why = "stopped", f"{motion.name}: {stopped}"
-                return
-            errors.append(found.measured_um)
-        attempt.measured_um = _mean(errors[1:])
-        attempt.verdict = "measured"
-
-    def run(self, gains: Mapping[str, float], motion: Motion) -> TriedRun:
-        """Follow ``motion`` with ``gains``."""
-        runs = self.report.runs
-        self.progress.stage(f"run {len(runs) + 1} of {self.budget}: {motion.name}")
-        file = run_file(self.folder, len(runs) + 1)
-        found = tried(self.stage, gains, motion, 1.0, file)
-        runs.append(found)
-        self.write()
-        return found
-
-    def restore(self) -> None:
-        """Set the best gains, if there are any."""
-        if self.report.best is not None:
-            self.stage.apply(self.report.attempts[self.report.best].gains)
-
-    def records(self) -> list[Record]:
-        """Return the last runs as records, each until its first missing number."""
-        found = []
-        for run in self.report.runs[-FITTED:]:
-            columns = np.stack(load_samples(self.folder / run.file))
-            known = np.cumprod(np.isfinite(columns).all(axis=0)).astype(bool)
-            reference, measured, voltage = columns[:, known]
-            if len(measured) >= SHORTEST and np.ptp(measured) > 0.0 < np.ptp(voltage):
-                about = {"source": run.file, "reference": reference}
-                found.append(Record(voltage, measured, self.stage.dt, **about))
-        return found
-
-
-def _small(motion: Motion) -> Motion:
-    """Return the small motion before ``motion``."""
-    return Motion(PROBE, probe(motion.reference), None, motion.start, motion.noise)
-
-
-def _rings(run: TriedRun, motion: Motion) -> bool:
-    """Return whether the error of a ``run`` is too large for its small ``motion``."""
-    return (run.measured_um or 0.0) > RINGING * float(np.std(motion.reference))
-
-
-def _mean(errors: Sequence[float]) -> float:
-    """Return the geometric mean of ``errors`` (um)."""
-    return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
-
-
-def _measure_present(bench: _Bench) -> None:
+def _measure_present(bench: Bench) -> None:
     """Measure the gains of the stage; if they are stopped, its safe gains.
 
     Raises _HopelessError if a small motion with the safe gains is stopped.
@@ -328,7 +170,7 @@ def _measure_present(bench: _Bench) -> None:
         raise _HopelessError(f"{PROBE} with the safe gains: {why}")
 
 
-def _improve(bench: _Bench, plant: KnownPlant, case: Case, path: Path) -> None:
+def _improve(bench: Bench, plant: KnownPlant, case: Case, path: Path) -> None:
     """Fit, tune and run until the runs are used up or no improvement is expected."""
     report, within, failed = bench.report, WITHIN, 0
     while bench.enough() and failed < PATIENCE:
@@ -398,10 +240,10 @@ def _predicted(outcome: Outcome) -> float | None:
     noise = study.by_axis(study.sensor.noise_rms)[0]
     errors = outcome.result.holdout.per_reference_rms_um.values()
     known = [math.hypot(error, noise) for error in errors if error is not None]
-    return _mean(known) if len(known) == len(errors) else None
+    return geometric_mean(known) if len(known) == len(errors) else None
 
 
-def _try(bench: _Bench, attempt: Attempt, outcome: Outcome) -> bool:
+def _try(bench: Bench, attempt: Attempt, outcome: Outcome) -> bool:
     """Run ``attempt`` and keep its gains if they are better; return if it was run.
 
     Raises _HopelessError if it was stopped and the best gains are stopped since.
@@ -430,7 +272,7 @@ def _try(bench: _Bench, attempt: Attempt, outcome: Outcome) -> bool:
         bench.restore()
     if stopped and len(report.runs) < bench.budget:
         # The gains, or a fault of the stage? Gains that it followed with tell.
-        found = bench.run(bench.stage.gains(), _small(bench.motions[0]))
+        found = bench.run(bench.stage.gains(), small_motion(bench.motions[0]))
         if found.stopped:
             raise _HopelessError(f"{PROBE} after a stopped run: {found.stopped}")
     return True

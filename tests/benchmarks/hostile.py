@@ -30,7 +30,7 @@ from piezojax.stages import Fault, LostError, RemoteStage
 from piezojax.stages.emulated import EmulatedStage
 from piezojax.stages.run_files import load_samples, run_files
 from piezojax.tuning import RetuneReport, retune
-from piezojax.tuning.retuning import RETUNE_FILE
+from piezojax.tuning.attempts import RETUNE_FILE
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 

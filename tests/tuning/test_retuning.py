@@ -27,7 +27,8 @@ from piezojax.core.temporaries import claimed
 from piezojax.dynamics import FractionalDelay
 from piezojax.stages import Fault, LostError
 from piezojax.tuning import retuning
-from piezojax.tuning.retuning import RETUNE_FILE, RetuneReport, retune
+from piezojax.tuning.attempts import RETUNE_FILE, RetuneReport
+from piezojax.tuning.retuning import retune
 
 GOOD = {"proportional": 4.0, "integral": 2500.0}
 WORSE = {"proportional": 0.5, "integral": 400.0}
@@ -241,6 +242,28 @@ def test_safe_gains_that_are_stopped_end_it(study, tmp_path):
     assert report.best is None
     assert report.alarms[0].startswith("small motion with the safe gains: the ")
     assert len(report.runs) == 2
+
+
+def test_without_gains_that_follow_the_stage_has_its_safe_gains(
+    study, tmp_path, scripted
+):
+    scripted((GOOD, 0.01), (GOOD, 0.01))
+    one = stage()
+    whole = one.run
+
+    def run(reference, gains):
+        one.faults = [] if np.ptp(reference) < 1.0 else [Fault("stuck", 300, 900)]
+        return whole(reference, gains)
+
+    one.run = run
+    report = retune(study, one, out(tmp_path), runs=20)
+    assert [attempt.verdict for attempt in report.attempts] == ["stopped"] * 4
+    assert report.verdict == "done"
+    assert report.alarms == [
+        "no gains followed the references; the safe gains of the stage are set"
+    ]
+    assert one.gains() | SAFE == one.gains()
+    assert one.voltage == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,109 @@
+"""Runs of a retuning: a small motion and the references, with their records."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..core.files import write_text
+from ..core.progress import Progress
+from ..identification import Record
+from ..stages import Motion, Stage, TriedRun
+from ..stages.probe import probe
+from ..stages.run_files import load_samples, run_file
+from ..stages.try_gains import tried
+from .attempts import RETUNE_FILE, Attempt, RetuneReport
+
+PROBE = "small motion"
+"""Name of the small motion in the list of runs."""
+
+RINGING = 2.0
+"""Ratio of the rms error in the small motion to that of the motion itself above which
+the loop rings: a sensitivity peak of 2 allows no more."""
+
+FITTED, SHORTEST = 4, 400
+"""Number of runs that are records of the plant, the last ones; fewest samples of a run
+that was stopped."""
+
+
+@dataclass
+class Bench:
+    """The stage with its runs: what was run, and what may still be run."""
+
+    stage: Stage
+    motions: Sequence[Motion]
+    folder: Path
+    report: RetuneReport
+    budget: int
+    progress: Progress
+
+    def enough(self) -> bool:
+        """Return whether another attempt can be run."""
+        return len(self.report.runs) + 1 + len(self.motions) <= self.budget
+
+    def write(self) -> None:
+        """Write the report."""
+        text = self.report.model_dump_json(indent=2) + "\n"
+        write_text(self.folder / RETUNE_FILE, text)
+
+    def measure(self, attempt: Attempt) -> None:
+        """Run a small motion and the references with the gains of ``attempt``."""
+        self.report.attempts.append(attempt)
+        errors = []
+        for motion in (small_motion(self.motions[0]), *self.motions):
+            found = self.run(attempt.gains, motion)
+            stopped = found.stopped
+            if motion.name == PROBE and _rings(found, motion):
+                self.stage.safe()  # the guard has not seen it
+                stopped = "the loop rings"
+            if stopped or found.measured_um is None:
+                attempt.verdict, attempt.why = "stopped", f"{motion.name}: {stopped}"
+                return
+            errors.append(found.measured_um)
+        attempt.measured_um = geometric_mean(errors[1:])
+        attempt.verdict = "measured"
+
+    def run(self, gains: Mapping[str, float], motion: Motion) -> TriedRun:
+        """Follow ``motion`` with ``gains``."""
+        runs = self.report.runs
+        self.progress.stage(f"run {len(runs) + 1} of {self.budget}: {motion.name}")
+        file = run_file(self.folder, len(runs) + 1)
+        found = tried(self.stage, gains, motion, 1.0, file)
+        runs.append(found)
+        self.write()
+        return found
+
+    def restore(self) -> None:
+        """Set the best gains, or the safe ones if no gains followed the references."""
+        if self.report.best is None:
+            self.stage.safe()
+        else:
+            self.stage.apply(self.report.attempts[self.report.best].gains)
+
+    def records(self) -> list[Record]:
+        """Return the last runs as records, each until its first missing number."""
+        found = []
+        for run in self.report.runs[-FITTED:]:
+            columns = np.stack(load_samples(self.folder / run.file))
+            known = np.cumprod(np.isfinite(columns).all(axis=0)).astype(bool)
+            reference, measured, voltage = columns[:, known]
+            if len(measured) >= SHORTEST and np.ptp(measured) > 0.0 < np.ptp(voltage):
+                about = {"source": run.file, "reference": reference}
+                found.append(Record(voltage, measured, self.stage.dt, **about))
+        return found
+
+
+def small_motion(motion: Motion) -> Motion:
+    """Return the small motion before ``motion``."""
+    return Motion(PROBE, probe(motion.reference), None, motion.start, motion.noise)
+
+
+def _rings(run: TriedRun, motion: Motion) -> bool:
+    """Return whether the error of a ``run`` is too large for its small ``motion``."""
+    return (run.measured_um or 0.0) > RINGING * float(np.std(motion.reference))
+
+
+def geometric_mean(errors: Sequence[float]) -> float:
+    """Return the geometric mean of ``errors`` (um)."""
+    return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
