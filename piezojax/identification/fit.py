@@ -360,9 +360,8 @@ def _fit_error(
 def _error_warnings(
     records: Sequence[Record], runs: Sequence[np.ndarray], part: slice
 ) -> list[str]:
-    # In a closed loop a model explains the response to the excitation, not the noise.
     errors, outputs = (
-        np.concatenate([excited_columns(record, each)[part] for record, each in pairs])
+        np.concatenate([_to_explain(record, each, part) for record, each in pairs])
         for pairs in (
             [(r, run - r.outputs) for r, run in zip(records, runs, strict=True)],
             [(r, r.outputs) for r in records],
@@ -375,6 +374,17 @@ def _error_warnings(
         f"the model explains little: its validation error is {100.0 * share:.0f} % of "
         "the output's own deviation"
     ]
+
+
+def _to_explain(record: Record, columns: np.ndarray, part: slice) -> np.ndarray:
+    """Return what a model has to explain of a ``part`` of ``columns`` [samples, p].
+
+    In a closed loop it is the response to the excitation, without noise and drift.
+    """
+    if not record.excitation.size:
+        return columns[part]
+    found = excited_columns(record, columns)[part]
+    return found - found.mean(axis=0)
 
 
 def unexplained_share(errors: np.ndarray, outputs: np.ndarray) -> float:

@@ -177,6 +177,17 @@ def test_the_part_that_responds_to_the_excitation():
         projected(noisy.input[:100], noisy.excitation[:100])
 
 
+def test_a_drift_that_the_excitation_does_not_cause_is_left_out():
+    random = np.random.default_rng(4)
+    excitation = np.sin(0.1 * np.arange(3000))[:, None]
+    response = 0.01 * excitation[:, 0]
+    drift = 0.01 * np.cumsum(random.standard_normal(3000))
+    found = projected(response + drift, excitation)
+    assert np.mean(found) == pytest.approx(np.mean(drift + response))
+    late = slice(1500, None)
+    assert np.std(found[late]) < 0.2 * np.std((drift + response)[late])
+
+
 def test_strongly_coloured_noise_becomes_white():
     noise = oracle.noise(np.random.default_rng(1), 3000, 1.0)
     filtered = np.convolve(noise, whitening_filter([noise[:1500], noise[1500:]]))

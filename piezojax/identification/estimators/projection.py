@@ -120,7 +120,11 @@ def _regressed(signals: np.ndarray, order: int, first: int) -> tuple[np.ndarray,
 
 
 def _response(solution: np.ndarray, excitation: np.ndarray) -> np.ndarray:
-    """Return the output [samples] of the model under the excitation alone."""
+    """Return the output [samples] of the model under the excitation, without its mean.
+
+    The mean is not that of the model, whose static gain is not known well if a pole is
+    close to 1.
+    """
     import scipy.signal  # takes long to import
 
     signals = excitation.shape[1]
@@ -130,15 +134,9 @@ def _response(solution: np.ndarray, excitation: np.ndarray) -> np.ndarray:
     # All poles move inwards by one factor: roots of high order are not exact enough to
     # move one.
     below *= min(1.0, STABLE / max(largest, STABLE)) ** np.arange(order + 1)
-    response = np.full(len(excitation), solution[-1] / below.sum())
+    response = np.zeros(len(excitation))
     above = solution[order:-1].reshape(signals, order + 1)
     for numerator, column in zip(above, excitation.T, strict=True):
         # Before the record the excitation had its first value.
-        steady = scipy.signal.lfiltic(
-            numerator,
-            below,
-            np.full(order, column[0] * numerator.sum() / below.sum()),
-            np.full(order, column[0]),
-        )
-        response += scipy.signal.lfilter(numerator, below, column, zi=steady)[0]
-    return response
+        response += scipy.signal.lfilter(numerator, below, column - column[0])
+    return response - response.mean()
