@@ -15,7 +15,7 @@ from ..identification.known_plant import KnownPlant
 from ..identification.residual_record import ResidualRecord, save_residual
 from ..stages import Stage
 from ..stages.of_study import motions_of
-from ..stages.try_gains import abandoned
+from ..stages.try_gains import SMALL, abandoned
 from ..study import Case, Study, build, load, sha256_of
 from ..study.parameters import PART
 from ..study.schema import TunedTable
@@ -155,6 +155,7 @@ def _report(
 def _measure_present(bench: Bench) -> None:
     """Measure the gains of the stage; if they are stopped, its safe gains.
 
+    If the latter are stopped too, they follow small shares of the first reference.
     Raises _HopelessError if a small motion with the safe gains is stopped.
     """
     report = bench.report
@@ -165,26 +166,48 @@ def _measure_present(bench: Bench) -> None:
             report.best = report.attempts.index(attempt)
             return
         report.notes.append(f"the {kind} of the stage were stopped: {attempt.why}")
-    if report.runs[-1].reference == PROBE:
+    if report.runs[-1].reference != PROBE:
+        # Slow gains follow less of it, and that shows the plant.
+        for share in SMALL:
+            bench.run(bench.stage.gains(), bench.motions[0], share)
+    else:
         why = report.attempts[-1].why.removeprefix(f"{PROBE}: ")
         raise _HopelessError(f"{PROBE} with the safe gains: {why}")
 
 
 def _improve(bench: Bench, plant: KnownPlant, case: Case, path: Path) -> None:
     """Fit, tune and run until the runs are used up or no improvement is expected."""
-    report, within, failed = bench.report, WITHIN, 0
+    within, failed = WITHIN, 0
     while bench.enough() and failed < PATIENCE:
+        found = _next_gains(bench, plant, case, path, within)
+        if found is None:
+            break
+        attempt, outcome = found
+        _try(bench, attempt, outcome)
+        failed = 0 if attempt.verdict == "better" else failed + 1
+        as_predicted = attempt.error <= NEAR * (attempt.predicted_um or 0.0)
+        factor = within**2 if as_predicted and not failed else math.sqrt(within)
+        within = min(max(factor, LEAST), MOST)
+
+
+def _next_gains(
+    bench: Bench, plant: KnownPlant, case: Case, path: Path, within: float
+) -> tuple[Attempt, Outcome] | None:
+    """Return gains that are worth a run, or None and a note for the report.
+
+    The plant is fitted to the last runs. Stopped ones may contain what no plant
+    explains, such as a limit: if they lead to nothing, the others alone are fitted.
+    """
+    report = bench.report
+    best = None if report.best is None else report.attempts[report.best].gains
+    for records in bench.records():
         file = bench.folder / f"model_{len(report.attempts)}.json"
         bench.progress.stage("fitting the plant to the runs")
-        records = bench.records()
-        if not records:
-            report.notes.append("no run is long enough to fit the plant to it")
-            break
         alarms = _fit_again(plant, records, file)
         if alarms:
-            report.notes.append(f"{file.name} describes the runs badly: {alarms[0]}")
-            break
-        best = None if report.best is None else report.attempts[report.best].gains
+            runs = ", ".join(record.source for record in records)
+            report.notes.append(f"no plant describes {runs}: {alarms[0]}")
+            continue
         study = _near(case, file, best, within)
         outcome = tune(build(study, path), progress=bench.progress)
         if outcome.result.status == "interrupted":
@@ -195,19 +218,37 @@ def _improve(bench: Bench, plant: KnownPlant, case: Case, path: Path) -> None:
             within=None if best is None else within,
             predicted_um=_predicted(outcome),
         )
-        if not _try(bench, attempt, outcome):
-            break
-        failed = 0 if attempt.verdict == "better" else failed + 1
-        as_predicted = attempt.error <= NEAR * (attempt.predicted_um or 0.0)
-        factor = within**2 if as_predicted and not failed else math.sqrt(within)
-        within = min(max(factor, LEAST), MOST)
+        attempt.why = _why_not(attempt, outcome, report)
+        if not attempt.why:
+            return attempt, outcome
+        attempt.verdict = "not tried"
+        report.attempts.append(attempt)
+        report.notes.append(f"{attempt.model}: not tried: {attempt.why}")
+    return None
+
+
+def _why_not(attempt: Attempt, outcome: Outcome, report: RetuneReport) -> str:
+    """Return why ``attempt`` is not worth a run, "" if it is."""
+    if outcome.result.alarms:
+        return "; ".join(outcome.result.alarms)
+    if attempt.predicted_um is None:
+        return "the prediction is not a number"
+    if report.tuned and attempt.predicted_um > ENOUGH * report.best_error:
+        return "no improvement is expected"
+    return ""
 
 
 def _fit_again(
     plant: KnownPlant, records: Sequence[Record], file: Path
 ) -> Sequence[str]:
-    """Fit ``plant`` to ``records``; write it with its residual; return its alarms."""
-    fit = identify(records, plant.model, options=Options(known=plant))
+    """Fit ``plant`` to ``records``; write it with its residual; return its alarms.
+
+    There is none for records to which it cannot be fitted, only the reason.
+    """
+    try:
+        fit = identify(records, plant.model, options=Options(known=plant))
+    except ValueError as error:
+        return [str(error)]
     save(fit.plant, file, about=fit.about)
     save_residual(ResidualRecord.of(fit), file)
     return fit.report.alarms
@@ -243,23 +284,12 @@ def _predicted(outcome: Outcome) -> float | None:
     return geometric_mean(known) if len(known) == len(errors) else None
 
 
-def _try(bench: Bench, attempt: Attempt, outcome: Outcome) -> bool:
-    """Run ``attempt`` and keep its gains if they are better; return if it was run.
+def _try(bench: Bench, attempt: Attempt, outcome: Outcome) -> None:
+    """Run ``attempt`` and keep its gains if they are better.
 
     Raises _HopelessError if it was stopped and the best gains are stopped since.
     """
     report = bench.report
-    if outcome.result.alarms:
-        attempt.why = "; ".join(outcome.result.alarms)
-    elif attempt.predicted_um is None:
-        attempt.why = "the prediction is not a number"
-    elif report.tuned and attempt.predicted_um > ENOUGH * report.best_error:
-        attempt.why = "no improvement is expected"
-    if attempt.why:
-        attempt.verdict = "not tried"
-        report.attempts.append(attempt)
-        report.notes.append(f"{attempt.model}: not tried: {attempt.why}")
-        return False
     bench.measure(attempt)
     stopped = attempt.verdict == "stopped"
     if attempt.error < report.best_error:
@@ -275,4 +305,3 @@ def _try(bench: Bench, attempt: Attempt, outcome: Outcome) -> bool:
         found = bench.run(bench.stage.gains(), small_motion(bench.motions[0]))
         if found.stopped:
             raise _HopelessError(f"{PROBE} after a stopped run: {found.stopped}")
-    return True

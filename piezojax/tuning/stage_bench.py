@@ -64,12 +64,14 @@ class Bench:
         attempt.measured_um = geometric_mean(errors[1:])
         attempt.verdict = "measured"
 
-    def run(self, gains: Mapping[str, float], motion: Motion) -> TriedRun:
-        """Follow ``motion`` with ``gains``."""
+    def run(
+        self, gains: Mapping[str, float], motion: Motion, share: float = 1.0
+    ) -> TriedRun:
+        """Follow a ``share`` of ``motion`` with ``gains``."""
         runs = self.report.runs
         self.progress.stage(f"run {len(runs) + 1} of {self.budget}: {motion.name}")
         file = run_file(self.folder, len(runs) + 1)
-        found = tried(self.stage, gains, motion, 1.0, file)
+        found = tried(self.stage, gains, motion, share, file)
         runs.append(found)
         self.write()
         return found
@@ -81,17 +83,30 @@ class Bench:
         else:
             self.stage.apply(self.report.attempts[self.report.best].gains)
 
-    def records(self) -> list[Record]:
-        """Return the last runs as records, each until its first missing number."""
-        found = []
-        for run in self.report.runs[-FITTED:]:
-            columns = np.stack(load_samples(self.folder / run.file))
-            known = np.cumprod(np.isfinite(columns).all(axis=0)).astype(bool)
-            reference, measured, voltage = columns[:, known]
-            if len(measured) >= SHORTEST and np.ptp(measured) > 0.0 < np.ptp(voltage):
-                about = {"source": run.file, "reference": reference}
-                found.append(Record(voltage, measured, self.stage.dt, **about))
-        return found
+    def records(self) -> list[list[Record]]:
+        """Return records of the last runs, and if some were stopped, of the others.
+
+        Each ends at its first missing number.
+        """
+        runs = self.report.runs
+        sets = runs[-FITTED:], [run for run in runs if not run.stopped][-FITTED:]
+        # A run that is too short for a record is in neither.
+        found = {
+            tuple(record.source for record in records): records
+            for each in sets
+            if (records := [*filter(None, map(self._record, each))])
+        }
+        return [*found.values()]
+
+    def _record(self, run: TriedRun) -> Record | None:
+        """Return the record of ``run``, or None if it is too short or does not move."""
+        columns = np.stack(load_samples(self.folder / run.file))
+        known = np.cumprod(np.isfinite(columns).all(axis=0)).astype(bool)
+        reference, measured, voltage = columns[:, known]
+        if len(measured) < SHORTEST or 0.0 in (np.ptp(measured), np.ptp(voltage)):
+            return None
+        about = {"source": run.file, "reference": reference}
+        return Record(voltage, measured, self.stage.dt, **about)
 
 
 def small_motion(motion: Motion) -> Motion:

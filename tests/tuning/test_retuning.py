@@ -33,6 +33,7 @@ from piezojax.tuning.retuning import retune
 GOOD = {"proportional": 4.0, "integral": 2500.0}
 WORSE = {"proportional": 0.5, "integral": 400.0}
 WILD = {"proportional": 150.0, "integral": 900.0}
+SLOW = {"proportional": 0.0, "integral": 60.0}
 
 
 @pytest.fixture
@@ -235,6 +236,28 @@ def test_a_start_that_is_stopped_continues_with_the_safe_gains(
     assert one.gains() | GOOD == one.gains()
 
 
+def test_safe_gains_that_are_too_slow_show_the_plant_by_small_shares(
+    study, tmp_path, scripted
+):
+    scripted((GOOD, 0.05))
+    one = stage(safe_gains=SLOW)
+    one.apply(WILD)
+    report = retune(study, one, out(tmp_path), runs=7)
+    assert report.notes == [
+        f"the {kind} of the stage were stopped: {where}: {why}"
+        for kind, where, why in (
+            ("gains", "small motion", report.runs[0].stopped),
+            ("safe gains", "SIN2", "the tracking error is too large"),
+        )
+    ]
+    shares = [(run.reference, run.share) for run in report.runs[1:5]]
+    assert shares == [("small motion", 1.0), *(("SIN2", x) for x in (1.0, 0.1, 0.3))]
+    assert not any(run.stopped for run in report.runs[3:])
+    assert [attempt.verdict for attempt in report.attempts[2:3]] == ["better"]
+    assert report.ratio == np.inf
+    assert one.gains() | GOOD == one.gains()
+
+
 def test_safe_gains_that_are_stopped_end_it(study, tmp_path):
     one = stage(safe_gains=WILD)
     report = retune(study, one, out(tmp_path))
@@ -267,7 +290,8 @@ def test_without_gains_that_follow_the_stage_has_its_safe_gains(
 
 
 @pytest.mark.parametrize(
-    ("begin", "fitted"), [(600, [1000, 600, 1000, 1000]), (300, [1000, 1000, 1000])]
+    ("begin", "fitted"),
+    [(600, [[1000, 600, 1000, 1000], [1000] * 3]), (300, [[1000] * 3])],
 )
 def test_a_run_is_fitted_until_its_first_missing_number(
     study, tmp_path, scripted, monkeypatch, begin, fitted
@@ -277,13 +301,17 @@ def test_a_run_is_fitted_until_its_first_missing_number(
     monkeypatch.setattr(
         retuning,
         "_fit_again",
-        lambda plant, records, file: seen.extend(r.samples for r in records) or ["no"],
+        lambda plant, records, file: (
+            seen.append([r.samples for r in records]) or ["no"]
+        ),
     )
     one = failing_at(
         stage(), 2, lambda: setattr(one, "faults", [Fault("dropout", begin, 400)])
     )
-    retune(study, one, out(tmp_path), runs=8)
+    report = retune(study, one, out(tmp_path), runs=8)
+    # The second time without the run that was stopped.
     assert seen == fitted
+    assert report.notes[-1].startswith("no plant describes run_01.npz, run_03.npz, ")
 
 
 @pytest.mark.parametrize("run", [1, 2, 4])
