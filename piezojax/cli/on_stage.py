@@ -16,7 +16,7 @@ stage_option: Callable = click.option(
     "name",
     required=True,
     metavar="NAME",
-    help="Stage: host:port, as printed by python -m piezojax.emulate, or "
+    help="Stage: host:port, as printed by python -m piezojax.emulate, nv200:host, or "
     "module:function of your own stage.",
 )
 
@@ -53,16 +53,16 @@ def connected(name: str) -> "Iterator[Stage]":
 
     Raises ValueError, one line, for a StageError.
     """
-    from ..stages import RemoteStage, StageError, stage_of
+    from ..stages import ConnectedStage, StageError, stage_of
 
     stage = None
     try:
         stage = stage_of(name)
         yield stage
-        if isinstance(stage, RemoteStage):
+        if isinstance(stage, ConnectedStage):
             stage.close()
     except BaseException as error:
-        if isinstance(stage, RemoteStage):
+        if isinstance(stage, ConnectedStage):
             stage.abandon()
         if isinstance(error, StageError):
             raise ValueError(str(error)) from None

@@ -9,6 +9,8 @@ from .connect import stage_of as stage_of
 from .emulated import EmulatedStage as EmulatedStage
 from .emulated import Limits as Limits
 from .faults import Fault as Fault
+from .nv200_stage import NV200Stage as NV200Stage
+from .protocol import ConnectedStage as ConnectedStage
 from .protocol import LostError as LostError
 from .protocol import Stage as Stage
 from .protocol import StageError as StageError

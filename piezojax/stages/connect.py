@@ -2,20 +2,28 @@
 
 import importlib
 
+from .nv200_stage import nv200_stage
 from .protocol import Stage
 from .remote import RemoteStage
 
+DEVICES = {"nv200": nv200_stage}
+"""Functions that connect to a device, by the word before its address."""
+
 
 def stage_of(name: str) -> Stage:
-    """Return the stage at ``name``: "host:port", or "module:function".
+    """Return the stage at ``name``.
 
+    It is "host:port", "nv200:host" of a device in ``DEVICES``, or "module:function".
     The function has no argument and returns a Stage. Raises ValueError for another
     name, a module or function that is missing, or one that does not return a stage.
     """
+    device, _, address = name.partition(":")
+    if device in DEVICES:
+        return DEVICES[device](address)
     place, _, what = name.rpartition(":")
     if not (place and what):
         raise ValueError(
-            f"--stage is {name!r}; give host:port, as 127.0.0.1:5025, or "
+            f"--stage is {name!r}; give host:port, as 127.0.0.1:5025, nv200:host, or "
             "module:function of your own stage"
         )
     if what.isdigit():

@@ -73,3 +73,16 @@ class Stage(Protocol):
         May be called from another thread. Raises LostError without a connection.
         """
         ...
+
+
+@runtime_checkable
+class ConnectedStage(Stage, Protocol):
+    """A stage at the end of a connection."""
+
+    def close(self) -> None:
+        """End the connection with a goodbye: the stage keeps its gains."""
+        ...
+
+    def abandon(self) -> None:
+        """End the connection after a failure: the stage becomes safe."""
+        ...
