@@ -120,10 +120,10 @@ def _check(case: Case, stage: Stage) -> None:
             f"{case.study.rate:.6g} Hz; they must be the same"
         )
     known = stage.gains()
-    for path in scalars(case.loop.controller):
-        if path not in known:
+    for path in case.space.ranges():
+        if (gain := path.removeprefix(PART)) not in known:
             raise ValueError(
-                f"the controller of the study has the gain {path}, the stage has "
+                f"the study tunes {path}, but the stage has no gain {gain}; it has "
                 f"{', '.join(known)}"
             )
 
@@ -212,13 +212,14 @@ def _next_gains(
         outcome = tune(build(study, path), progress=bench.progress)
         if outcome.result.status == "interrupted":
             raise KeyboardInterrupt
+        gains = scalars(outcome.controller)
         attempt = Attempt(
-            gains=scalars(outcome.controller),
+            gains={path: gains[path] for path in gains if path in report.before},
             model=file.name,
             within=None if best is None else within,
             predicted_um=_predicted(outcome),
         )
-        attempt.why = _why_not(attempt, outcome, report)
+        attempt.why = _why_not(attempt, outcome, report, case)
         if not attempt.why:
             return attempt, outcome
         attempt.verdict = "not tried"
@@ -227,8 +228,14 @@ def _next_gains(
     return None
 
 
-def _why_not(attempt: Attempt, outcome: Outcome, report: RetuneReport) -> str:
+def _why_not(
+    attempt: Attempt, outcome: Outcome, report: RetuneReport, case: Case
+) -> str:
     """Return why ``attempt`` is not worth a run, "" if it is."""
+    fixed = scalars(case.loop.controller)
+    for path, value in scalars(outcome.controller).items():
+        if path not in report.before and not math.isclose(value, fixed[path]):
+            return f"the design changes {path}, and the stage has no such gain"
     if outcome.result.alarms:
         return "; ".join(outcome.result.alarms)
     if attempt.predicted_um is None:

@@ -178,6 +178,26 @@ def test_gains_with_an_alarm_are_not_tried(study, tmp_path, scripted):
     assert one.gains() == before
 
 
+@pytest.mark.parametrize("changed", [{}, {"derivative_filter": 100.0}])
+def test_a_gain_that_the_stage_lacks_must_not_change(
+    study, tmp_path, scripted, changed
+):
+    scripted((GOOD | changed, 0.05), (WORSE, 5.0))
+    one = stage()
+    whole = one.gains
+    one.gains = lambda: {
+        path: value for path, value in whole().items() if path != "derivative_filter"
+    }
+    report = retune(study, one, out(tmp_path))
+    assert "derivative_filter" not in report.attempts[1].gains
+    if changed:
+        assert report.attempts[1].why == (
+            "the design changes derivative_filter, and the stage has no such gain"
+        )
+    else:
+        assert report.attempts[1].verdict == "better"
+
+
 def test_no_expected_improvement_ends_it(study, tmp_path, scripted):
     """The first tuned gains are run in any case: they show what the start hides."""
     scripted((GOOD, 5.0), (GOOD, 5.0))
@@ -408,13 +428,13 @@ def test_a_report_of_another_study_is_refused(study, tmp_path, scripted):
     [
         ({"rate": 2e3}, "rate"),
         ({"actuator": STUDY["actuator"] | {"bandwidth": 300.0}}, "an amplifier"),
-        ({}, "the controller of the study has the gain proportional"),
+        ({}, "tunes controller.proportional, but the stage has no gain proportional"),
     ],
 )
 def test_another_stage_is_refused(tmp_path, tables, message):
     path = write_study(tmp_path, **tables)
     one = stage()
-    if "gain" in message:
+    if "no gain" in message:
         one.gains = lambda: {"speed": 1.0}
     with pytest.raises(ValueError, match=message):
         retune(path, one, out(tmp_path))
