@@ -75,7 +75,8 @@ class NV200Stage:
 
     The safe gains and the safe position are those at the beginning. The device watches
     its voltage limits alone: its status is read during a run, and what the record
-    shows is judged after it. ``largest_error`` (um) is by default a tenth of the range.
+    shows is judged after it. Without a connection it keeps the gains that it has.
+    ``largest_error`` (um) is by default a tenth of the range.
 
     Needs the library ``nv200`` (Python 3.12 or 3.13). Raises ValueError without it,
     and for a loop that is open or a position that is not in um; StageError for a
