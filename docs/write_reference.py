@@ -265,7 +265,7 @@ def _on_one_line(found: re.Match[str]) -> str:
 
 COMMANDS = (
     *("excite", "start", "identify", "validate", "tune", "export", "sweep"),
-    *("trial", "retune", "watch", "emulate", "reproduce"),
+    *("trial", "retune", "learn", "watch", "emulate", "reproduce"),
 )
 
 VALUES = {

@@ -118,6 +118,7 @@ REFUSED = {
     "trial": ["nowhere", "--stage", "127.0.0.1:1"],
     "watch": ["nowhere", "--stage", "127.0.0.1:1"],
     "retune": ["nowhere.toml", "--stage", "127.0.0.1:1"],
+    "learn": ["nowhere", "--stage", "127.0.0.1:1"],
     "emulate": ["nowhere.toml"],
 }
 """Arguments that each command refuses."""

@@ -18,7 +18,7 @@ alone imports ``report``."""
 
 ENTRIES = (
     *("__init__", "tune", "identify", "validate", "sweep", "reproduce"),
-    *("export", "start", "excite", "emulate", "trial", "retune", "watch"),
+    *("export", "start", "excite", "emulate", "trial", "retune", "learn", "watch"),
 )
 """Modules at the top: they may import any subpackage; no subpackage imports them."""
 

@@ -9,6 +9,7 @@ import click
 
 if TYPE_CHECKING:
     from ..stages import Motion, Stage
+    from ..stages.learning import LearningFilter
     from ..tuning.result import Result
 
 stage_option: Callable = click.option(
@@ -45,6 +46,25 @@ def tuned_gains(
     promised = {name: error for name, error in promised.items() if error is not None}
     motions = motions_of(load_study(results / STUDY_FILE), results, promised)
     return result, gains, motions
+
+
+def learning_law(results: Path, named: Path | None) -> "LearningFilter":
+    """Return the learning filter of the loop in a folder of ``tune``.
+
+    ``named`` is the file of its study, by default the one in the folder. Raises
+    ValueError as ``study.read`` and ``load`` do.
+    """
+    from dataclasses import replace
+
+    from ..core.serial import load
+    from ..stages.learning import learning_filter
+    from ..study import read
+    from ..tuning.result import GAINS_FILE, STUDY_FILE
+
+    case = read(named or results / STUDY_FILE)
+    loop = replace(case.loop, controller=load(results / GAINS_FILE))
+    bound = case.plant_about.error_bound
+    return learning_filter(loop, case.highest_reference, case.study.dt, bound)
 
 
 @contextmanager

@@ -126,7 +126,7 @@ def trial(
     try:
         for number, (motion, share) in enumerate(planned, start=1):
             file = run_file(folder, number)
-            run = tried(stage, gains, motion, share, file)
+            run, _ = tried(stage, gains, motion, share, file)
             report.runs.append(run)
             _write(report, folder)
             if run.stopped or run.ratio > FAR:
@@ -146,11 +146,18 @@ def trial(
 
 
 def tried(
-    stage: Stage, gains: Gains, motion: Motion, share: float, file: Path
-) -> TriedRun:
+    stage: Stage,
+    gains: Gains,
+    motion: Motion,
+    share: float,
+    file: Path,
+    command: Float[np.ndarray, " samples"] | None = None,
+) -> tuple[TriedRun, Float[np.ndarray, " samples"] | None]:
     """Run a ``share`` of ``motion`` with ``gains``; write its samples into ``file``.
 
-    A run that is stopped has the reason, and no error. Raises as ``Stage.run`` does in
+    The stage follows ``command`` (um) instead of the motion if it is given; errors are
+    relative to the motion. Returns the run and its readings (um). A run that is
+    stopped has the reason, no error and no readings. Raises as ``Stage.run`` does in
     other cases.
     """
     begin = motion.reference[0]
@@ -159,12 +166,14 @@ def tried(
         reference=motion.name, share=share, promised_um=motion.promised, file=file.name
     )
     try:
-        record = stage.run(reference, gains)
+        record = stage.run(reference if command is None else command, gains)
     except StoppedError as stop:
-        save_samples(file, stop.reference, stop.measured, stop.voltage)
-        return run.model_copy(update={"stopped": stop.reason})
+        known = reference[: len(stop.measured)]
+        save_samples(file, known, stop.measured, stop.voltage)
+        return run.model_copy(update={"stopped": stop.reason}), None
     save_samples(file, reference, record.output, record.input)
-    return run.model_copy(update=_figures(record, reference, motion))
+    figures = _figures(record, reference, motion)
+    return run.model_copy(update=figures), record.output
 
 
 def _figures(record: Record, reference: np.ndarray, motion: Motion) -> dict:

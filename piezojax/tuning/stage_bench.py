@@ -71,7 +71,7 @@ class Bench:
         runs = self.report.runs
         self.progress.stage(f"run {len(runs) + 1} of {self.budget}: {motion.name}")
         file = run_file(self.folder, len(runs) + 1)
-        found = tried(self.stage, gains, motion, share, file)
+        found, _ = tried(self.stage, gains, motion, share, file)
         runs.append(found)
         self.write()
         return found

@@ -125,6 +125,7 @@ SPECIAL = {
         command: Special("with an emulated stage", ON_STAGE.format(command))
         for command in (
             TRIED.format("trial", ""),
+            TRIED.format("learn", ""),
             TRIED.format("watch", " --out baseline"),
             TRIED.format("watch", " --baseline baseline"),
         )

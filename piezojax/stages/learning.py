@@ -1,0 +1,252 @@
+"""Iterative learning on a stage: the reference of a repeated motion is corrected."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Complex, Float
+from pydantic import BaseModel
+
+from ..analysis.stability.differentiable import (
+    lines,
+    references_followed,
+    sensitivities,
+)
+from ..analysis.stability.operating_point import OperatingPoint
+from ..core.error_bound import ErrorBound
+from ..core.feedback import Feedback
+from ..core.files import write_text
+from ..core.progress import Progress, Silent
+from .protocol import Gains, Stage, StageError
+from .run_files import run_file
+from .try_gains import Motion, TriedRun, abandoned, tried
+
+LEARN_FILE, LEARNED_FILE, TABLE_FILE = "learn.json", "learned.csv", "table.csv"
+
+ASSUMED = 0.3
+"""Relative error of a plant without a bound from its record."""
+
+TRUSTED = 0.5
+"""Relative error of the closed loop at which half of an error is corrected."""
+
+LARGEST = 2.0
+"""Largest correction of an error at one frequency, as a multiple of it."""
+
+REACH = 0.1
+"""Largest correction, as a share of the range of the motion."""
+
+ABOVE = 3.0
+"""Power of a line over that of noise alone which noise exceeds in 5 % of the lines."""
+
+RISE = 0.02
+"""Share of the motion at the beginning over which a correction rises from 0."""
+
+PATIENCE = 2
+"""Number of runs in a row without an improvement after which the learning ends."""
+
+GAINED = 0.98
+"""Ratio of two errors below which the smaller one is an improvement."""
+
+
+class LearnReport(BaseModel):
+    """Report of a learning, the content of ``learn.json``.
+
+    ``gains`` are those during the runs, ``before`` all gains of the stage before, which
+    are set again at the end. Run 1 follows the ``reference`` itself. ``best`` is the
+    place of the run with the smallest error, None if none was completed. ``verdict`` is
+    "done", "stopped" (a run was stopped, or the user ended it: the safe gains are set)
+    or "lost" (no connection); "running" until then.
+    """
+
+    stage: str
+    reference: str
+    gains: dict[str, float]
+    before: dict[str, float]
+    runs: list[TriedRun] = []
+    best: int | None = None
+    verdict: Literal["running", "done", "stopped", "lost"] = "running"
+    alarms: list[str] = []
+    notes: list[str] = []
+
+    @property
+    def ratio(self) -> float:
+        """Error of the first run relative to the smallest one."""
+        if self.best is None:
+            return math.nan
+        first, best = self.runs[0].measured_um, self.runs[self.best].measured_um
+        return (first or math.nan) / (best or math.nan)
+
+
+@dataclass(frozen=True)
+class LearningFilter:
+    """Correction of a reference per error, at ``frequency`` (Hz)."""
+
+    frequency: Float[np.ndarray, " lines"]
+    gain: Complex[np.ndarray, " lines"]
+
+    def correction(
+        self, error: Float[np.ndarray, " samples"], dt: float, noise: float = 0.0
+    ) -> Float[np.ndarray, " samples"]:
+        """Return the correction (um) for the ``error`` (um) of a run.
+
+        Outside the run the error counts as 0. Lines whose power is not above ABOVE
+        times that of white ``noise`` (um rms) are not corrected, stronger ones by what
+        is above it.
+        """
+        samples = len(error)
+        padded = 1 << (2 * samples - 1).bit_length()
+        at = np.fft.rfftfreq(padded, dt)
+        parts = (
+            np.interp(at, self.frequency, part)
+            for part in (self.gain.real, self.gain.imag)
+        )
+        real, imaginary = parts
+        spectrum = np.fft.rfft(error, padded)
+        floor = ABOVE * noise**2 * samples / np.maximum(np.abs(spectrum) ** 2, 1e-300)
+        spectrum *= np.clip(1.0 - floor, 0.0, 1.0) * (real + 1j * imaginary)
+        return np.fft.irfft(spectrum, padded)[:samples]
+
+
+def learning_filter(
+    loop: Feedback, highest: float, dt: float, bound: ErrorBound | None = None
+) -> LearningFilter:
+    """Return the filter of ``loop``, an inverse as far as its plant is known.
+
+    The reference passes the closed loop T (displacement over reference, small motions
+    below ``highest`` (um), mean of both branches of the hysteresis), so that an error e
+    asks for the correction e / T. If the plant has the relative error d, that of T is
+    |S| d, and what is left of e after a run |S| d e: the correction is multiplied by
+    1 / (1 + (|S| d / TRUSTED)^2), and is at most LARGEST times the error. d is
+    ``bound``, or ASSUMED without one. One axis.
+    """
+    point = OperatingPoint(np.asarray(highest), dt=dt)
+    followed = np.mean(np.asarray(references_followed(loop, point)), axis=0)
+    sensitivity = np.abs(np.asarray(sensitivities(loop, point))[..., 0, 0])
+    at = lines(dt)
+    unknown = np.full(len(at), ASSUMED) if bound is None else bound.at(at)
+    left = np.max(sensitivity, axis=0) * unknown
+    trust = 1.0 / (1.0 + (left / TRUSTED) ** 2)
+    size = np.minimum(trust / np.maximum(np.abs(followed), 1e-12), LARGEST)
+    return LearningFilter(at, size * np.exp(-1j * np.angle(followed)))
+
+
+def learn_reference(
+    stage: Stage,
+    gains: Gains,
+    motion: Motion,
+    law: LearningFilter,
+    folder: Path,
+    *,
+    runs: int,
+    points: int | None = None,
+    name: str = "stage",
+    progress: Progress | None = None,
+) -> LearnReport:
+    """Repeat ``motion`` on ``stage`` with ``gains``, and correct it after each run.
+
+    The corrected reference moves the stage along ``motion``. Learning ends after
+    ``runs`` runs, or when the error does not fall any more; then the gains from before
+    are set, after a run that was stopped or a fault the safe ones. ``folder`` receives
+    the samples of every run (its reference is the motion), the best reference in
+    ``learned.csv``, as a table of at most ``points`` points in ``table.csv``, and after
+    each run the report.
+
+    Raises as ``Stage.run`` does for gains that the stage does not have.
+    """
+    progress = progress or Silent()
+    report = LearnReport(
+        stage=name, reference=motion.name, gains=dict(gains), before=stage.gains()
+    )
+    _write(report, folder)
+    progress.stage(f"learning {motion.name} on the stage", runs)
+    try:
+        best = _repeat(stage, motion, law, folder, report, runs, progress)
+        _write_learned(folder, stage.dt, motion.reference, best, points)
+        if report.verdict == "running":
+            stage.apply(report.before)
+            report.verdict = "done"
+    except BaseException as error:
+        report.verdict, alarm = abandoned(stage, error)
+        report.alarms.append(alarm)
+        if not isinstance(error, StageError):
+            _write(report, folder)
+            raise
+    _write(report, folder)
+    return report
+
+
+def _repeat(
+    stage: Stage,
+    motion: Motion,
+    law: LearningFilter,
+    folder: Path,
+    report: LearnReport,
+    runs: int,
+    progress: Progress,
+) -> np.ndarray:
+    """Run and correct; return the best reference, um."""
+    wanted = motion.reference
+    largest, worse = REACH * float(np.ptp(wanted)), 0
+    rise = np.clip(np.arange(len(wanted)) / (RISE * len(wanted)), 0.0, 1.0)
+    rise = 0.5 - 0.5 * np.cos(np.pi * rise)
+    command = best = wanted
+    smallest = math.inf
+    while len(report.runs) < runs and worse < PATIENCE:
+        file = run_file(folder, len(report.runs) + 1)
+        run, measured = tried(stage, report.gains, motion, 1.0, file, command)
+        report.runs.append(run)
+        _write(report, folder)
+        if run.stopped or run.measured_um is None or measured is None:
+            stage.safe()
+            report.verdict = "stopped"
+            report.alarms.append(
+                f"run {len(report.runs)}: {run.stopped}; the safe gains of the stage "
+                "are set"
+            )
+            return best
+        progress.advance(
+            run.measured_um, f"{motion.name}: {1e3 * run.measured_um:.3g} nm rms"
+        )
+        worse = 0 if run.measured_um < GAINED * smallest else worse + 1
+        if run.measured_um < smallest:
+            smallest, best = run.measured_um, command
+            report.best = len(report.runs) - 1
+            _write_learned(folder, stage.dt, wanted, best)
+        change = law.correction(wanted - measured, stage.dt, motion.noise)
+        learned = command - wanted + rise * change
+        if np.max(np.abs(learned)) > largest and not report.notes:
+            report.notes.append(
+                f"corrections are cut at {largest:.4g} um, a tenth of the motion"
+            )
+        command = wanted + np.clip(learned, -largest, largest)
+    return best
+
+
+def _write(report: LearnReport, folder: Path) -> None:
+    write_text(folder / LEARN_FILE, report.model_dump_json(indent=2) + "\n")
+
+
+def _write_learned(
+    folder: Path,
+    dt: float,
+    wanted: np.ndarray,
+    command: np.ndarray,
+    points: int | None = None,
+) -> None:
+    """Write the motion and the reference that leads to it, and that in ``points``.
+
+    A waveform generator holds each point; all times are multiples of ``dt``.
+    """
+    both = np.stack([wanted, command])
+    tables = [(LEARNED_FILE, "time_s,motion_um,reference_um", both, 1)]
+    if points is not None:
+        hold = math.ceil(len(command) / points)
+        tables.append((TABLE_FILE, "time_s,reference_um", command[None], hold))
+    for name, head, columns, hold in tables:
+        rows = (
+            ",".join([f"{dt * hold * k:.9g}", *(f"{value:.7g}" for value in row)])
+            for k, row in enumerate(columns[:, ::hold].T)
+        )
+        write_text(folder / name, "\n".join([head, *rows]) + "\n")
