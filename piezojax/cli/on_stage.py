@@ -56,6 +56,8 @@ def learning_law(results: Path, named: Path | None) -> "LearningFilter":
     """
     from dataclasses import replace
 
+    import numpy as np
+
     from ..core.serial import load
     from ..stages.learning import learning_filter
     from ..study import read
@@ -64,7 +66,8 @@ def learning_law(results: Path, named: Path | None) -> "LearningFilter":
     case = read(named or results / STUDY_FILE)
     loop = replace(case.loop, controller=load(results / GAINS_FILE))
     bound = case.plant_about.error_bound
-    return learning_filter(loop, case.highest_reference, case.study.dt, bound)
+    highest = float(np.max(case.highest_reference))
+    return learning_filter(loop, highest, case.study.dt, bound)
 
 
 @contextmanager

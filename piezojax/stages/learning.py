@@ -100,7 +100,7 @@ class LearningFilter:
         at = np.fft.rfftfreq(padded, dt)
         parts = (
             np.interp(at, self.frequency, part)
-            for part in (self.gain.real, self.gain.imag)
+            for part in (np.real(self.gain), np.imag(self.gain))
         )
         real, imaginary = parts
         spectrum = np.fft.rfft(error, padded)
