@@ -225,8 +225,9 @@ class NV200Stage:
                 )
 
     async def _move(self, position: float) -> None:
-        await self._device.write("modsrc,0")
+        # The setpoint acts from modsrc on: the other order would move twice.
         await self._device.write(f"set,{position:.4f}")
+        await self._device.write("modsrc,0")
 
     async def _retreat(self) -> None:
         await self._generator.stop()
@@ -245,8 +246,8 @@ class NV200Stage:
         await self._start_recorder(reference.size)
         await self._generator.start(cycles=1)
         reason = await self._watched(reference.size * SAMPLE)
-        await self._device.write(f"set,{reference[-1]:.4f}")
-        await self._device.write("modsrc,0")
+        if not self._asked:  # else the stage moves to its safe position
+            await self._move(reference[-1])
         await self._recorder.stop_recording()
         columns = await self._recorder.read_recorded_data()
         measured, voltage = (np.array(column.values) for column in columns)
