@@ -90,6 +90,11 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+def write_report(path: Path, report: BaseModel) -> None:
+    """Write ``report`` to ``path`` as JSON, atomically; ``read_model`` reads it."""
+    write_text(path, report.model_dump_json(indent=2) + "\n")
+
+
 def read_model(kind: type[Model], path: Path, wrong: str) -> Model:
     """Read a JSON file as a model of class ``kind``.
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..core.about import About
 from ..core.axes import PerAxis
 from ..core.feedback import Observation
-from ..core.files import write_text
+from ..core.files import write_report
 from ..core.serial import from_data
 from ..core.system import System, accepts, rest_output
 from ..hardware import Saturation
@@ -128,7 +128,7 @@ def export(
     files = write_c(system, interface, inputs, folder, name, about, precision)
     if report is not None:
         files.append(folder / REPORT)
-        write_text(files[-1], report.model_dump_json(indent=2) + "\n")
+        write_report(files[-1], report)
     return files
 
 

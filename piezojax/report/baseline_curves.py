@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 from rich.text import Text
 
-from ..core.files import write_text
+from ..core.files import write_report
 from ..tuning.baselines import BaselineEntry, Baselines
 from ..tuning.baselines.entries import BASELINES_FILE
 from .comparison_map import MARKERS, SERIES_COLOURS
@@ -74,7 +74,7 @@ def _times(value: float | None) -> str:
 
 def write_baselines(baselines: Baselines, folder: Path) -> None:
     """Write baselines.json and baselines.png into ``folder``."""
-    write_text(folder / BASELINES_FILE, baselines.model_dump_json(indent=2) + "\n")
+    write_report(folder / BASELINES_FILE, baselines)
     with plot_style():
         write(baselines_figure(baselines), folder / "baselines.png")
 

@@ -10,7 +10,7 @@ from matplotlib.ticker import NullLocator
 from rich.table import Table
 from rich.text import Text
 
-from ..core.files import write_text
+from ..core.files import write_report
 from ..tuning.comparison import COMPARISON_FILE, ComparisonResult, TunedStudy
 from .figures import AFTER, BEFORE, MEASURED, figure, plot_style, write
 from .page import Page
@@ -137,8 +137,7 @@ def perturbed_text(comparison: ComparisonResult) -> str:
 
 def write_comparison(comparison: ComparisonResult, folder: Path) -> None:
     """Write comparison.json and comparison.png into ``folder``."""
-    text = comparison.model_dump_json(indent=2)
-    write_text(folder / COMPARISON_FILE, text + "\n")
+    write_report(folder / COMPARISON_FILE, comparison)
     if any(row.after_um for row in comparison.rows):
         with plot_style():
             write(comparison_figure(comparison), folder / "comparison.png")

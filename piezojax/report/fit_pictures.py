@@ -5,7 +5,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..core.files import write_text
+from ..core.files import write_report
 from ..core.serial import save
 from ..identification.estimators.estimate import LinearDetail
 from ..identification.fit import Fit
@@ -46,8 +46,7 @@ def write_model(fit: Fit, folder: Path) -> None:
     """Write model.json, its residual and fit.json into ``folder``."""
     save(fit.plant, folder / MODEL_FILE, fit.about)
     save_residual(ResidualRecord.of(fit), folder / MODEL_FILE)
-    text = fit.report.model_dump_json(indent=2)
-    write_text(folder / FIT_FILE, text + "\n")
+    write_report(folder / FIT_FILE, fit.report)
 
 
 def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> Pictures:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ..core.files import write_text
+from ..core.files import write_report, write_text
 from ..identification.fit import Fit
 from ..identification.ranking import (
     ModelRanking,
@@ -89,7 +89,7 @@ def _write_table(ranking: ModelRanking, report: RankingReport, folder: Path) -> 
             if not (place / FIT_FILE).exists():
                 place.mkdir(parents=True, exist_ok=True)
                 write_model(ranking.fits[row.model], place)
-    write_text(folder / RANKING_FILE, report.model_dump_json(indent=2) + "\n")
+    write_report(folder / RANKING_FILE, report)
     write_text(folder / TABLE_FILE, _csv(report))
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from ..core.files import write_text
+from ..core.files import write_report
 from ..core.serial import save
 from ..identification.residual_record import ResidualRecord, save_residual
 from ..identification.validation import RecordCheck, Validation, ValidationReport
@@ -42,8 +42,7 @@ def write_validation(
     save(found.system, folder / MODEL_FILE, found.about)
     if residual is not None:
         save_residual(residual, folder / MODEL_FILE)
-    text = found.report.model_dump_json(indent=2)
-    write_text(folder / VALIDATION_FILE, text + "\n")
+    write_report(folder / VALIDATION_FILE, found.report)
     with plot_style():
         return write(validation_figure(found), folder / VALIDATION_PICTURE)
 

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..core.files import write_text
+from ..core.files import write_report
 from ..core.serial import save
 from ..identification.estimators.modal_model import CONFIDENCE, ModalFit
 from ..identification.measured_response import distortion_level
@@ -55,8 +55,7 @@ def write_response(found: ResponseModel, folder: Path) -> Pictures:
     Returns the picture.
     """
     save(found.system, folder / MODEL_FILE, found.about)
-    text = found.report.model_dump_json(indent=2)
-    write_text(folder / REPORT_FILE, text + "\n")
+    write_report(folder / REPORT_FILE, found.report)
     save_response(found.response, folder / TABLE_FILE)
     with plot_style():
         picture = measured_figure(found.response, found.fit, found.report.found)
@@ -73,8 +72,7 @@ def write_levels(found: ResponseLevels, folder: Path) -> Pictures:
         inner.mkdir(parents=True)
         write_response(model, inner)
     drawn = write_response(found.chosen, folder)
-    text = found.report.model_dump_json(indent=2)
-    write_text(folder / LEVELS_FILE, text + "\n")
+    write_report(folder / LEVELS_FILE, found.report)
     with plot_style():
         return drawn | write(levels_figure(found), folder / LEVELS_PICTURE)
 

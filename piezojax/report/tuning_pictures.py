@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..core.axes import axis_of
-from ..core.files import write_text
+from ..core.files import write_report, write_text
 from ..core.serial import save
 from ..signals.waveforms import parse
 from ..study import Study, as_toml
@@ -80,7 +80,7 @@ def write_numbers(outcome: Outcome, folder: Path) -> None:
     before, after = outcome.drive
     found = {"drive_before": before, "drive": after}
     result = outcome.result.model_copy(update=found)
-    write_text(folder / RESULT_FILE, result.model_dump_json(indent=2) + "\n")
+    write_report(folder / RESULT_FILE, result)
     save(outcome.controller, folder / GAINS_FILE, outcome.about)
     write_text(folder / STUDY_FILE, as_toml(outcome.case.study))
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel
 
-from ..core.files import write_text
+from ..core.files import write_report
 from ..core.progress import Progress, Silent
 from ..identification import Record
 from .protocol import Gains, LostError, Stage, StoppedError
@@ -241,7 +241,7 @@ def watch(
         runs=judged,
         alarms=[sentence for each in judged if (sentence := _alarm(each))],
     )
-    write_text(folder / WATCH_FILE, report.model_dump_json(indent=2) + "\n")
+    write_report(folder / WATCH_FILE, report)
     return report
 
 

@@ -17,11 +17,11 @@ from ..analysis.stability.differentiable import (
 from ..analysis.stability.operating_point import OperatingPoint
 from ..core.error_bound import ErrorBound
 from ..core.feedback import Feedback
-from ..core.files import write_text
+from ..core.files import write_report, write_text
 from ..core.progress import Progress, Silent
-from .protocol import Gains, Stage, StageError
+from .protocol import Gains, Stage
 from .run_files import run_file
-from .try_gains import Motion, TriedRun, abandoned, tried
+from .try_gains import Motion, TriedRun, safe_after_failure, tried
 
 LEARN_FILE, LEARNED_FILE, TABLE_FILE = "learn.json", "learned.csv", "table.csv"
 
@@ -159,21 +159,14 @@ def learn_reference(
     report = LearnReport(
         stage=name, reference=motion.name, gains=dict(gains), before=stage.gains()
     )
-    _write(report, folder)
+    file = folder / LEARN_FILE
+    write_report(file, report)
     progress.stage(f"learning {motion.name} on the stage", runs)
-    try:
-        best = _repeat(stage, motion, law, folder, report, runs, progress)
-        _write_learned(folder, stage.dt, motion.reference, best, points)
+    with safe_after_failure(stage, report, file):
+        _repeat(stage, motion, law, folder, report, runs, points, progress)
         if report.verdict == "running":
             stage.apply(report.before)
             report.verdict = "done"
-    except BaseException as error:
-        report.verdict, alarm = abandoned(stage, error)
-        report.alarms.append(alarm)
-        if not isinstance(error, StageError):
-            _write(report, folder)
-            raise
-    _write(report, folder)
     return report
 
 
@@ -184,20 +177,20 @@ def _repeat(
     folder: Path,
     report: LearnReport,
     runs: int,
+    points: int | None,
     progress: Progress,
-) -> np.ndarray:
-    """Run and correct; return the best reference, um."""
+) -> None:
     wanted = motion.reference
     largest, worse = REACH * float(np.ptp(wanted)), 0
     rise = np.clip(np.arange(len(wanted)) / (RISE * len(wanted)), 0.0, 1.0)
     rise = 0.5 - 0.5 * np.cos(np.pi * rise)
-    command = best = wanted
+    command = wanted
     smallest = math.inf
     while len(report.runs) < runs and worse < PATIENCE:
         file = run_file(folder, len(report.runs) + 1)
         run, measured = tried(stage, report.gains, motion, 1.0, file, command)
         report.runs.append(run)
-        _write(report, folder)
+        write_report(folder / LEARN_FILE, report)
         if run.stopped or run.measured_um is None or measured is None:
             stage.safe()
             report.verdict = "stopped"
@@ -205,15 +198,14 @@ def _repeat(
                 f"run {len(report.runs)}: {run.stopped}; the safe gains of the stage "
                 "are set"
             )
-            return best
+            return
         progress.advance(
             run.measured_um, f"{motion.name}: {1e3 * run.measured_um:.3g} nm rms"
         )
         worse = 0 if run.measured_um < GAINED * smallest else worse + 1
         if run.measured_um < smallest:
-            smallest, best = run.measured_um, command
-            report.best = len(report.runs) - 1
-            _write_learned(folder, stage.dt, wanted, best)
+            smallest, report.best = run.measured_um, len(report.runs) - 1
+            _write_learned(folder, stage.dt, wanted, command, points)
         change = law.correction(wanted - measured, stage.dt, motion.noise)
         learned = command - wanted + rise * change
         if np.max(np.abs(learned)) > largest and not report.notes:
@@ -221,11 +213,6 @@ def _repeat(
                 f"corrections are cut at {largest:.4g} um, a tenth of the motion"
             )
         command = wanted + np.clip(learned, -largest, largest)
-    return best
-
-
-def _write(report: LearnReport, folder: Path) -> None:
-    write_text(folder / LEARN_FILE, report.model_dump_json(indent=2) + "\n")
 
 
 def _write_learned(
@@ -233,7 +220,7 @@ def _write_learned(
     dt: float,
     wanted: np.ndarray,
     command: np.ndarray,
-    points: int | None = None,
+    points: int | None,
 ) -> None:
     """Write the motion and the reference that leads to it, and that in ``points``.
 

@@ -2,16 +2,16 @@
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel
 
-from ..core.files import write_text
+from ..core.files import write_report
 from ..core.progress import Progress, Silent
 from ..identification import Record
 from .protocol import Gains, LostError, Stage, StageError, StoppedError
@@ -119,30 +119,42 @@ def trial(
         raise ValueError(
             f"the stage has no gain {missing[0]}; it has {', '.join(report.before)}"
         )
-    _write(report, folder)
+    file = folder / TRIAL_FILE
+    write_report(file, report)
     first = [(motions[0], share) for share in SMALL]
     planned = first + [(motion, 1.0) for motion in motions]
     progress.stage("trying the gains on the stage", len(planned))
-    try:
+    with safe_after_failure(stage, report, file):
         for number, (motion, share) in enumerate(planned, start=1):
-            file = run_file(folder, number)
-            run, _ = tried(stage, gains, motion, share, file)
+            samples = run_file(folder, number)
+            run, _ = tried(stage, gains, motion, share, samples)
             report.runs.append(run)
-            _write(report, folder)
+            write_report(file, report)
             if run.stopped or run.ratio > FAR:
                 break
             progress.advance(
                 run.ratio, f"{_named(run)}: {run.ratio:.2f} of the promised error"
             )
         _judge(stage, report)
+    return report
+
+
+@contextlib.contextmanager
+def safe_after_failure(stage: Stage, report: Any, file: Path) -> Iterator[None]:
+    """Do some work on ``stage`` and write ``report`` to ``file`` at its end.
+
+    If it fails, the stage is made safe and ``report`` has the alarm. An error of the
+    stage ends here, others are raised again.
+    """
+    try:
+        yield
     except BaseException as error:
         report.verdict, alarm = abandoned(stage, error)
         report.alarms.append(alarm)
         if not isinstance(error, StageError):
-            _write(report, folder)
             raise
-    _write(report, folder)
-    return report
+    finally:
+        write_report(file, report)
 
 
 def tried(
@@ -236,7 +248,3 @@ def _cause(error: BaseException) -> str:
 
 def _named(run: TriedRun) -> str:
     return f"{run.reference} at {100.0 * run.share:g} %"
-
-
-def _write(report: TrialReport, folder: Path) -> None:
-    write_text(folder / TRIAL_FILE, report.model_dump_json(indent=2) + "\n")

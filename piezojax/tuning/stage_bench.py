@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.files import write_text
+from ..core.files import write_report
 from ..core.progress import Progress
 from ..identification import Record
 from ..stages import Motion, Stage, TriedRun
@@ -44,8 +44,7 @@ class Bench:
 
     def write(self) -> None:
         """Write the report."""
-        text = self.report.model_dump_json(indent=2) + "\n"
-        write_text(self.folder / RETUNE_FILE, text)
+        write_report(self.folder / RETUNE_FILE, self.report)
 
     def measure(self, attempt: Attempt) -> None:
         """Run a small motion and the references with the gains of ``attempt``."""
