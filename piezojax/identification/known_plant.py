@@ -44,11 +44,13 @@ GAIN, DELAY = "calibration.gain", "delay"
 class KnownPlant:
     """A ``system`` and its origin ``about``, which names its fitted parameters.
 
+    Its linear dynamics, the delay included, are not fitted again if they are ``held``.
     Raises ValueError for a plant without fitted parameters.
     """
 
     system: System
     about: About
+    held: bool = False
 
     def __post_init__(self):
         if not self.about.standard_errors:
@@ -68,7 +70,9 @@ class KnownPlant:
         """Return the plant as a structure to fit to ``records``.
 
         It starts from the resonances that the records show, and from the known values.
-        A gain and a delay are fitted beside its own parameters.
+        A gain and a delay are fitted beside its own parameters. The errors of a record
+        count relative to its range: those of a hysteresis grow with the motion, and
+        would hide what a small motion shows.
         """
         whole = slice(0, max(record.samples for record in records))
         best, *_ = by_evidence(records, whole)
@@ -77,7 +81,10 @@ class KnownPlant:
         ranges = {path: _range(system, path, s) for path, s in deviations.items()}
         space = space_of(ranges)
         known = point_of(system, space)
-        explained = UNEXPLAINED * max(record.span for record in records)
+        spans = np.array([record.span for record in records])
+        sizes = [record.samples for record in records]
+        span = float(np.average(spans**-2.0, weights=sizes) ** -0.5)
+        explained = UNEXPLAINED * span
         widths = np.asarray(space.upper - space.lower)
         weights = widths / np.array(list(deviations.values()))
         prior = Prior(known, explained / math.sqrt(INDEPENDENT) * weights)
@@ -89,10 +96,17 @@ class KnownPlant:
             space,
             np.stack(starts),
             own=tuple(p for p in ranges if p == OFFSET or p.endswith("rest_input")),
-            dynamics=tuple(p for p in ranges if p.split(".")[0] in LINEAR),
+            dynamics=tuple(filter(_is_linear, ranges)),
             whitening=shown.whitening if shown.modes else (),
             prior=prior,
+            weights=tuple(map(float, span / spans)),
         )
+
+    def with_dynamics(self, fitted: System) -> "KnownPlant":
+        """Return this plant with the dynamics of ``fitted``, a fit of it, held."""
+        own = parameters(self.system)
+        others = {path: own[path] for path in own if not _is_linear(path)}
+        return dataclasses.replace(self, system=replace(fitted, others), held=True)
 
     def widened(self, about: About) -> About:
         """Return the origin ``about`` of a new fit, with the known ranges of inputs."""
@@ -110,7 +124,14 @@ class KnownPlant:
             if path in there
         }
         late = {path: LATE * dt for path in there if path.startswith(f"{DELAY}.")}
-        return found | late
+        every = found | late
+        return {
+            path: every[path] for path in every if not (self.held and _is_linear(path))
+        }
+
+
+def _is_linear(path: str) -> bool:
+    return path.partition(".")[0] in LINEAR
 
 
 def _with_delay(system: System, dt: float) -> System:

@@ -203,7 +203,7 @@ def _next_gains(
     for records in bench.records():
         file = bench.folder / f"model_{len(report.attempts)}.json"
         bench.progress.stage("fitting the plant to the runs")
-        alarms = _fit_again(plant, records, file)
+        alarms = _fit_again(plant, records, bench.small(records), file)
         if alarms:
             runs = ", ".join(record.source for record in records)
             report.notes.append(f"no plant describes {runs}: {alarms[0]}")
@@ -246,13 +246,22 @@ def _why_not(
 
 
 def _fit_again(
-    plant: KnownPlant, records: Sequence[Record], file: Path
+    plant: KnownPlant, records: Sequence[Record], small: Sequence[Record], file: Path
 ) -> Sequence[str]:
     """Fit ``plant`` to ``records``; write it with its residual; return its alarms.
 
-    There is none for records to which it cannot be fitted, only the reason.
+    Its dynamics are fitted to the ``small`` ones alone, if there are any: an error of
+    the hysteresis in a large motion would move them. A plant that cannot be fitted is
+    not written, and the reason is returned.
     """
     try:
+        if small:
+            every = slice(0, max(record.samples for record in small))
+            options = Options(known=plant)
+            fast = identify(
+                small, plant.model, train=every, validate=every, options=options
+            )
+            plant = plant.with_dynamics(fast.plant)
         fit = identify(records, plant.model, options=Options(known=plant))
     except ValueError as error:
         return [str(error)]

@@ -97,6 +97,11 @@ class Bench:
         }
         return [*found.values()]
 
+    def small(self, records: Sequence[Record]) -> list[Record]:
+        """Return those of ``records`` that are of small motions."""
+        files = {run.file for run in self.report.runs if run.reference == PROBE}
+        return [record for record in records if record.source in files]
+
     def _record(self, run: TriedRun) -> Record | None:
         """Return the record of ``run``, or None if it is too short or does not move."""
         columns = np.stack(load_samples(self.folder / run.file))

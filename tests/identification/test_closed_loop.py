@@ -239,6 +239,35 @@ def test_the_error_bound_of_a_loop_is_that_of_the_stage():
     assert np.median(wrong.error[certain]) == pytest.approx(1.0 / 3.0, abs=0.1)
 
 
+def slow_loop(seed, top=150.0, samples=3000, dt=1e-4):
+    """Return the record of a slow loop under sines up to ``top`` Hz, and its model.
+
+    The voltage contains more noise than response to them.
+    """
+    random = np.random.default_rng(seed)
+    time = dt * np.arange(samples)
+    sines = np.linspace(10.0, top, 15)
+    phases = random.uniform(0.0, 2.0 * np.pi, 15)
+    reference = np.sum(np.sin(2.0 * np.pi * sines * time[:, None] + phases), axis=1)
+    noise = 0.05 * random.standard_normal(samples)
+    output, input = np.zeros((2, samples))
+    for k in range(samples):
+        input[k] = input[k - 1] + 0.2 * (reference[k] - output[k] - noise[k])
+        if k + 1 < samples:
+            output[k + 1] = 0.9 * output[k] + 0.01 * input[k]
+    return Record(input, output + noise, dt, reference=reference), output
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_lines_that_the_reference_does_not_excite_show_no_error(seed):
+    """There the error is noise, and the response of the model is nearly zero."""
+    record, model = slow_loop(seed)
+    found = relative_error(record, model, slice(1500, 3000))
+    assert found.frequency.min() < 100.0
+    assert found.frequency.max() < 400.0
+    assert not np.any(found.sure)
+
+
 # Fits
 
 

@@ -112,6 +112,36 @@ def test_one_standard_deviation_costs_a_hundredth_of_the_range():
     assert np.count_nonzero(extra) == 1
 
 
+def test_errors_count_relative_to_the_range_of_their_record():
+    small = record(plant(), 30.0)
+    large = Record(4.0 * small.input, 4.0 * small.output, DT)
+    shape = known().structure([large, small])
+    shape = shape.without(shape.own)
+    problem = problem_of(shape, [large, small], slice(0, 1500))
+    of_large, of_small = np.asarray(problem.weights)
+    np.testing.assert_allclose(of_small[100:1500], 4.0 * of_large[100:1500])
+    assert np.sum(problem.weights**2) == pytest.approx(1.0)
+
+
+def test_held_dynamics_are_those_of_the_first_fit():
+    """The hysteresis of the stage is another one: the large motion moves the mode."""
+    stage = plant(frequency=700.0, delay=1.0)
+    other = replace(stage, {"hysteresis.weights.0": 0.04})
+    small = record(stage, 30.0)
+    drive = 15.0 * (small.input - small.input[0])
+    large = Record(drive, np.asarray(free_run(other, jnp.asarray(drive), 0.0)), DT)
+    start = known()
+    fast = identify(small, start.model, options=Options(known=start)).plant
+    again = start.with_dynamics(fast)
+    fit = identify([small, large], start.model, options=Options(known=again))
+    for path in ("dynamics.frequency", "dynamics.damping", "delay.delay"):
+        assert float(get(fit.plant, path)) == float(get(fast, path))
+        assert path not in fit.report.parameters
+    assert float(get(fast, "dynamics.frequency")) == pytest.approx(700.0, rel=0.02)
+    assert "hysteresis.weights.0" in fit.report.parameters
+    assert "calibration.gain" in fit.report.parameters
+
+
 def test_the_jacobian_contains_the_prior():
     start = known()
     one = record(plant(), 30.0)

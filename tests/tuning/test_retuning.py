@@ -65,7 +65,7 @@ def scripted(monkeypatch):
                 result=result, controller=controller, case=case, about=about
             )
 
-        def fitted(plant, records, file):
+        def fitted(plant, records, small, file):
             save(plant.system, file, plant.about)
 
         monkeypatch.setattr(retuning, "tune", tuned)
@@ -321,7 +321,7 @@ def test_a_run_is_fitted_until_its_first_missing_number(
     monkeypatch.setattr(
         retuning,
         "_fit_again",
-        lambda plant, records, file: (
+        lambda plant, records, small, file: (
             seen.append([r.samples for r in records]) or ["no"]
         ),
     )

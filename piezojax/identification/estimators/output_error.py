@@ -228,8 +228,8 @@ def problem_of(
         size = min(record.samples, samples)
         inputs[row, :size], inputs[row, size:] = drive[:size], drive[size - 1]
         outputs[row, :size] = record.output[:size]
-        weights[row, train.start : size] = 1.0
-    weights /= np.sqrt(np.sum(weights))
+        weights[row, train.start : size] = structure.weight(row)
+    weights /= np.sqrt(np.sum(weights**2))
     return Problem(
         structure.system,
         structure.space,

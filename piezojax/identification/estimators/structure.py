@@ -28,6 +28,7 @@ class Structure(NamedTuple):
     ``whitening`` holds the coefficients of a filter that turns the errors into white
     noise; if it has any, the filtered errors count as much as the errors themselves,
     which are largest at low frequencies. ``prior`` is that of the parameters, if any.
+    ``weights`` are those of the errors of each record, by default equal.
     """
 
     system: System
@@ -37,6 +38,11 @@ class Structure(NamedTuple):
     dynamics: tuple[str, ...] = ()
     whitening: tuple[float, ...] = ()
     prior: Prior | None = None
+    weights: tuple[float, ...] = ()
+
+    def weight(self, record: int) -> float:
+        """Return the weight of the errors of a record."""
+        return self.weights[record] if self.weights else 1.0
 
     @property
     def order(self) -> int:

@@ -102,7 +102,8 @@ def relative_error(record: Record, run: np.ndarray, part: slice) -> RelativeErro
     )
     size = np.maximum(np.abs(own.response), np.finfo(float).tiny)
     resolution = 1.0 / ((period or segment) * record.dt)
-    kept = slice(None) if period else _stands_out(own, resolution)
+    lines = _places(own, resolution)
+    kept = slice(None) if period else _stands_out(own.power, lines)
     return RelativeError(
         residual.frequency[kept],
         (np.abs(residual.response) / size)[kept],
@@ -127,7 +128,10 @@ def _closed_loop_error(
     resolution = 1.0 / (segment * record.dt)
     # Of noise alone, few averages explain a share by chance.
     chance = 1.0 - CHANCE ** (1.0 / max(own.averages - 1.0, 1.0))
-    excited = _stands_out(own, resolution)
+    places = _places(own, resolution)
+    excited = _stands_out(own.power, places)
+    # Where the excitation is leakage of its own other lines, so is what follows it.
+    excited &= _stands_out(_power(signals, segment)[places], places)
     if np.any(excited & (own.coherence > chance)):
         excited &= own.coherence > chance
     kept = np.isin(ratio.frequency, own.frequency[excited])
@@ -139,17 +143,33 @@ def _closed_loop_error(
     )
 
 
-def _stands_out(found: SpectralResponse, resolution: float) -> np.ndarray:
-    """Return whether the input's power in each line exceeds the leakage of others."""
+def _places(found: SpectralResponse, resolution: float) -> np.ndarray:
+    """Return the numbers of the lines of ``found``."""
+    return np.round(found.frequency / resolution).astype(int)
+
+
+def _power(signals: np.ndarray, segment: int) -> np.ndarray:
+    """Return the power by line of ``signals`` [samples, k], each of variance 1."""
     import scipy.signal  # takes long to import
 
-    places = np.round(found.frequency / resolution).astype(int)
-    power = np.zeros(places.max() + 1)
-    power[places] = found.power
-    distance = np.arange(1, power.size)
+    settings = {"nperseg": segment, "detrend": "linear", "axis": 0}
+    _, power = scipy.signal.welch(signals / signals.std(axis=0), **settings)
+    return np.sum(power, axis=1)
+
+
+def _stands_out(power: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return whether the ``power`` of each line exceeds the leakage of the others.
+
+    ``places`` are the numbers of the lines.
+    """
+    import scipy.signal  # takes long to import
+
+    every = np.zeros(places.max() + 1)
+    every[places] = power
+    distance = np.arange(1, every.size)
     kernel = np.where(distance > 2, LEAKAGE / distance.astype(float) ** 6, 0.0)
-    leaked = scipy.signal.fftconvolve(power, np.r_[kernel[::-1], 0.0, kernel])
-    return found.power > leaked[places + power.size - 1]
+    leaked = scipy.signal.fftconvolve(every, np.r_[kernel[::-1], 0.0, kernel])
+    return power > leaked[places + every.size - 1]
 
 
 def error_bound(
