@@ -69,10 +69,11 @@ class KnownPlant:
     def structure(self, records: Sequence[Record]) -> Structure:
         """Return the plant as a structure to fit to ``records``.
 
-        It starts from the resonances that the records show, and from the known values.
-        A gain and a delay are fitted beside its own parameters. The errors of a record
-        count relative to its range: those of a hysteresis grow with the motion, and
-        would hide what a small motion shows.
+        It starts from the resonances that the records show, and from the known values,
+        both also with a longer delay, because a search does not leave a delay of 0. A
+        gain and a delay are fitted beside its own parameters. If the dynamics are
+        held, the errors of a record count relative to its range: those of a hysteresis
+        grow with the motion, and would hide what a small motion shows of the gain.
         """
         whole = slice(0, max(record.samples for record in records))
         best, *_ = by_evidence(records, whole)
@@ -82,6 +83,8 @@ class KnownPlant:
         space = space_of(ranges)
         known = point_of(system, space)
         spans = np.array([record.span for record in records])
+        if not self.held:
+            spans = np.full_like(spans, spans.max())
         sizes = [record.samples for record in records]
         span = float(np.average(spans**-2.0, weights=sizes) ** -0.5)
         explained = UNEXPLAINED * span
@@ -90,7 +93,9 @@ class KnownPlant:
         prior = Prior(known, explained / math.sqrt(INDEPENDENT) * weights)
         shown = dynamics_of(best)
         resonances = [mode.frequency for mode in shown.modes]
-        starts = [point_of(_at_resonances(system, ranges, resonances), space), known]
+        moved = _at_resonances(system, ranges, resonances)
+        later = [_later(one, ranges, best.dt) for one in (moved, system)]
+        starts = [point_of(one, space) for one in (moved, system, *later)]
         return Structure(
             system,
             space,
@@ -163,6 +168,12 @@ def _range(system: System, path: str, deviation: float) -> Range:
         low = max(low, limits.least, limits.above + margin)
         high = min(high, limits.most, limits.below - margin)
     return Range(low, high)
+
+
+def _later(system: System, ranges: Mapping[str, Range], dt: float) -> System:
+    """Return ``system`` with its fitted delay one standard deviation longer."""
+    found = [path for path in ranges if path.startswith(f"{DELAY}.")]
+    return replace(system, {p: float(get(system, p)) + LATE * dt for p in found})
 
 
 def _at_resonances(

@@ -250,24 +250,29 @@ def _fit_again(
 ) -> Sequence[str]:
     """Fit ``plant`` to ``records``; write it with its residual; return its alarms.
 
-    Its dynamics are fitted to the ``small`` ones alone, if there are any: an error of
-    the hysteresis in a large motion would move them. A plant that cannot be fitted is
-    not written, and the reason is returned.
+    If it describes the ``small`` ones alone, they give its dynamics: an error of the
+    hysteresis in a large motion would move them. A plant that cannot be fitted is not
+    written, and the reason is returned.
     """
     try:
-        if small:
-            every = slice(0, max(record.samples for record in small))
-            options = Options(known=plant)
-            fast = identify(
-                small, plant.model, train=every, validate=every, options=options
-            )
-            plant = plant.with_dynamics(fast.plant)
-        fit = identify(records, plant.model, options=Options(known=plant))
+        fit = identify(
+            records, plant.model, options=Options(known=_with_shown(plant, small))
+        )
     except ValueError as error:
         return [str(error)]
     save(fit.plant, file, about=fit.about)
     save_residual(ResidualRecord.of(fit), file)
     return fit.report.alarms
+
+
+def _with_shown(plant: KnownPlant, small: Sequence[Record]) -> KnownPlant:
+    """Return ``plant`` with the dynamics that the ``small`` records show, if any do."""
+    if not small:
+        return plant
+    every = slice(0, max(record.samples for record in small))
+    options = Options(known=plant)
+    fit = identify(small, plant.model, train=every, validate=every, options=options)
+    return plant if fit.report.alarms else plant.with_dynamics(fit.plant)
 
 
 def _near(

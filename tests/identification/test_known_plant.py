@@ -112,14 +112,17 @@ def test_one_standard_deviation_costs_a_hundredth_of_the_range():
     assert np.count_nonzero(extra) == 1
 
 
-def test_errors_count_relative_to_the_range_of_their_record():
+@pytest.mark.parametrize(("held", "factor"), [(False, 1.0), (True, 4.0)])
+def test_errors_count_relative_to_the_range_if_dynamics_are_held(held, factor):
     small = record(plant(), 30.0)
     large = Record(4.0 * small.input, 4.0 * small.output, DT)
-    shape = known().structure([large, small])
+    start = known()
+    start = start.with_dynamics(plant(delay=1.0)) if held else start
+    shape = start.structure([large, small])
     shape = shape.without(shape.own)
     problem = problem_of(shape, [large, small], slice(0, 1500))
     of_large, of_small = np.asarray(problem.weights)
-    np.testing.assert_allclose(of_small[100:1500], 4.0 * of_large[100:1500])
+    np.testing.assert_allclose(of_small[100:1500], factor * of_large[100:1500])
     assert np.sum(problem.weights**2) == pytest.approx(1.0)
 
 
@@ -180,15 +183,18 @@ def test_a_delay_may_grow(delay):
     assert float(get(shape.system, "delay.delay")) == pytest.approx(before * DT)
 
 
-def test_the_search_also_starts_at_the_resonance_of_the_record():
+def test_the_search_also_starts_at_the_resonance_of_the_record_and_later():
     changed = record(plant(frequency=600.0), 30.0)
     shape = known().structure([changed])
-    place = shape.space.paths.index("dynamics.frequency")
-    values = [
-        np.asarray(shape.space.from_unit(jnp.asarray(start)))[place]
-        for start in shape.starts
-    ]
-    assert values == pytest.approx([600.0, 800.0], rel=0.02)
+    places = [*map(shape.space.paths.index, ("dynamics.frequency", "delay.delay"))]
+    frequencies, delays = np.array(
+        [
+            np.asarray(shape.space.from_unit(jnp.asarray(u)))[places]
+            for u in shape.starts
+        ]
+    ).T
+    assert frequencies == pytest.approx([600.0, 800.0, 600.0, 800.0], rel=0.02)
+    assert delays == pytest.approx([0.0, 0.0, DT, DT], abs=1e-3 * DT)
 
 
 def test_the_range_of_the_known_record_remains():
