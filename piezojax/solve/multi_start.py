@@ -5,8 +5,10 @@ Optimiser (``BatchedDescents``). ``minimise`` adds the rounds of the augmented
 Lagrangian; its strategies are ``successive_halving`` and ``lockstep``.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,9 @@ from .augmented_lagrangian import rounds, update_multipliers
 from .optimisers import View
 from .problem import TOLERANCE, Problem, Verdict
 from .search_state import SearchState
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 Cut = Callable[[int, int], int | None]
 """``cut(step, running)`` returns the number of descents kept after a step, or None to
@@ -102,18 +107,34 @@ def descend(
             bests = []
 
 
-def in_batches(program: Callable[[Any], Any], points: Any, width: int) -> Any:
+def in_threads(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """Return ``function`` of each of ``items``, computed in parallel threads.
+
+    A compiled program uses one processor and releases the interpreter lock.
+    """
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        return list(pool.map(function, items))
+
+
+def in_batches(
+    program: Callable[[Any], Any],
+    points: Any,
+    width: int,
+    each: Callable[[Callable, Iterable], Iterable] = map,
+) -> Any:
     """Call ``program``, which takes ``width`` points, on any number of points.
 
     Leaves of the points and of the result have a leading axis for the points. Copies of
-    the last point fill the last batch.
+    the last point fill the last batch. ``each`` calls a function with every batch:
+    ``map``, or ``in_threads`` if the memory suffices for several at once.
     """
     count = len(jax.tree.leaves(points)[0])
     rows = np.minimum(np.arange(-(-count // width) * width), count - 1)
-    results = [
-        program(jax.tree.map(lambda x, rows=batch: as_array(x[rows]), points))
-        for batch in rows.reshape(-1, width)
-    ]
+
+    def of_batch(batch: np.ndarray) -> Any:
+        return program(jax.tree.map(lambda x: as_array(x[batch]), points))
+
+    results = each(of_batch, rows.reshape(-1, width))
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *results)
 
 

@@ -1,9 +1,6 @@
 """Successive halving: every few steps the worse half of the descents is dropped."""
 
-import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
 
 import jax
 import numpy as np
@@ -13,13 +10,11 @@ from ..core.arrays import as_array
 from ..core.progress import Progress
 from .augmented_lagrangian import with_zero_multipliers
 from .clock import Clock
-from .gauss_newton import PARALLEL, Descent, GaussNewton
-from .local_model import UNIT_BOX
-from .multi_start import Patience, in_batches
-from .problem import Problem, Verdict
+from .gauss_newton import PARALLEL, Descent, GaussNewton, Trials
+from .local_model import UNIT_BOX, LocalModel
+from .multi_start import Patience, in_batches, in_threads
+from .problem import Errors, Problem, Verdict
 from .sampled_errors import derivatives_at, errors_at, local_model, trials_of
-
-R = TypeVar("R")
 
 HALVING_STEPS = 3
 """Number of steps after which the worse half of the descents is dropped."""
@@ -27,8 +22,8 @@ HALVING_STEPS = 3
 PATIENCE = 5
 """Number of steps in which a descent must gain its tolerance."""
 
-POINTS = len(PARALLEL.multiples)
-"""Points evaluated at once."""
+LANES = 32
+"""Least number of runs in one program: fewer take as long."""
 
 
 def better_half(step: int, running: int) -> int | None:
@@ -36,24 +31,13 @@ def better_half(step: int, running: int) -> int | None:
     return (running + 1) // 2 if step % HALVING_STEPS == 0 else None
 
 
-def in_threads(function: Callable[[np.ndarray], R]) -> Callable[[np.ndarray], list[R]]:
-    """Return a function that calls ``function`` with each row, in parallel threads.
-
-    An evaluation uses one processor and releases the interpreter lock.
-    """
-
-    def of_all(rows: np.ndarray) -> list[R]:
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            return list(pool.map(function, rows))
-
-    return of_all
-
-
 class SuccessiveHalving:
     """Gauss-Newton descents on ``problem``; every few steps the worse half is dropped.
 
     The curvature is computed from every ``every``-th error. A descent ends when it
-    gains less than ``tolerance`` in PATIENCE steps. ``size`` is the number of unknowns.
+    gains less than ``tolerance`` in PATIENCE steps. ``size`` is the number of unknowns,
+    ``lanes`` that of the runs at a point; points that give ``LANES`` runs are evaluated
+    in one program, and several such programs in parallel.
     After the first round of an augmented Lagrangian only the best descent continues.
     """
 
@@ -62,11 +46,19 @@ class SuccessiveHalving:
     finalists = 1
 
     def __init__(
-        self, problem: Problem, size: int, clock: Clock, *, tolerance: float, every: int
+        self,
+        problem: Problem,
+        size: int,
+        clock: Clock,
+        *,
+        lanes: int,
+        tolerance: float,
+        every: int,
     ):
         self._problem = problem = with_zero_multipliers(problem)
         self._clock, self._patience = clock, Patience(PATIENCE, gain=tolerance)
-        units = as_array(np.zeros((POINTS, size)))
+        self._width = min(-(-LANES // lanes), len(PARALLEL.multiples))
+        units = as_array(np.zeros((self._width, size)))
         # The derivatives compile in the background, while the box is screened.
         self._pool = ThreadPoolExecutor(1)
         self._derivatives = self._pool.submit(
@@ -82,13 +74,14 @@ class SuccessiveHalving:
     def screen(self, problem: Problem, units: np.ndarray) -> tuple[np.ndarray, Verdict]:
         """Return loss, without multipliers, and verdict of any number of points."""
         problem = problem.with_multipliers(self._problem.multipliers)
-        return self._screened(problem, units)
+        points = self._errors_at(problem, units)
+        return np.asarray(points.loss), points.verdict
 
-    def _screened(
-        self, problem: Problem, units: np.ndarray
-    ) -> tuple[np.ndarray, Verdict]:
-        points = in_batches(lambda batch: self._errors(problem, batch), units, POINTS)
-        return points.loss, points.verdict
+    def _errors_at(self, problem: Problem, units: np.ndarray) -> Errors:
+        def program(batch: Array) -> Errors:
+            return self._errors(problem, batch)
+
+        return in_batches(program, units, self._width, in_threads)
 
     def wait(self) -> None:
         """Wait until the derivatives are compiled."""
@@ -105,14 +98,20 @@ class SuccessiveHalving:
         """Return descents from ``units``, and the number of evaluations used."""
         # Multipliers are 0 in the first round; later there is only one descent.
         problem = problem.with_multipliers(multipliers[0])
-        losses, verdicts = self._screened(problem, units)
+        here = self._errors_at(problem, units)
 
-        def linearise(unit):
+        def linearise(units: np.ndarray) -> list[LocalModel | None]:
             derivatives = self._derivatives.result()
-            return local_model(unit, derivatives(problem, as_array(unit)))
+            found = in_threads(lambda u: derivatives(problem, as_array(u)), units)
+            return [*map(local_model, units, found)]
 
-        def evaluate(units):
-            return trials_of(self._errors(problem, as_array(units)))
+        def evaluate(points: np.ndarray) -> list[Trials]:
+            descents, tried, size = points.shape
+            every = self._errors_at(problem, points.reshape(-1, size))
+            return [
+                trials_of(jax.tree.map(lambda x, i=i: x[i : i + tried], every))
+                for i in range(0, descents * tried, tried)
+            ]
 
         descents = [
             Descent(
@@ -120,10 +119,9 @@ class SuccessiveHalving:
                 PARALLEL,
                 UNIT_BOX,
                 self._patience,
-                loss=float(losses[i]),
-                verdict=jax.tree.map(lambda x, i=i: x[i], verdicts),
+                loss=float(here.loss[i]),
+                verdict=jax.tree.map(lambda x, i=i: x[i], here.verdict),
             )
             for i, unit in enumerate(units)
         ]
-        group = GaussNewton(descents, in_threads(evaluate), in_threads(linearise))
-        return group, len(descents)
+        return GaussNewton(descents, evaluate, linearise), len(descents)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..analysis.constraints import LoopFigures, worst_by_plant
 from ..core.progress import Progress
+from ..solve.multi_start import in_threads
 from ..study import Case
 from .alarms import PEAK
 from .data import Data
@@ -30,9 +31,10 @@ def figures_beside(
         name: replace(own, loop=replace(own.loop, controller=controller))
         for name, controller in case.beside.items()
     }
+    progress.stage(f"evaluating {len(others)} other controllers")
+    in_threads(HeldOut.compute, others.values())
     found = {}
     for name, held_out in (others | dict(loops)).items():
-        progress.stage(f"evaluating {name}")
         (error,) = _errors(held_out.nominal, driven)
         plants = held_out.perturbed
         peak = np.inf

@@ -24,7 +24,7 @@ from ..core.feedback import Feedback
 from ..core.metrics import ExtremeFigures, Extremes, TrackingFigures
 from ..core.rollout import Metric
 from ..solve.clock import Clock
-from ..solve.multi_start import in_batches
+from ..solve.multi_start import in_batches, in_threads
 from ..study import Case, Stage
 from ..study.ensemble import Part
 from .data import held, own_stage
@@ -32,8 +32,12 @@ from .level_stages import level_stages
 from .objective import MARGIN_BLOCK, StepTest, margins_on
 from .runs import Signals, evaluate
 
-CARRIED = 64
-"""Largest number of plants whose margins a search computes at a point."""
+EVERY = 65
+"""Largest number of plants whose margins a search computes all at every point: those
+that an ensemble draws by default, and the nominal one."""
+
+CARRIED = 16
+"""Number of plants whose margins a search computes if there are more."""
 
 
 RUN_BLOCK = 8
@@ -128,22 +132,28 @@ class Evaluator:
         The compiled program evaluates ``width`` stages at a time.
         """
         dynamic, static = eqx.partition(stages, eqx.is_array)
+        first = np.minimum(np.arange(width), _count(stages) - 1)
 
-        def found(batch):
-            every = eqx.combine(batch, static), *arguments
-            return self._clock.compiled(program, *every)(*every)
+        def with_arguments(batch):
+            return eqx.combine(batch, static), *arguments
 
-        return jax.tree.map(jnp.asarray, in_batches(found, dynamic, width))
+        compiled = self._clock.compiled(
+            program, *with_arguments(jax.tree.map(lambda x: x[first], dynamic))
+        )
+        found = in_batches(
+            lambda batch: compiled(*with_arguments(batch)), dynamic, width, in_threads
+        )
+        return jax.tree.map(jnp.asarray, found)
 
     def worst_plants(self, loop: Feedback, before: Carried | None = None) -> Carried:
-        """Return the plants that a search from ``loop`` carries: ``CARRIED`` at most.
+        """Return the plants that a search from ``loop`` carries.
 
-        They have the largest excess over the limits on margins. Up to half of them are
-        the worst of those carried ``before``, so that a search keeps the plants whose
-        limits were active.
+        Of more than ``EVERY`` plants it carries ``CARRIED``: those with the largest
+        excess over the limits on margins. Up to half of them are the worst of those
+        carried ``before``, so that a search keeps the plants whose limits were active.
         """
         stages = self.margin_stages
-        if _count(stages) <= CARRIED or not uses(self.limits, "margins"):
+        if _count(stages) <= EVERY or not uses(self.limits, "margins"):
             return Carried(0.0, None, np.empty(0, int))
         margins = self._margins(loop, stages)
         assert margins is not None

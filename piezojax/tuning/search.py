@@ -29,7 +29,12 @@ def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:
         counted = objective.signals.references.shape[1] - objective.start
         every = spacing(objective.lanes, counted)
         return SuccessiveHalving(
-            objective, size, clock, tolerance=table.tolerance, every=every
+            objective,
+            size,
+            clock,
+            lanes=objective.lanes,
+            tolerance=table.tolerance,
+            every=every,
         )
     below = FORWARD_BELOW_WITH_AXES if case.study.axes else FORWARD_BELOW
     return LockstepDescent(

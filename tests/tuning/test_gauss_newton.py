@@ -19,7 +19,7 @@ from piezojax.core.feedback import loop_inputs
 from piezojax.solve.clock import Clock
 from piezojax.solve.gauss_newton import PARALLEL, Descent, GaussNewton
 from piezojax.solve.local_model import UNIT_BOX, LocalModel
-from piezojax.solve.multi_start import Patience, descend
+from piezojax.solve.multi_start import Patience, descend, in_threads
 from piezojax.solve.problem import Errors, Verdict
 from piezojax.solve.sampled_errors import (
     derivatives_at,
@@ -28,7 +28,7 @@ from piezojax.solve.sampled_errors import (
     spacing,
     trials_of,
 )
-from piezojax.solve.successive_halving import POINTS, better_half, in_threads
+from piezojax.solve.successive_halving import better_half
 from piezojax.study import Study, build
 from piezojax.tuning.data import make_data
 from piezojax.tuning.objective import Objective
@@ -91,8 +91,11 @@ def descents_on(kind, units, linearise=None, tolerance=1e-14):
         )
         for unit in units
     ]
-    evaluate = in_threads(lambda u: trials_of(errors(as_array(u))))
-    return descents, GaussNewton(descents, evaluate, in_threads(linearise))
+    return descents, GaussNewton(
+        descents,
+        lambda units: in_threads(lambda u: trials_of(errors(as_array(u))), units),
+        lambda units: in_threads(linearise, units),
+    )
 
 
 @pytest.mark.parametrize("kind", PROBLEMS)
@@ -276,7 +279,7 @@ def programs(objective):
 
 
 def test_screening_any_number_of_points(objective, programs):
-    points = np.random.default_rng(0).uniform(0.1, 0.9, (POINTS + 1, 2))
+    points = np.random.default_rng(0).uniform(0.1, 0.9, (5, 2))
     found, verdict = programs.screen(objective, points)
     np.testing.assert_array_equal(found, verdict.loss)
     expected = jax.jit(jax.vmap(lambda u: objective.loss(u)))(jnp.asarray(points))
@@ -299,7 +302,7 @@ def test_a_study_is_tuned(outcome):
     assert len(result.times_s) == len(history)
     # Each step of each descent needs derivatives, unless the last step was rejected,
     # and three times as many points as dampings.
-    steps = (result.evaluations - 9 - 3) / (1 + 3 * POINTS)
+    steps = (result.evaluations - 9 - 3) / (1 + 3 * len(PARALLEL.multiples))
     assert len(history) < steps <= 3 * len(history)
 
 

@@ -194,6 +194,7 @@ def test_the_limit_is_kept_and_active_at_the_exact_margin(outcome):
 def test_a_search_on_the_worst_plants_keeps_the_limit_on_all(
     outcome, monkeypatch, tmp_path
 ):
+    monkeypatch.setattr(evaluator, "EVERY", 2)
     monkeypatch.setattr(evaluator, "CARRIED", 2)
     found = pj.tune(written(tmp_path, changed(pareto=None))).result
     kept = found.constraints["sensitivity_peak"]
@@ -202,6 +203,7 @@ def test_a_search_on_the_worst_plants_keeps_the_limit_on_all(
 
 
 def test_the_worst_plants_are_those_with_the_largest_exact_peak(outcome, monkeypatch):
+    monkeypatch.setattr(evaluator, "EVERY", 2)
     monkeypatch.setattr(evaluator, "CARRIED", 2)
     case = dataclasses.replace(
         outcome.case,
