@@ -384,7 +384,8 @@ def _to_explain(record: Record, columns: np.ndarray, part: slice) -> np.ndarray:
     if not record.excitation.size:
         return columns[part]
     found = excited_columns(record, columns)[part]
-    return found - found.mean(axis=0)
+    # A record that ends before the part has nothing in it.
+    return found - found.mean(axis=0) if len(found) else found
 
 
 def unexplained_share(errors: np.ndarray, outputs: np.ndarray) -> float:

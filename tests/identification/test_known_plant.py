@@ -95,6 +95,19 @@ def test_the_bias_by_feedback_is_said():
     assert report.closed_loop.startswith("free run from the measured input, near")
 
 
+def test_a_run_that_ended_early_is_not_validated():
+    start, one = known(), record(plant(), 30.0)
+    whole = Record(one.input, one.output, DT, reference=one.output)
+    early = Record(one.input[:600], one.output[:600], DT, reference=one.output[:600])
+    options = Options(known=start, steps=1)
+    both, alone = (
+        identify(records, start.model, options=options).report
+        for records in ([whole, early], whole)
+    )
+    assert np.isfinite(both.validation.rmse)
+    assert both.validation.rmse == pytest.approx(alone.validation.rmse, rel=0.1)
+
+
 def test_one_standard_deviation_costs_a_hundredth_of_the_range():
     start = known()
     one = record(plant(), 30.0)
