@@ -99,7 +99,7 @@ class KnownPlant:
         return Structure(
             system,
             space,
-            np.stack(starts),
+            np.stack([*{tuple(start): start for start in starts}.values()]),
             own=tuple(p for p in ranges if p == OFFSET or p.endswith("rest_input")),
             dynamics=tuple(filter(_is_linear, ranges)),
             whitening=shown.whitening if shown.modes else (),

@@ -31,21 +31,25 @@ def figures_beside(
         name: replace(own, loop=replace(own.loop, controller=controller))
         for name, controller in case.beside.items()
     }
-    progress.stage(f"evaluating {len(others)} other controllers")
-    in_threads(HeldOut.compute, others.values())
-    found = {}
-    for name, held_out in (others | dict(loops)).items():
-        (error,) = _errors(held_out.nominal, driven)
-        plants = held_out.perturbed
-        peak = np.inf
-        if PEAK in case.study.limits:
-            peak = np.max(worst_by_plant([PEAK], plants or held_out.nominal)[PEAK])
-        found[name] = Beside(
-            nominal_rms_um=number(error),
-            **({} if plants is None else _of_plants(_errors(plants, driven))),
-            sensitivity_peak=number(peak),
-        )
-    return found
+    every = others | dict(loops)
+    progress.stage("evaluating the other controllers")
+    found = in_threads(
+        lambda held_out: _figures(held_out, case, driven), every.values()
+    )
+    return dict(zip(every, found, strict=True))
+
+
+def _figures(held_out: HeldOut, case: Case, driven: np.ndarray) -> Beside:
+    (error,) = _errors(held_out.nominal, driven)
+    plants = held_out.perturbed
+    peak = np.inf
+    if PEAK in case.study.limits:
+        peak = np.max(worst_by_plant([PEAK], plants or held_out.nominal)[PEAK])
+    return Beside(
+        nominal_rms_um=number(error),
+        **({} if plants is None else _of_plants(_errors(plants, driven))),
+        sensitivity_peak=number(peak),
+    )
 
 
 def _of_plants(errors: np.ndarray) -> dict[str, Any]:

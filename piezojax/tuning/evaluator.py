@@ -39,7 +39,6 @@ that an ensemble draws by default, and the nominal one."""
 CARRIED = 16
 """Number of plants whose margins a search computes if there are more."""
 
-
 RUN_BLOCK = 8
 """Plants on which runs are simulated in one call of a program."""
 
@@ -129,7 +128,8 @@ class Evaluator:
     def _on_each(self, program: Any, width: int, stages: Stage, *arguments: Any) -> Any:
         """Return ``program(stages, *arguments)`` for any number of stacked stages.
 
-        The compiled program evaluates ``width`` stages at a time.
+        The compiled program evaluates ``width`` stages at a time. Several such calls
+        run in parallel, unless the memory suffices for one stage only.
         """
         dynamic, static = eqx.partition(stages, eqx.is_array)
         first = np.minimum(np.arange(width), _count(stages) - 1)
@@ -141,7 +141,10 @@ class Evaluator:
             program, *with_arguments(jax.tree.map(lambda x: x[first], dynamic))
         )
         found = in_batches(
-            lambda batch: compiled(*with_arguments(batch)), dynamic, width, in_threads
+            lambda batch: compiled(*with_arguments(batch)),
+            dynamic,
+            width,
+            in_threads if width > 1 else map,
         )
         return jax.tree.map(jnp.asarray, found)
 

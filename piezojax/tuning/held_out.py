@@ -35,10 +35,6 @@ class HeldOut:
             return None
         return self.evaluator.limited(self.loop, self.signals, self.stages, self.stages)
 
-    def compute(self) -> None:
-        """Compute all figures now."""
-        _ = self.nominal, self.perturbed
-
 
 def held_out_loops(
     case: Case, evaluator: Evaluator, data: Data, after: Feedback
