@@ -5,6 +5,12 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
+import jax
+
+_FEWER_PASSES = {"xla_backend_optimization_level": 1}
+"""Options of the compiler on a CPU: a sixth to a fifth less time, and programs of a
+search that are as fast. (A loop of few states alone is up to a quarter slower.)"""
+
 
 class Clock:
     """Wall time since construction; ``compile_s`` (s) is the part spent compiling."""
@@ -21,7 +27,12 @@ class Clock:
         module is compiled once for all arguments of the same structure and shapes.
         """
         start = time.perf_counter()
-        executable = program.lower(*arguments).compile()
+        full = jax.default_backend() != "cpu" or jax.config.read(
+            "jax_disable_most_optimizations"
+        )
+        options = None if full else _FEWER_PASSES
+        lowered = program.lower(*arguments)
+        executable = lowered.compile(compiler_options=options)
         self.compile_s += time.perf_counter() - start
         return executable
 
