@@ -126,6 +126,61 @@ def test_compiled_programs_are_kept_in_the_given_folder(tmp_path):
     assert any(inside.iterdir())
 
 
+KEEP = """
+from piezojax.core.runtime import keep_programs
+keep_programs()
+import piezojax, jax, jax.numpy as jnp
+print(jax.config.jax_compilation_cache_dir)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+"""
+
+
+def kept_in(home, **variables):
+    """Simulate with the folder of caches in ``home``; return the programs there."""
+    variables |= {"XDG_CACHE_HOME": str(home), "PYTHONWARNINGS": "error"}
+    done = python(KEEP + SIMULATE, **variables)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "float64"
+    return sorted(path for path in home.rglob("*-cache"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="XDG_CACHE_HOME names the folder")
+def test_commands_keep_programs_and_compile_damaged_ones_again(tmp_path):
+    kept = kept_in(tmp_path)
+    assert kept
+    assert {path.parent.parent for path in kept} == {tmp_path / "piezojax/programs"}
+    for path in kept:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert kept_in(tmp_path) == kept
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="XDG_CACHE_HOME names the folder")
+def test_no_programs_are_kept_if_the_variable_is_empty(tmp_path):
+    assert not kept_in(tmp_path, PIEZOJAX_COMPILATION_CACHE="")
+
+
+def test_a_given_folder_of_programs_stays(tmp_path, monkeypatch):
+    monkeypatch.delenv(_runtime.CACHE_VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    before = jax.config.jax_compilation_cache_dir
+    assert before  # that of conftest.py
+    _runtime.keep_programs()
+    assert jax.config.jax_compilation_cache_dir == before
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_oldest_programs_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(_runtime, "MOST_KEPT", 250)
+    for age in range(4):
+        path = tmp_path / "versions" / f"{age}"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(bytes(100))
+        os.utime(path, (1e9 - age, 1e9 - age))
+    _runtime._remove_oldest(tmp_path)
+    left = sorted(path.name for path in tmp_path.glob("*/*"))
+    assert left == ["0", "1"]
+
+
 @pytest.mark.parametrize(
     ("version", "expected"),
     [

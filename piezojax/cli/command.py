@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from ..core.files import fresh_folder, numbered_folder
+from ..core.runtime import keep_programs
 from ..core.temporaries import claimed, is_claimed, remove_stale
 from .stopping import exit_interrupted, terminable
 from .terminal import console
@@ -90,6 +91,7 @@ def results_folder(
 
 def run(quiet: bool, body: Callable[[Console], Any]) -> None:
     """Run ``body``; report bad input in one line, with a non-zero exit status."""
+    keep_programs()
     try:
         with terminable():
             body(console(quiet))

@@ -4,6 +4,8 @@ import os
 import sys
 import warnings
 from importlib.metadata import version
+from itertools import accumulate
+from pathlib import Path
 from typing import Any
 
 Version = tuple[int, ...]
@@ -43,6 +45,10 @@ _CPU_FLAGS: dict[str, tuple[str, Version, Version]] = {
 }
 
 CACHE_VARIABLE = "PIEZOJAX_COMPILATION_CACHE"
+
+MOST_KEPT = 1 << 30
+"""Size of the folder of compiled programs, bytes, above which commands remove the
+oldest ones."""
 
 
 def _set(option: str, value: Any) -> None:
@@ -84,9 +90,7 @@ def configure() -> None:
     because XLA then ignores the flags and loops run 3 to 75 times slower.
     """
     _set("jax_enable_x64", True)
-    jaxlib = tuple(
-        int(part) for part in version("jaxlib").split(".")[:3] if part.isdigit()
-    )
+    jaxlib = _jaxlib()
     current = os.environ.get("XLA_FLAGS", "")
     missing = _missing_flags(current, jaxlib)
     if missing and _backend_is_running():
@@ -115,6 +119,52 @@ def simulate_side_by_side() -> bool:
 
 
 _side_by_side: list[bool] = []
+
+
+def keep_programs() -> None:
+    """Keep compiled programs for the next command, in the user's folder of caches.
+
+    ``CACHE_VARIABLE`` names another folder, or none if it is empty; a folder that JAX
+    was given before stays. The oldest programs are removed above ``MOST_KEPT``. Nothing
+    is kept if the folder cannot be written, and a damaged program is compiled again.
+    """
+    jax = sys.modules.get("jax")
+    given = jax and jax.config.jax_compilation_cache_dir
+    if given or CACHE_VARIABLE in os.environ or _JAX_CACHE_VARIABLE in os.environ:
+        return
+    from platformdirs import user_cache_path
+
+    folder = user_cache_path("piezojax", appauthor=False) / "programs"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _remove_oldest(folder)
+    except OSError:
+        return
+    if os.access(folder, os.W_OK):
+        # JAX leaves out what it cannot read or write, with a warning.
+        for text in ("reading", "writing"):
+            warnings.filterwarnings(
+                "ignore", f"Error {text} persistent compilation cache entry"
+            )
+        _use_cache(str(folder), _jaxlib())
+
+
+_JAX_CACHE_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
+
+
+def _remove_oldest(folder: Path) -> None:
+    files = [(path, path.stat()) for path in folder.glob("*/*") if path.is_file()]
+    files.sort(key=lambda file: -file[1].st_mtime)
+    for (path, _), size in zip(
+        files, accumulate(stat.st_size for _, stat in files), strict=True
+    ):
+        if size > MOST_KEPT:
+            path.unlink(missing_ok=True)
+
+
+def _jaxlib() -> Version:
+    parts = version("jaxlib").split(".")[:3]
+    return tuple(int(part) for part in parts if part.isdigit())
 
 
 def _use_cache(folder: str, jaxlib: Version) -> None:
