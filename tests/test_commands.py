@@ -277,7 +277,7 @@ def test_export_writes_the_tuned_controller_with_its_limits(tuned, tmp_path):
     text = (out / "controller.c").read_text(encoding="utf-8")
     assert "Study: small, seed 3." in text
     written = (tuned[1] / "study.toml").read_bytes()
-    assert f"SHA-256 of study.toml: {hashlib.sha256(written).hexdigest()}." in text
+    assert f"SHA-256 of the study: {hashlib.sha256(written).hexdigest()}." in text
     assert re.search(r"parameters.actuator_\w*lower = -20.0;", text)
     assert re.search(r"parameters.actuator_\w*upper = 120.0;", text)
     assert "Judged: tuned loop: sensitivity peak" in text
@@ -441,7 +441,7 @@ def test_the_page_of_tuning_holds_the_figures_of_its_result(tuned):
     notes = [x for x in printed.stdout.splitlines() if x.startswith(("note:", "limit"))]
     assert all(note in text for note in notes)
     assert notes != []
-    assert "SHA-256 of study.toml" in text
+    assert "SHA-256 of the study" in text
     assert "jaxlib" in text
 
 

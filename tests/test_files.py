@@ -27,6 +27,16 @@ def test_written_files_can_be_read_by_others(tmp_path):
     assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == 0o644
 
 
+def test_names_of_files_are_moved_to_another_folder(tmp_path):
+    base, folder = tmp_path / "a", tmp_path / "b" / "c"
+    for path in (base, folder):
+        path.mkdir(parents=True)
+    assert files.seen_from(folder, base, "model.json") == "../../a/model.json"
+    assert files.seen_from(base, base, "data/model.json") == "data/model.json"
+    here = (tmp_path / "model.json").as_posix()
+    assert files.seen_from(folder, base, here) == here
+
+
 def test_writing_again_replaces(tmp_path):
     write_bytes(tmp_path / "a.bin", b"a long first version")
     write_bytes(tmp_path / "a.bin", b"short")

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import tomllib
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from piezojax.identification.residual_record import (
     residual_path,
 )
 from piezojax.report.fit_pictures import write_model
-from piezojax.study import Study, build
+from piezojax.study import Study, as_toml, build, sha256_of
 from piezojax.study.schema import AxesTable
 from piezojax.tuning.data import make_data
 from piezojax.tuning.make_result import _residual_notes
@@ -101,6 +102,15 @@ def test_a_study_fits_what_identify_fits(folder, case):
             )
     assert case.fit.report.validation.rmse == direct.report.validation.rmse
     assert case.fit.report.validation.rmse < 0.1
+
+
+def test_a_study_keeps_its_records_and_its_hash_in_another_folder():
+    study = study_of()
+    moved = study_of(**tomllib.loads(as_toml(study, lambda file: f"../{file}")))
+    assert moved.plant["record"] == ["../a.csv", "../b.csv"]
+    assert sha256_of(moved) == sha256_of(study)
+    renamed = study_of(**tomllib.loads(as_toml(study, lambda file: f"{file}_2")))
+    assert sha256_of(renamed) != sha256_of(study)
 
 
 def test_the_residual_is_that_of_every_record(case):

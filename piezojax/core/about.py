@@ -63,7 +63,7 @@ class About(BaseModel):
             *(f"UNSAFE: {each}" for each in self.unsafe),
             f"{subject}, exported by piezojax {self.piezojax}.",
             *([f"Study: {self.study}{seed}."] if self.study else []),
-            *([f"SHA-256 of study.toml: {hashed}."] if hashed else []),
+            *([f"SHA-256 of the study: {hashed}."] if hashed else []),
             *([f"Record: {self.record}."] if self.record else []),
             *([f"Sampling rate: {rate}."] if rate else []),
             *(f"Judged: {each}." for each in self.judged),

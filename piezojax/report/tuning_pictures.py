@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..core.axes import axis_of
-from ..core.files import write_report, write_text
+from ..core.files import seen_from, write_report, write_text
 from ..core.serial import save
 from ..signals.waveforms import parse
 from ..study import Study, as_toml
@@ -76,13 +76,18 @@ def write_results(outcome: Outcome, folder: Path) -> Pictures:
 
 
 def write_numbers(outcome: Outcome, folder: Path) -> None:
-    """Write result.json, gains.toml and study.toml into ``folder``."""
+    """Write result.json, gains.toml and study.toml into ``folder``.
+
+    The names of files in study.toml are relative to ``folder``.
+    """
+    case = outcome.case
     before, after = outcome.drive
     found = {"drive_before": before, "drive": after}
     result = outcome.result.model_copy(update=found)
     write_report(folder / RESULT_FILE, result)
     save(outcome.controller, folder / GAINS_FILE, outcome.about)
-    write_text(folder / STUDY_FILE, as_toml(outcome.case.study))
+    text = as_toml(case.study, lambda file: seen_from(folder, case.folder, file))
+    write_text(folder / STUDY_FILE, text)
 
 
 def _quantity(trace: Trace) -> str:

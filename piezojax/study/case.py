@@ -51,7 +51,8 @@ class Case:
     ``output_disturbance`` and ``input_disturbance`` are read from files;
     ``study.sensor.noise_rms`` is then the rms value of ``sensor_noise``.
     ``saved_residual`` is the residual of a plant from a file, ``response`` the model of
-    a plant that is fitted to a frequency response.
+    a plant that is fitted to a frequency response. The names of files in ``study`` are
+    relative to ``folder``.
     """
 
     study: Study
@@ -71,6 +72,7 @@ class Case:
     input_disturbance: MeasuredNoise | None = None
     saved_residual: ResidualRecord | None = None
     response: ResponseModel | None = None
+    folder: Path = Path()
 
     @cached_property
     def residual(self) -> ResidualRecord | None:
@@ -177,6 +179,7 @@ def build(
         **measured,
         saved_residual=_saved_residual(study, path.parent, about),
         response=response,
+        folder=path.parent,
     )
 
 

@@ -1,6 +1,7 @@
 """Tables of a study file, and their validation."""
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -485,14 +486,34 @@ class Study(Table):
         return {"": reference}
 
 
-def as_toml(study: Study) -> str:
-    """Return the text of ``study`` as a file, with every default written out."""
-    return tomli_w.dumps(study.model_dump(mode="json", exclude_none=True))
+_FILES = frozenset({"file", "record", "response", "check"})
+"""Keys of a study whose texts name files."""
+
+
+def as_toml(study: Study, renamed: Callable[[str], str] = str) -> str:
+    """Return the text of ``study`` as a file, with every default written out.
+
+    ``renamed`` maps the names of files to those in the text.
+    """
+    content = study.model_dump(mode="json", exclude_none=True)
+    return tomli_w.dumps(_with_files(content, renamed))
+
+
+def _with_files(content: Any, renamed: Callable[[str], str], key: str = "") -> Any:
+    if isinstance(content, dict):
+        return {name: _with_files(x, renamed, name) for name, x in content.items()}
+    if isinstance(content, list):
+        return [_with_files(x, renamed, key) for x in content]
+    return renamed(content) if key in _FILES and isinstance(content, str) else content
 
 
 def sha256_of(study: Study) -> str:
-    """Return the SHA-256 of ``as_toml``; it identifies a study and ignores comments."""
-    return hashlib.sha256(as_toml(study).encode("utf-8")).hexdigest()
+    """Return the SHA-256 of ``as_toml`` with the names of files without folders.
+
+    It identifies a study; comments and the folder of the study do not count.
+    """
+    text = as_toml(study, lambda file: Path(file).name)
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()
 
 
 def load(path: str | Path) -> Study:

@@ -216,8 +216,7 @@ def tuned(tmp_path_factory):
 
 
 def commanded(tuned, address, *more):
-    study = tuned.parent / "study.toml"
-    return call("learn", tuned, "--study", study, "--stage", address, *more)
+    return call("learn", tuned, "--stage", address, *more)
 
 
 def test_the_command_writes_a_page(tuned, tmp_path):
