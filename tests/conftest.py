@@ -36,6 +36,8 @@ if PROGRAMS not in os.environ:
 jax.config.update("jax_compilation_cache_dir", os.environ[PROGRAMS])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.01)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+# Commands in processes of their own use that folder too, not that of the user.
+os.environ.setdefault("PIEZOJAX_COMPILATION_CACHE", os.environ[PROGRAMS])
 
 
 @pytest.fixture
@@ -92,6 +94,19 @@ def modules_with_arrays():
 
 # Shapes and types of their annotated functions are checked while the tests run.
 install_import_hook([*modules_with_arrays()], "beartype.beartype")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forgotten():
+    """Forget traces and programs after each file: compiling slows down with them."""
+    yield
+    jax.clear_caches()
+
+
+def pytest_collection_finish():
+    """Leave out of every collection of garbage what the imports created."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items):
