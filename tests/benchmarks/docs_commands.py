@@ -36,7 +36,7 @@ from piezojax.signals.excitation import Generator, excitation
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from shown_commands import DOCS, OWN_FILE, PAGES, ROOT, blocks_in, scripts_in
-from small_runs import write_study
+from stages.stage_in_tests import write_study
 
 LONGEST = 7200.0
 """Time after which a command is stopped, s."""
@@ -87,6 +87,9 @@ SPECIAL = {
         "the page names the alarm", statuses=(3,)
     ),
     "python -m piezojax.start record.csv": Special(
+        "Enter at each question", typed="\n" * 20
+    ),
+    "python -m piezojax.start record.csv --controller nv200 --scale 9.3": Special(
         "Enter at each question", typed="\n" * 20
     ),
     "srun python -m piezojax.sweep study.toml --out /shared/map "
@@ -305,7 +308,7 @@ def sweeps(folder, page):
 
 
 def trial(folder, page):
-    study = write_study(folder, "study.toml")
+    study = write_study(folder)
     shell(f"python -m piezojax.tune {study.name} --out results/study", folder)
 
 
