@@ -45,6 +45,7 @@ _CPU_FLAGS: dict[str, tuple[str, Version, Version]] = {
 }
 
 CACHE_VARIABLE = "PIEZOJAX_COMPILATION_CACHE"
+_JAX_CACHE_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 
 MOST_KEPT = 1 << 30
 """Size of the folder of compiled programs, bytes, above which commands remove the
@@ -147,9 +148,6 @@ def keep_programs() -> None:
                 "ignore", f"Error {text} persistent compilation cache entry"
             )
         _use_cache(str(folder), _jaxlib())
-
-
-_JAX_CACHE_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 
 
 def _remove_oldest(folder: Path) -> None:
