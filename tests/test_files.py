@@ -31,10 +31,9 @@ def test_names_of_files_are_moved_to_another_folder(tmp_path):
     base, folder = tmp_path / "a", tmp_path / "b" / "c"
     for path in (base, folder):
         path.mkdir(parents=True)
-    assert files.seen_from(folder, base, "model.json") == "../../a/model.json"
-    assert files.seen_from(base, base, "data/model.json") == "data/model.json"
-    here = (tmp_path / "model.json").as_posix()
-    assert files.seen_from(folder, base, here) == here
+    assert files.seen_from(folder, base / "model.json") == "../../a/model.json"
+    assert files.seen_from(base, base / "data/model.json") == "data/model.json"
+    assert files.seen_from(folder, tmp_path / "model.json") == "../../model.json"
 
 
 def test_writing_again_replaces(tmp_path):

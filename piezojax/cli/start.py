@@ -216,8 +216,8 @@ def _concerns(name: str, plan: "Plan") -> bool:
 
 def _check_same(study: Path, record: Path, given: dict[str, Any]) -> None:
     """Raise ValueError if ``study`` has another record, or ``given`` has an option."""
+    from ..core.files import seen_from
     from ..study import load
-    from ..study.first_study import seen_from
 
     known = load(study).plant["record"]
     known = known if isinstance(known, list) else [known]

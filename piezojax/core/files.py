@@ -109,18 +109,13 @@ def read_model(kind: type[Model], path: Path, wrong: str) -> Model:
         raise ValueError(f"{path} {wrong}: {error.errors()[0]['msg']}") from None
 
 
-def seen_from(folder: Path, base: Path, file: str) -> str:
-    """Return the name of ``file``, relative to ``base``, as one relative to ``folder``.
-
-    It is absolute if ``file`` is, or if the folders have no common root.
-    """
-    if Path(file).is_absolute():
-        return file
-    path = (base / file).resolve()
+def seen_from(folder: Path, file: Path) -> str:
+    """Return the path of ``file`` relative to ``folder``, or absolute without one."""
+    file = file.resolve()
     try:
-        return Path(os.path.relpath(path, folder.resolve())).as_posix()
-    except ValueError:  # another drive of Windows
-        return path.as_posix()
+        return Path(os.path.relpath(file, folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return file.as_posix()
 
 
 def fresh_folder(path: Path) -> Path:

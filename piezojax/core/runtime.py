@@ -4,7 +4,6 @@ import os
 import sys
 import warnings
 from importlib.metadata import version
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -152,10 +151,9 @@ def keep_programs() -> None:
 
 def _remove_oldest(folder: Path) -> None:
     files = [(path, path.stat()) for path in folder.glob("*/*") if path.is_file()]
-    files.sort(key=lambda file: -file[1].st_mtime)
-    for (path, _), size in zip(
-        files, accumulate(stat.st_size for _, stat in files), strict=True
-    ):
+    size = 0
+    for path, stat in sorted(files, key=lambda file: -file[1].st_mtime):
+        size += stat.st_size
         if size > MOST_KEPT:
             path.unlink(missing_ok=True)
 

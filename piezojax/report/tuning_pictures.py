@@ -78,7 +78,7 @@ def write_results(outcome: Outcome, folder: Path) -> Pictures:
 def write_numbers(outcome: Outcome, folder: Path) -> None:
     """Write result.json, gains.toml and study.toml into ``folder``.
 
-    The names of files in study.toml are relative to ``folder``.
+    Relative names of files in study.toml are relative to ``folder``.
     """
     case = outcome.case
     before, after = outcome.drive
@@ -86,8 +86,12 @@ def write_numbers(outcome: Outcome, folder: Path) -> None:
     result = outcome.result.model_copy(update=found)
     write_report(folder / RESULT_FILE, result)
     save(outcome.controller, folder / GAINS_FILE, outcome.about)
-    text = as_toml(case.study, lambda file: seen_from(folder, case.folder, file))
-    write_text(folder / STUDY_FILE, text)
+
+    def moved(file: str) -> str:
+        path = Path(file)
+        return file if path.is_absolute() else seen_from(folder, case.folder / path)
+
+    write_text(folder / STUDY_FILE, as_toml(case.study, moved))
 
 
 def _quantity(trace: Trace) -> str:

@@ -1,7 +1,6 @@
 """First study of a stage, from its record and the answers of its user."""
 
 import json
-import os
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from string import Template
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..control.devices.servo_loop import FIXED_DT
+from ..core.files import seen_from
 from ..identification import DEFAULT, Record
 from ..identification.records.recognise import noise_rms
 from ..signals import signal, time_grid
@@ -380,14 +380,6 @@ def _toml(value: Any) -> str:
         return repr(float(value))
     # A JSON string without escaped slashes is a basic string of TOML.
     return json.dumps(value, ensure_ascii=False)
-
-
-def seen_from(folder: Path, file: Path) -> str:
-    """Return the path of ``file`` relative to ``folder``, or absolute without one."""
-    try:
-        return Path(os.path.relpath(file, folder)).as_posix()
-    except ValueError:  # on another drive
-        return file.absolute().as_posix()
 
 
 def _rounded(value: float) -> float:
