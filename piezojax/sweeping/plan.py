@@ -18,6 +18,9 @@ from ..study.parameters import check_value
 from ..study.sweep_table import SweepTable, SweptTable
 from ..tuning.unexplained import STRETCHES
 
+ACCELERATED_BLOCK = 131072
+"""Points of a block on an accelerator, which are enough to occupy it."""
+
 CHUNK_LANE_STEPS = 5e7
 """Simulated samples of a chunk, all plants and references together.
 
@@ -48,7 +51,7 @@ class Axis(NamedTuple):
 
 
 class Plan:
-    """Points of a sweep, which depend on the study alone.
+    """Points of a sweep, which depend on the study alone; blocks on the device too.
 
     ``shape`` is the shape of the grid, or the number of random samples. Points are
     numbered in C order. A chunk holds ``chunk`` points, in blocks of ``width``.
@@ -68,7 +71,10 @@ class Plan:
             self._sampled = _samples(table, self.axes, study.seed)
         self.points = math.prod(self.shape)
         most = max(1, int(CHUNK_BYTES / bytes_of_point(study)))
-        self.width = min(BLOCK, self.points, most)
+        block = BLOCK if jax.default_backend() == "cpu" else ACCELERATED_BLOCK
+        if table.chunk is not None:
+            block = min(block, max(BLOCK, table.chunk))
+        self.width = min(block, self.points, most)
         self.chunk = self._chunk(study, table, most)
         self.chunks = -(-self.points // self.chunk)
 

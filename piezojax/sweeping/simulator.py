@@ -18,13 +18,14 @@ from ..core.axes import PerAxisMetric, packed
 from ..core.feedback import Feedback, LoopSample, loop_inputs
 from ..core.metrics import Tracking
 from ..core.paths import replace
-from ..core.rollout import Metric, simulate
+from ..core.rollout import Metric, in_blocks, simulate
 from ..core.system import System
 from ..signals.waveforms import time_grid
 from ..study import Case, Stage
 from ..study.sweep_table import SENSITIVITY
 from ..tuning.data import make_data
 from ..tuning.runs import RunNoise
+from .fused_loop import simulate_lanes
 from .plan import TRAJECTORIES, Plan, plants_of, references_of, sweep_table
 
 # Poles of the hysteresis lie at 1, up to rounding, and must count as stable.
@@ -112,7 +113,7 @@ class Simulator:
         The sensitivity is returned as the arrays of ``_peaks`` [width, branches, ...].
         """
         paths = [axis.path for axis in self.plan.axes]
-        metric = self._metric()
+        metric, every = self._metric(), self.every
 
         def loop_at(values):
             return replace(loop, dict(zip(paths, values, strict=True)))
@@ -121,16 +122,18 @@ class Simulator:
             reference, run_noise = drives
             inputs = loop_inputs(reference, *run_noise)
 
+            def started(values):
+                system = loop_at(values)
+                return system, system.init(reference[0])
+
+            if every is None:
+                return simulate_lanes(started, values, inputs, metric)._asdict()
+            step = every
+
             def simulate_point(values):
-                system, first = loop_at(values), reference[0]
-                if self.every is None:
-                    start = system.init(first)
-                    return simulate(
-                        system, inputs, start, metric=metric, segment=self.samples
-                    )[1], {}
-                metered = LoopWithMetric(system, metric)
+                metered = LoopWithMetric(loop_at(values), metric)
                 end, log = simulate(
-                    metered, inputs, metered.init(first), every=self.every
+                    metered, inputs, metered.init(reference[0]), every=step
                 )
                 signals = {name: packed(getattr(log, name)) for name in TRAJECTORIES}
                 # The data set has time as its last dimension.
@@ -142,7 +145,7 @@ class Simulator:
 
         results = jax.lax.map(run, (reference, run_noise))
         if SENSITIVITY in self.metrics:
-            results[SENSITIVITY] = jax.vmap(lambda v: self._peaks(loop_at(v)))(values)
+            results[SENSITIVITY] = in_blocks(lambda v: self._peaks(loop_at(v)), values)
         names = (*self.metrics, *(TRAJECTORIES if self.every else ()))
         return {name: results[name] for name in names}
 
