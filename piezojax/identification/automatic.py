@@ -8,7 +8,7 @@ from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
 from ..hysteresis.model import hystereses
 from .chain import dynamics_of, dynamics_parts, structure
-from .estimators.output_error import from_rest, output_error, starts_of
+from .estimators.output_error import from_rest, leading, output_error, starts_of
 from .held_dynamics import HeldDynamics
 from .records.record import Record
 
@@ -51,7 +51,8 @@ def automatic(
 
     The hysteresis is the first of ``HYSTERESES``, unless another one has a clearly
     smaller error (``CLEARLY``) after short fits to ``record`` and those ``beside`` it.
-    The fits use a lower sampling rate if it resolves the resonances and the input.
+    The fits use the first samples of a long record (``leading``), and a lower sampling
+    rate if it resolves the resonances and the input.
     With ``dynamics``, which are held, the chain has no other dynamics.
     """
     hysteresis = hysteresis_for([record, *beside], progress, dynamics)
@@ -76,6 +77,9 @@ def hysteresis_for(
     if records[0].samples < LEAST:
         return first
     (progress or Silent()).stage("choosing the hysteresis")
+    records = [
+        each.until(leading(each.input, slice(0, each.samples)).stop) for each in records
+    ]
     every = _slowing(records[0])
     slow = [_slowed(record, every) for record in records]
     least, chosen = CLEARLY * _error(first, slow, dynamics), first

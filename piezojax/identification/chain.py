@@ -21,6 +21,9 @@ from .records.record import Record
 LINEAR = ("dynamics", "lag", "delay")
 """Places of linear dynamics, whose parameters the record must excite."""
 
+SLOW = ("creep",)
+"""Places of slow parts, whose parameters a short record does not determine."""
+
 DEFAULT = "auto"
 """Model that is fitted by default (``automatic``)."""
 
@@ -197,16 +200,19 @@ def structure(
         if f"{place}.{path}" not in gains[:-1]
     }
     space = space_of(bounds)
+    own = [f"{place}.{path}" for place, part in parts.items() for path in part.own]
+
+    def within(places: Sequence[str]) -> tuple[str, ...]:
+        return tuple(path for path in bounds if path.split(".")[0] in places)
+
     return Structure(
         system,
         space,
         _starts(system, space, parts),
-        (
-            *(f"{place}.{path}" for place, part in parts.items() for path in part.own),
-            OFFSET,
-        ),
-        tuple(path for path in bounds if path.split(".")[0] in LINEAR),
-        shown.whitening if shown.modes and dynamics is None else (),
+        own=(*own, OFFSET),
+        dynamics=within(LINEAR),
+        slow=within(SLOW),
+        whitening=shown.whitening if shown.modes and dynamics is None else (),
     )
 
 

@@ -107,8 +107,20 @@ def test_an_undetermined_parameter_has_no_standard_error():
     assert "not exciting enough" in text or "one frequency" in text
 
 
+def test_the_first_samples_show_the_range_of_the_input(monkeypatch):
+    monkeypatch.setattr(output_error, "LEADING", 10)
+    late = np.concatenate([np.zeros(25), np.linspace(0.0, 1.0, 75)])
+    assert output_error.leading(np.sin(np.arange(100)), slice(0, 100)) == slice(0, 10)
+    assert output_error.leading(np.sin(np.arange(100)), slice(5, 100)) == slice(5, 15)
+    assert output_error.leading(late, slice(0, 100)) == slice(0, 100)
+    assert output_error.leading(np.minimum(late, 0.15), slice(0, 100)) == slice(0, 40)
+    assert output_error.leading(np.sin(np.arange(19)), slice(0, 19)) == slice(0, 19)
+
+
 @pytest.mark.slow
-def test_hysteresis_creep_lag_and_delay_are_recovered():
+@pytest.mark.parametrize("leading", [output_error.LEADING, 700])
+def test_hysteresis_creep_lag_and_delay_are_recovered(leading, monkeypatch):
+    monkeypatch.setattr(output_error, "LEADING", leading)
     # Three frequencies, a decade apart: the phase of a lag and a delay depends on
     # frequency, that of hysteresis does not, and creep decreases with frequency.
     model, dt = "coleman_hodgdon+logarithmic_creep+lag+delay", 2e-3

@@ -62,6 +62,13 @@ UNDETERMINED = 1e-14
 undetermined: rounding errors are a hundredth of it."""
 
 
+LEADING = 50_000
+"""Number of samples to which a long record is fitted first."""
+
+RANGE = 0.95
+"""Share of the range of the input that these samples must contain."""
+
+
 class Optimum(NamedTuple):
     """Results of all starts, best first.
 
@@ -283,6 +290,21 @@ def free_runs(
     ), [0.0]
 
 
+def leading(input: np.ndarray, train: slice) -> slice:
+    """Return the first samples of ``train``, from which a long fit may start.
+
+    They are ``LEADING`` samples, or more if these do not show the range of the input
+    [samples], or all of ``train`` if that is less than twice as long.
+    """
+    size, whole = LEADING, np.ptp(input[train])
+    while 2 * size <= train.stop - train.start:
+        part = slice(train.start, train.start + size)
+        if np.ptp(input[part]) >= RANGE * whole:
+            return part
+        size *= 2
+    return train
+
+
 def at_starts(problem: Problem, starts: Sequence[Start]) -> Problem:
     """Return the problem whose records begin at the ``starts``."""
     stacked = jax.tree.map(lambda *each: jnp.stack(each), *starts)
@@ -305,11 +327,13 @@ def output_error(
     """Fit ``structure`` to ``records`` by the mean square of the free-run error.
 
     Levenberg-Marquardt with the forward Jacobian descends from all starts of the
-    structure; after a few steps only the best continue, up to ``steps`` steps. The
-    error counts over the samples ``train`` of each record; the model sees the input
-    alone, from the first sample on. With several records the state before each and the
-    zero of each take the place of the structure's ``own`` parameters; so does that of a
-    single one with ``own_starts``.
+    structure; after a few steps only the best continue, up to ``steps`` steps. A single
+    long record is fitted from the optimum of its first samples (``leading``), except
+    for the ``own`` and ``slow`` parameters, which these do not determine. The error
+    counts over the samples ``train`` of each record; the model sees the input alone,
+    from the first sample on. With several records the state before each and the zero of
+    each take the place of the structure's ``own`` parameters; so does that of a single
+    one with ``own_starts``.
 
     With a ``noise_model`` the error is that of the prediction by the model and an
     autoregressive model of its errors, which are fitted alternately (Ljung, System
@@ -320,15 +344,30 @@ def output_error(
     """
     progress = progress or Silent()
     several = own_starts or len(records) > 1
+    first = train if several else leading(records[0].input, train)
     if several:
         structure = structure.without(structure.own)
-    problem = problem_of(structure, records, train, drives)
     starts, whitened = structure.starts, bool(structure.whitening or noise_model)
+    known = first != train  # the optimum of the first samples
+    if known:
+        best = output_error(
+            structure,
+            records,
+            first,
+            steps=steps,
+            progress=progress,
+            noise_model=noise_model,
+            drives=drives,
+        ).units[0]
+        slow = {*structure.own, *structure.slow}
+        restarted = [path in slow for path in structure.space.paths]
+        starts = np.where(restarted, starts[:1], best)
+    problem = problem_of(structure, records, train, drives)
     if noise_model:
         idle = jnp.zeros(NOISE_ORDER + 1)  # of the final size, to compile once
         problem = eqx.tree_at(lambda p: p.whitening, problem, idle)
     # One start is added below: all passes have the same width, to compile once.
-    width = min(PARALLEL_STARTS, len(starts) + int(whitened))
+    width = min(PARALLEL_STARTS, len(starts) + int(whitened and not known))
     progress.stage(f"compiling the fit of {starts.shape[1]} parameters")
     rough = min(steps, ROUGH_STEPS) if whitened or several else steps
     units, losses, finished = _inside(starts), np.zeros(len(starts)), False
@@ -349,7 +388,7 @@ def output_error(
             problem = problem.predicting(point)
         else:
             problem = _balanced(problem, point)
-        if np.isinf(before):
+        if np.isinf(before) and not known:
             # Errors of the hysteresis may have hidden a resonance from the first fit.
             dynamics = [problem.space.paths.index(path) for path in structure.dynamics]
             again = units.copy()

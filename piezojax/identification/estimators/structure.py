@@ -24,7 +24,8 @@ class Structure(NamedTuple):
     """A model to fit: its System, the box of its parameters, starts in the box.
 
     ``own`` holds the paths of the state before a record and of the sensor's zero, which
-    differ from record to record. ``dynamics`` holds the paths of linear dynamics.
+    differ from record to record. ``dynamics`` holds the paths of linear dynamics, and
+    ``slow`` those of creep, which a short record does not determine.
     ``whitening`` holds the coefficients of a filter that turns the errors into white
     noise; if it has any, the filtered errors count as much as the errors themselves,
     which are largest at low frequencies. ``prior`` is that of the parameters, if any.
@@ -36,6 +37,7 @@ class Structure(NamedTuple):
     starts: np.ndarray
     own: tuple[str, ...] = ()
     dynamics: tuple[str, ...] = ()
+    slow: tuple[str, ...] = ()
     whitening: tuple[float, ...] = ()
     prior: Prior | None = None
     weights: tuple[float, ...] = ()
