@@ -22,7 +22,11 @@ from .terminal import Bar
 
 # The bodies import JAX and its users, so that --help does not wait for them.
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+    from ..core.progress import Progress
     from ..tuning.baselines import Budget
+    from ..tuning.gain_surrogate import GainSurrogate
     from ..tuning.outcome import Outcome
     from ..tuning.result import Result
 
@@ -106,6 +110,8 @@ def tune_study(
     sliders: bool,
 ) -> "Outcome":
     """Tune the study at ``path``, write and print the outcome, and return it."""
+    from concurrent.futures import ThreadPoolExecutor
+
     from .. import study as studies
     from ..report.baseline_curves import write_baselines
     from ..report.bode import write_stability
@@ -119,7 +125,8 @@ def tune_study(
     from ..tuning.gain_surrogate import gain_surrogate
     from ..tuning.tuner import tune
 
-    with Bar(console) as bar:
+    # Gains near the tuned ones are simulated beside drawing.
+    with Bar(console) as bar, ThreadPoolExecutor(1) as pool:
         bar.stage(f"reading {path.name}")
         description = studies.load(path)
         with results_folder(out, path.stem) as folder:
@@ -129,6 +136,7 @@ def tune_study(
                 print_alarms(console, case.fit.report.alarms)
             outcome = tune(case, baselines=baselines, progress=bar)
             bar.finish()
+            near = pool.submit(gain_surrogate, outcome) if sliders else None
             bar.stage("drawing")
             if outcome.baselines is not None:
                 write_baselines(outcome.baselines, folder)
@@ -141,11 +149,22 @@ def tune_study(
             pictures |= write_stability(outcome.stability, folder, heading)
             bar.stage("computing the limit of linear control")
             write_limit(outcome.limit, folder, heading)
-            surrogate = gain_surrogate(outcome, bar) if sliders else None
+            surrogate = near and _surrogate(near, bar)
             page = tuning_page(outcome, surrogate)
             write_page(page, folder, pictures, gain_sliders(surrogate, outcome))
     print_results(page, folder, console)
     return outcome
+
+
+def _surrogate(
+    found: "Future[GainSurrogate | str]", progress: "Progress"
+) -> "GainSurrogate | str":
+    """Wait for the surrogate; ``Ctrl-C`` ends the wait."""
+    progress.stage("simulating gains near the tuned ones")
+    try:
+        return found.result()
+    except KeyboardInterrupt:
+        return "interrupted"
 
 
 def _compare(

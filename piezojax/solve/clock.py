@@ -12,6 +12,19 @@ _FEWER_PASSES = {"xla_backend_optimization_level": 1}
 search that are as fast. (A loop of few states alone is up to a quarter slower.)"""
 
 
+def compiled(program: Any, *arguments: Any) -> Callable:
+    """Compile ``program`` for ``arguments``, for a search.
+
+    ``program`` is a function after ``jax.jit`` or ``eqx.filter_jit``. One of a module
+    is compiled once for all arguments of the same structure and shapes.
+    """
+    full = jax.default_backend() != "cpu" or jax.config.read(
+        "jax_disable_most_optimizations"
+    )
+    options = None if full else _FEWER_PASSES
+    return program.lower(*arguments).compile(compiler_options=options)
+
+
 class Clock:
     """Wall time since construction; ``compile_s`` (s) is the part spent compiling."""
 
@@ -21,18 +34,9 @@ class Clock:
         self.compile_s = 0.0
 
     def compiled(self, program: Any, *arguments: Any) -> Callable:
-        """Compile ``program`` for ``arguments``; add the time to ``compile_s``.
-
-        ``program`` is a function after ``jax.jit`` or ``eqx.filter_jit``. One of a
-        module is compiled once for all arguments of the same structure and shapes.
-        """
+        """Return ``compiled(program, *arguments)``; add the time to ``compile_s``."""
         start = time.perf_counter()
-        full = jax.default_backend() != "cpu" or jax.config.read(
-            "jax_disable_most_optimizations"
-        )
-        options = None if full else _FEWER_PASSES
-        lowered = program.lower(*arguments)
-        executable = lowered.compile(compiler_options=options)
+        executable = compiled(program, *arguments)
         self.compile_s += time.perf_counter() - start
         return executable
 

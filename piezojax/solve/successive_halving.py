@@ -9,7 +9,7 @@ from jaxtyping import Array
 from ..core.arrays import as_array
 from ..core.progress import Progress
 from .augmented_lagrangian import with_zero_multipliers
-from .clock import Clock
+from .clock import Clock, compiled
 from .gauss_newton import PARALLEL, Descent, GaussNewton, Trials
 from .local_model import UNIT_BOX, LocalModel
 from .multi_start import Patience, in_batches, in_threads
@@ -62,7 +62,7 @@ class SuccessiveHalving:
         # The derivatives compile in the background, while the box is screened.
         self._pool = ThreadPoolExecutor(1)
         self._derivatives = self._pool.submit(
-            lambda: derivatives_at.lower(problem, units[0], every).compile()
+            compiled, derivatives_at, problem, units[0], every
         )
         self._errors = clock.compiled(errors_at, problem, units, every)
 

@@ -61,13 +61,18 @@ def make_data(case: Case) -> Data:
     )
 
 
+def depends_on_loop(case: Case) -> bool:
+    """Return whether ``judging`` changes the hold-out: with a residual, on one axis."""
+    return case.residual is not None and not case.study.axes
+
+
 def judging(data: Data, case: Case, loop: Feedback) -> Data:
     """Return ``data`` with the residual of the plant where it harms ``loop`` most.
 
     Only the hold-out changes. Without a residual, and on several axes, nothing does.
     """
     study, highest = case.study, case.highest_reference
-    if case.residual is None or isinstance(highest, tuple):
+    if not depends_on_loop(case) or isinstance(highest, tuple):
         return data
     samples = case.references.shape[1]
     worst_for = suppression_of(loop, highest, samples, study.settled, study.dt)

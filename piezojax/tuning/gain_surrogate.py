@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.progress import Progress, Silent
 from .near_gains import BATCH, LARGEST_PEAK, MARGINS, NearGains, simulate_near
 from .outcome import Outcome
 from .traces import traces_of
@@ -97,24 +96,18 @@ class GainSurrogate:
     doubt: Doubt
 
 
-def gain_surrogate(
-    outcome: Outcome, progress: Progress | None = None
-) -> GainSurrogate | str:
+def gain_surrogate(outcome: Outcome) -> GainSurrogate | str:
     """Return the surrogate of the tuned loop of ``outcome``, or why there is none.
 
     Its figures are those of ``simulate_near``; the first of the gain sets are left out
-    of the interpolation and test it. ``Ctrl-C`` ends the simulation.
+    of the interpolation and test it.
     """
     if outcome.case.study.axes is not None:
         return "they are for one axis only"
     count = len(outcome.case.space.paths)
     if count > MOST_GAINS:
         return f"{count} gains are tuned, and they are for {MOST_GAINS} at most"
-    (progress or Silent()).stage("simulating gains near the tuned ones")
-    try:
-        near = simulate_near(outcome)
-    except KeyboardInterrupt:
-        return "interrupted"
+    near = simulate_near(outcome)
     if near is None:
         return (
             "gains very near the tuned ones diverge, stay at a voltage limit, or have "

@@ -35,11 +35,16 @@ class HeldOut:
             return None
         return self.evaluator.limited(self.loop, self.signals, self.stages, self.stages)
 
+    def on(self, signals: Signals) -> "HeldOut":
+        """Return the same loop on ``signals``."""
+        return self if signals is self.signals else replace(self, signals=signals)
 
-def held_out_loops(
-    case: Case, evaluator: Evaluator, data: Data, after: Feedback
-) -> dict[str, HeldOut]:
-    """Return the loops "before" and "tuned", which is ``after``, on the hold-out."""
+    def with_loop(self, loop: Feedback) -> "HeldOut":
+        """Return ``loop`` on the same signals and plants."""
+        return replace(self, loop=loop)
+
+
+def held_out(case: Case, evaluator: Evaluator, data: Data) -> HeldOut:
+    """Return the loop of the study on the hold-out."""
     stages = case.ensemble.stages("holdout") if case.ensemble else None
-    before = HeldOut(evaluator, case.loop, data.holdout, stages)
-    return {"before": before, "tuned": replace(before, loop=after)}
+    return HeldOut(evaluator, case.loop, data.holdout, stages)

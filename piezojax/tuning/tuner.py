@@ -13,12 +13,12 @@ from ..solve.clock import Clock
 from ..study import Case, read, shipped
 from .alarms import alarms_of, peak_notes
 from .baselines import Budget, compare_baselines
-from .beside import figures_beside
-from .data import judging, make_data
+from .beside import FiguresBeside
+from .data import depends_on_loop, judging, make_data
 from .device_alarms import device_alarms
 from .evaluator import Evaluator
 from .front import trace_front
-from .held_out import held_out_loops
+from .held_out import held_out
 from .limited_search import search_within_limits
 from .make_objective import make_objective
 from .make_result import constraint_outcomes, make_result
@@ -66,6 +66,17 @@ def _tune(
     baselines: Budget | None = None,
 ) -> Outcome:
     """Tune one structure; ``also`` are further points [points, n] to start from."""
+    with FiguresBeside(case) as beside:
+        return _tuned(case, beside, also, progress, baselines)
+
+
+def _tuned(
+    case: Case,
+    beside: FiguresBeside,
+    also: np.ndarray | None,
+    progress: Progress,
+    baselines: Budget | None,
+) -> Outcome:
     clock = Clock()
     table, space = case.study, case.space
     data = make_data(case)
@@ -74,26 +85,30 @@ def _tune(
     progress.stage("simulating the start")
     evaluator = Evaluator(clock, case)
     before = evaluator.figures(case.loop, data.tuning)
+    own = held_out(case, evaluator, data)
+    if not depends_on_loop(case):
+        beside.begin(data, own)
     objective = make_objective(case, data, evaluator, before)
     objective, search, strategy, stability = search_within_limits(
         objective, case, evaluator, clock, progress, also
     )
 
     after = space.put(case.loop, as_array(search.unit))
-    loops = held_out_loops(case, evaluator, data, after)
     try:
         front, kept = None, constraint_outcomes(objective, evaluator, after)
         if table.pareto is not None and strategy and search.status != "interrupted":
             front = trace_front(objective, case, search, strategy, evaluator, progress)
         progress.stage("evaluating on held-out noise")
         data = judging(data, case, after)
-        loops = held_out_loops(case, evaluator, data, after)
+        own = own.on(data.holdout)
+        loops = {"before": own, "tuned": own.with_loop(after)}
         result = make_result(
             case, data, evaluator, before, loops, search, clock, kept, front
         )
     except KeyboardInterrupt:
         # Keep the gains; only a second interrupt ends this evaluation too.
         search.status = "interrupted"
+        loops = {"before": own, "tuned": own.with_loop(after)}
         result = make_result(
             case, data, evaluator, before, loops, search, clock, {}, None
         )
@@ -101,7 +116,8 @@ def _tune(
         result.sliding_before, result.sliding = (
             sliding_share(loop, data, evaluator.start) for loop in (case.loop, after)
         )
-        result.beside = figures_beside(case, data, loops, progress)
+        beside.begin(data, own)
+        result.beside = beside.all(loops["tuned"], progress)
         note = tip_note(case, after, data, evaluator.start)
         result.warnings += [note] if note else []
     except KeyboardInterrupt:

@@ -16,10 +16,10 @@ from piezojax.core.progress import Silent
 from piezojax.report.summary_tables import beside_table
 from piezojax.solve.clock import Clock
 from piezojax.study import read
-from piezojax.tuning.beside import figures_beside
+from piezojax.tuning.beside import FiguresBeside
 from piezojax.tuning.data import make_data
 from piezojax.tuning.evaluator import Evaluator
-from piezojax.tuning.held_out import held_out_loops
+from piezojax.tuning.held_out import held_out
 
 RULE = {"catalog": "p753_feedforward_simc_pi"}
 BESIDE = {
@@ -64,8 +64,10 @@ def written(folder, **changes):
 def found_of(path):
     case = read(path)
     data = make_data(case)
-    loops = held_out_loops(case, Evaluator(Clock(), case), data, case.loop)
-    return case, data, figures_beside(case, data, loops, Silent())
+    own = held_out(case, Evaluator(Clock(), case), data)
+    with FiguresBeside(case) as beside:
+        beside.begin(data, own)
+        return case, data, beside.all(own, Silent())
 
 
 @pytest.fixture(scope="module")

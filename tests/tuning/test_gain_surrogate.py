@@ -1,5 +1,6 @@
 """Sliders of the tuned gains: simulated gain sets and their interpolation."""
 
+from concurrent.futures import Future
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,9 @@ from study_tables import PID_ON_LAG, with_values
 
 import piezojax as pj
 from piezojax.analysis.step_response import step_ends
+from piezojax.cli.tune import _surrogate
 from piezojax.core.arrays import as_array
+from piezojax.core.progress import Silent
 from piezojax.study import Study, build
 from piezojax.tuning import near_gains
 from piezojax.tuning.data import make_data
@@ -160,13 +163,10 @@ def test_no_surrogate_is_made_at_the_edge_of_stability():
     assert "a sensitivity peak above 5" in found
 
 
-def test_an_interrupt_ends_the_simulation_alone(outcome, monkeypatch):
-    def interrupted(outcome):
-        raise KeyboardInterrupt
-
-    module = "piezojax.tuning.gain_surrogate.simulate_near"
-    monkeypatch.setattr(module, interrupted)
-    assert gain_surrogate(outcome) == "interrupted"
+def test_an_interrupt_ends_the_wait_alone():
+    found = Future()
+    found.set_exception(KeyboardInterrupt())
+    assert _surrogate(found, Silent()) == "interrupted"
 
 
 def test_axes_and_many_gains_have_no_surrogate(outcome):
