@@ -105,6 +105,11 @@ def run(quiet: bool, body: Callable[[Console], Any]) -> None:
         exit_interrupted()
 
 
+def print_loading(console: Console) -> None:
+    """Print the first sign of life, because importing JAX takes seconds."""
+    console.print("loading", style="dim")
+
+
 def print_alarms(console: Console, alarms: Sequence[str]) -> None:
     """Print ``alarms`` in red, on standard error if the console is quiet."""
     shown = Console(stderr=True, highlight=False) if console.quiet else console

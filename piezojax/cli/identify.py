@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from .command import Command, common, print_results, results_folder, run
+from .command import Command, common, print_loading, print_results, results_folder, run
 from .identify_response import (
     Amplitudes,
     ResponseOptions,
@@ -195,6 +195,7 @@ def main(
 
     # JAX and its users are imported here, so that --help does not wait for them.
     def body(console):
+        print_loading(console)
         from ..identification.estimators.estimate import Options
         from ..identification.fit import identify
         from ..identification.records.record import read_record

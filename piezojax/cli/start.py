@@ -8,7 +8,7 @@ import click
 from rich.console import Console
 
 from ..core.files import numbered_folder, write_text
-from .command import RESULTS, Command, common, print_alarms, run
+from .command import RESULTS, Command, common, print_alarms, print_loading, run
 from .export import export_file
 from .records import print_columns, recognised_columns
 from .tune import finish, sliders_option, tune_study
@@ -96,6 +96,7 @@ def main(record, model, check, yes, sliders, out, seed, quiet, **given):
     """
 
     def body(console):
+        print_loading(console)
         from ..report.page import PAGE
         from ..tuning.result import load_result
 

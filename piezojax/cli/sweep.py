@@ -10,7 +10,7 @@ from rich.console import Console
 
 from ..core.files import numbered_folder
 from ..core.runtime import simulate_side_by_side
-from .command import RESULTS, Command, common, print_page, run
+from .command import RESULTS, Command, common, print_loading, print_page, run
 from .stopping import exit_interrupted
 from .terminal import Bar
 
@@ -67,6 +67,7 @@ def main(
     simulate_side_by_side()
 
     def body(console: Console) -> None:
+        print_loading(console)
         from ..report.page import write_page
         from ..report.sweep_maps import sweep_page, write_pictures
         from ..sweeping.cluster import dask_client

@@ -13,6 +13,7 @@ from .command import (
     common,
     exit_unsafe,
     print_alarms,
+    print_loading,
     print_results,
     results_folder,
     run,
@@ -74,6 +75,8 @@ def main(
     """
 
     def body(console: Console) -> None:
+        if not schema:
+            print_loading(console)
         from .. import study as studies
         from ..tuning.baselines import Budget
 

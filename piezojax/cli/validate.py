@@ -4,7 +4,15 @@ from pathlib import Path
 
 import click
 
-from .command import Command, common, exit_unsafe, print_results, results_folder, run
+from .command import (
+    Command,
+    common,
+    exit_unsafe,
+    print_loading,
+    print_results,
+    results_folder,
+    run,
+)
 from .records import SampleRange, print_columns, record_columns
 from .terminal import Bar
 
@@ -35,6 +43,7 @@ def main(model, records, estimate, out, seed, quiet, **columns):
     del seed  # nothing is random
 
     def body(console):
+        print_loading(console)
         from ..core.serial import load, read_about
         from ..identification import read_record, validate
         from ..identification.residual_record import load_residual
