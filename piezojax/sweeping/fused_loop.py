@@ -40,23 +40,49 @@ TYPES: dict[Kind, Any] = {
     "boolean": jnp.bool_,
 }
 
+
+def _larger(a: Array, b: Array) -> Array:
+    """Return the larger of both, NaN if one is: the maximum of Triton drops NaN.
+
+    A loop that diverges must not look finite behind a limit.
+    """
+    return jnp.where((a > b) | (a != a), a, b)
+
+
+def _smaller(a: Array, b: Array) -> Array:
+    """Return the smaller of both, NaN if one is."""
+    return jnp.where((a < b) | (a != a), a, b)
+
+
+def _rounded(x: Array, method: Any) -> Array:
+    below = lax.floor(x)
+    rest = x - below
+    if method == lax.RoundingMethod.TO_NEAREST_EVEN:
+        up = below != 2.0 * lax.floor(0.5 * below)
+    else:
+        up = x > 0.0
+    return jnp.where((rest > 0.5) | ((rest == 0.5) & up), below + 1.0, below)
+
+
 OPERATIONS: dict[str, Callable[..., Array]] = {
     **{
         name: getattr(lax, name)
         for name in (
             *("abs", "acos", "add", "asin", "atan", "atan2", "ceil", "cos", "cosh"),
             *("div", "eq", "exp", "expm1", "floor", "ge", "gt", "is_finite", "le"),
-            *("log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg"),
+            *("log", "log1p", "logistic", "lt", "mul", "ne", "neg"),
             *("pow", "rem", "rsqrt", "sign", "sin", "sinh", "sqrt", "square", "sub"),
             *("tan", "tanh"),
         )
     },
     "and": lax.bitwise_and,
-    "clamp": lambda least, x, most: lax.min(lax.max(x, least), most),
+    "clamp": lambda least, x, most: _larger(least, _smaller(x, most)),
     "integer_pow": lax.integer_pow,
+    "max": _larger,
+    "min": _smaller,
     "not": lax.bitwise_not,
     "or": lax.bitwise_or,
-    "round": lambda x, method: _rounded(x, method),
+    "round": _rounded,
     "select_n": lax.select_n,
     "xor": lax.bitwise_xor,
 }
@@ -411,13 +437,3 @@ def _typed(x: Array, kind: Kind) -> Array:
 def _plain(x: Array) -> Array:
     """Return ``x``, true and false as 1 and 0: a kernel carries numbers."""
     return x.astype(jnp.int32) if x.dtype == bool else x
-
-
-def _rounded(x: Array, method: Any) -> Array:
-    below = lax.floor(x)
-    rest = x - below
-    if method == lax.RoundingMethod.TO_NEAREST_EVEN:
-        up = below != 2.0 * lax.floor(0.5 * below)
-    else:
-        up = x > 0.0
-    return jnp.where((rest > 0.5) | ((rest == 0.5) & up), below + 1.0, below)

@@ -22,6 +22,9 @@ from piezojax.sweeping.simulator import Simulator
 
 SAMPLES = 12
 
+DROPPING = ("max", "min", "clamp")
+"""Operations that drop NaN in a kernel of a GPU, but not when it is interpreted."""
+
 
 class Means(Metric):
     """The means of the output and of its square, from sample 2 on."""
@@ -67,6 +70,26 @@ class Everything(System):
         return (x, count, x > 0.0), total
 
 
+def primitives(jaxpr):
+    """Yield the names of the operations of a jaxpr and of those inside it."""
+    for equation in jaxpr.eqns:
+        yield equation.primitive.name
+        for value in equation.params.values():
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                yield from primitives(inner)
+
+
+def kernel_of(program, *arguments):
+    """Return the jaxpr of the kernel in a program."""
+    (call,) = [
+        equation
+        for equation in jax.make_jaxpr(program)(*arguments).jaxpr.eqns
+        if equation.primitive.name == "pallas_call"
+    ]
+    return call.params["jaxpr"]
+
+
 def driven(amplitude=60.0):
     rng = np.random.default_rng(3)
     return jnp.array(amplitude * rng.uniform(0.0, 1.0, SAMPLES))
@@ -78,12 +101,12 @@ def loop_inputs():
     return LoopInput(steps, jnp.array(rng.standard_normal(SAMPLES)))
 
 
-def both(system, path, lanes, inputs, metric, start=0.0):
+def both(system, path, lanes, inputs, metric, start=0.0, scale=1.0):
     """Return the results of one kernel and of the loop of simulate, leaf by leaf.
 
     The lanes differ in the parameter ``path``. Fails unless the kernel is used.
     """
-    values = jnp.linspace(0.5, 1.5, lanes)
+    values = scale * jnp.linspace(0.5, 1.5, lanes)
 
     def run_of(value):
         changed = replace(system, {path: value})
@@ -92,8 +115,9 @@ def both(system, path, lanes, inputs, metric, start=0.0):
     def simulated(values, **options):
         return simulate_lanes(run_of, values, inputs, metric, **options)
 
+    names = {*primitives(kernel_of(lambda v: simulated(v, fused=True), values))}
+    assert names.isdisjoint(DROPPING)
     kernel = jax.jit(lambda v: simulated(v, fused=True, interpret=True))
-    assert "pallas_call" in str(kernel.trace(values).jaxpr)
     plain = jax.jit(lambda v: simulated(v, fused=False))(values)
     return jax.tree.leaves(kernel(values)), jax.tree.leaves(plain)
 
@@ -252,6 +276,32 @@ def test_a_sweep_uses_the_kernel_and_larger_blocks_on_a_gpu(case_of, monkeypatch
     assert "pallas_call" in str(block)
     assert Simulator(case_of(table | {"chunk": 100})).plan.width == 100
     assert Simulator(case_of(table | {"chunk": 10})).plan.width == 64
+
+
+@pytest.mark.parametrize("name", ["max", "min"])
+def test_nan_passes_a_limit(name):
+    values = jnp.array([-np.inf, -1.0, 0.0, 2.0, np.inf, np.nan])
+    a, b = (x.ravel() for x in jnp.meshgrid(values, values))
+    found = fused_loop.OPERATIONS[name](a, b)
+    numpy = {"max": np.maximum, "min": np.minimum}[name]
+    np.testing.assert_array_equal(found, numpy(np.asarray(a), np.asarray(b)))
+    clamped = fused_loop.OPERATIONS["clamp"](as_array(-1.0), values, as_array(1.0))
+    np.testing.assert_array_equal(clamped, np.clip(np.asarray(values), -1.0, 1.0))
+
+
+def test_a_loop_that_diverges_is_reported():
+    loop = p753.loop(p753.pid())
+    found, expected = both(
+        loop,
+        "controller.proportional",
+        3,
+        loop_inputs(),
+        Tracking(start=4),
+        scale=1e308,
+    )
+    assert not np.isfinite(found[0]).any()
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(np.isnan(one), np.isnan(other))
 
 
 @example(x=np.nextafter(0.5, 0.0))
