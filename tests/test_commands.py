@@ -615,15 +615,29 @@ def test_identify_all_keeps_fitted_models(record, tmp_path, monkeypatch):
             terminate()
         advance(self, text, steps)
 
-    monkeypatch.setattr(Bar, "stage", send)
     among = ("--model", "all", "--among", "coleman_hodgdon", "--steps", 1)
-    result = call("identify", record, *COLUMNS, *among, "--out", tmp_path / "out")
+    command = ("identify", record, *COLUMNS, *among, "--out", tmp_path / "out")
+    with monkeypatch.context() as patch:
+        patch.setattr(Bar, "stage", send)
+        result = call(*command)
     assert result.exit_code == 143, result.output
     report = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert report["interrupted"]
     assert [row["status"] for row in report["rows"]].count("fitted") == 1
     assert pj.load(tmp_path / "out" / "model.json")
     assert not (tmp_path / "out" / "models").exists()
+    hint = f"the same command with --out {tmp_path / 'out'} goes on from these fits"
+    assert hint in result.stdout
+    # The first fit is not repeated.
+    again = succeeded(call(*command))
+    assert "1 of about" not in again.stdout
+    assert "2 of about" in again.stdout
+    report = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert not report["interrupted"]
+    assert not (tmp_path / "out" / "search").exists()
+    refused = call(*command)
+    assert refused.exit_code == 1
+    assert "out" in refused.stderr
 
 
 def test_a_folder_in_use_is_refused(study, tmp_path):

@@ -293,6 +293,7 @@ def main(
 
     def compare(console, loaded, options):
         from ..identification.compare import identify_all
+        from ..identification.unfinished import KEY
         from ..report.model_ranking import (
             ranking_page,
             write_ranking,
@@ -300,7 +301,10 @@ def main(
         )
         from ..report.page import write_page
 
-        with Bar(console) as bar, results_folder(out, records[0].stem) as folder:
+        with (
+            Bar(console) as bar,
+            results_folder(out, records[0].stem, KEY) as folder,
+        ):
             ranking = identify_all(
                 loaded,
                 hysteresis=None if among is None else among.split(","),
@@ -310,6 +314,7 @@ def main(
                 options=options,
                 progress=bar,
                 done=lambda ranking: write_ranking_so_far(ranking, folder),
+                folder=folder,
             )
             bar.finish()
             bar.stage("drawing")
@@ -318,6 +323,10 @@ def main(
             write_page(page, folder, pictures)
         print_results(page, folder, console)
         if ranking.report.interrupted:
+            console.print(
+                f"the same command with --out {folder} goes on from these fits",
+                soft_wrap=True,
+            )
             exit_interrupted()
 
     run(quiet, body)

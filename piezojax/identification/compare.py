@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from ..core.progress import Progress, Silent
 from .candidates import (
@@ -24,6 +25,7 @@ from .ranking import (
 )
 from .records.parts import check_compatible, train_validation_and_test
 from .records.record import Record
+from .unfinished import Unfinished
 
 CHAINS_KEPT = 2
 """Number of chains with a hysteresis that enter each further round."""
@@ -39,6 +41,7 @@ def identify_all(
     options: Options | None = None,
     progress: Progress | None = None,
     done: Callable[[ModelRanking], None] | None = None,
+    folder: Path | None = None,
 ) -> ModelRanking:
     """Fit every model that ``records`` support, and choose one by RULE.
 
@@ -52,10 +55,12 @@ def identify_all(
     the report. ``train`` and ``validate`` are as in ``identify``; by default they are
     the halves of the samples before ``test``. ``done`` receives the ranking so far,
     marked as interrupted, after each fit. Ctrl-C ends the search and keeps the models
-    fitted so far.
+    fitted so far. In ``folder``, if given, the fits are stored until the search has
+    ended; another call with the same arguments goes on from them.
 
     Raises ValueError as ``identify`` does for records and parts, for a ``test`` that
-    shares samples with the other parts, and if no model can be fitted.
+    shares samples with the other parts, for a ``folder`` with fits of another search,
+    and if no model can be fitted.
     """
     began = time.perf_counter()
     records = (records,) if isinstance(records, Record) else tuple(records)
@@ -65,6 +70,10 @@ def identify_all(
     options = options or Options()
     first, untried = first_round(records, train, options, hysteresis)
     search = Search(records, train, validate, options, progress or Silent())
+    if folder is not None:
+        search.unfinished = Unfinished(
+            folder, records, (train, validate, test), options
+        )
     if len(records) > 1 and single_channel(records):
         # The choice must not use the test part.
         search.left_out = tuple(
@@ -107,6 +116,8 @@ def identify_all(
             "; ".join(f"{one.model}: {one.reason}" for one in untried)
         )
         raise ValueError(f"no model could be fitted ({why})")
+    if search.unfinished is not None:
+        search.unfinished.remove()
     return _ranking_of(search, untried, test, False, time.perf_counter() - began)
 
 

@@ -13,6 +13,7 @@ from .estimators.estimate import Options
 from .fit import Fit, identify
 from .ranking import RankedModel
 from .records.record import Record
+from .unfinished import Finished, Unfinished
 
 
 class _LabelledProgress:
@@ -34,6 +35,7 @@ class Search:
     ``fitted`` is called after each fit. ``left_out`` are the records that are left out
     of a fit in turn; if there are none, the validation part decides. ``across`` holds
     the errors on them by model, None for a model that fails on one of them.
+    ``unfinished`` holds the fits of a search that goes on, if any.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class Search:
         self.left_out: tuple[Record, ...] = ()
         self.across: dict[str, tuple[np.ndarray, ...] | None] = {}
         self.fitted: Callable[[], None] = lambda: None
+        self.unfinished: Unfinished | None = None
 
     def fit(self, candidates: Sequence[Candidate], total: int) -> None:
         """Fit ``candidates``, of about ``total`` models in the whole search."""
@@ -59,10 +62,14 @@ class Search:
         for candidate in candidates:
             number = len(self.fits) + len(self.failed) + 1
             label = f"{number} of about {total}, {candidate.model}"
-            began = time.perf_counter()
+            began, known = time.perf_counter(), self._known(candidate.model)
             try:
-                fit = self._fit_to(
-                    candidate, self.records, self.train, self.validate, label
+                fit = (
+                    known.fit
+                    if known
+                    else self._fit_to(
+                        candidate, self.records, self.train, self.validate, label
+                    )
                 )
                 rmse = fit.report.train.rmse + fit.report.validation.rmse
                 if not np.isfinite(rmse):
@@ -82,17 +89,35 @@ class Search:
             else:
                 self.fits[candidate.model] = fit
             self.waiting.remove(candidate)
-            if candidate.model in self.fits:
-                # Keep the fit first: its evaluation on other records takes as long.
-                self.fitted()
-                if self.left_out:
-                    self.across[candidate.model] = errors_across(
-                        self.left_out,
-                        lambda others, part, candidate=candidate, label=label: (
-                            self._fit_to(candidate, others, part, part, label)
-                        ),
-                    )
-                    self.fitted()
+            if candidate.model not in self.fits:
+                continue
+            # Keep the fit first: its evaluation on other records takes as long.
+            if known is None:
+                self._keep(candidate.model)
+            self.fitted()
+            if not self.left_out:
+                continue
+            if known is not None and known.has_across:
+                self.across[candidate.model] = known.across
+            else:
+                self.across[candidate.model] = errors_across(
+                    self.left_out,
+                    lambda others, part, candidate=candidate, label=label: self._fit_to(
+                        candidate, others, part, part, label
+                    ),
+                )
+                self._keep(candidate.model)
+            self.fitted()
+
+    def _known(self, model: str) -> Finished | None:
+        if self.unfinished is None:
+            return None
+        return self.unfinished.found(model, self.records, self.train, self.validate)
+
+    def _keep(self, model: str) -> None:
+        if self.unfinished is not None:
+            across, has_across = self.across.get(model), model in self.across
+            self.unfinished.keep(model, self.fits[model], across, has_across)
 
     def _fit_to(
         self,

@@ -22,6 +22,7 @@ from piezojax.identification import (
 )
 from piezojax.identification.across import errors_across
 from piezojax.identification.candidates import parts_at
+from piezojax.identification.estimators.estimate import Options
 from piezojax.identification.fit import Fit, FitError, FitReport
 from piezojax.identification.ranking import RankingReport
 from piezojax.report.model_ranking import (
@@ -183,6 +184,55 @@ def test_a_killed_search_leaves_a_ranking_of_the_finished_fits(made, tmp_path):
     assert (tmp_path / "model.json").exists()
     places = {row.folder for row in found.report.rows if row.folder not in (None, ".")}
     assert {f"models/{p.name}" for p in (tmp_path / "models").iterdir()} == places
+
+
+def counted(monkeypatch, stop=None):
+    """Return the list of the models that are fitted; ``stop`` interrupts its fit."""
+    models, fit = [], model_search.identify
+
+    def one(records, model, **more):
+        if stop is not None and model.startswith(stop):
+            raise KeyboardInterrupt
+        models.append(model)
+        return fit(records, model, **more)
+
+    monkeypatch.setattr(model_search, "identify", one)
+    return models
+
+
+@pytest.mark.parametrize("records", [[RICH], [RICH, RICH]])
+def test_an_interrupted_search_goes_on(records, made, monkeypatch, tmp_path):
+    made({"bouc_wen": ValueError("fails")})
+    whole = identify_all(records)
+    with monkeypatch.context() as patch:
+        before = counted(patch, "prandtl_ishlinskii")
+        assert identify_all(records, folder=tmp_path).report.interrupted
+    after = counted(monkeypatch)
+    (next((tmp_path / "search").glob("*.npz"))).write_bytes(b"damaged")
+    found = identify_all(records, folder=tmp_path)
+    assert not (tmp_path / "search").exists()
+    # A failed fit and the damaged one are repeated.
+    fits = [model for model in before if "bouc_wen" not in model]
+    assert len(set(fits) & set(after)) == 1
+    assert not found.report.interrupted
+
+    def figures(ranking):
+        return [row.model_copy(update={"wall_s": 0.0}) for row in ranking.report.rows]
+
+    assert figures(found) == figures(whole)
+
+
+def test_a_search_goes_on_only_with_the_same_records(made, monkeypatch, tmp_path):
+    made({"prandtl_ishlinskii": KeyboardInterrupt()})
+    identify_all(RICH, folder=tmp_path)
+    other = Record(TONES, 0.1 * TONES + 1.1, 1e-3)
+    for changes in (
+        {"records": other},
+        {"train": slice(0, 900)},
+        {"options": Options(steps=7)},
+    ):
+        with pytest.raises(ValueError, match="other records, parts, options or ver"):
+            identify_all(**({"records": RICH, "folder": tmp_path} | changes))
 
 
 def test_ctrl_c_before_anything_is_fitted(made):
