@@ -1,8 +1,8 @@
 """Figures of other controllers on the hold-out, beside those of the tuned one."""
 
+import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from threading import Event
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from ..analysis.constraints import LoopFigures, worst_by_plant
 from ..core.progress import Progress
 from ..study import Case
 from .alarms import PEAK
-from .data import Data
+from .data import Data, depends_on_loop
 from .held_out import HeldOut
 from .result import Beside, log_errors, number
 
@@ -19,53 +19,46 @@ from .result import Beside, log_errors, number
 class FiguresBeside:
     """Figures of the controllers that a study names beside its own, on the hold-out.
 
-    A thread computes them beside other work from ``begin`` on, until the context ends.
+    They are computed from ``begin`` on, until the context ends: in one thread beside
+    the search, or in several after it if the hold-out depends on the tuned loop.
     """
 
     def __init__(self, case: Case):
-        self._case, self._stopped = case, Event()
-        self._pool = ThreadPoolExecutor(1)
-        self._found: Future[dict[str, Beside]] | None = None
+        threads = os.cpu_count() if depends_on_loop(case) else 1
+        self._case, self._pool = case, ThreadPoolExecutor(threads)
+        self._found: dict[str, Future[Beside]] = {}
 
     def __enter__(self) -> "FiguresBeside":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stopped.set()
-        self._pool.shutdown(wait=False)
+        self._pool.shutdown(wait=False, cancel_futures=True)
 
     def begin(self, data: Data, own: HeldOut) -> None:
         """Begin to compute the figures, with those of ``own``, the loop of the study.
 
         Does nothing if they have begun, or if the study names no controller.
         """
-        if not self._case.beside or self._found is not None:
+        if not self._case.beside or self._found:
             return
         self._driven = np.array([trace.driven for trace in data.traces])
         # The result needs the figures of the study's own loop first.
         loops = {"before": own}
         for name, controller in self._case.beside.items():
             loops[name] = own.with_loop(replace(own.loop, controller=controller))
-        self._found = self._pool.submit(self._compute, loops)
-
-    def _compute(self, loops: dict[str, HeldOut]) -> dict[str, Beside]:
-        found = {}
         for name, loop in loops.items():
-            if self._stopped.is_set():
-                break
-            found[name] = self._figures(loop)
-        return found
+            self._found[name] = self._pool.submit(self._figures, loop)
 
     def all(self, tuned: HeldOut, progress: Progress) -> dict[str, Beside]:
         """Return the figures of all controllers, of the start and of the tuned loop.
 
         There are none without ``begin``.
         """
-        if self._found is None:
+        if not self._found:
             return {}
         progress.stage("evaluating the other controllers")
         last = self._figures(tuned)
-        found = self._found.result()
+        found = {name: figures.result() for name, figures in self._found.items()}
         return found | {"before": found.pop("before"), "tuned": last}
 
     def _figures(self, held_out: HeldOut) -> Beside:

@@ -75,7 +75,7 @@ def test_a_grid_equals_single_evaluations(case_of):
                 np.testing.assert_allclose(
                     found[name].sel(values).isel(plant=0),
                     np.asarray(getattr(figures, name))[:, 0],
-                    rtol=1e-11,
+                    rtol=1e-12,
                     err_msg=f"{name} at {values}",
                 )
 
@@ -108,7 +108,7 @@ def test_trajectories_have_every_nth_sample(case_of):
             chosen[name], np.asarray(getattr(log, name))[::every], atol=1e-12
         )
     np.testing.assert_array_equal(chosen.followed, reference[::every])
-    np.testing.assert_allclose(chosen.rms_error, figures.rms_error, rtol=1e-11)
+    np.testing.assert_allclose(chosen.rms_error, figures.rms_error, rtol=1e-12)
 
 
 def test_samples_carry_their_parameters(case_of):
@@ -126,7 +126,7 @@ def test_samples_carry_their_parameters(case_of):
     judge = jax.jit(lambda loop: evaluate(lambda x: x, loop, signals, start=100))
     figures = judge(replace(case.loop, last))
     np.testing.assert_allclose(
-        found.rms_error[-1, 0], figures.rms_error[:, 0], rtol=1e-11
+        found.rms_error[-1, 0], figures.rms_error[:, 0], rtol=1e-12
     )
 
 
