@@ -131,6 +131,23 @@ class Extremes(Metric):
         return ExtremeFigures(total["slew"], jnp.where(moves, overshoot, 0.0))
 
 
+class Chosen(Metric):
+    """The figures ``names`` of a metric, as a dict: the others are not accumulated."""
+
+    metric: Metric
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def init(self) -> State:
+        return self.metric.init()
+
+    def update(self, total: State, index: Array, output: LoopSample) -> State:
+        return self.metric.update(total, index, output)
+
+    def result(self, total: State) -> dict[str, Any]:
+        figures = self.metric.result(total)._asdict()
+        return {name: figures[name] for name in self.names}
+
+
 class MetricPair(Metric):
     """Two metrics of one run; the result is the tuple of their figures."""
 

@@ -72,7 +72,7 @@ def simulate(
     for name, value in (("every", every), ("segment", segment)):
         if value < 1:
             raise ValueError(f"{name} is {value}; it must be at least 1")
-    samples = _length(inputs)
+    samples = samples_of(inputs)
     if metric is not None and every > samples:
         raise ValueError(f"every is {every}; the run has {samples} samples")
     system = resolve(system)
@@ -87,7 +87,8 @@ def simulate(
     return jax.lax.scan(lambda s, u: system.step(s, u), state, inputs)
 
 
-def _length(inputs: Any) -> int:
+def samples_of(inputs: Any) -> int:
+    """Return the number of samples; ValueError for ragged or empty inputs."""
     lengths = {jnp.shape(leaf)[0] for leaf in jax.tree.leaves(inputs) if jnp.ndim(leaf)}
     if len(lengths) != 1:
         raise ValueError(

@@ -104,11 +104,21 @@ def statements(
     of an input by its place; ``held`` holds the expressions of nodes that are computed
     elsewhere. A comment names the Python function behind each group of operations.
     """
-    writer = _Writer(graph, outputs, names, precision, held)
+    writer = Writer(graph, outputs, names, precision, held)
     return list(writer.block(graph.block, "    ")), writer.expression
 
 
-class _Writer:
+class Writer:
+    """Writer of the operations of a graph, with the arguments of ``statements``.
+
+    ``forms`` are the expressions of operations, ``logical`` the infix operators of
+    boolean operands, and ``types`` the types of C.
+    """
+
+    forms: Mapping[str, str] = FORMS
+    logical: Mapping[str, str] = LOGICAL
+    types: Mapping[str, str] = TYPES
+
     def __init__(
         self,
         graph: Graph,
@@ -122,6 +132,7 @@ class _Writer:
         self.variables: dict[int, str] = {}
 
     def expression(self, number: int) -> str:
+        """Return the expression of a node."""
         if number in self.held:
             return self.held[number]
         node = self.graph.nodes[number]
@@ -138,13 +149,15 @@ class _Writer:
             text = str(int(node.value))
         return f"({text})" if text.startswith("-") else text
 
-    def _type(self, node: Node) -> str:
-        return TYPES.get(node.kind, self.precision.real)
+    def type_of(self, node: Node) -> str:
+        """Return the type of a node."""
+        return self.types.get(node.kind, self.precision.real)
 
     def _name(self, number: int) -> str:
         return self.variables.setdefault(number, f"v{len(self.variables)}")
 
     def block(self, block: Block, indent: str) -> Iterator[str]:
+        """Yield the statements of a block."""
         source = ""
         for alike, group in itertools.groupby(self._computed(block), self._alike):
             numbers = list(group)
@@ -180,7 +193,7 @@ class _Writer:
     def _statements(self, numbers: Sequence[int], indent: str) -> list[str]:
         """Return the statements of equal operations, in loops if these are shorter."""
         if len(numbers) < ROLLED:
-            return [self._single(number, indent) for number in numbers]
+            return [self.statement(number, indent) for number in numbers]
         name = f"a{len(self.variables)}"
         self.variables |= {number: f"{name}[{i}]" for i, number in enumerate(numbers)}
         tables, rows = self._tabulated(numbers, name, indent)
@@ -195,16 +208,17 @@ class _Writer:
             lines += self._statements(numbers[first:end], indent)
         return lines
 
-    def _single(self, number: int, indent: str) -> str:
+    def statement(self, number: int, indent: str) -> str:
+        """Return the statement of a single node."""
         node = self.graph.nodes[number]
         text = self._operation(node, [self.expression(n) for n in node.operands])
-        return f"{indent}const {self._type(node)} {self._name(number)} = {text};"
+        return f"{indent}const {self.type_of(node)} {self._name(number)} = {text};"
 
     def _array(
         self, numbers: Sequence[int], name: str, found: Sequence[Piece], indent: str
     ) -> Iterator[str]:
         node = self.graph.nodes[numbers[0]]
-        yield f"{indent}{self._type(node)} {name}[{len(numbers)}];"
+        yield f"{indent}{self.type_of(node)} {name}[{len(numbers)}];"
         for first, end, operands in found:
             text = self._operation(node, operands)
             if end == first + 1:
@@ -232,7 +246,7 @@ class _Writer:
             ]
             if alone:
                 table = f"{name}_{place}"
-                declaration = f"{self._type(nodes[column[alone[0]]])} {table}"
+                declaration = f"{self.type_of(nodes[column[alone[0]]])} {table}"
                 tables += constant_array(declaration, [texts[i] for i in alone], indent)
                 for index, i in enumerate(alone):
                     texts[i] = f"{table}[{index}]"
@@ -246,7 +260,7 @@ class _Writer:
             return
         for place in used:
             first, carried = loop.first[place], loop.carried[place]
-            kind, name = self._type(nodes[first]), self._name(carried)
+            kind, name = self.type_of(nodes[first]), self._name(carried)
             yield f"{indent}{kind} {name} = {self.expression(first)};"
         for i, node in enumerate(nodes):
             if node.operation == RESULT and node.value[0] == number:
@@ -259,7 +273,7 @@ class _Writer:
         changed = [p for p in used if loop.carried[p] != loop.last[p]]
         # New values may depend on old ones: compute all before assigning any.
         for p in changed:
-            kind = self._type(nodes[loop.carried[p]])
+            kind = self.type_of(nodes[loop.carried[p]])
             last = self.expression(loop.last[p])
             yield f"{inner}const {kind} n{loop.carried[p]} = {last};"
         for p in changed:
@@ -275,7 +289,7 @@ class _Writer:
         if name == READ:
             return f"{self.names(int(node.value)).partition('[')[0]}[{a}]"
         if name in LOGICAL and kinds[0] == "boolean":
-            return f"{a} {LOGICAL[name]} {b}"
+            return f"{a} {self.logical[name]} {b}"
         if name in BITWISE:
             return f"{a} {BITWISE[name]} {b}"
         if name in INFIX:
@@ -285,10 +299,10 @@ class _Writer:
         if name == "round":
             even = node.value == jax.lax.RoundingMethod.TO_NEAREST_EVEN
             return f"{'rint' if even else 'round'}{self.precision.suffix}({a})"
-        form = OF_KIND.get((name, node.kind)) or FORMS.get(name)
+        form = OF_KIND.get((name, node.kind)) or self.forms.get(name)
         if form is not None:
             more = {"one": self._one(), "f": self.precision.suffix}
-            return form.format(a=a, b=b, c=c, type=self._type(node), **more)
+            return form.format(a=a, b=b, c=c, type=self.type_of(node), **more)
         if name in FUNCTIONS:
             function = FUNCTIONS[name] + self.precision.suffix
             return f"{function}({a}, {b})" if b else f"{function}({a})"

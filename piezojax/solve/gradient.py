@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..engines import reverse_mode
 from .problem import FAILED_LOSS
 
 
@@ -40,7 +41,8 @@ def with_finite_gradient(loss, *, forward: bool):
                 out_axes=(None, 0),
             )(jnp.eye(fixed.shape[0]))
         else:
-            value, gradient = jax.value_and_grad(loss)(fixed)
+            with reverse_mode(True):
+                value, gradient = jax.value_and_grad(loss)(fixed)
         usable = jnp.all(jnp.isfinite(gradient)) & (value < FAILED_LOSS)
         gradient = jnp.where(usable, jnp.nan_to_num(gradient), 0.0)
         return _guarded(value, gradient, unit)

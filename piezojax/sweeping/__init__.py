@@ -1,6 +1,5 @@
 """Sweeps: tracking figures of a loop over parameters, plants and references."""
 
-from .fused_loop import simulate_lanes as simulate_lanes
 from .sweeper import SweepResult as SweepResult
 from .sweeper import read_swept as read_swept
 from .sweeper import run_sweep as run_sweep

@@ -16,16 +16,16 @@ from ..analysis.stability.operating_point import BRANCHES
 from ..core.arrays import State
 from ..core.axes import PerAxisMetric, packed
 from ..core.feedback import Feedback, LoopSample, loop_inputs
-from ..core.metrics import Tracking
+from ..core.metrics import Chosen, Tracking
 from ..core.paths import replace
 from ..core.rollout import Metric, in_blocks, simulate
 from ..core.system import System
+from ..engines import metered
 from ..signals.waveforms import time_grid
 from ..study import Case, Stage
 from ..study.sweep_table import SENSITIVITY
 from ..tuning.data import make_data
 from ..tuning.runs import RunNoise
-from .fused_loop import simulate_lanes
 from .plan import TRAJECTORIES, Plan, plants_of, references_of, sweep_table
 
 # Poles of the hysteresis lie at 1, up to rounding, and must count as stable.
@@ -96,7 +96,8 @@ class Simulator:
         ]
 
     def _metric(self) -> Metric:
-        metric: Metric = Tracking(start=self.start)
+        names = tuple(name for name in self.metrics if name != SENSITIVITY)
+        metric: Metric = Chosen(Tracking(start=self.start), names)
         if self.reference.ndim > 2:
             metric = PerAxisMetric(metric, self.reference.shape[2])
         return metric
@@ -122,12 +123,13 @@ class Simulator:
             reference, run_noise = drives
             inputs = loop_inputs(reference, *run_noise)
 
-            def started(values):
+            def figures(values):
                 system = loop_at(values)
-                return system, system.init(reference[0])
+                state = system.init(reference[0])
+                return metered(system, inputs, state, metric)[0]
 
             if every is None:
-                return simulate_lanes(started, values, inputs, metric)._asdict()
+                return jax.vmap(figures)(values)
             step = every
 
             def simulate_point(values):
@@ -140,8 +142,8 @@ class Simulator:
                 signals = {name: jnp.moveaxis(x, 0, -1) for name, x in signals.items()}
                 return metric.result(end[1]), signals
 
-            figures, log = jax.vmap(simulate_point)(values)
-            return figures._asdict() | log
+            found, log = jax.vmap(simulate_point)(values)
+            return found | log
 
         results = jax.lax.map(run, (reference, run_noise))
         if SENSITIVITY in self.metrics:

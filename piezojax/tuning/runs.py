@@ -10,10 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..core.axes import PerAxisMetric
-from ..core.feedback import Feedback, loop_inputs
+from ..core.feedback import Feedback, LoopSample, loop_inputs
 from ..core.metrics import MetricPair, Tracking
-from ..core.rollout import Metric, simulate
+from ..core.rollout import Metric
 from ..core.system import resolve
+from ..engines import metered
 from ..study import Stage
 
 
@@ -71,6 +72,10 @@ class Signals(eqx.Module):
         return dataclasses.replace(self, holding=stage.holding)
 
 
+def _error(sample: LoopSample) -> Any:
+    return jax.tree.map(jnp.subtract, sample.displacement, sample.reference)
+
+
 def evaluate(
     loop_of: Callable[[Any], Feedback],
     parameters: Any,
@@ -110,12 +115,10 @@ def sampled(
         loop = resolve(loop_of(parameters))  # once for the start and the run
         inputs = loop_inputs(reference, *run_noise)
         state = loop.init(reference[0], holding)
-        found = simulate(loop, inputs, state, metric=metric, every=every)[1]
+        figures, log = metered(loop, inputs, state, metric, every=every, log=_error)
         if every == 1:
-            return found, None
-        figures, log = found
-        error = jax.tree.map(jnp.subtract, log.displacement, log.reference)
-        counted = jax.tree.map(lambda x: x[start // every :], error)
+            return figures, None
+        counted = jax.tree.map(lambda x: x[start // every :], log)
         return figures, jnp.stack(counted) if isinstance(counted, tuple) else counted
 
     # Each run has a copy of the parameters: their gradients are summed once, after the

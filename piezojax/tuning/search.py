@@ -5,6 +5,7 @@ import scipy
 
 from ..core.progress import Progress
 from ..core.rollout import BLOCK
+from ..engines import default_engine
 from ..solve.clock import Clock
 from ..solve.lockstep import LockstepDescent
 from ..solve.multi_start import Strategy, minimise
@@ -16,9 +17,12 @@ from ..solve.successive_halving import SuccessiveHalving
 from ..study import Case
 from .objective import Objective
 
-FORWARD_BELOW, FORWARD_BELOW_WITH_AXES = 5, 64
-"""Numbers of parameters below which forward-mode differentiation is used, with one axis
-and with several. With several axes the reverse pass takes minutes to compile, three
+FORWARD_BELOW = {"native": 9, "loop": 5}
+"""Numbers of parameters below which forward-mode differentiation is faster, by engine;
+5 for others."""
+
+FORWARD_BELOW_WITH_AXES = 64
+"""The same with several axes, where the reverse pass takes minutes to compile, three
 times as long as the forward pass."""
 
 
@@ -36,7 +40,9 @@ def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:
             tolerance=table.tolerance,
             every=every,
         )
-    below = FORWARD_BELOW_WITH_AXES if case.study.axes else FORWARD_BELOW
+    below = FORWARD_BELOW.get(default_engine(), FORWARD_BELOW["loop"])
+    if case.study.axes:
+        below = FORWARD_BELOW_WITH_AXES
     return LockstepDescent(
         objective,
         size,

@@ -5,16 +5,16 @@
 Simulates the two loops of throughput.py in float64, every lane with its own gains and
 all lanes with the same reference and noise, as in a sweep. Rows of the JSON file:
 
-    engine            fused: simulate_lanes, one kernel for all steps; xla: the same
-                      function with fused=False, jax.vmap of the loop over time; c: 64
-                      lanes on one core of the host, each with signals of its own
+    engine            gpu: one kernel for all steps; loop: jax.vmap of the loop over
+                      time, by XLA; c: 64 lanes on one core of the host, each with
+                      signals of its own
     seconds           shortest of --repeats runs of --steps steps of all lanes
     ns_per_lane_step  seconds / (lanes * steps), in ns
     compile_s         tracing and compiling
     largest_deviation largest relative deviation of a figure of a lane from the engine
-                      xla, over 2000 steps of up to 1000 lanes
+                      loop, over 2000 steps of up to 1000 lanes
 
-Without a GPU the engines xla and c run, and fused is left out.
+Without a GPU the engines loop and c run.
 """
 
 import argparse
@@ -46,7 +46,7 @@ def parse():
     return parser.parse_args()
 
 
-def compiled(problem, lanes, steps, fused):
+def compiled(problem, lanes, steps, engine):
     """Return a function that simulates and waits, and the seconds of compiling."""
     import jax
     import jax.numpy as jnp
@@ -54,7 +54,7 @@ def compiled(problem, lanes, steps, fused):
     from piezojax.core.axes import PerAxisMetric
     from piezojax.core.feedback import LoopInput
     from piezojax.core.metrics import Tracking
-    from piezojax.sweeping import simulate_lanes
+    from piezojax.engines import metered
 
     loop_of = LOOPS[problem.name]()
     gains, reference, noise = problem.problem(min(lanes, CHECKED[0]), steps)
@@ -67,27 +67,24 @@ def compiled(problem, lanes, steps, fused):
         signals = (tuple(jnp.array(x[:, i]) for i in range(axes)) for x in signals)
     inputs = LoopInput(*(jax.tree.map(jnp.array, x) for x in signals))
 
-    def run_of(gains):
+    def lane(gains, inputs):
         loop = loop_of(gains)
-        return loop, loop.init(start)
+        return metered(loop, inputs, loop.init(start), metric, engine=engine)[0]
 
     begin = time.perf_counter()
-    program = (
-        jax.jit(lambda g, u: simulate_lanes(run_of, g, u, metric, fused=fused))
-        .lower(jnp.array(gains), inputs)
-        .compile()
-    )
+    lanes_of = jax.jit(jax.vmap(lane, in_axes=(0, None)))
+    program = lanes_of.lower(jnp.array(gains), inputs).compile()
     seconds, arguments = time.perf_counter() - begin, (jnp.array(gains), inputs)
     return lambda: jax.block_until_ready(program(*arguments)), seconds
 
 
 def deviation(problem):
-    """Return the largest relative deviation between the engines fused and xla."""
+    """Return the largest relative deviation between the engines gpu and loop."""
     import jax
 
     one, other = (
-        jax.tree.map(np.asarray, compiled(problem, *CHECKED, fused)[0]())
-        for fused in (True, False)
+        jax.tree.map(np.asarray, compiled(problem, *CHECKED, engine)[0]())
+        for engine in ("gpu", "loop")
     )
     each = jax.tree.map(
         lambda a, b: np.abs(a - b) / np.maximum(np.abs(b), 1e-9), one, other
@@ -121,7 +118,7 @@ def main():
 
     console, rows = Console(), []
     device = jax.devices()[0]
-    names = ("fused", "xla") if device.platform == "gpu" else ("xla",)
+    names = ("gpu", "loop") if device.platform == "gpu" else ("loop",)
 
     def add(loop, engine, lanes, seconds, compile_s=None):
         each = 1e9 * seconds / (lanes * options.steps)
@@ -148,13 +145,11 @@ def main():
         seconds = host_seconds(problem, options.steps, options.repeats)
         if seconds is not None:
             add(name, "c", HOST_LANES, seconds)
-        if "fused" in names:
+        if "gpu" in names:
             result["largest_deviation"][name] = deviation(problem)
         for lanes in map(int, options.lanes.split(",")):
             for engine in names:
-                run, compile_s = compiled(
-                    problem, lanes, options.steps, engine == "fused"
-                )
+                run, compile_s = compiled(problem, lanes, options.steps, engine)
                 add(name, engine, lanes, shortest(run, options.repeats), compile_s)
                 options.json.write_text(json.dumps(result, indent=2) + "\n")
     table = Table(title=result["device"])
@@ -179,7 +174,7 @@ def main():
         )
     console.print(table)
     for name, found in result["largest_deviation"].items():
-        console.print(f"{name}: fused deviates from xla by at most {found:.1e}")
+        console.print(f"{name}: gpu deviates from loop by at most {found:.1e}")
 
 
 if __name__ == "__main__":

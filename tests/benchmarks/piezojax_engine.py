@@ -10,10 +10,11 @@ import numpy as np
 from engines import DOB_PID_SMC, Engine
 from loop_three_dof import THREE_DOF_PID_SMC
 
-import piezojax
 from piezojax.catalog import p558_control, p753
 from piezojax.core.axes import PerAxisMetric
 from piezojax.core.feedback import LoopInput
+from piezojax.core.metrics import Chosen, Tracking
+from piezojax.engines import metered
 
 BLOCK = 64  # lanes simulated at a time
 
@@ -66,41 +67,36 @@ LOOPS = {DOB_PID_SMC.name: lambda: loop, THREE_DOF_PID_SMC.name: three_dof_loops
 """Functions that make loop_of(gains), by the name of the loop."""
 
 
-def rms(loop_of, gains, inputs, **options):
+def rms(loop_of, gains, inputs):
     """Return the RMS errors of one lane over the second half of the run, by axis."""
     system = loop_of(gains)
     samples = jax.tree.leaves(inputs)[0].shape[0]
-    metric = piezojax.core.metrics.Tracking(start=samples // 2)
+    metric = Tracking(start=samples // 2)
     start = 0.0
     if isinstance(inputs.noise, tuple):
         metric = PerAxisMetric(metric, len(inputs.noise))
         start = (0.0,) * len(inputs.noise)
-    _, figures = piezojax.simulate(
-        system, inputs, system.init(start), metric=metric, **options
-    )
-    return figures.rms_error
+    metric = Chosen(metric, ("rms_error",))
+    return metered(system, inputs, system.init(start), metric)[0]["rms_error"]
 
 
 def block_of_rms(loop_of, gains, inputs):
-    """Return the RMS errors of a block: gains [width, n], inputs [steps, width].
-
-    One plain loop, which reads signals with time first.
-    """
-    steps = jax.tree.leaves(inputs)[0].shape[0]
-    return jax.vmap(lambda g, u: rms(loop_of, g, u, segment=steps), in_axes=(0, 1))(
-        gains, inputs
-    )
+    """Return the RMS errors of a block: gains [width, n], inputs [steps, width]."""
+    return jax.vmap(lambda g, u: rms(loop_of, g, u), in_axes=(0, 1))(gains, inputs)
 
 
 def mean_square(loop_of, gains, inputs):
-    """Return the loss for gains [n] of all lanes and inputs [lanes, steps]."""
-    lanes = jax.tree.leaves(inputs)[0].shape[0]
-    # One copy per lane: gradients are then summed once, not in each step.
-    each = jnp.broadcast_to(gains, (lanes, len(gains)))
-    blocks = piezojax.core.rollout.in_blocks(
-        lambda g, u: rms(loop_of, g, u), each, inputs
-    )
-    return jnp.mean(blocks**2)
+    """Return the loss for gains [n] of all lanes and inputs [steps, lanes]."""
+    lanes = jax.vmap(lambda u: rms(loop_of, gains, u), in_axes=1)(inputs)
+    return jnp.mean(lanes**2)
+
+
+def value_and_gradient(loop_of, gains, inputs):
+    """Return the loss and its gradient [n], in forward mode as in a search."""
+    return jax.vmap(
+        lambda d: jax.jvp(lambda g: mean_square(loop_of, g, inputs), (gains,), (d,)),
+        out_axes=(None, 0),
+    )(jnp.eye(len(gains)))
 
 
 def signals(reference, noise):
@@ -125,7 +121,7 @@ class PiezojaxEngine(Engine):
 
     gradient: one gains vector [8], shared by all lanes; the loss is the mean over
     lanes of the mean over k = steps//2 ... steps-1 of (y(k) - r(k))^2, in um^2;
-    `run` returns (loss, gradient [8]), in reverse mode.
+    `run` returns (loss, gradient [8]), in forward mode.
     """
 
     name = "piezojax"
@@ -152,8 +148,9 @@ class PiezojaxEngine(Engine):
             ]
             function = partial(block_of_rms, self._loop_of)
         else:
-            self._calls = [jax.tree.map(jnp.array, (gains, inputs))]
-            function = jax.value_and_grad(partial(mean_square, self._loop_of))
+            first = jax.tree.map(lambda x: jnp.array(x.T), inputs)
+            self._calls = [(jnp.array(gains), first)]
+            function = partial(value_and_gradient, self._loop_of)
         begin = time.perf_counter()
         self._compiled = jax.jit(function).lower(*self._calls[0]).compile()
         self.compile_s = time.perf_counter() - begin

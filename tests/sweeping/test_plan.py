@@ -2,6 +2,7 @@
 
 import copy
 
+import jax
 import numpy as np
 import pytest
 from swept_studies import GRID, PARAMETERS
@@ -191,3 +192,11 @@ def test_shards_are_counted_from_one(case_of):
     for shard in ((0, 3), (4, 3), (1, 0)):
         with pytest.raises(ValueError, match="shards are counted from 1/"):
             plan.share(shard)
+
+
+def test_blocks_are_larger_on_a_gpu(case_of, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    table = {"method": "sobol", "samples": 1000, "metrics": ["rms_error"]}
+    assert Plan(case_of(table)).width == 1000
+    assert Plan(case_of(table | {"chunk": 100})).width == 100
+    assert Plan(case_of(table | {"chunk": 10})).width == 64

@@ -1,0 +1,6 @@
+"""Engines that run many lanes at once, in compiled C or in one kernel of a GPU."""
+
+from .engine import Engine as Engine
+from .engine import default_engine as default_engine
+from .engine import metered as metered
+from .engine import reverse_mode as reverse_mode

@@ -1,0 +1,108 @@
+"""Batch axes of the operands of a run, sorted by what depends on them."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+Positions = tuple[int | None, ...]
+"""For each batch axis, its position in the shape of an operand; None if it has none."""
+
+
+def sizes_of(
+    operands: Sequence[Any], positions: Sequence[Positions]
+) -> tuple[int, ...]:
+    """Return the size of each batch axis; ``operands`` are arrays or their shapes."""
+    sizes = [1] * len(positions[0])
+    for x, where in zip(operands, positions, strict=True):
+        for axis, position in enumerate(where):
+            if position is not None:
+                sizes[axis] = x.shape[position]
+    return tuple(sizes)
+
+
+def batched(positions: Positions, axis: int | None) -> Positions:
+    """Return the positions with a further batch axis, which comes first."""
+    if axis is None:
+        return None, *positions
+    moved = (p if p is None or p < axis else p + 1 for p in positions)
+    return axis, *moved
+
+
+class Batch(NamedTuple):
+    """Batch axes of a run in three groups.
+
+    ``directions`` are those of derivatives alone, ``inner`` those on which the inputs
+    depend, and ``outer`` the others. If the inputs depend on none, all are inner.
+    """
+
+    sizes: tuple[int, ...]
+    directions: list[int]
+    outer: list[int]
+    inner: list[int]
+
+    @classmethod
+    def sorted(
+        cls,
+        sizes: tuple[int, ...],
+        values: Sequence[Positions],
+        inputs: Sequence[Positions],
+    ) -> "Batch":
+        """Return the groups for the positions in ``values``, and ``inputs`` among them.
+
+        ``values`` are the operands that are not derivatives.
+        """
+        axes = range(len(sizes))
+        lanes = [
+            axis for axis in axes if any(where[axis] is not None for where in values)
+        ]
+        inner = [a for a in lanes if any(where[a] is not None for where in inputs)]
+        inner = inner or lanes
+        return cls(
+            sizes,
+            [axis for axis in axes if axis not in lanes],
+            [axis for axis in lanes if axis not in inner],
+            inner,
+        )
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Number of directions, of outer and of inner lanes."""
+        count = (math.prod(self.sizes[axis] for axis in group) for group in self[1:])
+        directions, outer, inner = count
+        return directions, outer, inner
+
+    def grouped(self, x: Any, where: Positions, *, last: bool = False) -> Array:
+        """Return an operand with three batch axes, one for each group.
+
+        An axis has the size 1 if the operand has none of its group. The batch axes come
+        first, or ``last``.
+        """
+        own = [axis for axis in range(x.ndim) if axis not in where]
+        order = [axis for group in self[1:] for axis in group]
+        present = [p for axis in order if (p := where[axis]) is not None]
+        shape, whole, counts = [], [], []
+        for group, count in zip(self[1:], self.counts, strict=True):
+            mine = any(where[axis] is not None for axis in group)
+            for axis in group:
+                size = self.sizes[axis]
+                shape.append(1 if where[axis] is None else size)
+                whole.append(size if mine else 1)
+            counts.append(count if mine else 1)
+        rest = [x.shape[axis] for axis in own]
+        if last:
+            found = x.transpose(*own, *present).reshape(*rest, *shape)
+            return jnp.broadcast_to(found, (*rest, *whole)).reshape(*rest, *counts)
+        found = x.transpose(*present, *own).reshape(*shape, *rest)
+        return jnp.broadcast_to(found, (*whole, *rest)).reshape(*counts, *rest)
+
+    def restored(self, x: Array) -> Array:
+        """Return an array with three batch axes with those of the run, in order."""
+        order = [axis for group in self[1:] for axis in group]
+        rest = x.shape[3:]
+        split = x.reshape(*(self.sizes[axis] for axis in order), *rest)
+        places = [int(i) for i in np.argsort(order)]
+        return split.transpose(*places, *range(len(order), split.ndim))

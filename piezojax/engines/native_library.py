@@ -1,0 +1,147 @@
+"""Compiled C functions that XLA calls on a CPU."""
+
+import ctypes
+import functools
+import hashlib
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections import defaultdict
+from contextlib import suppress
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import jax
+
+from ..core.files import write_bytes
+
+FLAGS = (
+    *("-std=gnu11", "-march=native", "-fPIC", "-shared", "-w", "-ftree-vectorize"),
+    # No function of the C library sets errno here, and no operation traps.
+    *("-fno-math-errno", "-fno-trapping-math"),
+)
+
+QUICK = 2000
+"""Lines of a source above which it is compiled with fewer optimisations: half the time,
+or less, for a loop that is up to a third slower."""
+
+CALL = Template("""
+#include "xla/ffi/api/c_api.h"
+
+static XLA_FFI_Buffer *buffer(void **all, int64_t place)
+{
+    return all[place];
+}
+
+static double *data(void **all, int64_t place)
+{
+    return buffer(all, place)->data;
+}
+
+XLA_FFI_Error *call(XLA_FFI_CallFrame *frame)
+{
+    const XLA_FFI_Extension_Base *more = frame->extension_start;
+    if (more && more->type == XLA_FFI_Extension_Metadata) {
+        XLA_FFI_Metadata *about = ((XLA_FFI_Metadata_Extension *)more)->metadata;
+        about->api_version.major_version = XLA_FFI_API_MAJOR;
+        about->api_version.minor_version = XLA_FFI_API_MINOR;
+        return NULL;
+    }
+    void **in = frame->args.args, **out = frame->rets.rets;
+    const int64_t *sizes = buffer(in, 3)->dims;
+    run_blocks(sizes[0], sizes[1], sizes[2], buffer(in, 5)->dims[0],
+               data(in, 0), data(in, 1), data(in, 2), data(in, 3), data(in, 4)$rows,
+               data(out, 0), data(out, 1), data(out, 2), data(out, 3));
+    return NULL;
+}
+""")
+"""Function that XLA calls, from its interface in C.
+
+XLA first asks for the version of the interface, in an extension of the call."""
+
+_locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+_libraries: dict[str, ctypes.CDLL] = {}
+
+_DIGEST = hashlib.sha256().digest_size
+
+
+class CompileError(RuntimeError):
+    """A source could not be compiled or loaded."""
+
+
+@functools.cache
+def compiler() -> str | None:
+    """Return the path of a C compiler, gcc rather than another; None without one."""
+    return shutil.which("gcc") or shutil.which("cc")
+
+
+def registered(text: str, rows: int) -> str:
+    """Return the name under which XLA knows the function ``run_blocks`` of a source.
+
+    ``rows`` is its number of arrays of inputs. The library is kept in the folder of
+    compiled programs of JAX, if there is one. Raises CompileError.
+    """
+    text = _called(text, rows)
+    name = "piezojax_" + hashlib.sha256(text.encode()).hexdigest()[:24]
+    with _locks[name]:
+        if name not in _libraries:
+            library = _kept(name) or _compiled(name, text)
+            call = jax.ffi.pycapsule(library.call)
+            jax.ffi.register_ffi_target(name, call, platform="cpu")
+            _libraries[name] = library
+    return name
+
+
+def _called(text: str, rows: int) -> str:
+    """Return a source with the function that XLA calls."""
+    pointers = "".join(f", data(in, {5 + i})" for i in range(rows))
+    return text + CALL.substitute(rows=pointers)
+
+
+def _path(name: str) -> Path | None:
+    config: Any = jax.config
+    folder = config.jax_compilation_cache_dir
+    return Path(folder) / f"{name}.so" if folder else None
+
+
+def _kept(name: str) -> ctypes.CDLL | None:
+    """Return the library that an earlier process has compiled, if it is undamaged."""
+    path = _path(name)
+    try:
+        content = path.read_bytes() if path else b""
+        # The digest follows the content, where loaders do not look.
+        if hashlib.sha256(content[:-_DIGEST]).digest() != content[-_DIGEST:]:
+            return None
+        return ctypes.CDLL(str(path))
+    except OSError:
+        return None
+
+
+def _compiled(name: str, text: str) -> ctypes.CDLL:
+    level = "-O2" if text.count("\n") < QUICK else "-O1"
+    include = f"-I{jax.ffi.include_dir()}"
+    command = [str(compiler()), level, *FLAGS, include, "-o", "run.so", "run.c", "-lm"]
+    with tempfile.TemporaryDirectory() as scratch:
+        source, library = Path(scratch) / "run.c", Path(scratch) / "run.so"
+        source.write_text(text, encoding="utf-8")
+        try:
+            subprocess.run(
+                command, cwd=scratch, capture_output=True, text=True, check=True
+            )
+            loaded = ctypes.CDLL(str(library))
+        except subprocess.CalledProcessError as error:
+            raise CompileError(f"{command[0]} fails: {error.stderr.strip()}") from None
+        except OSError as error:
+            raise CompileError(f"the compiled loop cannot be used: {error}") from None
+        _keep(name, library.read_bytes())
+    return loaded
+
+
+def _keep(name: str, content: bytes) -> None:
+    path = _path(name)
+    if path is not None:
+        with suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, content + hashlib.sha256(content).digest())

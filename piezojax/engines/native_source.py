@@ -1,0 +1,509 @@
+"""C source of a run of many lanes, whose inner loops become SIMD instructions."""
+
+from collections.abc import Iterable, Sequence
+from string import Template
+from types import MappingProxyType
+from typing import NamedTuple
+
+import jax
+
+from ..exporting.c_source import BITWISE, DOUBLE, FORMS, LOGICAL, Writer
+from ..exporting.graph import CONSTANT, INPUT, Node
+from .scalar_step import Element, Place, ScalarStep
+
+OPERATIONS = frozenset(
+    (
+        *("abs", "add", "and", "ceil", "clamp", "convert_element_type", "div", "eq"),
+        *("floor", "ge", "gt", "integer_pow", "is_finite", "le", "lt", "max", "min"),
+        *("mul", "ne", "neg", "not", "or", "round", "rsqrt", "select_n", "sign"),
+        *("sqrt", "square", "sub", "xor"),
+    )
+)
+"""Operations that compilers vectorise; a single other one would keep a whole loop from
+becoming SIMD."""
+
+GROUP = 8
+"""Lanes of an inner loop: the numbers of an AVX-512 register."""
+
+PAIRED = 400
+"""Number of operations of a step below which two groups of lanes run in turn: one alone
+waits for its own results most of the time."""
+
+
+class Rows(NamedTuple):
+    """A leaf of the inputs: its elements, and whether lanes have their own."""
+
+    size: int
+    by_lane: bool
+
+
+class Shape(NamedTuple):
+    """Lanes of a group, groups that run in turn, and samples between logged outputs."""
+
+    width: int
+    groups: int
+    every: int
+
+
+class Arrays(NamedTuple):
+    """Elements in the columns of the arrays of ``run_blocks``.
+
+    ``shared`` are the numbers of a system that are equal in all lanes, ``own`` those
+    that differ, and ``slopes`` derivatives of numbers. ``end`` and ``slope_end`` are
+    the elements of the carry that are wanted after the last step.
+    """
+
+    shared: list[Place]
+    own: list[Place]
+    slopes: list[Place]
+    end: list[Place]
+    slope_end: list[Place]
+
+
+def shape_for(step: ScalarStep, lanes: int, every: int) -> Shape:
+    """Return the fastest shape for a number of lanes."""
+    paired = lanes > GROUP and len(step.moving) < PAIRED and not step.slopes
+    return Shape(1 if lanes == 1 else GROUP, 2 if paired else 1, every)
+
+
+def has_source(step: ScalarStep) -> bool:
+    """Return whether the moving nodes of a step become SIMD instructions."""
+    away = jax.lax.RoundingMethod.AWAY_FROM_ZERO
+    nodes = (step.graph.nodes[n] for n in (*step.moving, *step.moving_slopes))
+    return all(
+        node.operation in OPERATIONS and node.value != away
+        for node in nodes
+        if node.operation != INPUT
+    )
+
+
+HEAD = Template("""#include <math.h>
+#include <stdbool.h>
+#include <stdint.h>
+#include <stdlib.h>
+
+#define WIDTH $width
+#define GROUPS $groups
+#define STRIDE (GROUPS * WIDTH)
+#define EVERY $every
+#define OUTPUTS $outputs
+#define LANES for (int l = 0; l < WIDTH; l++)
+#define INLINE static inline __attribute__((always_inline))
+#define LANE_ARRAY(name) double name[WIDTH] __attribute__((aligned(64)))
+
+/* Values that are the same at each step: in all lanes, and by lane. */
+struct fixed {
+$fixed
+};
+
+struct steady {
+$steady
+};
+
+/* Values of a step that its derivatives need. */
+struct kept {
+$kept
+};
+
+INLINE void start_fixed(struct fixed *of, const double *restrict shared)
+{
+$start_fixed
+}
+
+INLINE void start_steady(struct steady *of, const struct fixed *restrict fixed,
+                         const double *restrict shared, const double *restrict own)
+{
+    LANES {
+$start_steady
+    }
+}
+""")
+
+PART = Template("""
+struct ${part} {
+$fields
+};
+
+INLINE void start_${part}(struct ${part} *of, const double *restrict start,
+                          const struct fixed *restrict fixed,
+                          const struct steady *restrict steady,
+                          const double *restrict shared, const double *restrict own,
+                          const double *restrict slopes)
+{
+    LANES {
+$start
+    }
+}
+
+INLINE void step_${part}(struct ${part} *restrict of, $kept *restrict kept, int64_t k,
+                         int64_t lanes, const struct fixed *restrict fixed,
+                         const struct steady *restrict steady,
+                         const double *restrict shared, const double *restrict own,
+                         const double *restrict slopes, double *restrict log$rows)
+{
+    LANES {
+$step
+    }
+}
+
+INLINE void end_${part}(const struct ${part} *of, double *restrict end)
+{
+    LANES {
+$end
+    }
+}
+""")
+
+RUN = Template("""
+void run_blocks(int64_t outer, int64_t blocks, int64_t directions, int64_t samples,
+                const double *shared, const double *all_own, const double *start,
+                const double *all_slopes, const double *slope_start$rows,
+                double *end, double *log, double *slope_end, double *slope_log)
+{
+    const int64_t lanes = blocks * STRIDE, logged = samples / (EVERY ? EVERY : samples);
+    struct fixed fixed;
+    start_fixed(&fixed, shared);
+    $begin
+    for (int64_t block = 0; block < outer * blocks; block++) {
+        const double *own = all_own + block * $own * STRIDE;
+        const int64_t first = block % blocks * STRIDE;
+        double ignored[(OUTPUTS + 1) * STRIDE];
+        int64_t row = block * logged, left = EVERY;
+        struct kept kept;
+        $start
+        for (int64_t k = 0; k < samples; k++) {
+            const bool now = --left == 0;
+            double *here = now ? log + row * OUTPUTS * STRIDE : ignored;
+            $step
+            if (now) {
+                left = EVERY;
+                row++;
+            }
+        }
+        $end
+    }
+    $finish
+}
+""")
+
+VALUES = {
+    "start": """struct steady steady$g;
+        struct values values$g;
+        start_steady(&steady$g, &fixed, shared, own + $g * WIDTH);
+        start_values(&values$g, start + block * $carried * STRIDE + $g * WIDTH,
+                     &fixed, &steady$g, shared, own + $g * WIDTH, NULL);""",
+    "step": """step_values(&values$g, &kept, k, lanes, &fixed, &steady$g, shared,
+                        own + $g * WIDTH, NULL, here + $g * WIDTH$row_values);""",
+    "end": "end_values(&values$g, end + block * $ends * STRIDE + $g * WIDTH);",
+}
+"""Parts of ``RUN`` for each group; explicit, because compilers do not unroll them."""
+
+SLOPES = {
+    "begin": "struct slopes *turned = aligned_alloc(64, directions * sizeof *turned);",
+    "start": """for (int64_t n = 0; n < directions; n++)
+            start_slopes(&turned[n],
+                         slope_start + (block * directions + n) * $sloping * STRIDE,
+                         &fixed, &steady0, shared, own,
+                         all_slopes + (block * directions + n) * $slopes * STRIDE);""",
+    "step": """for (int64_t n = 0; n < directions; n++)
+                step_slopes(&turned[n], &kept, k, lanes, &fixed, &steady0, shared, own,
+                            all_slopes + (block * directions + n) * $slopes * STRIDE,
+                            now ? slope_log + OUTPUTS * STRIDE
+                                * (row + (block * (directions - 1) + n) * logged)
+                                : ignored$row_values);""",
+    "end": """for (int64_t n = 0; n < directions; n++)
+            end_slopes(&turned[n], slope_end
+                       + (block * directions + n) * $slope_ends * STRIDE);""",
+    "finish": "free(turned);",
+}
+"""Parts of ``RUN`` for the derivatives."""
+
+
+def source(step: ScalarStep, arrays: Arrays, rows: Sequence[Rows], shape: Shape) -> str:
+    """Return the C source of ``run_blocks`` for a step.
+
+    All arrays are of doubles. Except for ``shared`` and the inputs, they have a last
+    dimension STRIDE, for the lanes of a block:
+
+        shared        [columns]
+        in0, ...      [samples][elements][1, or lanes if these have their own inputs,
+                      which are the same for all outer]
+        own, start    [outer][blocks][columns, or elements of the carry]
+        end           [outer][blocks][columns]
+        log           [outer][blocks][samples / EVERY][outputs]
+        slopes, slope_start, slope_end, slope_log
+                      the same, with [directions] after [blocks]
+    """
+    return _Source(step, arrays, rows).text(shape)
+
+
+class _LaneWriter(Writer):
+    """Writer of the statements of a lane.
+
+    Maximum and minimum are NaN if an operand is: a loop that diverges must not look
+    finite behind a limit. A division by a steady value is a product.
+    """
+
+    forms = FORMS | {
+        "max": "(({a} > {b}) | ({a} != {a})) ? {a} : {b}",
+        "min": "(({a} < {b}) | ({a} != {a})) ? {a} : {b}",
+        "sign": "{a} > 0 ? 1 : ({a} < 0 ? -1 : {a})",
+        "is_finite": "fabs({a}) <= 1.7976931348623157e308",
+    }
+    logical = LOGICAL | BITWISE  # without branches
+    types = MappingProxyType({"integer": "int64_t", "boolean": "bool"})
+
+    def __init__(self, step: ScalarStep, arrays: Arrays, rows: Sequence[Rows]):
+        self.step, self.rows = step, rows
+        self.columns = {place: f"shared[{i}]" for i, place in enumerate(arrays.shared)}
+        for name in ("own", "slopes"):
+            for i, place in enumerate(getattr(arrays, name)):
+                self.columns[place] = f"{name}[{i}*STRIDE + l]"
+        self.kinds = {n.value: n.kind for n in step.graph.nodes if n.operation == INPUT}
+        self.inverse: dict[int, str] = {}
+        self.stored = {number: "0.0" for number in step.zero}
+        super().__init__(step.graph, step.last, self.input, DOUBLE, self.stored)
+
+    def input(self, number: int) -> str:
+        """Return the expression of an input of the step."""
+        place = self.step.places[number]
+        if place.part == "system":
+            return self.typed(self.columns[place], self.kinds[number])
+        if place.part == "index":
+            return "k"
+        if place.part == "carry":
+            return _name(place)
+        size, by_lane = self.rows[place.leaf]
+        where = f"k*{size} + {place.element}"
+        return f"in{place.leaf}[{f'({where})*lanes + l' if by_lane else where}]"
+
+    def typed(self, text: str, kind: str) -> str:
+        """Return an element of an array of doubles in the type of a kind."""
+        if kind == "boolean":
+            return f"({text} != 0.0)"
+        return f"(int64_t){text}" if kind == "integer" else text
+
+    def _operation(self, node: Node, operands: Sequence[str]) -> str:
+        if node.operation == "div" and node.kind == "real":
+            divisor = node.operands[1]
+            if self.graph.nodes[divisor].operation == CONSTANT:
+                return f"{operands[0]} * (1.0 / {operands[1]})"
+            if divisor in self.inverse:
+                return f"{operands[0]} * {self.inverse[divisor]}"
+        return super()._operation(node, operands)
+
+    def statements(self, numbers: Iterable[int]) -> list[str]:
+        """Return the statements of nodes that are not inputs."""
+        nodes = self.graph.nodes
+        return [
+            self.statement(number, "")
+            for number in numbers
+            if nodes[number].operation != INPUT
+        ]
+
+    def store(self, numbers: Iterable[int], write: str, read: str) -> list[str]:
+        """Return the statements that store nodes; they are read from there then."""
+        lines = []
+        for number in numbers:
+            lines.append(f"{write.format(f'v{number}')} = {self.expression(number)};")
+            kind = self.graph.nodes[number].kind
+            self.stored[number] = self.typed(read.format(f"v{number}"), kind)
+        return lines
+
+    def invert(self, numbers: Iterable[int], write: str, read: str) -> list[str]:
+        """Return the statements that store the reciprocals of nodes."""
+        lines = []
+        for number in numbers:
+            value = self.expression(number)
+            lines.append(f"{write.format(f'r{number}')} = 1.0 / {value};")
+            self.inverse[number] = read.format(f"r{number}")
+        return lines
+
+
+class _Before(NamedTuple):
+    """Names that are stored before the first step, and the statements."""
+
+    names: list[str]
+    lines: list[str]
+
+
+class _Source:
+    """Source for a step; the parts are written in the order in which they run."""
+
+    def __init__(
+        self,
+        step: ScalarStep,
+        arrays: Arrays,
+        rows: Sequence[Rows],
+    ):
+        self.step, self.arrays, self.rows = step, arrays, rows
+        self.writer = _LaneWriter(step, arrays, rows)
+        self.inputs = [f"in{i}" for i in range(len(rows))]
+        self.pointers = "".join(f", const double *restrict {x}" for x in self.inputs)
+        self.moving = [*step.moving, *step.moving_slopes]
+        self.divisors = {
+            node.operands[1]
+            for node in (step.graph.nodes[n] for n in self.moving)
+            if node.operation == "div" and node.kind == "real"
+        }
+
+    def text(self, shape: Shape) -> str:
+        step, arrays, nodes = self.step, self.arrays, self.step.graph.nodes
+        fixed: dict[int, None] = {}
+        steady: dict[int, None] = {}
+        for number in step.steady:
+            operands = (n for n in nodes[number].operands if n not in fixed)
+            equal = all(nodes[n].operation == CONSTANT for n in operands)
+            if nodes[number].operation == INPUT:
+                equal = step.place(number) in arrays.shared
+            (fixed if equal else steady)[number] = None
+
+        in_fixed = self._before(fixed, [*steady, *step.steady_slopes], "fixed", "")
+        in_steady = self._before(steady, step.steady_slopes, "steady", "[l]")
+        kept = [n for n in step.moving if n in self._read_by_slopes()]
+        values = self._part(
+            "values", [], step.moving, step.carried, step.log, kept, arrays.end
+        )
+        head = HEAD.substitute(
+            shape._asdict(),
+            outputs=len(step.log),
+            fixed=_fields("double {};", in_fixed.names),
+            steady=_fields("LANE_ARRAY({});", in_steady.names),
+            kept=_fields("LANE_ARRAY({});", [f"v{n}" for n in kept]),
+            start_fixed=_lines(in_fixed.lines, 4),
+            start_steady=_lines(in_steady.lines, 8),
+        )
+        slopes = ""
+        if step.slopes:
+            slopes = self._part(
+                "slopes",
+                step.steady_slopes,
+                step.moving_slopes,
+                step.slopes,
+                step.log_slopes,
+                [],
+                arrays.slope_end,
+            )
+        return head + values + slopes + self._run(shape)
+
+    def _before(
+        self, numbers: Iterable[int], later: Sequence[int], part: str, lane: str
+    ) -> _Before:
+        """Return what a part computes before the first step.
+
+        The nodes ``later`` and the moving ones read its nodes ``numbers``.
+        """
+        writer, nodes = self.writer, self.step.graph.nodes
+        read = {n for each in (*later, *self.moving) for n in nodes[each].operands}
+        read.update(self.step.last)
+        where = f"of->{{}}{lane}", f"{part}->{{}}{lane}"
+        computed = [n for n in numbers if nodes[n].operation != INPUT]
+        stored = [n for n in computed if n in read]
+        inverse = [n for n in numbers if n in self.divisors]
+        return _Before(
+            [*(f"v{n}" for n in stored), *(f"r{n}" for n in inverse)],
+            [
+                *writer.statements(computed),
+                *writer.invert(inverse, *where),
+                *writer.store(stored, *where),
+            ],
+        )
+
+    def _read_by_slopes(self) -> set[int]:
+        """Return the moving nodes without slopes that the slopes of a step need."""
+        step = self.step
+        read = {
+            n for each in step.moving_slopes for n in step.graph.nodes[each].operands
+        }
+        read.update(each.last for each in step.slopes)
+        read.update(step.log_slopes)
+        inputs = {n for n in read if (place := step.place(n)) and place.part != "carry"}
+        return read - inputs
+
+    def _part(
+        self,
+        part: str,
+        steady: Sequence[int],
+        moving: Sequence[int],
+        elements: Sequence[Element],
+        log: Sequence[int],
+        kept: Sequence[int],
+        end: Sequence[Place],
+    ) -> str:
+        """Return the source for the values of a group of lanes, or for the slopes."""
+        writer, nodes = self.writer, self.step.graph.nodes
+        names = [_name(each.place) for each in elements]
+        start = [
+            f"of->{name}[l] = start[{i}*STRIDE + l];" for i, name in enumerate(names)
+        ]
+        own = self._before(steady, [], "of", "[l]")
+        lines = []
+        for name, each in zip(names, elements, strict=True):
+            kind = nodes[each.last]
+            lines.append(f"const {writer.type_of(kind)} {name} = of->{name}[l];")
+        lines += writer.statements(moving)
+        lines += [
+            f"log[{i}*STRIDE + l] = {writer.expression(n)};" for i, n in enumerate(log)
+        ]
+        lines += [
+            f"of->{name}[l] = {writer.expression(each.last)};"
+            for name, each in zip(names, elements, strict=True)
+        ]
+        # Last, because from here on they are read from where they are stored.
+        lines += writer.store(kept, "kept->{}[l]", "kept->{}[l]")
+        return PART.substitute(
+            part=part,
+            kept="const struct kept" if part == "slopes" else "struct kept",
+            fields=_fields("LANE_ARRAY({});", [*names, *own.names]),
+            rows=self.pointers,
+            start=_lines(start + own.lines, 8),
+            step=_lines(lines, 8),
+            end=_lines(
+                [
+                    f"end[{i}*STRIDE + l] = of->{_name(x)}[l];"
+                    for i, x in enumerate(end)
+                ],
+                8,
+            ),
+        )
+
+    def _run(self, shape: Shape) -> str:
+        step, arrays = self.step, self.arrays
+        sizes = {
+            "carried": len(step.carried),
+            "own": len(arrays.own),
+            "ends": len(arrays.end),
+            "sloping": len(step.slopes),
+            "slopes": len(arrays.slopes),
+            "slope_ends": len(arrays.slope_end),
+        }
+        parts = {"begin": "", "finish": ""}
+        for name, text in VALUES.items():
+            parts[name] = "\n        ".join(
+                self._call(text, sizes, g) for g in range(shape.groups)
+            )
+        if step.slopes:
+            for name, text in SLOPES.items():
+                more = self._call(text, sizes, 0)
+                parts[name] = f"{parts[name]}\n        {more}" if parts[name] else more
+        return RUN.substitute(parts, rows=self.pointers, own=sizes["own"])
+
+    def _call(self, text: str, sizes: dict[str, int], group: int) -> str:
+        rows = "".join(
+            f", {name} + first + {group} * WIDTH" if leaf.by_lane else f", {name}"
+            for name, leaf in zip(self.inputs, self.rows, strict=True)
+        )
+        return Template(text).substitute(sizes, g=group, row_values=rows)
+
+
+def _name(place: Place) -> str:
+    return f"{'d' if place.tangent else 'x'}{place.leaf}_{place.element}"
+
+
+def _fields(form: str, names: Sequence[str]) -> str:
+    """Return the declarations of fields; a structure of C has at least one."""
+    return _lines([form.format(name) for name in names] or ["int none;"], 4)
+
+
+def _lines(lines: Iterable[str], indent: int) -> str:
+    return "\n".join(" " * indent + line.strip() for line in lines)

@@ -1,0 +1,307 @@
+"""A step of a System and its Metric as scalar operations, with derivatives."""
+
+import math
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..exporting.graph import CONSTANT, INPUT, Graph
+from ..exporting.memory import NotScalarError
+from ..exporting.trace import LONG, trace
+
+MOST = 4000
+"""Largest number of operations of a step; compilers take minutes for more."""
+
+
+class Place(NamedTuple):
+    """An input of a step: element ``element`` of leaf ``leaf`` of ``part``.
+
+    The parts are "system", "carry" (state and totals of the metric), "row" (a sample of
+    the inputs) and "index" (its number). A ``tangent`` is a derivative of such an
+    element.
+    """
+
+    part: str
+    leaf: int
+    element: int
+    tangent: bool = False
+
+
+class Element(NamedTuple):
+    """An element of the carry: its place, and its node after the step."""
+
+    place: Place
+    last: int
+
+
+class ScalarStep(NamedTuple):
+    """Scalar operations of a step.
+
+    ``places`` are the inputs of ``graph`` by their number. ``carried`` are the elements
+    of the carry that are computed, ``log`` the nodes of the outputs. ``steady`` are the
+    nodes that have the same value at each step, ``moving`` the others, both in the
+    order of their computation.
+
+    With derivatives, ``slopes`` are their elements of the carry and ``log_slopes``
+    those of the outputs. The nodes that depend on them are ``steady_slopes`` and
+    ``moving_slopes``; ``steady`` and ``moving`` are the other ones. Nodes of ``zero``
+    are derivatives that vanish.
+    """
+
+    graph: Graph
+    places: list[Place]
+    carried: list[Element]
+    log: list[int]
+    steady: list[int]
+    moving: list[int]
+    slopes: list[Element]
+    log_slopes: list[int]
+    steady_slopes: list[int]
+    moving_slopes: list[int]
+    zero: frozenset[int]
+
+    def place(self, number: int) -> Place | None:
+        """Return the place of a node that is an input, else None."""
+        node = self.graph.nodes[number]
+        return self.places[int(node.value)] if node.operation == INPUT else None
+
+    @property
+    def last(self) -> list[int]:
+        """The nodes of all results of the step."""
+        values = [element.last for element in (*self.carried, *self.slopes)]
+        return [*values, *self.log, *self.log_slopes]
+
+    def used(self, numbers: Sequence[int]) -> list[int]:
+        """Return those of the nodes ``numbers`` that steps use, in order."""
+        moving = (*self.moving, *self.moving_slopes)
+        read = {n for each in moving for n in self.graph.nodes[each].operands}
+        read.update(self.last)
+        return [number for number in numbers if number in read]
+
+    def operations(self) -> set[str]:
+        """Return the names of the operations of the step."""
+        steady = (*self.steady, *self.steady_slopes)
+        numbers = (*steady, *self.moving, *self.moving_slopes)
+        return {self.graph.nodes[number].operation for number in numbers} - {INPUT}
+
+
+def scalar_step(
+    step: Callable[..., Any],
+    parts: Sequence[Sequence[jax.ShapeDtypeStruct]],
+    outputs: Collection[tuple[int, int]],
+    active: Collection[tuple[str, int]] = (),
+) -> ScalarStep:
+    """Return the scalar operations of a step.
+
+    ``step(system, carry, row, index)`` takes lists of leaves with the shapes ``parts``
+    and returns the new leaves of the carry and those of the log. ``outputs`` are the
+    elements (leaf, element) of the carry that are wanted after the run. ``active`` are
+    the leaves (part, leaf) with derivatives, if any.
+
+    Raises NotScalarError for a step that has no such form or is too long.
+    """
+    if max((math.prod(x.shape) for part in parts for x in part), default=0) >= LONG:
+        raise NotScalarError("it has a long array")
+    index = jax.ShapeDtypeStruct((), jnp.int32)
+    places = [
+        Place(part, leaf, element)
+        for part, leaves in zip(("system", "carry", "row"), parts, strict=True)
+        for leaf, x in enumerate(leaves)
+        for element in range(math.prod(x.shape))
+    ]
+    places.append(Place("index", 0, 0))
+    differentiated = [*active]
+    if active:
+        carry = [("carry", leaf) for leaf, x in enumerate(parts[1]) if _is_real(x)]
+        differentiated += [each for each in carry if each not in active]
+        names: tuple[str, ...] = ("system", "carry", "row")
+        shape_of: dict[str, Any] = dict(zip(names, parts, strict=True))
+        tangents = [shape_of[part][leaf] for part, leaf in differentiated]
+        places += [
+            Place(*each, element, tangent=True)
+            for each, x in zip(differentiated, tangents, strict=True)
+            for element in range(math.prod(x.shape))
+        ]
+        function, more = _with_slopes(step, differentiated), [tangents]
+    else:
+        function, more = step, []
+    with jax.ensure_compile_time_eval():
+        graph, results = trace(function, *parts, index, *more)
+    return _sorted(graph, places, results, len(parts[1]), outputs, active)
+
+
+def _with_slopes(step: Callable, differentiated: Sequence[tuple[str, int]]) -> Callable:
+    """Return the step with its derivatives in the direction ``tangents``."""
+
+    def function(system, carry, row, index, tangents):
+        parts = {"system": [*system], "carry": [*carry], "row": [*row]}
+        values = [parts[part][leaf] for part, leaf in differentiated]
+
+        def of(values):
+            for (part, leaf), value in zip(differentiated, values, strict=True):
+                parts[part][leaf] = value
+            return step(parts["system"], parts["carry"], parts["row"], index)
+
+        # The tangents of integers are of the type float0, without a value.
+        results, slopes = jax.jvp(of, (values,), (tangents,))
+        return results, jax.tree.map(
+            lambda x, t: t if _is_real(x) else jnp.zeros(jnp.shape(x)),
+            results,
+            slopes,
+        )
+
+    return function
+
+
+def _sorted(
+    graph: Graph,
+    places: list[Place],
+    results: list[np.ndarray],
+    leaves: int,
+    outputs: Collection[tuple[int, int]],
+    active: Collection[tuple[str, int]],
+) -> ScalarStep:
+    """Return the step whose ``results`` are the nodes of carry and log.
+
+    The carry has a number of ``leaves``. With derivatives, those of carry and log
+    follow.
+    """
+    half = len(results) // 2 if active else len(results)
+    after = _by_place(results[:leaves], tangent=False)
+    slopes = _by_place(results[half : half + leaves], tangent=True)
+    log, log_slopes = _flat(results[leaves:half]), _flat(results[half + leaves :])
+    zero = _vanishing(graph, places, slopes, active) if active else frozenset()
+    after |= {place: node for place, node in slopes.items() if node not in zero}
+
+    def needed() -> set[int]:
+        wanted = [*(after[place] for place in kept), *log, *log_slopes]
+        return graph.needed(wanted, zero) - zero
+
+    # The elements of the carry on which the results depend, at this step or later ones.
+    every = {
+        Place("carry", *each, tangent) for each in outputs for tangent in (False, True)
+    }
+    kept: set[Place] = every & after.keys()
+    while more := _read(graph, places, needed()) - kept:
+        kept |= more
+    numbers = needed()
+    if graph.loops or len(numbers) > MOST:
+        raise NotScalarError("its loops or operations are too long for a kernel")
+    steady, steady_slopes, moving, moving_slopes = _divided(graph, places, numbers)
+    elements = [Element(place, after[place]) for place in sorted(kept)]
+    return ScalarStep(
+        graph,
+        places,
+        [each for each in elements if not each.place.tangent],
+        log,
+        steady,
+        moving,
+        [each for each in elements if each.place.tangent],
+        log_slopes,
+        steady_slopes,
+        moving_slopes,
+        zero,
+    )
+
+
+def _read(
+    graph: Graph, places: Sequence[Place], numbers: Collection[int]
+) -> set[Place]:
+    """Return the elements of the carry among nodes."""
+    nodes = (graph.nodes[number] for number in numbers)
+    read = {places[int(node.value)] for node in nodes if node.operation == INPUT}
+    return {place for place in read if place.part == "carry"}
+
+
+def _divided(
+    graph: Graph, places: Sequence[Place], needed: Collection[int]
+) -> tuple[list[int], ...]:
+    """Return the needed nodes that are steady and moving, each without and with slopes.
+
+    They are in the order of their computation.
+    """
+    found: tuple[list[int], ...] = ([], [], [], [])
+    moving: set[int] = set()
+    sloping: set[int] = set()
+    for number in graph.block.order:
+        node = graph.nodes[number]
+        if number not in needed or node.operation == CONSTANT:
+            continue
+        if node.operation == INPUT:
+            place = places[int(node.value)]
+            moves, slopes = place.part != "system", place.tangent
+        else:
+            moves = not moving.isdisjoint(node.operands)
+            slopes = not sloping.isdisjoint(node.operands)
+        if moves:
+            moving.add(number)
+        if slopes:
+            sloping.add(number)
+        found[2 * moves + slopes].append(number)
+    return found
+
+
+def _vanishing(
+    graph: Graph,
+    places: Sequence[Place],
+    slopes: dict[Place, int],
+    active: Collection[tuple[str, int]],
+) -> frozenset[int]:
+    """Return the nodes of derivatives that vanish, and those of the constant 0.
+
+    ``slopes`` are the derivatives of the carry after a step. Those of the leaves that
+    are not ``active`` vanish before the first step.
+    """
+    vanish = {
+        place
+        for place in places
+        if place.tangent and (place.part, place.leaf) not in active
+    }
+    while True:
+        zero: set[int] = set()
+        directed: set[int] = set()
+        for number, node in enumerate(graph.nodes):
+            if node.operation == INPUT:
+                place = places[int(node.value)]
+                if place.tangent:
+                    directed.add(number)
+                    if place in vanish:
+                        zero.add(number)
+            elif node.operation == CONSTANT:
+                if node.kind == "real" and node.value == 0.0:
+                    zero.add(number)
+            elif not directed.isdisjoint(node.operands):
+                directed.add(number)
+                values = node.operands[_FIRST_VALUE.get(node.operation, 0) :]
+                join = any if node.operation == "mul" else all
+                if node.operation == "div":
+                    values = values[:1]
+                if node.kind == "real" and join(n in zero for n in values):
+                    zero.add(number)
+        left = {place for place in vanish if slopes.get(place) in zero}
+        if left == vanish:
+            return frozenset(zero)
+        vanish = left
+
+
+_FIRST_VALUE = {"select_n": 1}
+"""Position of the first operand that is a value and not a condition."""
+
+
+def _is_real(x: Any) -> bool:
+    return bool(jnp.issubdtype(jnp.result_type(x), jnp.floating))
+
+
+def _flat(arrays: Sequence[np.ndarray]) -> list[int]:
+    return [int(number) for array in arrays for number in array.ravel()]
+
+
+def _by_place(arrays: Sequence[np.ndarray], tangent: bool) -> dict[Place, int]:
+    return {
+        Place("carry", leaf, element, tangent): int(number)
+        for leaf, array in enumerate(arrays)
+        for element, number in enumerate(array.ravel())
+    }
