@@ -3,6 +3,7 @@
 import os
 import sys
 import warnings
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -163,9 +164,9 @@ def _jaxlib() -> Version:
     return tuple(int(part) for part in parts if part.isdigit())
 
 
-def _use_cache(folder: str, jaxlib: Version) -> None:
-    # Code compiled by another version or for another CPU has crashed when loaded: the
-    # name of the folder contains both.
+@cache
+def processor() -> str:
+    """Return a name of the instructions of this processor, 12 characters."""
     import hashlib
     import platform
 
@@ -175,7 +176,12 @@ def _use_cache(folder: str, jaxlib: Version) -> None:
             cpu += next((line for line in file if line.startswith("flags")), "")
     except OSError:
         pass
-    key = hashlib.sha256(cpu.encode()).hexdigest()[:12]
-    name = f"jax{version('jax')}-jaxlib{'.'.join(map(str, jaxlib))}-{key}"
+    return hashlib.sha256(cpu.encode()).hexdigest()[:12]
+
+
+def _use_cache(folder: str, jaxlib: Version) -> None:
+    # Code compiled by another version or for another CPU has crashed when loaded: the
+    # name of the folder contains both.
+    name = f"jax{version('jax')}-jaxlib{'.'.join(map(str, jaxlib))}-{processor()}"
     _set("jax_compilation_cache_dir", os.path.join(folder, name))
     _set("jax_persistent_cache_min_compile_time_secs", 0.2)

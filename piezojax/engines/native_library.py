@@ -16,6 +16,7 @@ from typing import Any
 import jax
 
 from ..core.files import write_bytes
+from ..core.runtime import processor
 
 FLAGS = (
     *("-std=gnu11", "-march=native", "-fPIC", "-shared", "-w", "-ftree-vectorize"),
@@ -84,7 +85,9 @@ def registered(text: str, rows: int) -> str:
     compiled programs of JAX, if there is one. Raises CompileError.
     """
     text = _called(text, rows)
-    name = "piezojax_" + hashlib.sha256(text.encode()).hexdigest()[:24]
+    # Machines of a cluster may share the folder: the name depends on the processor.
+    key = "".join((text, *FLAGS, processor()))
+    name = "piezojax_" + hashlib.sha256(key.encode()).hexdigest()[:24]
     with _locks[name]:
         if name not in _libraries:
             library = _kept(name) or _compiled(name, text)

@@ -5,11 +5,11 @@ from .chain import chain as chain
 from .closed_loop import APPROACHES as APPROACHES
 from .compare import identify_all as identify_all
 from .estimators.estimate import Options as Options
+from .estimators.free_runs import free_run as free_run
 from .estimators.loop_response import loop_response as loop_response
 from .estimators.model_bouc_wen import bouc_wen as bouc_wen
 from .estimators.neural import fit_neural_state_space as fit_neural_state_space
 from .estimators.neural import neural_start as neural_start
-from .estimators.output_error import free_run as free_run
 from .estimators.preisach_density import fit_preisach as fit_preisach
 from .estimators.preisach_density import (
     fit_rate_dependent_preisach as fit_rate_dependent_preisach,

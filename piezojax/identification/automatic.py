@@ -8,7 +8,8 @@ from ..core.arrays import as_array
 from ..core.progress import Progress, Silent
 from ..hysteresis.model import hystereses
 from .chain import dynamics_of, dynamics_parts, structure
-from .estimators.output_error import from_rest, leading, output_error, starts_of
+from .estimators.free_runs import from_rest, starts_of
+from .estimators.output_error import leading, output_error
 from .held_dynamics import HeldDynamics
 from .records.record import Record
 

@@ -20,8 +20,9 @@ from ..core.system import System
 from ..hysteresis.model import hystereses
 from .chain import structure, training_record
 from .estimators.controlled_stage import ControlledStage, loop_drive, replayed
+from .estimators.error_problem import Problem
 from .estimators.estimate import Options
-from .estimators.output_error import Optimum, Problem, output_error
+from .estimators.output_error import Optimum, output_error
 from .estimators.projection import projected
 from .estimators.structure import Structure
 from .records.record import Record

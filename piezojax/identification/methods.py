@@ -14,16 +14,12 @@ from ..hysteresis.model import hystereses
 from .chain import OFFSET, structure, training_record
 from .closed_loop import LoopFit, is_closed, loop_fit
 from .estimators.estimate import Estimate, FittedParameter, Options, bound_warning
+from .estimators.free_runs import free_runs
 from .estimators.linear import by_frequency_response, by_subspace
 from .estimators.model_bouc_wen import bouc_wen
 from .estimators.model_preisach import PLAIN, RATE_DEPENDENT, preisach_with_lag
 from .estimators.neural import fit_neural_state_space
-from .estimators.output_error import (
-    Optimum,
-    free_runs,
-    output_error,
-    values_and_errors,
-)
+from .estimators.output_error import Optimum, output_error, values_and_errors
 from .estimators.regression import instrumental_variables, least_squares
 from .estimators.scheduled_fit import MODEL as SCHEDULED
 from .estimators.scheduled_fit import by_amplitude

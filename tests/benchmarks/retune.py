@@ -31,7 +31,7 @@ from piezojax.hysteresis import (
     PrandtlIshlinskii,
     ShapedColemanHodgdon,
 )
-from piezojax.identification.estimators.output_error import free_run
+from piezojax.identification.estimators.free_runs import free_run
 from piezojax.stages.of_study import emulated_stage
 from piezojax.tuning import retune
 

@@ -25,16 +25,14 @@ from piezojax.identification.estimators.controlled_stage import (
     loop_drive,
     replayed,
 )
+from piezojax.identification.estimators.error_problem import problem_of
+from piezojax.identification.estimators.free_runs import from_rest
 from piezojax.identification.estimators.loop_response import (
     controller_responses,
     loop_response,
 )
 from piezojax.identification.estimators.noise_model import whitening_filter
-from piezojax.identification.estimators.output_error import (
-    Optimum,
-    from_rest,
-    problem_of,
-)
+from piezojax.identification.estimators.output_error import Optimum
 from piezojax.identification.estimators.projection import projected
 from piezojax.identification.plausibility import plausibility_warnings
 from piezojax.identification.residuals.bound import relative_error

@@ -14,7 +14,7 @@ from piezojax.core.about import About
 from piezojax.core.error_bound import UNSEEN, ErrorBound
 from piezojax.core.serial import read_about, save
 from piezojax.identification.chain import structure
-from piezojax.identification.estimators.output_error import free_run
+from piezojax.identification.estimators.free_runs import free_run
 from piezojax.identification.held_dynamics import combined_bound, held_dynamics
 from piezojax.identification.records.record import Record
 

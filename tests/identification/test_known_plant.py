@@ -10,8 +10,9 @@ from piezojax.core.paths import get, parameters, replace
 from piezojax.dynamics import FirstOrderLag, FractionalDelay, Mode
 from piezojax.hysteresis import PrandtlIshlinskii
 from piezojax.identification import Record, identify
+from piezojax.identification.estimators.error_problem import problem_of
 from piezojax.identification.estimators.estimate import Options
-from piezojax.identification.estimators.output_error import free_run, problem_of
+from piezojax.identification.estimators.free_runs import free_run
 from piezojax.identification.known_plant import CHANGED, KnownPlant
 
 DT = 1e-4

@@ -12,11 +12,8 @@ from piezojax.identification import free_run
 from piezojax.identification.chain import structure
 from piezojax.identification.estimators import output_error
 from piezojax.identification.estimators.approach import run_after, start_columns
-from piezojax.identification.estimators.output_error import (
-    at_starts,
-    problem_of,
-    starts_of,
-)
+from piezojax.identification.estimators.error_problem import at_starts, problem_of
+from piezojax.identification.estimators.free_runs import starts_of
 
 MODEL = "coleman_hodgdon+arma"
 

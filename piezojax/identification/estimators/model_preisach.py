@@ -16,7 +16,8 @@ from ...hysteresis import Preisach, RateDependentPreisach
 from ...hysteresis.preisach import STARTS
 from ..records.record import Record
 from .estimate import bound_warning
-from .output_error import from_rest, standard_errors
+from .free_runs import from_rest
+from .output_error import standard_errors
 from .preisach_density import (
     empty,
     fit_preisach,

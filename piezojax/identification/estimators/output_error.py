@@ -9,12 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...core.arrays import ScalarLike, as_array
+from ...core.arrays import as_array
 from ...core.progress import Progress, Silent
-from ...core.rollout import simulate
-from ...core.space import INSIDE, Space, squash, unsquash
-from ...core.system import System, at_rest, resolve
-from ...hysteresis.model import input_before
+from ...core.space import INSIDE, squash, unsquash
+from ...core.system import System
 from ...solve.gauss_newton import (
     TRUST_REGION,
     Descent,
@@ -25,8 +23,9 @@ from ...solve.local_model import normal_equations
 from ...solve.multi_start import Patience, descend
 from ...solve.problem import linearised
 from ..records.record import Record
-from .approach import Start, most_likely, run_after, start_columns, start_of
-from .noise_model import NOISE_ORDER, whitening_filter
+from .error_problem import Problem, at_starts, problem_of
+from .free_runs import starts_of
+from .noise_model import NOISE_ORDER
 from .structure import Structure
 
 PARALLEL_STARTS = 4
@@ -76,7 +75,7 @@ class Optimum(NamedTuple):
     ``finished`` is True if the best descent ended by itself.
     """
 
-    problem: "Problem"
+    problem: Problem
     units: np.ndarray
     losses: np.ndarray
     finished: bool
@@ -86,208 +85,6 @@ class Optimum(NamedTuple):
         """The best System; with several records, its zero is that of the structure."""
         problem = self.problem
         return problem.space.put(problem.system, as_array(self.units[0]))
-
-
-class Problem(eqx.Module):
-    """Fit of one System to several records, padded to one length with zero weights.
-
-    A single record begins at rest. Each of several records has its own start, stacked
-    in ``starts``. ``plain`` (0 or 1) is the weight of the errors, ``share`` that of the
-    errors filtered by ``whitening``, if it has coefficients.
-    """
-
-    system: System
-    space: Space
-    inputs: Float[Array, "records samples *m"]
-    outputs: Float[Array, "records samples"]
-    weights: Float[Array, "records samples"]
-    starts: Start | None
-    plain: Float[Array, ""]
-    whitening: Float[Array, " taps"]
-    share: Float[Array, ""]
-    prior: Float[Array, "2 known"]
-
-    def errors(self, unit: Float[Array, " n"]) -> Float[Array, "records samples"]:
-        """Return the errors of the free run of every record."""
-        return self._errors_and_starts(unit)[0]
-
-    def _errors_and_starts(self, unit: Array) -> tuple[Array, Array]:
-        """Return the errors, and the prior residuals of the state before each record.
-
-        The columns of the starts are not differentiated: at the most likely amounts the
-        gradient of the squares does not depend on them (variable projection as in
-        Kaufman, BIT 15, 1975, 49-57).
-        """
-        system = self.space.put(self.system, unit)
-        if self.starts is None:
-            runs = jax.vmap(lambda input: from_rest(system, input))(self.inputs)
-            return runs - self.outputs, jnp.zeros((len(self.inputs), 0))
-        held = self.space.put(self.system, jax.lax.stop_gradient(unit))
-
-        def one(input, output, weights, start):
-            run = run_after(system, input, start.levels).reshape(-1, 1)
-            error = _bounded(output[:, None] - run)
-            columns = start_columns(held, input, start)
-            counted = (weights > 0.0).astype(error.dtype)
-            amounts = most_likely(columns, error, counted, start.variance)
-            error = jnp.einsum("ksp,k->s", columns, amounts) - error[:, 0]
-            spread = jnp.sqrt(start.variance) * jnp.max(weights)
-            return error, spread * amounts[1:]
-
-        return jax.vmap(one)(self.inputs, self.outputs, self.weights, self.starts)
-
-    def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " all"]:
-        """Return the weighted errors; their sum of squares is the mean square."""
-        error, unlikely = self._errors_and_starts(unit)
-        error = _bounded(error)
-        counted = [self.plain * self.weights * error, unlikely]
-        if self.whitening.size:
-            counted.append(self.share * self.weights * self.whitened(error))
-        if self.prior.size:
-            known, weights = self.prior
-            counted.append(weights * (unit - known))
-        return jnp.concatenate([part.ravel() for part in counted])
-
-    def whitened(
-        self, error: Float[Array, "records samples"]
-    ) -> Float[Array, "records samples"]:
-        """Return the errors behind the filter ``whitening``."""
-        padded = jnp.pad(error, ((0, 0), (self.whitening.size - 1, 0)))
-        white, last = jnp.zeros_like(error), padded.shape[1]
-        for i, tap in enumerate(self.whitening):
-            white = white + tap * padded[:, last - error.shape[1] - i : last - i]
-        return white
-
-    def balanced(self, unit: Float[Array, " n"]) -> "Problem":
-        """Return the problem with equal norms of both kinds of errors at ``unit``."""
-        error = self.errors(unit)
-        plain = jnp.linalg.norm(self.weights * error)
-        white = jnp.linalg.norm(self.weights * self.whitened(error))
-        return eqx.tree_at(lambda problem: problem.share, self, plain / white)
-
-    def predicting(self, unit: Float[Array, " n"]) -> "Problem":
-        """Return the problem of prediction errors, with the noise model at ``unit``.
-
-        The first samples, for which the filter lacks earlier errors, do not count.
-        """
-        errors, weights = map(np.asarray, (self.errors(unit), self.weights))
-        counted = [each[used > 0.0] for each, used in zip(errors, weights, strict=True)]
-        weights = weights.copy()
-        weights[:, :NOISE_ORDER] = 0.0
-        weights /= np.sqrt(np.sum(weights**2))
-        return eqx.tree_at(
-            lambda problem: (
-                problem.whitening,
-                problem.weights,
-                problem.plain,
-                problem.share,
-            ),
-            self,
-            (*map(as_array, (whitening_filter(counted), weights, 0.0, 1.0)),),
-        )
-
-
-def _bounded(error: Array) -> Array:
-    """Limit ``error``, so that a start that diverges does not affect its batch."""
-    return jnp.where(jnp.isfinite(error), jnp.clip(error, -1e6, 1e6), 1e6)
-
-
-def free_run(
-    system: System, input: Float[Array, "n ..."], before: ScalarLike | Array
-) -> Float[Array, "n ..."]:
-    """Return the output samples that ``system`` predicts from ``input`` alone.
-
-    A plant maps u(k) to y(k+1), as in the loop; the first output is that at rest under
-    ``before``, the input in force when the record begins.
-    """
-    system = resolve(system)  # once for the start and the run
-    state, first = at_rest(system, before)
-    _, outputs = simulate(system, input, state)
-    return jnp.concatenate([first[None], outputs[:-1]])
-
-
-def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Return the free run from the rest input of the model, or from the first input.
-
-    A System of several inputs starts from the first of these.
-    """
-    before = input_before(system, input[0]) if input.ndim == 1 else input[0]
-    return free_run(system, input, before)
-
-
-def problem_of(
-    structure: Structure,
-    records: Sequence[Record],
-    train: slice,
-    drives: Sequence[np.ndarray] | None = None,
-) -> Problem:
-    """Return the fit of ``structure`` to ``records``.
-
-    Errors count over the samples ``train`` of each record. ``drives`` [samples, m] take
-    the place of the inputs of the records.
-    """
-    drives = [record.input for record in records] if drives is None else drives
-    count = len(records)
-    samples = min(train.stop, max(record.samples for record in records))
-    inputs = np.zeros((count, samples, *drives[0].shape[1:]))
-    outputs, weights = np.zeros((2, count, samples))
-    for row, (record, drive) in enumerate(zip(records, drives, strict=True)):
-        size = min(record.samples, samples)
-        inputs[row, :size], inputs[row, size:] = drive[:size], drive[size - 1]
-        outputs[row, :size] = record.output[:size]
-        weights[row, train.start : size] = structure.weight(row)
-    weights /= np.sqrt(np.sum(weights**2))
-    return Problem(
-        structure.system,
-        structure.space,
-        as_array(inputs),
-        as_array(outputs),
-        as_array(weights),
-        None,
-        as_array(1.0),
-        as_array(structure.whitening),
-        as_array(0.0),
-        as_array(np.stack(structure.prior) if structure.prior else np.zeros((2, 0))),
-    )
-
-
-def starts_of(
-    system: System, records: Sequence[Record], train: slice
-) -> tuple[list[Start], list[np.ndarray], list[float]]:
-    """Return starts, runs [samples, 1] and zeros of the sensor, one for each record.
-
-    The starts are estimated for ``system`` on the samples ``train``.
-    """
-    ends = np.array([f([f(r.input) for r in records]) for f in (np.min, np.max)])
-    found, runs, zeros = [], [], []
-    for record in records:
-        part = slice(train.start, min(train.stop, record.samples))
-        start, run, zero = start_of(system, record.input, record.output, part, ends)
-        found.append(start)
-        runs.append(run)
-        zeros.append(float(zero[0]))
-    return found, runs, zeros
-
-
-def free_runs(
-    system: System,
-    records: Sequence[Record],
-    train: slice,
-    *,
-    own_starts: bool = False,
-) -> tuple[tuple[np.ndarray, ...], list[float]]:
-    """Return the free run [samples, 1] of each of ``records``, and their zeros.
-
-    A single record begins at rest and has no zero of its own; the starts of several
-    records, or with ``own_starts``, are estimated on their samples ``train``.
-    """
-    if own_starts or len(records) > 1:
-        _, runs, zeros = starts_of(system, records, train)
-        return tuple(runs), zeros
-    run = eqx.filter_jit(from_rest)
-    return tuple(
-        np.asarray(run(system, as_array(r.input)))[:, None] for r in records
-    ), [0.0]
 
 
 def leading(input: np.ndarray, train: slice) -> slice:
@@ -303,14 +100,6 @@ def leading(input: np.ndarray, train: slice) -> slice:
             return part
         size *= 2
     return train
-
-
-def at_starts(problem: Problem, starts: Sequence[Start]) -> Problem:
-    """Return the problem whose records begin at the ``starts``."""
-    stacked = jax.tree.map(lambda *each: jnp.stack(each), *starts)
-    return eqx.tree_at(
-        lambda p: p.starts, problem, stacked, is_leaf=lambda leaf: leaf is None
-    )
 
 
 def output_error(

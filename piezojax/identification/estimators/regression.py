@@ -22,7 +22,8 @@ from scipy.optimize import minimize_scalar
 from ...core.arrays import as_array, check
 from ...hysteresis import HystereticARMA
 from ..records.record import Record
-from .output_error import FAILED_LOSS, free_run
+from .free_runs import free_run
+from .output_error import FAILED_LOSS
 from .regressors import Orders, operator_outputs, row_matrix, rows
 
 GRID = 9

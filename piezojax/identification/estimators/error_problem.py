@@ -1,0 +1,166 @@
+"""The errors of free runs of several records as a problem of least squares."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...core.arrays import as_array
+from ...core.space import Space
+from ...core.system import System
+from ..records.record import Record
+from .approach import Start, most_likely, run_after, start_columns
+from .free_runs import from_rest
+from .noise_model import NOISE_ORDER, whitening_filter
+from .structure import Structure
+
+
+class Problem(eqx.Module):
+    """Fit of one System to several records, padded to one length with zero weights.
+
+    A single record begins at rest. Each of several records has its own start, stacked
+    in ``starts``. ``plain`` (0 or 1) is the weight of the errors, ``share`` that of the
+    errors filtered by ``whitening``, if it has coefficients.
+    """
+
+    system: System
+    space: Space
+    inputs: Float[Array, "records samples *m"]
+    outputs: Float[Array, "records samples"]
+    weights: Float[Array, "records samples"]
+    starts: Start | None
+    plain: Float[Array, ""]
+    whitening: Float[Array, " taps"]
+    share: Float[Array, ""]
+    prior: Float[Array, "2 known"]
+
+    def errors(self, unit: Float[Array, " n"]) -> Float[Array, "records samples"]:
+        """Return the errors of the free run of every record."""
+        return self._errors_and_starts(unit)[0]
+
+    def _errors_and_starts(self, unit: Array) -> tuple[Array, Array]:
+        """Return the errors, and the prior residuals of the state before each record.
+
+        The columns of the starts are not differentiated: at the most likely amounts the
+        gradient of the squares does not depend on them (variable projection as in
+        Kaufman, BIT 15, 1975, 49-57).
+        """
+        system = self.space.put(self.system, unit)
+        if self.starts is None:
+            runs = jax.vmap(lambda input: from_rest(system, input))(self.inputs)
+            return runs - self.outputs, jnp.zeros((len(self.inputs), 0))
+        held = self.space.put(self.system, jax.lax.stop_gradient(unit))
+
+        def one(input, output, weights, start):
+            run = run_after(system, input, start.levels).reshape(-1, 1)
+            error = _bounded(output[:, None] - run)
+            columns = start_columns(held, input, start)
+            counted = (weights > 0.0).astype(error.dtype)
+            amounts = most_likely(columns, error, counted, start.variance)
+            error = jnp.einsum("ksp,k->s", columns, amounts) - error[:, 0]
+            spread = jnp.sqrt(start.variance) * jnp.max(weights)
+            return error, spread * amounts[1:]
+
+        return jax.vmap(one)(self.inputs, self.outputs, self.weights, self.starts)
+
+    def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " all"]:
+        """Return the weighted errors; their sum of squares is the mean square."""
+        error, unlikely = self._errors_and_starts(unit)
+        error = _bounded(error)
+        counted = [self.plain * self.weights * error, unlikely]
+        if self.whitening.size:
+            counted.append(self.share * self.weights * self.whitened(error))
+        if self.prior.size:
+            known, weights = self.prior
+            counted.append(weights * (unit - known))
+        return jnp.concatenate([part.ravel() for part in counted])
+
+    def whitened(
+        self, error: Float[Array, "records samples"]
+    ) -> Float[Array, "records samples"]:
+        """Return the errors behind the filter ``whitening``."""
+        padded = jnp.pad(error, ((0, 0), (self.whitening.size - 1, 0)))
+        white, last = jnp.zeros_like(error), padded.shape[1]
+        for i, tap in enumerate(self.whitening):
+            white = white + tap * padded[:, last - error.shape[1] - i : last - i]
+        return white
+
+    def balanced(self, unit: Float[Array, " n"]) -> "Problem":
+        """Return the problem with equal norms of both kinds of errors at ``unit``."""
+        error = self.errors(unit)
+        plain = jnp.linalg.norm(self.weights * error)
+        white = jnp.linalg.norm(self.weights * self.whitened(error))
+        return eqx.tree_at(lambda problem: problem.share, self, plain / white)
+
+    def predicting(self, unit: Float[Array, " n"]) -> "Problem":
+        """Return the problem of prediction errors, with the noise model at ``unit``.
+
+        The first samples, for which the filter lacks earlier errors, do not count.
+        """
+        errors, weights = map(np.asarray, (self.errors(unit), self.weights))
+        counted = [each[used > 0.0] for each, used in zip(errors, weights, strict=True)]
+        weights = weights.copy()
+        weights[:, :NOISE_ORDER] = 0.0
+        weights /= np.sqrt(np.sum(weights**2))
+        return eqx.tree_at(
+            lambda problem: (
+                problem.whitening,
+                problem.weights,
+                problem.plain,
+                problem.share,
+            ),
+            self,
+            (*map(as_array, (whitening_filter(counted), weights, 0.0, 1.0)),),
+        )
+
+
+def _bounded(error: Array) -> Array:
+    """Limit ``error``, so that a start that diverges does not affect its batch."""
+    return jnp.where(jnp.isfinite(error), jnp.clip(error, -1e6, 1e6), 1e6)
+
+
+def problem_of(
+    structure: Structure,
+    records: Sequence[Record],
+    train: slice,
+    drives: Sequence[np.ndarray] | None = None,
+) -> Problem:
+    """Return the fit of ``structure`` to ``records``.
+
+    Errors count over the samples ``train`` of each record. ``drives`` [samples, m] take
+    the place of the inputs of the records.
+    """
+    drives = [record.input for record in records] if drives is None else drives
+    count = len(records)
+    samples = min(train.stop, max(record.samples for record in records))
+    inputs = np.zeros((count, samples, *drives[0].shape[1:]))
+    outputs, weights = np.zeros((2, count, samples))
+    for row, (record, drive) in enumerate(zip(records, drives, strict=True)):
+        size = min(record.samples, samples)
+        inputs[row, :size], inputs[row, size:] = drive[:size], drive[size - 1]
+        outputs[row, :size] = record.output[:size]
+        weights[row, train.start : size] = structure.weight(row)
+    weights /= np.sqrt(np.sum(weights**2))
+    return Problem(
+        structure.system,
+        structure.space,
+        as_array(inputs),
+        as_array(outputs),
+        as_array(weights),
+        None,
+        as_array(1.0),
+        as_array(structure.whitening),
+        as_array(0.0),
+        as_array(np.stack(structure.prior) if structure.prior else np.zeros((2, 0))),
+    )
+
+
+def at_starts(problem: Problem, starts: Sequence[Start]) -> Problem:
+    """Return the problem whose records begin at the ``starts``."""
+    stacked = jax.tree.map(lambda *each: jnp.stack(each), *starts)
+    return eqx.tree_at(
+        lambda p: p.starts, problem, stacked, is_leaf=lambda leaf: leaf is None
+    )

@@ -1,0 +1,77 @@
+"""Free runs: the output that a System predicts from the input alone."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...core.arrays import ScalarLike, as_array
+from ...core.rollout import simulate
+from ...core.system import System, at_rest, resolve
+from ...hysteresis.model import input_before
+from ..records.record import Record
+from .approach import Start, start_of
+
+
+def free_run(
+    system: System, input: Float[Array, "n ..."], before: ScalarLike | Array
+) -> Float[Array, "n ..."]:
+    """Return the output samples that ``system`` predicts from ``input`` alone.
+
+    A plant maps u(k) to y(k+1), as in the loop; the first output is that at rest under
+    ``before``, the input in force when the record begins.
+    """
+    system = resolve(system)  # once for the start and the run
+    state, first = at_rest(system, before)
+    _, outputs = simulate(system, input, state)
+    return jnp.concatenate([first[None], outputs[:-1]])
+
+
+def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """Return the free run from the rest input of the model, or from the first input.
+
+    A System of several inputs starts from the first of these.
+    """
+    before = input_before(system, input[0]) if input.ndim == 1 else input[0]
+    return free_run(system, input, before)
+
+
+def starts_of(
+    system: System, records: Sequence[Record], train: slice
+) -> tuple[list[Start], list[np.ndarray], list[float]]:
+    """Return starts, runs [samples, 1] and zeros of the sensor, one for each record.
+
+    The starts are estimated for ``system`` on the samples ``train``.
+    """
+    ends = np.array([f([f(r.input) for r in records]) for f in (np.min, np.max)])
+    found, runs, zeros = [], [], []
+    for record in records:
+        part = slice(train.start, min(train.stop, record.samples))
+        start, run, zero = start_of(system, record.input, record.output, part, ends)
+        found.append(start)
+        runs.append(run)
+        zeros.append(float(zero[0]))
+    return found, runs, zeros
+
+
+def free_runs(
+    system: System,
+    records: Sequence[Record],
+    train: slice,
+    *,
+    own_starts: bool = False,
+) -> tuple[tuple[np.ndarray, ...], list[float]]:
+    """Return the free run [samples, 1] of each of ``records``, and their zeros.
+
+    A single record begins at rest and has no zero of its own; the starts of several
+    records, or with ``own_starts``, are estimated on their samples ``train``.
+    """
+    if own_starts or len(records) > 1:
+        _, runs, zeros = starts_of(system, records, train)
+        return tuple(runs), zeros
+    run = eqx.filter_jit(from_rest)
+    return tuple(
+        np.asarray(run(system, as_array(r.input)))[:, None] for r in records
+    ), [0.0]
