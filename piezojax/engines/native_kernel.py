@@ -10,7 +10,8 @@ from jaxtyping import Array
 
 from .lane_values import LaneValues
 from .native_library import registered
-from .native_source import Arrays, Rows, has_source, shape_for, source
+from .native_source import has_source, shape_for, source
+from .native_writer import Arrays, Rows
 from .scalar_step import ScalarStep
 
 

@@ -189,9 +189,15 @@ def test_every_operation(engine):
 @pytest.mark.parametrize("lanes", [1, 2, 8, 9, 16, 64, 65, 130])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_any_number_of_lanes(engine, lanes):
-    system = FirstOrderLag(1e-3, 1e-4) >> Affine(1.0, 0.3)
-    simulated = lanes_of(system, "1.gain", driven(), Means())
-    means, _ = assert_engine_equals_loop(engine, simulated, spread(lanes))
+    def simulated(values, engine):
+        def lane(value):
+            system = FirstOrderLag(1e-3, 1e-4) >> Affine(value, 0.3)
+            start = system.init(10.0 * value)
+            return metered(system, driven(), start, Means(), engine=engine)[0]
+
+        return jax.vmap(lane)(values)
+
+    means = assert_engine_equals_loop(engine, simulated, spread(lanes))
     assert means.shape == (lanes, 2)
 
 
@@ -310,11 +316,14 @@ def test_each_lane_and_draw_has_its_inputs(every):
 
 
 @needs_compiler
-def test_derivatives_by_parameters_start_and_inputs():
+@pytest.mark.parametrize(
+    ("places", "kernels"), [((0,), 2), ((1,), 2), ((0, 1), 2), ((2,), 1), ((0, 2), 1)]
+)
+def test_derivatives_by_gain_start_and_inputs(places, kernels):
+    """Those by the inputs have no kernel, those by the others do."""
     system = Plain(as_array(1.0)) >> FirstOrderLag(1e-3, 1e-4)
 
-    def total(parts, engine):
-        gain, x, inputs = parts
+    def total(gain, x, inputs, engine):
         changed = replace(system, {"0.gain": gain})
         (_, count, above), lag = changed.init()
         state = (x, count, above), lag
@@ -322,19 +331,10 @@ def test_derivatives_by_parameters_start_and_inputs():
 
     parts = as_array(1.1), as_array(0.2), driven(2.0)
     for mode in (jax.jacfwd, jax.jacrev):
-        program = jax.jit(mode(total), static_argnums=1)
-        assert_equal(program(parts, "native"), program(parts, "loop"))
-    # Derivatives by the inputs alone have no kernel, those by the others do.
-    of = {
-        "inputs": lambda u: jax.jvp(
-            lambda u: total((*parts[:2], u), "native"), (u,), (u,)
-        )[1],
-        "start": lambda x: jax.jvp(
-            lambda x: total((parts[0], x, parts[2]), "native"), (x,), (x,)
-        )[1],
-    }
-    assert lowered(of["inputs"], parts[2]).count("custom_call @piezojax_") == 1
-    assert lowered(of["start"], parts[1]).count("custom_call @piezojax_") == 2
+        program = jax.jit(mode(total, places), static_argnums=3)
+        assert_equal(program(*parts, "native"), program(*parts, "loop"))
+    forward = lowered(lambda *p: jax.jacfwd(total, places)(*p, "native"), *parts)
+    assert forward.count("custom_call @piezojax_") == kernels
 
 
 @needs_compiler

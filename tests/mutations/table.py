@@ -17,11 +17,41 @@ class Mutation(NamedTuple):
 
 
 _DATA = "tests/tuning/test_data.py"
+_ENGINES = "tests/engines/test_engines_for_lanes.py"
 _LOOPS = "tests/control/test_loops.py"
 _ROBUST = "tests/tuning/test_robust.py"
 _MULTI_AXIS = ("tests/control/test_multi_axis.py", "-k", "published")
 
 MUTATIONS = (
+    # Many lanes in compiled C
+    Mutation(
+        "a maximum that drops NaN",
+        "engines/native_writer.py",
+        '"max": "(({a} > {b}) | ({a} != {a})) ? {a} : {b}"',
+        '"max": "{a} > {b} ? {a} : {b}"',
+        (_ENGINES, "-k", "nan"),
+    ),
+    Mutation(
+        "outer lanes with the state of the first",
+        "engines/native_source.py",
+        "start + block * $carried * STRIDE",
+        "start + 0 * block * $carried * STRIDE",
+        (_ENGINES, "-k", "number_of_lanes"),
+    ),
+    Mutation(
+        "derivatives of the state that vanish for good",
+        "engines/scalar_step.py",
+        "if left == vanish:",
+        "if left is not None:",
+        (_ENGINES, "-k", "derivatives"),
+    ),
+    Mutation(
+        "a sum that vanishes with one of its terms",
+        "engines/scalar_step.py",
+        'any if node.operation == "mul" else all',
+        "any",
+        (_ENGINES, "-k", "derivatives"),
+    ),
     # Signals of a study
     Mutation(
         "hold-out noise from the tuning's stream",
