@@ -43,7 +43,7 @@ static double *data(void **all, int64_t place)
 
 XLA_FFI_Error *call(XLA_FFI_CallFrame *frame)
 {
-    const XLA_FFI_Extension_Base *more = frame->extension_start;
+    __auto_type more = frame->extension_start;  /* its type depends on the version */
     if (more && more->type == XLA_FFI_Extension_Metadata) {
         XLA_FFI_Metadata *about = ((XLA_FFI_Metadata_Extension *)more)->metadata;
         about->api_version.major_version = XLA_FFI_API_MAJOR;
@@ -135,7 +135,9 @@ def _compiled(name: str, text: str) -> ctypes.CDLL:
             )
             loaded = ctypes.CDLL(str(library))
         except subprocess.CalledProcessError as error:
-            raise CompileError(f"{command[0]} fails: {error.stderr.strip()}") from None
+            lines = [x for x in error.stderr.splitlines() if "error" in x]
+            reason = lines[0] if lines else f"status {error.returncode}"
+            raise CompileError(f"{command[0]} fails: {reason}") from None
         except OSError as error:
             raise CompileError(f"the compiled loop cannot be used: {error}") from None
         _keep(name, library.read_bytes())

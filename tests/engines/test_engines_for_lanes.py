@@ -412,6 +412,10 @@ def test_other_steps_run_in_the_loop(system, engine):
     np.testing.assert_array_equal(program(values, engine), program(values, "loop"))
 
 
+@pytest.mark.skipif(
+    jax.__version_info__ >= (0, 12),
+    reason="this version of JAX lowers for a GPU only where there is one",
+)
 def test_the_kernel_of_a_loop_compiles_for_a_gpu():
     loop = p753.loop(p753.disturbance_observer())
     simulated = lanes_of(loop, "controller.cutoff", loop_inputs(), Tracking())
