@@ -9,9 +9,9 @@ import pytest
 import piezojax
 
 SUBPACKAGES = (
-    *("core", "signals", "dynamics", "hysteresis", "hardware", "control", "analysis"),
-    *("exporting", "engines", "solve", "identification", "catalog", "study", "stages"),
-    *("tuning", "sweeping", "reproduction", "report", "cli"),
+    *("core", "scalar", "engines", "signals", "dynamics", "hysteresis", "hardware"),
+    *("control", "analysis", "exporting", "solve", "identification", "catalog"),
+    *("study", "stages", "tuning", "sweeping", "reproduction", "report", "cli"),
 )
 """Subpackages from the lowest up: each may import those before it, so that ``cli``
 alone imports ``report``."""

@@ -60,17 +60,17 @@ def metered(
     system: System,
     inputs: Any,
     state: State,
-    metric: Metric,
+    metric: Metric | None = None,
     *,
+    log: Callable[[Any], Any] | None = None,
     every: int = 1,
-    log: Callable[[Any], Any] = lambda output: output,
     engine: Engine | None = None,
 ) -> tuple[Any, Any]:
     """Return the result of ``metric`` over a run, and a log of the outputs.
 
     The run is that of ``simulate`` with the same arguments. The log holds ``log`` of
-    the last output of each whole block of ``every`` samples, stacked in time; None if
-    ``every`` is 1.
+    the last output of each whole block of ``every`` samples, stacked in time. Without
+    ``metric`` or ``log``, None is returned in its place.
 
     Under ``jax.vmap``, all lanes run in one kernel of ``engine``, by default
     ``default_engine()``; so do derivatives in forward mode on a CPU. A step without a
@@ -82,7 +82,7 @@ def metered(
     """
     if engine is None:
         engine = "loop" if reverse_mode.value else default_engine()
-    operands, run = separated(system, inputs, state, metric, every, log)
+    operands, run = separated(system, inputs, state, metric, log, every)
     if engine == "loop":
         return run.unpacked(*run.plain(SEGMENT, *operands))
     totals, rows = _metered.bind(

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..exporting.graph import Kind
+from ..scalar.graph import Kind
 from .lane_values import LaneValues, has_values, typed, value
 from .lane_values import values as values_of
 from .scalar_step import ScalarStep

@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..exporting.graph import CONSTANT, INPUT, Graph, Kind
+from ..scalar.graph import CONSTANT, INPUT, Graph, Kind
 from .scalar_step import Place, ScalarStep
 
 TYPES: dict[Kind, Any] = {

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from ..core.arrays import State
 from ..core.rollout import Metric, samples_of, simulate
 from ..core.system import System, resolve
-from ..exporting.memory import NotScalarError
+from ..scalar.memory import NotScalarError
 from .scalar_step import ScalarStep, scalar_step
 
 
@@ -34,13 +34,40 @@ class _Totals(Metric):
         return jnp.concatenate([jnp.zeros(0), *(leaves[i] for i in self.chosen)])
 
 
+class _Nothing(Metric):
+    """The metric of a run of which only a log is wanted; its result is None."""
+
+    def init(self) -> State:
+        return ()
+
+    def update(self, total: State, index: Array, output: Any) -> State:
+        return total
+
+    def result(self, total: State) -> None:
+        return None
+
+
+class _Logged(System):
+    """A system that also accumulates a metric, for a run with all its outputs."""
+
+    system: System
+    metric: Metric
+
+    def init(self, input: Any = 0.0) -> State:
+        return self.system.init(input), self.metric.init(), jnp.zeros((), jnp.int32)
+
+    def step(self, state: State, input: Any) -> tuple[State, Any]:
+        inner, total, index = state
+        inner, output = self.system.step(inner, input)
+        return (inner, self.metric.update(total, index, output), index + 1), output
+
+
 class MeteredRun:
     """A run of a System with a metric, without its operands.
 
     The operands are the arrays of system, state and inputs, in this order. ``rest`` is
     the system without its arrays, ``trees`` are the structures of the three, and
-    ``leaves`` the operands of each. The log holds ``log`` of every ``every``-th output
-    if ``every`` is above 1.
+    ``leaves`` the operands of each. The log holds ``log`` of every ``every``-th output.
 
     Attributes: ``counts``, the number of operands of each of the three; ``samples``;
     ``empty``, the totals of the metric before the run; ``chosen``, the leaves of the
@@ -54,11 +81,12 @@ class MeteredRun:
         trees: Sequence[Any],
         leaves: Sequence[Sequence[Array]],
         metric: Metric,
+        log: Callable[[Any], Any] | None,
         every: int,
-        log: Callable[[Any], Any],
     ):
         self.rest, self.trees = rest, trees
-        self.metric, self.every, self.log = metric, every, log
+        self.metric, self.log = metric, log
+        self.every = 0 if log is None else every
         self.counts = [len(each) for each in leaves]
         self.samples = leaves[2][0].shape[0]
         self._shapes = [
@@ -67,15 +95,13 @@ class MeteredRun:
         with jax.ensure_compile_time_eval():
             self.empty = jax.tree.map(jnp.asarray, metric.init())
         self.chosen = _read_by(metric.result, self.empty)
-        self.logged: Any = ()
-        if every > 1:
-            self.logged = jax.eval_shape(self._output, *self._shapes)
+        self.logged: Any = jax.eval_shape(self._first_row, *self._shapes)
         self._steps: dict[Sequence[int], ScalarStep | None] = {}
 
-    def _output(self, *operands: Any) -> Any:
+    def _first_row(self, *operands: Any) -> Any:
         system, state, inputs = self.whole(operands)
         row = jax.tree.map(lambda x: x[0], inputs)
-        return self.log(system.step(state, row)[1])
+        return None if self.log is None else self.log(system.step(state, row)[1])
 
     def parts(self, operands: Sequence[Any]) -> list[list[Any]]:
         """Return the operands of system, state and inputs."""
@@ -92,7 +118,7 @@ class MeteredRun:
         """Return the number of totals, and the samples and numbers of the log."""
         leaves = jax.tree.leaves(self.empty)
         outputs = sum(math.prod(x.shape) for x in jax.tree.leaves(self.logged))
-        rows = self.samples // self.every if self.every > 1 else 0
+        rows = self.samples // self.every if self.every else 0
         return sum(leaves[i].size for i in self.chosen), (rows, outputs)
 
     def unpacked(self, totals: Array, rows: Array) -> tuple[Any, Any]:
@@ -104,7 +130,7 @@ class MeteredRun:
             first += leaves[i].size
             leaves[i] = found.reshape(leaves[i].shape).astype(leaves[i].dtype)
         result = self.metric.result(jax.tree.unflatten(tree, leaves))
-        if self.every == 1:
+        if self.log is None:
             return result, None
         shapes, tree = jax.tree.flatten(self.logged)
         ends = np.cumsum([math.prod(x.shape) for x in shapes])[:-1]
@@ -119,17 +145,22 @@ class MeteredRun:
         """Return the numbers of totals and log, computed in the loop of simulate."""
         system, state, inputs = self.whole(operands)
         metric = _Totals(self.metric, self.chosen)
-        options: dict[str, Any] = {"segment": segment}
-        if self.every > 1:
-            options = {"every": self.every}
-        found = simulate(system, inputs, state, metric=metric, **options)[1]
-        if self.every == 1:
+        if self.every == 0:
+            found = simulate(system, inputs, state, metric=metric, segment=segment)[1]
             return found, jnp.zeros(self.sizes()[1])
-        totals, outputs = found
+        if self.every == 1:
+            both = _Logged(system, metric)
+            start = state, metric.init(), jnp.zeros((), jnp.int32)
+            (_, total, _), outputs = simulate(both, inputs, start)
+            totals = metric.result(total)
+        else:
+            options: dict[str, Any] = {"metric": metric, "every": self.every}
+            totals, outputs = simulate(system, inputs, state, **options)[1]
+        assert self.log is not None
         leaves = jax.tree.leaves(jax.vmap(self.log)(outputs))
         columns = [x.reshape(len(x), -1).astype(float) for x in leaves]
-        rows = jnp.concatenate(columns, axis=1)[: self.samples // self.every]
-        return totals, rows
+        rows = jnp.concatenate([jnp.zeros((len(columns[0]), 0)), *columns], axis=1)
+        return totals, rows[: self.samples // self.every]
 
     def step(self, active: Sequence[int] = ()) -> ScalarStep | None:
         """Return the scalar step with derivatives for the operands ``active``, or None.
@@ -154,7 +185,7 @@ class MeteredRun:
             total = jax.tree.unflatten(jax.tree.structure(self.empty), total)
             state, output = of.step(state, row)
             total = self.metric.update(total, index, output)
-            logged = self.log(output) if self.every > 1 else ()
+            logged = () if self.log is None else self.log(output)
             return [*jax.tree.leaves((state, total)), *jax.tree.leaves(logged)]
 
         if any(self.place(i)[0] == "row" for i in active):
@@ -213,16 +244,17 @@ def separated(
     system: System,
     inputs: Any,
     state: State,
-    metric: Metric,
+    metric: Metric | None,
+    log: Callable[[Any], Any] | None,
     every: int,
-    log: Callable[[Any], Any],
 ) -> tuple[list[Array], MeteredRun]:
     """Return the operands of a run, and the run without them."""
     samples_of(inputs)
     arrays, rest = eqx.partition(resolve(system), eqx.is_array)
     parts = [jax.tree.flatten(part) for part in (arrays, state, inputs)]
     leaves = [[jnp.asarray(leaf) for leaf in each] for each, _ in parts]
-    run = MeteredRun(rest, [tree for _, tree in parts], leaves, metric, every, log)
+    trees = [tree for _, tree in parts]
+    run = MeteredRun(rest, trees, leaves, metric or _Nothing(), log, every)
     return [leaf for each in leaves for leaf in each], run
 
 

@@ -33,11 +33,11 @@ def results(
     ``counts`` are the directions, outer and inner lanes; both results begin with these
     axes. The ``inputs`` end with them, [samples, ..., 1, 1, inner or 1]. ``wanted`` are
     the elements of the carry (leaf, element). The outputs are logged at the last of
-    each ``every`` samples if that is above 1. Derivatives are returned if the step
+    each ``every`` samples, for 0 never. Derivatives are returned if the step
     computes any.
     """
     directions, outer, inner = counts
-    shape = shape_for(step, inner, every if every > 1 else 0)
+    shape = shape_for(step, inner, every)
     block = shape.width * shape.groups
     blocks = -(-inner // block)
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax
 
-from ..exporting.graph import CONSTANT, INPUT
+from ..scalar.graph import CONSTANT, INPUT
 from .native_writer import Arrays, LaneWriter, Rows, carried_name
 from .scalar_step import Element, Place, ScalarStep
 

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
-from ..exporting.c_source import BITWISE, DOUBLE, FORMS, LOGICAL, Writer
-from ..exporting.graph import CONSTANT, INPUT, Node
+from ..scalar.c_source import BITWISE, DOUBLE, FORMS, LOGICAL, Writer
+from ..scalar.graph import CONSTANT, INPUT, Node
 from .scalar_step import Place, ScalarStep
 
 

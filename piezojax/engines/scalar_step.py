@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..exporting.graph import CONSTANT, INPUT, Graph
-from ..exporting.memory import NotScalarError
-from ..exporting.trace import LONG, trace
+from ..scalar.graph import CONSTANT, INPUT, Graph
+from ..scalar.memory import NotScalarError
+from ..scalar.trace import LONG, trace
 
 MOST = 4000
 """Largest number of operations of a step; compilers take minutes for more."""

@@ -5,9 +5,6 @@ from .driven import Driven as Driven
 from .driven import Seen as Seen
 from .exporter import export as export
 from .exporter import export_alarms as export_alarms
-from .graph import Graph as Graph
 from .linear_models import from_control as from_control
 from .linear_models import to_control as to_control
-from .memory import NotScalarError as NotScalarError
-from .trace import trace as trace
 from .vendor import device_values as device_values

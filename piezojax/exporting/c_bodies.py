@@ -7,14 +7,14 @@ import equinox as eqx
 import numpy as np
 
 from ..core.system import System
-from .c_source import NOTHING, TYPES, Precision, statements
+from ..scalar.c_source import NOTHING, TYPES, Precision, statements
+from ..scalar.graph import READ, Graph
+from ..scalar.memory import Memory, NotScalarError
+from ..scalar.trace import trace
 from .compensated import compensate
-from .graph import READ, Graph
-from .memory import Memory, NotScalarError
 from .prepared import prepared_nodes
 from .products import shorten_products
 from .slots import PREPARED, Interface, Slot, expressions, type_of
-from .trace import trace
 
 MANY = 8
 """Largest array of equal elements that is assigned without a loop."""

@@ -14,11 +14,11 @@ from ..core.about import About
 from ..core.parameter import Parameter
 from ..core.paths import declared
 from ..core.system import System, resolve
+from ..scalar.c_source import PRECISIONS
+from ..scalar.rolled import ROLLED, constant_array
 from .c_bodies import Fields, StepBodies, init_body, step_bodies
-from .c_source import PRECISIONS
 from .c_templates import HEADER, PREPARED_TYPE, SOURCE
 from .driven import Driven
-from .rolled import ROLLED, constant_array
 from .slots import PREPARED, Interface, Slot, expressions, slots, type_of
 
 

@@ -7,7 +7,7 @@ ZAMM 54, 1974). It then accumulates increments far below the last digit of its v
 
 from collections.abc import Mapping, Sequence
 
-from .graph import INPUT, Graph
+from ..scalar.graph import INPUT, Graph
 
 SUMS = {"add", "sub"}
 """Operations whose rounding error is carried."""

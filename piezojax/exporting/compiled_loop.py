@@ -13,10 +13,10 @@ from jaxtyping import Float
 
 from ..core.about import About
 from ..core.system import System
+from ..scalar.memory import NotScalarError
 from .c_project import CProject
 from .c_templates import LOOP
 from .fmu import FLAGS
-from .memory import NotScalarError
 from .slots import Interface
 
 TURNS = 5

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from .graph import CARRY, CONSTANT, INPUT, READ, RESULT, Graph
+from ..scalar.graph import CARRY, CONSTANT, INPUT, READ, RESULT, Graph
 
 
 def prepared_nodes(graph: Graph, outputs: Sequence[int], parameters: int) -> list[int]:

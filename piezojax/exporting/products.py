@@ -1,6 +1,6 @@
 """Rewriting of products of a signal and parameters as one multiplication."""
 
-from .graph import CONSTANT, Graph
+from ..scalar.graph import CONSTANT, Graph
 from .prepared import varying_nodes
 
 SHARP = {

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .c_source import TYPES, Precision
+from ..scalar.c_source import TYPES, Precision
 
 PREPARED = "prepared"
 """Name of the field that holds the numbers computed from the parameters."""

@@ -115,8 +115,9 @@ def sampled(
         loop = resolve(loop_of(parameters))  # once for the start and the run
         inputs = loop_inputs(reference, *run_noise)
         state = loop.init(reference[0], holding)
-        figures, log = metered(loop, inputs, state, metric, every=every, log=_error)
-        if every == 1:
+        logged = _error if every > 1 else None
+        figures, log = metered(loop, inputs, state, metric, log=logged, every=every)
+        if log is None:
             return figures, None
         counted = jax.tree.map(lambda x: x[start // every :], log)
         return figures, jnp.stack(counted) if isinstance(counted, tuple) else counted

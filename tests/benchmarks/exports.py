@@ -28,9 +28,9 @@ from rich.table import Table
 import piezojax as pj
 from piezojax.catalog import CONTROLLERS, PLANTS
 from piezojax.core.axes import Packed
-from piezojax.exporting import NotScalarError
 from piezojax.exporting.c_export import write_c
 from piezojax.exporting.slots import Interface
+from piezojax.scalar import NotScalarError
 
 # The tests are not installed.
 sys.path.append(str(Path(__file__).resolve().parents[1]))

@@ -265,13 +265,16 @@ def test_loops_on_a_gpu(name, in_registers, monkeypatch):
 
 
 @needs_compiler
-@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize("every", [0, 1, 5])
 def test_each_lane_and_draw_has_its_inputs(every):
     """Axes of plants, references and draws, in any order, with time first or last."""
     rng = np.random.default_rng(7)
     references = jnp.array(rng.uniform(0.0, 5.0, (SAMPLES, 2)))
     noise = jnp.array(rng.standard_normal((3, SAMPLES, 2)))
     loop = p753.loop(p753.disturbance_observer())
+
+    def error(sample):
+        return sample.displacement - sample.reference
 
     def simulated(cutoffs, engine):
         def one(cutoff, reference, noise):
@@ -281,8 +284,8 @@ def test_each_lane_and_draw_has_its_inputs(every):
                 LoopInput(reference, noise),
                 changed.init(reference[0]),
                 Chosen(Tracking(start=2), ("rms_error", "peak_voltage")),
-                every=every,
-                log=lambda sample: sample.displacement - sample.reference,
+                log=error if every else None,
+                every=every or 1,
                 engine=engine,
             )
 
@@ -295,8 +298,8 @@ def test_each_lane_and_draw_has_its_inputs(every):
     assert {*figures} == {"rms_error", "peak_voltage"}
     assert figures["rms_error"].shape == (4, 2, 3)
     assert len({*np.asarray(figures["rms_error"]).ravel()}) == 24
-    assert (log is None) == (every == 1)
-    if every > 1:
+    assert (log is None) == (every == 0)
+    if every:
         assert log.shape == (4, 2, 3, SAMPLES // every)
 
     def slopes(values, engine):
@@ -335,6 +338,27 @@ def test_derivatives_by_gain_start_and_inputs(places, kernels):
         assert_equal(program(*parts, "native"), program(*parts, "loop"))
     forward = lowered(lambda *p: jax.jacfwd(total, places)(*p, "native"), *parts)
     assert forward.count("custom_call @piezojax_") == kernels
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_log_without_a_metric(engine):
+    system = Plain(as_array(1.0))
+
+    def logged(engine, every):
+        return metered(
+            *(system, driven(2.0), system.init()),
+            log=lambda output: {"output": output, "double": 2.0 * output},
+            every=every,
+            engine=engine,
+        )
+
+    _, outputs = pj.simulate(system, driven(2.0))
+    for every in (1, 5):
+        none, log = logged(engine, every)
+        assert none is None
+        wanted = outputs[every - 1 :: every][: SAMPLES // every]
+        np.testing.assert_allclose(log["output"], wanted, rtol=1e-12)
+        np.testing.assert_allclose(log["double"], 2.0 * wanted, rtol=1e-12)
 
 
 @needs_compiler

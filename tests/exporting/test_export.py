@@ -17,11 +17,12 @@ from piezojax.catalog import CONTROLLERS, PLANTS
 from piezojax.core.parameter import parameter
 from piezojax.core.serial import to_data
 from piezojax.core.system import System
-from piezojax.exporting import Driven, NotScalarError, Seen, trace
-from piezojax.exporting.c_source import DOUBLE, statements
-from piezojax.exporting.graph import CONSTANT, INPUT
+from piezojax.exporting import Driven, Seen
 from piezojax.exporting.prepared import prepared_nodes
 from piezojax.exporting.products import shorten_products
+from piezojax.scalar import NotScalarError, trace
+from piezojax.scalar.c_source import DOUBLE, statements
+from piezojax.scalar.graph import CONSTANT, INPUT
 
 ACTUATOR = to_data(pj.Saturation(-20.0, 120.0))
 ABOUT = pj.About(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import piezojax as pj
 from piezojax.core.system import System
-from piezojax.exporting.rolled import ROLLED, pieces
+from piezojax.scalar.rolled import ROLLED, pieces
 
 
 def elements(piece):

@@ -26,9 +26,9 @@ from jaxtyping import Array, Complex, Float
 
 from ...core.arrays import Scalar, ScalarLike, State, as_array, largest, smallest
 from ...core.feedback import Feedback
-from ...core.rollout import simulate
 from ...core.system import System
 from ...dynamics.linearise import linearise, split_static
+from ...engines import metered
 from .broken_loop import BrokenLoop, BrokenState, cut, open_loop
 from .operating_point import BRANCHES, OperatingPoint
 
@@ -161,7 +161,7 @@ def references_followed(
         # r(0) is known one sample before.
         following = jnp.zeros(samples + 1).at[0].set(1.0)
         now = jnp.zeros(samples + 1).at[1].set(1.0)
-        return simulate(SmallFollowing(broken), (now, following))[1][1:]
+        return _run(SmallFollowing(broken), (now, following))[1:]
 
     return jnp.fft.rfft(jax.vmap(one)(_sides()), PADDING * samples, axis=1)
 
@@ -230,7 +230,12 @@ def _impulse(
 ) -> Float[Array, "samples 1 1"]:
     """Return the impulse response of S, from a run of ``SmallMotion``."""
     impulse = jnp.zeros(samples).at[0].set(1.0)
-    return simulate(SmallMotion(broken), impulse)[1][:, None, None]
+    return _run(SmallMotion(broken), impulse)[:, None, None]
+
+
+def _run(motion: SmallMotion, inputs: Any) -> Float[Array, " samples"]:
+    """Return the output of a small motion at each sample."""
+    return metered(motion, inputs, motion.init(), log=lambda output: output)[1]
 
 
 def _axes_impulse(

@@ -65,6 +65,9 @@ SAME = (
 ALIASES = {"add_any": "add"}
 """Operations under a second name."""
 
+TRACERS = frozenset({"exporting", "engines", "scalar"})
+"""Subpackages whose functions are not the source of an operation."""
+
 LONG = 256
 """Smallest size of a real input that remains an array in C."""
 
@@ -343,7 +346,7 @@ def _source_of(equation: Any) -> str:
         path = Path(frame.file_name)
         # A nested function or lambda has the name of the function that encloses it.
         name = frame.function_name.partition(".<")[0]
-        own = "piezojax" in path.parts and "exporting" not in path.parts
+        own = "piezojax" in path.parts and TRACERS.isdisjoint(path.parts)
         if own and name[0] != "<":
             return name
     return ""
