@@ -47,8 +47,8 @@ class _Nothing(Metric):
         return None
 
 
-class _Logged(System):
-    """A system that also accumulates a metric, for a run with all its outputs."""
+class WithMetric(System):
+    """A system that also accumulates a metric: one run gives outputs and metric."""
 
     system: System
     metric: Metric
@@ -149,7 +149,7 @@ class MeteredRun:
             found = simulate(system, inputs, state, metric=metric, segment=segment)[1]
             return found, jnp.zeros(self.sizes()[1])
         if self.every == 1:
-            both = _Logged(system, metric)
+            both = WithMetric(system, metric)
             start = state, metric.init(), jnp.zeros((), jnp.int32)
             (_, total, _), outputs = simulate(both, inputs, start)
             totals = metric.result(total)

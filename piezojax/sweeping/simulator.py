@@ -13,14 +13,12 @@ from jaxtyping import Array, Float
 from ..analysis.stability import OperatingPoint, open_loop
 from ..analysis.stability.differentiable import peak_of, sensitivities
 from ..analysis.stability.operating_point import BRANCHES
-from ..core.arrays import State
 from ..core.axes import PerAxisMetric, packed
-from ..core.feedback import Feedback, LoopSample, loop_inputs
+from ..core.feedback import Feedback, loop_inputs
 from ..core.metrics import Chosen, Tracking
 from ..core.paths import replace
 from ..core.rollout import Metric, in_blocks, simulate
-from ..core.system import System
-from ..engines import metered
+from ..engines import WithMetric, metered
 from ..signals.waveforms import time_grid
 from ..study import Case, Stage
 from ..study.sweep_table import SENSITIVITY
@@ -30,22 +28,6 @@ from .plan import TRAJECTORIES, Plan, plants_of, references_of, sweep_table
 
 # Poles of the hysteresis lie at 1, up to rounding, and must count as stable.
 _TOLERANCE = 1e-6
-
-
-class LoopWithMetric(System):
-    """A loop that also accumulates a metric: one run gives signals and metric."""
-
-    loop: Feedback
-    metric: Metric
-
-    def init(self, input: Any = 0.0) -> State:
-        zero = jnp.zeros((), jnp.int32)
-        return self.loop.init(input), self.metric.init(), zero
-
-    def step(self, state: State, input: Any) -> tuple[State, LoopSample]:
-        inner, total, index = state
-        inner, output = self.loop.step(inner, input)
-        return (inner, self.metric.update(total, index, output), index + 1), output
 
 
 class Simulator:
@@ -133,10 +115,8 @@ class Simulator:
             step = every
 
             def simulate_point(values):
-                metered = LoopWithMetric(loop_at(values), metric)
-                end, log = simulate(
-                    metered, inputs, metered.init(reference[0]), every=step
-                )
+                both = WithMetric(loop_at(values), metric)
+                end, log = simulate(both, inputs, both.init(reference[0]), every=step)
                 signals = {name: packed(getattr(log, name)) for name in TRAJECTORIES}
                 # The data set has time as its last dimension.
                 signals = {name: jnp.moveaxis(x, 0, -1) for name, x in signals.items()}
