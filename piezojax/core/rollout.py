@@ -69,12 +69,9 @@ def simulate(
     Raises ValueError for empty or ragged inputs, ``every`` or ``segment`` below 1, or,
     with ``metric``, ``every`` longer than the run.
     """
-    for name, value in (("every", every), ("segment", segment)):
-        if value < 1:
-            raise ValueError(f"{name} is {value}; it must be at least 1")
-    samples = samples_of(inputs)
-    if metric is not None and every > samples:
-        raise ValueError(f"every is {every}; the run has {samples} samples")
+    _check_positive("every", every)
+    _check_positive("segment", segment)
+    samples = samples_of(inputs, every if metric is not None else 1)
     system = resolve(system)
     state = system.init() if state is None else state
     if metric is not None and every > 1:
@@ -87,8 +84,18 @@ def simulate(
     return jax.lax.scan(lambda s, u: system.step(s, u), state, inputs)
 
 
-def samples_of(inputs: Any) -> int:
-    """Return the number of samples; ValueError for ragged or empty inputs."""
+def _check_positive(name: str, value: int) -> None:
+    if value < 1:
+        raise ValueError(f"{name} is {value}; it must be at least 1")
+
+
+def samples_of(inputs: Any, every: int = 1) -> int:
+    """Return the number of samples of a run, in blocks of ``every`` samples.
+
+    Raises ValueError for ragged or empty inputs, and for an ``every`` that is below 1
+    or longer than the run.
+    """
+    _check_positive("every", every)
     lengths = {jnp.shape(leaf)[0] for leaf in jax.tree.leaves(inputs) if jnp.ndim(leaf)}
     if len(lengths) != 1:
         raise ValueError(
@@ -97,6 +104,8 @@ def samples_of(inputs: Any) -> int:
     (samples,) = lengths
     if samples == 0:
         raise ValueError("inputs hold no samples")
+    if every > samples:
+        raise ValueError(f"every is {every}; the run has {samples} samples")
     return samples
 
 

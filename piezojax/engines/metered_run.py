@@ -249,7 +249,7 @@ def separated(
     every: int,
 ) -> tuple[list[Array], MeteredRun]:
     """Return the operands of a run, and the run without them."""
-    samples_of(inputs)
+    samples_of(inputs, every)
     arrays, rest = eqx.partition(resolve(system), eqx.is_array)
     parts = [jax.tree.flatten(part) for part in (arrays, state, inputs)]
     leaves = [[jnp.asarray(leaf) for leaf in each] for each, _ in parts]

@@ -611,3 +611,13 @@ def test_ragged_inputs_are_refused():
             None,
             Tracking(),
         )
+
+
+@pytest.mark.parametrize("engine", ["native", "loop"])
+@pytest.mark.parametrize(
+    ("every", "message"),
+    [(0, "every is 0; it must be at least 1"), (13, "every is 13; the run has 12")],
+)
+def test_a_log_that_does_not_fit_is_refused(engine, every, message):
+    with pytest.raises(ValueError, match=message):
+        metered(Affine(2.0, 1.0), driven(), (), log=abs, every=every, engine=engine)
