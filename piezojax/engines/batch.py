@@ -1,9 +1,10 @@
 """Batch axes of the operands of a run, sorted by what depends on them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -106,3 +107,23 @@ class Batch(NamedTuple):
         split = x.reshape(*(self.sizes[axis] for axis in order), *rest)
         places = [int(i) for i in np.argsort(order)]
         return split.transpose(*places, *range(len(order), split.ndim))
+
+
+def mapped(
+    function: Callable[..., Any],
+    operands: Sequence[Any],
+    positions: Sequence[Positions],
+) -> Any:
+    """Return ``function`` of the operands of each lane."""
+    sizes, left = sizes_of(operands, positions), [list(where) for where in positions]
+    axes = []
+    # The axis of a map is counted without those of the maps around it.
+    for axis in range(len(sizes)):
+        axes.append(tuple(where[axis] for where in left))
+        for where, mapped in zip(left, axes[-1], strict=True):
+            if mapped is not None:
+                where[axis] = None
+                where[:] = [p - 1 if p is not None and p > mapped else p for p in where]
+    for in_axes, size in reversed(list(zip(axes, sizes, strict=True))):
+        function = jax.vmap(function, in_axes=in_axes, axis_size=size)
+    return function(*operands)

@@ -14,6 +14,7 @@ from ..core.arrays import State
 from ..core.rollout import Metric, samples_of, simulate
 from ..core.system import System, resolve
 from ..scalar.memory import NotScalarError
+from .adjoint_step import adjoint_step
 from .scalar_step import ScalarStep, scalar_step
 
 
@@ -89,14 +90,14 @@ class MeteredRun:
         self.every = 0 if log is None else every
         self.counts = [len(each) for each in leaves]
         self.samples = leaves[2][0].shape[0]
-        self._shapes = [
+        self.shapes = [
             jax.ShapeDtypeStruct(x.shape, x.dtype) for each in leaves for x in each
         ]
         with jax.ensure_compile_time_eval():
             self.empty = jax.tree.map(jnp.asarray, metric.init())
         self.chosen = _read_by(metric.result, self.empty)
-        self.logged: Any = jax.eval_shape(self._first_row, *self._shapes)
-        self._steps: dict[Sequence[int], ScalarStep | None] = {}
+        self.logged: Any = jax.eval_shape(self._first_row, *self.shapes)
+        self._steps: dict[tuple, ScalarStep | None] = {}
 
     def _first_row(self, *operands: Any) -> Any:
         system, state, inputs = self.whole(operands)
@@ -167,15 +168,26 @@ class MeteredRun:
 
         There is none with derivatives for inputs.
         """
-        if active not in self._steps:
-            try:
-                self._steps[active] = self._scalar_step(active)
-            except NotScalarError:
-                self._steps[active] = None
-        return self._steps[active]
+        return self._found("step", active)
 
-    def _scalar_step(self, active: Sequence[int]) -> ScalarStep:
-        systems, states, inputs = self.parts(self._shapes)
+    def adjoint(self, active: Sequence[int]) -> ScalarStep | None:
+        """Return the step of the reverse pass for the operands ``active``, or None.
+
+        There is none with derivatives for inputs, or if not every output is logged.
+        """
+        return None if self.every > 1 else self._found("adjoint", active)
+
+    def _found(self, kind: str, active: Sequence[int]) -> ScalarStep | None:
+        key = kind, *active
+        if key not in self._steps:
+            try:
+                self._steps[key] = self._scalar_step(kind, active)
+            except NotScalarError:
+                self._steps[key] = None
+        return self._steps[key]
+
+    def _scalar_step(self, kind: str, active: Sequence[int]) -> ScalarStep:
+        systems, states, inputs = self.parts(self.shapes)
         rows = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in inputs]
         totals = jax.tree.leaves(self.empty)
 
@@ -190,12 +202,12 @@ class MeteredRun:
 
         if any(self.place(i)[0] == "row" for i in active):
             raise NotScalarError("its inputs have derivatives")
-        found = scalar_step(
-            step,
-            (systems, [*states, *totals], rows),
-            self.wanted(),
-            [self.place(i) for i in active],
-        )
+        parts, wanted = (systems, [*states, *totals], rows), self.wanted()
+        places = [self.place(i) for i in active]
+        if kind == "adjoint":
+            found = adjoint_step(step, parts, wanted, places, self.sizes()[1][1])
+        else:
+            found = scalar_step(step, parts, wanted, places)
         if active and not found.slopes:
             raise NotScalarError("its derivatives vanish")
         return found

@@ -30,17 +30,22 @@ waits for its own results most of the time."""
 
 
 class Shape(NamedTuple):
-    """Lanes of a group, groups that run in turn, and samples between logged outputs."""
+    """Lanes of a group, groups that run in turn, and samples between logged outputs.
+
+    A reverse pass has ``segment`` samples between stored carries, another run none.
+    """
 
     width: int
     groups: int
     every: int
+    segment: int = 0
 
 
-def shape_for(step: ScalarStep, lanes: int, every: int) -> Shape:
+def shape_for(step: ScalarStep, lanes: int, every: int, segment: int = 0) -> Shape:
     """Return the fastest shape for a number of lanes."""
-    paired = lanes > GROUP and len(step.moving) < PAIRED and not step.slopes
-    return Shape(1 if lanes == 1 else GROUP, 2 if paired else 1, every)
+    short = len(step.moving) < PAIRED and (segment > 0 or not step.slopes)
+    paired = lanes > GROUP and short
+    return Shape(1 if lanes == 1 else GROUP, 2 if paired else 1, every, segment)
 
 
 def has_source(step: ScalarStep) -> bool:
@@ -63,6 +68,7 @@ HEAD = Template("""#include <math.h>
 #define GROUPS $groups
 #define STRIDE (GROUPS * WIDTH)
 #define EVERY $every
+#define SEGMENT $segment
 #define OUTPUTS $outputs
 #define LANES for (int l = 0; l < WIDTH; l++)
 #define INLINE static inline __attribute__((always_inline))
@@ -163,6 +169,59 @@ void run_blocks(int64_t outer, int64_t blocks, int64_t directions, int64_t sampl
 }
 """)
 
+REVERSE = Template("""
+void run_blocks(int64_t outer, int64_t blocks, int64_t directions, int64_t samples,
+                const double *shared, const double *all_own, const double *start,
+                const double *all_slopes, const double *slope_start$rows,
+                double *end, double *log, double *slope_end, double *slope_log)
+{
+    const int64_t lanes = blocks * STRIDE, segments = (samples + SEGMENT - 1) / SEGMENT;
+    struct kept *kept = aligned_alloc(64, SEGMENT * GROUPS * sizeof *kept);
+    struct fixed fixed;
+    start_fixed(&fixed, shared);
+    for (int64_t block = 0; block < outer * blocks; block++) {
+        const double *own = all_own + block * $own * STRIDE;
+        const int64_t first = block % blocks * STRIDE;
+        $start
+        for (int64_t segment = segments - 1; segment >= 0; segment--) {
+            const int64_t begin = segment * SEGMENT, most = begin + SEGMENT;
+            const int64_t stop = most < samples ? most : samples;
+            $again
+            for (int64_t k = begin; k < stop; k++) {
+                struct kept *here = kept + (k - begin) * GROUPS;
+                $forth
+            }
+            for (int64_t k = stop - 1; k >= begin; k--) {
+                struct kept *here = kept + (k - begin) * GROUPS;
+                $back
+            }
+        }
+        $end
+    }
+    free(kept);
+}
+""")
+"""Reverse pass: each segment runs once more from its stored carry, then back."""
+
+BACK = {
+    "start": """struct steady steady$g;
+        struct slopes slopes$g;
+        start_steady(&steady$g, &fixed, shared, own + $g * WIDTH);
+        start_slopes(&slopes$g, slope_start + block * $sloping * STRIDE + $g * WIDTH,
+                     &fixed, &steady$g, shared, own + $g * WIDTH, NULL);""",
+    "again": """struct values values$g;
+            start_values(&values$g, start + (block * segments + segment) * $carried
+                         * STRIDE + $g * WIDTH, &fixed, &steady$g, shared,
+                         own + $g * WIDTH, NULL);""",
+    "forth": """step_values(&values$g, here + $g, k, lanes, &fixed, &steady$g, shared,
+                            own + $g * WIDTH, NULL, NULL$row_values);""",
+    "back": """step_slopes(&slopes$g, here + $g, k, lanes, &fixed, &steady$g, shared,
+                            own + $g * WIDTH, NULL, NULL$row_values);""",
+    "end": "end_slopes(&slopes$g, slope_end + block * $slope_ends * STRIDE"
+    " + $g * WIDTH);",
+}
+"""Parts of ``REVERSE`` for each group."""
+
 VALUES = {
     "start": """struct steady steady$g;
         struct values values$g;
@@ -210,6 +269,11 @@ def source(step: ScalarStep, arrays: Arrays, rows: Sequence[Rows], shape: Shape)
         log           [outer][blocks][samples / EVERY][outputs]
         slopes, slope_start, slope_end, slope_log
                       the same, with [directions] after [blocks]
+
+    With a ``segment`` in ``shape``, the step is that of a reverse pass. Its ``start``,
+    [outer][blocks][segments][elements of the carry], are the carries before each
+    segment; ``slope_start`` and ``slope_end`` are derivatives with respect to the carry
+    after and before the run, and totals.
     """
     return _Source(step, arrays, rows).text(shape)
 
@@ -371,11 +435,15 @@ class _Source:
             "slopes": len(arrays.slopes),
             "slope_ends": len(arrays.slope_end),
         }
-        parts = {"begin": "", "finish": ""}
-        for name, text in VALUES.items():
-            parts[name] = "\n        ".join(
+        each = BACK if shape.segment else VALUES
+        parts = {"begin": "", "finish": ""} | {
+            name: "\n        ".join(
                 self._call(text, sizes, g) for g in range(shape.groups)
             )
+            for name, text in each.items()
+        }
+        if shape.segment:
+            return REVERSE.substitute(parts, rows=self.pointers, own=sizes["own"])
         if step.slopes:
             for name, text in SLOPES.items():
                 more = self._call(text, sizes, 0)
@@ -383,11 +451,15 @@ class _Source:
         return RUN.substitute(parts, rows=self.pointers, own=sizes["own"])
 
     def _call(self, text: str, sizes: dict[str, int], group: int) -> str:
-        rows = "".join(
+        rows = self._row_values(group)
+        return Template(text).substitute(sizes, g=group, row_values=rows)
+
+    def _row_values(self, group: int) -> str:
+        """Return the arguments for the inputs of a group of lanes."""
+        return "".join(
             f", {name} + first + {group} * WIDTH" if leaf.by_lane else f", {name}"
             for name, leaf in zip(self.inputs, self.rows, strict=True)
         )
-        return Template(text).substitute(sizes, g=group, row_values=rows)
 
 
 def _fields(form: str, names: Sequence[str]) -> str:

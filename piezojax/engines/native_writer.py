@@ -65,7 +65,7 @@ class LaneWriter(Writer):
             return self.typed(self.columns[place], self.kinds[number])
         if place.part == "index":
             return "k"
-        if place.part == "carry":
+        if place.part in ("carry", "total"):
             return carried_name(place)
         size, by_lane = self.rows[place.leaf]
         where = f"k*{size} + {place.element}"
@@ -115,5 +115,6 @@ class LaneWriter(Writer):
 
 
 def carried_name(place: Place) -> str:
-    """Return the name of an element of the carry."""
-    return f"{'d' if place.tangent else 'x'}{place.leaf}_{place.element}"
+    """Return the name of an element of the carry, or of a total of derivatives."""
+    letter = "t" if place.part == "total" else "d" if place.tangent else "x"
+    return f"{letter}{place.leaf}_{place.element}"

@@ -1,7 +1,7 @@
 """A step of a System and its Metric as scalar operations, with derivatives."""
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +12,9 @@ from ..scalar.graph import CONSTANT, INPUT, Graph
 from ..scalar.memory import NotScalarError
 from ..scalar.trace import LONG, trace
 
+INDEX = jax.ShapeDtypeStruct((), jnp.int32)
+"""Type of the number of a sample."""
+
 MOST = 4000
 """Largest number of operations of a step; compilers take minutes for more."""
 
@@ -21,7 +24,8 @@ class Place(NamedTuple):
 
     The parts are "system", "carry" (state and totals of the metric), "row" (a sample of
     the inputs) and "index" (its number). A ``tangent`` is a derivative of such an
-    element.
+    element or, in an adjoint step, with respect to it: of "row" to a logged output, and
+    of "total" the sum of those with respect to a number of the system.
     """
 
     part: str
@@ -103,34 +107,70 @@ def scalar_step(
 
     Raises NotScalarError for a step that has no such form or is too long.
     """
-    if max((math.prod(x.shape) for part in parts for x in part), default=0) >= LONG:
-        raise NotScalarError("it has a long array")
-    index = jax.ShapeDtypeStruct((), jnp.int32)
-    places = [
-        Place(part, leaf, element)
-        for part, leaves in zip(("system", "carry", "row"), parts, strict=True)
-        for leaf, x in enumerate(leaves)
-        for element in range(math.prod(x.shape))
-    ]
-    places.append(Place("index", 0, 0))
+    places = inputs_of(parts)
     differentiated = [*active]
     if active:
-        carry = [("carry", leaf) for leaf, x in enumerate(parts[1]) if _is_real(x)]
+        carry = [("carry", leaf) for leaf, x in enumerate(parts[1]) if is_real(x)]
         differentiated += [each for each in carry if each not in active]
         names: tuple[str, ...] = ("system", "carry", "row")
         shape_of: dict[str, Any] = dict(zip(names, parts, strict=True))
         tangents = [shape_of[part][leaf] for part, leaf in differentiated]
-        places += [
-            Place(*each, element, tangent=True)
-            for each, x in zip(differentiated, tangents, strict=True)
-            for element in range(math.prod(x.shape))
-        ]
+        for (part, leaf), x in zip(differentiated, tangents, strict=True):
+            places += places_of(part, [(leaf, x)], tangent=True)
         function, more = _with_slopes(step, differentiated), [tangents]
     else:
         function, more = step, []
     with jax.ensure_compile_time_eval():
-        graph, results = trace(function, *parts, index, *more)
-    return _sorted(graph, places, results, len(parts[1]), outputs, active)
+        graph, results = trace(function, *parts, INDEX, *more)
+    leaves, half = len(parts[1]), len(results) // 2 if active else len(results)
+    after = nodes_by_place("carry", enumerate(results[:leaves]))
+    slopes = nodes_by_place(
+        "carry", enumerate(results[half : half + leaves]), tangent=True
+    )
+    zero: frozenset[int] = frozenset()
+    if active:
+        # The derivatives of leaves that are not active vanish before the first step.
+        vanish = {
+            place
+            for place in places
+            if place.tangent and (place.part, place.leaf) not in active
+        }
+        zero = vanishing(graph, places, slopes, vanish)
+    return sorted_step(
+        graph,
+        places,
+        after | slopes,
+        zero,
+        {Place("carry", *each, tangent) for each in outputs for tangent in (False, True)},
+        _flat(results[leaves:half]),
+        _flat(results[half + leaves :]),
+    )
+
+
+def inputs_of(parts: Sequence[Sequence[jax.ShapeDtypeStruct]]) -> list[Place]:
+    """Return the places of the inputs of a step with leaves of these shapes.
+
+    Raises NotScalarError if one is too long.
+    """
+    if max((math.prod(x.shape) for part in parts for x in part), default=0) >= LONG:
+        raise NotScalarError("it has a long array")
+    places = [
+        place
+        for part, leaves in zip(("system", "carry", "row"), parts, strict=True)
+        for place in places_of(part, enumerate(leaves))
+    ]
+    return [*places, Place("index", 0, 0)]
+
+
+def places_of(
+    part: str, leaves: Iterable[tuple[int, Any]], *, tangent: bool = False
+) -> list[Place]:
+    """Return the places of the elements of numbered leaves."""
+    return [
+        Place(part, leaf, element, tangent)
+        for leaf, x in leaves
+        for element in range(math.prod(x.shape))
+    ]
 
 
 def _with_slopes(step: Callable, differentiated: Sequence[tuple[str, int]]) -> Callable:
@@ -148,7 +188,7 @@ def _with_slopes(step: Callable, differentiated: Sequence[tuple[str, int]]) -> C
         # The tangents of integers are of the type float0, without a value.
         results, slopes = jax.jvp(of, (values,), (tangents,))
         return results, jax.tree.map(
-            lambda x, t: t if _is_real(x) else jnp.zeros(jnp.shape(x)),
+            lambda x, t: t if is_real(x) else jnp.zeros(jnp.shape(x)),
             results,
             slopes,
         )
@@ -156,35 +196,31 @@ def _with_slopes(step: Callable, differentiated: Sequence[tuple[str, int]]) -> C
     return function
 
 
-def _sorted(
+def sorted_step(
     graph: Graph,
     places: list[Place],
-    results: list[np.ndarray],
-    leaves: int,
-    outputs: Collection[tuple[int, int]],
-    active: Collection[tuple[str, int]],
+    after: dict[Place, int],
+    zero: frozenset[int],
+    wanted: Collection[Place],
+    log: list[int],
+    log_slopes: list[int],
 ) -> ScalarStep:
-    """Return the step whose ``results`` are the nodes of carry and log.
+    """Return the step of which the elements ``wanted`` and the log are results.
 
-    The carry has a number of ``leaves``. With derivatives, those of carry and log
-    follow.
+    ``after`` are the nodes of the carry after the step, ``zero`` those of derivatives
+    that vanish. Raises NotScalarError for a step that is too long.
     """
-    half = len(results) // 2 if active else len(results)
-    after = _by_place(results[:leaves], tangent=False)
-    slopes = _by_place(results[half : half + leaves], tangent=True)
-    log, log_slopes = _flat(results[leaves:half]), _flat(results[half + leaves :])
-    zero = _vanishing(graph, places, slopes, active) if active else frozenset()
-    after |= {place: node for place, node in slopes.items() if node not in zero}
 
     def needed() -> set[int]:
-        wanted = [*(after[place] for place in kept), *log, *log_slopes]
-        return graph.needed(wanted, zero) - zero
+        nodes = [*(after[place] for place in kept), *log, *log_slopes]
+        return graph.needed(nodes, zero) - zero
 
     # The elements of the carry on which the results depend, at this step or later ones.
-    every = {
-        Place("carry", *each, tangent) for each in outputs for tangent in (False, True)
+    kept = {
+        place
+        for place in wanted
+        if place in after and not (place.tangent and after[place] in zero)
     }
-    kept: set[Place] = every & after.keys()
     while more := _read(graph, places, needed()) - kept:
         kept |= more
     numbers = needed()
@@ -213,7 +249,7 @@ def _read(
     """Return the elements of the carry among nodes."""
     nodes = (graph.nodes[number] for number in numbers)
     read = {places[int(node.value)] for node in nodes if node.operation == INPUT}
-    return {place for place in read if place.part == "carry"}
+    return {place for place in read if place.part in ("carry", "total")}
 
 
 def _divided(
@@ -244,22 +280,19 @@ def _divided(
     return found
 
 
-def _vanishing(
+def vanishing(
     graph: Graph,
     places: Sequence[Place],
     slopes: dict[Place, int],
-    active: Collection[tuple[str, int]],
+    vanish: set[Place],
+    always: Collection[Place] = (),
 ) -> frozenset[int]:
     """Return the nodes of derivatives that vanish, and those of the constant 0.
 
-    ``slopes`` are the derivatives of the carry after a step. Those of the leaves that
-    are not ``active`` vanish before the first step.
+    ``slopes`` are the derivatives of the carry after a step. Those at ``vanish`` are 0
+    before the first step, and those at ``always`` before each.
     """
-    vanish = {
-        place
-        for place in places
-        if place.tangent and (place.part, place.leaf) not in active
-    }
+    vanish = vanish.union(always)
     while True:
         zero: set[int] = set()
         directed: set[int] = set()
@@ -275,23 +308,23 @@ def _vanishing(
                     zero.add(number)
             elif not directed.isdisjoint(node.operands):
                 directed.add(number)
-                values = node.operands[_FIRST_VALUE.get(node.operation, 0) :]
+                values = node.operands[FIRST_VALUE.get(node.operation, 0) :]
                 join = any if node.operation == "mul" else all
                 if node.operation == "div":
                     values = values[:1]
                 if node.kind == "real" and join(n in zero for n in values):
                     zero.add(number)
-        left = {place for place in vanish if slopes.get(place) in zero}
+        left = {p for p in vanish if p in always or slopes.get(p) in zero}
         if left == vanish:
             return frozenset(zero)
         vanish = left
 
 
-_FIRST_VALUE = {"select_n": 1}
+FIRST_VALUE = {"select_n": 1}
 """Position of the first operand that is a value and not a condition."""
 
 
-def _is_real(x: Any) -> bool:
+def is_real(x: Any) -> bool:
     return bool(jnp.issubdtype(jnp.result_type(x), jnp.floating))
 
 
@@ -299,9 +332,12 @@ def _flat(arrays: Sequence[np.ndarray]) -> list[int]:
     return [int(number) for array in arrays for number in array.ravel()]
 
 
-def _by_place(arrays: Sequence[np.ndarray], tangent: bool) -> dict[Place, int]:
+def nodes_by_place(
+    part: str, leaves: Iterable[tuple[int, np.ndarray]], *, tangent: bool = False
+) -> dict[Place, int]:
+    """Return the nodes in the arrays of numbered leaves, by their place."""
     return {
-        Place("carry", leaf, element, tangent): int(number)
-        for leaf, array in enumerate(arrays)
+        Place(part, leaf, element, tangent): int(number)
+        for leaf, array in leaves
         for element, number in enumerate(array.ravel())
     }

@@ -32,12 +32,12 @@ ELEMENTWISE = {
 MOVES = {
     **dict.fromkeys(("broadcast_in_dim", "concatenate", "expand_dims", "pad"), ()),
     **dict.fromkeys(("reshape", "rev", "slice", "split", "squeeze", "stack"), ()),
-    "transpose": (),
+    **dict.fromkeys(("transpose", "unstack"), ()),
     "dynamic_slice": range(1, 32),
     "dynamic_update_slice": range(2, 32),
     "gather": (1,),
     "scatter": (1,),
-    "scatter-add": (1,),
+    "scatter-add": (),
 }
 """Operations that move elements, with the positions of their index operands."""
 
@@ -196,6 +196,8 @@ class _Tracer:
     def moved(self, equation: Any, operands: list[Numbers]) -> list[Numbers]:
         """Return the node numbers after an operation that only moves elements."""
         name, arrays = equation.primitive.name, []
+        if name == "scatter-add":
+            return [self.added(equation, operands)]
         for place, (numbers, atom) in enumerate(
             zip(operands, equation.invars, strict=True)
         ):
@@ -208,6 +210,22 @@ class _Tracer:
         if any(((each < 0) | (each >= len(self.graph.nodes))).any() for each in found):
             raise NotScalarError(f"its {name} reads outside the array")
         return found
+
+    def added(self, equation: Any, operands: list[Numbers]) -> Numbers:
+        """Return the nodes of an array to which elements are added at some places."""
+        array, index, more = operands
+        places = self.arrays.values(index, equation.invars[1].aval.dtype)
+        if places is None:
+            return self.arrays.at_computed_place("scatter-add", operands)
+        # Each element is added alone to zeros: it is at the places that are 1 then.
+        units = np.eye(more.size).reshape(more.size, *more.shape)
+        found = [_bound(equation, [np.zeros(array.shape), places, x])[0] for x in units]
+        total = array.copy()
+        for number, where in zip(more.ravel(), found, strict=True):
+            for place in np.argwhere(where):
+                pair = [total[*place], np.asarray(number)]
+                total[*place] = self.arrays.elementwise("add", pair, "real")
+        return total
 
     def linear_solve(self, params: Any, operands: list[Numbers]) -> list[Numbers]:
         """Return the solution of linear equations whose matrix is factorised."""

@@ -23,9 +23,8 @@ from piezojax.engines import (
     gpu_kernel,
     lane_values,
     metered,
-    reverse_mode,
 )
-from piezojax.engines import engine as engine_module
+from piezojax.engines import forward
 from piezojax.engines import native_library as library
 from piezojax.hardware import Quantiser, Saturation, Sensor
 from piezojax.hysteresis import PrandtlIshlinskii
@@ -117,7 +116,7 @@ def kernel_of(program, *arguments):
     """Return the jaxpr of the kernel of a GPU in a program."""
     (run,) = equations(jax.make_jaxpr(program)(*arguments).jaxpr, "metered_run")
     operands = [variable.aval for variable in run.invars]
-    inside = jax.make_jaxpr(partial(engine_module._evaluated, **run.params))(*operands)
+    inside = jax.make_jaxpr(partial(forward._evaluated, **run.params))(*operands)
     (call,) = equations(inside.jaxpr, "pallas_call")
     return call.params["jaxpr"]
 
@@ -590,17 +589,6 @@ def test_an_engine_is_chosen_by_the_environment(monkeypatch):
     monkeypatch.delenv("PIEZOJAX_ENGINE")
     monkeypatch.setattr("piezojax.engines.engine.compiler", lambda: None)
     assert default_engine() == "loop"
-
-
-@needs_compiler
-def test_a_gradient_in_reverse_mode_uses_the_loop():
-    def simulated(gain):
-        return metered(Affine(gain, 1.0), driven(), (), Means())[0]
-
-    assert is_native(simulated, 2.0)
-    with reverse_mode(True):
-        assert not is_native(simulated, 2.0)
-    assert is_native(simulated, 2.0)
 
 
 def test_ragged_inputs_are_refused():

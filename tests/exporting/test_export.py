@@ -433,6 +433,9 @@ def run(function, *arguments):
         lambda a, b: jnp.einsum("ij,jk,ik->k", a, b, a),
         lambda a, b: jax.lax.dynamic_slice(a[0], (a[1, 1].astype(int),), (1,)),
         lambda a, b: a[0].at[b[1, 1].astype(int)].add(3.0),
+        lambda a, b: a.at[1, 2].add(b[0, 0]),
+        lambda a, b: a.at[jnp.array([2, 0, 2])].add(b),
+        lambda a, b: jax.vjp(lambda x: jnp.stack([x[1], x[0] * x[0, 0]]), a)[1](b[:2]),
     ],
 )
 def test_arrays_become_the_scalars_that_jax_computes(function):

@@ -1,0 +1,172 @@
+"""Runs of many lanes as an operation of JAX, with derivatives in forward mode."""
+
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+from ..core.rollout import SEGMENT
+from . import gpu_kernel, native_kernel
+from .batch import Batch, Positions, batched, mapped, sizes_of
+from .lane_values import LaneValues
+from .metered_run import MeteredRun
+from .native_library import CompileError
+
+Engine = Literal["loop", "native", "gpu", "interpreted"]
+"""``loop`` is that of ``simulate``, ``native`` compiled C on a CPU, and ``gpu`` one
+kernel of a GPU, which ``interpreted`` computes without one, slowly."""
+
+KERNELS = {"native": native_kernel, "gpu": gpu_kernel, "interpreted": gpu_kernel}
+"""Module of each engine with a kernel."""
+
+
+def lanes(operands: Sequence[Any], run: MeteredRun, engine: Engine) -> Sequence[Array]:
+    """Return totals and log of a run; under ``jax.vmap``, all lanes run in a kernel."""
+    positions = ((),) * len(operands)
+    return _metered.bind(
+        *operands, run=run, positions=positions, active=(), engine=engine
+    )
+
+
+def _looped_slopes(
+    operands: Sequence[Any],
+    run: MeteredRun,
+    positions: Sequence[Positions],
+    active: Sequence[int],
+) -> tuple[Array, Array]:
+    """Return the derivatives of totals and log, computed in the loop of ``simulate``.
+
+    The derivatives of the operands ``active`` follow the operands.
+    """
+    count = len(positions) - len(active)
+
+    def slopes(*all_: Any) -> tuple[Array, Array]:
+        values, directions = all_[:count], all_[count:]
+
+        def of(*changed: Any) -> tuple[Array, Array]:
+            new = dict(zip(active, changed, strict=True))
+            return run.plain(SEGMENT, *(new.get(i, x) for i, x in enumerate(values)))
+
+        return jax.jvp(of, tuple(values[i] for i in active), directions)[1]
+
+    return mapped(slopes, operands, positions)
+
+
+def _evaluated(
+    *operands: Any,
+    run: MeteredRun,
+    positions: Sequence[Positions],
+    active: Sequence[int],
+    engine: Engine,
+) -> tuple[Array, Array]:
+    """Return totals and log of all lanes, or derivatives if operands are ``active``."""
+    try:
+        found = _in_kernel(operands, run, positions, active, engine)
+    except CompileError as error:
+        warnings.warn(f"{error}; XLA runs the loops instead", stacklevel=2)
+        found = None
+    if found is not None:
+        return found
+    if active:
+        return _looped_slopes(operands, run, positions, active)
+    return mapped(partial(run.plain, run.samples), operands, positions)
+
+
+def _in_kernel(
+    operands: Sequence[Any],
+    run: MeteredRun,
+    positions: Sequence[Positions],
+    active: Sequence[int],
+    engine: Engine,
+) -> tuple[Array, Array] | None:
+    """Return the results of the kernel of an engine, None if it cannot compute them."""
+    if engine not in KERNELS:
+        return None
+    kernel, step = KERNELS[engine], run.step(active)
+    count, first = sum(run.counts), sum(run.counts[:2])
+    by_lane = any(p is not None for each in positions[first:count] for p in each)
+    if step is None or not kernel.computes(step, by_lane):
+        return None
+    sizes = sizes_of(operands, positions)
+    batch = Batch.sorted(sizes, positions[:count], positions[first:count])
+    pairs = [*zip(operands, positions, strict=True)]
+    grouped = [batch.grouped(x, where) for x, where in (*pairs[:first], *pairs[count:])]
+    inputs = [batch.grouped(x, where, last=True) for x, where in pairs[first:count]]
+    options = {"interpret": True} if engine == "interpreted" else {}
+    found = kernel.results(
+        step,
+        LaneValues(step, run.leaves(grouped, active)),
+        inputs,
+        batch.counts,
+        run.wanted(),
+        run.every,
+        **options,
+    )
+    totals, rows = (batch.restored(x) for x in found)
+    return totals, rows
+
+
+_metered = Primitive("metered_run")
+_metered.multiple_results = True
+
+
+@_metered.def_impl
+def _called(*operands, **params):
+    return jax.jit(partial(_evaluated, **params))(*operands)
+
+
+@_metered.def_abstract_eval
+def _abstract(*operands, run, positions, active, engine):
+    sizes = sizes_of(operands, positions)
+    totals, rows = run.sizes()
+    types = [ShapedArray((*sizes, *shape), float) for shape in ((totals,), rows)]
+    return types
+
+
+def _batched(operands, axes, *, positions, **params):
+    positions = tuple(map(batched, positions, axes))
+    return _metered.bind(*operands, positions=positions, **params), [0, 0]
+
+
+def _differentiated(operands, slopes, *, active, **params):
+    if active:
+        params |= {"engine": "loop"}
+        slopes = tuple(ad.instantiate_zeros(slope) for slope in slopes)
+        return jax.jvp(partial(_evaluated, active=active, **params), operands, slopes)
+    values = _metered.bind(*operands, active=(), **params)
+    active = tuple(i for i, slope in enumerate(slopes) if type(slope) is not ad.Zero)
+    where = params.pop("positions")
+    found = _metered.bind(
+        *operands,
+        *(slopes[i] for i in active),
+        positions=(*where, *(where[i] for i in active)),
+        active=active,
+        **params,
+    )
+    return values, found
+
+
+def _transposed(cotangents, *operands, run, positions, active, engine):
+    count = len(positions) - len(active)
+    values, slopes = operands[:count], operands[count:]
+    cotangents = [ad.instantiate_zeros(each) for each in cotangents]
+
+    def function(*slopes):
+        return _looped_slopes((*values, *slopes), run, positions, active)
+
+    zeros = [jnp.zeros(x.aval.shape, x.aval.dtype) for x in slopes]
+    found = jax.vjp(function, *zeros)[1](tuple(cotangents))
+    return [None] * count + list(found)
+
+
+batching.primitive_batchers[_metered] = _batched
+ad.primitive_jvps[_metered] = _differentiated
+ad.primitive_transposes[_metered] = _transposed
+mlir.register_lowering(_metered, mlir.lower_fun(_evaluated, multiple_results=True))
