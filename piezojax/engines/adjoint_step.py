@@ -53,9 +53,7 @@ def adjoint_step(
     function = _with_reverse_pass(step, system, carry)
     try:
         with jax.ensure_compile_time_eval():
-            graph, results = trace(
-                function, *parts, INDEX, [*states], [*numbers], log
-            )
+            graph, results = trace(function, *parts, INDEX, [*states], [*numbers], log)
     except NotScalarError:
         raise
     except (TypeError, ValueError, NotImplementedError) as error:

@@ -72,5 +72,7 @@ def metered(
     if engine == "loop":
         return run.unpacked(*run.plain(SEGMENT, *operands))
     if reverse_mode.value:
-        return run.unpacked(*reversible(run, operands))
-    return run.unpacked(*lanes(operands, run, engine))
+        found: Any = reversible(run, operands)
+    else:
+        found = lanes(operands, run, engine)
+    return run.unpacked(*found)

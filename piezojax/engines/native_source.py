@@ -70,6 +70,7 @@ HEAD = Template("""#include <math.h>
 #define EVERY $every
 #define SEGMENT $segment
 #define OUTPUTS $outputs
+#define AHEAD 8  /* samples from which inputs are fetched */
 #define LANES for (int l = 0; l < WIDTH; l++)
 #define INLINE static inline __attribute__((always_inline))
 #define LANE_ARRAY(name) double name[WIDTH] __attribute__((aligned(64)))
@@ -124,6 +125,7 @@ INLINE void step_${part}(struct ${part} *restrict of, $kept *restrict kept, int6
                          const double *restrict shared, const double *restrict own,
                          const double *restrict slopes, double *restrict log$rows)
 {
+$ahead
     LANES {
 $step
     }
@@ -298,6 +300,12 @@ class _Source:
         self.writer = LaneWriter(step, arrays, rows)
         self.inputs = [f"in{i}" for i in range(len(rows))]
         self.pointers = "".join(f", const double *restrict {x}" for x in self.inputs)
+        self.ahead = [
+            f"__builtin_prefetch({name} + ((k + AHEAD)*{leaf.size} + {element})*lanes);"
+            for name, leaf in zip(self.inputs, rows, strict=True)
+            for element in range(leaf.size)
+            if leaf.by_lane
+        ]
         self.moving = [*step.moving, *step.moving_slopes]
         self.divisors = {
             node.operands[1]
@@ -400,11 +408,9 @@ class _Source:
             kind = nodes[each.last]
             lines.append(f"const {writer.type_of(kind)} {name} = of->{name}[l];")
         lines += writer.statements(moving)
+        lines += [f"log[{i}*STRIDE + l] = {writer.real(n)};" for i, n in enumerate(log)]
         lines += [
-            f"log[{i}*STRIDE + l] = {writer.expression(n)};" for i, n in enumerate(log)
-        ]
-        lines += [
-            f"of->{name}[l] = {writer.expression(each.last)};"
+            f"of->{name}[l] = {writer.real(each.last)};"
             for name, each in zip(names, elements, strict=True)
         ]
         # Last, because from here on they are read from where they are stored.
@@ -414,6 +420,7 @@ class _Source:
             kept="const struct kept" if part == "slopes" else "struct kept",
             fields=_fields("LANE_ARRAY({});", [*names, *own.names]),
             rows=self.pointers,
+            ahead=_lines(self.ahead if part == "values" else [], 4),
             start=_lines(start + own.lines, 8),
             step=_lines(lines, 8),
             end=_lines(

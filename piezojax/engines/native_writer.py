@@ -86,6 +86,17 @@ class LaneWriter(Writer):
                 return f"{operands[0]} * {self.inverse[divisor]}"
         return super()._operation(node, operands)
 
+    def real(self, number: int) -> str:
+        """Return the expression of a node as a double.
+
+        Compilers do not vectorise the conversion of a boolean.
+        """
+        text = self.expression(number)
+        return f"{text} ? 1.0 : 0.0" if self._kind(number) == "boolean" else text
+
+    def _kind(self, number: int) -> str:
+        return self.graph.nodes[number].kind
+
     def statements(self, numbers: Iterable[int]) -> list[str]:
         """Return the statements of nodes that are not inputs."""
         nodes = self.graph.nodes
@@ -99,9 +110,9 @@ class LaneWriter(Writer):
         """Return the statements that store nodes; they are read from there then."""
         lines = []
         for number in numbers:
-            lines.append(f"{write.format(f'v{number}')} = {self.expression(number)};")
-            kind = self.graph.nodes[number].kind
-            self.stored[number] = self.typed(read.format(f"v{number}"), kind)
+            lines.append(f"{write.format(f'v{number}')} = {self.real(number)};")
+            text = read.format(f"v{number}")
+            self.stored[number] = self.typed(text, self._kind(number))
         return lines
 
     def invert(self, numbers: Iterable[int], write: str, read: str) -> list[str]:

@@ -69,10 +69,7 @@ def _forward(
 
 
 def _backward(run: MeteredRun, reverse: Partial, slopes: Sequence[Any]) -> Any:
-    whole = [
-        jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x
-        for x in slopes
-    ]
+    whole = [jnp.zeros(x.shape) if isinstance(x, SymbolicZero) else x for x in slopes]
     found = reverse(whole)
     return ([found.get(i) for i in range(sum(run.counts))],)
 
@@ -169,9 +166,13 @@ def _with_carry(
     return separated(storing, inputs, carry, metric, lambda both: both[1], every)
 
 
-def _of_active(run: MeteredRun, operands: Sequence[Array], active: Sequence[int]):
-    """Return the run in the loop of simulate as a function of active operands, and
-    these operands."""
+def _of_active(
+    run: MeteredRun, operands: Sequence[Array], active: Sequence[int]
+) -> tuple[Any, ...]:
+    """Return the run in the loop of ``simulate`` as a function, and its arguments.
+
+    These are the operands ``active``.
+    """
 
     def function(*changed):
         new = dict(zip(active, changed, strict=True))

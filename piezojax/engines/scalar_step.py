@@ -141,7 +141,7 @@ def scalar_step(
         places,
         after | slopes,
         zero,
-        {Place("carry", *each, tangent) for each in outputs for tangent in (False, True)},
+        {Place("carry", *each, slope) for each in outputs for slope in (False, True)},
         _flat(results[leaves:half]),
         _flat(results[half + leaves :]),
     )
@@ -325,6 +325,7 @@ FIRST_VALUE = {"select_n": 1}
 
 
 def is_real(x: Any) -> bool:
+    """Return whether an array, or its type, is of real numbers."""
     return bool(jnp.issubdtype(jnp.result_type(x), jnp.floating))
 
 

@@ -17,13 +17,13 @@ from ..solve.successive_halving import SuccessiveHalving
 from ..study import Case
 from .objective import Objective
 
-FORWARD_BELOW = {"native": 9, "loop": 5}
+FORWARD_BELOW = {"native": 4, "loop": 5}
 """Numbers of parameters below which forward-mode differentiation is faster, by engine;
 5 for others."""
 
-FORWARD_BELOW_WITH_AXES = 64
-"""The same with several axes, where the reverse pass takes minutes to compile, three
-times as long as the forward pass."""
+FORWARD_BELOW_WITH_AXES = {"native": 4, "loop": 64}
+"""The same with several axes, where XLA compiles a reverse pass for minutes, three
+times as long as a forward pass."""
 
 
 def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:
@@ -40,9 +40,8 @@ def make_strategy(objective: Objective, case: Case, clock: Clock) -> Strategy:
             tolerance=table.tolerance,
             every=every,
         )
-    below = FORWARD_BELOW.get(default_engine(), FORWARD_BELOW["loop"])
-    if case.study.axes:
-        below = FORWARD_BELOW_WITH_AXES
+    limits = FORWARD_BELOW_WITH_AXES if case.study.axes else FORWARD_BELOW
+    below = limits.get(default_engine(), limits["loop"])
     return LockstepDescent(
         objective,
         size,

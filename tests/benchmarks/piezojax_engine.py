@@ -14,7 +14,7 @@ from piezojax.catalog import p558_control, p753
 from piezojax.core.axes import PerAxisMetric
 from piezojax.core.feedback import LoopInput
 from piezojax.core.metrics import Chosen, Tracking
-from piezojax.engines import metered
+from piezojax.engines import metered, reverse_mode
 
 BLOCK = 64  # lanes simulated at a time
 
@@ -92,11 +92,9 @@ def mean_square(loop_of, gains, inputs):
 
 
 def value_and_gradient(loop_of, gains, inputs):
-    """Return the loss and its gradient [n], in forward mode as in a search."""
-    return jax.vmap(
-        lambda d: jax.jvp(lambda g: mean_square(loop_of, g, inputs), (gains,), (d,)),
-        out_axes=(None, 0),
-    )(jnp.eye(len(gains)))
+    """Return the loss and its gradient [n], in reverse mode as in a search."""
+    with reverse_mode(True):
+        return jax.value_and_grad(lambda g: mean_square(loop_of, g, inputs))(gains)
 
 
 def signals(reference, noise):
@@ -121,7 +119,7 @@ class PiezojaxEngine(Engine):
 
     gradient: one gains vector [8], shared by all lanes; the loss is the mean over
     lanes of the mean over k = steps//2 ... steps-1 of (y(k) - r(k))^2, in um^2;
-    `run` returns (loss, gradient [8]), in forward mode.
+    `run` returns (loss, gradient [8]), in reverse mode.
     """
 
     name = "piezojax"

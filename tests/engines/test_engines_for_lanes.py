@@ -20,11 +20,11 @@ from piezojax.core.system import Affine, Delay, System
 from piezojax.dynamics import FirstOrderLag
 from piezojax.engines import (
     default_engine,
+    forward,
     gpu_kernel,
     lane_values,
     metered,
 )
-from piezojax.engines import forward
 from piezojax.engines import native_library as library
 from piezojax.hardware import Quantiser, Saturation, Sensor
 from piezojax.hysteresis import PrandtlIshlinskii

@@ -117,10 +117,8 @@ def test_gradient_by_numbers_and_start(samples, every):
         first, lag = system.init()
         state = (x, *first[1:]), lag
         more = {"log": lambda y: {"y": y, "large": y > 0.1}, "every": 1}
-        options = more if every else {}
-        return weighted(
-            metered(system, driven()[:samples], state, Means(), engine=engine, **options)
-        )
+        options = {"engine": engine} | (more if every else {})
+        return weighted(metered(system, driven()[:samples], state, Means(), **options))
 
     parts = as_array(1.1), jnp.array([0.1, -0.2]), as_array(0.2)
     calls = 3 if every else 2
@@ -204,7 +202,7 @@ def test_a_loop_of_three_axes():
                 changed.init((0.0,) * 3),
                 PerAxisMetric(Tracking(start=4), 3),
                 engine=engine,
-                )[0].rms_error
+            )[0].rms_error
         )
 
     assert_equals_loop(loss, as_array(1.0))
