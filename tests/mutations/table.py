@@ -19,6 +19,7 @@ class Mutation(NamedTuple):
 _DATA = "tests/tuning/test_data.py"
 _ENGINES = "tests/engines/test_engines_for_lanes.py"
 _LOOPS = "tests/control/test_loops.py"
+_REVERSE = "tests/engines/test_reverse_mode.py"
 _ROBUST = "tests/tuning/test_robust.py"
 _MULTI_AXIS = ("tests/control/test_multi_axis.py", "-k", "published")
 
@@ -51,6 +52,20 @@ MUTATIONS = (
         'any if node.operation == "mul" else all',
         "any",
         (_ENGINES, "-k", "derivatives"),
+    ),
+    Mutation(
+        "a reverse pass without the first segment",
+        "engines/native_source.py",
+        "segment = segments - 1; segment >= 0;",
+        "segment = segments - 1; segment > 0;",
+        (_REVERSE, "-k", "start"),
+    ),
+    Mutation(
+        "states that depend on tuned numbers only through others",
+        "engines/adjoint_step.py",
+        "if not more:",
+        "if more is not None:",
+        (_REVERSE, "-k", "many_lanes"),
     ),
     # Signals of a study
     Mutation(
