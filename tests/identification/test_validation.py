@@ -101,16 +101,20 @@ def test_estimating_the_state_before_the_record_reduces_the_error():
     assert np.std((from_rest - y)[1200:]) > 4.0 * NOISE
 
 
-@pytest.mark.parametrize(("low", "high"), [(35.0, 65.0), (10.0, 90.0)])
-def test_three_turns_beyond_the_range_of_the_record_are_found(low, high):
-    # Pairs of levels within the ranges leave more than twice the noise.
+@pytest.mark.parametrize(
+    ("low", "high", "determined"), [(35.0, 65.0, False), (10.0, 90.0, True)]
+)
+def test_three_turns_beyond_the_range_of_the_record_are_found(low, high, determined):
+    # Pairs of levels within the ranges leave more than twice the noise. In the narrow
+    # record the largest play never moves: it is a constant, as the zero is.
     u = excitation(3000, low, high)
     y = moved(u, (0.0, 112.0, 33.0, 58.0))
     ends = np.array([20.0, 100.0])
     start, run, zero = start_of(MODEL, u, y, slice(0, 3000), ends)
     assert np.std(run[:, 0] - y) < 1.1 * NOISE
     assert start.levels[1:] == pytest.approx([33.0, 58.0], abs=0.3)
-    assert zero == pytest.approx([0.0], abs=NOISE)
+    if determined:
+        assert zero == pytest.approx([0.0], abs=NOISE)
 
 
 def test_the_state_is_estimated_until_the_input_has_covered_its_range():

@@ -29,7 +29,14 @@ SAMPLES = 500
 """Samples of the motion from one level to the next."""
 
 LEVELS = 9
-"""Levels tried for each turning point before the best ones are refined."""
+"""Levels tried for each turning point."""
+
+REFINED = 3
+"""Number of candidates of the grid that are refined: the local optimum next to the best
+one may be a poor one."""
+
+FINE = 5 * 3**TURNS
+"""Levels tried for each turning point alone at the end."""
 
 BEYOND = 0.2
 """Share of the input's range by which the levels may lie outside of it: a stage that
@@ -216,32 +223,45 @@ class _LevelSearch(NamedTuple):
     def levels(self, columns: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the levels that fit best, and their mean square error.
 
-        Two levels are searched on a grid and refined; then a third one is inserted
-        before, between or after them, and all are refined.
+        All levels are searched on a grid, and the best of them refined. Last, each
+        level alone is searched on a fine grid: the optimum is narrow where an element
+        of a hysteresis moves only once in the record, and not far.
         """
         grid = np.linspace(0.0, 1.0, LEVELS)
-        pairs = [(a, a, b) for a, b in itertools.product(grid, grid)]
-        candidates = np.concatenate([self._rest()[None], self._between(pairs)])
+        every = self._between([*itertools.product(grid, repeat=TURNS)])
+        candidates = np.concatenate([self._rest()[None], every])
         variance = float(np.mean(np.var(self.outputs, axis=0)))
-        found, variance = self._best(candidates, columns, variance)
-        found, variance = self.refined(found, columns, variance)
-        inserted = [
-            np.insert(found[1:], place, level, axis=0)
-            for place in range(TURNS)
-            for level in self._between(grid)
+        errors = self._errors(candidates, columns, variance)
+        refined = [
+            self.refined(candidates[i], columns, float(errors[i]))
+            for i in np.argsort(errors, kind="stable")[:REFINED]
         ]
-        found, variance = self._best(np.stack([found, *inserted]), columns, variance)
-        return self.refined(found, columns, variance)
+        found, variance = min(refined, key=lambda each: each[1])
+        for turn in range(TURNS):
+            others = [np.delete(found, turn, axis=0)] * FINE
+            fine = self._between(np.linspace(0.0, 1.0, FINE))
+            scanned = [
+                np.insert(rest, turn, level, axis=0)
+                for rest, level in zip(others, fine, strict=True)
+            ]
+            found, variance = self._best(np.stack([found, *scanned]), columns, variance)
+        return self.refined(found, columns, variance, 1.0 / FINE)
 
     def refined(
-        self, levels: np.ndarray, columns: np.ndarray, variance: float
+        self,
+        levels: np.ndarray,
+        columns: np.ndarray,
+        variance: float,
+        step: float = 0.5 / (LEVELS - 1),
     ) -> tuple[np.ndarray, float]:
-        """Return the best levels around ``levels``, and their mean square error."""
+        """Return the best levels around ``levels``, and their mean square error.
+
+        The first ``step`` is a share of their range.
+        """
         shifts = sorted(
             itertools.product((-1.0, 0.0, 1.0), repeat=TURNS), key=np.linalg.norm
         )
         around = self._spread(shifts) * (self.high - self.low)
-        step = 0.5 / (LEVELS - 1)
         for _ in range(ROUNDS):
             moved = np.clip(levels + step * around, self.low, self.high)
             found, variance = self._best(moved, columns, variance)
@@ -255,6 +275,14 @@ class _LevelSearch(NamedTuple):
     def _best(
         self, candidates: np.ndarray, columns: np.ndarray, variance: float
     ) -> tuple[np.ndarray, float]:
+        errors = self._errors(candidates, columns, variance)
+        place = int(np.argmin(errors))
+        return candidates[place], float(errors[place])
+
+    def _errors(
+        self, candidates: np.ndarray, columns: np.ndarray, variance: float
+    ) -> np.ndarray:
+        """Return the mean square error of each candidate."""
         y = self.outputs
         runs = in_batches(
             lambda some: runs_after(self.system, self.inputs, some), candidates, WIDTH
@@ -266,8 +294,7 @@ class _LevelSearch(NamedTuple):
         # The prior's own rows have no error.
         error = error.reshape(len(candidates), -1)
         left = np.sum(error**2, axis=1) - np.sum((error @ base[: y.size]) ** 2, axis=1)
-        place = int(np.argmin(left))
-        return candidates[place], max(float(left[place]), 0.0) / y.size
+        return np.maximum(left, 0.0) / y.size
 
     def _rest(self) -> np.ndarray:
         first = np.asarray(self.inputs[0])
