@@ -218,8 +218,11 @@ class _Tracer:
         if places is None:
             return self.arrays.at_computed_place("scatter-add", operands)
         # Each element is added alone to zeros: it is at the places that are 1 then.
-        units = np.eye(more.size).reshape(more.size, *more.shape)
-        found = [_bound(equation, [np.zeros(array.shape), places, x])[0] for x in units]
+        units, zeros = np.eye(more.size), np.zeros(array.shape)
+        found = [
+            _bound(equation, [zeros, places, unit.reshape(more.shape)])[0]
+            for unit in units
+        ]
         total = array.copy()
         for number, where in zip(more.ravel(), found, strict=True):
             for place in np.argwhere(where):

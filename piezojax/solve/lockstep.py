@@ -15,7 +15,7 @@ from .augmented_lagrangian import with_zero_multipliers
 from .clock import Clock
 from .gradient import with_finite_gradient
 from .multi_start import BatchedDescents, Patience, in_batches
-from .optimisers import METHODS, Optimiser
+from .optimisers import METHODS, Optimiser, View
 from .problem import Problem, Verdict
 
 STALLED = Patience(20, gain=1e-3)
@@ -106,12 +106,16 @@ class LockstepDescent:
         """Return descents from ``units``, and the number of evaluations used."""
         begin, advance = self._programs[len(units)]
         problem = problem.with_multipliers(self._problem.multipliers)
-        descents = BatchedDescents(
-            lambda carry: advance(problem, carry, multipliers),
-            begin(problem, as_array(units), multipliers),
-            len(units),
-        )
-        return descents, 0
+
+        def advanced(carry: Any) -> tuple[Any, View, Verdict]:
+            carry, view = advance(problem, carry, multipliers)
+            if problem.limits:
+                # The compiled screening serves: the program of a step is smaller.
+                return carry, view, self.screen(problem, np.asarray(view.unit))[1]
+            return carry, view, Verdict(view.loss, np.zeros((len(view.loss), 0)))
+
+        started = begin(problem, as_array(units), multipliers)
+        return BatchedDescents(advanced, started, len(units)), 0
 
 
 @jax.jit
@@ -141,9 +145,6 @@ def _advanced(settings: _Settings, problem: Any, carry: Any, multipliers: Array)
     def advance_one(carry, multipliers):
         solver = _optimiser(settings, problem, multipliers)
         carry = solver.step(carry)
-        view = solver.view(carry)
-        if problem.limits:
-            return carry, view, problem.verdict(view.unit)
-        return carry, view, Verdict(view.loss, jnp.zeros(0))
+        return carry, solver.view(carry)
 
     return jax.vmap(advance_one)(carry, multipliers)

@@ -85,11 +85,7 @@ class Problem(Protocol):
         ...
 
     def value_and_verdict(self, unit: Unit) -> tuple[Float[Array, ""], Verdict]:
-        """Return ``loss`` and ``verdict`` of one evaluation."""
-        ...
-
-    def verdict(self, unit: Unit) -> Verdict:
-        """Return the objective without constraints, and all violations."""
+        """Return ``loss`` and the Verdict of one evaluation."""
         ...
 
     def errors(self, unit: Unit, every: int) -> Errors:

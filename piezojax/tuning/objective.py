@@ -292,7 +292,7 @@ class Objective(eqx.Module):
     def value_and_verdict(
         self, unit: Float[Array, " n"]
     ) -> tuple[Float[Array, ""], Verdict]:
-        """Return ``loss`` and ``verdict`` from the same simulation."""
+        """Return ``loss`` and the Verdict from the same simulation."""
         return self._evaluate(self.figures(unit))[:2]
 
     def _evaluate(self, figures: LoopFigures) -> tuple[Array, Verdict, Array]:
@@ -317,10 +317,6 @@ class Objective(eqx.Module):
         loss, verdict, added = self._evaluate(loop)
         flat = errors.reshape(-1, errors.shape[-1])
         return Errors(loss, verdict, flat, added, weights.ravel())
-
-    def verdict(self, unit: Float[Array, " n"]) -> Verdict:
-        """Return the objective without constraints, and all violations."""
-        return self.value_and_verdict(unit)[1]
 
     def residuals(self, unit: Float[Array, " n"]) -> Float[Array, " residuals"]:
         """Return residuals whose squares sum to the loss.

@@ -109,7 +109,7 @@ def test_lanes_and_constraints_are_counted(objective):
     assert objective.constraints == 0
     limited = objective.with_limits({"effort": 50.0})
     assert limited.constraints == PLANTS
-    found = limited.verdict(jnp.array([0.5])).violations
+    found = limited.value_and_verdict(jnp.array([0.5]))[1].violations
     # The loop has one plant; the scale was given for PLANTS.
     assert found.shape == (1,)
 
@@ -122,7 +122,7 @@ def test_limits_on_steps_use_the_step_test(objective):
     )
     rises = np.asarray(limited.figures(unit).steps.rise_time)
     assert rises.shape == (1, 2)
-    found = limited.verdict(unit).violations
+    found = limited.value_and_verdict(unit)[1].violations
     np.testing.assert_allclose(found, np.log(rises.max() / 1e-3), rtol=1e-9)
     assert objective.figures(unit).steps is None
 
