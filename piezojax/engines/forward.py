@@ -12,7 +12,6 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from ..core.rollout import SEGMENT
 from . import gpu_kernel, native_kernel
 from .batch import Batch, Positions, batched, mapped, sizes_of
 from .lane_values import LaneValues
@@ -49,12 +48,8 @@ def _looped_slopes(
 
     def slopes(*all_: Any) -> tuple[Array, Array]:
         values, directions = all_[:count], all_[count:]
-
-        def of(*changed: Any) -> tuple[Array, Array]:
-            new = dict(zip(active, changed, strict=True))
-            return run.plain(SEGMENT, *(new.get(i, x) for i, x in enumerate(values)))
-
-        return jax.jvp(of, tuple(values[i] for i in active), directions)[1]
+        function = run.of_active(values, active)
+        return jax.jvp(function, tuple(values[i] for i in active), directions)[1]
 
     return mapped(slopes, operands, positions)
 

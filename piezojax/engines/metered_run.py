@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..core.arrays import State
-from ..core.rollout import Metric, samples_of, simulate
+from ..core.rollout import SEGMENT, Metric, samples_of, simulate
 from ..core.system import System, resolve
 from ..scalar.memory import NotScalarError
 from .adjoint_step import adjoint_step
@@ -162,6 +162,17 @@ class MeteredRun:
         columns = [x.reshape(len(x), -1).astype(float) for x in leaves]
         rows = jnp.concatenate([jnp.zeros((len(columns[0]), 0)), *columns], axis=1)
         return totals, rows[: self.samples // self.every]
+
+    def of_active(
+        self, operands: Sequence[Any], active: Sequence[int]
+    ) -> Callable[..., tuple[Array, Array]]:
+        """Return ``plain`` as a function of the operands ``active``."""
+
+        def function(*changed: Any) -> tuple[Array, Array]:
+            new = dict(zip(active, changed, strict=True))
+            return self.plain(SEGMENT, *(new.get(i, x) for i, x in enumerate(operands)))
+
+        return function
 
     def step(self, active: Sequence[int] = ()) -> ScalarStep | None:
         """Return the scalar step with derivatives for the operands ``active``, or None.

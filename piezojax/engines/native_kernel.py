@@ -166,7 +166,7 @@ def _arrays(
         [x.place for x in each if (x.place.leaf, x.place.element) in wanted]
         for each in (step.carried, step.slopes)
     ]
-    own = [place for place in numbers if place not in shared]
+    own = [place for place in numbers if not values.is_shared(place)]
     return Arrays(shared, own, values.read(step.steady_slopes), *ends)
 
 

@@ -18,7 +18,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array
 
 from ..core.arrays import State
-from ..core.rollout import SEGMENT, Metric
+from ..core.rollout import Metric
 from ..core.system import System
 from . import native_kernel
 from .batch import Batch, Positions, batched, mapped, sizes_of
@@ -52,7 +52,8 @@ def _forward(
     )
     step = run.adjoint(active) if active else None
     if step is None or not native_kernel.computes(step, by_lane=True):
-        found, reverse = jax.vjp(*_of_active(run, operands, active))
+        function = run.of_active(operands, active)
+        found, reverse = jax.vjp(function, *(operands[i] for i in active))
         return found, Partial(partial(_of_loop, active), reverse)
     segment = max(LEAST, math.isqrt(run.samples))
     adjoint = Adjoint(run, step, active, segment)
@@ -166,21 +167,6 @@ def _with_carry(
     return separated(storing, inputs, carry, metric, lambda both: both[1], every)
 
 
-def _of_active(
-    run: MeteredRun, operands: Sequence[Array], active: Sequence[int]
-) -> tuple[Any, ...]:
-    """Return the run in the loop of ``simulate`` as a function, and its arguments.
-
-    These are the operands ``active``.
-    """
-
-    def function(*changed):
-        new = dict(zip(active, changed, strict=True))
-        return run.plain(SEGMENT, *(new.get(i, x) for i, x in enumerate(operands)))
-
-    return function, *(operands[i] for i in active)
-
-
 def _of_loop(active: Sequence[int], reverse: Any, slopes: Any) -> dict[int, Array]:
     return dict(zip(active, reverse(tuple(slopes)), strict=True))
 
@@ -214,8 +200,9 @@ def _evaluated(
         *values, rows, _, totals = operands
         if not adjoint.run.every:
             rows = jnp.zeros(adjoint.run.sizes()[1])
-        function = _of_active(adjoint.run, values, adjoint.active)
-        found = jax.vjp(*function)[1]((totals, rows))
+        function = adjoint.run.of_active(values, adjoint.active)
+        reverse = jax.vjp(function, *(values[i] for i in adjoint.active))[1]
+        found = reverse((totals, rows))
         return jnp.concatenate([jnp.ravel(x) for x in found])
 
     return [mapped(lane, operands, positions)]

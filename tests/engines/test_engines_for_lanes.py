@@ -533,14 +533,7 @@ def simple(value, scale=1.0):
 
 
 @needs_compiler
-def test_new_gains_and_lanes_need_no_new_library(monkeypatch):
-    compiled = []
-    compile_ = library._compiled
-    monkeypatch.setattr(
-        library, "_compiled", lambda *a: compiled.append(a) or compile_(*a)
-    )
-    monkeypatch.setattr(library, "_kept", lambda name: None)
-    monkeypatch.setattr(library, "_libraries", {})
+def test_new_gains_and_lanes_need_no_new_library(compiled):
     program = jax.jit(jax.vmap(lambda v: simple(v, 0.123)))
     first = program(spread(20))
     assert len(compiled) == 1
@@ -550,10 +543,8 @@ def test_new_gains_and_lanes_need_no_new_library(monkeypatch):
 
 
 @needs_compiler
-def test_a_failing_compiler_leaves_the_loop(monkeypatch):
-    monkeypatch.setattr(library, "compiler", lambda: "/bin/false")
-    monkeypatch.setattr(library, "_kept", lambda name: None)
-    monkeypatch.setattr(library, "_libraries", {})
+@pytest.mark.usefixtures("failing_compiler")
+def test_a_failing_compiler_leaves_the_loop():
     program = jax.jit(lambda v: simple(v, 0.456))
     with pytest.warns(UserWarning, match=r"/bin/false fails.*XLA runs the loops"):
         found = program(2.0)

@@ -258,14 +258,7 @@ def test_a_run_without_derivatives_in_the_context():
     np.testing.assert_allclose(slope, simple(2.0))
 
 
-def test_new_gains_and_lanes_need_no_new_library(monkeypatch):
-    compiled = []
-    compile_ = library._compiled
-    monkeypatch.setattr(
-        library, "_compiled", lambda *a: compiled.append(a) or compile_(*a)
-    )
-    monkeypatch.setattr(library, "_kept", lambda name: None)
-    monkeypatch.setattr(library, "_libraries", {})
+def test_new_gains_and_lanes_need_no_new_library(compiled):
     program = jax.jit(jax.vmap(with_reverse_pass(lambda v: simple(v, 0.123))))
     first = program(jnp.linspace(0.5, 1.5, 20))
     assert len(compiled) == 2
@@ -274,11 +267,9 @@ def test_new_gains_and_lanes_need_no_new_library(monkeypatch):
     assert len(compiled) == 2
 
 
-def test_a_failing_compiler_leaves_the_loop(monkeypatch):
+def test_a_failing_compiler_leaves_the_loop(request):
     expected = with_reverse_pass(lambda v: simple(v, 0.456))(2.0)
-    monkeypatch.setattr(library, "compiler", lambda: "/bin/false")
-    monkeypatch.setattr(library, "_kept", lambda name: None)
-    monkeypatch.setattr(library, "_libraries", {})
+    request.getfixturevalue("failing_compiler")
     program = jax.jit(with_reverse_pass(lambda v: simple(v, 0.456)))
     with pytest.warns(UserWarning, match=r"/bin/false fails.*XLA runs the loops"):
         found = program(2.0)

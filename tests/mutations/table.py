@@ -34,7 +34,7 @@ MUTATIONS = (
     ),
     Mutation(
         "outer lanes with the state of the first",
-        "engines/native_source.py",
+        "engines/native_templates.py",
         "start + block * $carried * STRIDE",
         "start + 0 * block * $carried * STRIDE",
         (_ENGINES, "-k", "number_of_lanes"),
@@ -55,7 +55,7 @@ MUTATIONS = (
     ),
     Mutation(
         "a reverse pass without the first segment",
-        "engines/native_source.py",
+        "engines/native_templates.py",
         "segment = segments - 1; segment >= 0;",
         "segment = segments - 1; segment > 0;",
         (_REVERSE, "-k", "start"),

@@ -237,14 +237,11 @@ class _LevelSearch(NamedTuple):
             for i in np.argsort(errors, kind="stable")[:REFINED]
         ]
         found, variance = min(refined, key=lambda each: each[1])
+        fine = self._between(np.linspace(0.0, 1.0, FINE))
         for turn in range(TURNS):
-            others = [np.delete(found, turn, axis=0)] * FINE
-            fine = self._between(np.linspace(0.0, 1.0, FINE))
-            scanned = [
-                np.insert(rest, turn, level, axis=0)
-                for rest, level in zip(others, fine, strict=True)
-            ]
-            found, variance = self._best(np.stack([found, *scanned]), columns, variance)
+            scanned = np.repeat(found[None], 1 + FINE, axis=0)
+            scanned[1:, turn] = fine
+            found, variance = self._best(scanned, columns, variance)
         return self.refined(found, columns, variance, 1.0 / FINE)
 
     def refined(

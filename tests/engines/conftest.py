@@ -1,0 +1,26 @@
+import pytest
+
+from piezojax.engines import native_library as library
+
+
+@pytest.fixture
+def no_libraries(monkeypatch):
+    """Let every library be compiled anew."""
+    monkeypatch.setattr(library, "_kept", lambda name: None)
+    monkeypatch.setattr(library, "_libraries", {})
+
+
+@pytest.fixture
+def compiled(monkeypatch, no_libraries):
+    """Return the list to which each compiled library is added."""
+    found = []
+    compile_ = library._compiled
+    monkeypatch.setattr(
+        library, "_compiled", lambda *a: found.append(a) or compile_(*a)
+    )
+    return found
+
+
+@pytest.fixture
+def failing_compiler(monkeypatch, no_libraries):
+    monkeypatch.setattr(library, "compiler", lambda: "/bin/false")
