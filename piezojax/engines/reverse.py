@@ -15,7 +15,7 @@ from jax.custom_derivatives import CustomVJPPrimal, SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jax.tree_util import Partial
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from ..core.arrays import State
 from ..core.rollout import Metric
@@ -33,7 +33,7 @@ LEAST = 128
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def reversible(run: MeteredRun, operands: Sequence[Array]) -> Sequence[Array]:
+def reversible(run: MeteredRun, operands: Sequence[ArrayLike]) -> Sequence[Array]:
     """Return totals and log of a run, with derivatives in reverse mode.
 
     The run stores its carry from time to time. Its reverse pass runs each segment once
@@ -155,7 +155,7 @@ def _elements(carry: Any, chosen: Sequence[tuple[int, int]]) -> Array:
 
 
 def _with_carry(
-    adjoint: Adjoint, operands: Sequence[Array]
+    adjoint: Adjoint, operands: Sequence[ArrayLike]
 ) -> tuple[list[Array], MeteredRun]:
     """Return the operands of a run that also stores its carries, and that run."""
     run = adjoint.run
@@ -172,7 +172,7 @@ def _of_loop(active: Sequence[int], reverse: Any, slopes: Any) -> dict[int, Arra
 
 
 def _of_kernel(
-    adjoint: Adjoint, operands: Sequence[Array], starts: Array, slopes: Any
+    adjoint: Adjoint, operands: Sequence[ArrayLike], starts: Array, slopes: Any
 ) -> dict[int, Array]:
     run = adjoint.run
     totals, rows = slopes
