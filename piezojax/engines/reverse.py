@@ -182,7 +182,7 @@ def _of_kernel(
     flat = _adjoint.bind(*every, adjoint=adjoint, positions=((),) * len(every))[0]
     found, first = {}, 0
     for i, size in zip(adjoint.active, adjoint.sizes, strict=True):
-        found[i] = flat[first : first + size].reshape(operands[i].shape)
+        found[i] = flat[first : first + size].reshape(jnp.shape(operands[i]))
         first += size
     return found
 
