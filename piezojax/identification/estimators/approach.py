@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from ...core.arrays import State
 from ...core.rollout import simulate
 from ...core.system import Series, System, resolve
+from ...engines import metered
 from ...hysteresis.model import hystereses
 from ...solve.multi_start import in_batches
 
@@ -48,7 +49,7 @@ FINEST = 1.0 / 1024.0
 ROUNDS = 20
 """Largest number of rounds of a refinement."""
 
-WIDTH = 3**TURNS
+WIDTH = REFINED * 3**TURNS
 """Candidates that are simulated together."""
 
 DEVIATION = 0.3
@@ -83,12 +84,16 @@ def run_after(
 
 def _state_after(system: System, first: Array, levels: Array) -> State:
     """Return the state one sample before the record."""
+    path = jnp.concatenate(_motion(first, levels))
+    state, _ = simulate(system, path, system.init(levels[0]))
+    return state
+
+
+def _motion(first: Array, levels: Array) -> list[Array]:
+    """Return the inputs of the motion over ``levels`` to the ``first`` input."""
     way = 0.5 - 0.5 * jnp.cos(jnp.linspace(0.0, jnp.pi, SAMPLES))
     way = way.reshape(-1, *[1] * first.ndim)
-    ends = [*levels, first]
-    path = [a + (b - a) * way for a, b in itertools.pairwise(ends)]
-    state, _ = simulate(system, jnp.concatenate(path), system.init(levels[0]))
-    return state
+    return [a + (b - a) * way for a, b in itertools.pairwise([*levels, first])]
 
 
 def _run_from(system: System, inputs: Array, state: State) -> Array:
@@ -162,7 +167,15 @@ def runs_after(
     levels: Float[Array, " candidates turns *m"],
 ) -> Array:
     """Return the outputs of ``run_after`` for each candidate of ``levels``."""
-    return jax.vmap(lambda turns: run_after(system, inputs, turns))(levels)
+    system = resolve(system)
+
+    def run(turns: Array) -> Array:
+        path = _motion(inputs[0], turns)
+        every = jnp.concatenate([*path, inputs[:1], inputs])
+        _, outputs = metered(system, every, system.init(turns[0]), log=lambda y: y)
+        return outputs[TURNS * SAMPLES : -1]
+
+    return jax.vmap(run)(levels)
 
 
 def levels_before(
@@ -194,8 +207,8 @@ def levels_before(
     if every.shape == columns.shape:
         return found
     smooth, _ = search.levels(every)
-    smooth, least = search.refined(smooth, columns, variance)
-    return smooth if least < variance else found
+    smooth, least = search.refined(smooth[None], columns, np.array([variance]))
+    return smooth[0] if least[0] < variance else found
 
 
 class _LevelSearch(NamedTuple):
@@ -232,66 +245,80 @@ class _LevelSearch(NamedTuple):
         candidates = np.concatenate([self._rest()[None], every])
         variance = float(np.mean(np.var(self.outputs, axis=0)))
         errors = self._errors(candidates, columns, variance)
-        refined = [
-            self.refined(candidates[i], columns, float(errors[i]))
-            for i in np.argsort(errors, kind="stable")[:REFINED]
-        ]
-        found, variance = min(refined, key=lambda each: each[1])
+        best = np.argsort(errors, kind="stable")[:REFINED]
+        refined, errors = self.refined(
+            candidates[best], columns, errors[best], finest=1.0 / FINE
+        )
+        found, variance = refined[np.argmin(errors)], float(np.min(errors))
         fine = self._between(np.linspace(0.0, 1.0, FINE))
         for turn in range(TURNS):
             scanned = np.repeat(found[None], 1 + FINE, axis=0)
             scanned[1:, turn] = fine
-            found, variance = self._best(scanned, columns, variance)
-        return self.refined(found, columns, variance, 1.0 / FINE)
+            errors = self._errors(scanned, columns, variance)
+            found, variance = scanned[np.argmin(errors)], float(np.min(errors))
+        refined, errors = self.refined(
+            found[None], columns, np.array([variance]), 1.0 / FINE
+        )
+        return refined[0], float(errors[0])
 
     def refined(
         self,
         levels: np.ndarray,
         columns: np.ndarray,
-        variance: float,
+        variances: np.ndarray,
         step: float = 0.5 / (LEVELS - 1),
-    ) -> tuple[np.ndarray, float]:
-        """Return the best levels around ``levels``, and their mean square error.
+        finest: float = FINEST,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the best levels around each of ``levels``, and their variances.
 
-        The first ``step`` is a share of their range.
+        ``variances`` are the mean square errors of ``levels`` [candidates, ...]. The
+        first ``step`` and the ``finest`` one are shares of their range.
         """
         shifts = sorted(
             itertools.product((-1.0, 0.0, 1.0), repeat=TURNS), key=np.linalg.norm
         )
         around = self._spread(shifts) * (self.high - self.low)
+        levels, variances = levels.copy(), variances.copy()
+        steps = np.full(len(levels), step)
         for _ in range(ROUNDS):
-            moved = np.clip(levels + step * around, self.low, self.high)
-            found, variance = self._best(moved, columns, variance)
-            if np.array_equal(found, levels):
-                step *= 0.5
-            levels = found
-            if step < FINEST:
+            moving = np.flatnonzero(steps >= finest)
+            if not len(moving):
                 break
-        return levels, variance
-
-    def _best(
-        self, candidates: np.ndarray, columns: np.ndarray, variance: float
-    ) -> tuple[np.ndarray, float]:
-        errors = self._errors(candidates, columns, variance)
-        place = int(np.argmin(errors))
-        return candidates[place], float(errors[place])
+            moved = [levels[i] + steps[i] * around for i in moving]
+            moved = np.clip(np.stack(moved), self.low, self.high)
+            runs = self._runs(moved.reshape(-1, *levels.shape[1:]))
+            runs = runs.reshape(*moved.shape[:2], *runs.shape[1:])
+            for i, near, outputs in zip(moving, moved, runs, strict=True):
+                errors = self._left(outputs, columns, variances[i])
+                place = np.argmin(errors)
+                if np.array_equal(near[place], levels[i]):
+                    steps[i] *= 0.5
+                levels[i], variances[i] = near[place], errors[place]
+        return levels, variances
 
     def _errors(
         self, candidates: np.ndarray, columns: np.ndarray, variance: float
     ) -> np.ndarray:
         """Return the mean square error of each candidate."""
-        y = self.outputs
+        return self._left(self._runs(candidates), columns, variance)
+
+    def _runs(self, candidates: np.ndarray) -> np.ndarray:
         runs = in_batches(
             lambda some: runs_after(self.system, self.inputs, some), candidates, WIDTH
         )
-        error = y - runs[:, self.part].reshape(len(candidates), *y.shape)
-        error = np.clip(np.nan_to_num(error, nan=1e15), -1e15, 1e15)
-        prior = np.sqrt(variance) * np.eye(columns.shape[1])[y.shape[1] :]
+        return runs[:, self.part].reshape(len(candidates), *self.outputs.shape)
+
+    def _left(
+        self, runs: np.ndarray, columns: np.ndarray, variance: float
+    ) -> np.ndarray:
+        """Return the mean square error that ``columns`` leave of each run."""
+        error = np.clip(np.nan_to_num(self.outputs - runs, nan=1e15), -1e15, 1e15)
+        prior = np.sqrt(variance) * np.eye(columns.shape[1])[self.outputs.shape[1] :]
         base, _ = np.linalg.qr(np.concatenate([columns, prior]))
         # The prior's own rows have no error.
-        error = error.reshape(len(candidates), -1)
-        left = np.sum(error**2, axis=1) - np.sum((error @ base[: y.size]) ** 2, axis=1)
-        return np.maximum(left, 0.0) / y.size
+        error, size = error.reshape(len(runs), -1), self.outputs.size
+        left = np.sum(error**2, axis=1) - np.sum((error @ base[:size]) ** 2, axis=1)
+        return np.maximum(left, 0.0) / size
 
     def _rest(self) -> np.ndarray:
         first = np.asarray(self.inputs[0])
