@@ -22,6 +22,8 @@ OPERATIONS = frozenset(
 """Operations that compilers vectorise; a single other one would keep a whole loop from
 becoming SIMD."""
 
+EXTREMES = ("max", "min")
+
 GROUP = 8
 """Lanes of an inner loop: the numbers of an AVX-512 register."""
 
@@ -129,6 +131,9 @@ class _Source:
 
         in_fixed = self._before(fixed, [*steady, *step.steady_slopes], "fixed", "")
         in_steady = self._before(steady, step.steady_slopes, "steady", "[l]")
+        limits = sorted(self._limits() & fixed.keys())
+        in_steady.names.extend(f"v{n}" for n in limits)
+        in_steady.lines.extend(self.writer.store(limits, "of->{}[l]", "steady->{}[l]"))
         kept = [n for n in step.moving if n in self._read_by_slopes()]
         values = self._part(
             "values", [], step.moving, step.carried, step.log, kept, arrays.end
@@ -177,6 +182,17 @@ class _Source:
                 *writer.store(stored, *where),
             ],
         )
+
+    def _limits(self) -> set[int]:
+        """Return the operands of maxima and minima.
+
+        Compilers compute whether a number is NaN for one lane after the other; if it is
+        stored for each lane, they compare vectors.
+        """
+        nodes = (self.step.graph.nodes[n] for n in self.moving)
+        return {
+            n for node in nodes if node.operation in EXTREMES for n in node.operands
+        }
 
     def _read_by_slopes(self) -> set[int]:
         """Return the moving nodes without slopes that the slopes of a step need."""
