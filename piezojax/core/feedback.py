@@ -5,12 +5,15 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .arrays import Signal, State, as_array, as_signal
 from .parameter import PartUnits
 from .system import System, at_rest, resolve, rest_output
+
+STEPS, NEWTON = 64, 1e-12
+"""Largest number of Newton steps, and the last change relative to 1 V and the input."""
 
 
 class Observation(NamedTuple):
@@ -191,15 +194,33 @@ def holding_input(plant: System, output: Signal) -> Signal:
     return _holding_input(plant, jax.tree.map(as_array, output))
 
 
-# Traced once for all plants of a structure, because root finding is slow to trace.
+# Traced once for all plants of a structure, because it takes longer than a run.
 @eqx.filter_jit
 def _holding_input(plant: System, output: Signal) -> Signal:
-    def residual(input, _):
-        return jax.tree.map(jnp.subtract, rest_output(plant, input), output)
+    wanted, signal = ravel_pytree(output)
+    arrays, static = eqx.partition(plant, eqx.is_array)
 
-    solver = optx.Newton(rtol=1e-12, atol=1e-12)
-    start = output if isinstance(output, tuple) else jnp.zeros_like(output)
-    solution = optx.root_find(residual, solver, start, max_steps=64, throw=False)
-    return jax.tree.map(
-        lambda value: jnp.where(jnp.isfinite(value), value, 0.0), solution.value
-    )
+    @jax.jit
+    def improved(arrays: Any, wanted: Array, input: Array) -> Array:
+        def missed(input: Array) -> Array:
+            found = rest_output(eqx.combine(arrays, static), signal(input))
+            return ravel_pytree(found)[0] - wanted
+
+        if input.size == 1:  # faster to compile
+            value, slope = jax.jvp(missed, (input,), (jnp.ones_like(input),))
+            return input - value / slope
+        return input - jnp.linalg.solve(jax.jacfwd(missed)(input), missed(input))
+
+    def advance(carry: tuple) -> tuple:
+        count, input, _ = carry
+        better = improved(*fixed, input)
+        change = jnp.abs(better - input)
+        return count + 1, better, jnp.any(change > NEWTON * (1.0 + jnp.abs(input)))
+
+    start = wanted if isinstance(output, tuple) else jnp.zeros_like(wanted)
+    fixed, start = jax.lax.stop_gradient(((arrays, wanted), start))
+    goes_on = lambda carry: (carry[0] < STEPS) & carry[2]  # noqa: E731
+    found = jax.lax.while_loop(goes_on, advance, (0, start, jnp.array(True)))[1]
+    # A step from the root has its derivative.
+    found = improved(arrays, wanted, found)
+    return signal(jnp.where(jnp.isfinite(found), found, 0.0))
