@@ -13,7 +13,8 @@ from .parameter import PartUnits
 from .system import System, at_rest, resolve, rest_output
 
 STEPS, NEWTON = 64, 1e-12
-"""Largest number of Newton steps, and the last change relative to 1 V and the input."""
+"""Largest number of Newton steps; change, relative to 1 V plus the input, that ends
+them."""
 
 
 class Observation(NamedTuple):
@@ -185,11 +186,11 @@ def holding_input(plant: System, output: Signal) -> Signal:
     """Return the constant input under which ``plant`` rests at ``output``.
 
     Newton's method is applied to the loading curve from the rest point of the plant. If
-    no input reaches ``output``, the last iterate is returned and the loop starts with
-    an error. Limits belong to the actuator of the loop, not to the plant, because the
-    curve is flat beyond them. The iteration starts at 0. With several axes it starts at
-    ``output``, because a command is then a pose, and the pose 0 may be outside, or on
-    the edge of, the range of a stage with an allocation.
+    no input reaches ``output``, the last iterate is returned, or 0 if it is not finite,
+    and the loop starts with an error. Limits belong to the actuator of the loop, not to
+    the plant, because the curve is flat beyond them. The iteration starts at 0. With
+    several axes it starts at ``output``, because a command is then a pose, and the pose
+    0 may be outside, or on the edge of, the range of a stage with an allocation.
     """
     return _holding_input(plant, jax.tree.map(as_array, output))
 
@@ -221,6 +222,6 @@ def _holding_input(plant: System, output: Signal) -> Signal:
     fixed, start = jax.lax.stop_gradient(((arrays, wanted), start))
     goes_on = lambda carry: (carry[0] < STEPS) & carry[2]  # noqa: E731
     found = jax.lax.while_loop(goes_on, advance, (0, start, jnp.array(True)))[1]
-    # A step from the root has its derivative.
+    # One more step, outside the loop, gives the root its derivative.
     found = improved(arrays, wanted, found)
     return signal(jnp.where(jnp.isfinite(found), found, 0.0))

@@ -38,7 +38,8 @@ def adjoint_step(
     respect to the log are a further leaf of the row. Those with respect to the
     numbers of the system are added to the totals (part "total").
 
-    Raises NotScalarError as ``scalar_step`` does, and where JAX has no reverse pass.
+    Raises NotScalarError as ``scalar_step`` does, and if JAX has no reverse pass for
+    the step.
     """
     system = [leaf for part, leaf in active if part == "system"]
     carry = [leaf for leaf, x in enumerate(parts[1]) if is_real(x)]
@@ -116,7 +117,7 @@ def _dependent(
     after: dict[Place, int],
     active: Collection[tuple[str, int]],
 ) -> set[Place]:
-    """Return the elements of the carry that depend on active ones at any step."""
+    """Return the active elements, and those of the carry that depend on them."""
     found = {p for p in places if not p.tangent and (p.part, p.leaf) in active}
     while True:
         depends: set[int] = set()

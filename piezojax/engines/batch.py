@@ -101,7 +101,7 @@ class Batch(NamedTuple):
         return jnp.broadcast_to(found, (*whole, *rest)).reshape(*counts, *rest)
 
     def restored(self, x: Array) -> Array:
-        """Return an array with three batch axes with those of the run, in order."""
+        """Replace the three batch axes of an array by those of the run, in order."""
         order = [axis for group in self[1:] for axis in group]
         rest = x.shape[3:]
         split = x.reshape(*(self.sizes[axis] for axis in order), *rest)
@@ -117,7 +117,7 @@ def mapped(
     """Return ``function`` of the operands of each lane."""
     sizes, left = sizes_of(operands, positions), [list(where) for where in positions]
     axes = []
-    # The axis of a map is counted without those of the maps around it.
+    # Each map counts axes without those that the maps around it removed.
     for axis in range(len(sizes)):
         axes.append(tuple(where[axis] for where in left))
         for where, mapped in zip(left, axes[-1], strict=True):

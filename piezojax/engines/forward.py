@@ -27,7 +27,7 @@ KERNELS = {"native": native_kernel, "gpu": gpu_kernel, "interpreted": gpu_kernel
 
 
 def lanes(operands: Sequence[Any], run: MeteredRun, engine: Engine) -> Sequence[Array]:
-    """Return totals and log of a run; under ``jax.vmap``, all lanes run in a kernel."""
+    """Return totals and log of a run; ``jax.vmap`` uses one kernel if it can."""
     positions = ((),) * len(operands)
     return _metered.bind(
         *operands, run=run, positions=positions, active=(), engine=engine

@@ -20,7 +20,7 @@ TYPES: dict[Kind, Any] = {
 
 
 def _larger(a: Array, b: Array) -> Array:
-    """Return the larger of both, NaN if one is: the maximum of Triton drops NaN.
+    """Return the larger number, or NaN if one is NaN; Triton's maximum drops NaN.
 
     A loop that diverges must not look finite behind a limit.
     """
@@ -28,7 +28,7 @@ def _larger(a: Array, b: Array) -> Array:
 
 
 def _smaller(a: Array, b: Array) -> Array:
-    """Return the smaller of both, NaN if one is."""
+    """Return the smaller number, or NaN if one is NaN."""
     return jnp.where((a < b) | (a != a), a, b)
 
 
@@ -106,7 +106,7 @@ class LaneValues:
         return typed(self._arrays[shape][..., column], kind)
 
     def read(self, numbers: Iterable[int]) -> list[Place]:
-        """Return the places of those of the nodes ``numbers`` that are inputs."""
+        """Return the places of the inputs among the nodes ``numbers``."""
         places = (self.step.place(number) for number in numbers)
         return [place for place in places if place is not None]
 
@@ -129,7 +129,7 @@ class LaneValues:
         return jnp.concatenate(found, axis=-1)[..., np.argsort(np.array(order, int))]
 
     def nodes(self) -> dict[int, Array]:
-        """Return the steady nodes that are computed."""
+        """Return the values of the steady nodes that are not inputs."""
         step, nodes = self.step, self.step.graph.nodes
         computed = [n for n in step.steady if nodes[n].operation != INPUT]
         read = {n for each in computed for n in nodes[each].operands}

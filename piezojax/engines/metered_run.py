@@ -1,4 +1,4 @@
-"""A run of a System with a metric, apart from its arrays."""
+"""A run of a System with a metric, without its arrays."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from .scalar_step import ScalarStep, scalar_step
 
 
 class _Totals(Metric):
-    """Leaves of the totals of a metric, in one array."""
+    """A metric whose result is the ``chosen`` leaves of the totals, in one array."""
 
     metric: Metric
     chosen: tuple[int, ...] = eqx.field(static=True)
@@ -116,7 +116,7 @@ class MeteredRun:
         return eqx.combine(arrays, self.rest), state, inputs
 
     def sizes(self) -> tuple[int, tuple[int, int]]:
-        """Return the number of totals, and the samples and numbers of the log."""
+        """Return the number of totals, and the rows and columns of the log."""
         leaves = jax.tree.leaves(self.empty)
         outputs = sum(math.prod(x.shape) for x in jax.tree.leaves(self.logged))
         rows = self.samples // self.every if self.every else 0

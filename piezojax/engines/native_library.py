@@ -58,7 +58,7 @@ XLA_FFI_Error *call(XLA_FFI_CallFrame *frame)
     return NULL;
 }
 """)
-"""Function that XLA calls, from its interface in C.
+"""Function that XLA calls, written for the C interface of XLA.
 
 XLA first asks for the version of the interface, in an extension of the call."""
 
@@ -74,7 +74,7 @@ class CompileError(RuntimeError):
 
 @functools.cache
 def compiler() -> str | None:
-    """Return the path of a C compiler, gcc rather than another; None without one."""
+    """Return the path of a C compiler, preferably gcc, or None if there is none."""
     return shutil.which("gcc") or shutil.which("cc")
 
 
@@ -110,7 +110,7 @@ def _path(name: str) -> Path | None:
 
 
 def _kept(name: str) -> ctypes.CDLL | None:
-    """Return the library that an earlier process has compiled, if it is undamaged."""
+    """Return the library of an earlier process, or None if missing or damaged."""
     path = _path(name)
     try:
         content = path.read_bytes() if path else b""

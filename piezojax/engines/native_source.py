@@ -19,8 +19,8 @@ OPERATIONS = frozenset(
         *("sqrt", "square", "sub", "xor"),
     )
 )
-"""Operations that compilers vectorise; a single other one would keep a whole loop from
-becoming SIMD."""
+"""Operations that compilers vectorise. A single other operation keeps the whole loop
+from becoming SIMD."""
 
 EXTREMES = ("max", "min")
 
@@ -35,7 +35,8 @@ waits for its own results most of the time."""
 class Shape(NamedTuple):
     """Lanes of a group, groups that run in turn, and samples between logged outputs.
 
-    A reverse pass has ``segment`` samples between stored carries, another run none.
+    ``segment`` is the number of samples between stored carries of a reverse pass; it is
+    0 for other runs.
     """
 
     width: int
@@ -86,7 +87,7 @@ def source(step: ScalarStep, arrays: Arrays, rows: Sequence[Rows], shape: Shape)
 
 
 class _Before(NamedTuple):
-    """Names that are stored before the first step, and the statements."""
+    """Names of values stored before the first step, and statements that store them."""
 
     names: list[str]
     lines: list[str]
@@ -186,8 +187,8 @@ class _Source:
     def _limits(self) -> set[int]:
         """Return the operands of maxima and minima.
 
-        Compilers compute whether a number is NaN for one lane after the other; if it is
-        stored for each lane, they compare vectors.
+        Compilers test a limit that all lanes share for NaN lane by lane, in each step.
+        If it is stored for each lane, they compare vectors.
         """
         nodes = (self.step.graph.nodes[n] for n in self.moving)
         return {
@@ -195,7 +196,7 @@ class _Source:
         }
 
     def _read_by_slopes(self) -> set[int]:
-        """Return the moving nodes without slopes that the slopes of a step need."""
+        """Return the nodes that the slopes read; of the inputs, only the carry."""
         step = self.step
         read = {
             n for each in step.moving_slopes for n in step.graph.nodes[each].operands
@@ -232,7 +233,7 @@ class _Source:
             f"of->{name}[l] = {writer.real(each.last)};"
             for name, each in zip(names, elements, strict=True)
         ]
-        # Last, because from here on they are read from where they are stored.
+        # Last, because expressions read stored nodes from where they are stored.
         lines += writer.store(kept, "kept->{}[l]", "kept->{}[l]")
         return PART.substitute(
             part=part,

@@ -13,12 +13,12 @@ HEAD = Template("""#include <math.h>
 #define EVERY $every
 #define SEGMENT $segment
 #define OUTPUTS $outputs
-#define AHEAD 8  /* samples from which inputs are fetched */
+#define AHEAD 8  /* samples by which inputs are fetched ahead */
 #define LANES for (int l = 0; l < WIDTH; l++)
 #define INLINE static inline __attribute__((always_inline))
 #define LANE_ARRAY(name) double name[WIDTH] __attribute__((aligned(64)))
 
-/* Values that are the same at each step: in all lanes, and by lane. */
+/* Values that do not change with the step: fixed in all lanes, steady by lane. */
 struct fixed {
 $fixed
 };
@@ -149,7 +149,7 @@ REVERSE = Template(
 }
 """
 )
-"""Reverse pass: each segment runs once more from its stored carry, then back."""
+"""Reverse pass: each segment runs forward again from its stored carry, then back."""
 
 BACK = {
     "start": """struct steady steady$g;

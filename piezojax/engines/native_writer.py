@@ -10,7 +10,7 @@ from .scalar_step import Place, ScalarStep
 
 
 class Rows(NamedTuple):
-    """A leaf of the inputs: its elements, and whether lanes have their own."""
+    """A leaf of the inputs: its number of elements, and whether they differ by lane."""
 
     size: int
     by_lane: bool
@@ -35,7 +35,8 @@ class LaneWriter(Writer):
     """Writer of the statements of a lane.
 
     Maximum and minimum are NaN if an operand is: a loop that diverges must not look
-    finite behind a limit. A division by a steady value is a product.
+    finite behind a limit. A division by a steady value is written as
+    a product with its reciprocal.
     """
 
     forms = FORMS | {
@@ -107,7 +108,7 @@ class LaneWriter(Writer):
         ]
 
     def store(self, numbers: Iterable[int], write: str, read: str) -> list[str]:
-        """Return the statements that store nodes; they are read from there then."""
+        """Return the statements that store nodes, which later ones read from there."""
         lines = []
         for number in numbers:
             lines.append(f"{write.format(f'v{number}')} = {self.real(number)};")

@@ -29,15 +29,16 @@ from .native_library import CompileError
 from .scalar_step import Place, ScalarStep, is_real
 
 LEAST = 128
-"""Smallest number of samples between stored carries; copies of fewer take time."""
+"""Smallest number of samples between stored carries: each copy takes time."""
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def reversible(run: MeteredRun, operands: Sequence[ArrayLike]) -> Sequence[Array]:
     """Return totals and log of a run, with derivatives in reverse mode.
 
-    The run stores its carry from time to time. Its reverse pass runs each segment once
-    more, then back. Memory grows with the root of the number of samples.
+    The run stores its carry before each segment of samples. The reverse pass runs each
+    segment forward again, then back. Memory grows with the square root of the number of
+    samples.
     """
     return lanes(operands, run, "native")
 

@@ -45,7 +45,8 @@ class ScalarStep(NamedTuple):
     """Scalar operations of a step.
 
     ``places`` are the inputs of ``graph`` by their number. ``carried`` are the elements
-    of the carry that are computed, ``log`` the nodes of the outputs. ``steady`` are the
+    of the carry that are computed, ``log`` the nodes of the
+    logged outputs. ``steady`` are the
     nodes that have the same value at each step, ``moving`` the others, both in the
     order of their computation.
 
@@ -79,7 +80,7 @@ class ScalarStep(NamedTuple):
         return [*values, *self.log, *self.log_slopes]
 
     def used(self, numbers: Sequence[int]) -> list[int]:
-        """Return those of the nodes ``numbers`` that steps use, in order."""
+        """Return the nodes of ``numbers`` that a step reads or returns, in order."""
         moving = (*self.moving, *self.moving_slopes)
         read = {n for each in moving for n in self.graph.nodes[each].operands}
         read.update(self.last)
@@ -205,7 +206,7 @@ def sorted_step(
     log: list[int],
     log_slopes: list[int],
 ) -> ScalarStep:
-    """Return the step of which the elements ``wanted`` and the log are results.
+    """Return the step that computes the elements ``wanted`` and the log.
 
     ``after`` are the nodes of the carry after the step, ``zero`` those of derivatives
     that vanish. Raises NotScalarError for a step that is too long.
@@ -225,7 +226,7 @@ def sorted_step(
         kept |= more
     numbers = needed()
     if graph.loops or len(numbers) > MOST:
-        raise NotScalarError("its loops or operations are too long for a kernel")
+        raise NotScalarError("it has a loop, or too many operations for a kernel")
     steady, steady_slopes, moving, moving_slopes = _divided(graph, places, numbers)
     elements = [Element(place, after[place]) for place in sorted(kept)]
     return ScalarStep(

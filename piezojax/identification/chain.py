@@ -66,15 +66,16 @@ def is_dynamic(part: str) -> bool:
 
 
 def training_record(records: Sequence[Record], train: slice) -> Record:
-    """Return the training samples of the record that shows most (``by_evidence``)."""
+    """Return the samples up to the end of ``train`` of the first ``by_evidence``."""
     return by_evidence(records, train)[0]
 
 
 def by_evidence(records: Sequence[Record], train: slice) -> list[Record]:
-    """Return the training samples of the records, the one with the largest range first.
+    """Return the samples of each record up to the end of ``train``, sorted.
 
-    Those with steps come before the others: they show resonances and the slew rate
-    best. Models, bounds and starts must not depend on the validation part.
+    Records with steps come first, because they show resonances and the slew rate best;
+    then those with the largest range. Models, bounds and starts must not depend on the
+    validation part.
     """
 
     def shows(record: Record) -> tuple[bool, float]:

@@ -240,7 +240,7 @@ def _fit(error: np.ndarray, voltage: np.ndarray, dt: float, lag: int) -> _Fit:
 
 
 def _columns(error: np.ndarray, dt: float, lag: int) -> np.ndarray:
-    """Return error, its integral and its derivative, and 1 [samples, 4]."""
+    """Return error, its integral, its derivative and 1, [samples - 1 - lag, 4]."""
     now, before = error[1 : error.size - lag], error[: error.size - lag - 1]
     return np.column_stack(
         [now, dt * np.cumsum(now), (now - before) / dt, np.ones_like(now)]

@@ -128,9 +128,11 @@ def _key(
     }
     digest = hashlib.sha256(json.dumps(known, sort_keys=True, default=str).encode())
     for record in records:
-        digest.update(
-            repr((record.dt, record.input_units, record.output_units)).encode()
-        )
-        for signal in (record.inputs, record.outputs):
-            digest.update(np.ascontiguousarray(signal).tobytes())
+        units = record.input_units, record.output_units
+        signals = record.inputs, record.outputs, record.reference, record.dither
+        shapes = [None if x is None else np.shape(x) for x in signals]
+        digest.update(repr((record.dt, units, record.period, shapes)).encode())
+        for signal in signals:
+            if signal is not None:
+                digest.update(np.ascontiguousarray(signal).tobytes())
     return digest.hexdigest()

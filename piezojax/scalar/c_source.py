@@ -88,7 +88,7 @@ DOUBLE = Precision("double", "", np.float64)
 SINGLE = Precision("float", "f", np.float32)
 COMPENSATED = SINGLE._replace(compensated=True)
 PRECISIONS = {"double": DOUBLE, "float": SINGLE, "compensated": COMPENSATED}
-"""Precisions by the value of the option."""
+"""Precisions by their name in an export."""
 
 
 def statements(
@@ -183,7 +183,7 @@ class Writer:
                 yield number
 
     def _alike(self, number: int) -> tuple | None:
-        """Return what is equal for the operations of an array; None for a loop."""
+        """Return a key shared by the operations of an array, or None for a loop."""
         if number < 0:
             return None
         node = self.graph.nodes[number]

@@ -1,4 +1,4 @@
-"""Graph of scalar operations, the intermediate form of an exported System."""
+"""Graph of scalar operations, from which C and kernels are written."""
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager

@@ -14,7 +14,7 @@ from .simplify import Simplifier
 def kind_of(dtype: Any) -> Kind:
     """Return the kind of the scalars of ``dtype``.
 
-    Raises NotScalarError for complex numbers and other types that are not exported.
+    Raises NotScalarError for complex numbers and other types without a scalar form.
     """
     if np.issubdtype(dtype, np.bool_):
         return "boolean"

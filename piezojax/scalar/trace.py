@@ -262,7 +262,8 @@ class _Tracer:
     def scan(self, params: Any, operands: list[Numbers]) -> list[Numbers]:
         """Return the results of a scan, which is unrolled.
 
-        A scan that only repeats, without rows in or out, remains a loop in C.
+        A scan that only repeats, without rows in or out, remains a loop in C if it is
+        not short.
         """
         consts, count = params["num_consts"], params["num_carry"]
         shared, carry = operands[:consts], operands[consts : consts + count]

@@ -15,8 +15,8 @@ search that are as fast. (A loop of few states alone is up to a quarter slower.)
 def compiled(program: Any, *arguments: Any) -> Callable:
     """Compile ``program`` for ``arguments``, for a search.
 
-    ``program`` is a function after ``jax.jit`` or ``eqx.filter_jit``. One of a module
-    is compiled once for all arguments of the same structure and shapes.
+    ``program`` is a function after ``jax.jit`` or ``eqx.filter_jit``. One at the
+    level of a module is compiled once for all arguments of one structure and shapes.
     """
     full = jax.default_backend() != "cpu" or jax.config.read(
         "jax_disable_most_optimizations"

@@ -110,7 +110,7 @@ class LockstepDescent:
         def advanced(carry: Any) -> tuple[Any, View, Verdict]:
             carry, view = advance(problem, carry, multipliers)
             if problem.limits:
-                # The compiled screening serves: the program of a step is smaller.
+                # The screening program gives them; that of a step stays smaller.
                 return carry, view, self.screen(problem, np.asarray(view.unit))[1]
             return carry, view, Verdict(view.loss, np.zeros((len(view.loss), 0)))
 

@@ -22,7 +22,7 @@ ACCELERATED_BLOCK = 131072
 """Points of a block on an accelerator, which are enough to occupy it."""
 
 CHUNK_LANE_STEPS = 5e7
-"""Simulated samples of a chunk, all plants and references together.
+"""Simulated samples of a chunk, all runs of its points together.
 
 A chunk takes almost a second: an interrupt loses little work, and writing takes less
 time than simulating.

@@ -69,7 +69,7 @@ class Store:
     """Finished chunks of one sweep, in a folder that several processes may share.
 
     A chunk is written to a temporary file, flushed to the disk and renamed, so that it
-    is either complete or missing. Writing a chunk again gives the same contents.
+    is either complete or missing. A chunk written again holds the same results.
     """
 
     def __init__(self, folder: Path, identity: dict[str, Any]):

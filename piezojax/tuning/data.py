@@ -24,7 +24,7 @@ _STREAMS: dict[Part, int] = {"train": 0, "validate": 1}
 """Streams of one seed: the hold-out draws are new for every reference."""
 
 PLACES = 8
-"""Places at which the inputs that hold a stage are computed together."""
+"""Number of places at which holding inputs are computed together."""
 
 
 @dataclass
@@ -169,7 +169,7 @@ def holding_inputs(stages: Stage, begins: Any) -> jax.Array:
     """Return the inputs [stages, begins, *axes] under which each stage rests."""
     # Many references begin at the same place: solve once for each place.
     places, which = np.unique(np.asarray(begins), axis=0, return_inverse=True)
-    # Copies of the last place, because few numbers of places are few programs.
+    # Pad with copies of the last place: fewer sizes need fewer programs.
     more = [(0, -len(places) % PLACES), *[(0, 0)] * (places.ndim - 1)]
     places = np.pad(places, more, mode="edge")
     found = np.asarray(_holding(stages.plant, as_array(places)))

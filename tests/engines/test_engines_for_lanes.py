@@ -322,7 +322,7 @@ def test_each_lane_and_draw_has_its_inputs(every):
     ("places", "kernels"), [((0,), 2), ((1,), 2), ((0, 1), 2), ((2,), 1), ((0, 2), 1)]
 )
 def test_derivatives_by_gain_start_and_inputs(places, kernels):
-    """Those by the inputs have no kernel, those by the others do."""
+    """Derivatives with respect to inputs have no kernel; the others have one."""
     system = Plain(as_array(1.0)) >> FirstOrderLag(1e-3, 1e-4)
 
     def total(gain, x, inputs, engine):

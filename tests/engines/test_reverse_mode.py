@@ -33,7 +33,7 @@ def short_segments(monkeypatch):
 
 
 class Means(Metric):
-    """The means of the output, of its square and of its largest values."""
+    """Means of the output and its square, and a decaying maximum by the count."""
 
     def init(self):
         return jnp.zeros(2), jnp.zeros(()), jnp.zeros((), jnp.int32)
@@ -93,7 +93,7 @@ def kernels(program, *arguments):
 
 
 def assert_equals_loop(loss, *arguments, calls=2, places=0):
-    """Fail unless the gradient is that of the loop, in ``calls`` runs of C."""
+    """Fail unless the gradient is that of the loop, with ``calls`` calls of C."""
     program = with_reverse_pass(lambda *x: loss(*x, "native"), places)
     assert kernels(program, *arguments) == calls
     found = jax.jit(program)(*arguments)

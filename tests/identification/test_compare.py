@@ -1,6 +1,7 @@
 """Comparison of models: fits, failures, and the written files."""
 
 import json
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -228,6 +229,8 @@ def test_a_search_goes_on_only_with_the_same_records(made, monkeypatch, tmp_path
     other = Record(TONES, 0.1 * TONES + 1.1, 1e-3)
     for changes in (
         {"records": other},
+        {"records": replace(RICH, period=len(TONES) // 8)},
+        {"records": replace(RICH, reference=RICH.output)},
         {"train": slice(0, 900)},
         {"options": Options(steps=7)},
     ):

@@ -33,8 +33,8 @@ LEVELS = 9
 """Levels tried for each turning point."""
 
 REFINED = 3
-"""Number of candidates of the grid that are refined: the local optimum next to the best
-one may be a poor one."""
+"""Number of candidates of the grid that are refined: the local optimum near the best
+one may be poor."""
 
 FINE = 5 * 3**TURNS
 """Levels tried for each turning point alone at the end."""
@@ -236,9 +236,10 @@ class _LevelSearch(NamedTuple):
     def levels(self, columns: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the levels that fit best, and their mean square error.
 
-        All levels are searched on a grid, and the best of them refined. Last, each
-        level alone is searched on a fine grid: the optimum is narrow where an element
-        of a hysteresis moves only once in the record, and not far.
+        All levels together are searched on a grid, and the best points are refined.
+        Then each level alone is searched on a fine grid, and the result refined again:
+        the optimum is narrow where an element of a hysteresis moves only once in the
+        record, and by little.
         """
         grid = np.linspace(0.0, 1.0, LEVELS)
         every = self._between([*itertools.product(grid, repeat=TURNS)])

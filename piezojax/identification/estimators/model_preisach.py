@@ -38,7 +38,7 @@ CELLS = range(3, 11)
 
 LEAST_EFFECT = 1e-3
 """Least rms change of the output (um) for a change of the weights of norm 1 um, in the
-direction of least effect. Below it, nanometres of output would determine tenths of a
+direction of least effect. Below it, a nanometre of output would determine more than a
 micrometre of weight."""
 
 TOO_FEW = {
