@@ -117,7 +117,7 @@ def banded(
     """Return the lines of a bound [lines] merged in bands of ``WIDTH``.
 
     A band has the largest ``relative`` of its lines, and is excited if all of them are.
-    Its frequency is the geometric mean of its ends, that of the last band the last
+    Its frequency is the geometric mean of its ends; that of the last band is the last
     ``frequency``.
     """
     band = np.floor(np.log(frequency / frequency[0]) / np.log1p(WIDTH))

@@ -13,8 +13,8 @@ from .parameter import PartUnits
 from .system import System, at_rest, resolve, rest_output
 
 STEPS, NEWTON = 64, 1e-12
-"""Largest number of Newton steps; change, relative to 1 V plus the input, that ends
-them."""
+"""Largest number of Newton steps, and the change, relative to 1 V plus the input, up to
+which they end."""
 
 
 class Observation(NamedTuple):
@@ -34,9 +34,9 @@ class LoopInput(NamedTuple):
     """Input of a loop at sample k.
 
     ``next_reference`` is r(k+1) in um, ``noise`` a unit-variance draw that the sensor
-    scales, ``disturbance`` an optional addition in um to the displacement at k+1, and
-    ``input_disturbance`` one in V to the voltage at the plant, which the controller
-    does not know.
+    scales. ``disturbance`` (um) is added to the displacement at k+1, and
+    ``input_disturbance`` (V) to the voltage at the plant, unknown to the controller;
+    both are optional.
     """
 
     next_reference: Signal
@@ -157,8 +157,8 @@ def loop_inputs(
 
     ``noise`` holds unit-variance draws, zero if left out; ``disturbance`` (um) is added
     to the output of the plant, ``input_disturbance`` (V) to its input. The last
-    reference is also the next reference of the last sample, where it acts only after
-    the end of the record. Several axes are columns, each in the unit of its axis.
+    reference is also the next reference of the last sample, but this acts only after
+    the end of the run. Several axes are columns, each in the unit of its axis.
     """
     reference = as_array(reference)
     following = _following(reference)

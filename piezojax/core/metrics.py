@@ -132,7 +132,7 @@ class Extremes(Metric):
 
 
 class Chosen(Metric):
-    """The figures ``names`` of a metric, as a dict: the others are not accumulated."""
+    """The figures ``names`` of a metric, as a dict; a compiler can drop the others."""
 
     metric: Metric
     names: tuple[str, ...] = eqx.field(static=True)

@@ -28,14 +28,13 @@ class Parameter:
     """Declaration of a parameter: its unit, meaning, limits and search range.
 
     ``above`` and ``below`` are exclusive limits, ``least`` and ``most`` inclusive ones.
-    ``typical`` is the search range if the study gives none, on
-    ``scale``: "log" for positive values that span decades, "logit" for values between 0
-    and 1. The ``unit`` of a pure number is "1"; a name in brackets, as in "[u]/um",
-    stands for a unit that only an outer System knows (see ``System.part_units``). A
-    frequency with ``below_nyquist`` must be below pi / dt in rad/s or 0.5 / dt in Hz,
-    with the sample time dt of the declaring System. A ``whole`` parameter is an
-    integer, such as a count. ``step`` is the smallest difference between two values
-    that a device accepts.
+    ``typical`` is the search range if the study gives none, on ``scale``: "log" for
+    positive values that span decades, "logit" for values between 0 and 1. The ``unit``
+    of a pure number is "1"; a name in brackets, as in "[u]/um", stands for a unit that
+    only an outer System knows (see ``System.part_units``). A frequency with
+    ``below_nyquist`` must be below pi / dt in rad/s or 0.5 / dt in Hz, with the sample
+    time dt of the declaring System. A ``whole`` parameter is an integer, such as a
+    count. ``step`` is the smallest difference between two values that a device accepts.
     """
 
     unit: str

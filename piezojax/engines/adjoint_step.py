@@ -33,9 +33,9 @@ def adjoint_step(
     """Return the scalar operations of a step and of its reverse pass.
 
     The arguments are those of ``scalar_step``; the outputs of the log have ``logged``
-    elements. The derivatives of the run's result with respect to the carry after the
-    step become, in ``slopes``, those with respect to the carry before it. Those with
-    respect to the log are a further leaf of the row. Those with respect to the
+    elements. ``slopes`` map the derivatives of the run's result with respect to the
+    carry after the step to those with respect to the carry before it. The derivatives
+    with respect to the log are a further leaf of the row. Those with respect to the
     numbers of the system are added to the totals (part "total").
 
     Raises NotScalarError as ``scalar_step`` does, and if JAX has no reverse pass for

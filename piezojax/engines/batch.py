@@ -1,4 +1,4 @@
-"""Batch axes of the operands of a run, sorted by what depends on them."""
+"""Batch axes of the operands of a run, grouped by the operands that have them."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 Positions = tuple[int | None, ...]
-"""For each batch axis, its position in the shape of an operand; None if it has none."""
+"""Position of each batch axis in the shape of an operand; None if that lacks it."""
 
 
 def sizes_of(
@@ -36,8 +36,8 @@ def batched(positions: Positions, axis: int | None) -> Positions:
 class Batch(NamedTuple):
     """Batch axes of a run in three groups.
 
-    ``directions`` are those of derivatives alone, ``inner`` those on which the inputs
-    depend, and ``outer`` the others. If the inputs depend on none, all are inner.
+    ``directions`` are the axes that only tangents have, ``inner`` the axes that inputs
+    have, and ``outer`` the others. If inputs have none, the others are inner.
     """
 
     sizes: tuple[int, ...]
@@ -52,9 +52,10 @@ class Batch(NamedTuple):
         values: Sequence[Positions],
         inputs: Sequence[Positions],
     ) -> "Batch":
-        """Return the groups for the positions in ``values``, and ``inputs`` among them.
+        """Return the groups of the axes, which have ``sizes``.
 
-        ``values`` are the operands that are not derivatives.
+        ``values`` are the positions of all operands except tangents, ``inputs`` those
+        of the inputs.
         """
         axes = range(len(sizes))
         lanes = [
@@ -79,8 +80,8 @@ class Batch(NamedTuple):
     def grouped(self, x: Any, where: Positions, *, last: bool = False) -> Array:
         """Return an operand with three batch axes, one for each group.
 
-        An axis has the size 1 if the operand has none of its group. The batch axes come
-        first, or ``last``.
+        The axis of a group has the size 1 if the operand has no axis of this group. The
+        batch axes come first, or ``last``.
         """
         own = [axis for axis in range(x.ndim) if axis not in where]
         order = [axis for group in self[1:] for axis in group]
@@ -114,10 +115,10 @@ def mapped(
     operands: Sequence[Any],
     positions: Sequence[Positions],
 ) -> Any:
-    """Return ``function`` of the operands of each lane."""
+    """Return the results of ``function`` for all lanes, with the batch axes first."""
     sizes, left = sizes_of(operands, positions), [list(where) for where in positions]
     axes = []
-    # Each map counts axes without those that the maps around it removed.
+    # Positions inside a map do not count the axes that the maps around it removed.
     for axis in range(len(sizes)):
         axes.append(tuple(where[axis] for where in left))
         for where, mapped in zip(left, axes[-1], strict=True):

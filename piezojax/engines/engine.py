@@ -18,10 +18,10 @@ VARIABLE = "PIEZOJAX_ENGINE"
 """Environment variable that names the engine to use."""
 
 reverse_mode = jax.make_user_context(default_value=False)
-"""Context ``with reverse_mode(True):`` of runs that are differentiated in reverse mode.
+"""Context ``with reverse_mode(True):`` for runs differentiated in reverse mode.
 
-Their forward pass stores what the reverse pass needs; they have no derivatives in
-forward mode."""
+In this context the engine ``native`` stores the carries that its reverse pass needs,
+and has no derivatives in forward mode. Other engines use the loop of ``simulate``."""
 
 
 def default_engine() -> Engine:
@@ -58,10 +58,15 @@ def metered(
     ``metric`` or ``log``, None is returned in its place.
 
     Under ``jax.vmap``, all lanes run in one kernel of ``engine``, by default
-    ``default_engine()``; so do derivatives on a CPU, those in reverse mode only inside
-    the context ``reverse_mode``. A step without a scalar form (see ``trace``), with a
-    loop inside, with too many operations, or with an operation that the engine lacks
-    runs in the loop of ``simulate``, with the same result.
+    ``default_engine()``. The engine ``native`` also has a kernel for derivatives, in
+    reverse mode only inside the context ``reverse_mode``. The following run in the loop
+    of ``simulate`` instead, with the same result:
+
+    - a step without a scalar form (see ``trace``), with a loop inside, with too many
+      operations, or with an operation that the engine lacks;
+    - second derivatives, and derivatives with respect to inputs;
+    - in reverse mode, a log with ``every`` above 1;
+    - on a GPU, a log, derivatives, and inputs that differ between lanes.
 
     Raises ValueError as ``simulate`` does.
     """

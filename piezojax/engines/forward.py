@@ -19,15 +19,15 @@ from .metered_run import MeteredRun
 from .native_library import CompileError
 
 Engine = Literal["loop", "native", "gpu", "interpreted"]
-"""``loop`` is that of ``simulate``, ``native`` compiled C on a CPU, and ``gpu`` one
-kernel of a GPU, which ``interpreted`` computes without one, slowly."""
+"""``loop`` is the loop of ``simulate``, ``native`` compiled C on a CPU, and ``gpu`` one
+kernel on a GPU. ``interpreted`` runs the same kernel without a GPU, slowly."""
 
 KERNELS = {"native": native_kernel, "gpu": gpu_kernel, "interpreted": gpu_kernel}
-"""Module of each engine with a kernel."""
+"""Module with the kernel of each engine; ``loop`` has none."""
 
 
 def lanes(operands: Sequence[Any], run: MeteredRun, engine: Engine) -> Sequence[Array]:
-    """Return totals and log of a run; ``jax.vmap`` uses one kernel if it can."""
+    """Return totals and log of a run, under ``jax.vmap`` in one kernel if possible."""
     positions = ((),) * len(operands)
     return _metered.bind(
         *operands, run=run, positions=positions, active=(), engine=engine
@@ -42,7 +42,7 @@ def _looped_slopes(
 ) -> tuple[Array, Array]:
     """Return the derivatives of totals and log, computed in the loop of ``simulate``.
 
-    The derivatives of the operands ``active`` follow the operands.
+    The tangents of the operands ``active`` follow the operands.
     """
     count = len(positions) - len(active)
 
@@ -61,7 +61,7 @@ def _evaluated(
     active: Sequence[int],
     engine: Engine,
 ) -> tuple[Array, Array]:
-    """Return totals and log of all lanes, or derivatives if operands are ``active``."""
+    """Return totals and log of all lanes; if operands are ``active``, derivatives."""
     try:
         found = _in_kernel(operands, run, positions, active, engine)
     except CompileError as error:
@@ -81,7 +81,7 @@ def _in_kernel(
     active: Sequence[int],
     engine: Engine,
 ) -> tuple[Array, Array] | None:
-    """Return the results of the kernel of an engine, None if it cannot compute them."""
+    """Return the results of an engine's kernel, or None if it cannot compute them."""
     if engine not in KERNELS:
         return None
     kernel, step = KERNELS[engine], run.step(active)

@@ -21,23 +21,27 @@ from .lane_values import values as values_of
 from .scalar_step import ScalarStep
 
 WIDTH = 64
-"""Lanes of a block of the kernel, one for each thread; a multiple of 32."""
+"""Number of lanes of a block of the kernel, one per thread; a multiple of 32."""
 
 REGISTERS = 100
-"""Largest number of values of a lane for which those that all lanes share stay in
-registers; more are read from memory at each step. A thread has 255 registers of 32 bits
-on the GPUs of 2026."""
+"""Largest number of values of a lane for which the shared ones stay in registers.
+
+With more, the values that all lanes share are read from memory at each step. A thread
+has 255 registers of 32 bits on the GPUs of 2026."""
 
 
 class _Table(NamedTuple):
-    """Values of nodes, one in each column of an array [lanes, nodes] or [1, nodes]."""
+    """Values of nodes, one node per column of an array [lanes, nodes] or [1, nodes]."""
 
     numbers: list[int]
     array: Array
 
 
 def computes(step: ScalarStep, by_lane: bool) -> bool:
-    """Return whether ``results`` exists for a step; for inputs that are ``by_lane``."""
+    """Return whether ``results`` can compute a step.
+
+    ``by_lane`` is true if inputs differ between lanes.
+    """
     return has_values(step) and not by_lane and not step.log and not step.slopes
 
 
@@ -51,7 +55,7 @@ def results(
     *,
     interpret: bool = False,
 ) -> tuple[Array, Array]:
-    """Return the elements of the carry after all steps, and an empty log.
+    """Return the elements ``wanted`` of the carry after all steps, and an empty log.
 
     See ``native_kernel.results``. ``interpret`` computes the kernel without a GPU.
     """
@@ -94,8 +98,9 @@ def _final(
 ) -> Array:
     """Return the elements of state and metric after all steps, [lanes, elements].
 
-    ``shared`` and ``own`` are the values of steady nodes, ``start`` the elements before
-    the first step, and ``rows`` the inputs [samples, elements].
+    ``shared`` are the values of steady nodes that are equal in all lanes, ``own`` those
+    of the others, ``start`` the elements before the first step, and ``rows`` the inputs
+    [samples, elements].
     """
     from jax.experimental import pallas
 
@@ -122,7 +127,8 @@ def _final(
         def body(k, carry):
             known = dict(before)
             if in_memory:
-                # Two equal rows: the compiler cannot move this in front of the loop.
+                # The table has two equal rows. Their index depends on k, so that the
+                # compiler does not move the reads in front of the loop.
                 known |= of(shared, shared_ref, lambda place: (k & 1, place))
 
             def given(number: int, kind: Kind) -> Array:
@@ -145,7 +151,8 @@ def _final(
             end_ref[place, block] = x.astype(float)
 
     def padded(array: Array) -> Array:
-        # Copies of the last lane fill the last block; a kernel reads no empty array.
+        # Copies of the last lane fill the last block. ``_filled`` adds a column,
+        # because a kernel cannot read an empty array.
         more = ((0, 0), (0, blocks * WIDTH - lanes))
         return jnp.pad(_filled(array).T, more, mode="edge")
 
@@ -179,5 +186,5 @@ def _compiler(interpret: bool) -> dict[str, Any]:
 
 
 def _plain(x: Array) -> Array:
-    """Return ``x``, true and false as 1 and 0: a kernel carries numbers."""
+    """Return ``x`` with booleans as 1 and 0, because a kernel carries numbers."""
     return x.astype(jnp.int32) if x.dtype == bool else x

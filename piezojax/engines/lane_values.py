@@ -70,7 +70,7 @@ CONVERT = "convert_element_type"
 
 
 def has_values(step: ScalarStep) -> bool:
-    """Return whether all operations of a step are known here."""
+    """Return whether ``values`` can compute all operations of a step."""
     return step.operations() <= {*OPERATIONS, CONVERT}
 
 
@@ -78,8 +78,8 @@ class LaneValues:
     """Values of the steady nodes of a step, and of the carry before the first step.
 
     ``leaves`` holds the leaves of system and carry by (part, leaf, tangent). Their
-    first axes are directions, outer and inner lanes (see ``Batch``), of size 1 where
-    all are equal.
+    first axes are directions, outer and inner lanes (see ``Batch``). An axis has the
+    size 1 if all values along it are equal.
     """
 
     def __init__(self, step: ScalarStep, leaves: dict[tuple[str, int, bool], Array]):

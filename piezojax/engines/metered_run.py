@@ -36,7 +36,7 @@ class _Totals(Metric):
 
 
 class _Nothing(Metric):
-    """The metric of a run of which only a log is wanted; its result is None."""
+    """The metric of a run that only logs; its result is None."""
 
     def init(self) -> State:
         return ()
@@ -123,7 +123,7 @@ class MeteredRun:
         return sum(leaves[i].size for i in self.chosen), (rows, outputs)
 
     def unpacked(self, totals: Array, rows: Array) -> tuple[Any, Any]:
-        """Return the result of the metric and the log from their numbers."""
+        """Return the result of the metric and the log from ``totals`` and ``rows``."""
         leaves, tree = jax.tree.flatten(self.empty)
         first = 0
         for i in self.chosen:
@@ -143,7 +143,7 @@ class MeteredRun:
         return result, jax.tree.unflatten(tree, log)
 
     def plain(self, segment: int, *operands: Any) -> tuple[Array, Array]:
-        """Return the numbers of totals and log, computed in the loop of simulate."""
+        """Return totals and log as arrays, computed in the loop of ``simulate``."""
         system, state, inputs = self.whole(operands)
         metric = _Totals(self.metric, self.chosen)
         if self.every == 0:
@@ -177,14 +177,16 @@ class MeteredRun:
     def step(self, active: Sequence[int] = ()) -> ScalarStep | None:
         """Return the scalar step with derivatives for the operands ``active``, or None.
 
-        There is none with derivatives for inputs.
+        It is None if the step has no scalar form, if an input is active, or if all
+        derivatives vanish.
         """
         return self._found("step", active)
 
     def adjoint(self, active: Sequence[int]) -> ScalarStep | None:
         """Return the step of the reverse pass for the operands ``active``, or None.
 
-        There is none with derivatives for inputs, or if not every output is logged.
+        It is None in the cases of ``step``, if JAX has no reverse pass for the step, or
+        if the log skips outputs.
         """
         return None if self.every > 1 else self._found("adjoint", active)
 
@@ -245,9 +247,9 @@ class MeteredRun:
     ) -> dict[tuple[str, int, bool], Array]:
         """Return the leaves of system and carry for ``LaneValues``.
 
-        ``grouped`` are the operands of system and state with three axes of lanes,
-        followed by the derivatives of the operands ``active``. Those of the rest of the
-        carry are 0.
+        ``grouped`` are the operands of system and state with the three axes of
+        ``Batch``, followed by the tangents of the operands ``active``. The tangents of
+        the rest of the carry are 0.
         """
         count = sum(self.counts[:2])
         leaves = {(*self.place(i), False): x for i, x in enumerate(grouped[:count])}

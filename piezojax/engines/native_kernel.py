@@ -17,7 +17,7 @@ from .scalar_step import Place, ScalarStep
 
 
 def computes(step: ScalarStep, by_lane: bool) -> bool:
-    """Return whether ``results`` exists for a step; for any inputs ``by_lane``."""
+    """Return whether ``results`` can compute a step; inputs may be ``by_lane``."""
     return has_source(step)
 
 
@@ -29,13 +29,13 @@ def results(
     wanted: Sequence[tuple[int, int]],
     every: int,
 ) -> tuple[Array, Array]:
-    """Return the elements of the carry after all steps, and the logged outputs.
+    """Return the elements ``wanted`` of the carry after all steps, and the log.
 
-    ``counts`` are the directions, outer and inner lanes; both results begin with these
-    axes. The ``inputs`` end with them, [samples, ..., 1, 1, inner or 1]. ``wanted`` are
-    the elements of the carry (leaf, element). The outputs are logged at the last of
-    each ``every`` samples, for 0 never. Derivatives are returned if the step
-    computes any.
+    ``counts`` are the numbers of directions, outer and inner lanes; both results begin
+    with these axes. The ``inputs`` end with them, [samples, ..., 1, 1, inner or 1].
+    ``wanted`` are pairs (leaf, element). The log holds the last output of each
+    ``every`` samples; it is empty if ``every`` is 0. If the step computes derivatives,
+    they are returned instead of the values.
     """
     _, outer, inner = counts
     blocks = _Blocks(shape_for(step, inner, every), counts)
@@ -80,10 +80,11 @@ def reversed_results(
 ) -> Array:
     """Return the derivatives of a result with respect to the elements ``wanted``.
 
-    ``slopes`` are those with respect to the elements ``results`` of the carry after all
-    steps; those with respect to the log are the last of the ``inputs``. ``starts`` are
-    the carries before each ``segment`` of samples, [..., segments, elements]. Otherwise
-    the arguments are those of ``results``, whose axes these arrays have first.
+    ``slopes`` are the derivatives with respect to the elements ``results`` of the carry
+    after all steps. The last of the ``inputs`` holds the derivatives with respect to
+    the log. ``starts`` [..., segments, elements] are the carries before each segment of
+    ``segment`` samples. ``slopes`` and ``starts`` begin with the axes of ``counts``, or
+    with axes of size 1. The other arguments are those of the function ``results``.
     """
     _, outer, inner = counts
     blocks = _Blocks(shape_for(step, inner, 0, segment), counts)
@@ -130,7 +131,7 @@ class _Blocks:
         return jnp.moveaxis(self.split(array), 0, 2)
 
     def inputs(self, inputs: Sequence[Array]) -> tuple[list[Array], list[Rows]]:
-        """Return the arrays of the inputs, and what they hold."""
+        """Return the arrays of the inputs, and the Rows of each."""
         leaves, rows = [], []
         for x in inputs:
             size, by_lane = math.prod(x.shape[1:-3]), x.shape[-1] > 1
@@ -143,7 +144,7 @@ class _Blocks:
     def called(
         self, name: str, sizes: Sequence[tuple[int, ...]], *arrays: Array
     ) -> list[Array]:
-        """Return the results of a library as [outer, inner, ...]; ``sizes`` follow."""
+        """Return the results of a library as [outer, inner, *size], one per size."""
         lead = self._outer, self._blocks
         types = [
             jax.ShapeDtypeStruct((*lead, *size, self._lanes), float) for size in sizes
@@ -171,7 +172,7 @@ def _arrays(
 
 
 def _at(places: Sequence[Any], wanted: Sequence[Any], array: Array) -> Array:
-    """Return the columns at the places ``wanted``, 0 for one that ``array`` lacks."""
+    """Return the columns at the places ``wanted``; those that ``array`` lacks are 0."""
     order = {place: i for i, place in enumerate(places)}
     columns = np.array([order.get(each, -1) for each in wanted], int)
     return jnp.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, 1)])[..., columns]

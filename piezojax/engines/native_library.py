@@ -20,13 +20,14 @@ from ..core.runtime import processor
 
 FLAGS = (
     *("-std=gnu11", "-march=native", "-fPIC", "-shared", "-w", "-ftree-vectorize"),
-    # No function of the C library sets errno here, and no operation traps.
+    # The code needs neither errno nor floating-point traps.
     *("-fno-math-errno", "-fno-trapping-math"),
 )
 
 QUICK = 2000
-"""Lines of a source above which it is compiled with fewer optimisations: half the time,
-or less, for a loop that is up to a third slower."""
+"""Number of lines from which a source is compiled with fewer optimisations.
+
+This takes at most half the time; the loop is up to a third slower."""
 
 CALL = Template("""
 #include "xla/ffi/api/c_api.h"
@@ -82,7 +83,8 @@ def registered(text: str, rows: int) -> str:
     """Return the name under which XLA knows the function ``run_blocks`` of a source.
 
     ``rows`` is its number of arrays of inputs. The library is kept in the folder of
-    compiled programs of JAX, if there is one. Raises CompileError.
+    compiled programs of JAX, if there is one. Raises CompileError if the source cannot
+    be compiled or loaded.
     """
     text = _called(text, rows)
     # Machines of a cluster may share the folder: the name depends on the processor.

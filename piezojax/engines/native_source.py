@@ -28,8 +28,8 @@ GROUP = 8
 """Lanes of an inner loop: the numbers of an AVX-512 register."""
 
 PAIRED = 400
-"""Number of operations of a step below which two groups of lanes run in turn: one alone
-waits for its own results most of the time."""
+"""Number of operations of a step below which two groups of lanes run in turn, because a
+single group mostly waits for its own results."""
 
 
 class Shape(NamedTuple):
@@ -70,18 +70,19 @@ def source(step: ScalarStep, arrays: Arrays, rows: Sequence[Rows], shape: Shape)
     dimension STRIDE, for the lanes of a block:
 
         shared        [columns]
-        in0, ...      [samples][elements][1, or lanes if these have their own inputs,
-                      which are the same for all outer]
+        in0, ...      [samples][elements][1, or inner lanes if their inputs differ];
+                      all outer lanes share them
         own, start    [outer][blocks][columns, or elements of the carry]
         end           [outer][blocks][columns]
         log           [outer][blocks][samples / EVERY][outputs]
         slopes, slope_start, slope_end, slope_log
-                      the same, with [directions] after [blocks]
+                      as own, start, end and log, with [directions] after [blocks]
 
     With a ``segment`` in ``shape``, the step is that of a reverse pass. Its ``start``,
     [outer][blocks][segments][elements of the carry], are the carries before each
-    segment; ``slope_start`` and ``slope_end`` are derivatives with respect to the carry
-    after and before the run, and totals.
+    segment. ``slope_start`` holds the derivatives with respect to the carry after the
+    run, and the totals at the start; ``slope_end`` holds the derivatives with respect
+    to the carry before the run, and the final totals.
     """
     return _Source(step, arrays, rows).text(shape)
 
@@ -164,9 +165,10 @@ class _Source:
     def _before(
         self, numbers: Iterable[int], later: Sequence[int], part: str, lane: str
     ) -> _Before:
-        """Return what a part computes before the first step.
+        """Return the values that a part stores before the first step.
 
-        The nodes ``later`` and the moving ones read its nodes ``numbers``.
+        The part computes the nodes ``numbers``, and stores those that the nodes
+        ``later`` or the moving ones read. ``lane`` is the index of a lane in C, if any.
         """
         writer, nodes = self.writer, self.step.graph.nodes
         read = {n for each in (*later, *self.moving) for n in nodes[each].operands}
@@ -187,8 +189,8 @@ class _Source:
     def _limits(self) -> set[int]:
         """Return the operands of maxima and minima.
 
-        Compilers test a limit that all lanes share for NaN lane by lane, in each step.
-        If it is stored for each lane, they compare vectors.
+        If all lanes share a limit, compilers test it for NaN lane by lane, in each
+        step. If it is stored for each lane, they compare vectors.
         """
         nodes = (self.step.graph.nodes[n] for n in self.moving)
         return {
@@ -233,7 +235,7 @@ class _Source:
             f"of->{name}[l] = {writer.real(each.last)};"
             for name, each in zip(names, elements, strict=True)
         ]
-        # Last, because expressions read stored nodes from where they are stored.
+        # Last, because later expressions would read the stored copies of these nodes.
         lines += writer.store(kept, "kept->{}[l]", "kept->{}[l]")
         return PART.substitute(
             part=part,

@@ -180,7 +180,8 @@ VALUES = {
                         own + $g * WIDTH, NULL, here + $g * WIDTH$row_values);""",
     "end": "end_values(&values$g, end + block * $ends * STRIDE + $g * WIDTH);",
 }
-"""Parts of ``RUN`` for each group; explicit, because compilers do not unroll them."""
+"""Parts of ``RUN``, written for each group, because compilers do not unroll a loop over
+groups."""
 
 SLOPES = {
     "begin": "struct slopes *turned = aligned_alloc(64, directions * sizeof *turned);",

@@ -20,7 +20,7 @@ class Arrays(NamedTuple):
     """Elements in the columns of the arrays of ``run_blocks``.
 
     ``shared`` are the numbers of a system that are equal in all lanes, ``own`` those
-    that differ, and ``slopes`` derivatives of numbers. ``end`` and ``slope_end`` are
+    that differ, and ``slopes`` the tangents of numbers. ``end`` and ``slope_end`` are
     the elements of the carry that are wanted after the last step.
     """
 
@@ -34,9 +34,9 @@ class Arrays(NamedTuple):
 class LaneWriter(Writer):
     """Writer of the statements of a lane.
 
-    Maximum and minimum are NaN if an operand is: a loop that diverges must not look
-    finite behind a limit. A division by a steady value is written as
-    a product with its reciprocal.
+    Maximum and minimum are NaN if an operand is NaN, because a loop that diverges must
+    not look finite behind a limit. A division by a constant or steady value is written
+    as a product with its reciprocal.
     """
 
     forms = FORMS | {
@@ -108,7 +108,7 @@ class LaneWriter(Writer):
         ]
 
     def store(self, numbers: Iterable[int], write: str, read: str) -> list[str]:
-        """Return the statements that store nodes, which later ones read from there."""
+        """Return the statements that store nodes; later expressions read the copies."""
         lines = []
         for number in numbers:
             lines.append(f"{write.format(f'v{number}')} = {self.real(number)};")

@@ -24,8 +24,9 @@ class Place(NamedTuple):
 
     The parts are "system", "carry" (state and totals of the metric), "row" (a sample of
     the inputs) and "index" (its number). A ``tangent`` is a derivative of such an
-    element or, in an adjoint step, with respect to it: of "row" to a logged output, and
-    of "total" the sum of those with respect to a number of the system.
+    element. In an adjoint step it is the derivative of the result of the run with
+    respect to the element, for "row" with respect to a logged output; a "total" sums
+    the derivatives with respect to a number of the system.
     """
 
     part: str
@@ -45,15 +46,15 @@ class ScalarStep(NamedTuple):
     """Scalar operations of a step.
 
     ``places`` are the inputs of ``graph`` by their number. ``carried`` are the elements
-    of the carry that are computed, ``log`` the nodes of the
-    logged outputs. ``steady`` are the
-    nodes that have the same value at each step, ``moving`` the others, both in the
-    order of their computation.
+    of the carry that are computed, ``log`` the nodes of the logged outputs. ``steady``
+    are the nodes that have the same value at each step, ``moving`` the others, both in
+    the order of their computation.
 
-    With derivatives, ``slopes`` are their elements of the carry and ``log_slopes``
-    those of the outputs. The nodes that depend on them are ``steady_slopes`` and
-    ``moving_slopes``; ``steady`` and ``moving`` are the other ones. Nodes of ``zero``
-    are derivatives that vanish.
+    With derivatives, ``slopes`` are the computed tangents of the carry, in an adjoint
+    step also the totals; ``log_slopes`` are the nodes of the derivatives of the logged
+    outputs. The nodes that depend on tangents are ``steady_slopes`` and
+    ``moving_slopes``; ``steady`` and ``moving`` exclude them. The nodes ``zero`` are
+    derivatives that vanish, and the constant 0.
     """
 
     graph: Graph
@@ -209,7 +210,7 @@ def sorted_step(
     """Return the step that computes the elements ``wanted`` and the log.
 
     ``after`` are the nodes of the carry after the step, ``zero`` those of derivatives
-    that vanish. Raises NotScalarError for a step that is too long.
+    that vanish. Raises NotScalarError for a step that is too long or has a loop.
     """
 
     def needed() -> set[int]:
@@ -247,7 +248,7 @@ def sorted_step(
 def _read(
     graph: Graph, places: Sequence[Place], numbers: Collection[int]
 ) -> set[Place]:
-    """Return the elements of the carry among nodes."""
+    """Return the elements of the carry, and the totals, among nodes."""
     nodes = (graph.nodes[number] for number in numbers)
     read = {places[int(node.value)] for node in nodes if node.operation == INPUT}
     return {place for place in read if place.part in ("carry", "total")}
@@ -256,9 +257,9 @@ def _read(
 def _divided(
     graph: Graph, places: Sequence[Place], needed: Collection[int]
 ) -> tuple[list[int], ...]:
-    """Return the needed nodes that are steady and moving, each without and with slopes.
+    """Return the needed nodes: steady, steady slopes, moving, and moving slopes.
 
-    They are in the order of their computation.
+    Each list is in the order of computation.
     """
     found: tuple[list[int], ...] = ([], [], [], [])
     moving: set[int] = set()
@@ -290,8 +291,8 @@ def vanishing(
 ) -> frozenset[int]:
     """Return the nodes of derivatives that vanish, and those of the constant 0.
 
-    ``slopes`` are the derivatives of the carry after a step. Those at ``vanish`` are 0
-    before the first step, and those at ``always`` before each.
+    ``slopes`` are the nodes of the derivatives of the carry after a step. Derivatives
+    at ``vanish`` are 0 before the first step, those at ``always`` before each step.
     """
     vanish = vanish.union(always)
     while True:

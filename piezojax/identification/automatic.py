@@ -29,11 +29,12 @@ CLEARLY = 0.8
 """Ratio to the error of the first model below which another one is chosen."""
 
 LEAST, SAMPLES, MOST = 1000, 4000, 100_000
-"""Fewest samples from which a hysteresis is chosen; fewest and most of a trial."""
+"""Numbers of samples: least number from which a hysteresis is chosen, least number of a
+trial, and number of a trial from which VARIATION no longer raises the rate."""
 
 VARIATION = 0.95
-"""Share of the total variation of the input that a lower rate must keep. A hysteresis
-follows every motion: without the fast ones its state is another one."""
+"""Share of the total variation of the input that a lower rate must keep: the state of a
+hysteresis depends on every motion, the fast ones included."""
 
 RESOLVED = 8.0
 """Least number of samples in a period of the fastest resonance in a trial."""
@@ -132,11 +133,12 @@ def _slowed(record: Record, every: int) -> Record:
 def _error(
     name: str, records: Sequence[Record], dynamics: HeldDynamics | None
 ) -> float:
-    """Return the rms error after a short fit; with several records, after one to each.
+    """Return the error of the model ``name`` after a short fit to each of ``records``.
 
-    With several records, each fit is evaluated on the other records. The error is
-    infinite if a fit fails, or if the fitted hysteresis has no inverse over the range
-    of the input, because controllers need the inverse.
+    For a single record it is the standard deviation of the free-run error. With several
+    records, each fit is evaluated on the other records, and the rms error over all of
+    them is returned. The error is infinite if a fit fails, or if the fitted hysteresis
+    has no inverse over the range of the input, because controllers need the inverse.
     """
     first = records[0]
     shape = structure(_chain_of(name, first, dynamics), first, dynamics)

@@ -302,7 +302,7 @@ def _objection_to_periods(
 def _objection_to_scheduled(
     records: Sequence[Record], train: slice, options: Options
 ) -> str | None:
-    """Return the objection unless there are several channels, periods and levels."""
+    """Return the objection unless there are periods, several channels and levels."""
     del options
     if any(record.period is None for record in records):
         return "it needs periodic records (--period)"

@@ -66,7 +66,7 @@ def is_dynamic(part: str) -> bool:
 
 
 def training_record(records: Sequence[Record], train: slice) -> Record:
-    """Return the samples up to the end of ``train`` of the first ``by_evidence``."""
+    """Return the first record of ``by_evidence``, up to the end of ``train``."""
     return by_evidence(records, train)[0]
 
 

@@ -1,7 +1,7 @@
 """Fits to records of a closed loop: direct, indirect and joint.
 
-In a closed loop ``u = K_r r + d - K_y y`` noise reaches the input. An estimator made
-for open loops, which takes the input as independent of the noise, is then biased
+In a closed loop with ``u = K_r r + d - K_y y``, noise reaches the input. An estimator
+made for open loops, which takes the input as independent of the noise, is then biased
 towards ``-1 / K_y``. Sources: Ljung, System Identification, 2nd ed., 13.4 and 13.5;
 Forssell and Ljung, Automatica 35, 1999; Van den Hof and Schrama, Automatica 29, 1993.
 """
@@ -71,10 +71,11 @@ class LoopFit(NamedTuple):
 
 
 def check_approach(records: Sequence[Record], options: Options) -> None:
-    """Raise ValueError unless ``options.closed_loop`` fits the ``records``.
+    """Raise ValueError unless approach and controller in ``options`` suit ``records``.
 
-    Indirect and joint need a reference or a dither that changes; indirect needs the
-    controller at the sampling rate of the record, and one record.
+    Indirect and joint need a reference or a dither that changes. Indirect also needs
+    the controller, at the sampling rate of the record, and a single record; no other
+    approach takes a controller.
     """
     name, controller = options.closed_loop, options.controller
     if name is None and controller is None:
@@ -122,8 +123,8 @@ def loop_fit(
 
     Without a name in ``options`` the approach is direct; a linear chain whose
     prediction errors are not white is fitted again by joint if there is an excitation.
-    Raises ValueError as ``check_approach``, for joint with a hysteresis, and as
-    ``output_error``.
+    Raises ValueError as ``structure``, ``without_noise`` and ``output_error`` do, for
+    joint with a hysteresis, and for indirect without a controller.
     """
     if options.closed_loop is not None:
         return _FITS[options.closed_loop](model, records, train, options, progress)
@@ -280,9 +281,9 @@ def feedback_warnings(records: Sequence[Record], train: slice) -> list[str]:
 
 
 def without_noise(record: Record) -> Record:
-    """Return ``record`` with the part of its input that responds to the excitation.
+    """Return ``record`` with its input reduced to the response to the excitation.
 
-    Raises ValueError as ``projected``.
+    Raises ValueError as ``projected`` does.
     """
     try:
         return replace(record, inputs=projected(record.input, record.excitation))
@@ -291,9 +292,9 @@ def without_noise(record: Record) -> Record:
 
 
 def whiteness(problem: Problem, unit: np.ndarray) -> Correlation:
-    """Return the largest autocorrelation of the prediction errors of all records.
+    """Return the largest autocorrelation of the prediction errors over all records.
 
-    It is the largest relative to its bound.
+    Correlations are compared relative to their bounds.
     """
     errors = np.asarray(problem.whitened(problem.errors(as_array(unit))))
     tests = [
@@ -304,9 +305,10 @@ def whiteness(problem: Problem, unit: np.ndarray) -> Correlation:
 
 
 def _replay_error(controller: System, record: Record, train: slice) -> float:
-    """Return the rms error of the controller's voltage over its own deviation.
+    """Return the error of the controller's voltage relative to the recorded voltage.
 
-    The mean does not count: it is the unknown state of the integrator at the start.
+    It is a ratio of standard deviations over ``train``. The mean error does not count,
+    because it depends on the unknown state of the integrator at the start.
     """
     wanted = record.input[train]
     error = (replayed(controller, record) - record.input)[train]

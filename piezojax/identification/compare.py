@@ -56,7 +56,7 @@ def identify_all(
     the halves of the samples before ``test``. ``done`` receives the ranking so far,
     marked as interrupted, after each fit. Ctrl-C ends the search and keeps the models
     fitted so far. In ``folder``, if given, the fits are stored until the search has
-    ended; another call with the same arguments goes on from them.
+    ended; another call with the same arguments continues from them.
 
     Raises ValueError as ``identify`` does for records and parts, for a ``test`` that
     shares samples with the other parts, for a ``folder`` with fits of another search,

@@ -83,9 +83,9 @@ def criteria(mean_squares: np.ndarray, samples: np.ndarray, count: int) -> Crite
 def validates_as_well(errors: Errors, best: Errors) -> bool:
     """Return whether ``errors`` are not significantly larger than the ``best``.
 
-    The test takes the mean difference of the squared errors, sample by sample. It must
-    be at most MARGIN of its standard errors, autocorrelation included. Errors common to
-    both models, such as noise, cancel in the difference.
+    The squared errors are subtracted sample by sample. The mean difference must be at
+    most MARGIN of its standard errors, which account for autocorrelation. Errors common
+    to both models, such as noise, cancel in the difference.
     """
     difference = np.concatenate(
         [
@@ -102,10 +102,11 @@ def validates_as_well(errors: Errors, best: Errors) -> bool:
 def ranking(
     bics: Sequence[float], validation: Sequence[Errors | None]
 ) -> tuple[list[int], list[bool]]:
-    """Return the order of the fits, best first, and whether each validates as well.
+    """Return the order of the fits, best first, and which validate as well as the best.
 
-    Fits whose ``validation`` errors are not significantly above the smallest come
-    first. Both groups are sorted by BIC, lowest first. Fits without errors come last.
+    First come the fits whose ``validation`` errors are not significantly above the
+    smallest, then those with larger errors, then those without errors. Each group is
+    sorted by BIC, lowest first.
     """
     known = [errors for errors in validation if errors is not None]
     best = min(known, key=lambda errors: float(np.mean(np.concatenate(errors) ** 2)))

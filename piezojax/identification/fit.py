@@ -53,7 +53,8 @@ class FitReport(BaseModel):
 
     ``residuals`` is the analysis of the free-run error; None in files of old versions.
     ``alarms`` are those of ``warnings`` that speak against any use of the model:
-    columns or units that are probably wrong, and a model that explains little.
+    columns or units that are probably wrong, and a model that explains little, lacks a
+    large resonance or holds dynamics of another gain.
     ``closed_loop`` says how a record of a closed loop was fitted, and with which bias.
     """
 
@@ -85,10 +86,9 @@ class Spectra(NamedTuple):
 class Fit:
     """A fitted plant, its report, the records and the simulated outputs.
 
-    The outputs are in the units of the records. ``system`` stores the input at which
-    the first record begins. ``count`` is the number of fitted parameters. ``held`` are
-    the dynamics that were not fitted, ``known`` the plant that was fitted again, if
-    any.
+    The outputs are in the units of the records. ``count`` is the number of fitted
+    parameters. ``held`` are the dynamics that were not fitted, ``known`` is the plant
+    that was fitted again, if any.
     """
 
     system: System
@@ -104,7 +104,7 @@ class Fit:
 
     @property
     def plant(self) -> System:
-        """The fitted System to save, at the rate of the dynamics that were held."""
+        """The fitted System to save, at the rate of the held dynamics, if any."""
         return self.system if self.held is None else self.held.plant(self.system)
 
     def errors(self, part: slice) -> list[np.ndarray]:
@@ -176,8 +176,8 @@ class Fit:
     def _parameter_units(self) -> dict[str, str]:
         """Return the units of the parameters of the System, by path.
 
-        Parts declare V and um, which stand for the units of the record. If its channels
-        have several units, that of a parameter is not known: it is "".
+        Parts declare V and um, which stand for the units of the inputs and outputs of
+        the record. If its channels differ in unit, that of a parameter is "" (unknown).
         """
         record = self.record
         sides = {"V": set(record.input_units), "um": set(record.output_units)}
@@ -197,7 +197,7 @@ class Fit:
 
     @property
     def simulated(self) -> np.ndarray:
-        """The simulated output of the first record, which has only one."""
+        """The only simulated output of the first record; ValueError if several."""
         if self.simulations[0].shape[1] != 1:
             raise ValueError(
                 f"the model has {self.simulations[0].shape[1]} outputs; it needs one"
@@ -227,8 +227,9 @@ def identify(
     out). A record without samples in ``validate`` is used for the fit only. Each of
     several records has its own zero of the sensor and its own initial state.
     ``Fit.records`` are sorted by length, the longest first.
-    A record with a reference or dither, or an approach in ``options.closed_loop``, is
-    fitted as one of a closed loop, which only ``output_error`` does without bias.
+    Records are fitted as those of a closed loop if one has a reference or dither, or if
+    ``options.closed_loop`` names an approach. Only ``output_error`` does so; the other
+    methods refuse an approach, and otherwise warn of their bias.
     Raises ValueError for an unknown model or method, an empty part, records of
     different sample time or units, an approach that does not suit records or method, or
     if no start leads to a finite fit.
@@ -377,14 +378,15 @@ def _error_warnings(
 
 
 def _to_explain(record: Record, columns: np.ndarray, part: slice) -> np.ndarray:
-    """Return what a model has to explain of a ``part`` of ``columns`` [samples, p].
+    """Return the motion in ``part`` of ``columns`` [samples, p] that a model explains.
 
-    In a closed loop it is the response to the excitation, without noise and drift.
+    In a closed loop it is the response to the excitation without its mean: noise and
+    drift are left out.
     """
     if not record.excitation.size:
         return columns[part]
     found = excited_columns(record, columns)[part]
-    # A record that ends before the part has nothing in it.
+    # A record that ends before the part has no samples in it.
     return found - found.mean(axis=0) if len(found) else found
 
 

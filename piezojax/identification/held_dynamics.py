@@ -1,8 +1,8 @@
 """Linear dynamics of a saved model, held while hysteresis and creep are fitted.
 
 A frequency response shows modes, lag and delay; a slow record over the whole range
-shows hysteresis and creep. With the dynamics of the first held in the fit to the second
-the two give the whole plant.
+shows hysteresis and creep. If the dynamics from the response are held in the fit to the
+record, both together give the whole plant.
 """
 
 import dataclasses
@@ -28,11 +28,11 @@ CONTINUOUS = (Mode, Modes, FirstOrderLag, SecondOrderLag, FractionalDelay)
 """Parts whose parameters are those of continuous time: they suit any sample time."""
 
 DECADE = 10.0
-"""Width of the band below the highest excited frequency of a record, as a ratio. The
-error in this band is taken for that of the hysteresis at all higher frequencies."""
+"""Ratio of the ends of a band up to the highest excited frequency of a record. The
+least error in this band is taken as that of the hysteresis at unexcited lines."""
 
 LEAST_GAIN, MOST_GAIN = 1.0 / 3.0, 1.5
-"""Bounds for a piezo on the gain for small motions over the slope of a record."""
+"""Bounds of the ratio of the gain for small motions to the slope of a record."""
 
 LINEAR = 1e-6
 """Largest relative deviation from f(a u) = a f(u) that counts as linear."""
@@ -208,10 +208,10 @@ def combined_bound(
 
     ``slow`` is that of the whole plant on the record of hysteresis and creep, ``fast``
     that of the dynamics that were held. At lines that the slow record excites, its
-    bound holds. Elsewhere hysteresis and dynamics may both be wrong: the error of the
-    hysteresis is the least bound in the highest decade of the slow record, because it
-    is one factor at all higher frequencies. The sample time of the plant is ``dt`` (s).
-    None if the slow record has no bound or excites nothing.
+    bound holds. Elsewhere the errors of hysteresis and dynamics are combined. That of
+    the hysteresis is taken as one factor at all these lines: the least bound in the
+    highest decade of the slow record. ``dt`` (s) is the sample time of the plant.
+    Returns None if the slow record has no bound or excites nothing.
     """
     if slow is None or not any(slow.excited):
         return None

@@ -1,8 +1,8 @@
 """A plant that is known already, fitted again to new records of the same stage.
 
 The fit is the most likely one a posteriori: every parameter has a normal prior around
-its known value. Where short records say nothing, as about voltages beyond their range,
-the known value stays.
+its known value. Where short records give no information, as on voltages beyond their
+range, the known value stays.
 """
 
 import dataclasses
@@ -34,8 +34,8 @@ FACTOR, REACH = 3.0, 4.0
 is smaller than its standard deviation, in these deviations."""
 
 UNEXPLAINED, INDEPENDENT = 0.01, 25
-"""Error of a model, as a share of the range of the output, and number of independent
-samples of that error: a change by one standard deviation must explain as much."""
+"""Assumed rms error of a model, as a share of the range of the output, and assumed
+number of independent samples of it. Both set the weight of the prior."""
 
 GAIN, DELAY = "calibration.gain", "delay"
 
@@ -69,11 +69,12 @@ class KnownPlant:
     def structure(self, records: Sequence[Record]) -> Structure:
         """Return the plant as a structure to fit to ``records``.
 
-        It starts from the resonances that the records show, and from the known values,
-        both also with a longer delay, because a search does not leave a delay of 0. A
-        gain and a delay are fitted beside its own parameters. If the dynamics are
-        held, the errors of a record count relative to its range: those of a hysteresis
-        grow with the motion, and would hide what a small motion shows of the gain.
+        The starts are the known values, as they are and with the modes moved to the
+        resonances that the records show. Both are also tried with a longer delay,
+        because a search does not leave a delay of 0. A gain and a delay are fitted
+        besides its own parameters. If the dynamics are held, the errors of a record
+        count relative to its range: the errors of a hysteresis grow with the motion,
+        and would hide the effect of the gain on small motions.
         """
         whole = slice(0, max(record.samples for record in records))
         best, *_ = by_evidence(records, whole)
@@ -108,7 +109,7 @@ class KnownPlant:
         )
 
     def with_dynamics(self, fitted: System) -> "KnownPlant":
-        """Return this plant with the dynamics of ``fitted``, a fit of it, held."""
+        """Return this plant with the linear dynamics of ``fitted``, a new fit, held."""
         own = parameters(self.system)
         others = {path: own[path] for path in own if not _is_linear(path)}
         return dataclasses.replace(self, system=replace(fitted, others), held=True)

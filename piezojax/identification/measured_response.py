@@ -14,7 +14,7 @@ from .records.record import Record
 from .records.response import FrequencyResponse
 
 ALIKE = 1.1
-"""Ratio of rms amplitudes up to which records count as of one amplitude."""
+"""Ratio of rms amplitudes below which two records count as equal in amplitude."""
 
 HIGHEST = 0.8
 """Share of half the rate below which the response to a held input is kept: near half

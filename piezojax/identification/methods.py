@@ -39,7 +39,7 @@ FITTED_AGAIN = (
     "free run from the measured input, near the known plant; biased towards -1 / "
     "controller where noise makes up most of the input"
 )
-"""How a plant that is known is fitted to records of a closed loop."""
+"""Text on the fit of a known plant to records of a closed loop."""
 
 Records = Sequence[Record]
 
@@ -115,7 +115,7 @@ def _optimum_warnings(
     steps: int,
 ) -> list[str]:
     found = []
-    # Their narrow bounds come from the record: a value at a bound needs no warning.
+    # The narrow bounds of shown dynamics come from the record: no warning at a bound.
     shown = shape.dynamics if shape.whitening else ()
     if not optimum.finished:
         found.append(f"the fit had not converged after its {steps} steps")

@@ -32,10 +32,11 @@ class _LabelledProgress:
 class Search:
     """Search state: fits, failed models and waiting candidates.
 
-    ``fitted`` is called after each fit. ``left_out`` are the records that are left out
-    of a fit in turn; if there are none, the validation part decides. ``across`` holds
-    the errors on them by model, None for a model that fails on one of them.
-    ``unfinished`` holds the fits of a search that goes on, if any.
+    ``fitted`` is called after each fit and each evaluation on other records.
+    ``left_out`` are the records that are left out of a fit in turn; if there are none,
+    the validation part decides. ``across`` holds the errors on them by model, None for
+    a model that fails on one of them. ``unfinished`` stores finished fits in files, so
+    that a later search can continue from them; None stores none.
     """
 
     def __init__(

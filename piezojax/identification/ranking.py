@@ -26,11 +26,10 @@ RULE_ACROSS = RULE.replace(
 class RankedModel(BaseModel):
     """Errors of a model of the ranking, or the reason why it has none.
 
-    ``parameters`` is the number of fitted parameters, ``across_rmse`` the rms error on
-    each record left out of a fit to the others, None for a single record and for a
-    model that fails on one of them. ``validates_as_well`` tells whether the model
-    validates as well as the best, ``folder`` the place of its model.json and
-    fit.json.
+    ``parameters`` is the number of fitted parameters. ``across_rmse`` is the rms error
+    over all records, each left out of a fit to the others, None for a single record and
+    for a model that fails on one of them. ``validates_as_well`` tells whether the model
+    validates as well as the best; ``folder`` holds its model.json and fit.json.
     """
 
     model: str

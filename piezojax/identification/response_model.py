@@ -31,7 +31,7 @@ FOLDED = 0.9
 """Share of half the rate above which a measured mode cannot be simulated."""
 
 LARGE = 2.0
-"""Mean square of the residual over the variance from which a note reports it."""
+"""Ratio of the residual's mean square to the variance above which a note reports it."""
 
 
 class ResponseReport(BaseModel):
@@ -77,16 +77,15 @@ def identify_response(
     most: int = MOST_MODES,
     measured: Measurement | None = None,
 ) -> ResponseModel:
-    """Return the modes, lag and delay of ``response`` as a System of ``rate`` in Hz.
+    """Return the modes, lag and delay of ``response`` as a System at ``rate`` (Hz).
 
-    For a response that does not state how it was measured, ``held`` means through
-    converters at this rate that hold the input; otherwise an analogue analyser is
-    assumed. At most ``most`` modes are fitted; the lines are weighted by the variances
-    of the response, if it has any.
-    ``measured`` goes into the report. The saved model carries a bound on its error, so
-    that a study limits the margins under errors that the response does not show. Raises
-    ValueError for a rate that is not above 0, a mode too near half the rate, and a
-    response that no mode explains.
+    If the response does not state how it was measured, ``held`` tells that converters
+    at this rate held its input; otherwise an analogue analyser is assumed. At most
+    ``most`` modes are fitted; the lines are weighted by the variances of the response,
+    if it has any. ``measured`` goes into the report. The saved model carries a bound on
+    its error, so that a study requires robustness to errors that the response does not
+    show. Raises ValueError for a rate that is not above 0, a mode too near half the
+    rate, and a response that no mode explains.
     """
     if not (math.isfinite(rate) and rate > 0.0):
         raise ValueError(f"rate is {rate:g} Hz; it must be above 0")

@@ -1,4 +1,4 @@
-"""Finished fits of an unfinished search in files, from which the search goes on."""
+"""Files of the finished fits of an unfinished search, from which it can continue."""
 
 import hashlib
 import io
@@ -30,7 +30,7 @@ Errors = tuple[np.ndarray, ...] | None
 
 
 class Finished(NamedTuple):
-    """A finished fit; ``across`` holds its errors on records left out, if known."""
+    """A finished fit; ``across``: its errors on other records, if ``has_across``."""
 
     fit: Fit
     across: Errors
@@ -64,7 +64,7 @@ class Unfinished:
         write_text(folder / KEY, key + "\n")
 
     def keep(self, model: str, fit: Fit, across: Errors, has_across: bool) -> None:
-        """Write a fit; not one with details for plots, or with held dynamics."""
+        """Write a fit, except one with details for plots or with held dynamics."""
         if fit.linear is not None or fit.held is not None:
             return
         arrays = {f"run_{i}": run for i, run in enumerate(fit.simulations)}

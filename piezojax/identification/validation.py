@@ -24,9 +24,9 @@ SHARE = 0.2
 """First share of a record, on which its initial state and zero are estimated."""
 
 COVERED = 0.9
-"""Share of its range in the record that each input has covered by the end of that part.
-Before that no model distinguishes the zero from the memory of earlier motions, which
-only larger extrema wipe out."""
+"""Share of its range in the record that each input should cover within that part. Until
+then no model distinguishes the zero from the memory of earlier motions, which only
+larger extrema wipe out."""
 
 LATEST = 0.5
 """Largest share of a record that is used for the estimate."""
@@ -49,10 +49,10 @@ BEYOND = 0.1
 
 
 class PartError(BaseModel):
-    """RMS error (unit of the outputs) of the stretches with a ``kind`` of input.
+    """RMS error (unit of the outputs) over stretches of similar amplitude or rate.
 
     ``kind`` is "amplitude", the range of the input within a stretch, or "rate", the rms
-    value of its slope; it lies between ``low`` and ``high``.
+    value of its slope; in these stretches it lies between ``low`` and ``high``.
     """
 
     kind: str
@@ -103,8 +103,8 @@ class ValidationReport(BaseModel):
 class Validation:
     """A model validated on ``records``, with its ``runs`` [samples, p] over them.
 
-    ``about`` is the origin of the model with what these records add: their names, the
-    alarms, and an error bound that also holds for them.
+    ``about`` is the origin of the model, extended by the names of these records, the
+    alarms, and an error bound that also holds for these records.
     """
 
     system: System
@@ -296,7 +296,7 @@ def _signals(system: System, record: Record) -> np.ndarray:
 
 
 def _ranges(inputs: np.ndarray, about: About) -> np.ndarray:
-    """Return the ends [2] or [2, m] of the inputs, in this record and the model's."""
+    """Return the ends [2] or [2, m] of the range of record and model together."""
     low, high = np.min(inputs, axis=0), np.max(inputs, axis=0)
     if len(about.input_ranges) == np.size(low):
         known = np.asarray(about.input_ranges).T.reshape(2, *np.shape(low))
@@ -338,7 +338,7 @@ def _by_input(record: Record, error: np.ndarray, part: slice) -> list[PartError]
 
 
 def _error_alarms(check: RecordCheck, about: About, share: float) -> Iterator[str]:
-    """Yield an alarm if the error is large compared with the motion, and unexpected.
+    """Yield an alarm if the error is large relative to the motion and that of the fit.
 
     On a record of small motions an error as small as that of the fit raises no alarm.
     """
@@ -366,12 +366,15 @@ def _worse(check: RecordCheck) -> Iterator[str]:
 
 def _beyond(about: About, record: Record) -> Iterator[str]:
     """Yield a note for each input that leaves the range of the model's record."""
-    for (low, high), column in zip(about.input_ranges, record.inputs.T, strict=False):
+    columns, units = record.inputs.T, record.input_units
+    for (low, high), column, unit in zip(
+        about.input_ranges, columns, units, strict=False
+    ):
         slack = BEYOND * (high - low)
         least, most = float(column.min()), float(column.max())
         if least < low - slack or most > high + slack:
             yield (
-                f"the input covers {least:.4g} to {most:.4g} {record.input_unit}, the "
+                f"the input covers {least:.4g} to {most:.4g} {unit}, the "
                 f"record of the model {low:.4g} to {high:.4g}: outside it the model "
                 "extrapolates"
             )

@@ -98,10 +98,10 @@ def statements(
     precision: Precision,
     held: Mapping[int, str] = MappingProxyType({}),
 ) -> tuple[list[str], Callable[[int], str]]:
-    """Return the statements that compute ``outputs``, and a function of a node.
+    """Return the statements that compute ``outputs``, and a function for expressions.
 
-    The function returns the C expression of the node. ``names`` returns the expression
-    of an input by its place; ``held`` holds the expressions of nodes that are computed
+    The function returns the C expression of a node. ``names`` returns the expression of
+    an input by its place; ``held`` holds the expressions of nodes that are computed
     elsewhere. A comment names the Python function behind each group of operations.
     """
     writer = Writer(graph, outputs, names, precision, held)
@@ -200,7 +200,7 @@ class Writer:
         found = list(pieces(rows))
         if 2 * len(found) <= len(numbers):
             return [*tables, *self._array(numbers, name, found, indent)]
-        # The long pieces alone.
+        # Write long pieces as loops, and each other operation as a statement.
         for number in numbers:
             del self.variables[number]
         lines = []
@@ -230,9 +230,10 @@ class Writer:
     def _tabulated(
         self, numbers: Sequence[int], name: str, indent: str
     ) -> tuple[list[str], list[tuple[str, ...]]]:
-        """Return tables of the operands that are changing constants, and all operands.
+        """Return tables of constants that differ from their neighbours, and operands.
 
-        The expressions of such operands are elements of the tables.
+        The operands are the expressions of all operations. Those of the constants in a
+        table are elements of the table.
         """
         nodes, tables, columns = self.graph.nodes, [], []
         operands = [nodes[number].operands for number in numbers]

@@ -133,7 +133,7 @@ class Graph:
     def needed(self, outputs: Sequence[int], held: Collection[int] = ()) -> set[int]:
         """Return the numbers of the nodes that ``outputs`` depend on.
 
-        The nodes ``held`` are included, but not what they depend on.
+        The nodes ``held`` are included, but not the nodes on which these depend.
         """
         carried = {
             number: (loop, place)

@@ -19,7 +19,7 @@ class Memory(NamedTuple):
     """A long array, or a slice of one, with access to single elements.
 
     ``place`` is the place of the first element of the stored array among the inputs.
-    ``writes`` are the elements changed since, as pairs of index node and value node.
+    ``writes`` are the changed elements, as pairs of index node and value node.
     For a slice, ``offset`` is the node of the flat index of its first element.
     """
 

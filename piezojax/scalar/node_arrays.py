@@ -156,7 +156,7 @@ class NodeArrays:
         return self.elementwise("select_n", [here, other, value], self.kind(value))
 
     def reduced(self, name: str, operand: Numbers, axes: Sequence[int]) -> Numbers:
-        """Return the nodes of a reduction along ``axes``, from the first element on."""
+        """Return the nodes of a reduction along ``axes``, taken in element order."""
         kept = [axis for axis in range(operand.ndim) if axis not in axes]
         shape = [operand.shape[axis] for axis in kept]
         rows = operand.transpose([*axes, *kept]).reshape(-1, *shape)
@@ -188,7 +188,8 @@ class NodeArrays:
         if matrix.ndim != 2:
             raise NotScalarError("it solves several systems of equations at once")
         lower, left = params["lower"], params["left_side"]
-        if params["transpose_a"] == left:  # of both or of none
+        # A' X = B needs the transpose of A, and so does X A = B, as A' X' = B'.
+        if params["transpose_a"] == left:
             matrix, lower = matrix.T, not lower
         rows = right if left else right.T
         found: dict[int, Numbers] = {}

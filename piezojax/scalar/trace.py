@@ -79,7 +79,8 @@ def trace(function: Callable, *arguments: Any) -> tuple[Graph, list[Any]]:
     """Return the graph of ``function`` and the nodes of its outputs, leaf by leaf.
 
     The place of an input is its index among all elements of the leaves of
-    ``arguments``. Raises NotScalarError for an operation that has no scalar form.
+    ``arguments``. Raises NotScalarError for an operation without a scalar form, and for
+    more than ``MOST`` nodes.
     """
     closed: Any = jax.make_jaxpr(function)(*arguments)
     # Solvers use primitives of Equinox that exist only as Python implementations.
@@ -217,7 +218,7 @@ class _Tracer:
         places = self.arrays.values(index, equation.invars[1].aval.dtype)
         if places is None:
             return self.arrays.at_computed_place("scatter-add", operands)
-        # Each element is added alone to zeros: it is at the places that are 1 then.
+        # Add each element, as 1, to zeros: the places that become 1 are its own.
         units, zeros = np.eye(more.size), np.zeros(array.shape)
         found = [
             _bound(equation, [zeros, places, unit.reshape(more.shape)])[0]
@@ -262,8 +263,7 @@ class _Tracer:
     def scan(self, params: Any, operands: list[Numbers]) -> list[Numbers]:
         """Return the results of a scan, which is unrolled.
 
-        A scan that only repeats, without rows in or out, remains a loop in C if it is
-        not short.
+        A scan without rows in or out remains a loop in C if it is not short.
         """
         consts, count = params["num_consts"], params["num_carry"]
         shared, carry = operands[:consts], operands[consts : consts + count]
@@ -284,7 +284,7 @@ class _Tracer:
     def _repeated(
         self, closed: Any, shared: list[Numbers], carry: list[Numbers], length: int
     ) -> list[Numbers]:
-        """Return the carry after ``length`` evaluations, which a loop in C counts."""
+        """Return the carry after ``length`` evaluations in a loop in C."""
         one, end = (self.arrays.constants(np.asarray(n)) for n in (1, length))
 
         def condition(inside: list[Numbers]) -> Numbers:

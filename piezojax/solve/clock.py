@@ -8,15 +8,16 @@ from typing import Any
 import jax
 
 _FEWER_PASSES = {"xla_backend_optimization_level": 1}
-"""Options of the compiler on a CPU: a sixth to a fifth less time, and programs of a
-search that are as fast. (A loop of few states alone is up to a quarter slower.)"""
+"""Options of the compiler on a CPU. They save a sixth to a fifth of its time, and the
+programs of a search run as fast. (A loop of few states alone is up to a quarter
+slower.)"""
 
 
 def compiled(program: Any, *arguments: Any) -> Callable:
     """Compile ``program`` for ``arguments``, for a search.
 
-    ``program`` is a function after ``jax.jit`` or ``eqx.filter_jit``. One at the
-    level of a module is compiled once for all arguments of one structure and shapes.
+    ``program`` is a function after ``jax.jit`` or ``eqx.filter_jit``. A function
+    defined at module level is compiled once for each structure and shapes of arguments.
     """
     full = jax.default_backend() != "cpu" or jax.config.read(
         "jax_disable_most_optimizations"

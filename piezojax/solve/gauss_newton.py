@@ -86,8 +86,9 @@ class Descent:
     """Descent from one start: its settings, best point and state between steps.
 
     It is ``done`` when the damping exceeds its last value, ``patience`` is exhausted,
-    or a step and the change of the loss fall below ``tolerance``, relative to the point
-    and the loss. ``losses`` holds the loss after each step.
+    the derivatives are not finite, or a step and the change of the loss fall below
+    ``tolerance``, relative to the point and the loss. ``losses`` holds the loss after
+    each step.
     """
 
     point: np.ndarray
@@ -105,7 +106,7 @@ class Descent:
         self.damping = self.rule.first
 
     def step(self) -> Generator[np.ndarray, Trials, None]:
-        """Yield points [points, n] to try, receive their Trials, move to the best.
+        """Yield points [points, n] to try, receive Trials, and move to an accepted one.
 
         Without a model only the present point is tried.
         """

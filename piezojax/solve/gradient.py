@@ -29,7 +29,8 @@ def with_finite_gradient(loss, *, forward: bool):
 
     The gradient is computed together with the value. That of a diverged run is NaN and
     would spoil the memory of the optimiser; it is replaced by zero. ``forward`` selects
-    forward mode, faster for few parameters and few lanes, else reverse mode.
+    forward mode, which is faster for few parameters and few lanes; otherwise the
+    gradient comes from reverse mode.
     """
 
     def guarded(unit):

@@ -25,12 +25,12 @@ UNIT_BOX, UNBOUNDED = (0.0, 1.0), (-np.inf, np.inf)
 
 
 class LocalModel(NamedTuple):
-    """Quadratic model of a loss at a ``point`` and, for corrections, its parts.
+    """Quadratic model of a loss at a ``point``, with the parts for corrections.
 
     ``gradient`` [n] and ``curvature`` [n, n] are those of the loss: J'r and J'J for
     half a sum of squares. ``metric`` [n] weights the damping of each unknown; 1 damps
-    all equally. ``jacobian`` [n, residuals] is that of the weighted residuals,
-    ``weights`` [residuals] their weights.
+    all equally. Corrections need ``jacobian`` [n, residuals], the derivatives of the
+    weighted residuals, and their ``weights`` [residuals].
     """
 
     point: np.ndarray
@@ -111,7 +111,7 @@ def normal_equations(
     """Return loss, gradient and curvature of half a sum of squares at every point.
 
     ``linearise(point)`` returns Jacobian [residuals, n] and residuals. Only J'J and J'r
-    are kept, which suits long residuals of few unknowns.
+    are kept, which suits many residuals and few unknowns.
     """
 
     def at(point):

@@ -33,7 +33,7 @@ class _Settings(NamedTuple):
 class LockstepDescent:
     """Descents of the optimiser ``method`` on ``problem``, vmapped over the starts.
 
-    ``size`` is the number of unknowns; ``tolerance`` is that of the optimiser,
+    ``size`` is the number of unknowns, ``tolerance`` that of the optimiser;
     ``forward`` selects forward-mode gradients. Screening evaluates ``at_once`` points
     together.
     """
@@ -86,7 +86,7 @@ class LockstepDescent:
         """Do nothing, because no program compiles in the background."""
 
     def prepare(self, starts: int, progress: Progress) -> None:
-        """Compile the programs that begin and advance."""
+        """Compile the programs that begin and advance the descents."""
         progress.stage("compiling the gradient")
         if starts in self._programs:
             return
@@ -110,7 +110,8 @@ class LockstepDescent:
         def advanced(carry: Any) -> tuple[Any, View, Verdict]:
             carry, view = advance(problem, carry, multipliers)
             if problem.limits:
-                # The screening program gives them; that of a step stays smaller.
+                # The screening program computes the verdicts, so that the program of a
+                # step stays smaller.
                 return carry, view, self.screen(problem, np.asarray(view.unit))[1]
             return carry, view, Verdict(view.loss, np.zeros((len(view.loss), 0)))
 

@@ -273,7 +273,7 @@ PULLS, SHARES = 2, np.linspace(0.125, 1.0, 8)
 def _pull_back(
     strategy: Strategy, problem: Problem, end: np.ndarray, state: SearchState
 ) -> None:
-    """Improve ``state`` on the segment from it to ``end``, which violates a constraint.
+    """Search the segment from the best point to ``end``, which violates a constraint.
 
     The augmented Lagrangian approaches an active constraint from both sides, and its
     last points may miss it by more than the tolerance.

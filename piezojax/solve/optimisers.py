@@ -56,7 +56,7 @@ def strongly_typed(carry: Carry) -> Carry:
 
 
 def frozen_when_done(old: Carry, new: Carry) -> Carry:
-    """Return ``new``, or ``old`` if that start had already finished."""
+    """Return ``new``, or ``old`` if that descent was already done."""
     kept = jax.tree.map(lambda o, n: jnp.where(old.done, o, n), old, new)
     return strongly_typed(kept)
 
@@ -64,7 +64,10 @@ def frozen_when_done(old: Carry, new: Carry) -> Carry:
 def _optimistix(
     solver: Any, function: Function, loss_of: Callable[[Array], Array], options: dict
 ) -> Optimiser:
-    """Wrap an optimistix solver; without bounds, it searches the real line."""
+    """Wrap an optimistix solver.
+
+    The solver has no bounds; ``squash`` maps its unbounded unknowns to the unit box.
+    """
 
     def objective(free, _):
         value = function(squash(free))
@@ -121,11 +124,14 @@ def bfgs(loss: Function, residuals: Function, tolerance: float) -> Optimiser:
 def levenberg_marquardt(
     loss: Function, residuals: Function, tolerance: float
 ) -> Optimiser:
-    """Return Levenberg-Marquardt (optimistix) on the residuals, forward Jacobian."""
+    """Return Levenberg-Marquardt (optimistix) on the residuals.
+
+    The Jacobian comes from forward mode.
+    """
     del loss
     # There are far more residuals than unknowns, so the normal equations are small. A
-    # QR of the tall Jacobian takes most of a step, and many times more on a busy
-    # machine.
+    # QR of the tall Jacobian would take most of the time of a step, and many times more
+    # on a busy machine.
     solver = optx.LevenbergMarquardt(
         rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky())
     )
@@ -172,4 +178,4 @@ METHODS: dict[str, Callable[[Function, Function, float], Optimiser]] = {
 """Optimisers by the name a study uses."""
 
 GAUSS_NEWTON = "gauss_newton"
-"""Name a study uses for SuccessiveHalving, Gauss-Newton descents on the errors."""
+"""Name that a study uses for SuccessiveHalving, Gauss-Newton descents on the errors."""

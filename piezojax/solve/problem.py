@@ -18,7 +18,7 @@ TOLERANCE = 1e-3
 
 
 class Verdict(NamedTuple):
-    """Objective without constraints at a point, and the violation of each constraint.
+    """Objective at a point without penalties, and the violation of each constraint.
 
     Violations are on the last axis, positive where a constraint is violated.
     """
@@ -37,9 +37,9 @@ class Errors(NamedTuple):
 
     ``loss`` is minimised; ``errors`` are a sample of the errors of each run, ``added``
     the terms of the augmented Lagrangian. A weight is the derivative of the loss with
-    respect to half the mean square of the errors of a run. With these weights, and 2
-    for the added terms, half the sum of squares has the gradient of the loss, as far as
-    the loss depends on these terms.
+    respect to half the mean square of the errors of a run. Half the weighted sum of
+    these mean squares, plus the sum of the squared added terms, has the gradient of the
+    loss, as far as the loss depends on these terms.
     """
 
     loss: Float[Array, ""]

@@ -84,7 +84,7 @@ def trials_of(points: Errors) -> Trials:
 
 
 def spacing(runs: int, counted: int) -> int:
-    """Return the distance between sampled errors, a prime number against aliasing."""
+    """Return the distance between sampled errors, a prime number to avoid aliasing."""
     most = max(2, counted // LEAST_SPACING)
     wanted = min(max(LEAST_SPACING, -(-runs * counted // SAMPLES)), most)
     return next(

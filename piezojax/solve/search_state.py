@@ -21,7 +21,7 @@ class SearchState:
     ``loss`` is its objective, ``violation`` its largest violation of a constraint.
     ``losses_by_start`` holds the lowest loss of each of the ``starts`` after each step,
     None before its first point that is finite and satisfies the constraints;
-    ``history`` holds the best of all against time.
+    ``history`` holds the best loss of all starts against time.
     """
 
     unit: np.ndarray

@@ -23,7 +23,7 @@ PATIENCE = 5
 """Number of steps in which a descent must gain its tolerance."""
 
 LANES = 32
-"""Least number of runs in one program: fewer take as long."""
+"""Wanted number of runs in one program, because fewer take as long."""
 
 
 def better_half(step: int, running: int) -> int | None:
@@ -36,8 +36,8 @@ class SuccessiveHalving:
 
     The curvature is computed from every ``every``-th error. A descent ends when it
     gains less than ``tolerance`` in PATIENCE steps. ``size`` is the number of unknowns,
-    ``lanes`` that of the runs at a point; points that give ``LANES`` runs are evaluated
-    in one program, and several such programs in parallel.
+    ``lanes`` the number of runs at a point. A program evaluates the points that give
+    LANES runs, but at most the points of one attempt; several programs run in parallel.
     After the first round of an augmented Lagrangian only the best descent continues.
     """
 

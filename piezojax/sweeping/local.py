@@ -19,7 +19,11 @@ FinishedChunk = tuple[int, dict[str, np.ndarray], float]
 
 
 def worker_devices() -> list[Any]:
-    """Return the device of each thread; a CPU has a thread for each available core."""
+    """Return the device of each thread.
+
+    A CPU has a thread for each available core, or one if threads cannot run in
+    parallel.
+    """
     parallel = simulate_side_by_side()
     devices = jax.local_devices()
     if devices[0].platform != "cpu":

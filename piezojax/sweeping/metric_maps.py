@@ -55,7 +55,7 @@ def metrics_in(dataset: "Dataset") -> list[str]:
 
 
 def averaging(name: str) -> str:
-    """Return the kind of mean that is taken of a metric over references and draws."""
+    """Return the kind of mean of a metric over references and draws."""
     return "mean" if name == "saturated" else "geometric mean"
 
 
@@ -75,7 +75,7 @@ def metric_maps(dataset: "Dataset", name: str) -> list[MetricMap]:
 
 
 def _mean(variable: Any, name: str) -> np.ndarray:
-    """Return the mean over references and draws, geometric unless of a share."""
+    """Return the mean over references and draws: geometric, of a share arithmetic."""
     over = [d for d in ("reference", "draw") if d in variable.dims]
     if not over:
         return np.asarray(variable.values)

@@ -19,13 +19,13 @@ from ..study.sweep_table import SweepTable, SweptTable
 from ..tuning.unexplained import STRETCHES
 
 ACCELERATED_BLOCK = 131072
-"""Points of a block on an accelerator, which are enough to occupy it."""
+"""Number of points of a block on an accelerator: enough to occupy it."""
 
 CHUNK_LANE_STEPS = 5e7
-"""Simulated samples of a chunk, all runs of its points together.
+"""Number of simulated samples of a chunk, over all runs of its points.
 
-A chunk takes almost a second: an interrupt loses little work, and writing takes less
-time than simulating.
+A chunk takes almost a second, so that an interrupt loses little work, and writing takes
+less time than simulating.
 """
 
 CHUNK_BYTES = 64e6
@@ -36,7 +36,7 @@ MOST_CHUNKS = 4096
 ``CHUNK_BYTES``."""
 
 FEWEST_CHUNKS = 16
-"""Smallest number of chunks, so that small sweeps keep several cores busy."""
+"""Target for the smallest number of chunks; it keeps several cores busy."""
 
 TRAJECTORIES = ("displacement", "voltage")
 """Signals that a sweep may record at every N-th sample."""
@@ -51,8 +51,9 @@ class Axis(NamedTuple):
 
 
 class Plan:
-    """Points of a sweep, which depend on the study alone; blocks on the device too.
+    """Points of a sweep, divided into chunks and blocks.
 
+    The points depend only on the study, the chunks and blocks also on the device.
     ``shape`` is the shape of the grid, or the number of random samples. Points are
     numbered in C order. A chunk holds ``chunk`` points, in blocks of ``width``.
     """

@@ -205,7 +205,7 @@ def _simulate(
             now = time.perf_counter()
             each = (now - begin) / number
             if number == 1:
-                first = now  # earlier, the workers of a cluster start and compile
+                first = now  # before this, workers of a cluster start and compile
             else:
                 each = (now - first) / (number - 1)
             progress.advance(math.nan, remaining(each * (len(todo) - number)))

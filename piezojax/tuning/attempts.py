@@ -1,4 +1,4 @@
-"""Report of a retuning: the gains that were tried, and what they did."""
+"""Report of a retuning: the gains tried, with predicted and measured errors."""
 
 import math
 from typing import Literal
@@ -15,14 +15,14 @@ AttemptVerdict = Literal[
 
 
 class Attempt(BaseModel):
-    """Gains of a stage, what was expected of them and what they did.
+    """One set of gains in a retuning, with its predicted and measured errors.
 
-    ``gains`` are all gains of the controller. ``model`` is the file of the plant on
-    which they were tuned, ``within`` the largest factor between a tuned gain and the
-    best one before; "" and None for gains that were on the stage, and without a best
-    one. ``predicted_um`` and ``measured_um`` are rms errors with the noise of the
-    sensor, geometric means over the references; None if they are not known. ``why`` is
-    the reason for which gains were stopped, or not tried.
+    ``gains`` are the gains of the stage by path. ``model`` is the file of the plant on
+    which they were tuned, "" for gains that were on the stage already. ``within`` is
+    the largest factor allowed between a tuned gain and the best one before, None if
+    there was none. ``predicted_um`` and ``measured_um`` are rms errors with the noise
+    of the sensor, geometric means over the references; None if they are not known.
+    ``why`` tells why the gains were stopped or not tried.
     """
 
     gains: dict[str, float]
@@ -42,11 +42,12 @@ class Attempt(BaseModel):
 class RetuneReport(BaseModel):
     """Report of a retuning, the content of ``retune.json``.
 
-    ``title`` is that of the study. ``before`` are all gains of the stage before,
-    ``units`` their units by path. The ``attempts`` begin with gains that were on the
-    stage. ``best`` is the place of those that are set at the end; None if these are the
-    safe gains. ``verdict`` is "done", "stopped" (the user or a fault ended it: the safe
-    gains are set) or "lost" (no connection); "running" until then.
+    ``title`` is that of the study. ``before`` holds all gains of the stage before the
+    retuning, ``units`` the units of gains by path. The ``attempts`` begin with the
+    gains that were on the stage. ``best`` is the index of the best attempt, None if no
+    gains followed the references. ``verdict`` is "done", "stopped" (the user or a fault
+    ended the retuning: the safe gains are set) or "lost" (no connection); "running"
+    until then.
     """
 
     stage: str
@@ -68,16 +69,20 @@ class RetuneReport(BaseModel):
 
     @property
     def improved(self) -> bool:
-        """Whether the best gains are others than those of the first attempt."""
+        """Whether the best attempt is not the first one."""
         return self.best is not None and self.best > 0
 
     @property
     def tuned(self) -> bool:
-        """Whether tuned gains were run; the first show what the start hides."""
+        """Whether tuned gains were run.
+
+        The first ones are run whatever their prediction: their runs may show dynamics
+        that those of the start hide.
+        """
         return any(each.model and each.verdict != "not tried" for each in self.attempts)
 
     @property
     def ratio(self) -> float:
-        """Error at the beginning relative to the best one; infinite if a run with these
-        gains was stopped."""
+        """Error of the first attempt relative to the best one; infinite if the first
+        attempt was stopped."""
         return self.attempts[0].error / self.best_error if self.attempts else math.nan

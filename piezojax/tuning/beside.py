@@ -52,7 +52,7 @@ class FiguresBeside:
     def all(self, tuned: HeldOut, progress: Progress) -> dict[str, Beside]:
         """Return the figures of all controllers, of the start and of the tuned loop.
 
-        There are none without ``begin``.
+        The result is empty without ``begin``.
         """
         if not self._found:
             return {}

@@ -21,10 +21,10 @@ from .traces import Trace, traces_of
 from .unexplained import STRETCHES, Suppression, residual_disturbances, suppression_of
 
 _STREAMS: dict[Part, int] = {"train": 0, "validate": 1}
-"""Streams of one seed: the hold-out draws are new for every reference."""
+"""Random streams of one seed: the hold-out has other draws than tuning."""
 
 PLACES = 8
-"""Number of places at which holding inputs are computed together."""
+"""Holding inputs are computed at a multiple of this number of places."""
 
 
 @dataclass
@@ -45,8 +45,8 @@ class Data:
 def make_data(case: Case) -> Data:
     """Return the signals of ``case``, the tuning references before the unseen ones.
 
-    The noise of the hold-out comes from a random stream of its own. With a fitted plant
-    there are ``STRETCHES`` times as many draws.
+    The noise of the hold-out comes from a random stream of its own. With a residual
+    both parts have ``STRETCHES`` times as many draws.
     """
     study = case.study
     (holding,) = holding_inputs(own_stage(case.loop), case.references[:, 0])
@@ -70,9 +70,10 @@ def depends_on_loop(case: Case) -> bool:
 
 
 def judging(data: Data, case: Case, loop: Feedback) -> Data:
-    """Return ``data`` with the residual of the plant where it harms ``loop`` most.
+    """Return ``data`` with the stretches of the residual that harm ``loop`` most.
 
-    Only the hold-out changes. Without a residual, and on several axes, nothing does.
+    Only the hold-out changes. ``data`` is returned as it is without a residual, and on
+    several axes.
     """
     study, highest = case.study, case.highest_reference
     if not depends_on_loop(case) or isinstance(highest, tuple):
@@ -90,9 +91,9 @@ def _signals(
     holding: jax.Array | None,
     loop: Suppression | None = None,
 ) -> Signals:
-    """Return the signals of all references; ``part`` is that of the record.
+    """Return the signals of all references, with one ``part`` of the records.
 
-    The training part is for tuning, the validation part for the hold-out.
+    The part "train" is for tuning, "validate" for the hold-out.
     """
     study, references = case.study, case.references
     time_s = waveforms.time_grid(study.references.duration, study.rate)

@@ -33,11 +33,11 @@ from .objective import MARGIN_BLOCK, StepTest, margins_on
 from .runs import Signals, evaluate
 
 EVERY = 65
-"""Largest number of plants whose margins a search computes all at every point: those
-that an ensemble draws by default, and the nominal one."""
+"""Number of plants up to which a search computes the margins of all at every point: the
+default number of an ensemble and the nominal plant."""
 
 CARRIED = 16
-"""Number of plants whose margins a search computes if there are more."""
+"""Number of plants whose margins a search computes if there are more than ``EVERY``."""
 
 RUN_BLOCK = 8
 """Plants on which runs are simulated in one call of a program."""

@@ -43,8 +43,8 @@ class Figures(NamedTuple):
 class Doubt(NamedTuple):
     """Relative errors that ``QUANTILE`` of the unseen gain sets do not exceed.
 
-    Those of the rms ``errors`` [references], of their geometric ``mean``, and of the
-    ``margins`` [margins].
+    They are given for the rms ``errors`` [references], for their geometric ``mean``,
+    and for the ``margins`` [margins].
     """
 
     errors: np.ndarray
@@ -99,8 +99,8 @@ class GainSurrogate:
 def gain_surrogate(outcome: Outcome) -> GainSurrogate | str:
     """Return the surrogate of the tuned loop of ``outcome``, or why there is none.
 
-    Its figures are those of ``simulate_near``; the first of the gain sets are left out
-    of the interpolation and test it.
+    It interpolates the gain sets of ``simulate_near``, except the first ``BATCH``: they
+    test it.
     """
     if outcome.case.study.axes is not None:
         return "they are for one axis only"
@@ -117,9 +117,9 @@ def gain_surrogate(outcome: Outcome) -> GainSurrogate | str:
 
 
 def fitted(near: NearGains, references: tuple[str, ...]) -> GainSurrogate:
-    """Return the surrogate that interpolates all sets of ``near`` but the first ones.
+    """Return the surrogate that interpolates ``near``, tested on its first sets.
 
-    A margin that is unlimited for some of the gains is left out.
+    A margin that is unlimited for some of the sets is left out.
     """
     places, found = near.places, near.simulated
     limited = [
@@ -168,7 +168,7 @@ def _interpolant(
         np.block([[rows], [polynomial, zeros]]),
         np.vstack([outputs, np.zeros((len(polynomial), outputs.shape[1]))]),
     )
-    # The page carries them: the errors on unseen sets are those of what it carries.
+    # The page stores float32 numbers; the errors on unseen sets include that rounding.
     weights, basis = weights.astype(np.float32), bases[-1].astype(np.float32)
     return Interpolant(centres, weights, tuple(map(len, bases)), basis)
 
@@ -176,7 +176,7 @@ def _interpolant(
 def _principal_components(signals: np.ndarray) -> np.ndarray:
     """Return the principal components [components, samples] of ``signals``.
 
-    The signals are not centred: the norm of their coefficients is their own.
+    The signals are not centred: each has the norm of its coefficients.
     """
     _, sizes, components = np.linalg.svd(signals, full_matrices=False)
     least = np.min(np.linalg.norm(signals, axis=1))

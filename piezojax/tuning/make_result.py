@@ -43,8 +43,8 @@ def make_result(
 ) -> Result:
     """Return the Result of ``search``.
 
-    ``before`` are the tuning figures of the study's own gains. ``loops`` are that loop,
-    "before", and the "tuned" one, ``kept`` the outcomes of the limits while tuning.
+    ``before`` are the tuning figures of the study's own gains. ``loops`` holds the
+    loops "before" and "tuned", ``kept`` the outcomes of the limits in tuning.
     """
     driven = np.array([trace.driven for trace in data.traces])
     tuned_on = np.arange(len(data.traces)) < data.tuned

@@ -27,13 +27,13 @@ BATCH = 32
 """Number of gain sets that are simulated at once."""
 
 WIDEST = 2.0
-"""Factor between a tuned gain and the ends of its range, on a logarithmic scale."""
+"""Largest factor between a gain on a logarithmic scale and the ends of its range."""
 
 WIDEST_SHARE = 0.25
-"""Largest distance of these ends from the tuned gain, as a share of its bounds."""
+"""Largest distance of the ends from any tuned gain, as a share of the unit box."""
 
 SAMPLES = 1000
-"""Number of samples of a run above which only every n-th is kept."""
+"""Approximate largest number of samples kept of a run: every n-th, n at least 2."""
 
 LARGEST_PEAK = 5.0
 """Largest sensitivity peak of a gain set that counts as stable."""
@@ -54,7 +54,7 @@ class Margin(NamedTuple):
         return CONSTRAINTS[self.constraint].unit
 
     def worst(self, values: jax.Array) -> jax.Array:
-        """Return the worst of ``values``, those of branches or of bands too."""
+        """Return the worst of ``values`` over all branches and bands."""
         at_most = CONSTRAINTS[self.constraint].sense == "at most"
         return jnp.max(values) if at_most else jnp.min(values)
 
@@ -91,7 +91,7 @@ class NearGains(NamedTuple):
 
     ``places`` [sets, gains] run from 0 to 1 in that range. The first ``BATCH`` sets are
     random; then come the tuned set, the sets with one gain at an end of its range, and
-    further random ones. The step has the ``times`` (s).
+    further random ones. ``times`` (s) are those of the step.
     """
 
     lower: np.ndarray
@@ -104,9 +104,9 @@ class NearGains(NamedTuple):
 def simulate_near(outcome: Outcome) -> NearGains | None:
     """Simulate gain sets near the tuned one of ``outcome``, on one axis.
 
-    The range is halved until every set is stable; None if that is never so. The plant
-    is the nominal one, references and noise are those of the hold-out, and the margins
-    are those at the highest reference.
+    The range is halved until every set is stable; None if one is not stable in the
+    smallest range either. The plant is the nominal one, references and noise are those
+    of the hold-out, and the margins are those at the highest reference.
     """
     space, seed = outcome.case.space, outcome.case.study.seed
     tuned = np.asarray(space.to_unit(as_array([*outcome.result.gains.values()])))
@@ -125,7 +125,7 @@ def simulate_near(outcome: Outcome) -> NearGains | None:
 
 
 def _widest(space: Space) -> np.ndarray:
-    """Return the largest distance of the ends from the tuned gains, of the box."""
+    """Return the largest distance [gains] of a range's ends from the tuned gains."""
     return np.array(
         [
             min(WIDEST_SHARE, math.log(WIDEST) / math.log(bounds.upper / bounds.lower))
@@ -137,14 +137,14 @@ def _widest(space: Space) -> np.ndarray:
 
 
 def _random_places(gains: int, seed: int) -> np.ndarray:
-    """Return ``BATCH`` places that test, and all others that are not given."""
+    """Return ``BATCH`` places for the test, and the random ones to interpolate."""
     sampler = scipy.stats.qmc.Halton(gains, rng=np.random.default_rng(seed))
     interpolated = BATCH * min(max(gains, 2), 8)
     return sampler.random(BATCH + interpolated - 1 - 2 * gains)
 
 
 def _ends(own: np.ndarray) -> np.ndarray:
-    """Return the places ``own`` with one value at 0 or 1, if it is not there."""
+    """Return copies of ``own`` with one value moved to 0 or 1, without unmoved ones."""
     moved = np.eye(own.size, dtype=bool)
     places = np.concatenate([np.where(moved, end, own) for end in (0.0, 1.0)])
     return places[np.any(places != own, axis=1)]  # equal centres cannot be interpolated
@@ -199,7 +199,7 @@ def _program(outcome: Outcome) -> tuple[Callable, np.ndarray]:
 
 
 def _with_run(signals: Signals, reference: jax.Array, outcome: Outcome) -> Signals:
-    """Return ``signals`` and a run of ``reference`` without noise or disturbance."""
+    """Return ``signals`` and a run of ``reference``, with noise and disturbances 0."""
     noise = jax.tree.map(
         lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])]), signals.run_noise
     )

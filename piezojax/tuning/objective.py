@@ -122,9 +122,10 @@ class Objective(eqx.Module):
     error above the scale counts.
 
     ``stages``, stacked on a leading axis, replace the loop's own. ``over`` joins them:
-    their mean, the worst, or the mean over the worst share ``tail``. ``effort_weight``
-    and ``slew_weight`` weight the mean RMS voltage and the mean RMS change of voltage
-    per sample, both as a share of ``voltage_span``, which are added to the error.
+    their mean, the worst, or the mean over the worst share ``tail``. The mean RMS
+    voltage, weighted by ``effort_weight``, and the mean RMS change of voltage per
+    sample, weighted by ``slew_weight``, are added to the error, both as shares of
+    ``voltage_span``.
 
     ``limits`` are the limits of constraints by name (``constraints.CONSTRAINTS``). They
     must hold on every stage; limits on margins must hold on every one of

@@ -187,8 +187,8 @@ class Beside(BaseModel):
     ``worst_rms_um`` are its median and its largest value over ``plants`` held-out
     plants. On a plant on which a run diverges or stays at a voltage limit the error is
     infinite; ``unstable`` counts these plants. An infinite figure is None.
-    ``sensitivity_peak`` is the largest on these plants, on the nominal one without
-    them; None if it is not limited.
+    ``sensitivity_peak`` is the largest on these plants, or that of the nominal plant if
+    there are none; None if it is not limited.
     """
 
     nominal_rms_um: float | None

@@ -29,16 +29,18 @@ RUNS = 10
 """Default number of runs on the stage."""
 
 WITHIN, LEAST, MOST = 10.0, 1.5, 100.0
-"""Factor by which a gain may change at first, the smallest and the largest one."""
+"""First, smallest and largest value of the factor by which a gain may change."""
 
 NEAR = 1.3
-"""Ratio of the measured to the predicted error up to which this factor grows."""
+"""Ratio of the measured to the predicted error of better gains up to which this factor
+grows."""
 
 ENOUGH = 0.95
-"""Ratio of the predicted to the best error above which the retuning ends."""
+"""Ratio of the predicted to the best error above which gains are not tried, once tuned
+gains were run."""
 
 PATIENCE = 2
-"""Number of attempts in a row without an improvement after which it ends."""
+"""Number of attempts in a row without an improvement that end the retuning."""
 
 
 def retune(
@@ -53,18 +55,18 @@ def retune(
 ) -> RetuneReport:
     """Improve the gains of ``stage`` for the references of ``study``, in ``runs`` runs.
 
-    The gains of the stage are saved and measured first. Then, in turn, the plant is
-    fitted to the last runs, the study is tuned on it near the best gains, and the new
-    gains follow a small motion and all references to tune on. Gains with an alarm are
-    not tried. The best gains are set again after others that are not better, and at the
-    end. Any other end leaves the safe gains of the stage.
+    The gains of the stage are saved and measured first. Then three steps repeat: the
+    plant is fitted to the last runs, the study is tuned on it near the best gains, and
+    the stage follows a small motion and all tuning references with the new gains. Gains
+    with an alarm are not tried. After gains that are not better, and at the end, the
+    best gains are set again. If the retuning is stopped, the safe gains are set.
 
     ``folder`` receives the samples of every run, the models, the best gains and, after
     each step, the report. A report in it is continued.
 
     Raises ValueError for a study with several axes or an amplifier, a plant that was
-    not fitted, a stage with other gains or another sample time, and a report of another
-    study; and as ``build`` and ``identify`` do.
+    not fitted, a stage that lacks a tuned gain or has another sample time, and a report
+    of another study; and as ``build`` and ``tune`` do.
     """
     progress, path = progress or Silent(), Path(study)
     description = load(path)
@@ -104,7 +106,7 @@ def retune(
 
 
 class _HopelessError(Exception):
-    """The stage does not follow with gains that it followed with, or with safe ones."""
+    """A small motion with the best or the safe gains was stopped."""
 
 
 def _check(case: Case, stage: Stage) -> None:
@@ -131,7 +133,7 @@ def _check(case: Case, stage: Stage) -> None:
 def _report(
     folder: Path, name: str, study: Study, case: Case, stage: Stage
 ) -> RetuneReport:
-    """Return the report in ``folder`` to go on with, or a new one."""
+    """Return the report in ``folder``, to be continued, or a new one."""
     file, known = folder / RETUNE_FILE, sha256_of(study)
     if not file.exists():
         own = scalars(case.loop.controller)
@@ -153,10 +155,10 @@ def _report(
 
 
 def _measure_present(bench: Bench) -> None:
-    """Measure the gains of the stage; if they are stopped, its safe gains.
+    """Measure the gains of the stage or, if a run with them is stopped, its safe gains.
 
-    If the latter are stopped too, they follow small shares of the first reference.
-    Raises _HopelessError if a small motion with the safe gains is stopped.
+    If the safe gains are stopped too, the stage follows small shares of the first
+    reference with them. Raises _HopelessError if they are stopped in the small motion.
     """
     report = bench.report
     for kind in ("gains", "safe gains"):
@@ -167,7 +169,7 @@ def _measure_present(bench: Bench) -> None:
             return
         report.notes.append(f"the {kind} of the stage were stopped: {attempt.why}")
     if report.runs[-1].reference != PROBE:
-        # Slow gains follow less of it, and that shows the plant.
+        # Slow gains can follow a small share, and such runs show the plant.
         for share in SMALL:
             bench.run(bench.stage.gains(), bench.motions[0], share)
     else:
@@ -193,10 +195,11 @@ def _improve(bench: Bench, plant: KnownPlant, case: Case, path: Path) -> None:
 def _next_gains(
     bench: Bench, plant: KnownPlant, case: Case, path: Path, within: float
 ) -> tuple[Attempt, Outcome] | None:
-    """Return gains that are worth a run, or None and a note for the report.
+    """Return gains that are worth a run, or None; add a note for those that are not.
 
-    The plant is fitted to the last runs. Stopped ones may contain what no plant
-    explains, such as a limit: if they lead to nothing, the others alone are fitted.
+    The plant is fitted to the last runs. Stopped runs may contain effects that no plant
+    explains, such as a limit. If the fit to them gives no such gains, the plant is
+    fitted to the other runs alone.
     """
     report = bench.report
     best = None if report.best is None else report.attempts[report.best].gains
@@ -250,9 +253,9 @@ def _fit_again(
 ) -> Sequence[str]:
     """Fit ``plant`` to ``records``; write it with its residual; return its alarms.
 
-    If it describes the ``small`` ones alone, they give its dynamics: an error of the
-    hysteresis in a large motion would move them. A plant that cannot be fitted is not
-    written, and the reason is returned.
+    If the plant describes the ``small`` records alone, its dynamics are fitted to them:
+    in a large motion, an error of the hysteresis would distort the dynamics. A plant
+    that cannot be fitted is not written, and the reason is returned.
     """
     try:
         fit = identify(
@@ -266,7 +269,7 @@ def _fit_again(
 
 
 def _with_shown(plant: KnownPlant, small: Sequence[Record]) -> KnownPlant:
-    """Return ``plant`` with the dynamics that the ``small`` records show, if any do."""
+    """Return ``plant``, with dynamics fitted to ``small`` if it describes them."""
     if not small:
         return plant
     every = slice(0, max(record.samples for record in small))
@@ -280,8 +283,8 @@ def _near(
 ) -> Study:
     """Return the study with the plant in ``file``, to be tuned near the gains ``best``.
 
-    The search starts from them, and changes each by the factor ``within`` at most.
-    Without them it is that of the study.
+    The search starts from ``best`` and changes each gain by the factor ``within`` at
+    most. Without ``best`` the search is that of the study.
     """
     changes: dict[str, Any] = {"plant": {"file": str(file.resolve())}}
     if best is not None:
@@ -308,7 +311,8 @@ def _predicted(outcome: Outcome) -> float | None:
 def _try(bench: Bench, attempt: Attempt, outcome: Outcome) -> None:
     """Run ``attempt`` and keep its gains if they are better.
 
-    Raises _HopelessError if it was stopped and the best gains are stopped since.
+    Raises _HopelessError if it was stopped, and then a small motion with the best gains
+    is stopped too.
     """
     report = bench.report
     bench.measure(attempt)
@@ -322,7 +326,7 @@ def _try(bench: Bench, attempt: Attempt, outcome: Outcome) -> None:
     if attempt.verdict != "better":
         bench.restore()
     if stopped and len(report.runs) < bench.budget:
-        # The gains, or a fault of the stage? Gains that it followed with tell.
+        # A small motion with the best gains shows whether the stage has a fault.
         found = bench.run(bench.stage.gains(), small_motion(bench.motions[0]))
         if found.stopped:
             raise _HopelessError(f"{PROBE} after a stopped run: {found.stopped}")

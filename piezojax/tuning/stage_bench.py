@@ -19,17 +19,17 @@ PROBE = "small motion"
 """Name of the small motion in the list of runs."""
 
 RINGING = 2.0
-"""Ratio of the rms error in the small motion to that of the motion itself above which
-the loop rings: a sensitivity peak of 2 allows no more."""
+"""Ratio of the rms error in the small motion to the standard deviation of its reference
+above which the loop rings: a sensitivity peak of 2 allows no more."""
 
 FITTED, SHORTEST = 4, 400
-"""Number of runs that are records of the plant, the last ones; fewest samples of a run
-that was stopped."""
+"""Number of last runs to which the plant is fitted, and the fewest samples of such a
+run."""
 
 
 @dataclass
 class Bench:
-    """The stage with its runs: what was run, and what may still be run."""
+    """Stage with the runs of a retuning, at most ``budget`` of them."""
 
     stage: Stage
     motions: Sequence[Motion]
@@ -54,7 +54,7 @@ class Bench:
             found = self.run(attempt.gains, motion)
             stopped = found.stopped
             if motion.name == PROBE and _rings(found, motion):
-                self.stage.safe()  # the guard has not seen it
+                self.stage.safe()  # the guard did not stop it
                 stopped = "the loop rings"
             if stopped or found.measured_um is None:
                 attempt.verdict, attempt.why = "stopped", f"{motion.name}: {stopped}"
@@ -83,13 +83,14 @@ class Bench:
             self.stage.apply(self.report.attempts[self.report.best].gains)
 
     def records(self) -> list[list[Record]]:
-        """Return records of the last runs, and if some were stopped, of the others.
+        """Return the records of the last runs, and those of the last complete runs.
 
-        Each ends at its first missing number.
+        Complete runs are those that were not stopped. Equal sets are returned once. A
+        record ends at its first missing number.
         """
         runs = self.report.runs
         sets = runs[-FITTED:], [run for run in runs if not run.stopped][-FITTED:]
-        # A run that is too short for a record is in neither.
+        # A run that is too short for a record is in neither set.
         found = {
             tuple(record.source for record in records): records
             for each in sets

@@ -53,17 +53,17 @@ def residual_disturbances(
 ) -> Float[np.ndarray, "stretches samples ..."]:
     """Return the worst stretches of ``residual`` under ``reference``, in its unit.
 
-    Without them, a controller that contains the fitted model would be tuned and
-    evaluated as if the stage were that model. The errors of a hysteresis depend on the
-    path of the stage. The residual therefore advances with the distance that the
-    reference travels, or with time if that advances it farther. It is played forwards
-    and backwards until the reference ends. ``time_s`` are the times of the samples of
-    the reference, ``part`` names the part of the records.
+    Without this disturbance, a controller that contains the fitted model would be tuned
+    and evaluated as if the stage were that model. The error of a hysteresis model
+    depends on the path of the stage. The residual therefore advances with the distance
+    that the reference travels, or with time if that advances it farther. It is played
+    forwards and backwards until the reference ends. ``time_s`` are the times of the
+    samples of the reference, ``part`` names the part of the records.
 
     Of many starting points, evenly spaced over that part of each record, two are
     chosen: those with the largest error through ``loop``, each as it is or as its
     change since its first sample, whichever is worse. Without ``loop`` they are the one
-    with the largest deviation, for slow loops, and the one with the largest fast
+    with the largest deviation from its mean, and the one with the largest fast
     changes. Several axes share one distance, and one deviation in which each axis is
     divided by the deviation of its residual.
     """

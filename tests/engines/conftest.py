@@ -5,14 +5,14 @@ from piezojax.engines import native_library as library
 
 @pytest.fixture
 def no_libraries(monkeypatch):
-    """Let every library be compiled anew."""
+    """Compile every library anew."""
     monkeypatch.setattr(library, "_kept", lambda name: None)
     monkeypatch.setattr(library, "_libraries", {})
 
 
 @pytest.fixture
 def compiled(monkeypatch, no_libraries):
-    """Return the list to which each compiled library is added."""
+    """Return a list that gains an entry for each compiled library."""
     found = []
     compile_ = library._compiled
     monkeypatch.setattr(

@@ -98,7 +98,7 @@ class Everything(Plain):
 
 
 def primitives(jaxpr):
-    """Yield the names of the operations of a jaxpr and of those inside it."""
+    """Yield the names of the operations of a jaxpr and of the jaxprs inside it."""
     for equation in jaxpr.eqns:
         yield equation.primitive.name
         for value in equation.params.values():
@@ -122,7 +122,7 @@ def kernel_of(program, *arguments):
 
 
 def lowered(program, *arguments, platform="cpu"):
-    """Return the text of a program for a platform."""
+    """Return the text of a program lowered for a platform."""
     traced = jax.jit(program).trace(*arguments)
     return traced.lower(lowering_platforms=(platform,)).as_text()
 
@@ -143,7 +143,7 @@ def loop_inputs():
 
 
 def lanes_of(system, path, inputs, metric, start=0.0):
-    """Return the function from values of ``path`` and an engine to the results."""
+    """Return a function from values of ``path`` and an engine to the results."""
 
     def simulated(values, engine, **options):
         def lane(value):

@@ -28,12 +28,12 @@ SAMPLES = 23
 
 @pytest.fixture(autouse=True)
 def short_segments(monkeypatch):
-    """Let the runs have several segments, the last one shorter."""
+    """Divide the runs into several segments, the last one shorter."""
     monkeypatch.setattr(reverse, "LEAST", 5)
 
 
 class Means(Metric):
-    """Means of the output and its square, and a decaying maximum by the count."""
+    """Means of the output and its square, and a decaying maximum over the count."""
 
     def init(self):
         return jnp.zeros(2), jnp.zeros(()), jnp.zeros((), jnp.int32)
@@ -110,7 +110,7 @@ def assert_equals_loop(loss, *arguments, calls=2, places=0):
     ("samples", "every"), [(3, 0), (5, 1), (SAMPLES, 0), (SAMPLES, 1)]
 )
 def test_gradient_by_numbers_and_start(samples, every):
-    """One run of C with the carries, one for the log if any, and the reverse pass."""
+    """C runs once with the carries, once for a log if any, and once in reverse."""
 
     def loss(gain, offsets, x, engine):
         system = Mixed(gain, offsets) >> FirstOrderLag(1e-3, 1e-4)
@@ -158,7 +158,7 @@ LOOPS = {
     ],
 )
 def test_loops_of_many_lanes(name, lanes, shared):
-    """Gains of all lanes or of each, with references and noise of each."""
+    """Gains shared by all lanes or one per lane; references and noise of each lane."""
     controller, plant, paths = LOOPS[name]
     loop = Feedback(controller, plant, Saturation(-20.0, 120.0), Sensor(0.01))
     rng = np.random.default_rng(2)
@@ -232,7 +232,7 @@ def simple(gain, scale=1.0, inputs=None):
 
 
 def test_other_gradients_use_the_loop():
-    """Derivatives by inputs, of spaced logs, and of steps without a scalar form."""
+    """Derivatives with respect to inputs, and of logs that skip outputs."""
     by_input = with_reverse_pass(lambda u: simple(2.0, inputs=u))
     assert kernels(by_input, driven()) == 0
     difference = simple(2.0, inputs=driven().at[3].add(1e-6)) - simple(2.0)

@@ -280,10 +280,14 @@ def test_several_channels():
         x = np.array([0.9, 0.8]) * x + value
     # The step of a plant returns the next sample.
     y = np.array([y[0], *y[:-1]]) + [1.0, -2.0]
-    found = validate(system, About(), Record(u, y, DT, source="two.csv"))
+    about = About(input_ranges=[(-1e3, 1e3), (0.0, 1.0)])
+    two = Record(u, y, DT, input_units=("V", "mA"), source="two.csv")
+    found = validate(system, about, two)
     (check,) = found.report.records
     assert check.zero == pytest.approx([1.0, -2.0], abs=1e-6)
     assert check.rmse < 1e-6
+    (note,) = [note for note in found.report.notes if "extrapolates" in note]
+    assert "mA, the record of the model 0 to 1:" in note
 
 
 @pytest.mark.parametrize(

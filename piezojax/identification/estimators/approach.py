@@ -24,24 +24,24 @@ from ...hysteresis.model import hystereses
 from ...solve.multi_start import in_batches
 
 TURNS = 3
-"""Levels of the motion before a record."""
+"""Number of levels of the motion before a record."""
 
 SAMPLES = 500
-"""Samples of the motion from one level to the next."""
+"""Number of samples of the motion from one level to the next."""
 
 LEVELS = 9
-"""Levels tried for each turning point."""
+"""Number of values tried for each level, in all combinations."""
 
 REFINED = 3
 """Number of candidates of the grid that are refined: the local optimum near the best
 one may be poor."""
 
 FINE = 5 * 3**TURNS
-"""Levels tried for each turning point alone at the end."""
+"""Number of values tried afterwards for each level by itself."""
 
 BEYOND = 0.2
-"""Share of the input's range by which the levels may lie outside of it: a stage that
-was switched on has been at 0 V, and its record need not go there."""
+"""Share of the input's range by which the levels may lie outside it: a stage was at 0 V
+when it was switched on, and its record may not include 0 V."""
 
 FINEST = 1.0 / 1024.0
 """Share of the input's range to which the levels are refined."""
@@ -215,8 +215,8 @@ class _LevelSearch(NamedTuple):
     """Search for the levels, from ``low`` to ``high`` [m] or scalars.
 
     The free runs of ``system`` under ``inputs`` are compared with the ``outputs``
-    [samples, p] of ``part``. ``columns`` [samples p, k] are the effects of the zeros
-    and of the states before the record; their coefficients are those of
+    [samples, p] of ``part``. The methods take ``columns`` [samples p, k], the effects
+    of the zeros and of the states before the record; their coefficients are those of
     ``most_likely``.
     """
 
@@ -335,11 +335,11 @@ class _LevelSearch(NamedTuple):
 
 
 class Start(eqx.Module):
-    """State before a record: after a slow motion over levels of the input.
+    """State before a record, reached by a slow motion over ``levels`` of the input.
 
-    ``ends`` are those of the range of the inputs. The zeros of the outputs and the
-    linear states before the record follow from ``most_likely``, for other errors of the
-    ``variance``.
+    ``ends`` are the ends of the range of the inputs. The zeros of the outputs and the
+    linear states before the record follow from ``most_likely``; ``variance`` is that of
+    the remaining errors.
     """
 
     levels: Float[Array, " turns *m"]
@@ -378,8 +378,8 @@ def most_likely(
     """Return the maximum a posteriori coefficients of ``columns`` in ``error``.
 
     The coefficients of the states have a prior standard deviation of 1 (see
-    ``start_columns``), those of the zeros an infinite one, and the other errors have
-    the ``variance``. Only samples with ``counted`` equal to 1 are used. The
+    ``start_columns``), those of the zeros an infinite one; ``variance`` is that of
+    the remaining errors. Only samples with ``counted`` equal to 1 are used. The
     coefficients minimise the sum of the squared errors plus ``variance`` times the
     squared coefficients of the states.
     """

@@ -21,8 +21,8 @@ from .structure import Structure
 class Problem(eqx.Module):
     """Fit of one System to several records, padded to one length with zero weights.
 
-    A single record begins at rest. Each of several records has its own start, stacked
-    in ``starts``. ``plain`` (0 or 1) is the weight of the errors, ``share`` that of the
+    Without ``starts`` every record begins at rest; ``starts`` stacks a start for each
+    record. ``plain`` (0 or 1) is the weight of the errors, ``share`` that of the
     errors filtered by ``whitening``, if it has coefficients.
     """
 

@@ -32,7 +32,7 @@ def free_run(
 def from_rest(system: System, input: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """Return the free run from the rest input of the model, or from the first input.
 
-    A System of several inputs starts from the first of these.
+    A System of several inputs starts from their first sample.
     """
     before = input_before(system, input[0]) if input.ndim == 1 else input[0]
     return free_run(system, input, before)
@@ -65,8 +65,8 @@ def free_runs(
 ) -> tuple[tuple[np.ndarray, ...], list[float]]:
     """Return the free run [samples, 1] of each of ``records``, and their zeros.
 
-    A single record begins at rest and has no zero of its own; the starts of several
-    records, or with ``own_starts``, are estimated on their samples ``train``.
+    A single record begins at rest and has no zero of its own. With several records, or
+    with ``own_starts``, their starts and zeros are estimated on the samples ``train``.
     """
     if own_starts or len(records) > 1:
         _, runs, zeros = starts_of(system, records, train)

@@ -17,11 +17,11 @@ ORDER = 2
 """Order of the polynomials."""
 
 HALF = 5
-"""Lines on each side of the window of an arbitrary input."""
+"""Number of lines on each side of the centre of a window, for an arbitrary input."""
 
 BETWEEN = 5
-"""Lines on each side, between those of the input, that show the transient of a periodic
-input."""
+"""Number of lines on each side of a line of a periodic input that show the transient;
+they lie between the lines of the input."""
 
 CHUNK = 20_000
 """Windows that are solved at a time."""
@@ -33,9 +33,9 @@ def local_polynomial(
     """Estimate the response to any ``input`` [samples], best with all lines excited.
 
     In each window of 2 HALF + 1 lines the response and the transient are parabolas. One
-    line in HALF + 1 is returned, because closer estimates use mostly the same lines.
-    Windows are left out if the input has less than the share ``least`` of the power in
-    the strongest, or if they do not determine the response. ``dt`` in s. Raises
+    line in HALF + 1 is returned, because closer estimates use mostly the same lines. A
+    window is left out if its input power is less than the share ``least`` of that in
+    the strongest window, or if it does not determine the response. ``dt`` in s. Raises
     ValueError if no line is left.
     """
     samples = input.size
@@ -101,10 +101,10 @@ def periodic_local_polynomial(
     only transient and noise: a parabola over 2 BETWEEN of these lines gives the
     transient in each line of the input, and the noise. The response is not smoothed
     over frequency. All whole periods at the end of the record are used, including the
-    transient; the variance includes the noise of the input. ``least`` as for
-    ``local_polynomial``; lines in which the input has less than CLEAR times its
-    variance are left out too. Raises ValueError for fewer than two periods, or a period
-    too short.
+    transient; the variance includes the noise of the input. Lines in which the input
+    has less than the share ``least`` of the power of its strongest line, or less than
+    CLEAR times its variance, are left out. Raises ValueError for fewer than two
+    periods, or a period too short.
     """
     count = input.size // period
     if count < 2:

@@ -5,10 +5,10 @@ the input. From the input to the output the cross spectrum gives
 
     (G S_w - conj(K_y) S_v) / (S_w + |K_y|^2 S_v)
 
-with the spectrum S_w of ``K_r r + d`` and that S_v of v: the response of the stage
+with the spectra S_w of ``K_r r + d`` and S_v of v: this is the response of the stage
 where the excitation is strong, and ``-1 / K_y`` where the noise is strong (Ljung,
 System Identification, 2nd ed., 13.4). The approaches ``indirect`` and ``joint`` use
-only what is correlated with the excitation.
+only the part of the signals that is correlated with the excitation.
 """
 
 from typing import NamedTuple
@@ -89,15 +89,15 @@ def joint_response(
     segment: int | None = None,
     least: float = EXCITED,
 ) -> SpectralResponse:
-    """Estimate the response of ``output`` over that of ``input`` to an excitation.
+    """Estimate the ratio of the responses of ``output`` and ``input`` to an excitation.
 
-    ``excitation`` [samples, k], the other signals [samples], other arguments as for
-    ``spectral_response``. Noise that is independent of the excitation leaves the
-    estimate unbiased for long records. ``power`` is the part of the input power that
-    the excitation explains.
+    ``excitation`` is [samples, k], the other signals are [samples]; the other arguments
+    are those of ``spectral_response``. If the noise is independent of the excitation,
+    the estimate is unbiased for long records. The ``power`` returned is the part of the
+    input power that the excitation explains.
 
     Raises ValueError for an excitation that never changes, and as
-    ``spectral_response``.
+    ``spectral_response`` does.
     """
     check_excitation(excitation)
     if period is not None:
@@ -107,8 +107,13 @@ def joint_response(
 
 
 class _Spectra(NamedTuple):
-    """Spectra by line: of the ``excitation`` [lines, k, k], and of both signals with it
-    [lines, k]; powers of both and their cross spectrum [lines]; number of averages."""
+    """Spectra of a record, by line.
+
+    ``excitation`` [lines, k, k] is the spectrum matrix of the excitations, ``input``
+    and ``output`` [lines, k] are the cross spectra of both signals with them. ``power``
+    and ``total`` [lines] are the powers of input and output, ``cross`` [lines] is their
+    cross spectrum, ``averages`` the number of averages.
+    """
 
     frequency: np.ndarray
     excitation: np.ndarray
@@ -215,7 +220,7 @@ def controller_responses(
     """Return the responses [lines] of the command to the reference and to the output.
 
     ``frequency`` [lines] in Hz. The applied voltage of a sample is the command of the
-    sample before. At 0 Hz, where a controller may have a pole, they are 0.
+    sample before. At 0 Hz, where a controller may have a pole, both responses are 0.
     """
     rest = Observation(0.0, 0.0, 0.0, 0.0)
     model = linearise(controller, rest, dt=dt)

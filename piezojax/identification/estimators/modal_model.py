@@ -88,7 +88,7 @@ def lines_of(
 ) -> Lines:
     """Return the data of a fit at ``frequency`` (Hz); ``held`` as for ``modal_fit``.
 
-    ``count`` images on either side count.
+    ``count`` images on either side are included.
     """
     omega = 2.0 * np.pi * frequency
     if held is None:
@@ -218,7 +218,7 @@ class ModalFit:
     deviation of the noise of the real and of the imaginary part. ``excess`` is the mean
     square of the residual relative to the variance of the response, None if that is not
     known. ``searched`` is the number of lines in the search, below that of the response
-    if lines were merged; ``held`` is the argument of ``modal_fit``.
+    if lines were merged; ``held`` is the sample time (s) of converters, if any.
     """
 
     frequency: tuple[ModalValue, ...]

@@ -15,8 +15,8 @@ NU = 1.5
 """Exponent nu of the starts."""
 
 WIDE = 100.0
-"""Upper bound of beta_gamma and beta_delta, as a multiple of the starts; their unit
-depends on nu."""
+"""Upper bound of the size of beta_gamma and beta_delta, as a multiple of twice their
+size at the starts; their unit depends on nu."""
 
 
 def bouc_wen(record: Record) -> Structure:

@@ -104,7 +104,7 @@ class PreisachFit(NamedTuple):
 def distinguishable_cells(record: Record, train: slice, model: str = PLAIN) -> int:
     """Return the number of cells per side that the samples ``train`` determine, or 0.
 
-    They determine the cells for each of the histories STARTS before the record.
+    They must do so for each of the assumed histories before the record (STARTS).
     """
     seen = _delayed_input(record.until(train.stop))
     return next(
@@ -194,7 +194,7 @@ class _Problem(NamedTuple):
         return self.errors(self.fitted(logs, start).system())
 
     def slopes(self, logs: np.ndarray, start: str) -> np.ndarray:
-        """Return the slopes of those errors, one column per unknown."""
+        """Return the slopes of ``reduced``, one column per unknown."""
         here = self.reduced(logs, start)
         moved = [self.reduced(logs + s, start) for s in STEP * np.eye(logs.size)]
         return (np.column_stack(moved) - here[:, None]) / STEP

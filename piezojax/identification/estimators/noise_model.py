@@ -10,10 +10,11 @@ from .refined import NOISE_ORDER
 def whitening_filter(errors: Sequence[np.ndarray]) -> np.ndarray:
     """Return the filter [NOISE_ORDER + 1] that makes ``errors`` white.
 
-    Each of the errors [samples] is a stretch of one process. The filter is found by
-    least squares: the Yule-Walker equations include the edges of a stretch, which
-    leaves strongly coloured errors correlated. The first coefficient is 1. A stretch of
-    too few samples is not used; without any, the filter passes the errors unchanged.
+    ``errors`` are stretches [samples] of one process. The filter is found by least
+    squares, because the Yule-Walker equations include the edges of a stretch, and leave
+    strongly coloured errors correlated. The first coefficient is 1. A stretch of too
+    few samples is not used; if all are too short, the filter passes the errors
+    unchanged.
     """
     windows = [
         np.lib.stride_tricks.sliding_window_view(each, NOISE_ORDER + 1)[:, ::-1]

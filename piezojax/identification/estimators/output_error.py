@@ -120,9 +120,9 @@ def output_error(
     long record is fitted from the optimum of its first samples (``leading``), except
     for the ``own`` and ``slow`` parameters, which these do not determine. The error
     counts over the samples ``train`` of each record; the model sees the input alone,
-    from the first sample on. With several records the state before each and the zero of
-    each take the place of the structure's ``own`` parameters; so does that of a single
-    one with ``own_starts``.
+    from the first sample on. With several records, or with ``own_starts``, the state
+    before each record and its zero are estimated in place of the structure's ``own``
+    parameters.
 
     With a ``noise_model`` the error is that of the prediction by the model and an
     autoregressive model of its errors, which are fitted alternately (Ljung, System
@@ -199,10 +199,10 @@ def _inside(units: np.ndarray) -> np.ndarray:
 def _descended(
     problem: Problem, starts: np.ndarray, width: int, steps: int, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return at most ``width`` best points, their losses, and if the best has ended.
+    """Return the best points, their losses, and whether the best descent has ended.
 
-    ``width`` starts descend together. Raises ValueError when no start leads to a finite
-    simulation.
+    ``width`` starts descend together, and at most as many points are returned. Raises
+    ValueError if no start leads to a finite simulation.
     """
     evaluate = trials_with_models(lambda free: _normal_equations(problem, free), width)
     descents = [

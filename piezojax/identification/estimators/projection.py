@@ -28,7 +28,7 @@ STABLE = 0.9999
 
 
 def projected(signal: np.ndarray, excitation: np.ndarray) -> np.ndarray:
-    """Return the response of ``signal`` [samples] to ``excitation`` [samples, k].
+    """Return the part of ``signal`` [samples] due to ``excitation`` [samples, k].
 
     The model is linear, of the order with the least Akaike information criterion. The
     share of the noise that remains is about the number of coefficients over the number
@@ -48,7 +48,7 @@ def check_excitation(excitation: np.ndarray) -> None:
 
 @lru_cache(maxsize=8)
 def _projected(content: bytes, columns: int) -> np.ndarray:
-    """Return ``projected`` of the first column; reports ask for the same ones again."""
+    """Return ``projected`` of the first column; cached, as reports need it again."""
     both = np.frombuffer(content).reshape(-1, columns)
     signal, excitation = both[:, 0], both[:, 1:]
     samples, signals = excitation.shape
@@ -73,7 +73,7 @@ def _projected(content: bytes, columns: int) -> np.ndarray:
 
 
 def excited_columns(record: Record, columns: np.ndarray) -> np.ndarray:
-    """Return the ``columns`` [samples, p] that respond to the excitation of ``record``.
+    """Return the part of ``columns`` [samples, p] that the excitation of a loop causes.
 
     They are returned unchanged for a record of an open loop or of too few samples, and
     if they are not finite.
@@ -100,8 +100,8 @@ def excited_part(record: Record) -> Record:
 def _regressed(signals: np.ndarray, order: int, first: int) -> tuple[np.ndarray, float]:
     """Return the coefficients for the first signal, and the residual sum of squares.
 
-    They are those of its own past, then those of each excitation from its present on,
-    then the mean.
+    They are those of its own past, then those of the present and past of each
+    excitation, then the constant.
     """
     windows = np.lib.stride_tricks.sliding_window_view(signals, order + 1, axis=0)
     windows = windows[first - order :, :, ::-1]
@@ -122,7 +122,7 @@ def _regressed(signals: np.ndarray, order: int, first: int) -> tuple[np.ndarray,
 def _response(solution: np.ndarray, excitation: np.ndarray) -> np.ndarray:
     """Return the output [samples] of the model under the excitation, without its mean.
 
-    The mean is not that of the model, whose static gain is not known well if a pole is
+    The mean is removed, because the static gain of the model is uncertain if a pole is
     close to 1.
     """
     import scipy.signal  # takes long to import

@@ -49,10 +49,10 @@ class RecursiveLeastSquares(System):
     the estimate follows a plant that changes. ``c`` (1/V) is not estimated: take it
     from a fit. ``forgetting`` is lambda in (0, 1]: a sample n samples old has the
     weight lambda^n. ``prior`` is the variance of every coefficient before the first
-    sample; a larger one weakens the start at zero. The covariance is carried as a
-    square root (Potter's update), which stays positive over any run. Without noise, or
-    at lambda = 1 and a large prior, the result is that of ``least_squares``, including
-    its bias under noise.
+    sample; a larger one weakens the start at zero. The covariance is stored as a
+    square root (Potter's update), so that it stays positive over any run. Without
+    noise, or at lambda = 1 and a large prior, the result is that of ``least_squares``,
+    including its bias under noise.
 
     Raises ValueError for ``c >= 0``, forgetting outside (0, 1], a prior that is not
     positive, no coefficients or an unknown scheme.
@@ -73,7 +73,7 @@ class RecursiveLeastSquares(System):
         self._operators()
 
     def init(self, input: Measured = REST) -> RecursiveState:
-        """Return the state at zero coefficients, the plant at rest under ``input``."""
+        """Return the state of zero coefficients and a plant at rest under ``input``."""
         size = self._structure().size
         hysteresis, now = self._operate(None, input.voltage)
         return RecursiveState(

@@ -38,7 +38,7 @@ CONVERGED = 1e-7
 
 @dataclass(frozen=True)
 class RegressionFit:
-    """A fitted model, um from V.
+    """A fitted model from V to um.
 
     ``simulation_rms`` and ``one_step_rms`` (unit of the output) are the errors of the
     free run and of the one-step prediction over the training part. ``standard_errors``

@@ -20,7 +20,7 @@ SHORTEST = 400
 """Least number of samples from which dynamics are identified."""
 
 LONGEST = 40_000
-"""Number of samples that are used, those in which the output moves fastest."""
+"""Largest number of samples used; the output moves fastest in those chosen."""
 
 THRESHOLDS = (0.0, *np.geomspace(0.005, 0.4, 7))
 """Thresholds of the plays of the Hammerstein model, shares of the input's range."""
@@ -66,10 +66,10 @@ the record explains."""
 class LinearDynamics(NamedTuple):
     """Resonances, strongest first, time constants of lags (s) and the delay (s).
 
-    ``delay`` is beyond the one sample between input and output. ``slope`` is that of
-    the output over the full range of the input, below the resonances. Both are None if
-    no dynamics could be identified. ``whitening`` is the filter of the errors. ``slew``
-    is the slew rate of the input (its unit per s), None if it shows no limit.
+    ``delay`` is in excess of the one sample between input and output. ``slope`` is that
+    of the output over the full range of the input, below the resonances. Both are None
+    if no dynamics could be identified. ``whitening`` is the filter of the errors.
+    ``slew`` is the slew rate of the input (its unit per s), None if it shows no limit.
     """
 
     modes: tuple[Resonance, ...] = ()
@@ -194,7 +194,8 @@ class _Hammerstein(NamedTuple):
 
         The step response of a mode (poles p and conj(p) in the s plane) in series with
         lags (poles r) has at p the residue ``gain w^2 / ((p - conj(p)) p)`` divided by
-        ``prod (1 - p / r)``. So has the discrete transfer function over z - 1.
+        ``prod (1 - p / r)``. The discrete transfer function over z - 1 has the same
+        residue.
         """
         poles, slow = self.dynamics.poles(), self._real_rates()
         upper = poles[np.imag(poles) > 1e-9]
@@ -282,7 +283,7 @@ def _rates(mode: Resonance) -> tuple[complex, complex]:
 
 
 def _held(rates: Sequence[complex], dt: float, turn: np.ndarray) -> np.ndarray:
-    """Return the response to a held input at the end of the sample, unit DC gain.
+    """Return the response, of unit DC gain, to a held input at the end of the sample.
 
     ``rates`` are the poles in the s plane (1/s), ``turn`` is exp(-2 pi i f dt).
     """

@@ -42,12 +42,12 @@ def fit_response(
 ) -> ResponseFit:
     """Fit a stable model with ``order`` states to ``measured``.
 
-    The cost is the mean square of the outputs' error under the records' own inputs, not
-    noise-weighted, as in a validation by simulation. The fit starts at the subspace
-    estimate of McKelvey, Akcay and Ljung (IEEE Trans. Automatic Control 41, 1996,
-    algorithm 1) with ``rows`` block rows, stabilised if necessary, and is ``refined``
-    from there. Raises ValueError unless 1 <= order < rows * p, or for fewer lines than
-    the block rows need.
+    The cost is the mean square of the output error under the inputs of the records, as
+    in a validation by simulation; it is not weighted by the noise. The fit starts at
+    the subspace estimate of McKelvey, Akcay and Ljung (IEEE Trans. Automatic Control
+    41, 1996, algorithm 1) with ``rows`` block rows, stabilised if necessary, and is
+    ``refined`` from there. Raises ValueError unless 1 <= order < rows * p, or for fewer
+    lines than the block rows need.
     """
     lines, outputs, inputs = measured.response.shape
     if not 1 <= order < rows * outputs:
@@ -221,7 +221,7 @@ def _cost(modes: _Modes, data: _Data) -> Array:
 
 @jax.jit
 def _normal_equations(modes: _Modes, data: _Data) -> tuple[Array, Array]:
-    """Return gradient and Gauss-Newton matrix of half the cost, as in ``_moved``."""
+    """Return gradient and Gauss-Newton matrix of half the cost; order as ``_moved``."""
     outputs, inputs = modes.feedthrough.shape
 
     def slopes(response):

@@ -21,7 +21,7 @@ SAME_LEVEL = 0.1
 """Largest relative difference of the rms inputs of records of one level."""
 
 OFFSET = 0.1
-"""Mean of an input, as a share of its rms about it, above which a note warns."""
+"""Mean of an input, as a share of its standard deviation, above which a note warns."""
 
 
 def fit_scheduled(
@@ -134,9 +134,10 @@ def by_amplitude(
 def _run(
     model: AmplitudeScheduled, inputs: Float[np.ndarray, "n m"], period: int
 ) -> Float[np.ndarray, "n p"]:
-    """Return the outputs of a ``model`` one sample ahead, at the times of ``inputs``.
+    """Return the outputs of ``model`` at the times of ``inputs``.
 
-    It runs over one more period first, so that it has settled.
+    The model maps u(k) to y(k+1). It runs over one more period first, so that it has
+    settled.
     """
     whole = np.concatenate([inputs[:period], inputs])
     return np.asarray(steady_run(model, as_array(whole), 0))[period - 1 : -1]

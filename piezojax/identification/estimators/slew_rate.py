@@ -6,10 +6,10 @@ import numpy as np
 
 JUMP, STEPS, RARE = 0.05, 5, 0.02
 """Change of the input in a sample, as a share of its range, that is a step; fewest
-steps that show a slew rate, and largest share of samples with one."""
+steps that show a slew rate, and largest share of samples with a step."""
 
 SAMPLES = tuple(np.geomspace(0.75, 75.0, 12))
-"""Numbers of samples tried for the largest step at the slew rate."""
+"""Durations tried for the largest step at the slew rate, in samples."""
 
 ROUNDS = 3
 """Refinements of the slew rate, each with half the logarithmic step of the last."""
@@ -25,7 +25,7 @@ def has_steps(x: np.ndarray) -> bool:
 
 
 def slewed(x: np.ndarray, most: float) -> np.ndarray:
-    """Return the mean over each sample of ``x`` limited to a change of ``most`` in one.
+    """Return ``x`` slewed by at most ``most`` per sample, averaged over each sample.
 
     The result is that of ``dynamics.AmplifierSlew`` from rest under the first sample.
     """

@@ -12,8 +12,8 @@ from ...core.system import System
 class Prior(NamedTuple):
     """Normal prior of the parameters of a structure, in the unit box.
 
-    ``known`` [n] are the most likely values; ``weights`` [n] are those of the
-    differences from them beside the errors of the output, in its unit.
+    ``known`` [n] are the most likely values. The differences from them are multiplied
+    by ``weights`` [n] (unit of the output); their squares add to the mean square error.
     """
 
     known: np.ndarray

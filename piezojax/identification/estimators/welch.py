@@ -132,9 +132,9 @@ def _welch(
 
 
 def segment_length(samples: int) -> int:
-    """Return the number of samples in a segment by default: a power of 2.
+    """Return the default number of samples in a segment, a power of 2.
 
-    AVERAGES of them fit into ``samples``.
+    AVERAGES segments fit into ``samples``, unless they would be shorter than SHORTEST.
     """
     return max(SHORTEST, 2 ** int(np.log2(max(1, samples // AVERAGES))))
 

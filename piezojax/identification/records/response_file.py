@@ -57,10 +57,11 @@ def read_responses(
     and magnitude (a ratio, or dB re 1 unit of the response) with phase (degrees or
     radians), or real and imaginary part, or complex numbers, as the variables
     ``ResponseData``, ``Frequency`` and ``FrequencyUnit`` of a MATLAB file. A frequency
-    without a unit is in Hz, an omega in rad/s. With several columns of one role each
-    pair is a response: columns belong together by the number in their names, or by
-    their order. A column ``deviation`` is the standard deviation of a single response.
-    Other columns are ignored. The lines are sorted; one at 0 Hz is left out.
+    without a unit is in Hz, an omega in rad/s. With several columns of one role, each
+    pair of columns is a response; they are paired by the number in their names, or else
+    by their order. Columns ``deviation``, ``noise_deviation`` (standard deviations) and
+    ``coherence`` are read if the file holds a single response. Other columns are
+    ignored. The lines are sorted; one at 0 Hz is left out.
 
     A Touchstone file is read too: S11 of one port, S21 of two. ``unit`` is that of the
     response, if its columns do not state it; by default UNIT.

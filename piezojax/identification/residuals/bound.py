@@ -4,8 +4,8 @@ The residual ``e = y - y_model`` and the output of the model respond to the same
 The relative error is the ratio ``|G_eu| / |G_mu|`` of their empirical frequency
 responses, so that the model need not be linearised. The part of the residual that is
 not a linear response (noise, and hysteresis that the model does not follow) widens the
-confidence interval. In a closed loop noise reaches the input too, and both are the
-responses to the reference or the dither, if the record holds one.
+confidence interval. In a closed loop noise reaches the input too; if the record holds
+a reference or a dither, the ratio is that of the responses to it.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ CERTAIN = 1.0
 excited, unless the error itself is certain."""
 
 CHANCE = 0.01
-"""Probability that a line of a closed loop counts as excited by noise alone."""
+"""Probability that noise alone makes a line of a closed loop count as excited."""
 
 AVERAGES = 8
 """Segments without overlap into which a record is divided."""
@@ -50,9 +50,9 @@ parameters may absorb as much of the smooth error of the mode."""
 class RelativeError(NamedTuple):
     """Relative error of a model [lines] at the ``frequency`` (Hz) of excited lines.
 
-    ``error`` is the estimate, ``margin`` the half-width of its 99 % interval, ``gain``
-    that of the model, output over input. ``resolution`` (Hz) is the distance of two
-    lines if both are excited.
+    ``error`` is the estimate, ``margin`` the half-width of its 99 % interval, and
+    ``gain`` the gain of the model, output over input. ``resolution`` (Hz) is the
+    spacing of all lines, excited or not.
     """
 
     frequency: np.ndarray
@@ -126,11 +126,11 @@ def _closed_loop_error(
         for one, other, least in ((model, error, 0.0), (input, model, LEAST))
     )
     resolution = 1.0 / (segment * record.dt)
-    # Of noise alone, few averages explain a share by chance.
+    # With few averages, the excitation explains a share of pure noise by chance.
     chance = 1.0 - CHANCE ** (1.0 / max(own.averages - 1.0, 1.0))
     places = _places(own, resolution)
     excited = _stands_out(own.power, places)
-    # Where the excitation is leakage of its own other lines, so is what follows it.
+    # Where the excitation is leakage from its other lines, so is the response to it.
     excited &= _stands_out(_power(signals, segment)[places], places)
     if np.any(excited & (own.coherence > chance)):
         excited &= own.coherence > chance
@@ -178,7 +178,7 @@ def error_bound(
     """Return the error bound of a model from its free ``runs`` over ``records``.
 
     Every record has one input and one output, and so has its run. Raises ValueError as
-    ``relative_error``.
+    ``relative_error`` does.
     """
     return joined(
         [

@@ -11,7 +11,7 @@ LAGS = 25
 
 NORMAL = 3.54
 """Half-width, in standard deviations, of the interval that holds all LAGS normal
-estimates at once with 99 % (Bonferroni)."""
+estimates at once with a probability of 99 % (Bonferroni)."""
 
 
 class Correlation(BaseModel):

@@ -13,11 +13,11 @@ OWN, LAGS = 80, 3
 has more, because the output of a stage contains information on much older inputs."""
 
 STRETCH = 1000
-"""Samples that are predicted with one set of coefficients; those of a chirp vary."""
+"""Samples predicted with one set of coefficients; for a chirp, coefficients vary."""
 
 SHARE = 0.01
-"""Least share of the unpredictable part of the input that past outputs explain, from
-which the input counts as made by feedback."""
+"""Share of the unpredictable part of the input, explained by past outputs, from which
+the input counts as made by feedback."""
 
 PROBABILITY = 1e-4
 """Largest probability of such a share by chance."""
@@ -33,9 +33,9 @@ input counts as predictable from its own past."""
 def feedback_share(input: np.ndarray, output: np.ndarray) -> float:
     """Return the share of the input's prediction error that past outputs explain.
 
-    Both [samples]. The share expected by chance is subtracted. It is 0 if the rest may
-    be due to chance, for a record shorter than STRETCH, and for an input that its own
-    past determines.
+    Both [samples]. The share expected by chance is subtracted. The result is 0 if the
+    rest may be due to chance, for a record shorter than STRETCH, and for an input that
+    its own past determines.
     """
     likelihood, more, count = 0.0, 0, 0
     for start in range(0, min(input.size, MOST * STRETCH) - STRETCH + 1, STRETCH):
@@ -43,7 +43,7 @@ def feedback_share(input: np.ndarray, output: np.ndarray) -> float:
         own, both, rows = _left(input[part], output[part])
         if own <= PREDICTABLE * np.var(input[part]) * rows:
             continue
-        # Each stretch by its own variance: one with a large error would outweigh all.
+        # Each stretch counts relative to its own variance: none outweighs the others.
         likelihood += rows * np.log(own / max(both, np.finfo(float).tiny))
         more, count = more + LAGS, count + rows
     if not more or scipy.stats.chi2.sf(likelihood, more) > PROBABILITY:

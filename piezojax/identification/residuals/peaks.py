@@ -21,7 +21,8 @@ TOP = 0.9
 """Ratio of the lower ends of two lines above which either may be the top of a peak."""
 
 CLEAR = 3.0
-"""Noise of a line with little noise, as a multiple of the least noise beside it."""
+"""Largest noise of a line that counts as having little, as a multiple of the least
+noise on its side of the peak."""
 
 ENOUGH = 4
 """Least number of lines on a side of a peak."""
@@ -42,7 +43,8 @@ def unmodelled_peaks(found: RelativeError) -> list[Peak]:
 
     A peak counts if the lower end of its interval is above ``LEAST``, a line on its
     flanks is sure and has a similar error (at the top leakage widens the interval), and
-    it exceeds the errors on both sides within an octave by the factor ``SHARP``.
+    its error exceeds the median errors on both sides within an octave by the factor
+    ``SHARP``.
     """
     frequency, error = found.frequency, found.error
     amplitude = found.lower * found.gain / max(found.gain[0], np.finfo(float).tiny)
