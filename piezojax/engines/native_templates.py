@@ -151,10 +151,14 @@ REVERSE = Template(
 )
 """Reverse pass: each segment runs forward again from its stored carry, then back."""
 
-BACK = {
-    "start": """struct steady steady$g;
-        struct slopes slopes$g;
+STEADY = """struct steady steady$g;
         start_steady(&steady$g, &fixed, shared, own + $g * WIDTH);
+        """
+"""Start of each group, forward and back."""
+
+BACK = {
+    "start": STEADY
+    + """struct slopes slopes$g;
         start_slopes(&slopes$g, slope_start + block * $sloping * STRIDE + $g * WIDTH,
                      &fixed, &steady$g, shared, own + $g * WIDTH, NULL);""",
     "again": """struct values values$g;
@@ -171,9 +175,8 @@ BACK = {
 """Parts of ``REVERSE`` for each group."""
 
 VALUES = {
-    "start": """struct steady steady$g;
-        struct values values$g;
-        start_steady(&steady$g, &fixed, shared, own + $g * WIDTH);
+    "start": STEADY
+    + """struct values values$g;
         start_values(&values$g, start + block * $carried * STRIDE + $g * WIDTH,
                      &fixed, &steady$g, shared, own + $g * WIDTH, NULL);""",
     "step": """step_values(&values$g, &kept, k, lanes, &fixed, &steady$g, shared,
