@@ -28,7 +28,7 @@ from ..control.anticipation import Anticipation
 from ..control.multi_axis import MultiAxisSlidingMode
 from ..control.state_sliding_mode import StateSlidingMode
 from ..control.switching import SwitchingPID
-from ..core.axes import PerAxis, as_matrices, as_rows, diagonal
+from ..core.axes import PerAxis, as_matrices
 from ..core.feedback import Feedback
 from ..core.system import System
 from ..dynamics import MatrixARMA, SecondOrderLag, StateSpace, observability_form
@@ -85,7 +85,7 @@ def model(order: int = 12) -> StateSpace:
 
 
 def stage(*, order: int = 12) -> MatrixARMA:
-    """Return the mirror as plant of a loop, with a sample of delay for computation."""
+    """Return the mirror as the plant of a loop, delayed by a sample for computation."""
     return observability_form(model(order).delayed())
 
 
@@ -95,25 +95,26 @@ def detailed_stage() -> MatrixARMA:
 
 
 def multi_axis() -> MultiAxisSlidingMode:
-    """Return the control of chapter 7 on the model of 12 states and a sample of delay.
+    """Return the control of chapter 7 of Y. Cao's thesis, on the model of 12 states.
 
-    ``SURFACE``, ``REACHING``, ``PROPORTIONAL`` and ``INTEGRAL`` are ours: a random
-    search maximised the simultaneous margin of all axes around ``stage()``. The surface
-    is scaled by the inverse of S B, so the sliding variable is in V.
+    The model includes a sample of delay. ``SURFACE``, ``REACHING``, ``PROPORTIONAL``
+    and ``INTEGRAL`` are ours: a random search maximised the simultaneous margin of all
+    axes around ``stage()``. The surface is scaled by the inverse of S B, so the sliding
+    variable is in V.
 
     The gains hold for that model alone. On the model of 24 states the loop is unstable
-    (largest pole 1.25), because the prediction of chapter 7 needs a model of every
-    resonance; ``state_sliding_mode`` is stable on both. The real mirror will probably
-    need other gains or a better model.
+    (largest modulus of a pole 1.25), because the prediction of chapter 7 needs a model
+    of every resonance; ``state_sliding_mode`` is stable on both. The real mirror will
+    probably need other gains or a better model.
     """
     plant = stage(order=12)
     scale = _surface_scale(plant)
-    unit = np.eye(3)
+    none = (0.0, 0.0, 0.0)
     lags = FREQUENCY, DAMPING, DT
     return MultiAxisSlidingMode(
-        SwitchingPID(PROPORTIONAL * unit, INTEGRAL * unit, 0.0 * unit, dt=DT),
-        reaching=diagonal(REACHING),
-        decoupling=as_rows(0.0 * unit),
+        SwitchingPID((PROPORTIONAL,) * 3, (INTEGRAL,) * 3, none, dt=DT),
+        reaching=REACHING,
+        decoupling=none,
         surface=as_matrices(scale @ np.diag(weights) for weights in SURFACE),
         model=plant,
         reference_model=PerAxis(tuple(SecondOrderLag(*lags) for _ in range(3))),
@@ -124,15 +125,16 @@ def state_sliding_mode() -> StateSlidingMode:
     """Return state-tracking control on the model of 24 states; gains ours.
 
     ``STATE_GAINS`` come from a grid of three values each. With them the loop is stable
-    on the model of 24 states and on that of 12, with largest poles of 0.990 and 0.996.
+    on the model of 24 states and on that of 12; the largest moduli of its poles are
+    0.990 and 0.996.
     """
-    unit = np.eye(3)
+    none = (0.0, 0.0, 0.0)
     lags = FREQUENCY, DAMPING, DT
     return StateSlidingMode(
-        SwitchingPID(0.0 * unit, 0.0 * unit, 0.0 * unit, dt=DT),
+        SwitchingPID(none, none, none, dt=DT),
         model(24).delayed(),
         PerAxis(tuple(SecondOrderLag(*lags) for _ in range(3))),
-        reaching=diagonal((0.9,) * 3),
+        reaching=(0.9,) * 3,
         **STATE_GAINS,
     )
 

@@ -16,7 +16,7 @@ from ..control.nominal import NominalSlidingMode
 from ..control.pid import PID
 from ..control.state_sliding_mode import StateSlidingMode
 from ..control.switching import SwitchingPID
-from ..core.axes import PerAxis, diagonal
+from ..core.axes import PerAxis
 from ..core.feedback import Feedback
 from ..core.system import System
 from ..dynamics import ARMA, Channels, SecondOrderLag, channels_of, observability_form
@@ -114,16 +114,16 @@ def multi_axis(gains: str = "dynamic", filtered: bool = True) -> System:
     chosen = _one_of(MULTI_AXIS_GAINS, gains)
     scale = (SURFACE**2, 2.0 * SURFACE, 1.0)
     law = SwitchingPID(
-        diagonal(chosen["proportional"]),
-        diagonal(chosen["integral"]),
-        diagonal((0.0, 0.0, 0.0)),
+        chosen["proportional"],
+        chosen["integral"],
+        (0.0, 0.0, 0.0),
         dt=DT,
     )
     controller = MultiAxisSlidingMode(
         law,
-        reaching=diagonal(REACHING),
+        reaching=REACHING,
         decoupling=DECOUPLING,
-        surface=tuple(diagonal((s, s, s)) for s in scale),
+        surface=tuple((s, s, s) for s in scale),
         model=observability_form(p558.model("7")),
         reference_model=PerAxis(
             tuple(SecondOrderLag(chosen["frequency"], DAMPING, DT) for _ in OUTPUTS),
@@ -141,14 +141,14 @@ def state_sliding_mode() -> System:
 
     Reaching gain and reference model are those of ``multi_axis``.
     """
-    none = diagonal((0.0, 0.0, 0.0))
+    none = (0.0, 0.0, 0.0)
     frequency = MULTI_AXIS_GAINS["dynamic"]["frequency"]
     lags = tuple(SecondOrderLag(frequency, DAMPING, DT) for _ in OUTPUTS)
     return StateSlidingMode(
         SwitchingPID(none, none, none, dt=DT),
         p558.model("7"),
         PerAxis(lags, OUTPUTS),
-        reaching=diagonal(REACHING),
+        reaching=REACHING,
         **STATE_WEIGHTS,
     )
 
@@ -171,7 +171,7 @@ def anticipating_disturbance_observer() -> System:
 def nominal(arx: str = "repaired", filtered: bool = True, **options: Any) -> System:
     """Return a nominal PID-based sliding mode control on each axis, Table 8-1.
 
-    ``arx`` is "repaired" or "printed"; ``options`` are of ``NominalSlidingMode``.
+    ``arx`` is "repaired" or "printed"; ``options`` are those of ``NominalSlidingMode``.
     """
     return _per_axis("nominal", arx, filtered, options)
 
@@ -234,9 +234,10 @@ def loop(
     noise_rms: tuple[float, float, float] = NOISE_RMS,
     plant: System | None = None,
 ) -> Feedback:
-    """Return a loop of ``controller`` and ``plant``, by default (7.53), unlimited.
+    """Return a loop of ``controller`` and ``plant``, by default (7.53).
 
-    ``noise_rms`` in um, urad, urad.
+    Commands are limited to +-1e4, far beyond the travel. ``noise_rms`` in um, urad,
+    urad.
     """
     wide = PerAxis(tuple(Saturation(-1e4, 1e4) for _ in OUTPUTS), OUTPUTS)
     sensor = PerAxis(tuple(Sensor(rms) for rms in noise_rms), OUTPUTS)

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from ..core.arrays import State, as_array
 from ..core.axes import (
     Axes,
+    Matrix,
     Rows,
-    as_matrices,
-    as_rows,
+    as_full,
+    as_matrix,
     check_square,
     diagonal,
     inverse,
@@ -20,10 +21,10 @@ from ..core.axes import (
     product,
 )
 from ..core.feedback import Observation
-from ..core.parameter import PartUnits, declarations, parameter
+from ..core.parameter import PartUnits, parameter
 from ..core.system import Designed, System
 from ..dynamics.matrix_arma import MatrixARMA
-from .switching import SwitchingLaw
+from .switching import SwitchingLaw, check_gains
 
 
 class MultiAxisState(NamedTuple):
@@ -48,15 +49,16 @@ class MultiAxisSlidingMode(Designed):
     ``model`` has q axes and any number p of lags. The command is u1 + u2. u1 moves the
     model along the output y_d of ``reference_model``, which maps r(k) to y_d(k+1):
     ``u1(k) = F1 R1 - K_s (u1(k-1) + ... + u1(k-p+1))`` with
-    ``R1 = y_d(k+1) - sum_i A_i y_d``, ``decoupling`` K_s [q, q], lower triangular in
-    the thesis, and F1 = (I + (p-1) K_s)(sum B)^-1, so that the axes are decoupled at
-    rest. u2 acts on e = y - y_d. The state X2 = [e(k); e(k+1); ...; e(k+p-1)] contains
-    the known part of later errors, which depends on past e and u2 alone, and
-    ``s = surface[0] e(k) + surface[1] e(k+1) + ...`` (7.28), each [q, q];
+    ``R1 = y_d(k+1) - A_(p-1) y_d(k) - ... - A_0 y_d(k-p+1)``, ``decoupling`` K_s
+    [q, q], lower triangular in the thesis, and F1 = (I + (p-1) K_s)(sum B)^-1, so that
+    the axes are decoupled at rest. u2 acts on e = y - y_d. The state
+    X2 = [e(k); e(k+1); ...; e(k+p-1)] holds e(k) and the part of later errors that
+    follows from e up to e(k) and past u2 alone. The sliding variable is
+    ``s = surface[0] e(k) + surface[1] e(k+1) + ...`` (7.28), each matrix [q, q];
     ``u2 = (S B)^-1 (reaching s - S A X2) + law(s)`` with ``reaching`` PHI [q, q]. In
-    the thesis the law is a ``SwitchingPID`` with matrices [q, q] of gains; its output
+    the thesis the law is a ``SwitchingPID`` with one gain for each axis; its output
     is in the unit of the commands. PHI enters with the sign of (7.29), (7.31) and
-    (7.40); that of (7.30) and (7.34) is unstable.
+    (7.40); with that of (7.30) and (7.34) the loop is unstable.
 
     Input an Observation of q axes, output a tuple of q commands. The thesis filters the
     measurements (see ``Filtered``). No parameter is limited in sign, so a loop may be
@@ -64,11 +66,12 @@ class MultiAxisSlidingMode(Designed):
 
     At rest without disturbance the state is constant. If the DC gain of the model
     differs from that of the stage, a small error remains at s = 0, because the
-    prediction contains no disturbance, and the loop approaches it slowly from the
-    start.
+    prediction contains no disturbance. From the start the loop drifts slowly to this
+    error.
 
-    Raises ValueError for matrices that are not [q, q], or a surface that does not hold
-    p matrices.
+    A diagonal matrix may be given by the q numbers of its diagonal, which takes fewer
+    products in each step. Raises ValueError for other matrices that are not [q, q], or
+    a surface that does not hold p matrices.
     """
 
     part_units: ClassVar[PartUnits] = {"law": {"s": "um", "v": "[u]"}}
@@ -76,25 +79,22 @@ class MultiAxisSlidingMode(Designed):
     law: SwitchingLaw
     model: MatrixARMA
     reference_model: System
-    reaching: Rows = parameter(
-        "1", "reaching gain PHI", typical=(0.0, 0.99), converter=as_rows
+    reaching: Matrix = parameter(
+        "1", "reaching gain PHI", typical=(0.0, 0.99), converter=as_matrix
     )
-    decoupling: Rows = parameter(
-        "1", "static decoupling K_s", typical=(-0.45, 0.45), converter=as_rows
+    decoupling: Matrix = parameter(
+        "1", "static decoupling K_s", typical=(-0.45, 0.45), converter=as_matrix
     )
-    surface: tuple[Rows, ...] = parameter(
+    surface: tuple[Matrix, ...] = parameter(
         "1",
         "weights of the errors in s",
         typical=(-1.98, 1.98),
-        converter=as_matrices,
+        converter=lambda matrices: tuple(map(as_matrix, matrices)),
     )
 
     def __check_init__(self):
         q, p = self.model.axes, len(self.model.moving)
-        for name, _ in declarations(self.law):
-            gain = getattr(self.law, name)
-            if isinstance(gain, tuple):
-                check_square(f"law.{name}", gain, q)
+        check_gains(self.law, q)
         check_square("reaching", self.reaching, q)
         check_square("decoupling", self.decoupling, q)
         if len(self.surface) != p:
@@ -112,10 +112,11 @@ class MultiAxisSlidingMode(Designed):
 
     def resolved(self) -> "ResolvedMultiAxis":
         """Return the controller with its gain matrices computed."""
-        A, surface = self.model.autoregressive, self.surface
+        A, surface = self.model.autoregressive, tuple(map(as_full, self.surface))
         q, lags = self.model.axes, len(self.model.moving) - 1
         unit = diagonal([1.0] * q)
-        shared = plus(unit, jax.tree.map(lambda k: lags * k, self.decoupling))
+        decoupling = as_full(self.decoupling)
+        shared = plus(unit, jax.tree.map(lambda k: lags * k, decoupling))
         forward = matrix_product(shared, inverse(plus(*self.model.moving)))
         driven = plus(
             *(
@@ -130,12 +131,12 @@ class MultiAxisSlidingMode(Designed):
             moved = matrix_product(surface[-1], A[-1 - j])
             if j > 0:
                 moved = plus(moved, surface[j - 1])
-            wanted = minus(matrix_product(self.reaching, S), moved)
+            wanted = minus(matrix_product(as_full(self.reaching), S), moved)
             equivalent.append(matrix_product(reach, wanted))
         return ResolvedMultiAxis(
             self.law,
             self.decoupling,
-            surface,
+            self.surface,
             self.model,
             forward=forward,
             past_desired=tuple(matrix_product(forward, a) for a in A),
@@ -153,8 +154,8 @@ class ResolvedMultiAxis(System):
     """
 
     law: SwitchingLaw
-    decoupling: Rows
-    surface: tuple[Rows, ...]
+    decoupling: Matrix
+    surface: tuple[Matrix, ...]
     model: MatrixARMA
     forward: Rows
     past_desired: tuple[Rows, ...]
@@ -255,6 +256,6 @@ class ResolvedMultiAxis(System):
         return state, plus(forward, feedback)
 
 
-def _summed(matrices: tuple[Rows, ...], blocks: tuple[Axes, ...]) -> Axes:
+def _summed(matrices: tuple[Matrix, ...], blocks: tuple[Axes, ...]) -> Axes:
     pairs = zip(matrices, blocks, strict=True)
     return plus(*(product(matrix, block) for matrix, block in pairs))

@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 from ..core.arrays import Scalar, State, as_array
 from ..core.axes import (
     Axes,
-    Rows,
-    as_rows,
+    Matrix,
+    as_full,
+    as_matrix,
     check_square,
     minus,
     packed_matrix,
@@ -21,7 +22,7 @@ from ..core.parameter import PartUnits, parameter
 from ..core.system import Designed, System
 from ..dynamics.state_space import StateSpace
 from .riccati import riccati
-from .switching import SwitchingLaw
+from .switching import SwitchingLaw, check_gains
 
 Vector = Float[Array, " n"]
 
@@ -30,7 +31,7 @@ class StateSlidingModeState(NamedTuple):
     """States of the reference model and the law, the estimate, and the last signals.
 
     ``estimate`` holds x(k|k) of the model and the input disturbance d, ``desired``
-    y_d(k), ``command`` the last command.
+    y_d(k+1), ``command`` the last command.
     """
 
     reference_model: State
@@ -43,25 +44,25 @@ class StateSlidingModeState(NamedTuple):
 class StateSlidingMode(Designed):
     """Sliding mode control of q axes on the estimated state of ``model``.
 
-    The controller tracks states with state estimation, the first approach under the
-    third item of future work in the thesis; ``MultiAxisSlidingMode`` tracks outputs.
-    ``model`` has q inputs, q outputs and any number of states; u(k) moves it to y(k+1)
-    = C x(k+1). A steady-state Kalman filter estimates x and a disturbance d of the
-    inputs,
+    The controller tracks estimated states, as the thesis proposes (first approach under
+    the third item of future work); ``MultiAxisSlidingMode`` tracks outputs. ``model``
+    has q inputs, q outputs and any number of states; u(k) moves it to
+    y(k+1) = C x(k+1). A steady-state Kalman filter estimates x and a disturbance d of
+    the inputs,
 
     ``x(k+1) = A x(k) + B (u(k) + d(k) + w)``, ``d(k+1) = d(k) + n``, ``z = C x + v``,
 
     where w has the rms value ``process`` and n has ``drift``, both relative to that of
-    v, the sensor noise of all axes. The sliding variable s = B' P (x - N y_d) is zero
-    in the state in which the model rests at y_d, the output of ``reference_model`` from
-    r(k) to y_d(k+1). P solves the Riccati equation with the weights C' C and
+    v, the sensor noise of all axes. ``reference_model`` maps r(k) to y_d(k+1), and the
+    model rests at y_d in the state N y_d. The sliding variable is s = S (x - N y_d)
+    with S = B' P. P solves the Riccati equation with the weights C' C and
     ``effort_weight``^2, and the motion on s = 0 is stable for every weight. With the
     equivalent control, s(k+1) = ``reaching`` s(k) + S B law(s). The estimate of d
     removes offsets, so the law may be zero.
 
     Input an Observation of q axes, output a tuple of q commands. Raises ValueError for
     a model with a direct transmission or with different numbers of inputs and outputs,
-    and for ``reaching`` that is not [q, q].
+    and for ``reaching`` or a gain of the law that is not [q, q].
     """
 
     part_units: ClassVar[PartUnits] = {"law": {"s": "um", "v": "[u]"}}
@@ -69,22 +70,22 @@ class StateSlidingMode(Designed):
     law: SwitchingLaw
     model: StateSpace
     reference_model: System
-    reaching: Rows = parameter(
-        "1", "reaching gain PHI", typical=(0.0, 0.99), converter=as_rows
+    reaching: Matrix = parameter(
+        "1", "reaching gain PHI", typical=(0.0, 0.99), converter=as_matrix
     )
     effort_weight: Scalar = parameter(
         "um/[u]", "weight of the command", above=0.0, scale="log", typical=(1e-3, 1e2)
     )
     process: Scalar = parameter(
         "[u]/um",
-        "rms noise of the input over that of the sensor",
+        "rms noise of the input, relative to that of the sensor",
         above=0.0,
         scale="log",
         typical=(1e-3, 1e2),
     )
     drift: Scalar = parameter(
         "[u]/um",
-        "rms change of the disturbance in a sample over the noise of the sensor",
+        "rms change of the disturbance per sample, relative to the sensor noise",
         above=0.0,
         scale="log",
         typical=(1e-5, 1e1),
@@ -99,6 +100,7 @@ class StateSlidingMode(Designed):
             )
         if np.any(np.asarray(self.model.D)):
             raise ValueError("D of the model is not zero; y(k) must not depend on u(k)")
+        check_gains(self.law, outputs)
         check_square("reaching", self.reaching, outputs)
 
     @property
@@ -112,7 +114,7 @@ class StateSlidingMode(Designed):
         n, q = B.shape
         P, _ = riccati(A, B @ B.T / self.effort_weight**2, C.T @ C)
         S = B.T @ P
-        reach, PHI = jnp.linalg.inv(S @ B), packed_matrix(self.reaching)
+        reach, PHI = jnp.linalg.inv(S @ B), packed_matrix(as_full(self.reaching))
         # At rest at y the state is N y.
         gain = jnp.linalg.solve(jnp.eye(n) - A, B)
         N = gain @ jnp.linalg.inv(C @ gain)

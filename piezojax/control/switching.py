@@ -7,19 +7,19 @@ import jax
 import jax.numpy as jnp
 
 from ..core.arrays import Scalar, ScalarLike, Signal, State, as_array
-from ..core.axes import Rows, as_rows, product
-from ..core.parameter import parameter, sample_time
+from ..core.axes import Matrix, as_matrix, check_square, product
+from ..core.parameter import declarations, parameter, sample_time
 from ..core.system import System
 from .anti_windup import anti_windup
 
-Gain: TypeAlias = Scalar | Rows
-"""A gain of one axis, or a matrix of gains as rows of scalars."""
+Gain: TypeAlias = Scalar | Matrix
+"""A gain of one axis or for all axes, or a matrix of gains."""
 
 
 def as_gain(value: Any) -> Any:
-    """Return a number as a scalar, a matrix as rows of scalars."""
+    """Return a number as a scalar, and a matrix or its diagonal as a Matrix."""
     if isinstance(value, tuple | list) or jnp.ndim(value) == 2:
-        return as_rows(value)
+        return as_matrix(value)
     return as_array(value)
 
 
@@ -31,7 +31,7 @@ class SwitchingLaw(System):
 
     @abc.abstractmethod
     def start(self, sliding: Signal, output: Signal) -> State:
-        """Return the state in which the law gives ``output`` at a resting ``sliding``.
+        """Return the state in which the law gives ``output`` at a constant ``sliding``.
 
         A law without an integral adds a constant bias to its output, so that every
         start at rest is bumpless.
@@ -49,6 +49,14 @@ class SwitchingLaw(System):
         return self.start(input, jax.tree.map(jnp.zeros_like, input))
 
 
+def check_gains(law: SwitchingLaw, axes: int) -> None:
+    """Raise ValueError unless every matrix in ``law`` has ``axes`` rows and columns."""
+    for name, _ in declarations(law):
+        gain = getattr(law, name)
+        if isinstance(gain, tuple):
+            check_square(f"law.{name}", gain, axes)
+
+
 class SwitchingPIDState(NamedTuple):
     """Integral part in [v] and the last s in [s]."""
 
@@ -60,7 +68,8 @@ class SwitchingPID(SwitchingLaw):
     """PID as switching part: ``v = -(P s + I int s dt + D ds/dt)``.
 
     The law of (4.43), (5.18), (7.33) and (8.34). With several axes s and v are tuples
-    of one scalar per axis, and a gain is a matrix or a scalar for all axes.
+    of one scalar per axis, and a gain is a scalar for all axes, one number per axis, or
+    a matrix.
     ``anti_windup`` drives the integral by the difference of the applied and the last
     commanded v (back-calculation), for each axis separately; the thesis has none.
     """

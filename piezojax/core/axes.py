@@ -18,9 +18,11 @@ from .system import System
 
 Axes: TypeAlias = tuple[Scalar, ...]
 Rows: TypeAlias = tuple[tuple[Scalar, ...], ...]
+Matrix: TypeAlias = Rows | Axes
+"""A matrix as its rows, or a diagonal matrix as the numbers on its diagonal."""
 Plain: TypeAlias = tuple[Any, ...]
-"""Axes or Rows in a product, as plain tuples: checking the type of every scalar in
-every product would take most of the time of a traced test."""
+"""Axes, Rows or Matrix in a product, as plain tuples: checking the type of every scalar
+in every product would take most of the time of a traced test."""
 
 T = TypeVar("T")
 
@@ -35,6 +37,22 @@ def as_rows(values: Any) -> Rows:
         lengths = ", ".join(str(len(row)) for row in rows) or "none"
         raise ValueError(f"a matrix has rows of lengths {lengths}; they must be equal")
     return rows
+
+
+def as_matrix(values: Any) -> Matrix:
+    """Return a matrix as rows of scalars, or a diagonal [n] as a tuple of scalars.
+
+    A product with a diagonal takes n multiplications instead of n^2. Raises ValueError
+    unless all rows have one length.
+    """
+    values = tuple(values)
+    if values and not any(_is_row(value) for value in values):
+        return as_scalars(values)
+    return as_rows(values)
+
+
+def _is_row(value: Any) -> bool:
+    return isinstance(value, tuple | list) or jnp.ndim(value) > 0
 
 
 def as_matrices(values: Iterable[Any]) -> tuple[Rows, ...]:
@@ -52,13 +70,20 @@ def diagonal(values: Iterable[Any]) -> Rows:
     )
 
 
+def as_full(matrix: Matrix) -> Rows:
+    """Return the rows of ``matrix``, which may be a diagonal."""
+    return matrix if _is_row(matrix[0]) else diagonal(matrix)
+
+
 def packed_matrix(rows: Rows) -> jax.Array:
     """Return rows of scalars as a packed matrix [rows, columns]."""
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
 def product(matrix: Plain, vector: Plain) -> Plain:
-    """Return ``matrix @ vector``."""
+    """Return ``matrix @ vector``; a Matrix may be a diagonal."""
+    if not isinstance(matrix[0], tuple):
+        return tuple(m * v for m, v in zip(matrix, vector, strict=True))
     return tuple(
         sum(
             (m * v for m, v in zip(row[1:], vector[1:], strict=True)),
@@ -199,8 +224,9 @@ def packed(signals: Any) -> Any:
     )
 
 
-def check_square(name: str, matrix: Rows, size: int) -> None:
+def check_square(name: str, matrix: Matrix, size: int) -> None:
     """Raise ValueError unless ``matrix`` has ``size`` rows and columns, all finite."""
+    matrix = as_full(matrix)
     shape = len(matrix), len(matrix[0])
     if shape != (size, size):
         raise ValueError(

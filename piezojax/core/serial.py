@@ -90,11 +90,7 @@ def from_data(data: Any, where: str = "system") -> System:
 def _value_from_data(value: Any, kind: Any, where: str) -> Any:
     """Return ``value`` converted for a field of type ``kind``."""
     if isinstance(kind, UnionType):
-        listed = isinstance(value, list | tuple)
-        kind = next(
-            (arm for arm in get_args(kind) if (get_origin(arm) is tuple) == listed),
-            kind,
-        )
+        kind = min(get_args(kind), key=lambda arm: abs(_levels(arm) - _nested(value)))
     if get_origin(kind) is tuple:
         if not isinstance(value, list | tuple):
             raise ValueError(f"{where} is {shown(value)}; it must be a list")
@@ -117,6 +113,18 @@ def _value_from_data(value: Any, kind: Any, where: str) -> Any:
     if not isinstance(value, accepted) or isinstance(value, bool):
         raise ValueError(f"{where} is {shown(value)}; it must be {name}")
     return value
+
+
+def _levels(kind: Any) -> int:
+    """Return how many levels of lists a field of type ``kind`` holds."""
+    return 1 + _levels(get_args(kind)[0]) if get_origin(kind) is tuple else 0
+
+
+def _nested(value: Any) -> int:
+    """Return how many levels of lists ``value`` has, by its first elements."""
+    if not isinstance(value, list | tuple):
+        return 0
+    return 1 + (_nested(value[0]) if value else 0)
 
 
 def _array_from_data(value: Any, rank: int, where: str) -> np.ndarray:

@@ -43,7 +43,7 @@ def three_dof(gains, base, stage):
     diagonals = [gains[:3], gains[3:6], gains[6:]]
     controller = eqx.tree_at(
         lambda c: [
-            matrix[axis][axis]
+            matrix[axis]
             for matrix in (
                 c.controller.law.proportional,
                 c.controller.law.integral,

@@ -22,6 +22,7 @@ from piezojax.core import paths
 from piezojax.core.axes import (
     PerAxis,
     PerAxisMetric,
+    as_matrix,
     as_rows,
     check_square,
     inverse,
@@ -71,8 +72,7 @@ DERIVATIVE = {"multi-axis": [4e-4, 6e-4, 8e-4], "nominal": [1e-4, 2e-4, 3e-4]}
 def derived(controller, kind):
     """Return a controller with the D of DERIVATIVE on its axes."""
     names = [n for n in paths.parameters(controller) if "derivative" in n]
-    diagonal = [n for n in names if kind == "nominal" or n[-1] == n[-3]]
-    return paths.replace(controller, dict(zip(diagonal, DERIVATIVE[kind], strict=True)))
+    return paths.replace(controller, dict(zip(names, DERIVATIVE[kind], strict=True)))
 
 
 def with_derivative(gains, kind):
@@ -198,11 +198,11 @@ LEAVES = {
     "multi-axis": (
         catalog.loop(catalog.multi_axis(filtered=False)),
         {
-            "controller.law.proportional.0.0": 1e-4,
-            "controller.law.integral.1.1": 1e-2,
-            "controller.reaching.2.2": 1e-5,
+            "controller.law.proportional.0": 1e-4,
+            "controller.law.integral.1": 1e-2,
+            "controller.reaching.2": 1e-5,
             "controller.decoupling.1.0": 1e-5,
-            "controller.surface.0.0.0": 1e-5,
+            "controller.surface.0.0": 1e-5,
             "controller.model.moving.0.0.0": 1e-6,
             "controller.model.autoregressive.1.1.1": 1e-6,
             "controller.reference_model.Z.frequency": 1e-2,
@@ -313,10 +313,37 @@ def state_space(n, inputs, outputs, direct=0.0):
     return StateSpace(A, np.ones((n, inputs)), np.ones((outputs, n)), D, 2e-3)
 
 
+def test_a_diagonal_controls_as_its_matrix():
+    law = {"proportional": (0.5, 1.0, 2.0), "integral": (30.0, 50.0, 40.0)}
+    law["derivative"] = DERIVATIVE["multi-axis"]
+    others = {"reaching": (0.9, 0.5, 0.4), "decoupling": (-0.3, -0.2, -0.3)}
+    surface = ((0.49,) * 3, (-1.4, -1.3, -1.2), (1.0,) * 3)
+
+    def run(form):
+        controller = changed(
+            MULTI,
+            law=changed(MULTI.law, **{name: form(gain) for name, gain in law.items()}),
+            surface=[form(gains) for gains in surface],
+            **{name: form(gain) for name, gain in others.items()},
+        )
+        inputs = loop_inputs(jnp.asarray(MOVING[:LENGTH]), jnp.asarray(DRAWS[:LENGTH]))
+        loop = catalog.loop(controller)
+        rest = loop.init(tuple(map(jnp.asarray, (0.0,) * 3)))
+        return packed(simulate(loop, inputs, rest)[1]).command
+
+    np.testing.assert_allclose(run(tuple), run(np.diag), rtol=1e-12, atol=1e-12)
+
+
 REFUSED = [
     (lambda: PerAxis((NOMINAL,), ("Z", "Rx")), r"1 parts but names \('Z', 'Rx'\)"),
     (lambda: as_rows([[1.0, 2.0], [1.0]]), "rows of lengths 2, 1; they must be equal"),
     (lambda: as_rows([]), "rows of lengths none"),
+    (lambda: as_matrix(()), "rows of lengths none"),
+    (lambda: changed(MULTI, reaching=(0.5, 0.5)), "reaching is 2 x 2; .* 3 x 3"),
+    (
+        lambda: changed(MULTI, law=changed(MULTI.law, integral=(1.0,) * 4)),
+        "law.integral is 4 x 4; .* 3 x 3",
+    ),
     (
         lambda: check_square("gain", as_rows(np.ones((2, 3))), 3),
         "gain is 2 x 3; it must be 3 x 3",

@@ -152,6 +152,10 @@ DIRECT = StateSpace(np.eye(3) * 0.5, np.eye(3), np.eye(3), np.eye(3), T)
         ({"model": WIDE}, "the model has 1 inputs and 2 outputs; .* must be equal"),
         ({"model": DIRECT}, "D of the model is not zero"),
         ({"reaching": np.eye(2)}, "reaching is 2 x 2; it must be 3 x 3"),
+        (
+            {"law": SwitchingPID((1.0, 1.0), 0.0, 0.0, dt=T)},
+            "law.proportional is 2 x 2; it must be 3 x 3",
+        ),
         ({"effort_weight": 0.0}, "effort_weight .* is 0; .* above 0"),
     ],
 )

@@ -185,7 +185,7 @@ def test_loops_of_many_lanes(name, lanes, shared):
 
 def test_a_loop_of_three_axes():
     controller = p558_control.multi_axis("dynamic")
-    path = "controller.controller.law.proportional.1.1"
+    path = "controller.controller.law.proportional.1"
     rng = np.random.default_rng(2)
     references, noise = (
         tuple(jnp.array(rng.uniform(0.0, 1.0, SAMPLES)) for _ in range(3))
