@@ -101,7 +101,7 @@ class SensorResponse(System):
 
 
 class ChargeDriveState(NamedTuple):
-    """Last command, load voltage and charge over C_L, all in V; state of the load."""
+    """Last command, load voltage and q / C_L, all in V; state of the load."""
 
     command: Scalar
     voltage: Scalar

@@ -66,7 +66,7 @@ CHAPTER_6 = (
         ),
     },
 )
-"""(6.23)-(6.25), 7, 4 and 4 states."""
+"""(6.23)-(6.25), with 7, 4 and 4 states."""
 
 CHAPTER_7 = (
     {
@@ -109,7 +109,7 @@ CHAPTER_7 = (
         ),
     },
 )
-"""(7.53), 3 states each."""
+"""(7.53), with 3 states each."""
 
 MODELS = {"6": CHAPTER_6, "7": CHAPTER_7}
 """Printed models by chapter."""

@@ -1,9 +1,9 @@
 """Four actuators under the plate of the P-558.TCD stage: an assumption of ours.
 
 The thesis commands Z, Rx and Ry and gives no number, position or travel of the
-actuators. We assume four equal actuators in the corners of a square, which lift a rigid
-plate through equal stiffnesses. The plate then takes the least-squares pose of their
-elongations.
+actuators. Assumed are four equal actuators in the corners of a square, which lift a
+rigid plate through equal stiffnesses. The plate then takes the least-squares pose of
+their elongations.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ def geometry() -> Float[np.ndarray, "3 4"]:
 
 
 def allocation(method: str = "bounded") -> Allocation:
-    """Return the allocation of a pose to the four elongations in um."""
+    """Return the Allocation of a pose to the four elongations in um, by ``method``."""
     lower, upper = (jnp.full(len(POSITIONS), bound) for bound in TRAVEL)
     return Allocation(geometry(), lower, upper, method)
 
@@ -73,11 +73,10 @@ def stage(actuator: StateSpace, method: str = "bounded") -> Series:
 
 
 def four_actuators() -> Series:
-    """Return the stage on four actuators with the play of ``p558_stage`` each.
+    """Return the stage on four actuators, each with the play of ``p558_stage``.
 
-    Each has the dynamics of (8.40), the model of the Z axis, and differs from the
-    others in gain: ``GAINS``. A command of a pose is allocated to them within their
-    travel.
+    Each has the dynamics of (8.40), the model of the Z axis, with unit DC gain; their
+    gains differ: ``GAINS``. A commanded pose is allocated to them within their travel.
     """
     (a, b), *_ = ARX
     gain = sum(b) / (1.0 - sum(a))

@@ -1,8 +1,8 @@
 """The P-558.TCD as the plant of a loop: hysteresis, then the printed dynamics.
 
 No hysteresis of this stage is printed. A play operator of 2 % represents the residual
-hysteresis of its internal loop: an assumption of ours, consistent with the driven cells
-of Table 7-4.
+hysteresis of its internal loop: an assumption of ours, consistent with the errors of
+the driven axes in Table 7-4.
 """
 
 import jax
@@ -40,7 +40,7 @@ def plant(
     """Return the stage: hysteresis of each axis, then the dynamics of (7.53).
 
     Relative deviations by axis: ``gain`` of the channel; ``speed`` of its poles and
-    zeros (A becomes I + (1 + speed)(A - I) and B is scaled alike, at the same DC gain);
+    zeros (A becomes I + (1 + speed)(A - I) and B (1 + speed) B, at the same DC gain);
     ``hysteresis``, the share of play; ``coupling``, the gain to the other axes.
     ``delay`` in samples lies between hysteresis and dynamics and adds to the one sample
     of every model. Raises ValueError for a negative delay.

@@ -1,7 +1,7 @@
 """The P-753 actuator (Physik Instrumente, 15 um) and its printed controllers.
 
-Every number carries its equation or table in Y. Cao's thesis (2013). All sets hold at
-20 kHz unless their name states another rate.
+Every number carries its equation or table in Y. Cao's thesis (2013). Dynamics and gains
+hold at 20 kHz unless another rate is stated.
 """
 
 import numpy as np
@@ -274,13 +274,13 @@ def pid() -> PID:
 
 
 def kalman_sliding_mode(table: str = "5-2") -> SlidingMode:
-    """Return ``sliding_mode`` with a Kalman filter as observer."""
+    """Return ``sliding_mode`` with a Kalman filter (ours) as observer."""
     model = ARMA(**DYNAMICS_FROM_VOLTAGE)
     return _sliding_mode(model, GAINS[table]["pid"], kalman(model))
 
 
 def kalman_disturbance_observer(table: str = "5-2") -> DisturbanceObserverControl:
-    """Return ``disturbance_observer`` with a Kalman filter as observer.
+    """Return ``disturbance_observer`` with a Kalman filter (ours) as observer.
 
     The filter receives the Observation of the inner controller: its applied input is
     K_e times the sum of voltage and estimated disturbance.
@@ -296,7 +296,7 @@ def kalman_disturbance_observer(table: str = "5-2") -> DisturbanceObserverContro
 
 
 def mixed_sensitivity_inversion() -> InversionControl:
-    """Return an H-infinity controller (ours) of (5.33) with inverse hysteresis."""
+    """Return an H-infinity controller (ours) for (5.33), with inverse hysteresis."""
     error, effort = SENSITIVITY_WEIGHT, EFFORT_WEIGHT
     design = mixed_sensitivity(
         scaled_to_dc(ARMA(**DYNAMICS_BEHIND_HYSTERESIS), 1.0),
@@ -308,7 +308,7 @@ def mixed_sensitivity_inversion() -> InversionControl:
 
 
 def actuator() -> Saturation:
-    """Return the drive's voltage limits."""
+    """Return the Saturation at the voltage limits of the drive."""
     return Saturation(*VOLTAGE_LIMITS)
 
 

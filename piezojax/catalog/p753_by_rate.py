@@ -1,13 +1,14 @@
 """The P-753 and one controller of each kind at any sampling rate of Table 4-1.
 
 The gains are the printed ones where Y. Cao's thesis (2013) prints some. At other rates
-they are ours: the printed set of the nearest rate, scaled to the same loop in samples.
-With s the ratio of the two sample times, a gain on an error rate (um/s) is multiplied
-by s, one on its derivative by s^2 and a surface in 1/s by 1/s. Weights, the alpha-beta
-filter and cut-offs in rad/s are unchanged. The model is the row of Table 4-1 for the
-rate. Rates in Hz.
+they are ours: the printed gains of the nearest rate, scaled to the same loop in
+samples. With q the new sample time over the printed one, a gain on an error rate (um/s)
+is multiplied by q, one on its derivative by q^2 and the slope m of a surface (1/s) by
+1/q. Integral gains, weights, the alpha-beta filter and cut-offs in rad/s are unchanged.
+The model is the row of Table 4-1 for the rate. Rates in Hz.
 
-All functions raise ValueError, listing the known rates, for a rate without a model.
+Raises ValueError for a controller at a rate without a model, with a list of the known
+rates, and for a plant at a rate that does not divide 20 kHz.
 """
 
 import math
@@ -42,7 +43,7 @@ the loop with the linear part of ``chapter4_plant``, K_e and its dynamics, start
 oscillate. At 1 and 2 kHz the period is two samples."""
 
 SCALING = {"proportional": 1, "derivative": 2, "surface": -1}
-"""Power of the ratio of sample times by gain, 0 for the others."""
+"""Exponent of q, the ratio of sample times, by which a gain is scaled; 0 for others."""
 
 TO_SCALE = {
     "traditional": tuple(p753_chapter4.TRADITIONAL_GAINS),
@@ -50,8 +51,8 @@ TO_SCALE = {
     "bang_bang": tuple(p753_chapter4.BANG_BANG_GAINS),
     "chapter 5": (int(p753.RATE),),
 }
-"""Rates of the printed sets that are scaled to other rates. The continuous set of 5 kHz
-is left out: its integral gain looks ten times too small (see
+"""Rates of the printed gains that are scaled to other rates. The continuous gains of
+5 kHz are left out: the integral one looks ten times too small (see
 ``reproduction.chapter4.cells``)."""
 
 

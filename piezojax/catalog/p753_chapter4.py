@@ -42,7 +42,7 @@ TRADITIONAL_GAINS = {
         "control_weight": 400.0,
     },
 }
-"""Table 4-2, tuned for a step. Those behind Tables 4-5 and 4-6 are not printed."""
+"""Table 4-2, tuned for a step. The gains used for Tables 4-5, 4-6 are not printed."""
 
 MODEL_REFERENCE_GAINS = {
     "4-3": {
@@ -104,7 +104,8 @@ REFERENCE_MODELS = {
     "4-3": {"frequency": 1_000.0, "damping": 0.7},
     "4-4": {"frequency": 3_000.0, "damping": 0.25},
 }
-"""The second-order model (4.47) behind each table, sections 4.5.4.2 and 4.5.4.3."""
+"""Reference model (4.47) of each table, frequency in rad/s: sections 4.5.4.2 and
+4.5.4.3."""
 
 CONTINUOUS_GAINS = {
     5_000: {"proportional": 1e-4, "integral": 0.03, "derivative": 1e-7},
@@ -141,7 +142,7 @@ def alpha_beta(rate: int = 20_000) -> AlphaBeta:
 
 
 def unfiltered(rate: int = 20_000) -> AlphaBeta:
-    """Return a filter with the measured displacement as its position."""
+    """Return a filter whose position is the measured displacement."""
     return AlphaBeta(1.0, 0.0, 1.0 / rate)
 
 

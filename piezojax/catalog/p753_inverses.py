@@ -48,8 +48,8 @@ def preisach(cells: int = TRUE_CELLS) -> Preisach:
 
     No density of this stage is published. This one decays with the width of a relay,
     like measured densities of piezo ceramics, and grows along the diagonal:
-    density * exp(-(alpha - beta)/width) (1 + tilt ((alpha + beta)/2 - centre)), with
-    ``reversible`` um/V beside it. It rests at 0 um and 0 V.
+    density * exp(-(alpha - beta)/width) (1 + tilt ((alpha + beta)/2 - centre)). A part
+    without hysteresis adds ``reversible`` um/V. At rest under 0 V the output is 0 um.
     """
     low, high = p753.VOLTAGE_LIMITS
     size = (high - low) / cells

@@ -69,7 +69,7 @@ def _dynamics(poles: Scalar, zeros: Scalar) -> ARMA:
     return ARMA(*_coefficients(np.log(roots + 0j), poles, zeros))
 
 
-# One program instead of one for each operation.
+# Compiled as one program instead of one for each operation.
 @jax.jit
 def _coefficients(
     logarithms: Complex[Array, "2 2"], poles: Scalar, zeros: Scalar

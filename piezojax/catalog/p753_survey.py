@@ -43,7 +43,7 @@ from ..hysteresis import InverseColemanHodgdon
 from . import p753, p753_stage
 
 BOUNDARY_LAYER = {"gain": 1e4, "width": 4e4}
-"""K in V and the layer in um/s. K is large because the inverse passes 1 % of v."""
+"""K in V and the layer in um/s. K is large because Q/(Q + R) passes 1 % of v."""
 
 SUPER_TWISTING = {"root_gain": 10.0, "sign_gain": 1e6, "layer": 1e4}
 """Gains in V/(um/s)^(1/2) and V/s; layer in um/s."""
@@ -61,13 +61,15 @@ H_INFINITY_BOUND = 3.0
 """Bound of the weighted responses: ours."""
 
 REPETITIVE = {"gain": 0.7, "lead": 40, "advance": 8}
-"""Learning gain; lead and advance in samples; Q is a lag of ``advance`` samples."""
+"""Learning gain; lead and advance in samples. Q is a first-order lag whose time
+constant is ``advance`` samples."""
 
 LEARNING = {"gain": 0.7, "lead": 40, "smoothing": (0.25,)}
-"""Learning law of the reference of a loop, lead in samples."""
+"""LearningLaw for the reference of a loop, lead in samples."""
 
 POLES = (0.9992, 0.0, 0.0)
-"""Poles of the sliding variable: those of the printed I = 60 (Table 5-4), P = D = 0."""
+"""Poles of the sliding variable that give about the printed I = 60 (Table 5-4), and
+P = D = 0."""
 
 PHASER = {"share": 0.1, "threshold": 10.0}
 """Weight of the stop operator, and the voltage (V) at which it saturates."""
@@ -191,7 +193,7 @@ def adaptive_pi() -> Anticipation:
     """Return ``simc_pi`` in an AdaptiveInverse, um to V.
 
     The inverse leads the stage by the lag of the sensor; a negative lead of the
-    Anticipation compensates for it.
+    Anticipation, 0 before tuning, compensates for it.
     """
     return Anticipation(p753.with_adaptive_inverse(simc_pi()), (0.0,))
 

@@ -1,4 +1,4 @@
-"""Active damping: the filtered measurement, added to the command of a controller."""
+"""Active damping: a filtered measurement is added to the command of a controller."""
 
 from typing import NamedTuple
 
@@ -26,12 +26,13 @@ class ActiveDamping(System):
     - integral resonant control: ``LowPass`` of order 1 and a gain above 0, the form
       without feedthrough (Fleming, Aphale and Moheimani, IEEE Trans. Nanotechnol.
       9, 2010);
-    - resonant shift: ``Affine`` 1 and a gain below 0, which stiffens the stage.
+    - resonant shift: ``Affine(1.0)`` and a gain below 0, which stiffens the stage.
 
-    With a gain above 0, the product of gain and static gain of the stage must be below
-    1 for stability. The controller receives the applied voltage less the damping
-    command, so that its anti-windup responds to the limits. Input an Observation,
-    output in the unit of the controller's command.
+    With a gain above 0 and a filter of unit DC gain, the damped stage is stable only if
+    the product of this gain and the static gain of the stage is below 1. The controller
+    receives the applied voltage less the damping command, so that its anti-windup
+    responds to the limits. Input an Observation, output in the unit of the controller's
+    command.
     """
 
     controller: System

@@ -15,7 +15,7 @@ Row = tuple[Scalar, ...]
 
 
 class TermsState(NamedTuple):
-    """Last two positions, last position with its lead, and stop outputs, all in um."""
+    """Last two positions, last input of the stops, and their outputs, all in um."""
 
     positions: tuple[Scalar, Scalar]
     leading: Scalar
@@ -87,14 +87,16 @@ class AdaptiveInverse(System):
     Sources: adaptive inverse control, Widrow and Walach 1996; stop operators for the
     inverse of a hysteresis, Kuhnen and Krejci 2007.
 
-    With a ``share`` of 0 only ``controller`` acts. It sees the reference, measurement
-    and voltage less the parts that are fed forward. Only changes of the motion are fed
-    forward, so a learned weight does not change the voltage at rest, and the stability
-    margins at rest are those of ``controller``. While the stage moves, learning forms a
-    second, slow loop that these margins do not include.
+    ``controller`` receives the reference and the measurement, both less ``share`` times
+    the reference, and the applied voltage less the voltage fed forward. With a
+    ``share`` of 0 it acts alone. Only changes of the motion are fed forward, so a
+    learned weight does not change the voltage at rest, and the stability margins at
+    rest are those of ``controller``. While the stage moves, learning forms a second,
+    slow loop that these margins do not include.
 
-    ``weights`` are in V/um, V s/um and V s^2/um, then V/um for each stop. The offset
-    of the voltage is set at the start. Input an Observation, output V, one axis.
+    ``weights`` are in V/um, V s/um and V s^2/um, then V/um for each stop. An offset of
+    the voltage is learned with them, from its value at the start, but not fed forward.
+    Input an Observation, output V, one axis.
 
     Raises ValueError for a parameter outside its limits or counts that do not match.
     """
@@ -120,7 +122,7 @@ class AdaptiveInverse(System):
     )
     equation_error: Scalar = parameter(
         "V",
-        "standard deviation of the residual of the relation",
+        "standard deviation of the residual of the voltage model",
         above=0.0,
         scale="log",
         typical=(1e-2, 1e2),

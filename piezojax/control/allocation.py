@@ -83,12 +83,12 @@ class Allocation(System):
     Weights are 1 by default. An actuator with equal bounds is locked (see ``locked``):
     its effect is subtracted from the pose and the others produce the remainder.
 
-    There is no iteration: the least-squares solution on each of the 3^n faces of the
-    box of bounds is a fixed matrix times the pose, and the best one within the bounds
-    is returned. The matrices are computed from ``geometry`` and the weights at trace
-    time, so these are not parameters to differentiate; pose and bounds are. To study an
-    error of the geometry, change that of the stage. The commands of ``"bounded"`` are
-    continuous in pose and bounds, with kinks where the face changes.
+    There is no iteration. On each of the 3^n faces of the box of bounds the
+    least-squares solution is linear in pose and bounds, and the best one within the
+    bounds is returned. Its matrices are computed from ``geometry`` and the weights at
+    trace time, so only pose and bounds can be differentiated. To study an error of the
+    geometry, change that of the stage. The commands of ``"bounded"`` are continuous in
+    pose and bounds, with kinks where the face changes.
 
     The problem is stated by Johansen and Fossen, "Control allocation - a survey",
     Automatica 49 (2013). Raises ValueError for numbers that are not finite, weights
@@ -131,7 +131,7 @@ class Allocation(System):
         if rank < min(axes, actuators):
             raise ValueError(
                 f"geometry has rank {rank}; it must have {min(axes, actuators)}, "
-                "so that every axis can move alone"
+                "its full rank"
             )
         check_option("method", self.method, METHODS)
         if self.method == "minimum_norm" and len(set(self.weights)) > 1:

@@ -6,7 +6,7 @@ from ..core.parameter import parameter
 
 
 def anti_windup() -> Any:
-    """Return the field of a rate of back-calculation in 1/s, 0 by default.
+    """Return the field of a back-calculation rate in 1/s, 0 by default.
 
     The integral of a controller moves at this rate times the difference of the applied
     and the last commanded output (Astrom and Hagglund, Advanced PID Control, 2006).

@@ -1,8 +1,8 @@
 """Box-constrained least squares with few unknowns, exact and without iteration.
 
 A box with n unknowns has 3^n faces, which include its interior and its corners. On each
-face the least-squares solution is a fixed matrix times the wanted pose. The solution of
-the constrained problem is the best of those that lie within the box.
+face the least-squares solution is linear in the wanted pose and the bounds, with fixed
+matrices. The solution of the constrained problem is the best of those within the box.
 """
 
 import itertools
@@ -36,14 +36,14 @@ class Problem(NamedTuple):
 def clipped_commands(
     problem: Problem, bounds: Bounds, pose: Float[Array, " axes"]
 ) -> Float[Array, " actuators"]:
-    """Return the pseudo-inverse commands of the free actuators, clipped."""
+    """Return the pseudo-inverse commands, clipped, with locked actuators held."""
     lower, upper = bounds
     locked = lower == upper
     fixed = jnp.where(locked, lower, 0.0)
     free = jnp.where(locked, 0, 2 ** np.arange(lower.size))
     inverse = jnp.array(_inverses(problem))[jnp.sum(free)]
     commands = fixed + inverse @ (pose - jnp.array(problem.geometry) @ fixed)
-    # jnp.clip has the slope 1/2 on a bound, and stages rest on their bounds.
+    # Stages rest on their bounds, where jnp.clip has the derivative 1/2.
     commands = jnp.where(commands < lower, lower, commands)
     return jnp.where(commands > upper, upper, commands)
 
@@ -53,13 +53,13 @@ def bounded_commands(
 ) -> Float[Array, " actuators"]:
     """Return the commands within bounds with the least error, then the least effort."""
     sides, inverses = (jnp.array(table) for table in _faces(problem))
-    # The index of the face has no derivative; the commands on it have one.
+    # The index of the face has no derivative; the commands on the face have one.
     still = jax.lax.stop_gradient((bounds, pose))
     candidates = _face_commands(sides, inverses, problem, *still)
     face = _best(candidates, sides == 0, problem, *still)
     chosen = (sides[:, face, None], inverses[:, :, face, None])
     commands = _face_commands(*chosen, problem, bounds, pose)[:, 0]
-    # Rounding may exceed a bound; the slope of a clip there would be 1/2.
+    # Rounding may exceed a bound. A clip there would have the derivative 1/2.
     rounding = jnp.clip(commands, *bounds) - commands
     return commands + jax.lax.stop_gradient(rounding)
 
@@ -114,7 +114,8 @@ def _best(
 def _inverses(problem: Problem) -> Float[np.ndarray, "sets actuators axes"]:
     """Return the weighted pseudo-inverse for each set of free actuators.
 
-    Actuator i is in set number s if bit i of s is 1; the rows of others are zero.
+    Actuator i is in set number s if bit i of s is 1; the rows of the other actuators
+    are zero.
     """
     by_axis, by_command = np.sqrt(problem.axis_weights), np.sqrt(problem.weights)
     scaled = by_axis[:, None] * np.array(problem.geometry) / by_command
@@ -145,7 +146,10 @@ def _faces(
 def null_space(
     geometry: tuple[Numbers, ...],
 ) -> Float[np.ndarray, "redundancy actuators"]:
-    """Return an orthonormal basis of the null space, first entries positive."""
+    """Return an orthonormal basis of the null space.
+
+    The first nonzero entry of each vector is positive.
+    """
     matrix = np.array(geometry)
     basis = np.linalg.svd(matrix)[2][min(matrix.shape) :]
     first = basis[np.arange(len(basis)), np.argmax(np.abs(basis) > 1e-9, axis=1)]

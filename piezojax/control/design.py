@@ -26,7 +26,7 @@ def inversion_sliding_mode(
     """Return an inversion-based sliding mode controller with a PID law (PID-SMC).
 
     ``dt`` in s. Raises ValueError if the hysteresis has no inverse between ``limits``
-    (V), and in the cases of ``design_model``.
+    (V), and in the cases of ``design_model`` and ``DesignModel.fastest_stable``.
     """
     model = design_model(plant, dt, limits)
     inverse = model.inverse()
@@ -39,10 +39,11 @@ def inversion_sliding_mode(
 def disturbance_observer_sliding_mode(
     plant: System, dt: float, limits: Limits
 ) -> DisturbanceObserverControl:
-    """Return a DOB-based PID-SMC on the mean slope of the plant between ``limits`` (V).
+    """Return a PID-SMC with a disturbance observer (DOB).
 
-    ``dt`` in s. Raises ValueError if the slope is not positive, and in the cases of
-    ``design_model``.
+    The observer has the mean gain of the plant between ``limits`` (V); ``dt`` in s.
+    Raises ValueError if this gain is not positive, and in the cases of ``design_model``
+    and ``DesignModel.fastest_stable``.
     """
     model = design_model(plant, dt, limits)
     # The observer holds the whole gain from V to um; the model has unit gain.
@@ -70,7 +71,7 @@ def inversion_pid(plant: System, dt: float, limits: Limits) -> InversionControl:
     """Return an integral-dominated PID ahead of the inverse of the plant's hysteresis.
 
     ``dt`` in s. Raises ValueError if there is no inverse between ``limits`` (V), and in
-    the cases of ``design_model``.
+    the cases of ``design_model`` and ``DesignModel.fastest_stable``.
     """
     model = design_model(plant, dt, limits)
     inverse = model.inverse()
@@ -85,8 +86,8 @@ def inversion_pid(plant: System, dt: float, limits: Limits) -> InversionControl:
 
 
 def _sliding_mode(model: ARMA, dt: float, pace: float) -> SlidingMode:
-    # Scaled from the printed P-753 set, whose surface is 0.9 / dt: the loop then
-    # crosses over near 0.1 / dt at any rate, or at ``pace`` times that.
+    # Scaled from the printed P-753 set, with a surface of 0.5 / dt in place of
+    # 0.9 / dt: at any rate the loop crosses over near CROSSOVER * pace / dt.
     surface, weight = 0.5 / dt, 100.0
     scale = pace / model.dc_gain()
     integral = CROSSOVER * weight / (dt * surface)

@@ -31,10 +31,10 @@ CROSSOVER = 0.1
 """Highest crossover frequency of a design, rad per sample."""
 
 GAIN_MARGIN = 3.0
-"""Factor by which the plant's gain may rise before a designed loop is unstable."""
+"""Factor on the plant's gain at which a designed loop must still be stable."""
 
 SMALLEST_PACE = 1e-4
-"""Smallest pace that ``DesignModel.fastest_stable`` tries."""
+"""Pace below which ``DesignModel.fastest_stable`` gives up."""
 
 
 class NoInverseError(ValueError):
@@ -87,10 +87,10 @@ class DesignModel(NamedTuple):
     ) -> S:
         """Return ``make(pace)`` for the largest pace of 1, 1/2, ... with a stable loop.
 
-        The loop contains all of ``linear``, behind ``static`` if given. It must stay
-        stable with ``GAIN_MARGIN`` times the gain, because a resonance or a delay
-        beyond second order limits the crossover. Raises ValueError if no pace down to
-        ``SMALLEST_PACE`` gives a stable loop.
+        The pace scales the crossover frequency. The loop contains all of ``linear``,
+        behind ``static`` if given. It must stay stable with ``GAIN_MARGIN`` times the
+        gain, because a resonance or a delay beyond second order limits the crossover.
+        Raises ValueError if no pace down to ``SMALLEST_PACE`` gives a stable loop.
         """
         plant = self.linear if static is None else static >> self.linear
         held = self.rest if static is None else as_array(np.mean(self.limits))
@@ -106,7 +106,7 @@ class DesignModel(NamedTuple):
         raise ValueError(
             "the loop around the plant's linear part is unstable at any crossover down "
             f"to {SMALLEST_PACE * CROSSOVER / self.dt:g} rad/s; "
-            "no design is slower: give the controller as catalog, file or type"
+            "no slower design exists: give the controller as catalog, file or type"
         )
 
 
@@ -140,7 +140,7 @@ def _separated(plant: System) -> tuple[Hysteresis | None, tuple[System, ...]]:
             "a design needs one hysteresis in series with linear parts; the plant has "
             f"{', '.join(type(part).__name__ for part in parts)}"
         )
-    # A slew limit acts on large steps alone, and ahead of the hysteresis.
+    # A slew limit is left out: it acts on large steps only, ahead of the hysteresis.
     apart = (Hysteresis, AmplifierSlew)
     others = tuple(part for part in parts if not isinstance(part, apart))
     return (hysteretic[0] if hysteretic else None), others
@@ -148,7 +148,7 @@ def _separated(plant: System) -> tuple[Hysteresis | None, tuple[System, ...]]:
 
 def _in_series(plant: System) -> tuple[System, ...]:
     if isinstance(plant, HystereticARMA):
-        # Its two operators share the shape of the loop: take the nearest cascade.
+        # Approximate its two operators by one, with the nearest shared numerator.
         plant = plant.cascade(1.0)
     if not isinstance(plant, Series):
         return (plant,)

@@ -28,13 +28,13 @@ class DisturbanceObserverState(NamedTuple):
 
 
 class DisturbanceObserverControl(System):
-    """``u = f / gain - w``: the controller's f less the estimated disturbance w.
+    """``u = f / gain - w``: f from ``feedback``, w the estimated disturbance.
 
     Figure 5.2, (5.26)-(5.32): w = Q/(gain G) z - Q u, where G is ``model``
     of any order (a_1, ..., a_n | b_0, b_1, ..., DC gain near 1), ``gain`` K_e is the
     linear part of the hysteresis, and Q has G's zeros, unit DC gain and n equal poles
     at ``cutoff``, two for the second order of the thesis. u is the applied voltage,
-    after the limits. ``feedback`` sees f as applied, gain (u + w), in um.
+    after the limits. ``feedback`` receives gain (u + w) in um as its applied command.
 
     ``coefficients`` is ``"corrected"`` (poles by the bilinear transform) or
     ``"printed"`` ((5.32) as printed, for n = 2, whose poles lie at -0.54 and -7.46

@@ -1,4 +1,4 @@
-"""Guard: a controller whose command stays safe and that gives up in time."""
+"""Guard: limits the command of a controller and overrides it after a fault."""
 
 from typing import NamedTuple
 
@@ -19,18 +19,19 @@ REASONS = (
     "the voltage stays at a limit",
     "the voltage changes at the slew limit: it oscillates, or the reference jumps",
 )
-"""Reasons of a Guard to give up, by their number; 0 while it follows its controller."""
+"""Reasons for which a Guard gives up, by number; 0 while it follows its controller."""
 
 _NAN, _STUCK, _LOST, _FAR, _RAILED, _SLEWING = range(1, len(REASONS))
 
 
 class GuardState(NamedTuple):
-    """State of a Guard: that of its controller, and what it watches.
+    """State of the controller, last signals, and counts of faulty samples.
 
     ``reason`` is the index of the reason in ``REASONS``. ``command`` (V) and
     ``measured`` (um) are the last ones. ``far``, ``railed`` and ``slewing`` count
     consecutive samples with too large an error, at a limit of the voltage, and at the
-    slew limit; ``unseen`` is the way of the voltage (V) since the reading last changed.
+    slew limit; ``unseen`` is the travel of the voltage (V) since the reading last
+    changed.
     """
 
     controller: State
@@ -47,12 +48,16 @@ class Guard(System):
     """A ``controller`` with a limited command, which retreats at the first fault.
 
     The command stays between ``lower`` and ``upper`` and changes by at most ``slew``.
-    The guard gives up if the reading or the command of the controller is not a number,
-    if the tracking error exceeds ``largest_error``, or the command is at a limit of the
-    voltage or of the slew, for ``patience`` samples in a row, or if the voltage moves
-    by ``unseen`` while the reading does not change at all. From then on the command
-    moves to ``retreat`` at no more than ``slew``, until the guard is started again. For
-    one axis. The input is an Observation, the output the command.
+    The guard gives up in each of these cases:
+
+    - the reading or the command of the controller is not finite;
+    - the tracking error exceeds ``largest_error``, or the command of the controller is
+      at a limit of the voltage or of the slew, for ``patience`` samples in a row;
+    - the voltage travels more than ``unseen`` while the reading does not change at all.
+
+    From then on the command moves to ``retreat`` at no more than ``slew``, until the
+    guard is started again. For one axis. The input is an Observation, the output the
+    command.
 
     Raises ValueError unless ``lower`` is below ``upper`` and ``retreat`` between them.
     """
@@ -62,18 +67,18 @@ class Guard(System):
     upper: Scalar = parameter("V", "upper limit of the command")
     slew: Scalar = parameter("V/s", "slew limit of the command", above=0.0, scale="log")
     largest_error: Scalar = parameter(
-        "um", "tracking error at which to give up", above=0.0, scale="log"
+        "um", "tracking error at which the guard gives up", above=0.0, scale="log"
     )
     retreat: Scalar = parameter("V", "voltage after a fault")
     patience: int = parameter(
         "samples",
-        "samples in a row with a fault",
+        "number of samples in a row with a fault",
         least=1.0,
         whole=True,
         static=True,
     )
     unseen: Scalar = parameter(
-        "V", "way of the voltage without a change of the reading", above=0.0
+        "V", "travel of the voltage without a change of the reading", above=0.0
     )
     dt: float = sample_time()
 
@@ -126,8 +131,8 @@ class Guard(System):
         target = jnp.where(reason > 0, self.retreat, wanted)
         limited = state.command + jnp.clip(target - state.command, -most, most)
         command = jnp.clip(limited, self.lower, self.upper)
-        way = state.unseen + jnp.abs(command - state.command)
-        unseen = jnp.where(reading == state.measured, way, 0.0)
+        travel = state.unseen + jnp.abs(command - state.command)
+        unseen = jnp.where(reading == state.measured, travel, 0.0)
         return (
             GuardState(
                 controller, reason, command, reading, far, railed, slewing, unseen

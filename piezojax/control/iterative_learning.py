@@ -35,17 +35,18 @@ class LearningLaw(eqx.Module):
 
     The time-domain form of (2.14). Its learning function rho / G is a gain and a
     ``lead`` in samples, which compensates the lag of the system that u drives. ``gain``
-    is in the unit of u per um: V/um for a stage, without unit for a loop whose
+    is in the unit of u per um: V/um for a stage, dimensionless for a loop whose
     reference is corrected. Q is a zero-phase FIR filter with unit DC gain:
     ``smoothing`` holds the weights w_1, w_2, ... of the neighbours one, two, ...
     samples away on either side, and the weight of the sample itself is
-    1 - 2 (w_1 + w_2 + ...). Without weights Q = 1. Both signals are extended by their
-    end values.
+    1 - 2 (w_1 + w_2 + ...). Without weights Q = 1. Beyond the ends of a trial the end
+    values are used.
 
-    On a linear system with the matrix G from u to y, the trials contract to the fixed
-    point ``(I - Q (I - L G))^-1 Q L r`` if ``Q (I - L G)`` has norm below 1. For trials
-    much longer than the transients the condition is ``|Q (1 - gain z^lead G)| < 1`` at
-    all frequencies. The remaining error is zero only where Q = 1.
+    Let L = gain z^lead. On a linear system with the matrix G from u to y, the trials
+    contract to the fixed point ``(I - Q (I - L G))^-1 Q L r`` if ``Q (I - L G)`` has
+    norm below 1. For trials much longer than the transients the condition is
+    ``|Q (1 - L G)| < 1`` at all frequencies. The remaining error is zero only at
+    frequencies where Q = 1.
     """
 
     gain: Scalar = parameter(
@@ -105,8 +106,8 @@ def learn(
     Each trial starts from the same state at rest. ``system`` is a stage, V to um, whose
     input u is learned (y(k) is the output of the step with u(k)), or a Feedback loop,
     whose reference is corrected to r + u. ``noise`` [trials, samples] is added to the
-    measurement, for a stage in um, for a loop as unit-variance draws that its sensor
-    scales. ``feedforward`` of the first trial is zero by default, as in (2.14). The
+    measurement: in um for a stage, as unit-variance draws that the sensor scales for a
+    loop. ``feedforward`` of the first trial is zero by default, as in (2.14). The
     function is pure, and differentiable in ``law`` and ``system``. The returned errors
     are those of the true displacement.
 
@@ -155,7 +156,7 @@ def _stage_trial(
 def _loop_trial(
     system: System, reference: Signal, feedforward: Signal, noise: Signal
 ) -> tuple[Signal, Signal]:
-    # The loop rests at r: a correction of the first sample acts as a step.
+    # The loop starts at rest at r, so a correction of the first sample acts as a step.
     inputs = loop_inputs(reference + feedforward, noise)
     samples = simulate(system, inputs, system.init(reference[0]))[1]
     return samples.displacement, samples.measured

@@ -19,7 +19,7 @@ DOUBLINGS = 40
 class KalmanState(NamedTuple):
     """Estimates given z(k): y(k), y(k-1), ... and the drift, in um; past inputs.
 
-    ``inputs`` holds u(k-2), u(k-3), ..., in the unit of the model's input.
+    ``inputs`` holds u(k-1), u(k-2), ..., in the unit of the model's input.
     """
 
     positions: tuple[Scalar, ...]
@@ -137,7 +137,7 @@ def model_kalman(
     drift_rms: ScalarLike,
     dt: float,
 ) -> KalmanFilter:
-    """Return the Kalman filter on ``model`` for given noise of sensor and process.
+    """Return the Kalman filter on ``model`` for given sensor and process noise.
 
     All in um: ``noise_rms`` of the sensor, ``process_rms`` of the random motion per
     sample, ``drift_rms`` of the change of the drift per sample. Raises ValueError for
@@ -159,7 +159,7 @@ def model_kalman(
 def kinematic_kalman(
     noise_rms: ScalarLike, acceleration_rms: ScalarLike, dt: float
 ) -> KalmanFilter:
-    """Return the Kalman filter of constant velocity, without a model of the stage.
+    """Return the Kalman filter for constant velocity, without a model of the stage.
 
     ``noise_rms`` of the sensor in um; ``acceleration_rms`` in um/s^2 of a random
     acceleration, constant within a sample and independent of the others. It is an
@@ -170,7 +170,8 @@ def kinematic_kalman(
     check("noise_rms in um", noise_rms, above=0.0)
     check("acceleration_rms in um/s^2", acceleration_rms, above=0.0)
     check("sample time in s", dt, above=0.0)
-    # y(k-1) represents y(k) - dt dy/dt: acceleration moves both, in opposite senses.
+    # The state y(k-1) is y(k) - dt dy/dt: an acceleration moves y(k) and y(k-1) by
+    # equal amounts in opposite directions.
     push = 0.5 * float(acceleration_rms) * dt**2 * np.array([1.0, -1.0])
     model = ARMA((2.0, -1.0), (0.0,))
     A = np.array([[2.0, -1.0], [1.0, 0.0]])

@@ -30,15 +30,16 @@ class LearningControl(System):
     """``feedback`` with its reference corrected from trial to trial, (2.14).
 
     A trial is a ``period`` of the reference. ``feedback``, any controller, sees r + u
-    in place of r. At the start of each trial the ``LearningLaw`` with ``gain``,
-    ``smoothing`` and ``lead`` computes the corrections u from the trial before; in the
-    first trial u is 0. The law uses later samples of that trial, and its Q-filter has
-    zero phase; ``RepetitiveControl`` learns continuously instead, without trials.
-    The loop does not rest between trials; the errors decay provided that the transients
-    are shorter than a period.
+    in place of r. In each trial the ``LearningLaw`` with ``gain``, ``smoothing`` and
+    ``lead`` computes the correction u of every sample from the trial before; in the
+    first trial u is 0. The law also uses later samples of the trial before, and its
+    Q-filter has zero phase; ``RepetitiveControl`` learns continuously instead, without
+    trials. The loop does not rest between trials; the errors decay provided that the
+    transients are shorter than a period.
 
     Input an Observation, output that of ``feedback``. At rest without error u is zero.
-    Raises ValueError unless ``lead`` and ``smoothing`` are shorter than the period.
+    Raises ValueError unless ``lead`` plus the number of weights in ``smoothing`` is
+    below the period.
     """
 
     feedback: System

@@ -15,7 +15,7 @@ GAMMA_TOLERANCE = 1e-3
 
 
 class Design(NamedTuple):
-    """A controller and the bound gamma of its weighted loop: ||z / r|| < gamma."""
+    """A controller, and gamma, a bound of the H-infinity norm of its weighted loop."""
 
     controller: StateSpaceController
     gamma: float
@@ -39,12 +39,12 @@ def mixed_sensitivity(
     *,
     dt: float,
 ) -> Design:
-    """Return the controller that minimises the weighted responses to r.
+    """Return the controller that minimises the H-infinity norm of the weighted loop.
 
     ``model`` G maps u(k) to y(k+1) in um. At all frequencies up to the Nyquist
     frequency, |W1 S|^2 + |W2 K S|^2 + |W3 T|^2 < gamma^2, with S = 1/(1 + G K) and
     T = 1 - S, W1 = ``error_weight``, W2 = ``effort_weight``, a number above 0 in um per
-    unit of the input, and W3 = ``output_weight``, none if left out. Bisection brings
+    unit of the input, and W3 = ``output_weight``, 0 if left out. Bisection brings
     gamma within 0.1 % of its infimum. The controller has the states of the model and of
     the weights.
 
@@ -53,7 +53,7 @@ def mixed_sensitivity(
     discrete time Green and Limebeer, 1995, appendix B), then has the solution zero if
     the model and the weights are stable: an integrator in W1 must be leaky. Raises
     ValueError for an unstable model or weight, weights that are not scalar or have
-    another ``dt``, and an effort weight that is not above 0.
+    another ``dt``, an effort weight that is not above 0, and if no controller is found.
     """
     check("sample time in s", dt, above=0.0)
     check("effort_weight", effort_weight, above=0.0)

@@ -18,8 +18,8 @@ from .switching import SwitchingLaw
 class ModelReferenceState(NamedTuple):
     """States of the parts; histories, newest first, of y_d and errors in um.
 
-    ``desired`` starts at y_d(k); ``forward`` and ``feedback`` hold past u1 and u2 in V,
-    at least the last ones.
+    ``desired`` starts at y_d(k); ``forward`` and ``feedback`` hold past values of u1
+    and of u_eq + du in V, at least the last ones.
     """
 
     filter: State
@@ -32,7 +32,7 @@ class ModelReferenceState(NamedTuple):
 
 
 class ModelReferenceSlidingMode(System):
-    """Sliding mode control of a model of any order n along a reference model.
+    """Sliding mode control that tracks a reference model, on a model of any order n.
 
     The error is e = y - y_d, with y from ``filter`` and y_d the output of
     ``reference_model``. The sliding variable is ``s(k) = surface[0] e(k-n+1) + ... +
@@ -40,9 +40,9 @@ class ModelReferenceSlidingMode(System):
     printed form contains the unknown e(k+1). The voltage is u1 + u_eq + du: u1 moves
     ``model`` (a_1, ..., a_n | b_0, ..., b_0 not zero) along y_d (4.32), u_eq takes s to
     zero (4.42) and du is the output of ``law`` in V, a ``SwitchingPID`` in (4.43). Both
-    u1 and u_eq divide by b_0, in the form ``inversion`` of ``INVERSIONS``; du does not.
-    ``reference_model`` maps r(k) to y_d(k+1), so y_d lags r by a sample and by the lag
-    of the reference model; ``Anticipation`` compensates both.
+    u1 and u_eq contain the inverse of b_0, in the form ``inversion`` of ``INVERSIONS``;
+    du does not. ``reference_model`` maps r(k) to y_d(k+1), so y_d lags r by a sample
+    and by the lag of the reference model; ``Anticipation`` compensates both.
 
     Input an Observation, whose next reference is not used; output in V. Raises
     ValueError for a model without a_1, a surface that does not hold n - 1 weights, b_0
@@ -96,7 +96,7 @@ class ModelReferenceSlidingMode(System):
         reference = as_array(input.reference)
         order, lags = len(self.model.autoregressive), len(self.model.moving) - 1
         desired = (reference,) * order
-        # At rest u1 equals its past; two values of a linear map give the fixed point.
+        # At rest u1 equals its past: the fixed point of an affine map, from two values.
         wanted = reference - self._advanced(desired)
         start = self._inverse(wanted, (jnp.zeros_like(reference),) * lags)
         slope = self._inverse(jnp.zeros_like(reference), (as_array(1.0),) * lags)

@@ -30,8 +30,8 @@ class NominalState(NamedTuple):
 class NominalSlidingMode(System):
     """Sliding mode control of one axis on the state of a nominal model, (8.17)-(8.39).
 
-    On the measured state, every tried form of the printed equivalent control is
-    unstable. ``reading`` selects a replacement:
+    The printed equivalent control acts on the measured state, and no tested form of it
+    is stable. ``reading`` selects a replacement:
 
     - ``"nominal_state"``: the equivalent control acts on the state of ``model``, which
       runs on the applied input: y_n(k) and y_n(k+1). The law acts on the measured

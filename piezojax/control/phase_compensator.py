@@ -23,11 +23,11 @@ class PhaseCompensator(System):
 
     Section 2.5.2 regards a hysteresis as a transfer function whose magnitude and phase
     depend on frequency and amplitude (2.13), and balances its lag by a phaser with a
-    positive phase ahead of the stage. It does not specify the phaser. Here it is a stop
-    operator, which follows the input and saturates at ``threshold``. Its phase is a
-    lead that is the same at every frequency and falls with the amplitude. The gain lies
-    between 1 and 1 + ``share``. Sums of stops are the inverse of a Prandtl-Ishlinskii
-    model (``PrandtlIshlinskii.inverse``).
+    positive phase ahead of the stage. It does not specify the phaser. Here the phaser
+    adds a stop operator, which follows the input and saturates at ``threshold``. Its
+    phase is a lead that is the same at every frequency and falls with the amplitude.
+    The gain lies between 1 and 1 + ``share``. Sums of stops are the inverse of a
+    Prandtl-Ishlinskii model (``PrandtlIshlinskii.inverse``).
 
     ``controller`` sees the v that gives the applied voltage, so its limits and
     anti-windup stay correct. The stop starts at 0. Input an Observation, output in V.

@@ -14,7 +14,7 @@ class PlacedPID(SwitchingLaw):
     ``(z - p_1)(z - p_2)(z - p_3) = z^3 + g_2 z^2 + g_1 z + g_0``, hence
     D = g_0 dt / drive, P = -(g_1 + 2 g_0) / drive and
     I = (1 + g_2 + g_1 + g_0) / (drive dt). Poles (p, 0, 0) give an integral law, whose
-    s decays by the factor p per sample; with p = 1 there is no integral. ``drive`` is
+    s decays by the factor p per sample; a pole of 1 removes the integral. ``drive`` is
     S B_d of the controller, times the gain of its inversion at rest where the weight R
     is not 0; the placement is exact only for R = 0.
 

@@ -2,8 +2,8 @@
 
 A zero outside the unit circle makes the exact causal inverse unstable. An inverse that
 uses future values of the reference can be stable. These inverses act on a whole
-reference before the loop runs, as open-loop input or as the reference of a loop, or,
-with the references beyond r(k+1) extrapolated, inside a loop.
+reference before the loop runs; the result is an open-loop input or the reference of a
+loop. Inside a loop the references beyond r(k+1) are extrapolated.
 """
 
 from collections.abc import Callable
@@ -27,9 +27,9 @@ class PreviewInverse(eqx.Module):
     The model (a_1, ... | b_0, ...) maps u(k) to y(k+1), as in a loop.
     ``w(k) = sum_j weights[j] r(k + 1 + delay + j)``, and ``causal`` maps w to u. The
     output holds one input for each sample of the reference, in the unit of the model's
-    input. The reference is taken as constant before its first and after its last
-    sample, and the input before its first, for a bumpless start. Compile it with
-    ``eqx.filter_jit``.
+    input. The start is bumpless: before the first sample, reference and input are taken
+    as constant. After its last sample the reference is taken as constant, too. Compile
+    the inverse with ``eqx.filter_jit``.
     """
 
     causal: ARMA
@@ -66,12 +66,12 @@ class ExtrapolatedInverse(System):
     """PreviewInverse inside a loop, which knows the reference up to r(k+1) only.
 
     The references beyond r(k+1) are those of the line through r(k) and r(k+1), so that
-    the few samples that the inverse looks ahead need not be known. At j samples the
-    error is about a T^2 j^2 / 2 for a reference with the acceleration a and the sample
-    time T. Input r(k+1) in um, output in the unit of the model's input: the ``inverse``
-    of an ``InverseFeedforward`` or a ``FeedforwardFeedback``, alone or in series with
-    an inverse hysteresis. ``weights``, ``delay`` and ``causal`` as in
-    ``PreviewInverse``.
+    the few samples that the inverse looks ahead need not be known. At j samples beyond
+    r(k+1) the error is a T^2 j (j + 1) / 2 for a reference with the constant
+    acceleration a and the sample time T. The System serves as the ``inverse`` of an
+    ``InverseFeedforward`` or a ``FeedforwardFeedback``, alone or in series with an
+    inverse hysteresis. Input r(k+1) in um, output in the unit of the model's input.
+    ``weights``, ``delay`` and ``causal`` as in ``PreviewInverse``.
     """
 
     causal: ARMA
@@ -117,11 +117,12 @@ def direct_inverse(model: ARMA) -> PreviewInverse:
 def zero_phase_inverse(model: ARMA, margin: float = 1.0) -> PreviewInverse:
     """Return the zero-phase-error tracking controller (ZPETC; Tomizuka, 1987).
 
-    It cancels the zeros inside the circle of radius ``margin`` and the phase of the
-    others, B_u. The response from r to y is then B_u(z) B_u(1/z) / B_u(1)^2, which has
-    zero phase at all frequencies and is 1 at rest, but not elsewhere. Beyond the
-    model's delay, the inverse uses one sample of preview for each zero of B_u. Raises
-    ValueError for a margin outside (0, 1], a zero at z = 1 or b that are all zero.
+    It cancels the zeros inside the circle of radius ``margin``; of the other zeros,
+    with the polynomial B_u, it cancels only the phase. The response from r to y is then
+    B_u(z) B_u(1/z) / B_u(1)^2, which has zero phase at all frequencies and is 1 at
+    rest, but not elsewhere. Beyond the model's delay, the inverse uses one sample of
+    preview for each zero of B_u. Raises ValueError for a margin outside (0, 1], a zero
+    at z = 1 or b that are all zero.
     """
     scale, stable, unstable, delay = _split(model, margin)
     at_rest = unstable.sum()

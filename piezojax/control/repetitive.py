@@ -31,16 +31,17 @@ class RepetitiveControl(System):
     The plug-in form of section 2.6.3, Figure 2.17: ``feedback``, any controller, sees
     r + w in place of r, with
 
-    ``w = Q z^-period (w + gain z^lead e)``, e = r - z in um.
+    ``w = Q z^-period (w + gain z^lead e)``
 
-    ``filter`` Q is any low pass from um to um with unit DC gain, 0 at rest. Its delay
-    ``advance`` is subtracted from the delay line. A ``FirstOrderLag`` with time
-    constant tau has a delay of about tau / dt; symmetric ``ARMA`` coefficients make Q
-    exactly zero-phase.
+    and the error e, reference less measurement, in um. ``filter`` Q is any low pass
+    from um to um with unit DC gain and no offset. Its delay ``advance`` is subtracted
+    from the length of the delay line. A ``FirstOrderLag`` with time constant tau has a
+    delay of about tau / dt; symmetric ``ARMA`` coefficients make Q exactly zero-phase.
 
-    Let T be the inner loop from r to z, and take Q without its delay. The error of a
-    linear loop decays from period to period if ``|Q (1 - gain z^lead T)| < 1`` at all
-    frequencies. There is no anti-windup: an unreachable reference winds w up.
+    Let T be the inner loop from reference to measurement, and take Q without its delay.
+    The error of a linear loop decays from period to period if
+    ``|Q (1 - gain z^lead T)| < 1`` at all frequencies. There is no anti-windup: an
+    unreachable reference winds w up.
 
     Input an Observation, output that of ``feedback``. At rest without error w is zero.
     Raises ValueError for ``lead + advance >= period``.

@@ -1,4 +1,4 @@
-"""Discrete Riccati equations by doubling, which can be differentiated."""
+"""Differentiable solution of discrete Riccati equations by doubling."""
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,9 @@ DOUBLINGS = 20
 def riccati(
     A: Float[Array, "n n"], G: Float[Array, "n n"], H: Float[Array, "n n"]
 ) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
-    """Return the stabilising solution of X = H + A' X (1 + G X)^-1 A, and a residue.
+    """Return the stabilising solution of X = H + A' X (I + G X)^-1 A, and a residual.
 
-    ``G`` = B R^-1 B' and ``H`` are symmetric. The residue is 0 where the doubling
+    ``G`` = B R^-1 B' and ``H`` are symmetric. The residual is 0 if the doubling
     algorithm (Chu, Fan and Lin, 2005) has converged; it is not small if there is no
     stabilising solution.
     """

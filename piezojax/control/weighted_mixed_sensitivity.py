@@ -16,13 +16,14 @@ from .state_space_controller import StateSpaceController
 
 
 class WeightedMixedSensitivity(Designed):
-    """Central H-infinity controller for weights and a bound that are parameters.
+    """Central H-infinity controller, with its weights and its bound as parameters.
 
     ``model`` G maps u(k) to y(k+1) in um. At all frequencies |W1 S|^2 + |W2 K S|^2 <
     bound^2, with S = 1/(1 + G K). W1 has the gain ``low`` at 0, 1 at ``crossover`` and
-    ``high`` above it; W2 = ``effort_weight``. For a bound just above the least one this
-    is the design of ``mixed_sensitivity``; a larger bound approaches the H2 design. If
-    no controller meets the bound, the matrices are NaN and the loop diverges.
+    ``high`` above it; W2 = ``effort_weight``. For the smallest bound that a controller
+    meets this is the design of ``mixed_sensitivity``; a larger bound approaches the H2
+    design. If no controller meets the bound, the matrices are NaN and the loop
+    diverges.
 
     The Riccati equation is solved by the doubling algorithm (Chu, Fan and Lin, 2005),
     which can be differentiated. Input an Observation, output in the unit of u. Raises
@@ -119,7 +120,7 @@ def _augmented(control: WeightedMixedSensitivity) -> _Plant:
 def _riccati(
     plant: _Plant, R: Float[Array, "2 2"]
 ) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
-    """Return the stabilising solution X, and a residue near 0 if X exists."""
+    """Return the stabilising solution X, and a residual near 0 if X exists."""
     A, B, C, D, _ = plant
     cross = C.T @ D
     part = jnp.linalg.solve(R, cross.T)

@@ -1,4 +1,7 @@
-"""Dynamics of a stage: linear and scheduled models, creep, lags, delays and drift."""
+"""Dynamics of a stage: linear and scheduled models, filters, creep, delay and drift.
+
+Equations and sections without another source are those of Y. Cao's thesis (2013).
+"""
 
 from .analog_low_pass import AnalogLowPass as AnalogLowPass
 from .arma import ARMA as ARMA

@@ -91,10 +91,10 @@ class ARMA(Fittable):
 
 
 def _sampled(mode: Resonance, dt: float) -> dict[str, float]:
-    """Return the coefficients of a mode for a held input, by path."""
-    pulsation = 2.0 * np.pi * mode.frequency * dt
+    """Return the coefficients of ``mode``, by path, for a held input."""
+    angle = 2.0 * np.pi * mode.frequency * dt
     turn = np.sqrt(1.0 - mode.damping**2)
-    pole = np.exp(pulsation * (-mode.damping + 1j * turn))
+    pole = np.exp(angle * (-mode.damping + 1j * turn))
     # The first sample of the step response.
     first = 1.0 - pole.real - mode.damping / turn * pole.imag
     a1, a2 = 2.0 * pole.real, -(abs(pole) ** 2)

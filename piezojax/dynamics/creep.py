@@ -149,7 +149,7 @@ class LogarithmicCreep(Fittable):
 
 
 class SpringDamperCreep(Fittable):
-    """Creep of section 2.4.1: a spring and damped springs in series under one force.
+    """Creep of section 2.4.1: a spring and damped springs (Kelvin-Voigt) in series.
 
     ``y = F / spring + sum_i y_i`` with ``damping[i] y_i' + stiffness[i] y_i = F`` and
     ``F = force_per_volt u``: the cascade of Croft, Shed and Devasia (2001, reference
@@ -161,7 +161,7 @@ class SpringDamperCreep(Fittable):
     """
 
     part: ClassVar[Part] = Part(
-        "spring_damper_creep", "creep", "Creep of three damped springs behind a spring"
+        "spring_damper_creep", "creep", "Creep of a spring and three damped springs"
     )
 
     stiffness: Scalars = parameter(

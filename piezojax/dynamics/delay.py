@@ -1,4 +1,4 @@
-"""Fractional delay, a parameter that can be fitted."""
+"""Fractional delay that can be fitted."""
 
 from typing import ClassVar
 
@@ -40,7 +40,7 @@ class FractionalDelay(Fittable):
         starts = [0.5 * dt, 2.5 * dt] if found is None else [min(found, 4.5 * dt)]
         bounds = Range(0.0, 5.0 * dt)
         if found is not None and extent.modes:
-            # Errors of the hysteresis would bias the delay, as they would a mode.
+            # Errors of the hysteresis would bias the delay, as they would bias a mode.
             off = NEAR * dt
             bounds = Range(max(0.0, starts[0] - off), min(starts[0] + off, 5.0 * dt))
         return Recipe(

@@ -10,10 +10,10 @@ continuous filter, discretised by one of these methods:
   for a high-pass (Franklin, Powell and Workman, Digital Control of Dynamic Systems,
   1998, section 6.1).
 
-At rest the states of a section are its input and 0. In this form, unlike in that of a
-difference equation, the DC gain stays exact for cut-off frequencies far below the rate.
-Coefficients and derivatives are finite up to the Nyquist frequency: sine and cosine
-replace the tangent of the prewarped frequency.
+At rest one state of a section equals its input; the other, if any, is 0. In this form,
+unlike in that of a difference equation, the DC gain stays exact for cut-off frequencies
+far below the sampling rate. Coefficients and derivatives are finite up to the Nyquist
+frequency: sine and cosine replace the tangent of the prewarped frequency.
 """
 
 import math
@@ -63,7 +63,7 @@ class _Filter(Designed):
 
 
 class _Pass(_Filter):
-    """Low-pass or high-pass of any order."""
+    """Low-pass or high-pass of order 1 to 8."""
 
     frequency: Scalar = _frequency("cut-off frequency")
     dt: float = sample_time()
@@ -76,8 +76,9 @@ class LowPass(_Pass):
     """Low-pass of order 1 to 8 with unit DC gain and -3 dB at ``frequency``.
 
     The gain at ``frequency`` is exact for the bilinear transform. The ``kind`` is
-    "butterworth", or "equal poles", which are real. Input and output have the same
-    unit. Raises ValueError for parameters outside their limits and for an unknown name.
+    "butterworth" or "equal poles", all real. Input and output have the same unit.
+    Raises ValueError for parameters outside their limits and for an unknown ``kind`` or
+    ``discretisation``.
     """
 
     def resolved(self) -> System:
@@ -171,8 +172,9 @@ class Notch(_Filter):
 
     w = 2 pi frequency. The gain is ``depth`` at ``frequency`` and 1 far from it, so a
     depth of 1 switches the notch off. With a depth of 0 the gain is below -3 dB over a
-    width of 2 damping frequency (in Hz, for frequencies far below the rate). Input and
-    output have the same unit. Raises ValueError for parameters outside their limits.
+    width of 2 damping frequency (in Hz, for frequencies far below the sampling rate).
+    Input and output have the same unit. Raises ValueError for parameters outside their
+    limits.
     """
 
     frequency: Scalar = _frequency("frequency of the notch")
@@ -248,7 +250,10 @@ class SecondOrderSection(System):
 
 
 class _Place(NamedTuple):
-    """Frequency of poles: ``sine`` / ``cosine`` prewarps it, ``angle`` is w dt."""
+    """Frequency w of poles or zeros.
+
+    ``sine`` / ``cosine`` is the prewarped frequency, ``angle`` is w dt.
+    """
 
     sine: Scalar
     cosine: Scalar
@@ -256,7 +261,7 @@ class _Place(NamedTuple):
 
     @classmethod
     def at(cls, frequency: Scalar, dt: float, spread: float = 1.0) -> "_Place":
-        """Return the place of poles at ``spread`` times a prewarped ``frequency``."""
+        """Return poles at ``spread`` times a prewarped ``frequency``."""
         half = math.pi * dt * frequency
         return cls(spread * jnp.sin(half), jnp.cos(half), 2.0 * spread * half)
 
@@ -268,7 +273,7 @@ class _Place(NamedTuple):
 
 
 def _spread(kind: str, order: int) -> float:
-    """Return the natural frequency of the poles of a low-pass over its cut-off."""
+    """Return the natural frequency of a low-pass's poles over its cut-off frequency."""
     return 1.0 if kind == "butterworth" else 1.0 / math.sqrt(2.0 ** (1.0 / order) - 1.0)
 
 
@@ -361,7 +366,7 @@ def _second_order(
 
 
 class _Decay(NamedTuple):
-    """Functions of a pair of roots over one sample, exact also far below the rate.
+    """Functions of a pair of roots over one sample, exact for slow roots too.
 
     With s = damping angle and r^2 = (damping^2 - 1) angle^2 of either sign: ``gone`` is
     1 - exp(-s), ``excess`` exp(-s) (cosh(r) - 1) and ``odd`` exp(-s) sinh(r)/r.
@@ -406,12 +411,12 @@ class _Decay(NamedTuple):
 
     @property
     def at_dc(self) -> Scalar:
-        """The polynomial of the roots at z = 1."""
+        """Value at z = 1 of the monic polynomial with these roots."""
         return self.gone**2 - 2.0 * self.excess
 
     @property
     def at_nyquist(self) -> Scalar:
-        """The polynomial of the roots at z = -1."""
+        """Value at z = -1 of the monic polynomial with these roots."""
         return 1.0 + 2.0 * self.even + self.product
 
 

@@ -48,7 +48,7 @@ class FirstOrderLag(Fittable):
         return jnp.exp(-self.dt / self.time_constant)
 
     def as_arma(self) -> ARMA:
-        """Return the same lag as a second-order ARMA with two zero coefficients."""
+        """Return the same lag as a second-order ARMA, padded with zero coefficients."""
         pole = self.pole()
         return ARMA((pole, 0.0), (1.0 - pole, 0.0, 0.0))
 

@@ -31,9 +31,9 @@ def linearise(
 
     Without ``state``, the state at rest under ``input`` is used. Without ``dt`` (s),
     the sample time of the parts of the system is used. At a kink of the step, such as
-    that of a hysteresis at rest, the derivative is the one that JAX takes there: that
-    of the ascending branch for Coleman-Hodgdon models, that of a play at rest for a
-    play operator. To select a branch, move ``input`` slightly to one side.
+    that of a hysteresis at rest, the derivative is the one that JAX takes there: for
+    Coleman-Hodgdon models that of the ascending branch, for a play operator that of the
+    resting play. To select a branch, move ``input`` slightly to one side.
 
     The function works inside ``jax.jit`` and is differentiable. Raises ValueError if
     ``dt`` is not given and the parts of the system have no sample time or several.

@@ -23,9 +23,9 @@ is larger; the damping ratio changes by at most FADED."""
 class Mode(Designed, Fittable):
     """``y'' + 2 damping w y' + w^2 y = w^2 x`` with w = 2 pi frequency, unit DC gain.
 
-    The first resonance of a stage; y has the unit of x. It is the SecondOrderLag with
-    the frequency in Hz: exact for an input held between samples, and the output is y at
-    the end of the sample. Raises ValueError for parameters outside their limits.
+    A resonance of a stage; y has the unit of x. It is the SecondOrderLag with the
+    frequency in Hz: exact for an input held between samples, and the output is y at the
+    end of the sample. Raises ValueError for parameters outside their limits.
     """
 
     part: ClassVar[Part] = Part(
@@ -55,8 +55,8 @@ class Mode(Designed, Fittable):
 
     def resolved(self) -> LinearOscillator:
         """Return the LinearOscillator with the coefficients of one sample."""
-        pulsation = 2.0 * math.pi * self.frequency
-        return SecondOrderLag(pulsation, self.damping, self.dt).resolved()
+        angular_frequency = 2.0 * math.pi * self.frequency
+        return SecondOrderLag(angular_frequency, self.damping, self.dt).resolved()
 
 
 def mode_starts(extent: Extent) -> list[Resonance]:
@@ -68,9 +68,9 @@ def mode_starts(extent: Extent) -> list[Resonance]:
 def mode_bounds(extent: Extent, mode: Resonance) -> dict[str, Range]:
     """Return the bounds of frequency and damping, near ``mode`` if the record shows it.
 
-    Frequency and damping of ``mode`` were estimated from the errors at all frequencies.
-    A fit of a free run would change them, because the errors of the hysteresis dominate
-    a free run.
+    Frequency and damping of ``mode`` were estimated from whitened errors, in which all
+    frequencies count alike. A fit of a free run would bias them, because the errors of
+    the hysteresis dominate a free run.
     """
     if mode in extent.modes:
         off = extent.reach * max(NEAR, NEAR_DAMPED * mode.damping)

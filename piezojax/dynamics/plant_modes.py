@@ -37,7 +37,7 @@ class PlantMode(NamedTuple):
 
 
 def plant_modes(plant: System, reference: ScalarLike, dt: float) -> list[PlantMode]:
-    """Return the modes of a plant of one axis, by frequency.
+    """Return the lightly damped modes of a plant of one axis, sorted by frequency.
 
     The plant is linearised at rest at ``reference`` (um); ``dt`` is the sample time in
     s. The list is empty for a plant without finite derivatives.

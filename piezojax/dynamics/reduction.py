@@ -38,16 +38,16 @@ def balanced_reduction(model: StateSpace, order: int) -> Reduction:
     Sources: B. C. Moore, IEEE Trans. Automatic Control 26, 1981, pp. 17-32 (balancing);
     U. M. Al-Saggaf and G. F. Franklin, IEEE Trans. Automatic Control 32, 1987, pp.
     815-819 (the bound for discrete time). Raises ValueError for a model that is not
-    stable, and for an ``order`` below 1 or above the number of states that connect
-    inputs and outputs.
+    stable, and for an ``order`` below 1 or above the number of states that are
+    controllable and observable.
     """
     if not 1 <= order <= model.order:
         raise ValueError(f"order is {order}; it must be between 1 and {model.order}")
     balance = _balance(model)
     if order > balance.connected:
         raise ValueError(
-            f"order is {order}; only {balance.connected} states connect inputs and "
-            "outputs"
+            f"order is {order}; only {balance.connected} states are controllable and "
+            "observable"
         )
     return balance.truncated(model, order)
 
@@ -55,9 +55,9 @@ def balanced_reduction(model: StateSpace, order: int) -> Reduction:
 def reduced(model: StateSpace, most: int) -> StateSpace:
     """Return ``model`` with at most ``most`` states, by balanced reduction.
 
-    A model with at most ``most`` states is returned unchanged. Otherwise states that do
-    not connect input and output are removed too. Raises ValueError if a model with more
-    states is not stable.
+    A model with at most ``most`` states is returned unchanged. Otherwise states that
+    are not controllable or not observable are removed too. Raises ValueError if a model
+    with more states is not stable.
     """
     if model.order <= most:
         return model

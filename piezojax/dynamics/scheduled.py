@@ -18,9 +18,9 @@ class AmplitudeScheduled(System):
     are their rms inputs over all channels, ascending, in the unit of the input.
     ``time_constant`` (s) is that of the running mean square that measures the level.
     Between two levels the matrices are interpolated linearly in the level; beyond the
-    first and the last level the nearest model applies. If every A consists of scaled
-    rotations, no step enlarges a state, however the level changes: the interpolation is
-    as stable as its models.
+    first and the last level the nearest model applies. If every A consists of rotations
+    scaled by factors below 1, the states decay at zero input however the level changes:
+    the interpolation is as stable as its models.
 
     Raises ValueError for fewer than two models, models that differ in size or sample
     time, levels that do not ascend, or a time constant shorter than a sample.

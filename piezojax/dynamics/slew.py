@@ -12,8 +12,8 @@ OFF = 0.8, 1.25
 """Bounds of a rate, as multiples of the one estimated from the record."""
 
 SHORTEST = 2.0
-"""Samples in which the initial rate crosses the range of a record that shows no
-limit."""
+"""For a record without a visible limit the fit starts from the rate that crosses the
+range of the input in this number of samples."""
 
 
 class AmplifierSlew(Fittable):

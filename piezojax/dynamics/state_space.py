@@ -166,9 +166,9 @@ def reflected(
 ) -> tuple[Float[np.ndarray, "n n"], int]:
     """Return ``A`` with every eigenvalue inside the unit circle, and the number moved.
 
-    An eigenvalue z on or outside the circle becomes 1/conj(z), which preserves the
-    shape of its resonance. It is scaled within its diagonal block of the real Schur
-    form.
+    An eigenvalue z on or outside the circle is scaled to 1/conj(z), which preserves the
+    shape of its resonance, or to the modulus STABILISED_MODULUS if that is smaller. The
+    diagonal block of the real Schur form that contains it is scaled.
     """
     schur, basis = linalg.schur(A, output="real")[:2]
     moved, first = 0, 0

@@ -1,4 +1,7 @@
-"""Hysteresis models and their inverses, one model per file."""
+"""Hysteresis models and their inverses, one model per file.
+
+Equations and sections without another source are those of Y. Cao's thesis (2013).
+"""
 
 # isort: off
 # Models are listed and tried in this order.

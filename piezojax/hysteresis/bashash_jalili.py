@@ -34,36 +34,36 @@ class BashashJalili(Hysteresis, Fittable):
     """Hysteresis whose branches are curves between two remembered extrema.
 
     Input v in V, output x in um. The curve from a turning point (v1, x1) towards the
-    extreme (v2, x2) is (2.8)
+    extremum (v2, x2) is (2.8)
 
     ``x = x1 + k (1 + alpha exp(-tau |v - v1|)) (v - v1)``,
     ``k = (x2 - x1) / ((v2 - v1) (1 + alpha exp(-tau |v2 - v1|)))``,
 
     with two corrections of the printed equation: k contains v2 instead of v, so that
     the curve passes through both points, and the exponent contains the distance, so
-    that the curve also holds downwards. A turn stores an extreme, and the new branch
-    heads for the extreme stored before. When it arrives there, the loop is wiped out
-    and the branch that was interrupted there continues (2.9). The outermost extrema are
-    those of the reference loop, ``lower_input``, ``lower_output`` and ``upper_input``,
-    ``upper_output``; beyond them its branches are extended. The model starts on the
-    rising branch, or below ``lower_input`` on the falling one.
+    that the curve also holds downwards. Where the input turns, an extremum is stored,
+    and the new branch leads to the extremum stored before. When it arrives there, both
+    are wiped out and the branch interrupted there continues (2.9). The outermost
+    extrema are those of the reference loop, ``lower_input``, ``lower_output`` and
+    ``upper_input``, ``upper_output``; beyond them its branches are extended. The model
+    starts on the rising branch, or below ``lower_input`` on the falling one.
 
     The alphas lie above -1 and below e^2, so that every curve rises with v. With
-    negative alphas a branch starts flat, and loops run counter-clockwise, as for a
-    piezo; with positive alphas they run clockwise.
+    negative alphas a branch is least steep at its start, and loops run
+    counter-clockwise, as for a piezo; with positive alphas they run clockwise.
 
     The model remembers ``depth`` turning points inside the reference loop. When all are
     in use, a further turn moves back along the present branch: a loop nested deeper has
     no width, the output stays continuous, and the stored points stay valid.
 
     Return-point memory, wiping-out and rate independence hold exactly. Congruency does
-    not, because the height of a minor loop depends on its two extrema, which differ
-    after another history. The inverse is InverseHysteresis; there is no closed form,
+    not: the height of a minor loop depends on the outputs at its two ends, and these
+    depend on the history. The inverse is InverseHysteresis; there is no closed form,
     because v occurs in (2.8) outside and inside the exponential. Source: Bashash and
     Jalili 2007, J. Micromech. Microeng. 17.
 
-    Raises ValueError for numbers outside their limits, or a reference loop whose upper
-    extreme is not above the lower one.
+    Raises ValueError for parameters outside their limits, or a reference loop whose
+    upper end is not above the lower one.
     """
 
     rising: ClassVar[bool] = True
@@ -148,9 +148,9 @@ class BashashJalili(Hysteresis, Fittable):
         count = count + jnp.where(stores, 1.0, 0.0) - jnp.where(retraced, 1.0, 0.0)
         follows = ~turns | stores | retraced
 
-        # The branch heads for the second-last point. Beyond that point it heads for the
-        # point two places earlier, and so on. Every second point lies on this side of
-        # the input, the earlier ones further away.
+        # The branch leads to the second-last point. Beyond that point it leads to the
+        # one two places earlier, and so on. These points lie in the direction of the
+        # branch, the earlier ones further away.
         odd = count - 2.0 * jnp.floor(0.5 * count)
         wiped = jnp.zeros(())
         for i in range(1, slots - 1):
@@ -243,7 +243,7 @@ class BashashJalili(Hysteresis, Fittable):
 
 
 def _picked(points: Points, count: Scalar, back: int) -> Scalar:
-    """Return the valid point number ``back`` from the end; 1 is the last."""
+    """Return the ``back``-th of the ``count`` valid points, counted from the end."""
     picked = points[2 - back]
     for i in range(3 - back, len(points) + 1 - back):
         picked = jnp.where(count == i + back, points[i], picked)

@@ -52,12 +52,12 @@ class Duhem(Hysteresis, Fittable):
     length. A ShapedColemanHodgdon is ``reversible`` = (slope,), ``irreversible`` =
     (pull, (c,)); a BoucWen of nu = 1 is ``reversible`` = ((alpha,),),
     ``reversible_modulus`` = ((-beta_delta,),), ``irreversible`` = ((), (-beta_gamma,)).
-    The material starts on its virgin curve from ``rest_input`` (V), ``rest_memory``.
+    The material starts on its virgin curve from ``rest_input`` (V) and ``rest_memory``.
 
-    A step has ``substeps`` Runge-Kutta parts of fourth order, except where x changes
-    sign under a modulus. Rate independence holds to the same order; other laws depend
-    on the shape functions. In general, as in the two special cases, extrema are not
-    remembered: there is no return-point memory, no wiping-out and no congruency.
+    A step has ``substeps`` Runge-Kutta parts, of fourth order except where x changes
+    sign and a term contains |x|. Rate independence holds to the same order; other laws
+    depend on the shape functions. In general, as in the two special cases, extrema are
+    not remembered: there is no return-point memory, no wiping-out and no congruency.
     Source: Oh and Bernstein 2005, IEEE Trans. Automat. Contr. 50(5).
 
     If y rises with u on every branch, the inverse is InverseHysteresis.

@@ -1,4 +1,4 @@
-"""ARMA model with hysteresis, linear in all parameters except one."""
+"""ARMA model with hysteresis, linear in all coefficients except one."""
 
 from typing import ClassVar
 
@@ -82,7 +82,8 @@ class HystereticARMA(Hysteresis):
         both keep their DC gains, which become a and b, and share the shape that fits
         both best (the first singular vector of the two, each scaled to length one).
         Raises ValueError if the sine of the angle between them is above ``tolerance``
-        (1 accepts every model), or if the shared shape has no DC gain.
+        (1 accepts every model), if both are zero, or if the shared shape has a DC gain
+        of zero.
         """
         numerators = np.array([self.moving_1, self.moving_2], dtype=float)
         lengths = np.linalg.norm(numerators, axis=1, keepdims=True)

@@ -24,7 +24,7 @@ class HystereticOscillator(Hysteresis):
     """``mass y'' + damping y' + stiffness y + z = u``, z the Bouc-Wen force of y.
 
     The input u in N is held during the step; the output is y in m at its end. The
-    Runge-Kutta rule takes the ``substeps`` of ``hysteresis``. Source: Noel &
+    Runge-Kutta method uses the ``substeps`` of ``hysteresis``. Source: Noel &
     Schoukens, Hysteretic benchmark with a dynamic nonlinearity, 2016.
 
     Raises ValueError for parameters outside their limits.

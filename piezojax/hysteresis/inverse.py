@@ -65,8 +65,8 @@ class InverseHysteresis(Inverse):
     raises ValueError, naming the place, if the output does not rise. The reversals are
     samples: the test does not prove that every branch rises.
 
-    Raises ValueError in this case, for parameters outside their limits or ``lower >=
-    upper``.
+    Raises ValueError if the output does not rise, for parameters outside their limits
+    or ``lower >= upper``.
     """
 
     model: System
@@ -126,7 +126,8 @@ class InverseHysteresis(Inverse):
 
 
 MOSTLY = 0.8
-"""Share of steps against the input above which the sign is probably wrong."""
+"""Share of steps in which the output moves against the input, above which its sign is
+probably wrong."""
 
 FALLS = (
     ". This one falls while the input rises: reverse the sign of the displacement, or "
@@ -162,7 +163,7 @@ def check_rising(model: System, lower: ScalarLike, upper: ScalarLike) -> None:
 
 
 def _reversals(lower: float, upper: float) -> np.ndarray:
-    """Return inputs of loops that shrink to the middle, then of small rising loops."""
+    """Return inputs: loops that shrink to the middle, then small loops up the range."""
     shrinking = 0.5 + 0.5 * (-1.0) ** np.arange(1, 13) * np.linspace(1.0, 0.1, 12)
     steps = np.repeat(np.linspace(0.0, 1.0, 9), 2)[1:-1]
     climbing = steps - 0.05 * (np.arange(steps.size) % 2)

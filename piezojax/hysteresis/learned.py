@@ -20,9 +20,9 @@ LEARNED_PLAYS, NEURONS = 5, 4
 SEEDS = 16
 """Number of random starts of a fit, the same in every run.
 
-On records simulated with a learned operator (tests/benchmarks/choice.py), all of 12
-starts ended in a worse optimum than the true one for two of three noise draws. With 16
-starts, at least one start reached an optimum as good as the true one.
+On records simulated with a learned operator (tests/benchmarks/choice.py), each of 12
+starts ended in an optimum worse than the true parameters for two of three noise draws.
+Of 16 starts, at least one reached an optimum as good as the true parameters.
 """
 
 
@@ -38,7 +38,7 @@ class LearnedOperator(Hysteresis, Fittable):
     """``y(k) = sum_i a_i y(k-i) + linear . s(k) + output . tanh(mixing s(k) + bias)``.
 
     It suits a loop that no closed form fits. It is a nonlinear autoregressive model
-    with input (NARX, section 2.4.3) whose regressors s(k) have the memory of
+    with exogenous input (NARX, section 2.4.3) whose regressors s(k) have the memory of
     hysteresis. With n plays there are n + 2 regressors: the scaled input v = (x -
     centre) / scale, its plays of the half-widths ``thresholds``, and the change of the
     input over the last sample, (x(k) - x(k-1)) / ``pace``, which makes the loop
@@ -49,8 +49,8 @@ class LearnedOperator(Hysteresis, Fittable):
     without memory at ``rest_input``.
 
     Raises ValueError for parameters outside their limits, sizes that do not match, or
-    autoregressive coefficients whose sum is 1 or more: the model then has no output at
-    rest.
+    autoregressive coefficients whose sum is 1 or more: the model then has no stable
+    output at rest.
     """
 
     rest_field: ClassVar[str | None] = "rest_input"
@@ -143,7 +143,7 @@ class LearnedOperator(Hysteresis, Fittable):
                 ),
                 bias=[first[f"bias.{i}"] for i in range(NEURONS)],
                 output=[first[f"output.{i}"] for i in range(NEURONS)],
-                # A play wider than half the range of the input never moves.
+                # A half-width of 1 is half the range: a wider play adds no hysteresis.
                 thresholds=np.arange(1, LEARNED_PLAYS + 1) / (LEARNED_PLAYS + 1),
                 centre=0.5 * (extent.low + extent.high),
                 scale=0.5 * extent.width,

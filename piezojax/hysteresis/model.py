@@ -1,4 +1,4 @@
-"""Interface of hysteresis models, and the laws that a model keeps."""
+"""Interface of hysteresis models, and the laws that they obey."""
 
 import abc
 from collections.abc import Mapping
@@ -11,15 +11,18 @@ from ..core.system import System
 from .inverse import Inverse
 
 Laws: TypeAlias = Mapping[str, float]
-"""Laws that a model keeps, each with its largest defect as a share of the output's
-span."""
+"""Laws that a model obeys, each with its largest deviation.
+
+The deviation is a share of the output's span; that of "counter-clockwise", an area, is
+a share of the product of the spans of output and input.
+"""
 
 EXACT = 1e-9
-"""Largest defect of a law that holds up to rounding."""
+"""Largest deviation from a law that holds up to rounding."""
 
 STEP = 5e-3
-"""Largest defect of a law that holds to the order of the step, at 16 samples per
-branch."""
+"""Largest deviation from a law that holds only to the order of the integration, at 16
+samples per branch."""
 
 LAWS: Laws = {
     "return-point memory": EXACT,
@@ -30,8 +33,8 @@ LAWS: Laws = {
     "counter-clockwise": STEP,
 }
 """All laws, in this order: minor loops close; larger extrema wipe out those between
-them; minor loops of one input range have one shape; speed does not matter; pauses do
-not matter; loops run counter-clockwise, as for a piezo.
+them; minor loops between the same two inputs have the same shape; the speed of the
+input has no effect; pauses have no effect; loops run counter-clockwise, as for a piezo.
 """
 
 
@@ -53,7 +56,7 @@ class Hysteresis(System):
 
     ``rest_field`` is the name of the field with the input before a record, or None. A
     free run starts at rest under that input; with None it starts at rest under the
-    first input of the record. ``laws`` are the laws that the model keeps with the
+    first input of the record. ``laws`` are the laws that the model obeys with the
     parameters of a piezo, such as the starting values of its recipe.
 
     ``dynamic`` is True if the output can change while the input rests: the model

@@ -43,8 +43,8 @@ def advance_stops(change: Scalar, memory: Memory, thresholds: Memory) -> Memory:
 
 
 def _limited(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
-    # The gradient of jnp.maximum divides ties between its arguments, which takes twice
-    # as long.
+    # jnp.maximum divides its gradient between equal arguments, which takes twice as
+    # long.
     return jnp.where(value < low, low, jnp.where(value > high, high, value))
 
 
@@ -53,14 +53,14 @@ def check_plays(thresholds: Memory, weights: Memory, name: str = "weights") -> N
     if len(thresholds) != len(weights):
         raise ValueError(
             f"{len(thresholds)} thresholds and {len(weights)} {name}; "
-            "each play operator needs one of each"
+            "each operator needs one of each"
         )
 
 
 def plays_recipe(extent: Extent) -> tuple[dict[str, Any], dict[str, Range]]:
-    """Return the common fields and bounds of the Prandtl-Ishlinskii models."""
+    """Return the fields and bounds that all Prandtl-Ishlinskii models share."""
     width, slope = extent.width, extent.slope
-    # A play wider than half the range of the input never moves.
+    # A play with a half-width above half the range of the input adds no hysteresis.
     thresholds = 0.5 * width * np.arange(1, PLAYS + 1) / (PLAYS + 1)
     scales = [slope / width**i for i in range(3)]
     return (
@@ -95,7 +95,10 @@ def weighted_sum(weights: Memory, plays: Memory) -> Scalar:
 
 
 def check_invertible(polynomial: Memory, thresholds: Memory, weights: Memory) -> None:
-    """Raise ValueError unless ``invert_plays`` finds a unique input for any output."""
+    """Raise ValueError for plays that ``invert_plays`` cannot invert.
+
+    The slopes are checked for a linear polynomial only; ``check_rising`` tests others.
+    """
     if not polynomial:
         raise ValueError("the polynomial is empty; an inverse needs its linear term")
     for i, (low, high) in enumerate(itertools.pairwise(thresholds)):
@@ -160,7 +163,8 @@ def _root(polynomial: Memory, value: Scalar, low: Scalar, high: Scalar) -> Scala
         arrived = jnp.abs(newton - x) <= 1e-9 * (1.0 + jnp.abs(x))
         inside = (newton >= low) & (newton <= high)
         x = jnp.where(inside | arrived, newton, middle)
-    # A further step, differentiated at constant slope, has the implicit derivative.
+    # One more step, its slope held constant, has the derivative of the implicit
+    # function.
     return x - (polynomial_part(polynomial, x) - value) / _rising(fixed, x)
 
 

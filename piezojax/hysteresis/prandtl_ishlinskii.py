@@ -26,7 +26,7 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
     ``thresholds[i]``. The memoryless part is P(x) = polynomial[0] x + polynomial[1] x^2
     + ...: with terms above the first this is the model of Gu, Zhu and Su (2014, IEEE
     Trans. Ind. Electron. 61(3)). The material starts without memory at ``rest_input``.
-    Loops close for weights >= 0.
+    With weights >= 0 loops run counter-clockwise, as for a piezo.
 
     Raises ValueError for parameters outside their limits, or a different number of
     thresholds and weights.
@@ -83,20 +83,20 @@ class PrandtlIshlinskii(Hysteresis, Fittable):
 class InversePrandtlIshlinskii(Inverse):
     """Voltage that moves a Prandtl-Ishlinskii model to a wanted output.
 
-    Input f(k) in um, output u(k) in V. From a given memory the next output of the model
-    rises piecewise with its input, with a corner where each play begins to move; the
-    plays move in the order of their thresholds. The outputs at the corners determine
-    which plays move for f. The remaining equation is linear and solved in closed form;
-    with terms above the first in P it is a polynomial that rises on a known interval,
-    solved by a bracketed Newton method to 1e-9 um. For a linear P this is the inverse
-    of Krejci and Kuhnen (2001, IEE Proc. Control Theory Appl. 148(3)), which
-    ``operator`` returns as a Prandtl-Ishlinskii operator. The state is that of the
-    model, so that a controller can advance it with the voltage applied after clipping.
+    Input f(k) in um, output u(k) in V. For a given memory the next output of the model
+    rises with its input and has a corner where each play begins to move; the plays move
+    in the order of their thresholds. The outputs at the corners determine which plays
+    move for f. The remaining equation is linear and solved in closed form; with terms
+    above the first in P it is a polynomial that rises on a known interval, solved by a
+    bracketed Newton method to 1e-9 um. For a linear P this is the inverse of Krejci and
+    Kuhnen (2001, IEE Proc. Control Theory Appl. 148(3)), which ``operator`` returns as
+    a Prandtl-Ishlinskii operator. The state is that of the model, so that a controller
+    can advance it with the voltage applied after clipping.
 
     Raises ValueError for thresholds that do not ascend, an empty polynomial, or, with a
-    linear P, weights for which the output does not rise with the input. With a
-    polynomial P the output must rise over the inputs in use; otherwise the voltage is
-    finite but wrong.
+    linear P, weights for which the output does not rise with the input. With terms
+    above the first in P the output must rise over the inputs in use; otherwise the
+    voltage is finite but wrong.
     """
 
     model: PrandtlIshlinskii
@@ -120,8 +120,9 @@ class InversePrandtlIshlinskii(Inverse):
     def operator(self) -> PrandtlIshlinskii:
         """Return the inverse as a Prandtl-Ishlinskii operator from um to V.
 
-        Its plays depend only on the wanted output, from the virgin state. Raises
-        ValueError for a polynomial with terms above the first.
+        Its plays start from the virgin state and follow the wanted output, even where
+        the applied voltage is clipped. Raises ValueError for a polynomial with terms
+        above the first.
         """
         model = self.model
         first, *others = model.polynomial

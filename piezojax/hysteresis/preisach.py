@@ -44,9 +44,9 @@ class Preisach(Hysteresis, Designed):
     the output with all relays down. Input in V, output in um; beyond ``low`` and
     ``high`` the output is flat.
 
-    Within a cell the weight is distributed over relays on the diagonal of the cell,
-    where alpha - beta equals that of its corners. The relays therefore lie on n lines
-    of constant width alpha - beta = k (high - low)/n, k = 0 ... n-1. On each line the
+    Within a cell the weight is distributed over relays on the diagonal of the cell
+    along which alpha - beta is constant. The relays therefore lie on n lines of
+    constant width alpha - beta = k (high - low)/n, k = 0 ... n-1. On each line the
     relays are up exactly as far as the position of a play operator of that width. The
     memory thus consists of n scalars, without turning points or relays (Brokate and
     Sprekels, Hysteresis and Phase Transitions, 1996, section 2.2). The laws of the
@@ -112,10 +112,10 @@ def check_weights(name: str, weights: Matrix) -> None:
 
 @jax.jit
 def rows_of(weights: Matrix) -> Rows:
-    """Return the weights of all lines in each cell of beta.
+    """Return one row for each cell of beta: the weights of all lines in that cell.
 
-    Element k belongs to line k: the cells whose alpha lies k cells above their beta. It
-    is 0 beyond the end of the line.
+    Element k of a row belongs to line k, the cells whose alpha lies k cells above their
+    beta. It is 0 beyond the end of the line.
     """
     cells = weights.shape[0]
     column = np.arange(cells)
@@ -137,7 +137,7 @@ class Traverse(NamedTuple):
 
 @jax.jit
 def _upwards(rows: Rows) -> Traverse:
-    """Return the lines for a rising input, which passes their alphas."""
+    """Return the Traverse of a rising input, which passes the alphas of the lines."""
     alpha, line = np.arange(len(rows))[:, None], np.arange(len(rows))
     slopes = jnp.where(line <= alpha, jnp.stack(rows)[alpha - line, line], 0.0)
     return Traverse(jnp.cumsum(slopes, axis=0) - slopes, slopes)
@@ -145,7 +145,7 @@ def _upwards(rows: Rows) -> Traverse:
 
 @jax.jit
 def _downwards(rows: Rows) -> Traverse:
-    """Return the lines for a falling input, from the top and with reversed sign."""
+    """Return the Traverse of a falling input: cells from the top, outputs negated."""
     slopes = jnp.stack(rows)[::-1]
     reached = jnp.cumsum(slopes, axis=0) - slopes - jnp.sum(slopes, axis=0)
     return Traverse(reached, slopes)

@@ -91,8 +91,8 @@ class RateDependentPrandtlIshlinskii(Hysteresis, Fittable):
     @classmethod
     def recipe(cls, extent: Extent) -> Recipe:
         fields, bounds = plays_recipe(extent)
-        # A sine over the whole range needs several periods in the record; if the growth
-        # is a sixth of its period, no play moves.
+        # A sine over the whole range needs several periods in the record; a growth of a
+        # sixth of its period widens the plays by its amplitude where it is fastest.
         most = 0.05 * extent.duration
         return Recipe(
             cls(**fields, growth=0.01 * most, dt=extent.dt),
@@ -117,8 +117,8 @@ class InverseRateDependentPrandtlIshlinskii(Inverse):
     """Voltage that moves a rate-dependent model to a wanted output.
 
     Input f(k) in um, output u(k) in V. The thresholds of the next step are known, so
-    the step is inverted as in ``InversePrandtlIshlinskii``, exactly at every rate.
-    State and errors are those of that class.
+    the step is inverted as in ``InversePrandtlIshlinskii``, exactly at every rate. The
+    state is that of the model; the errors are those of that class.
     """
 
     model: RateDependentPrandtlIshlinskii

@@ -12,7 +12,7 @@ from .preisach import Levels, PlayLines, Preisach, Rows, check_weights, outputs,
 
 
 class RateDependentPreisach(Hysteresis, Designed):
-    """``y = integral of mu(alpha, beta, du/dt) relay(u)``, (2.10), of a Preisach model.
+    """Preisach model ``y = integral of mu(alpha, beta, du/dt) relay(u)``, (2.10).
 
     In each cell mu changes from the density of ``slow`` to that of ``fast_weights``
     (um, n x n as in Preisach) with the share r^2 / (1 + r^2), r = (du/dt) / ``rate``.

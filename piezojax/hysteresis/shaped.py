@@ -24,14 +24,15 @@ class ShapedColemanHodgdon(Hysteresis, Fittable):
     """``y' = |x'| (p(x) + c y) + g(x) x'`` with polynomials p and g.
 
     This is the general model of Coleman and Hodgdon, alpha |x'| (f(x) - y) + g(x) x',
-    with c = -alpha and p = alpha f; the thesis takes f and g linear (section 3.1, its
-    first limitation). Input x in V, output y in um; p(x) = pull[0] + pull[1] x + ...,
-    g(x) = slope[0] + slope[1] x + .... A step integrates the polynomials exactly and y
-    by the trapezoid rule. With ``pull = (0, a)``, ``slope = (b,)`` it is
-    ColemanHodgdon. As there, the virgin curve starts at ``rest_input``, and there is no
-    return-point memory, no wiping-out and no congruency. The inverse is
-    InverseHysteresis, if y rises on every branch. Loops run counter-clockwise, as for a
-    piezo, where p'(x) > |c| g(x), and clockwise where p'(x) < |c| g(x).
+    with c = -alpha and p = alpha f; the thesis takes f linear and g constant, (3.2) and
+    (3.3), and names this its first limitation (section 9.2). Input x in V, output y in
+    um; p(x) = pull[0] + pull[1] x + ..., g(x) = slope[0] + slope[1] x + .... A step
+    integrates the polynomials exactly and y by the trapezoid rule. With ``pull``
+    (0, a) and ``slope`` (b,) it is ColemanHodgdon. As there, the virgin curve starts at
+    ``rest_input``, and there is no return-point memory, no wiping-out and no
+    congruency. The inverse is InverseHysteresis, if y rises on every branch. Loops run
+    counter-clockwise, as for a piezo, where p'(x) > |c| g(x), and clockwise where
+    p'(x) < |c| g(x).
 
     Raises ValueError for parameters outside their limits or empty polynomials.
     """
@@ -41,7 +42,7 @@ class ShapedColemanHodgdon(Hysteresis, Fittable):
     part: ClassVar[Part] = Part(
         "shaped_coleman_hodgdon",
         "hysteresis",
-        "Coleman-Hodgdon with cubic shape functions: y' = |x'| (p(x) + c y) + g(x) x'",
+        "Coleman-Hodgdon, cubic p and quadratic g: y' = |x'| (p(x) + c y) + g(x) x'",
     )
 
     pull: Scalars = parameter(

@@ -46,7 +46,7 @@ class StopPrandtlIshlinskii(Hysteresis, Fittable):
     part: ClassVar[Part] = Part(
         "stop_prandtl_ishlinskii",
         "hysteresis",
-        "Prandtl-Ishlinskii by ten stop operators and a cubic polynomial",
+        "Prandtl-Ishlinskii: ten stop operators and a cubic polynomial",
     )
 
     polynomial: Scalars = parameter(

@@ -33,10 +33,11 @@ class ContourError(Metric):
     reference, or from their straight line if they lie on one. It is exact on circles
     and lines for any lag; elsewhere it is accurate if error and curvature change little
     over the lag. (The usual estimate, the component of the error across the velocity of
-    the reference, counts lag on a curve as contour error.) At rest and at a sharp
-    corner the path is a point, and the whole distance from it counts. The last sample
-    is left out, because it has no successor. If a run ends before ``start``, the
-    figures are NaN. The gradient is 0 where the distance is 0.
+    the reference, counts lag on a curve as contour error.) Where the reference rests or
+    reverses, the path is a point, and the whole distance from it counts; at a sharp
+    corner the circle is small, and almost the whole distance counts. The last sample is
+    left out, because it has no successor. If a run ends before ``start``, the figures
+    are NaN. The gradient is 0 where the distance is 0.
     """
 
     axes: tuple[int, int] = eqx.field(static=True, default=(0, 1))
@@ -94,7 +95,7 @@ def _square_distance(error: _Point, arriving: _Point, leaving: _Point) -> Scalar
     The circle passes through the three points -``arriving``, 0 and ``leaving``.
     """
     squares = [a * a + b * b for a, b in (arriving, leaving)]
-    # Inversion turns the circle into a line: its tangent at 0.
+    # Inversion turns the circle into a line parallel to its tangent at 0.
     tangent = [
         a / _positive(squares[0]) + b / _positive(squares[1])
         for a, b in zip(arriving, leaving, strict=True)

@@ -1,9 +1,10 @@
 """Contours: paths of two axes in time, and their names in a motion.
 
 A named contour stands for two signals of ``piezojax.signals``: ``Rx+Ry:CIRCLE5`` is a
-shorthand for ``Rx:SIN5 Ry:COS5``. Every contour starts on its path, so for a loop at
-rest at the first point only the speed jumps. It does not jump on an axis that follows
-SIN, SCAN or the steps of a raster, nor with ``rise`` in the functions below.
+shorthand for ``Rx:SIN5 Ry:COS5``. A loop starts at rest at the first point of the
+contour, so only the velocity of its reference jumps at the start. It does not jump on
+an axis that follows SIN, SCAN or the steps of a raster, nor with ``rise`` in the
+functions below.
 """
 
 import math
@@ -39,7 +40,7 @@ def circle(
 
     It runs clockwise from the middle of its left side, seen with the first axis to the
     right and the second up. ``frequency`` in Hz; ``amplitude``, the radius, and
-    ``offset`` in the unit of the axes. The speed rises evenly from rest over the first
+    ``offset`` in the unit of the axes. The speed rises linearly from 0 over the first
     ``rise`` s. Differentiable in all but ``rise``. Raises ValueError for a ``rise``
     below 0.
     """
@@ -56,10 +57,10 @@ def lissajous(
 ) -> Path:
     """Return the Lissajous figure that closes after 1/``frequency`` s.
 
-    Each axis swings ``cycles`` times in that time, a quarter of a period apart. The
-    leading axis is chosen so that the figure does not retrace itself. Other arguments
-    as for ``circle``. Raises ValueError for cycles that are not whole, positive and
-    without common factor.
+    In this time the axes complete ``cycles`` periods, one as SIN and the other as COS,
+    in the order for which the figure does not retrace itself. Other arguments as for
+    ``circle``. Raises ValueError for cycles that are not whole, positive and without
+    common factor.
     """
     whole = all(isinstance(count, int) and count > 0 for count in cycles)
     if not whole or math.gcd(*cycles) > 1:
@@ -136,8 +137,8 @@ def signals_of(name: str) -> tuple[str, str]:
 
 
 def _quadrature(first: int) -> tuple[str, str]:
-    # The figure cos(p w), sin(q w) with p and q coprime is mirrored in w, and so
-    # retraces itself, if and only if p is even.
+    # The figure cos(p w), sin(q w) with p and q coprime is symmetric about some w, and
+    # so retraces itself, if and only if p is even.
     return ("COS", "SIN") if first % 2 == 0 else ("SIN", "COS")
 
 

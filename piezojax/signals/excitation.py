@@ -16,13 +16,13 @@ SMALL = 0.02
 """Amplitude of the multisine, as a share of the range, if the slew rate allows it."""
 
 LINES = 600
-"""Most frequencies of the multisine: 1 % apart, so that none misses a resonance."""
+"""Most frequencies of a multisine; about 1 % apart, they miss no resonance."""
 
 PHASES = 50
-"""Random sets of phases; the multisine uses that with the lowest crest factor."""
+"""Number of random sets of phases; the one with the lowest crest factor is used."""
 
 EDGE = 0.02
-"""Duration of a move between levels, s, if the slew rate allows it."""
+"""Shortest duration of a move between levels, s; a low slew rate lengthens it."""
 
 COARSEST = 50
 """Smallest number of samples in a cycle over the whole range."""

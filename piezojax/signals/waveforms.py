@@ -1,4 +1,4 @@
-"""Reference and excitation signals: plain functions of time, batched by ``jax.vmap``.
+"""Reference and excitation signals: functions of time that ``jax.vmap`` can batch.
 
 Each takes ``time`` in s and parameters that may be arrays: ``frequency`` in Hz,
 ``amplitude`` and ``offset`` in um (or in V, for an excitation).
@@ -175,7 +175,7 @@ def chirp(
     amplitude: ScalarLike = 5.0,
     offset: ScalarLike = 0.0,
 ) -> Time:
-    """Sweep linearly from rest up to ``frequency`` at the last sample."""
+    """Sweep the frequency linearly from 0 to ``frequency`` at the last sample."""
     phase = 0.5 * frequency * time**2 / time[-1]
     return offset + amplitude * (1.0 - jnp.cos(2.0 * jnp.pi * phase))
 

@@ -1,4 +1,4 @@
-"""Controllers of vendors and a generic servo, with parameters as typed in."""
+"""Vendors' controllers and a generic servo, with parameters as users type them in."""
 
 from .device_designs import DEVICE_DESIGNS as DEVICE_DESIGNS
 from .e727 import E727 as E727

@@ -1,4 +1,4 @@
-"""Initial parameters of vendors' controllers for tuning: stable, slow, with a notch."""
+"""Initial parameters of vendors' controllers: stable, slow loops with a notch."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
@@ -18,10 +18,11 @@ Limits = tuple[float, float]
 
 
 class Start(NamedTuple):
-    """Gains and notch of a slow loop with a PI and one notch.
+    """Parameters of a slow loop with a PI and one notch.
 
     ``proportional`` is in V/um and ``integral`` in V/(um s); ``notch`` is the frequency
-    of the strongest mode of the plant in Hz, or a quarter of the rate without one.
+    of the plant's strongest mode in Hz, or a quarter of the sampling rate if it has
+    none.
     """
 
     proportional: float
@@ -70,7 +71,7 @@ def nv200(
 
 
 def _within_range(name: str, gain: float) -> float:
-    """Return ``gain``, moved into the declared range of a gain of the NV200."""
+    """Return ``gain``, clipped to the declared range of the NV200's gain ``name``."""
     declared = dict(declarations(NV200))[name].typical
     assert declared is not None
     return float(np.clip(gain, *declared))

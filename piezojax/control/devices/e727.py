@@ -68,20 +68,26 @@ class E727(Device):
     Options that the manual does not specify: ``structure`` is "series", in which P
     multiplies all terms, or "parallel"; ``anti_windup`` is "none" or "hold". A notch is
     ``(s^2 + 2 r k w s + w^2) / (s^2 + 2 k w s + w^2)`` with rejection r and bandwidth
-    k; with k = 1 both readings of the manual agree. ``notch_method`` (0x08000600) is 0,
-    bilinear, or 1, zero-order hold; method 2 of the device is not modelled.
+    k; with k = 1 both interpretations of the manual agree. ``notch_method``
+    (0x08000600) is 0, bilinear, or 1, zero-order hold; method 2 of the device is not
+    modelled.
 
     Input an Observation, output in V. Raises ValueError for a value out of range.
     """
 
     proportional: Scalar = parameter(
-        "1", "P", above=0.0, scale="log", typical=(1e-4, 10.0)
+        "1", "proportional gain P", above=0.0, scale="log", typical=(1e-4, 10.0)
     )
     integral_time: Scalar = parameter(
-        "s", "I", least=0.0, scale="log", typical=(1e-5, 1.0)
+        "s", "integral time; 0 is off", least=0.0, scale="log", typical=(1e-5, 1.0)
     )
     derivative_time: Scalar = parameter(
-        "s", "D", least=0.0, scale="log", typical=(1e-7, 1e-2), default=0.0
+        "s",
+        "derivative time",
+        least=0.0,
+        scale="log",
+        typical=(1e-7, 1e-2),
+        default=0.0,
     )
     scale: Scalar = parameter(
         "V/um", "command for P = 1 and an error of 1 um", kw_only=True
@@ -116,7 +122,7 @@ class E727(Device):
         check_option("filter_type", self.filter_type, (0, 1))
 
     def loop(self) -> ServoLoop:
-        """Return the loop of the parameters as they are."""
+        """Return the loop of the parameters, without rounding them."""
         gain = self.scale * self.proportional
         outer = gain if self.structure == "series" else self.scale
         notches = (

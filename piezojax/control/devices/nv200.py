@@ -67,18 +67,19 @@ class NV200(Device):
 
     The setpoint passes a slew limit (``sr``, % of the range per ms; 2000 is off) and a
     low-pass of order 4 (``setlpf``), the measurement a low-pass of order 1
-    (``poslpf``), and the command a notch (``notchf``, -3 dB width ``notchb``); each is
-    on with ``setlpon``, ``poslpon``, ``notchon``. ``kp``, ``ki``, ``kd`` and the
-    feedforwards ``pcf_x``, ``pcf_v``, ``pcf_a`` are the numbers that are typed in, with
-    three decimals. The manual does not give their scale: ``scale`` is in V per um for a
-    gain of 1, and ``device_scale`` measures it. If it is 0, the loop is assumed to
-    normalise voltage and position by their ranges, and the scale is (avmax - avmin) /
-    (posmax - posmin). Blocks, ranges and rounding are those of the vendor's manual and
-    library (versions in docs/devices.md). The width of the notch is exact for a depth
-    of 0 and a frequency far below 20 kHz; at 4 kHz the notch is 24 % narrower.
+    (``poslpf``), and the command a notch (``notchf``, -3 dB width ``notchb``);
+    ``setlpon``, ``poslpon`` and ``notchon`` switch these filters on. ``kp``, ``ki``,
+    ``kd`` and the feedforwards ``pcf_x``, ``pcf_v``, ``pcf_a`` are the numbers that are
+    typed in, with three decimals. The manual does not give their scale: ``scale`` is in
+    V per um for a gain of 1, and ``device_scale`` measures it. If it is 0, the loop is
+    assumed to normalise voltage and position by their ranges, and the scale is
+    (avmax - avmin) / (posmax - posmin). Blocks, ranges and rounding are those of the
+    vendor's manual and library (versions in docs/devices.md). The width of the notch is
+    exact for a depth of 0 and a frequency far below 20 kHz; at 4 kHz the notch is 24 %
+    narrower.
 
     Options that the manual does not specify: ``integration`` is "rectangular",
-    "trapezoidal" or "half" (rectangular with half the gain, as printed);
+    "trapezoidal" or "half" (rectangular with half the gain, as the manual prints it);
     ``setpoint_filter`` is "butterworth" or "equal poles"; ``notch_depth`` is the gain
     at the centre of the notch; ``anti_windup`` is "none" or "hold".
 
@@ -132,10 +133,10 @@ class NV200(Device):
         check_option("setpoint_filter", self.setpoint_filter, KINDS)
 
     def typed(self) -> "NV200":
-        """Return the device with its parameters as rounded when they are typed in.
+        """Return the device with its parameters rounded as they are typed in.
 
-        Rounding may make the notch a hertz wider than its limit of 2 notchf; the width
-        is then reduced to the limit.
+        Rounding could make the notch a hertz wider than its limit of 2 notchf.
+        Therefore the width is first limited to twice notchf rounded down.
         """
         width = jnp.minimum(self.notchb, 2.0 * jnp.floor(self.notchf))
         return rounded_fields(dataclasses.replace(self, notchb=width))
@@ -151,13 +152,13 @@ class NV200(Device):
             return ()
         return (
             f"the scale of the gains of the NV200 is assumed, "
-            f"{float(self._assumed_scale):.4g} V/um: the gains may act several times "
-            "as strongly; measure it (python -m piezojax.identify RECORD --controller "
-            "nv200) and set controller.scale",
+            f"{float(self._assumed_scale):.4g} V/um: on the device the gains may act "
+            "several times as strongly as simulated; measure it (python -m "
+            "piezojax.identify RECORD --controller nv200) and set controller.scale",
         )
 
     def loop(self) -> ServoLoop:
-        """Return the loop of the parameters as they are."""
+        """Return the loop of the parameters, without rounding them."""
         scale = jnp.where(self.scale > 0.0, self.scale, self._assumed_scale)
         range = self.posmax - self.posmin
         half = self.integration == "half"

@@ -49,12 +49,12 @@ class PyRPL(Device):
     set point: a loop that raises the output when the reading is too low has negative
     gains. ``i`` is the frequency at which the integral has the gain 1. Gains are
     rounded as in the registers. The first ``filters`` of four low-passes of order 1 are
-    on, with the cut-offs that the module has: 125 MHz / 2 pi over a power of two. The
+    on, at the cut-offs of the module: 125 MHz / 2 pi divided by a power of two. The
     integral stays between -4 and 4 V, the output between ``min_voltage`` and
     ``max_voltage``. The derivative is disabled in the gate array.
 
     The gate array runs at 125 MHz; here the module is sampled at ``dt``, and its delay,
-    about 0.3 us with the converters, belongs to ``computation`` of the study.
+    about 0.3 us with the converters, belongs in ``computation`` of the study.
     ``sensor_gain`` and ``amplifier_gain`` are the gains between the device and the
     stage, and ``offset`` is the voltage of the piezo at an output of 0 V. Source:
     PyRPL's PID module. Input an Observation, output in V. Raises ValueError for a value
@@ -98,7 +98,7 @@ class PyRPL(Device):
         return dataclasses.replace(rounded_fields(self), **cutoffs)
 
     def loop(self) -> ServoLoop:
-        """Return the loop of the parameters as they are."""
+        """Return the loop of the parameters, without rounding them."""
         gain = -self.sensor_gain * self.amplifier_gain
         ends = (self.min_voltage, self.max_voltage, -INTEGRAL, INTEGRAL)
         lower, upper, least, most = (

@@ -56,12 +56,12 @@ class Servo(Device):
 
     With the ``form`` "parallel" the PID is P e + I int e dt + D de/dt, with
     ``integral`` in V/(um s) and ``derivative`` in V s/um. With "standard" it is
-    P (e + int e dt / Ti + Td de/dt), with the times Ti and Td, in s, in their places:
-    a study must then give the bounds of ``integral``. In both forms an ``integral`` of
-    0 switches the integral off.
-    ``feedforward`` multiplies the setpoint behind its slew limit. ``low_pass_order`` is
-    0 for no low-pass, 1 or 2. ``anti_windup`` is "none" or "hold". Input an
-    Observation, output in V. Raises ValueError for a value out of range.
+    P (e + int e dt / Ti + Td de/dt), where ``integral`` and ``derivative`` hold the
+    times Ti and Td in s; a study must then give the bounds of ``integral``. In both
+    forms an ``integral`` of 0 switches the integral off. ``feedforward`` multiplies the
+    setpoint behind its slew limit. ``low_pass_order`` is 0 for no low-pass, 1 or 2.
+    ``anti_windup`` is "none" or "hold". Input an Observation, output in V. Raises
+    ValueError for a value out of range.
     """
 
     proportional: Scalar = parameter(
@@ -114,7 +114,7 @@ class Servo(Device):
             check(name, below, below=0.5 / self.dt)
 
     def loop(self) -> ServoLoop:
-        """Return the loop of the parameters as they are."""
+        """Return the loop of the parameters, without rounding them."""
         integral, derivative = self.integral, self.derivative
         if self.form == "standard":
             integral = self.proportional * inverse_or_off(integral)

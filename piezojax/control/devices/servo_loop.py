@@ -15,17 +15,17 @@ FIXED_DT = 5e-5
 """Sample time of devices with a fixed rate, s."""
 
 NO_SLEW = 1e9
-"""Slew rate (um/s) beyond every setpoint."""
+"""Slew rate (um/s) that no setpoint reaches."""
 
 NO_END = 1e9
-"""End of the range (V) of an integral without limits."""
+"""Limit (V) that no integral reaches."""
 
 INTEGRATIONS = ("rectangular", "trapezoidal")
 ANTI_WINDUPS = ("none", "hold")
 
 
 class Device(Designed):
-    """Digital controller of a vendor, with the parameters that are typed in.
+    """Digital controller of a vendor, with parameters as users type them in.
 
     Simulation uses the values as the device rounds them; gradients ignore the rounding,
     so that a device can be tuned.
@@ -48,7 +48,7 @@ class Device(Designed):
 
     @abc.abstractmethod
     def loop(self) -> System:
-        """Return the loop of the parameters as they are."""
+        """Return the loop of the parameters, without rounding them."""
 
 
 class ServoLoopState(NamedTuple):
@@ -72,12 +72,12 @@ class ServoLoop(System):
         s = setpoint(r);  e = s - position(z)
         u = output(P e + I sum(e) dt + D (e - e1)/dt + Fx s + Fv dr/dt + Fa d2r/dt2)
 
-    with the previous error e1, clipped to ``lower`` and ``upper``. ``integration`` is
-    "rectangular" (backward) or "trapezoidal". The integral, which includes the voltage
-    at rest, stays between its ends. The ``anti_windup`` "hold" is conditional
-    integration: no step drives a saturated output further; with "none" the integral
-    winds up. Each filter has unit DC gain. Input an Observation, output in V. Raises
-    ValueError for an unknown option.
+    with the previous error e1; u is clipped to ``lower`` and ``upper``. ``integration``
+    is "rectangular" (backward) or "trapezoidal". The integral includes the voltage at
+    rest and stays between ``least_integral`` and ``most_integral``. ``anti_windup``
+    "hold" is conditional integration: the integral holds its value while it would drive
+    a saturated output further. With "none" it winds up. Each filter has unit DC gain.
+    Input an Observation, output in V. Raises ValueError for an unknown option.
     """
 
     setpoint: System
@@ -167,7 +167,7 @@ def in_series(*filters: System | None) -> System:
 
 
 def inverse_or_off(time: Scalar) -> Scalar:
-    """Return 1 / ``time``, or 0 for an integral time of 0, which is off."""
+    """Return 1 / ``time``, or 0 if ``time`` is 0, which switches the integral off."""
     runs = time > 0.0
     return jnp.where(runs, 1.0 / jnp.where(runs, time, 1.0), 0.0)
 

@@ -32,13 +32,12 @@ class Stabilizer(Device):
 
     ``p``, ``i`` and ``d`` are the numbers under ``repr/Pid/gain`` (V/V times a power of
     s), ``limit_i`` and ``limit_d`` those under ``repr/Pid/limit``; the sign of ``p`` is
-    that of all of them. The ``order`` of the firmware is I. A feedback that raises
+    that of all of them. The ``order`` of the ``Pid`` is "I". A feedback that raises
     the output when the reading is too low has a negative ``p``. ``minimum`` and
     ``maximum`` limit the output; the biquad continues from the limited output, so that
     its integral does not wind up. Coefficients and the running sum are rounded to
     single precision, in codes of the converters, as the firmware does: at 781 kHz a
-    small integral gain loses small errors. The converters themselves are those of the
-    study.
+    small integral gain loses small errors. The study sets the converters themselves.
 
     ``sensor_gain`` and ``amplifier_gain`` are the gains between the device and the
     stage, and ``offset`` is the voltage of the piezo at an output of 0 V. Source:
