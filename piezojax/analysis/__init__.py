@@ -1,1 +1,1 @@
-"""Analysis of loops: stability, constraints, steps, the limit of linear control."""
+"""Analysis of loops: stability, constraints, step tests, stroke, linear limit."""

@@ -34,8 +34,8 @@ OFF = "off"
 """Limit in a study that switches a constraint off."""
 
 CAP = 3.0
-"""ln(value/limit) above which a violation is compressed: the loop is unstable there,
-and the size of the violation has no meaning."""
+"""ln(value/limit) above which a violation is compressed. Such a loop is usually
+unstable, and the size of its violation has no meaning."""
 
 
 MarginFigures = dict[str, Float[Array, "..."]]
@@ -68,7 +68,7 @@ class Constraint(NamedTuple):
     ``values(source, dt)`` returns the values of the figure, with the plants on the
     first axis, from the field ``source`` of the LoopFigures and dt in s. A limit must
     lie above ``above`` and below ``below``. ``default`` is the limit if a study gives
-    none. ``one_axis`` is True if the figure is known for one axis only. ``bands`` is
+    none. ``one_axis`` is True if the figure is defined for one axis only. ``bands`` is
     the number of values for each plant and branch. ``meaning`` describes the figure.
     """
 
@@ -163,8 +163,8 @@ def margin_figures(
     """Return the figures [branches] of those ``names`` that are margins.
 
     The loop is linearised at ``point``. The sensitivity peaks are those of
-    ``peaks_of``, [branches, bands]. ``error`` bounds the relative error of a plant of
-    one axis; it is None if no bound is known.
+    ``peaks_of``, [branches, bands]. ``error`` is the bound on the relative model error
+    of a plant of one axis; it is None if no bound is known.
     """
     found: MarginFigures = {}
     if not _MARGINS.keys().isdisjoint(names):
@@ -221,7 +221,7 @@ CONSTRAINTS: dict[str, Constraint] = {
         "at most",
         "tracking",
         lambda figures, dt: _largest(figures.peak_voltage),
-        meaning="Largest voltage of the runs",
+        meaning="Largest absolute voltage of the runs",
     ),
     "peak_slew": Constraint(
         "V/s",
@@ -242,7 +242,8 @@ CONSTRAINTS: dict[str, Constraint] = {
         "at most",
         "extremes",
         lambda found, dt: _largest(found.overshoot),
-        meaning="Largest displacement beyond the reference, as a share of its range",
+        meaning="Largest displacement above the highest reference, as a share of the "
+        "reference's range",
     ),
     "gain_margin": Constraint(
         "dB",
@@ -297,16 +298,17 @@ CONSTRAINTS: dict[str, Constraint] = {
         "steps",
         lambda found, dt: found.steady_state_error,
         one_axis=True,
-        meaning="Mean error in the last tenth of a step, as a share of its height",
+        meaning="Mean absolute error in the last tenth of a step, as a share of its "
+        "height",
     ),
 }
 """Constraints by their name in a study; each holds for every plant and reference of the
-objective. The margins, the bandwidth and the peak of y/r are those of the loop,
-linearised at the highest reference on both branches of the hysteresis; for a fitted
+objective. The margins, the bandwidth and the peak of y/r are those of the loop
+linearised at the highest reference, on both branches of the hysteresis. For a fitted
 plant the sensitivity peak and the delay margin are the worst within the error bound of
 its model. On several axes the sensitivity peak is the largest singular value of S, and
-the disk margin is a lower bound of that of all axes at once. The gain, phase and delay
-margins are those of the worst axis with the others closed. The times and the
+the disk margin is a lower bound on the one of all axes at once. The gain, phase and
+delay margins are those of the worst axis with the others closed. The times and the
 steady-state error are those of the worst of four steps without noise
 (``step_response``)."""
 
@@ -334,10 +336,10 @@ def uses(names: Iterable[str], source: Source) -> bool:
 def constraint_count(names: Iterable[str], plants: int, margin_plants: int) -> int:
     """Return the number of ``violations`` of the limits ``names``.
 
-    A limit on runs counts once for each of ``plants``, and a limit on steps once for
-    each of ``plants`` and step. A limit on margins counts once for each of
-    ``margin_plants`` and branch, and the limit on the sensitivity peak also once for
-    each band.
+    ``plants`` and ``margin_plants`` are numbers of plants. A limit on runs counts once
+    for each of ``plants``, a limit on steps once for each of them and each step. A
+    limit on margins counts once for each of ``margin_plants`` and each branch; the
+    limit on the sensitivity peak also counts once for each band.
     """
     each = {
         "margins": margin_plants * len(BRANCHES),
@@ -354,7 +356,7 @@ def violations(
 ) -> Float[Array, " constraints"]:
     """Return the ``excess`` over each of ``limits`` on each plant, step or branch.
 
-    The order is that of ``constraint_count``.
+    The values are in the order of ``limits``; ``constraint_count`` is their number.
     """
     found = [
         excess(name, limit, CONSTRAINTS[name].read(loop)).ravel()
@@ -368,8 +370,8 @@ def excess(
 ) -> Float[Array, "*batch"]:
     """Return ln(value/limit), with the opposite sign for a lower limit.
 
-    A number above 0 is a violation. An infinite or undefined value counts as a large
-    violation, and above ``CAP`` a number is compressed to CAP (1 + ln(number/CAP)).
+    A result above 0 is a violation. An infinite or undefined value counts as a large
+    violation. A result x above ``CAP`` is compressed to CAP (1 + ln(x/CAP)).
     """
     sign = 1.0 if CONSTRAINTS[name].sense == "at most" else -1.0
     by = sign * (jnp.log(jnp.maximum(values, 1e-12)) - jnp.log(limit))

@@ -17,8 +17,8 @@ class SlidingParts(NamedTuple):
     """RMS values of the sliding variable s = m e + de/dt and of its parts, um/s.
 
     ``sliding`` is s as the controller computes it from the measurement. ``error`` is
-    m e + de/dt of the displacement, and ``rest`` the difference of the two: the lag of
-    the observer behind the reference's motion, and sensor noise.
+    m e + de/dt of the true displacement. ``rest`` is their difference: the lag of the
+    observer behind the motion, and sensor noise.
     """
 
     sliding: Scalar
@@ -27,7 +27,7 @@ class SlidingParts(NamedTuple):
 
     @property
     def share(self) -> Scalar:
-        """Mean square of the error over the sum of those of error and rest, 0 to 1."""
+        """Share of ``error`` in the sum of both parts' mean squares, 0 to 1."""
         return self.error**2 / (self.error**2 + self.rest**2)
 
 
@@ -37,7 +37,7 @@ class _WatchedState(NamedTuple):
 
 
 class _Watched(SwitchingLaw):
-    """A switching law that keeps the last s in its state."""
+    """Switching law that stores the last s in its state."""
 
     law: SwitchingLaw
 
@@ -53,7 +53,7 @@ class _Watched(SwitchingLaw):
 
 
 class _Revealed(System):
-    """A loop that also returns the sliding variable of its watched law."""
+    """Loop that also outputs the sliding variable of its watched law."""
 
     loop: Feedback
 
@@ -84,10 +84,10 @@ def _watched(node: Any) -> Any:
 
 
 def sliding_mode_of(loop: Feedback) -> SlidingMode | ContinuousSlidingMode | None:
-    """Return the only sliding mode of the controller, if its s is m e + de/dt.
+    """Return the sliding mode of the controller if its s is m e + de/dt, else None.
 
-    None if there is no sliding mode, if there are several, or if it is a SlidingMode
-    whose order is not two.
+    The result is None if there is no sliding mode, if there are several, or if the only
+    one is a SlidingMode with a model whose order is not two.
     """
     nodes = jax.tree.leaves(loop.controller, is_leaf=_is_sliding)
     modes = [node for node in nodes if _is_sliding(node)]

@@ -38,8 +38,10 @@ class StepFigures(NamedTuple):
     - ``steady_state_error``: mean distance from the reference in the last tenth of the
       run, as a share of the height.
 
-    If the displacement does not rise or settle within the run, the time is longer than
-    the run and falls as the displacement comes nearer to the reference.
+    If the displacement does not settle within the run, the settling time is longer than
+    the run and falls as the displacement ends nearer to the reference. If it does not
+    reach 90 % of the height, the rise time is extrapolated likewise; if it does not
+    even reach 10 %, the rise time is 0.8 of the run.
     """
 
     rise_time: Array
@@ -53,8 +55,8 @@ class StepFigures(NamedTuple):
 def step_ends(references: np.ndarray) -> np.ndarray:
     """Return the references (um) before and after each step of ``NAMES``, [4, 2].
 
-    The large steps span the 5 % to 95 % quantiles of the ``references``: the extremes
-    may be short overshoots that no stage could hold.
+    The large steps go from the 5 % quantile of the ``references`` to the 95 % quantile:
+    the extremes may be short overshoots that no stage could hold.
     """
     low, high = np.quantile(references, [0.05, 0.95])
     middle, half = (low + high) / 2.0, SMALL * (high - low) / 2.0

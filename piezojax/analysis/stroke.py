@@ -30,15 +30,15 @@ def stroke_of(
 ) -> Stroke:
     """Return the stroke of ``stage`` between commands ``lower`` and ``upper`` [axes].
 
-    ``stage`` is a plant behind its actuator. Each drive begins at rest at one end, goes
+    ``stage`` is a plant behind its actuator. Each run begins at rest at one end, goes
     to the other end in ``SAMPLES`` samples, and returns. On one axis the ends are the
-    limits, in both orders. On several axes there is a drive from each corner of the box
+    limits, in both orders. On several axes there is a run from each corner of the box
     of the limits to the opposite one, and from each limit of an axis to the other, with
     the other axes in the middle.
 
-    The displacements at rest include the whole creep and the static gain, however slow
-    the stage; those of the drive include both branches of the hysteresis. Noise or
-    drift only widen the stroke. An axis with a displacement that is not finite has
+    The state at rest includes the whole creep and the full static gain, even of a slow
+    stage; the runs include both branches of the hysteresis. Noise and drift of the
+    stage can only widen the stroke. An axis with a displacement that is not finite has
     infinite bounds.
     """
     ends = _ends(np.array(lower), np.array(upper))
@@ -50,7 +50,7 @@ def stroke_of(
 
 
 def _ends(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return first and second end [drives, 2, axes] of each drive."""
+    """Return the first and the second end [runs, 2, axes] of each run."""
     middle, half = 0.5 * lower + 0.5 * upper, 0.5 * upper - 0.5 * lower
     axes = len(lower)
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=axes)))
@@ -60,16 +60,16 @@ def _ends(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
 
 @eqx.filter_jit
 def _extremes(stage: System, ends: Array) -> tuple[Array, Array]:
-    """Return the lowest and highest outputs over all drives between ``ends``."""
+    """Return the lowest and highest outputs over all runs between ``ends``."""
 
     def signal(points: Array) -> Array | tuple[Array, ...]:
         return points if points.ndim < 2 else tuple(points.T)
 
-    def drive(pair: Array) -> Array:
+    def run(pair: Array) -> Array:
         there = jnp.linspace(pair[0], pair[1], SAMPLES)
         path = signal(jnp.concatenate([there, there[::-1]]))
         first = jax.tree.map(lambda x: x[0], path)
         return packed(simulate(stage, path, stage.init(first))[1])
 
-    outputs = jax.vmap(drive)(ends)
+    outputs = jax.vmap(run)(ends)
     return jnp.min(outputs, axis=(0, 1)), jnp.max(outputs, axis=(0, 1))

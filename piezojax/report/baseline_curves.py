@@ -18,14 +18,14 @@ from .figures import AFTER, add_title, figure, plain_tick_labels, plot_style, wr
 def baselines_table(baselines: Baselines) -> Table:
     """Return a table of the methods: loss, held-out error, runs and wall time.
 
-    Two columns hold the time (s) at which the search of piezojax reached the loss of a
-    baseline, and the ratio of the wall time of the baseline to this time.
+    The last two columns hold the time at which the search of piezojax reached the loss
+    of the baseline, and the ratio of the wall time of the baseline to this time.
     """
     table = Table(
         title=Text(
             f"{baselines.title}\nbaselines on the same objective: "
             "error is the geometric mean on held-out noise\n"
-            "(as good: time at which piezojax reached this loss; sooner: ratio)"
+            "(as good: time when piezojax reached this loss; sooner: time / as good)"
         )
     )
     table.add_column("method")
@@ -121,5 +121,5 @@ def baselines_figure(baselines: Baselines) -> Figure:
 
 
 def _as_drawn(entry: BaselineEntry, geometric: bool) -> np.ndarray:
-    """Return the losses as drawn: the logarithm of a geometric mean is undone."""
+    """Return the losses, or their exponentials for a ``geometric`` mean."""
     return np.exp(entry.losses) if geometric else np.array(entry.losses)

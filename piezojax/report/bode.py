@@ -26,14 +26,14 @@ from .figures import (
 STABILITY_FILE, STABILITY_PICTURE = "stability.json", "stability.png"
 
 LINES = {"ascending": "-", "descending": "--"}
-_DECADES = 4.5  # frequency range drawn, below the Nyquist frequency
+_DECADES = 4.5  # decades drawn below the Nyquist frequency
 _HALF_SIDE = 2.5  # half the side of the Nyquist plot
 
 
 def write_stability(
     stability: StabilityReports, folder: Path, title: str = ""
 ) -> Pictures:
-    """Write stability.json and stability.png into ``folder``, return the picture."""
+    """Write stability.json and stability.png into ``folder``; return the picture."""
     write_json(folder / STABILITY_FILE, stability.as_dict())
     drawn: Pictures = {}
     with plot_style():
@@ -49,8 +49,8 @@ def write_stability(
 def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
     """Draw the Bode and Nyquist plots of L, and |S| and |T|.
 
-    Where the branches of a hysteresis differ, the ascending one is a full line and the
-    descending one a dashed line.
+    If the branches of the hysteresis differ, the ascending one is drawn solid and the
+    descending one dashed.
     """
     picture = figure(9.0, 6.6)
     (gain, nyquist), (phase, sensitivity) = picture.subplots(2, 2)
@@ -77,7 +77,7 @@ def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
     gain.axhline(1.0, color=REFERENCE, lw=0.8)
     gain.set(ylabel="|L| (-)", title="Loop transfer function, cut at the plant's input")
     low, high = gain.get_ylim()
-    gain.set_ylim(max(low, 1e-6), high)  # a zero at half the rate is of no interest
+    gain.set_ylim(max(low, 1e-6), high)  # cuts off a zero at the Nyquist frequency
     gain.legend(fontsize=7.5)
     phase.axhline(-180.0, color=REFERENCE, lw=0.8)
     phase.set(xlabel="frequency (Hz)", ylabel="phase of L (°)")
@@ -88,7 +88,7 @@ def stability_figure(stability: StabilityReports, title: str = "") -> Figure:
     sensitivity.set(
         xlabel="frequency (Hz)",
         ylabel="|S|, |T| (-)",
-        title="Sensitivity |S|, and thin |T|",
+        title="Sensitivity |S|; thin lines: |T|",
     )
     low, high = sensitivity.get_ylim()
     sensitivity.set_ylim(max(low, 1e-3), 30.0 * high)  # room for the legend
@@ -128,14 +128,14 @@ def _critical_point(ax: Axes) -> None:
         aspect="equal",
         xlabel="real part of L",
         ylabel="imaginary part of L",
-        title="Nyquist plot; inside the dots |S| > 2",
+        title="Nyquist plot; |S| > 2 inside the dotted circle",
     )
 
 
 def axes_figure(
     stabilities: dict[str, AxesStability], names: Sequence[str], title: str
 ) -> Figure:
-    """Draw |S| of each axis, all others closed, and the largest singular value of S."""
+    """Draw |S| of each axis, the others closed, and the largest singular value of S."""
     picture = figure(9.0, 3.6)
     left, right = picture.subplots(1, 2)
     lines = ("-", "--", "-.", ":")

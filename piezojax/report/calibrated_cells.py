@@ -27,7 +27,7 @@ def write_calibration(
 def calibration_figure(
     fits: Mapping[str, Sequence[HalfFit]], reports: Mapping[str, Report]
 ) -> Figure:
-    """Draw simulation against print: a row per experiment, a panel per half."""
+    """Draw simulated against printed values: a row per experiment, a panel per half."""
     picture = figure(8.4, 4.2 * len(fits))
     panels = picture.subplots(len(fits), 2, squeeze=False)
     for row, (name, halves) in zip(panels, fits.items(), strict=True):
@@ -61,7 +61,7 @@ def calibration_figure(
 def calibration_table(name: str, fits: Sequence[HalfFit], report: Report) -> Table:
     """Return the ratios, fitted values and selection rounds, one column for each half.
 
-    A suspect number of one half only has no value in the column of the other.
+    A suspect number that only one half selected has a dash in the other column.
     """
     table = Table(title=f"{name}: fitted to one half of the cells, tested on the other")
     table.add_column("")
@@ -121,7 +121,10 @@ def held_out_table(halves: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def _round_text(rounds: Sequence[Round]) -> str:
-    """Return the ratios of a round, one finalist on each line; "" without a round."""
+    """Return the ratios of a round, without and with each finalist, one on each line.
+
+    Return "" if ``rounds`` is empty.
+    """
     return "\n".join(
         line
         for entry in rounds

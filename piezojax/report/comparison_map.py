@@ -30,7 +30,7 @@ _COLUMNS = 4
 
 
 def comparison_page(comparison: ComparisonResult, studies: int) -> Page:
-    """Return the Page of ``comparison``, of so many ``studies`` when complete."""
+    """Return the Page of ``comparison``; ``studies`` is the number of all studies."""
     perturbed = perturbed_table(comparison)
     parts = [
         comparison_table(comparison),
@@ -44,7 +44,7 @@ def comparison_page(comparison: ComparisonResult, studies: int) -> Page:
 
 
 def comparison_table(comparison: ComparisonResult) -> Table:
-    """Return errors before and after tuning by controller and rate, in nm rms."""
+    """Return a table of rms errors before and after tuning, by controller and rate."""
     table = Table(
         title=Text(
             f"{comparison.title}\nrms tracking error on held-out noise, nm: geometric "
@@ -83,7 +83,7 @@ def _tuned(row: TunedStudy) -> str:
 
 
 def perturbed_table(comparison: ComparisonResult) -> Table | None:
-    """Return errors on held-out perturbed plants in nm rms; None without any."""
+    """Return a table of errors on held-out perturbed plants; None without any."""
     rows = [row for row in comparison.rows if row.perturbed is not None]
     if not rows:
         return None
@@ -107,9 +107,9 @@ def perturbed_table(comparison: ComparisonResult) -> Table | None:
         table.add_row(
             row.controller + (f", {float(rate) / 1000:g} kHz" if several else ""),
             str(row.tuned),
-            _finer(found.geomean_before_rms_um),
-            _finer(found.geomean_rms_um) + ("!" if row.alarms else ""),
-            _finer(found.worst_rms_um),
+            _fine_nanometres(found.geomean_before_rms_um),
+            _fine_nanometres(found.geomean_rms_um) + ("!" if row.alarms else ""),
+            _fine_nanometres(found.worst_rms_um),
             f"{found.unstable} of {found.plants}",
             "-" if peak is None or peak.value is None else f"{peak.value:.2f}",
             style="bold" if wins else None,
@@ -118,7 +118,7 @@ def perturbed_table(comparison: ComparisonResult) -> Table | None:
 
 
 def perturbed_text(comparison: ComparisonResult) -> str:
-    """Return a line for each rate: the best on held-out plants, and the next best."""
+    """Return a line for each rate: the two best controllers on held-out plants."""
     lines = []
     for rate, best in comparison.best_perturbed.items():
         errors = {
@@ -264,7 +264,7 @@ def _nanometres(value: float | None) -> str:
     return "-" if value is None else f"{1e3 * value:.1f}"
 
 
-def _finer(value: float | None) -> str:
+def _fine_nanometres(value: float | None) -> str:
     return "-" if value is None else f"{1e3 * value:.2f}"
 
 

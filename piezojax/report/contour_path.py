@@ -1,4 +1,4 @@
-"""Picture of contours: path, magnified error, and distance from it against time."""
+"""Picture of contours: paths with magnified error, and contour error against time."""
 
 from collections.abc import Sequence
 
@@ -65,8 +65,9 @@ def contour_figure(
 def _magnification(errors: list[np.ndarray], extent: float) -> float:
     """Return the magnification of errors: 1, 2 or 5 times a power of ten, at least 1.
 
-    The largest error is drawn as ``_SHARE`` of the contour's ``extent``, or less. Runs
-    with an error of at least ``extent`` do not count.
+    The largest error is drawn as at most ``_SHARE`` of the contour's ``extent``, unless
+    it is larger without magnification. Runs with an error of at least ``extent`` do not
+    count.
     """
     largest = [np.abs(e[np.isfinite(e)]).max(initial=0.0) for e in errors]
     near = max((value for value in largest if value < extent), default=extent)

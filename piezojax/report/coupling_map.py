@@ -17,8 +17,8 @@ def coupling_figure(
 ) -> Figure | None:
     """Draw heat maps of the held-out errors while only one axis is driven.
 
-    ``coupling`` is that before and after tuning. Return None if the stage has one axis,
-    or if no reference drives an axis alone.
+    ``coupling`` holds the coupling before and after tuning. Return None if the stage
+    has one axis, or if no reference drives an axis alone.
     """
     if coupling is None:
         return None
@@ -41,7 +41,7 @@ def coupling_figure(
         images[-1],
         ax=panels,
         label="rms error, % of the driven amplitude\n"
-        "(of unlike units: µm per 100 µrad, µrad per 100 µm)",
+        "(different units: µm per 100 µrad, µrad per 100 µm)",
     )
     add_title(picture, f"{title}: rms errors with one axis driven, hold-out")
     return picture

@@ -8,8 +8,8 @@ from ..tuning.drive import HIGH, Drive
 def drive_table(drive: tuple[dict[str, Drive], dict[str, Drive]], rate: float) -> Table:
     """Return the figures of the voltage at the piezo before and after tuning, by axis.
 
-    ``rate`` in Hz. Figures that need a capacitance are left out without one. On several
-    axes the unit V stands for that of the axis' commands.
+    ``rate`` is the sampling rate, Hz. Figures that need a capacitance are left out
+    without one. On a stage with several axes, V stands for the unit of the commands.
     """
     table = Table(title="voltage at the piezo on held-out noise, worst reference")
     table.add_column("figure")

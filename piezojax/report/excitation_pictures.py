@@ -15,7 +15,7 @@ PICTURE = "excitation.png"
 
 
 def excitation_page(parts: Sequence[Part], files: Mapping[str, Part]) -> Page:
-    """Return the Page of ``parts``, with the sizes of the ``files`` by name."""
+    """Return the Page of ``parts``, with the length of each of ``files`` (by name)."""
     sizes = [
         f"{name}: {part.voltages.size} samples at {part.rate:.6g} Hz, "
         f"{part.voltages.size / part.rate:.3g} s"
@@ -53,7 +53,7 @@ def excitation_table(parts: Iterable[Part]) -> Table:
 
 
 def write_excitation(parts: Sequence[Part], folder: Path) -> Pictures:
-    """Draw the voltages of ``parts`` to excitation.png, and return the picture."""
+    """Write excitation.png, with the voltages of ``parts``, and return the picture."""
     with plot_style():
         return write(excitation_figure(parts), folder / PICTURE)
 

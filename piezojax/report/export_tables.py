@@ -1,4 +1,4 @@
-"""Table of an exported controller in the simulated loop."""
+"""Table of the errors of an exported controller in the simulated loop."""
 
 from rich.table import Table
 
@@ -6,7 +6,7 @@ from ..exporting.judge import ExportReport
 
 
 def judgement(report: ExportReport) -> list[Table | str]:
-    """Return errors by reference and precision, the cost of a step, and warnings."""
+    """Return a table of errors by reference and precision, with notes and warnings."""
     if report.not_judged is not None:
         return [f"note: not judged in the simulated loop: {report.not_judged}"]
     table = Table(title=f"compiled in the simulated loop; written: {report.written}")

@@ -25,7 +25,7 @@ from .figures import (
 from .frequency_response import response_figure, singular_values_figure
 
 SHOWN = 400
-"""Samples drawn of each output of a record with several outputs."""
+"""Largest number of samples drawn of each output of a record with several outputs."""
 
 MODEL_FILE, FIT_FILE, PICTURE_FILE = "model.json", "fit.json", "fit.png"
 
@@ -71,7 +71,7 @@ def _write_linear(linear: LinearDetail, record: Record, folder: Path) -> Picture
 
 
 def outputs_figure(fit: Fit) -> Figure:
-    """Draw every output of the first record: its end and the residual's spectrum."""
+    """Draw each output of the first record: last validation samples, and spectra."""
     record, run, part = fit.record, fit.simulations[0], fit.validate
     shown = slice(max(part.start, part.stop - SHOWN), part.stop)
     picture = figure(9.0, 2.4 * run.shape[1] + 0.8)
@@ -104,7 +104,7 @@ def outputs_figure(fit: Fit) -> Figure:
 
 
 def loop_panel(ax: Axes, fit: Fit, label: str) -> None:
-    """Draw output against input over the validation part, the model as ``label``."""
+    """Draw output against input over the validation part; ``label`` names the model."""
     record, part = fit.record, fit.validate
     ax.plot(
         record.input[part],

@@ -22,7 +22,9 @@ def singular_values_figure(
     ax = picture.subplots()
     kept = number <= order
     ax.semilogy(number[kept], shares[kept], "o", ms=4, color=AFTER, label="kept")
-    ax.semilogy(number[~kept], shares[~kept], "o", ms=4, color=MEASURED, label="left")
+    ax.semilogy(
+        number[~kept], shares[~kept], "o", ms=4, color=MEASURED, label="left out"
+    )
     ax.axvline(order + 0.5, color=BEFORE, lw=1.0)
     ax.annotate(
         f"order {order}",

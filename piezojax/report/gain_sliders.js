@@ -1,4 +1,4 @@
-// The sliders moved: show what their gains would give, as GainSurrogate.at computes it.
+// Show the step and the figures of the gains of the sliders, as in GainSurrogate.at.
 
 const place = sliders.map((slider) => slider.value)
 const functions = centres.map((centre) =>

@@ -16,7 +16,7 @@ from ..tuning.outcome import Outcome
 from .figures import AFTER, BEFORE
 from .summary_tables import short_names
 
-# Bokeh is imported where it draws: it takes as long as the rest of the package.
+# Bokeh is imported where it draws: its import takes as long as all others together.
 if TYPE_CHECKING:
     from bokeh.models import ColumnDataSource, Slider, UIElement
 
@@ -24,15 +24,15 @@ MEAN = "geometric mean"
 
 SENTENCE = (
     "Move a slider to see what other gains would give on the nominal plant, with the "
-    "references and the noise of the hold-out. The figures are interpolated between "
-    "{simulated} simulated gain sets, all of them stable; the last column is the error "
-    "that 19 of 20 gain sets outside the interpolation do not exceed. Gains that you "
-    "choose here are not tested on other plants: write them into the study as starts "
-    "and tune again before you use them."
+    "references and the noise of the hold-out. {simulated} gain sets were simulated, "
+    "all of them stable; the figures are interpolated between most of them. The others "
+    "test the interpolation: on 19 of 20 its error is at most that in the last column. "
+    "Gains that you choose here are not tested on other plants: write them into the "
+    "study as starts and tune again before you use them."
 )
 
-_SETTLING_TIMES = 5.0  # of the tuned gains that are shown
-_LEAST = 0.02  # of the run that is shown
+_SETTLING_TIMES = 5.0  # number of settling times of the tuned loop that are shown
+_LEAST = 0.02  # smallest share of the run that is shown
 
 _MOVED = files("piezojax.report") / "gain_sliders.js"
 _VALUE = """
@@ -57,7 +57,7 @@ def gain_sliders(
 ) -> "UIElement | None":
     """Return the sliders of the tuned gains, the step, and the table of figures.
 
-    None without a surrogate.
+    Return None if ``surrogate`` is None or the reason why there is none.
     """
     if not isinstance(surrogate, GainSurrogate):
         return None
@@ -128,7 +128,7 @@ def _step_panel(tuned: "ColumnDataSource", shown: "ColumnDataSource") -> "UIElem
 
 
 def _shown_until(tuned: "ColumnDataSource") -> float:
-    """Return the time (ms) until which the step is shown: some settling times."""
+    """Return the time (ms) until which the step is shown, some settling times."""
     time, step = (np.asarray(tuned.data[name]) for name in ("time", "displacement"))
     away = np.abs(step - step[-1]) > BAND * np.ptp(step)
     until = _SETTLING_TIMES * max(time[away], default=0.0)
@@ -136,7 +136,7 @@ def _shown_until(tuned: "ColumnDataSource") -> float:
 
 
 def _sliders(surrogate: GainSurrogate, outcome: Outcome) -> "list[Slider]":
-    """Return a slider for each gain, from 0 to 1 in its range, that shows its value."""
+    """Return a slider for each gain: 0 to 1 in its range, labelled with its value."""
     from bokeh.models import CustomJSTickFormatter, Slider
 
     space, units = outcome.case.space, outcome.result.gain_units
@@ -187,7 +187,7 @@ def _back(sliders: "Sequence[Slider]") -> "UIElement":
 
 
 def _texts(surrogate: GainSurrogate) -> list[str]:
-    """Return the HTML of the table, cut where the figures of the sliders stand."""
+    """Return the HTML of the table, split where the figures of the sliders belong."""
     doubt = surrogate.doubt
     errors = [f"rms error under {name}" for name in surrogate.references]
     names = [*errors, MEAN, *surrogate.margins]

@@ -1,4 +1,4 @@
-"""Picture and table of a learning on a stage."""
+"""Picture and table of iterative learning on a stage."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ LEARN_PICTURE = "learn.png"
 def write_learning(report: LearnReport, folder: Path, dt: float) -> Pictures:
     """Write the picture of the runs in ``folder``; ``dt`` is their sample time, s.
 
-    There is none if no run was completed.
+    Return the picture. If no run was completed, there is none.
     """
     if report.best is None:
         return {}
@@ -61,7 +61,7 @@ def _figure(report: LearnReport, folder: Path, dt: float) -> Figure:
 
 
 def learn_page(report: LearnReport, title: str) -> Page:
-    """Return the Page of a learning with the gains of ``title``."""
+    """Return the Page of iterative learning; ``title`` is that of the study."""
     return Page(
         f"{title}: learning {report.reference} on {report.stage}",
         report.alarms,

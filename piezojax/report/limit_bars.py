@@ -27,7 +27,7 @@ CAUSES: dict[str | None, str] = {
     "predicted": "leaves an error that a linear filter of the reference would cancel",
     None: "is too nonlinear to name a cause",
 }
-"""Explanations of a large error, by the share that most exceeds that of the limit."""
+"""Causes of a large error, by the name of ``LimitComparison.largest_excess``."""
 
 
 def write_limit(report: LimitReport | str, folder: Path, title: str = "") -> None:

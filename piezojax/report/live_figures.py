@@ -25,7 +25,8 @@ BUDGET = 60_000
 NOTE = (
     "Point at a curve to read it, drag a rectangle to enlarge it, click a name to hide "
     "its curve. Long curves show the first, least, greatest and last sample of each of "
-    "{} columns, and a loop no segment twice; the files have all samples."
+    "{} columns; a loop that repeats itself is drawn once. The PNG files show all "
+    "samples."
 )
 
 _PIXELS = 105.0  # height of a panel on the screen for each inch of the picture
@@ -33,9 +34,10 @@ _PIXELS = 105.0  # height of a panel on the screen for each inch of the picture
 
 @dataclass(frozen=True)
 class LiveFigures:
-    """Interactive figures as HTML, by the file of their picture, and their scripts.
+    """Interactive figures as HTML, by name, with the scripts that draw them.
 
-    ``note`` tells how to use them, and how their curves are thinned.
+    The name of a figure is that of its PNG file. ``note`` tells how to use the figures,
+    and how their curves are thinned.
     """
 
     figures: Mapping[str, str] = field(default_factory=dict)
@@ -48,9 +50,9 @@ def live_figures(
 ) -> LiveFigures:
     """Return those of ``pictures`` that consist of curves as interactive figures.
 
-    Their curves are the samples of the picture, thinned so that all of them together
-    keep ``BUDGET``. ``widgets`` are added as they are. The scripts contain Bokeh; they
-    need no network.
+    Their curves are those of the pictures, thinned to at most ``BUDGET`` samples in
+    all. ``widgets`` are added unchanged. The scripts contain Bokeh; they need no
+    network.
     """
     widgets = widgets or {}
     drawn = {
@@ -79,7 +81,7 @@ def live_figures(
 
 
 def _thinned(panels: Sequence[Axes]) -> tuple[dict[Axes, Curves], int]:
-    """Return the curves of ``panels``, which keep ``BUDGET``, and their columns."""
+    """Return the curves of ``panels`` within ``BUDGET``, and the number of columns."""
     columns = COLUMNS
     while True:
         found = {ax: curves(ax, columns) for ax in panels}
@@ -107,7 +109,7 @@ def _grid(picture: Figure, samples: Mapping[Axes, Curves]) -> "LayoutDOM":
         grid[spec.rowspan.start][spec.colspan.start] = panels[ax]
     found = gridplot(grid, toolbar_options={"logo": None})
     found.sizing_mode = "stretch_width"
-    found.update(cols="minmax(0, 1fr)")  # equal widths, whatever the panels
+    found.update(cols="minmax(0, 1fr)")  # equal widths
     return found
 
 
@@ -124,7 +126,7 @@ def _height(spec: SubplotSpec, picture: Figure) -> float:
 
 
 def _labels(ax: Axes, places: Mapping[Axes, SubplotSpec]) -> tuple[str, str]:
-    """Return the labels of x and y, which may be those of the same column or row."""
+    """Return the labels of x and y; a missing one is that of the column or row."""
     here = places[ax]
     column = [other for other, spec in places.items() if spec.colspan == here.colspan]
     row = [other for other, spec in places.items() if spec.rowspan == here.rowspan]

@@ -14,7 +14,7 @@ from matplotlib.ticker import FixedFormatter, FuncFormatter
 
 from .thinned_curves import GAP, kept_samples
 
-# Bokeh is imported where it draws: it takes as long as the rest of the package.
+# Bokeh is imported where it draws: its import takes as long as all others together.
 if TYPE_CHECKING:
     from bokeh.models import GlyphRenderer
     from bokeh.plotting import figure as LivePanel  # noqa: N812
@@ -36,14 +36,14 @@ _LEGEND: dict[str, Any] = {
     "padding": 0,
     "margin": 0,
 }
-_TARGET = 12.0  # pixels of a sample of a loop that react to the pointer
+_TARGET = 12.0  # size (pixels) in which a sample of a loop reacts to the pointer
 
 
 def has_curves_only(ax: Axes) -> bool:
     """Return whether ``live_panel`` can draw all of ``ax``.
 
-    It draws lines, markers, and shades across a panel of a grid whose axes have
-    numbers.
+    It draws lines without steps, markers, and shaded bands across the whole panel. The
+    panel must be in a grid and have linear or logarithmic scales with numbers as ticks.
     """
     return (
         ax.get_subplotspec() is not None
@@ -61,7 +61,7 @@ def live_panel(
     """Return ``ax`` as a panel with a ``height`` in pixels.
 
     Colours, scales, ranges and legend are those of ``ax``; ``labels`` are those of its
-    x and y axis. ``samples`` are those of its ``curves``.
+    x and y axis. ``samples`` is the result of ``curves`` for ``ax``.
     """
     from bokeh.models import BoxAnnotation, HoverTool, Legend
     from bokeh.plotting import figure
@@ -87,7 +87,7 @@ def live_panel(
 
 
 def _frame(ax: Axes, labels: tuple[str, str]) -> dict[str, Any]:
-    """Return title, labels, scales and ranges of ``ax``; no zoom leaves the ranges."""
+    """Return title, labels, scales and ranges of ``ax``; the ranges limit the zoom."""
     from bokeh.models import Range1d
 
     frame: dict[str, Any] = {
@@ -129,9 +129,9 @@ def _sides(ax: Axes) -> list[tuple[Axis, tuple[float, float]]]:
 
 
 def _on_axes(artist: Line2D | Patch, ax: Axes) -> tuple[bool, bool]:
-    """Return whether x and y of ``artist`` are values on the axes of ``ax``.
+    """Return whether x and y of ``artist`` are in data coordinates of ``ax``.
 
-    A line or a shade across the whole panel has only one value.
+    Of a line or a band across the whole panel only one of the two is.
     """
     is_patch = isinstance(artist, Patch)
     transform = artist.get_data_transform() if is_patch else artist.get_transform()
@@ -145,7 +145,7 @@ def _has_words(axis: Axis) -> bool:
 
 
 def _shade(patch: Patch, ax: Axes) -> dict[str, Any]:
-    """Return the place and colour of a shade across the panel."""
+    """Return the position and colour of a shaded band across the panel."""
     place = patch.get_window_extent().transformed(ax.transData.inverted())
     return {
         "left": place.x0,
@@ -193,7 +193,7 @@ def _label(line: Line2D) -> str:
 
 
 def _reading(line: Line2D, labels: tuple[str, str]) -> dict[str, Any]:
-    """Return how the values of ``line`` are shown at the pointer."""
+    """Return the HoverTool settings that show the values of ``line`` at the pointer."""
     return {
         "mode": "vline" if _rises(line) else "mouse",
         "limit": 1,
@@ -204,7 +204,7 @@ def _reading(line: Line2D, labels: tuple[str, str]) -> dict[str, Any]:
 
 
 def _rises(line: Line2D) -> bool:
-    """Return whether ``line`` has one y for each x."""
+    """Return whether x of ``line`` rises from each sample to the next."""
     return bool(np.all(np.diff(np.asarray(line.get_xdata(), dtype=float)) > 0.0))
 
 

@@ -41,7 +41,7 @@ RANKING_PICTURE = "comparison.png"
 _MODELS = "models"
 
 SHOWN = 3
-"""Number of models with drawn residuals."""
+"""Number of models whose residuals are drawn, the best ones."""
 
 SHADES = (AFTER, BEFORE, REFERENCE)
 
@@ -49,8 +49,8 @@ SHADES = (AFTER, BEFORE, REFERENCE)
 def write_ranking(ranking: ModelRanking, folder: Path) -> Pictures:
     """Write the ranking, the files of the best fit, and the other models.
 
-    The other models are in the folders that their rows name, under models/. Returns
-    the pictures.
+    Each of the other models has a folder under models/, named in its row. Returns the
+    pictures.
     """
     drawn = write_fit(ranking.best, folder)
     _write_table(ranking, ranking.report, folder)
@@ -193,7 +193,7 @@ def _rows(report: RankingReport, status: str) -> list[RankedModel]:
 
 
 def ranking_figure(ranking: ModelRanking) -> Figure:
-    """Draw the validation errors of all models; loop and residuals of the best."""
+    """Draw all errors, the loop of the best model, and residuals of the best few."""
     report = ranking.report
     picture = figure(10.0, max(4.5, 0.9 + 0.36 * len(ranking.fits)))
     grid = picture.add_gridspec(2, 2, width_ratios=(1.15, 1.0))

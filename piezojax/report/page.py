@@ -1,7 +1,7 @@
-"""Page with the results of a command: ``report.html``, one file without links.
+"""Page with the results of a command: ``report.html``, a self-contained file.
 
 The page contains the tables and sentences that the command prints, and the pictures in
-its folder. Pictures of curves are interactive on a screen with scripts.
+its folder. Pictures of curves are interactive in a browser that runs scripts.
 """
 
 import base64
@@ -31,9 +31,9 @@ PICTURES = {
     "tracking.png": "References and tracking errors, before and after tuning",
     "steps.png": "Steps of the reference, before and after tuning",
     "stability.png": "Open loop, sensitivities and margins",
-    "robustness.png": "Errors and sensitivity peaks on the perturbed plants",
-    "hysteresis.png": "Displacement over voltage, and error over reference",
-    "fit.png": "Record, model and residual, with the error bound",
+    "robustness.png": "Errors and limited figures on the perturbed plants",
+    "hysteresis.png": "Hysteresis of the stage, and error over reference",
+    "fit.png": "Record, model and residual",
     "response.png": "Measured frequency response and its model",
     "comparison.png": "Errors of the compared models or controllers",
     "validation.png": "The model on the other records",
@@ -43,8 +43,8 @@ PICTURES = {
     "watch.png": "The stage in each run, beside the baseline",
     "limit.png": "Errors beside the limit of linear control",
     "structures.png": "Errors by the number of notches",
-    "pareto.png": "Error against the limit of a constraint",
-    "convergence.png": "Objective over the evaluations",
+    "pareto.png": "Error against the limited figure",
+    "convergence.png": "Objective over the steps of the search",
 }
 """Captions of the pictures by file, in the order of the page; others follow."""
 
@@ -102,7 +102,7 @@ def write_page(
 
 
 def page_html(page: Page, folder: Path, live: LiveFigures) -> str:
-    """Return ``page`` as HTML, with the pictures in ``folder`` and ``live`` ones."""
+    """Return ``page`` as HTML, with the pictures in ``folder`` and ``live`` figures."""
     title = escape(page.title)
     tables = [part for part in page.parts if isinstance(part, Table)]
     sentences = [part for part in page.parts if not isinstance(part, Table)]

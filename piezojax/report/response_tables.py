@@ -17,9 +17,10 @@ def response_page(
     levels: ResponseLevels | None,
     measured: Iterable[Measurement | None],
 ) -> Page:
-    """Return the Page of ``model``, which ``levels`` chose if there are several.
+    """Return the Page of ``model``.
 
-    ``measured`` are the responses that were measured on records, None for files.
+    ``levels`` compares the amplitudes if there are several; ``model`` is the chosen one
+    then. ``measured`` holds the Measurement of each response, None for one from a file.
     """
     report = model.report
     parts: list[Table | str] = [measurement_table(m) for m in measured if m is not None]

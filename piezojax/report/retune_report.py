@@ -1,4 +1,4 @@
-"""Pictures and tables of a retuning on a stage."""
+"""Picture and tables of a retuning on a stage."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ FIRST = "first run"
 def write_retuning(report: RetuneReport, folder: Path, dt: float) -> Pictures:
     """Write the picture of the runs in ``folder``; ``dt`` is their sample time, s.
 
-    There is none if no reference was followed to its end.
+    Return the picture. If no gains followed the references, there is none.
     """
     if report.best is None:
         return {}
@@ -62,7 +62,7 @@ def _figure(report: RetuneReport, folder: Path, dt: float) -> Figure:
 
 
 def _first_and_best(report: RetuneReport) -> dict[str, TriedRun]:
-    """Return the first run of a reference, and the one with the smallest error."""
+    """Return the first run of a reference, and the best of its later runs, if any."""
     runs = [run for run in report.runs if run.reference != PROBE]
     same = [run for run in runs if run.reference == runs[0].reference]
     measured = [run for run in same[1:] if run.measured_um is not None]
@@ -125,10 +125,10 @@ def _left(report: RetuneReport) -> str:
 
 
 def attempts_table(report: RetuneReport) -> Table:
-    """Return the gains that were tried: predicted and measured errors."""
+    """Return the table of the attempts: predicted and measured errors, and verdicts."""
     table = Table(title="attempts: rms error with noise, mean of the references")
     table.add_column("attempt", justify="right")
-    for name in ("gains within", "predicted", "measured"):
+    for name in ("gains", "predicted", "measured"):
         table.add_column(name, justify="right")
     table.add_column("verdict", overflow="fold")
     for number, attempt in enumerate(report.attempts, start=1):
@@ -145,7 +145,11 @@ def attempts_table(report: RetuneReport) -> Table:
 def _within(attempt: Attempt) -> str:
     if not attempt.model:
         return "of the stage"
-    return "the study" if attempt.within is None else f"a factor {attempt.within:.3g}"
+    return (
+        "within the study"
+        if attempt.within is None
+        else f"within a factor {attempt.within:.3g}"
+    )
 
 
 def _runs_table(report: RetuneReport) -> Table:

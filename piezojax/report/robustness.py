@@ -1,4 +1,4 @@
-"""Tables and pictures of tuned gains on perturbed plants and Pareto fronts."""
+"""Tables and pictures of constraints, perturbed plants and Pareto fronts."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from .figures import AFTER, BEFORE, add_title, figure, plain_tick_labels
 
 
 def constraints_table(result: Result) -> Table:
-    """Return the limits, the values reached, and the held-out plants that keep them."""
+    """Return a table of limits, values reached, and held-out plants that keep them."""
     table = Table(
         title="limits on the worst plant of the search, or within the model's error"
     )
@@ -54,7 +54,7 @@ def front_table(front: Sequence[FrontPoint], constraint: str) -> Table:
 
 
 def perturbed_figure(perturbed: Perturbed | None, title: str) -> Figure | None:
-    """Draw distributions over the held-out plants: errors and limited figures."""
+    """Draw cumulative distributions of errors and limited figures, held-out plants."""
     if perturbed is None or not perturbed.geomeans_um:
         return None
     limited = list(perturbed.values)

@@ -21,7 +21,8 @@ _COLUMNS = {
     "overshoot": ("over-\nshoot %", 100.0),
     "steady_state_error": ("error\nleft %", 100.0),
 }
-"""Columns of the table: title with unit, and the factor from s or a share to it."""
+"""Columns of the table: title with unit, and the factor from s or a share to the
+unit."""
 
 _ROOM = 4.0  # length of the picture, in settling times
 _HEIGHTS = 3.0  # most overshoot that is drawn, in heights of the step

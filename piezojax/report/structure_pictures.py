@@ -46,9 +46,10 @@ def _nanometres(value: float | None) -> str:
 
 
 def structures_figure(search: StructureSearch | None, title: str) -> Figure | None:
-    """Draw the errors of each structure, and the modes in the loop of the chosen one.
+    """Draw the errors of each structure, and the modes in two of the tuned loops.
 
-    Return None if fewer than two structures were tuned.
+    They are the loops of the first structure and of the chosen one. Return None if
+    fewer than two structures were tuned.
     """
     tuned = [one for one in search.structures if one.log_errors] if search else []
     if len(tuned) < 2:
@@ -77,7 +78,7 @@ def _draw_errors(panel: Axes, tuned: Sequence[Structure]) -> None:
     panel.set(
         xlabel="notches, at Hz",
         ylabel="rms error on the hold-out (nm)",
-        title="each plant or reference, and the median",
+        title="each plant or reference; bar: median or mean",
     )
 
 

@@ -41,7 +41,7 @@ def _ratio(before: float | None, after: float | None) -> str:
 
 
 def tuning_table(result: Result) -> Table:
-    """Return the before/after table on held-out noise, in nm rms."""
+    """Return a table of rms errors on held-out noise, before and after tuning."""
     unit = " or ".join(dict.fromkeys(_SMALL[u] for u in result.units.values())) or "nm"
     table = Table(
         title=Text(f"{result.heading}\nrms tracking error on held-out noise, {unit}")
@@ -118,11 +118,12 @@ def beside_table(result: Result) -> Table:
 
 
 _ANY_PEAK = 100.0
-"""Ms above which the loop counts as unstable: the impulse response of S grows."""
+"""Ms from which a loop is shown as unstable: Ms is computed from the impulse response
+of S, which grows in an unstable loop."""
 
 
 def perturbed_text(perturbed: Perturbed) -> str:
-    """Return one line on the plants of the ensemble."""
+    """Return one line on the held-out perturbed plants."""
     if perturbed.unstable or perturbed.median_better is None:
         return (
             f"{perturbed.plants} perturbed plants: {perturbed.unstable} unstable "
@@ -142,7 +143,10 @@ def perturbed_text(perturbed: Perturbed) -> str:
 
 
 def sliding_text(result: Result) -> str | None:
-    """Return one line on the error in the sliding variable; None without one."""
+    """Return one line on the share of the error in the sliding variable.
+
+    Return None for a controller without a sliding variable.
+    """
     shares = [
         "-" if parts is None or parts.share is None else f"{100.0 * parts.share:.1f} %"
         for parts in (result.sliding_before, result.sliding)
@@ -177,7 +181,7 @@ def gains_table(result: Result) -> Table:
 
 
 def short_names(paths: Iterable[str]) -> tuple[str, list[str]]:
-    """Return the common start of ``paths``, "" if there is none, and the rests."""
+    """Return the common start of ``paths`` ("" without one), and the rest of each."""
     paths = list(paths)
     parents = zip(*(path.split(".")[:-1] for path in paths), strict=False)
     common = takewhile(lambda names: len(set(names)) == 1, parents)
@@ -293,7 +297,7 @@ def _margins(reports: Sequence[StabilityReport]) -> tuple[str, ...]:
 def fit_table(report: FitReport, units: Mapping[str, str] | None = None) -> Table:
     """Return the parameters of a fit, with its training and validation errors.
 
-    ``units`` holds the units of the parameters by path; with it the table has them.
+    ``units`` holds the units by path; with it the table has a column of units.
     """
     errors = "; ".join(
         f"{name} {part.rmse:.3g} {part.unit}, {part.rmse_percent_of_span:.2f} % of span"

@@ -204,7 +204,7 @@ def best_table(path: Path) -> Table:
         for axis in axes:
             table.add_column(axis.label, justify="right")
         table.add_column("least", justify="right")
-        table.add_column("diverged", justify="right")
+        table.add_column("unstable or lost", justify="right")
         for panel in panels(dataset, name):
             values = panel.finite()
             lost = int(np.isnan(values).sum())

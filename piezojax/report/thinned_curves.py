@@ -15,12 +15,12 @@ def kept_samples(
 ) -> Int[np.ndarray, " kept"]:
     """Return the indices of the samples that draw the curve through (x, y).
 
-    The places are shares of the drawn range, from 0 to 1. If x rises, one sample is
-    kept to the left and right of the range, and of each of ``columns`` inside the
-    first, least, greatest and last, which draw the same pixels (M4: Jugel et al., Proc.
-    VLDB Endowment 7, 2014). Otherwise the curve is a loop. If it has more samples than
-    that, only those of its segments are kept that end in a cell of a grid for the first
-    time, with a ``GAP`` where others are left out.
+    x and y are shares of the drawn range, which is from 0 to 1. If x rises, the range
+    is divided into ``columns``. The first, least, greatest and last sample of each are
+    kept, which draw the same pixels (M4: Jugel et al., Proc. VLDB Endowment 7, 2014),
+    and one sample on each side of the range. Otherwise the curve is a loop. A loop of
+    more than ``PER_COLUMN`` times ``columns`` samples keeps only the segments that end
+    in a cell of a grid for the first time, with a ``GAP`` where others are left out.
     """
     if np.all(np.diff(x) >= 0.0):
         first = max(np.searchsorted(x, 0.0) - 1, 0)
@@ -35,7 +35,7 @@ def kept_samples(
 
 def _by_column(column: np.ndarray, y: np.ndarray) -> np.ndarray:
     missing = np.isnan(y)
-    # A column is parted where samples are missing.
+    # A column is split where samples are missing.
     begins = (np.diff(column) != 0.0) | np.diff(missing)
     part = np.concatenate([[0], np.cumsum(begins)])
     first = np.concatenate([[0], 1 + np.flatnonzero(begins)])

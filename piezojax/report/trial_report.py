@@ -86,7 +86,10 @@ def _title(run: TriedRun) -> str:
 
 
 def trial_page(report: TrialReport, title: str, units: Mapping[str, str]) -> Page:
-    """Return the Page of a trial of the gains of ``title``, which have ``units``."""
+    """Return the Page of a trial.
+
+    ``title`` is that of the study; ``units`` holds the units of the gains by path.
+    """
     return Page(
         f"{title}: trial on {report.stage}",
         report.alarms,
@@ -140,7 +143,7 @@ def stage_gains_table(
     name: str,
     units: Mapping[str, str],
 ) -> Table:
-    """Return the gains of a stage ``before``, and ``gains`` in a column ``name``."""
+    """Return a table of the gains ``before``, and ``gains`` in the column ``name``."""
     table = Table(title="gains of the stage")
     table.add_column("gain", overflow="fold")
     for column in ("before", name):

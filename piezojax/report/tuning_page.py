@@ -30,7 +30,7 @@ from .summary_tables import (
 def tuning_page(outcome: Outcome, surrogate: GainSurrogate | str | None = None) -> Page:
     """Return the Page of a tuned study.
 
-    ``surrogate`` is that of its sliders, or why there are none.
+    ``surrogate`` is that of the sliders, or the reason why there are no sliders.
     """
     result, study = outcome.result, outcome.case.study
     stability, baselines = outcome.stability, outcome.baselines
@@ -94,7 +94,10 @@ def _fitted(fit: Fit | None) -> str | None:
 
 
 def values_to_type(outcome: Outcome) -> Table | str | None:
-    """Return the values to type in; None if the controller is not a Device."""
+    """Return the table of values to type in, or a note on why there is none.
+
+    Return None if the controller is not a Device.
+    """
     if not isinstance(outcome.controller, Device):
         return None
     try:

@@ -32,8 +32,8 @@ from .robustness import front_figure, perturbed_figure
 from .step_pictures import steps_figure
 from .structure_pictures import structures_figure
 
-_MOST_TRACES = 3  # in the tracking picture
-_PERIODS = 4.0  # of the reference, drawn from the end of the run
+_MOST_TRACES = 3  # largest number in the tracking picture
+_PERIODS = 4.0  # periods of the reference that are drawn, at the end of the run
 
 
 def write_results(outcome: Outcome, folder: Path) -> Pictures:
@@ -106,10 +106,9 @@ def _axis_logs(study: Study, trace: Trace, both: Logs) -> Logs:
 
 
 def _drawn_traces(outcome: Outcome) -> list[Trace]:
-    """Return the traces to draw.
+    """Return the traces to draw, ``_MOST_TRACES`` at most.
 
-    They are those with the largest error before tuning, for each kind of signal on each
-    axis.
+    Each has the largest error before tuning of its axis and kind of signal.
     """
     errors = outcome.result.before.per_reference_rms_um
     study = outcome.case.study
@@ -201,7 +200,7 @@ def hysteresis_figure(outcome: Outcome, logs: dict[Trace, Logs]) -> Figure:
     left.set(
         xlabel=f"{drive} ({drive_unit})",
         ylabel=f"{_quantity(trace)} ({unit})",
-        title=f"{name}: displacement over voltage, tuned loop",
+        title=f"{name}: {_quantity(trace)} over {drive}, tuned loop",
     )
     for log, colour, label in ((before, BEFORE, "before"), (after, AFTER, "tuned")):
         error = 1e3 * (log.displacement - log.reference)

@@ -30,7 +30,7 @@ _COLUMNS = {
 
 
 def write_watch(report: WatchReport, folder: Path) -> None:
-    """Write the picture of the runs in ``folder``."""
+    """Write watch.png into ``folder`` if there is a baseline."""
     if report.baseline:
         with plot_style():
             write(_figure(report), folder / WATCH_PICTURE)
@@ -65,11 +65,11 @@ def _shown(features: RunFeatures, name: str) -> float:
 
 
 def watch_page(report: WatchReport, title: str) -> Page:
-    """Return the Page of a watch with the gains of ``title``."""
+    """Return the Page of a watch; ``title`` is that of the study."""
     changed = sum(run.moved for run in report.runs)
     verdict = (
-        f"{changed} of {len(report.runs)} runs differ from the baseline; of an "
-        f"unchanged stage {100.0 * report.false_alarms:g} % do"
+        f"{changed} of {len(report.runs)} runs differ from the baseline; on an "
+        f"unchanged stage {100.0 * report.false_alarms:g} % of the runs would"
         if report.runs
         else "these runs are a baseline; compare later ones with --baseline"
     )

@@ -27,12 +27,12 @@ from .stage_parameters import quantities, within
 from .suspect_numbers import candidates_of
 
 HALVES = ("even", "odd")
-"""Halves of the cells, by position in the printed order: row by row, then table."""
+"""Halves of the cells, by position in the printed order: table by table, row by row."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """Tables that one stage has to explain, and the printed dynamics of that stage."""
+    """Tables of one stage, their fitted ``columns``, and its printed dynamics."""
 
     chapter: str
     tables: tuple[str, ...]
@@ -42,7 +42,7 @@ class Experiment:
     def cells(self) -> dict[str, list[Cell]]:
         """Return the cells of each half: every other cell in the printed order.
 
-        The cells of omitted columns keep their position but are left out.
+        Cells of other columns than ``columns`` count in this order but are left out.
         """
         every = [
             cell
@@ -58,7 +58,7 @@ class Experiment:
         """Return the fitted quantities: those of the stage, then all candidates."""
         every = [cell for half in self.cells().values() for cell in half]
         return quantities(self.dynamics) | {
-            name: within(1.0, suspect.span, "of print")
+            name: within(1.0, suspect.span, "of the printed value")
             for name, suspect in candidates_of(every).items()
         }
 
@@ -124,8 +124,8 @@ def calibrate(
 ) -> list[HalfFit]:
     """Return both fits of ``EXPERIMENTS[name]``, each tested on the other half.
 
-    The fits use shortened runs (``lanes.WARM_UP``, ``lanes.SHORT``); the tests use the
-    runs of the tables of this package. The held-out cells are simulated after both fits
+    The fits use shortened runs (``lanes.WARM_UP``, ``lanes.SHORT``); the tests use runs
+    as long as those of the tables. The held-out cells are simulated after both fits
     are final. ``steps`` is the largest number of optimiser steps from each start.
     """
     progress = Silent() if progress is None else progress

@@ -8,7 +8,7 @@ from .cell import Cell
 from .summary import ratio_of
 
 TARGET = 1.25
-"""Target for the largest geometric-mean ratio of the held-out cells."""
+"""Largest geometric-mean ratio of the held-out cells that meets the target."""
 
 
 def _ratios(cells: Sequence[Cell]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Printed cells, and the window in which errors count, for all chapters."""
+"""Printed cells of all chapters, and the error window of chapters 3 to 5."""
 
 import csv
 from dataclasses import dataclass, replace

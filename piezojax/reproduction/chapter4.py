@@ -39,7 +39,11 @@ def _model_target(controller: Any, reference: jax.Array) -> jax.Array:
 
 
 class Column(NamedTuple):
-    """Functions that make the controller for a rate (Hz) and its target (um)."""
+    """Column of a table: ``make`` returns its controller at a rate (Hz).
+
+    ``target`` maps controller and reference (um) to the target of the displacement
+    (um).
+    """
 
     make: Callable[[int], System]
     target: Callable[[System, jax.Array], jax.Array]
@@ -56,7 +60,7 @@ COLUMNS = {
         "continuous": Column(p753_chapter4.continuous, _reference_target),
     },
 }
-"""Columns of the tables by their names in ``cells.csv``.
+"""Columns of the tables by their names in ``data/ch4.csv``.
 
 Table 4-6 lacks the traditional column, because its gains at 5 kHz are not printed.
 """
@@ -68,7 +72,7 @@ def displacement(
 ) -> jax.Array:
     """Return the displacement (um) of a loop without noise, from rest at zero.
 
-    ``reference`` (um) is sampled at ``rate`` (Hz). ``stage`` is that of
+    ``reference`` (um) is sampled at ``rate`` (Hz). ``stage`` is passed to
     ``p753_chapter4.loop``.
     """
     loop = p753_chapter4.loop(controller, rate, stage, noise_rms=0.0)
@@ -171,15 +175,16 @@ FIGURES = {
     "figure-4-5": ("bang_bang",),
     "figure-4-7": ("reference_model", "model_reference"),
 }
-"""Columns of each figure with numbers in the text, at 20 kHz."""
+"""Columns of each figure whose numbers are in the text of the thesis, at 20 kHz."""
 
 TABLES = (*RATES, *FIGURES)
 
 
 def cells(table: str) -> list[Cell]:
-    """Return the cells of ``table`` ("4-5", "4-6" or a figure's numbers), simulated.
+    """Return the cells of ``table`` (one of ``TABLES``), simulated.
 
-    One reading of the thesis applies to all cells of both tables; nothing is tuned:
+    One reading of the thesis applies to all cells of Tables 4-5 and 4-6; nothing is
+    tuned:
 
     - The gains and the rows of Table 4-1 are used as printed. The alpha-beta filter of
       20 kHz is also used at 5 kHz, where none is printed.

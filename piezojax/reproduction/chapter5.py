@@ -16,7 +16,7 @@ COLUMNS = {
     "inversion": p753.inversion,
     "dob": p753.disturbance_observer,
 }
-"""Controllers of the columns, by their names in ``cells.csv``."""
+"""Controllers of the columns, by their names in ``data/ch5.csv``."""
 
 TABLES = {"5-3": "5-2", "5-5": "5-4"}
 """Table of the gains of each result table."""

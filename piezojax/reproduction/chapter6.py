@@ -27,7 +27,7 @@ ORDERS = (7, 4, 4)
 
 @dataclass(frozen=True)
 class Method:
-    """An estimator of the Hankel-Toeplitz parameters, and p of each channel."""
+    """An estimator of the Hankel-Toeplitz parameters, and its window p by channel."""
 
     estimate: Estimator
     p: tuple[int, int, int]
@@ -68,13 +68,15 @@ def cells(table: str) -> list[Cell]:
     chirp from 1 to 100 Hz and predicts sines of 1, 5 and 10 Hz in a free run. A cell is
     the RMS error over the second half of 4 s. Nothing is tuned for single cells.
 
-    6-7 is MAP with its prior. 6-8 is the method of comparison, least squares without a
-    prior. Taken literally, it fails on a chirp (errors of 1e2 to 1e8 urad), so the
-    printed method must have been regularised. Here, directions weaker than 1e-4 of the
-    strongest are left out. Poles outside the unit circle are reflected.
+    Table 6-7 is the maximum a posteriori estimate ``PRIOR``. Table 6-8 is least squares
+    without a prior, for comparison. Taken literally, it fails on a chirp (errors of 1e2
+    to 1e8 urad), so the printed method must have been regularised. Here, directions
+    weaker than 1e-4 of the strongest are left out. Poles outside the unit circle are
+    reflected.
 
-    The driven axes and the order of the two tables can be compared. The couplings
-    cannot: a linear stage lacks the coupling that a linear model fails to predict.
+    The driven axes and the order of the two tables can be compared with the thesis. The
+    couplings cannot: the printed model is linear, so it has no coupling that a linear
+    model fails to predict.
     """
     method = METHODS[table]
     paper = printed("ch6", table)

@@ -13,7 +13,7 @@ COLUMNS = {
     "pid_smc": Column(partial(p558_control.multi_axis, "dynamic", False), DELAY),
     "pid": Column(p558_control.pid, DELAY),
 }
-"""Controllers by their names in ``cells.csv``."""
+"""Controllers by their names in ``data/ch7.csv``."""
 
 FIGURE = "figure-7-4"
 """Second combined experiment; no numbers are printed for the first (Figure 7.3)."""

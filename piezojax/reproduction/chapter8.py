@@ -11,7 +11,7 @@ COLUMNS = {
     "dob_smc": Column(p558_control.disturbance_observer, DELAY),
     "nominal_smc": Column(p558_control.nominal, DELAY),
 }
-"""Controllers by their names in ``cells.csv``."""
+"""Controllers by their names in ``data/ch8.csv``."""
 
 FIGURES = dict(zip(("figure-8-4", "figure-8-5"), EXPERIMENTS, strict=True))
 """Combined experiment of each figure."""

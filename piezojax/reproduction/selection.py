@@ -16,16 +16,16 @@ from .stage_fit import STEPS, Point, Problem, costs, fit, log_ratios
 from .summary import geomean
 
 PENALTY_WEIGHTS = (0.3, 3.0)
-"""Candidate weights of the penalty on the distance of the stage from print.
+"""Candidate weights of the penalty on the stage's distance from the printed values.
 
-The weight is the residual of a step over the whole range of a quantity.
+A weight is the residual for a deviation by the whole range of a quantity.
 """
 
 FOLDS = 5
 """Parts of the fitting half; each has one cell of each column of each table."""
 
 SHIFTS = ({}, {"slow_pole": 0.2})
-"""Starts of a fit of the stage alone, as shifts from print in the unit box."""
+"""Starts of a fit of the stage alone: shifts from the printed point in the unit box."""
 
 MAX_SUSPECTS = 3
 """Largest number of selected suspect numbers."""
@@ -34,17 +34,20 @@ MIN_IMPROVEMENT = 1.02
 """Smallest factor by which a suspect number must lower the cross-validated ratio."""
 
 GRID = 5
-"""Grid values of a candidate with the stage fixed; the middle one is as printed."""
+"""Number of grid values of a candidate around the printed one, the stage fixed."""
 
 SCREENING = 3
-"""Steps of the optimiser from the best grid value, with the stage free."""
+"""Number of optimiser steps from the best grid value, with the stage free."""
 
 FINALISTS = 3
 """Number of candidates with the least cost after screening that are cross-validated."""
 
 
 class Round(NamedTuple):
-    """One round: cross-validated ratios before it and with each finalist."""
+    """One round: cross-validated ratios before it and with each finalist.
+
+    ``taken`` is the selected finalist, None if none improves the ratio enough.
+    """
 
     before: float
     after: dict[str, float]
@@ -114,11 +117,11 @@ def screen(
 ) -> list[tuple[int, Point]]:
     """Return the ``FINALISTS`` candidates with the least cost, each with its point.
 
-    A grid search comes first, because the best value may be decades from the printed
-    one, where the slope at the printed value is misleading. A few steps of the
-    optimiser follow, together with the quantities that are already ``free``. Both run
-    twice, from ``point`` and from the printed stage, because a stage fitted to
-    compensate a misprint hides the misprint.
+    A grid search of the candidate comes first: its best value may be decades from the
+    printed one, and the slope at the printed value does not lead there. A few steps of
+    the optimiser follow, in which the quantities ``free`` vary too. Both run twice,
+    from ``point`` and from the printed stage, because a stage that was fitted with a
+    misprint may compensate for it and hide it.
     """
     progress = Silent() if progress is None else progress
     grid = (jnp.arange(GRID) + 0.5) / GRID

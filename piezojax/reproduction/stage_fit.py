@@ -25,13 +25,13 @@ CORNER = 0.1
 """|ln(sim/print)| at which the cost changes from quadratic to linear."""
 
 TOLERANCE = 1e-4
-"""Relative change of cost and point at which the descent from a start ends."""
+"""Relative change of cost and point below which the descent from a start ends."""
 
 STEEPEST = 1e4
 """Largest slope of a residual over the unit box; larger ones are set to zero.
 
-An unstable loop has larger ones: unlike its voltage, its slope has no limits. The value
-also replaces residuals that are not finite.
+The slopes of an unstable loop may exceed it: its voltage has limits, but they bound no
+slope. The value also replaces residuals that are not finite.
 """
 
 Point = Float[Array, " n"]
@@ -98,7 +98,11 @@ class Problem(eqx.Module):
 def _normal_equations(
     problem: Problem, base: Point, free: Free, points: Float[Array, "points free"]
 ) -> tuple[Array, Array, Array]:
-    """Return the normal equations of ``free`` quantities, the others as in ``base``."""
+    """Return the normal equations of the quantities ``free`` at each of ``points``.
+
+    ``points`` are in the unbounded coordinates of ``unsquash``. The other quantities
+    are as in ``base``.
+    """
 
     def linearise(point):
         part = squash(point)
@@ -130,7 +134,8 @@ def fit(
     """Return the point with the least cost, from all starts, and this cost.
 
     Only the quantities ``free`` are varied; the others are those of the first start. A
-    trial step into instability has a larger cost and is rejected; the damping grows.
+    trial step into instability has a larger cost and is rejected; then the damping
+    grows.
     """
     progress = Silent() if progress is None else progress
     base, places = starts[0], jnp.asarray(free)

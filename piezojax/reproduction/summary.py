@@ -1,4 +1,4 @@
-"""Agreement of simulated tables with print, and their comma-separated text."""
+"""Agreement of simulated with printed tables, and their comma-separated text."""
 
 import csv
 import io
@@ -12,7 +12,10 @@ from .cell import Cell
 
 
 class Agreement(BaseModel):
-    """Geometric-mean and worst ratio of simulation to print, both at least 1."""
+    """Geometric-mean and worst ratio of simulated to printed values.
+
+    A ratio below 1 counts as its inverse, so both are at least 1.
+    """
 
     geomean_ratio: float
     worst_ratio: float

@@ -110,9 +110,8 @@ def build(
 ) -> Case:
     """Build the Case of ``study``; ``seed`` replaces the seed of the study.
 
-    The files that the study names lie beside ``path``. ``progress`` receives that of
-    the fit of a plant. Raises ValueError: one line with the key, the value and the
-    allowed values.
+    The files that the study names lie beside ``path``. ``progress`` reports the fit of
+    a plant. Raises ValueError: one line with the key, the value and the allowed values.
     """
     path = Path(path)
     if seed is not None:
@@ -194,7 +193,10 @@ def read(path: str | Path, seed: int | None = None) -> Case:
 def _with_measured_noise(
     study: Study, folder: Path
 ) -> tuple[Study, dict[str, MeasuredNoise]]:
-    """Return ``study`` with the rms noise of its sensor, and the noise of its files."""
+    """Return ``study`` with the rms noise of its sensor, and the measured noise.
+
+    The keys of the measured noise are fields of a Case.
+    """
     units = study.axes.units if study.axes else ("um",)
     volts = ("V",) * study.axis_count
     tables = {
@@ -276,7 +278,7 @@ def _swept_plants(study: Study, zero: Any) -> dict[str, System]:
 def _with_gains(
     controller: System, gains: Mapping[str, float], study: Study, where: str
 ) -> System:
-    """Return ``controller`` with other ``gains``, by path, for the rate of ``study``.
+    """Return ``controller`` with the values ``gains``, by path.
 
     Raises ValueError, starting with ``where``, for a wrong rate, path or value.
     """

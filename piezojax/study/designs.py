@@ -17,10 +17,10 @@ ALL_DESIGNS: Mapping[str, Callable[..., System]] = DESIGNS | DEVICE_DESIGNS
 
 
 def design_of(table: Mapping[str, Any]) -> Callable[..., System]:
-    """Return the design that ``table`` names, with the settings beside the name.
+    """Return the design that ``table`` names, with the settings of the table.
 
-    They are the keyword arguments of the design. Raises ValueError for an unknown
-    design, an unknown, missing or wrong setting.
+    The settings are the keyword arguments of the design. Raises ValueError for an
+    unknown design, and for an unknown, missing or wrong setting.
     """
     settings = dict(table)
     name = one_of(settings.pop("design"), ALL_DESIGNS)

@@ -161,7 +161,7 @@ def ensemble_of(
 def _behind(
     amplifier: System | None, make: Callable[..., System]
 ) -> Callable[..., System]:
-    """Return ``make`` with the plant that it makes behind ``amplifier``."""
+    """Return a function that puts the plants of ``make`` behind ``amplifier``."""
 
     def made(**deviations: Any) -> System:
         return driven(amplifier, make(**deviations))

@@ -11,8 +11,9 @@ from .tables import Finite, Positive, Table, example
 class EnsembleTable(Table):
     """Random stages: relative deviations, ranges and standard errors of parameters.
 
-    The keys of ``spread`` and ``range`` are deviations of the catalogued plant or paths
-    (``plant.hysteresis.a``, ``sensor.noise.noise_rms``).
+    The keys of ``spread`` and ``range`` are names of deviations of the catalogued
+    plant, such as ``gain``, or paths, such as ``plant.hysteresis.a`` and
+    ``sensor.noise.noise_rms``.
     """
 
     model_config = example(
@@ -37,13 +38,13 @@ class EnsembleTable(Table):
     """Number of drawn stages in the objective, in addition to the nominal one."""
     margins: Annotated[int, Field(strict=True, ge=0, le=1024)] = 64
     """Number of drawn stages on which margins are limited, in addition to the nominal
-    one; the first of them are those of ``tune``. A search uses the worst, and all are
-    checked at its end."""
+    one; the first of them are those of ``tune``. If there are more than 64, a search
+    uses the worst ones only, and its result is checked on all."""
     holdout: Annotated[int, Field(strict=True, ge=1, le=1024)] = 50
     """Number of other stages on which the tuned gains are evaluated."""
     aggregate: Literal["mean", "worst", "cvar"] = "mean"
-    """Objective of several stages: the mean of theirs, the worst, or the mean of the
-    worst share ``tail`` (CVaR)."""
+    """Objective of several stages: the mean of their objectives, the worst, or the mean
+    over the worst share ``tail`` of the stages (CVaR)."""
     tail: Annotated[float, Field(gt=0.0, le=1.0)] = 0.25
     """Share of the stages in ``cvar``."""
 

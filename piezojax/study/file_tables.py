@@ -28,7 +28,7 @@ class SignalFile(Table):
     time: ColumnKey | None = None
     """Column of the time, unless ``rate`` or the file gives the sample time."""
     rate: Annotated[Positive | None, in_unit("Hz")] = None
-    """Sampling rate, without a column of the time."""
+    """Sampling rate, if no column gives the time."""
     unit: str | None = None
     """Unit of columns whose unit is given neither by the file nor by their name."""
     scale: Finite = 1.0
@@ -72,8 +72,9 @@ class TrajectoryTable(SignalFile):
     offset: Annotated[ByAxis[Finite], in_unit("um or urad")] = 0.0
     """Value added to the trajectory."""
     then: Literal["hold", "repeat"] | None = None
-    """Continuation of a file that ends before the reference: its last value, or from
-    its beginning. Without this key such a file is an error."""
+    """Continuation of a file that ends before the reference: ``hold`` keeps its last
+    value, ``repeat`` begins again at ``start``. Without this key such a file is an
+    error."""
 
     @model_validator(mode="after")
     def _scaled(self) -> "TrajectoryTable":

@@ -44,8 +44,8 @@ DEVICES: dict[str, dict[str, float | None]] = {
         "notch_frequency_1": 1.5,
     },
 }
-"""Parameters to tune of each design of a device; a factor limits the deviation from the
-value of the design."""
+"""Parameters to tune of each design of a device. A number is the factor by which a
+parameter may differ from the value of the design; None stands for declared bounds."""
 
 _MEASURE = (
     "measure it (python -m piezojax.identify LOOP --controller {}, with a record of "
@@ -68,9 +68,9 @@ class Plan:
     ``frequency`` is that of the slowest one. The references cover ``offset`` to
     ``offset + 2 amplitude``. The controller follows at most the slew ``slew``, um/s: it
     sees faster references, such as jumps, as ramps. ``controller`` is the name of a
-    design. For a device, ``scale`` is that of its gains (V/um; 0 stands for the assumed
-    one), and its range are the positions ``lowest`` to ``highest``. Raises ValueError
-    for values that no stage can have, and for unknown references or designs.
+    design. For a device, ``scale`` is that of its gains (V/um; 0 if it is unknown and
+    to be assumed), and its positions range from ``lowest`` to ``highest``. Raises
+    ValueError for values that no stage can have, and for unknown references or designs.
     """
 
     lower: float

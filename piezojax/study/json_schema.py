@@ -23,9 +23,9 @@ UNIT = " Unit: {}."
 def study_schema() -> dict[str, Any]:
     """Return the schema of a study file, JSON Schema draft 2020-12.
 
-    It has every table with its keys, types, bounds and defaults, and the names that a
-    key may have: catalogues, designs, types, constraints and optimisers. Conditions
-    between keys are checked only when the study is read.
+    It has every table with its keys, types, bounds and defaults, and the names that
+    some keys take as values: catalogue entries, designs, types, constraints, metrics
+    and optimisers. Conditions between keys are checked only when the study is read.
     """
     schema = Study.model_json_schema()
     properties, tables = schema["properties"], schema["$defs"]
@@ -71,7 +71,7 @@ def _source(catalog: Iterable[str], **named: Iterable[str]) -> dict[str, Any]:
 
 
 def _several_names(record: dict[str, Any]) -> None:
-    """Let a plant name its records as ``records`` too, and a single file as a text."""
+    """Allow ``records`` as another name of ``record``, and a string for one file."""
     properties = record["properties"]
     for key in ("record", "check"):
         files = properties[key]

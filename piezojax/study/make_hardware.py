@@ -25,9 +25,9 @@ def per_axis(study: Study, make: Callable[[int], Any]) -> Any:
 
 
 def make_actuator(study: Study) -> System:
-    """Return the actuator: limits, slew rate and converter, known to the controller.
+    """Return the actuator: limits, slew rate and converter.
 
-    It maps the command (V) to the voltage (V) after them.
+    It maps the command (V) to the voltage (V), which the controller knows.
     """
     table = study.actuator
 
@@ -45,8 +45,9 @@ def make_actuator(study: Study) -> System:
 def make_amplifier(study: Study) -> System | None:
     """Return the delay and the bandwidth between actuator and plant, V to V.
 
-    The controller does not know the voltage behind them. Returns None if the study has
-    neither. Raises ValueError for a delay above ``LONGEST`` samples.
+    The controller does not know the output voltage. Returns None if the study has
+    neither delay nor bandwidth. Raises ValueError for a delay above ``LONGEST``
+    samples.
     """
     table = study.actuator
 
@@ -60,7 +61,7 @@ def make_amplifier(study: Study) -> System | None:
 def driven(amplifier: System | None, plant: System) -> System:
     """Return ``plant`` behind ``amplifier``.
 
-    The paths of a Series stay the same; any other plant is named ``stage``.
+    The parts of a Series keep their paths; any other plant becomes the part ``stage``.
     """
     if amplifier is None:
         return plant
@@ -125,7 +126,7 @@ def _converter(
 def _response(
     study: Study, name: str, table: ElectronicsTable, axis: int, samples: float = 0.0
 ) -> Parts:
-    """Return delay and low-pass, where given; ``samples`` are added to the delay."""
+    """Return delay and low-pass, if given; ``samples`` are added to the delay."""
     parts: Parts = {}
     delay = samples + _of(table.delay, axis) / study.dt
     if delay > LONGEST:

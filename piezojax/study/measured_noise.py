@@ -1,4 +1,4 @@
-"""Measured noise and vibrations in files: random draws, or stretches of a record."""
+"""Measured noise and vibrations in files: random draws, or sections of a record."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -71,7 +71,7 @@ class Density(NamedTuple):
 class MeasuredNoise:
     """Noise of a file at the rate of a study, in the units of its axes.
 
-    ``density`` gives random draws, ``record`` [samples, axes] stretches; one of them is
+    ``density`` gives random draws, ``record`` [samples, axes] sections; one of them is
     None. ``rms`` [axes] is that of the whole noise; ``note`` describes its source and
     its conversion.
     """
@@ -93,7 +93,7 @@ class MeasuredNoise:
 
         Draws are Gaussian with the density of the file: each line of their spectrum is
         an independent complex normal number (J. Timmer and M. Koenig, Astronomy and
-        Astrophysics 300 (1995) 707). Stretches begin at random places of the first half
+        Astrophysics 300 (1995) 707). Sections begin at random samples of the first half
         of a record for the ``part`` "train", of the second for "validate".
         """
         if self.record is not None:
@@ -115,7 +115,7 @@ class MeasuredNoise:
 
 
 def _lines(samples: int, rate: float) -> tuple[Float[np.ndarray, " lines"], int]:
-    """Return the lines (Hz) of a period of twice ``samples`` or more, and its length.
+    """Return the lines (Hz) of a period of at least twice ``samples``, and its length.
 
     A draw is a part of this period, so that its two ends are not correlated.
     """
@@ -132,7 +132,7 @@ def read_noise(
     *,
     sensor: bool = False,
 ) -> MeasuredNoise:
-    """Read the noise of ``table``, the key ``where`` of ``study``, in ``units``.
+    """Return the noise of ``table`` in ``units``; ``where`` is its key in ``study``.
 
     The noise of a ``sensor`` must be known up to nearly half the rate of the study.
     Raises ValueError, starting with ``where``, for a file that cannot be read, is too
@@ -220,7 +220,7 @@ def _played(
     """Return the noise that plays ``values`` at the rate of the study."""
     rate = 1.0 / signals.dt
     note = (
-        f"{where}: stretches of {len(values)} samples of {table.file.name} at "
+        f"{where}: sections of the {len(values)} samples of {table.file.name} at "
         f"{rate:.6g} Hz, of the first half in tuning, of the second in the hold-out"
     )
     values, done = _at_rate(values, rate, study.rate)
@@ -241,8 +241,8 @@ def _at_rate(
 ) -> tuple[Float[np.ndarray, "resampled axes"], str]:
     """Return ``values`` of ``rate`` (Hz) at the ``wanted`` rate, and a part of a note.
 
-    A whole fraction of the rate takes every n-th sample. Any other rate takes values of
-    the band-limited signal between the samples.
+    If ``rate`` is n times the wanted one, every n-th sample is taken. Otherwise the
+    band-limited signal is interpolated between the samples.
     """
     every = round(rate / wanted)
     if every and abs(rate / wanted / every - 1.0) < SAME:
@@ -256,7 +256,7 @@ def _at_rate(
 
 
 def _band(known: float, study: Study) -> str:
-    """Return the part of a note on frequencies that the file does not reach."""
+    """Return the part of a note on frequencies that are missing or aliased."""
     nyquist = 0.5 * study.rate
     if known < nyquist * (1.0 - SAME):
         return (

@@ -13,7 +13,7 @@ from .schema import Study
 
 
 def in_study_units(record: Record, study: Study, where: str) -> Record:
-    """Return ``record``, named at the key ``where``, in V and the units of the axes.
+    """Return ``record`` in V and the units of the axes; ``where`` is its key.
 
     Raises ValueError for a unit that cannot be converted.
     """

@@ -22,7 +22,7 @@ def search_space(
     """Return ``loop`` with the starts of the study, its Space, and notes on starts.
 
     A parameter that only a pattern of ``tune`` matches may be 0 in the controller
-    (switched off), although 0 lies outside its logarithmic range. The search then
+    (switched off), although a ``log`` or ``logit`` scale excludes 0. The search then
     starts from the lower bound of the range, and a note says so.
 
     Raises ValueError, naming the path, for a path that is not a scalar of the
@@ -81,7 +81,7 @@ def _range(loop: Feedback, path: str, table: TunedTable) -> Range:
 
 
 def _reaching(bounds: Range, start: float) -> Range:
-    """Return ``bounds``, extended to a decade beyond a ``start`` outside them.
+    """Return ``bounds``, extended to a decade beyond a ``start`` on or outside them.
 
     Only bounds on a logarithmic scale are extended. Declared ranges suit common
     controllers; a design may start outside them.

@@ -25,8 +25,8 @@ class ResponsePlant(Table):
     response: Path
     """File with the frequency response, relative to the study."""
     held: bool = False
-    """Whether the response was measured through converters at the rate of the
-    study."""
+    """True if converters at the rate of the study held the input during the
+    measurement; ignored if the file states how the response was measured."""
     unit: str = "um/V"
     """Unit of the response, output over input."""
 
@@ -52,8 +52,8 @@ class RecordPlant(Table):
     record: tuple[Path, ...] = Field(
         min_length=1, validation_alias=AliasChoices("record", "records")
     )
-    """File of a record, or several of one stage, relative to the study; ``records`` is
-    the same key."""
+    """File of a record, or several of one stage, relative to the study. The key may
+    also be written ``records``."""
     model: str = DEFAULT
     """Model of ``identify``: a chain of parts joined by ``+``, or ``all`` for the best
     of all that the records support."""
@@ -68,7 +68,7 @@ class RecordPlant(Table):
     output: Column | tuple[Column, ...] = 1
     """Column of the displacement, or a list for several axes."""
     record_rate: Annotated[Positive | None, in_unit("Hz")] = None
-    """Sampling rate of the records, without a column of the time."""
+    """Sampling rate of the records, if no column gives the time."""
     resample: Annotated[Positive | None, in_unit("Hz")] = None
     """Rate to which the records are interpolated."""
     period: Annotated[
@@ -86,14 +86,14 @@ class RecordPlant(Table):
     order: Count = Options.order
     """Number of states of a linear or neural model."""
     window: Annotated[Count, in_unit("samples")] = Options.window
-    """Past and future samples in the Hankel-Toeplitz regression."""
+    """Number of past and of future samples in the Hankel-Toeplitz regression."""
     oversample: Count = Options.oversample
     """Simulated samples per sample of a periodic record, for ``bouc_wen``."""
     steps: Count = Options.steps
     """Largest number of optimiser steps."""
     check: tuple[Path, ...] = ()
-    """Other records of the stage with the same columns, or one, on which the fitted
-    plant is validated."""
+    """Another record of the stage with the same columns, or several, on which the
+    fitted plant is validated."""
 
     @field_validator("record", "check", mode="before")
     @classmethod

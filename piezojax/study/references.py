@@ -15,7 +15,7 @@ def reference_signals(
 ) -> Float[np.ndarray, "references samples *axes"]:
     """Return the references of ``study``, the tuning ones before the unseen ones.
 
-    They are in um, or in the units of the axes. ``trajectories`` are those of its
+    They are in um, or in the units of the axes. ``trajectories`` holds those from
     files, by name.
     """
     table = study.references

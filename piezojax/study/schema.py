@@ -136,13 +136,13 @@ class TunedTable(RangeTable):
     start: Finite | None = None
     """Start of the search; without this key the value in the controller."""
     within: Annotated[float, Field(gt=1.0, allow_inf_nan=False)] | None = None
-    """Factor by which the parameter may differ from its start, instead of bounds: a
-    design computes the start for a plant that is not known before."""
+    """Factor by which the parameter may differ from its start, instead of ``lower`` and
+    ``upper``: for a start that a design computes for the plant."""
 
     @model_validator(mode="after")
     def _one_pair_of_bounds(self) -> "TunedTable":
         if self.within is not None and (self.lower, self.upper) != (None, None):
-            raise ValueError("within stands for lower and upper: give one of both")
+            raise ValueError("within stands for lower and upper; leave these out")
         return self
 
     def bounded(self, value: float, where: str) -> "TunedTable":
@@ -189,7 +189,7 @@ class ParetoTable(Table):
     )
 
     constraint: str
-    """Name of one of the limits in ``[constraints]``."""
+    """Name of a constraint with a limit, in ``[constraints]`` or by default."""
     limits: tuple[Positive, ...] = Field(min_length=2)
     """Limits, in the unit of the constraint."""
     steps: Annotated[int, Field(strict=True, ge=1, le=10000)] = 30
@@ -231,7 +231,7 @@ class OptimiserTable(Table):
     starts: Annotated[int, Field(strict=True, ge=1, le=256)] = 8
     """Number of starting points: the start of the study and the best candidates."""
     candidates: Annotated[int, Field(strict=True, ge=0, le=65536)] = 64
-    """Number of points of the box that are simulated first."""
+    """Number of points of the box that are simulated to choose the starts."""
     steps: Annotated[int, Field(strict=True, ge=1, le=10000)] = 60
     """Largest number of steps from each start."""
     tolerance: Positive = 1e-4
@@ -508,7 +508,7 @@ def _with_files(content: Any, renamed: Callable[[str], str], key: str = "") -> A
 
 
 def sha256_of(study: Study) -> str:
-    """Return the SHA-256 of ``as_toml`` with the names of files without folders.
+    """Return the SHA-256 of ``as_toml``, with file names without their folders.
 
     It identifies a study; comments and the folder of the study do not count.
     """

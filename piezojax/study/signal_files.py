@@ -21,10 +21,11 @@ from .schema import Study
 
 
 class FileSignals(NamedTuple):
-    """Signals of a file: a column for each axis, in its unit; 0 for other axes.
+    """Signals of a file by axis, each in the unit of its axis.
 
-    ``values`` [samples, axes]; ``instants`` (s) [samples] begin at 0 and ``dt`` is
-    their mean step; ``columns`` are the names by axis, "" for an axis without one.
+    ``values`` [samples, axes] are 0 for an axis without a column; ``instants`` (s)
+    [samples] begin at 0 and ``dt`` is their mean step; ``columns`` are the names of the
+    columns by axis, "" for an axis without one.
     """
 
     values: Float[np.ndarray, "samples axes"]
@@ -47,7 +48,7 @@ def read_signals(
     *,
     even: bool = True,
 ) -> FileSignals:
-    """Read the signals of ``table``, the key ``where`` of ``study``, in ``units``.
+    """Return the signals of ``table`` in ``units``; ``where`` is its key in ``study``.
 
     The file lies in ``folder``; ``units`` are those of the axes. With ``even`` the
     samples must be evenly spaced. Raises ValueError, starting with ``where``, for an
@@ -85,7 +86,7 @@ LEAST_LINES = 3
 def read_densities(
     table: NoiseFile, study: Study, folder: Path, where: str, units: Sequence[str]
 ) -> tuple[Float[np.ndarray, " lines"], Float[np.ndarray, "lines axes"]]:
-    """Read the spectra of ``table``: frequency (Hz) and one-sided power densities.
+    """Return the spectra of ``table``: frequencies (Hz), one-sided power densities.
 
     The densities are in the square of each of ``units`` over Hz, 0 for an axis without
     a column. A line at 0 Hz is left out. Raises ValueError, starting with ``where``, as
@@ -112,7 +113,8 @@ def read_densities(
         frequency, levels = frequency[kept], levels[kept]
         if frequency.size < LEAST_LINES:
             raise ValueError(
-                f"the file has {frequency.size} lines; it must have {LEAST_LINES}"
+                f"the file has {frequency.size} lines; it must have at least "
+                f"{LEAST_LINES}"
             )
         if frequency[0] < 0.0 or np.any(np.diff(frequency) <= 0.0):
             raise ValueError("the frequencies must be above 0 and increase")

@@ -24,7 +24,7 @@ def about_file(table: Mapping[str, Any], folder: Path) -> About:
 def source_error(
     table: Mapping[str, Any], where: str, allowed: Iterable[str]
 ) -> ValueError:
-    """Return the error for a ``table`` without exactly one source of ``allowed``."""
+    """Return the error for a ``table`` that has not exactly one of ``allowed``."""
     return ValueError(
         f"{where} has the keys {', '.join(table) or 'none'}; "
         f"it must have exactly one of {', '.join(allowed)}"

@@ -30,7 +30,7 @@ class ElectronicsTable(Table):
     order: Order | None = None
     """Order of that low-pass; without this key 1."""
     delay: Annotated[ByAxis[NotNegative], in_unit("s")] = 0.0
-    """Delay."""
+    """Delay of the electronics."""
 
     @model_validator(mode="after")
     def _converter(self) -> "ElectronicsTable":
@@ -68,7 +68,8 @@ class Actuator(ElectronicsTable):
     capacitance: Annotated[ByAxis[Positive] | None, in_unit("F")] = None
     """Capacitance of the stage."""
     computation: Annotated[NotNegative, in_unit("samples")] = 0.0
-    """Time from the sample of the sensor to the change of the voltage."""
+    """Delay from the sample of the sensor to the change of the voltage, in addition to
+    ``delay``."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "Actuator":
@@ -102,7 +103,8 @@ class SensorTable(ElectronicsTable):
     measured_noise: NoiseFile | None = None
     """Measured noise instead of ``noise_rms``."""
     anti_aliasing: Annotated[ByAxis[Bandwidth] | None, in_unit("Hz")] = None
-    """Bandwidth of a low-pass of displacement and noise before the converter."""
+    """Bandwidth of a low-pass that filters displacement and noise before the
+    converter."""
     anti_aliasing_order: Order | None = None
     """Order of that low-pass; without this key 1."""
 
@@ -124,7 +126,8 @@ class DisturbanceTable(Table):
     model_config = example({"drift_rms": 0.005})
 
     drift_rms: Annotated[ByAxis[NotNegative], in_unit("um or urad")] = 0.0
-    """Rms value of a random walk of the displacement after one second."""
+    """Rms value, after one second, of a random walk that is added to the
+    displacement."""
     output: NoiseFile | None = None
     """Measured vibration, added to the displacement; in um or urad, or a unit that is
     converted to it."""

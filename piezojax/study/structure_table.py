@@ -11,7 +11,7 @@ MOST_NOTCHES = 4
 
 
 class StructuresTable(Table):
-    """Structures of the controller that are tuned alike: numbers of notches."""
+    """Structures of the controller to compare; they differ in the number of notches."""
 
     model_config = example({"notches": [0, 1, 2], "behind": "controller.feedback"})
 
@@ -23,8 +23,8 @@ class StructuresTable(Table):
     """Path of the part whose command the notches filter; by default the feedback of the
     controller, or the controller if it has no such part."""
     worth: Annotated[float, Field(gt=0.0, lt=1.0, strict=True)] = 0.1
-    """Least relative decrease of the error on the hold-out, and more than two standard
-    errors, for which a further notch is kept."""
+    """Least relative decrease of the error on the hold-out for which a further notch is
+    kept. The decrease must also exceed two standard errors."""
 
     @field_validator("notches")
     @classmethod

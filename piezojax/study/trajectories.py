@@ -31,7 +31,7 @@ def read_trajectories(study: Study, folder: Path) -> dict[str, Trajectory]:
 
     Between two samples of the file the reference is linear. Raises ValueError, naming
     the key, for a file that cannot be read or ends too early, and for a part of a file
-    that is used both in tuning and as unseen.
+    that both a tuning and an unseen reference use.
     """
     table, units = study.references, study.axes.units if study.axes else ("um",)
     time_s = study.dt * np.arange(round(table.duration * study.rate))
@@ -121,7 +121,7 @@ def _note(
 
 
 def _check_unseen(study: Study, parts: Mapping) -> None:
-    """Raise ValueError for an unseen reference that shares samples with a tuned one."""
+    """Raise ValueError if an unseen reference shares samples with a tuning one."""
     table = study.references
     for seen, unseen in product(table.tune, table.unseen):
         if seen not in parts or unseen not in parts:

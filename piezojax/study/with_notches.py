@@ -1,4 +1,4 @@
-"""Case with notches in its feedback, whose parameters are tuned too."""
+"""Case with notches in its feedback; their parameters are tuned too."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ WIDTHS = 0.03, 0.8
 NOTCH = "notch_{}"
 """Name of a notch by its number, from 1 on."""
 
-_UNTUNED = 0.5
+_UNTUNED = 0.5  # damping ratio at the start
 
 
 def with_notches(case: Case, modes: Sequence[Resonance]) -> Case:
@@ -76,7 +76,7 @@ def with_notches(case: Case, modes: Sequence[Resonance]) -> Case:
 def place_of(case: Case) -> str:
     """Return the path of the part whose command the notches filter.
 
-    Raises ValueError as ``with_notches``.
+    Raises ValueError as ``with_notches`` does.
     """
     table, controller = case.study.structures, case.loop.controller
     behind = table.behind if table else None
@@ -111,9 +111,9 @@ def place_of(case: Case) -> str:
 
 
 def _feedback_of(controller: System) -> str:
-    """Return the path of the feedback in ``controller``, without one its own path.
+    """Return the path of the feedback in ``controller``, or "controller" without one.
 
-    Around a controller with feedback there may be another, as a LimitedReference.
+    Other controllers, such as a LimitedReference, may enclose the one with feedback.
     """
     part, path = controller, "controller"
     while isinstance(inner := getattr(part, "controller", None), System):

@@ -35,7 +35,7 @@ class LimitComparison:
     references. ``disturbance`` is the whole disturbance, and ``unpredicted`` its part
     that the reference does not predict. ``bandwidth`` is the highest frequency (Hz) at
     which the spectrum of that part lies above that of the noise. ``tuned_shares`` is
-    None if the loop is too nonlinear for its error to be the sum of shares.
+    None if the loop is too nonlinear to split its error into shares.
     """
 
     tuned: float
@@ -83,9 +83,9 @@ class LimitReport:
     """Comparison of a loop with the limit of linear control, by reference.
 
     ``noise_rms`` in um; ``resolution`` of the spectra in Hz; ``gain`` of the linear
-    plant at rest in um/V. ``delay`` is that of the plant's inner part for slow motion,
-    in samples. ``sensitivity_peak`` is that of the one controller; the limit does not
-    bound it. ``dt`` in s.
+    plant at rest in um/V. ``delay`` is the low-frequency delay of the plant's inner
+    (all-pass) factor, in samples. ``sensitivity_peak`` is that of the one controller;
+    the limit does not bound it. ``dt`` in s.
     """
 
     references: dict[str, LimitComparison]

@@ -70,8 +70,8 @@ class LinearPlant(System):
     def delay_and_zeros(self) -> tuple[int, np.ndarray]:
         """Return the delay (samples) and the zeros outside the unit circle.
 
-        Both limit every controller. The delay includes the loop's sample. The zeros are
-        in the z plane; zeros on the circle cost nothing and are left out. Raises
+        Both limit every controller. The delay includes the loop's own sample. The zeros
+        are in the z plane; zeros on the circle cost nothing and are left out. Raises
         ValueError if the voltage does not move the plant.
         """
         A, B, C, D = (np.asarray(x) for x in (self.A, self.B, self.C, self.D))
@@ -147,18 +147,19 @@ def _responses(plant: LinearPlant, voltage: jax.Array, rest: jax.Array) -> jax.A
 def gain_from_noise(
     response: np.ndarray, displacement: np.ndarray, noise: np.ndarray
 ) -> float:
-    """Return the gain of the stage for voltage caused by sensor noise.
+    """Return the factor that scales the response of a linear plant to the stage's.
 
-    All arguments are transforms [..., lines]. ``response`` is that of a plant of gain 1
-    to the voltage and ``displacement`` that of the stage, both without the part that
-    the reference predicts; ``noise`` is the sensor's.
+    Only the part of the voltage that sensor noise causes counts. All arguments are
+    transforms [..., lines]. ``response`` is that of the linear plant to the voltage and
+    ``displacement`` that of the stage, both without the part that the reference
+    predicts; ``noise`` is the sensor's.
 
-    The gain is an instrumental-variable estimate with the noise as instrument: the
+    The factor is an instrumental-variable estimate with the noise as instrument: the
     residual displacement is then uncorrelated with the noise, as a disturbance must be.
-    Lines are weighted by 1 / (power of the residual), updated in rounds. A hysteresis
-    responds less to small fast motions than to large slow ones. The reference predicts
-    the large ones; feedback acts on the small ones, so their gain is the one estimated.
-    Raises ValueError if there is no positive gain.
+    Lines are weighted by 1 / (power of the residual), updated in each iteration. A
+    hysteresis responds less to small fast motions than to large slow ones. The
+    reference predicts the large ones; feedback acts on the small ones, so the factor is
+    estimated from these. Raises ValueError if the estimate is not positive.
     """
     runs = tuple(range(response.ndim - 1))
     driven = np.mean(response * np.conj(noise), axis=runs)

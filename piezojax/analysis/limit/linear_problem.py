@@ -11,10 +11,10 @@ from .spectra import ReferencePredictor, grid_size, spectra, windowed
 
 
 class LinearProblem(NamedTuple):
-    """Linear control problem, and the grids on which it was measured.
+    """Linear control problem, and the lengths of its windows and spectra.
 
     ``plant`` is the linear model of the stage, and ``residual`` [references, draws,
-    samples] the disturbance (um): the displacement of the runs without the response of
+    samples] the disturbance (um): the displacement of the runs minus the response of
     that model. ``predictor`` is the linear filter that predicts the disturbance from
     the reference, ``spectra`` [references, points] (um^2) are those of the unpredicted
     part, and ``variance`` (um^2) is that of the sensor's noise. ``window`` is in

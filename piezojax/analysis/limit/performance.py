@@ -1,7 +1,7 @@
 """Limit of linear control for a loop and its references.
 
-The plant P is the linearised stage (``linear_plant``). Its gain is that of the stage
-for voltage caused by sensor noise in the loop's own runs (``gain_from_noise``). The
+The plant P is the linearised stage (``linear_plant``). Its gain is fitted to the
+response of the stage to sensor noise in the loop's own runs (``gain_from_noise``). The
 disturbance is the residual of the plant in those runs, d = y - P u: the effect of
 hysteresis, creep, drift and the study's own disturbance. It is taken from the assessed
 runs with their noise, because noise that reaches the voltage changes the state of a
@@ -43,7 +43,8 @@ from .wiener import (
 SEGMENT = 0.1
 """Length of the windows of the spectra, s; its inverse is their resolution."""
 
-_LINEAR = 1.2  # largest root sum square of the shares of a linear loop, over its error
+# Largest ratio of the shares' root sum square to the error of a nearly linear loop.
+_LINEAR = 1.2
 
 
 def performance_limit(
@@ -60,10 +61,10 @@ def performance_limit(
     """Return the limit for ``loop`` and the comparison of its runs with it.
 
     ``references`` [names, samples] in um; ``noise`` [names, draws, samples], draws of
-    unit variance; ``disturbance`` in um, if any, broadcasts to the shape of the noise:
-    the fields of the tuner's Signals. Samples before ``start`` do not count.
+    unit variance; ``disturbance`` in um, if any, broadcasts to the shape of the noise.
+    They are the fields of the tuner's Signals. Samples before ``start`` do not count.
     ``segment`` (s) is the length of the windows of the spectra, at most that of the
-    counted samples; ``dt`` (s) is by default that of the loop.
+    samples on which signals are predicted; ``dt`` (s) is by default that of the loop.
 
     Raises ValueError for several axes, a sensor without noise, runs that diverge, and
     a plant that is unstable or does not move as its linear model does.

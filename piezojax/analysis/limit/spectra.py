@@ -2,29 +2,32 @@
 
 A hysteresis under a periodic reference makes a periodic disturbance, which is
 predictable without error given its frequencies and unlimited time. A spectrum is
-therefore meaningful only together with its resolution. Welch's method (IEEE Trans.
-Audio Electroacoustics 15 (1967) 70-73) with Hann windows of a tenth of a second that
-overlap by half treats as unpredictable all that a tenth of a second cannot resolve.
-Longer windows lower the limit; their length is part of every figure computed with them.
+therefore meaningful only together with its resolution. Spectra are computed by Welch's
+method (IEEE Trans. Audio Electroacoustics 15 (1967) 70-73) with Hann windows of a tenth
+of a second by default, which overlap by half. Whatever a window cannot resolve counts
+as unpredictable. Longer windows lower the limit; their length is part of every figure
+computed with them.
 """
 
 import numpy as np
 
 TAPS = 100
-"""Taps of the filter of the reference: 1 ms apart over a tenth of a second."""
+"""Approximate number of taps of the reference's filter: 1 ms apart for windows of a
+tenth of a second."""
 
 LEAST_SHARE = 1e-10
-"""Least power of a direction in which taps are fitted, as a share of the largest."""
+"""Smallest eigenvalue, relative to the largest, whose direction the fit of the taps
+keeps."""
 
 
 class ReferencePredictor:
     """Prediction of signals by one linear, non-causal filter of the reference.
 
-    ``references`` [references, samples] in um are constant before they begin. The
-    filter reaches ``reach`` samples back and ahead. Signals are therefore predicted on
-    ``count`` samples: from ``start`` to ``reach`` samples before the end. The filter is
-    fitted to all references at once, by least squares of the differences between
-    consecutive samples: slow parts weigh less, because feedback removes them.
+    ``references`` [references, samples] in um are taken as constant before their first
+    sample. The filter reaches ``reach`` samples back and ahead. Signals are therefore
+    predicted on ``count`` samples: from ``start`` to ``reach`` samples before the end.
+    The filter is fitted to all references at once, by least squares of the differences
+    between consecutive samples: slow parts weigh less, because feedback removes them.
     """
 
     def __init__(self, references: np.ndarray, start: int, reach: int):
@@ -90,9 +93,9 @@ class ReferencePredictor:
 def grid_size(segment: int) -> int:
     """Return the number of points around the circle for windows of ``segment`` samples.
 
-    The factors of a spectrum have a longer memory than the spectrum. The circle
-    therefore has at least 32 times as many points as a window, and at least 2^14
-    because of the memory of the plant.
+    The impulse response of a spectral factor is longer than the autocovariance. The
+    circle therefore has at least 32 times as many points as a window has samples, and
+    at least 2^14 because of the impulse response of the plant.
     """
     return max(2**14, 2 ** int(np.ceil(np.log2(32 * segment))))
 

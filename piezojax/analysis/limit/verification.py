@@ -92,8 +92,8 @@ class LinearLimit(System):
 class LimitErrors(NamedTuple):
     """RMS errors [references] in um, predicted and simulated on the stage.
 
-    Both leave out the mean of a run, which is not part of a spectrum and which the
-    slowest integral action would remove.
+    Both leave out the mean of a run. It is not part of a spectrum, and even the slowest
+    integral action would remove it.
     """
 
     predicted: np.ndarray

@@ -36,11 +36,11 @@ make it ill-conditioned.
 import numpy as np
 
 FLOOR = 1e-12
-"""Least magnitude of a factor, over its largest; it replaces zeros on the circle."""
+"""Smallest magnitude relative to the largest; it replaces zeros on the circle."""
 
 
 def outer_factor(magnitude: np.ndarray) -> np.ndarray:
-    """Return the stable, causal response [N] with a stable inverse and ``magnitude``.
+    """Return the minimum-phase response [N] of the given ``magnitude`` [N].
 
     Raises ValueError for magnitudes that are not finite, or all zero.
     """

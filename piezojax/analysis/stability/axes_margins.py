@@ -118,7 +118,10 @@ def _figures(loop: LinearAxes) -> dict[str, Any]:
 def _structured_peak(
     loop: LinearAxes, grid: np.ndarray, sampled: np.ndarray
 ) -> tuple[float, float]:
-    """Return the peak of the structured singular value of (S - T)/2, and its angle."""
+    """Return the peak of ``structured_bound`` of (S - T)/2, and its angle.
+
+    ``sampled`` [lines, q, q] is (S - T)/2 on ``grid`` (rad/sample).
+    """
     bounds = largest_singular(balancing(sampled)[1])
     best, at = 0.0, 0
     while True:

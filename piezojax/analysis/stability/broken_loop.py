@@ -15,13 +15,13 @@ from ...hardware import Quantiser, Saturation
 from .operating_point import OperatingPoint
 
 VOLTAGE_PUSH = 2.0**-40
-"""Push on voltages as a share of 1 + |u|: enough to select a branch, too small to move
-along it."""
+"""Push, a small constant added to voltages, as a share of 1 + |u|: enough to select a
+branch, too small to move along it."""
 
 COMMAND_PUSH = 2.0**-30
-"""Push on the command, applied at the reference, as a share of 1 + |u|. It is larger
-than ``VOLTAGE_PUSH``, so that an inverse hysteresis in the controller is on the same
-branch."""
+"""Push on the command, made by a change of the reference, as a share of 1 + |u|. It is
+larger than ``VOLTAGE_PUSH``, so that an inverse hysteresis in the controller is on the
+same branch."""
 
 
 class BrokenState(NamedTuple):
@@ -91,12 +91,12 @@ class BrokenLoop(System):
         added: Signal,
         moved: tuple[Signal, Signal] | None = None,
     ) -> tuple[BrokenState, Signal]:
-        """Step with the loop closed for small motions, with ``added`` (V) at the plant.
+        """Step the loop, closed for small motions, with ``added`` (V) at the plant.
 
-        Return the new state and the voltage that acts there. This voltage is exactly
-        that of the operating point plus ``added``. Its derivatives with respect to the
-        state and to ``moved``, the deviations of r(k) and r(k+1) from the reference,
-        are those of the actuator's voltage.
+        Return the new state and the voltage at the plant. Its value is exactly that of
+        the operating point plus ``added``. Its derivatives with respect to the state
+        and to ``moved``, the deviations of r(k) and r(k+1) from the reference, are
+        those of the actuator's voltage.
         """
         controller, actuator, sensor, applied = self._answer(state, moved)
         acting = jax.tree.map(
@@ -173,17 +173,17 @@ def broken_loop(loop: Feedback, at: Any = 0.0) -> BrokenLoop:
     ``at`` is an ``OperatingPoint``, or the reference (um) at which the loop rests. At
     rest the plant is on the virgin loading curve of its hysteresis. There the local
     gain depends on the direction in which the voltage moves next. The ``branch`` of the
-    point selects it: "ascending" continues along the curve, "descending" turns back. A
-    push of about 1e-12 V selects the same side of all kinks, including those of an
-    inverse hysteresis in the controller. For a Coleman-Hodgdon model at (x, y) the two
-    slopes are b + h and b - h, h = a x + c y. Their mean is b, and far along a branch b
-    + h tends to -a/c, the slope of the loop's axis. For a plant without kinks both
-    branches are the same.
+    point selects it: "ascending" continues along the curve, "descending" turns back.
+    Pushes (``VOLTAGE_PUSH``, ``COMMAND_PUSH``) select the same side of all kinks,
+    including those of an inverse hysteresis in the controller. For a Coleman-Hodgdon
+    model at (x, y) the two slopes are b + h and b - h, h = a x + c y. Their mean is b.
+    Far along a branch, b + h tends to -a/c, the slope of the axis of the hysteresis
+    loop. For a plant without kinks both branches are the same.
 
-    Limits of the voltage (Saturation) are removed from the actuator, because margins
-    hold for small motions, and so are the steps of converters (Quantiser), at which no
-    loop rests exactly. Slew limits have their slope at rest, 1. A switching term
-    (``BangBang``) has no slope and is left out.
+    Limits (Saturation) are removed from the actuator and the sensor, because margins
+    hold for small motions, and so are converters (Quantiser), on whose steps no loop
+    rests exactly. A slew limit has its slope at rest, 1. A switching term
+    (``BangBang``) has slope 0 and does not count.
     """
     point = OperatingPoint.at(at)
     return cut(loop, point.signal, point.side, point.state)

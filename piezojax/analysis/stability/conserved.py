@@ -9,7 +9,7 @@ import numpy as np
 from scipy import linalg
 
 FEW = 50
-"""Lines below which a transfer function is solved one line at a time."""
+"""Number of lines below which a transfer function is solved one line at a time."""
 
 TOLERANCE = 1e-9
 """Largest singular value of a conserved direction, with rows of [A - I, B] scaled to

@@ -119,7 +119,7 @@ def sensitivity(
     One axis gives matrices of 1 x 1, at lines 1/(``PADDING`` T) apart; with several
     axes they are 1/T apart. T is ``duration`` (s), by default ``DURATION`` or
     ``LEAST`` samples, whichever is longer. L, ``at`` and the errors raised are those of
-    ``broken_loop``. Usable inside ``jax.jit`` and differentiable. The impulse response
+    ``open_loop``. Usable inside ``jax.jit`` and differentiable. The impulse response
     of an unstable loop grows, and S is large: it serves as a barrier with a slope and
     has no meaning as a figure.
     """
@@ -158,7 +158,7 @@ def references_followed(
 
     def one(side: ScalarLike) -> Float[Array, " samples"]:
         broken = cut(loop, point.signal, side, point.state)
-        # r(0) is known one sample before.
+        # The impulse enters as r(k+1) one sample before it enters as r(k).
         following = jnp.zeros(samples + 1).at[0].set(1.0)
         now = jnp.zeros(samples + 1).at[1].set(1.0)
         return _run(SmallFollowing(broken), (now, following))[1:]
@@ -249,7 +249,8 @@ def _axes_impulse(
     model = linearise(broken, broken.start.voltage, broken.init(), dt)
     A, B, C = model.A - model.B @ model.C, model.B, model.C
     axes, later = B.shape[1], samples - 1
-    # A^k B for few k and C A^k for all their multiples: few products, little memory.
+    # A^k B for k < size, and C A^k for the multiples of size: few products, little
+    # memory.
     size = 1 << (math.isqrt(later) - 1).bit_length()
     states, outputs = B[None], C[None]
     power = A
@@ -410,7 +411,7 @@ def _delay_margin(sensitivity: Complex[Array, " lines"]) -> Float[Array, ""]:
 def _least_of_axes(
     margin: Callable[[Array], Array], sensitivity: Sensitivity
 ) -> Float[Array, ""]:
-    """Return the least ``margin`` of an axis, 0 for an axis with none left."""
+    """Return the least ``margin`` of the axes; 0 where |S| exceeds ``NO_MARGIN``."""
 
     def left(axis: Complex[Array, " lines"]) -> Float[Array, ""]:
         return jnp.where(jnp.max(jnp.abs(axis)) > NO_MARGIN, 0.0, margin(axis))

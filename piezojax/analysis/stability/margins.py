@@ -42,10 +42,10 @@ class StabilityReport:
     - ``slowest_time_constant_s``: of the pole nearest to the unit circle;
     - ``gain_margin``: smallest factor above 1 on the loop gain that makes the loop
       unstable; ``gain_margin_dB``: the same in dB; ``phase_crossover_Hz``: frequency of
-      the oscillation then; ``gain_reduction_margin``: largest such factor below 1, 0 if
-      there is none;
+      the oscillation at this gain; ``gain_reduction_margin``: largest factor below 1
+      that makes the loop unstable, 0 if there is none;
     - ``phase_margin_deg``: smallest phase, lag or lead, that makes the loop unstable;
-      ``gain_crossover_Hz``: frequency of the oscillation then;
+      ``gain_crossover_Hz``: frequency of the oscillation at this phase;
     - ``delay_margin_s``, ``delay_margin_samples``: smallest delay that makes the loop
       unstable, exact for whole samples: the loop is stable with any whole number of
       samples below it;
@@ -53,8 +53,7 @@ class StabilityReport:
       within ``disk_gain_margin`` (that factor or its inverse) and
       ``disk_phase_margin_deg``. Source: Seiler, Packard and Gahinet, An introduction to
       disk margins, 2020;
-    - ``sensitivity_peak``: Ms = max |S|; ``complementary_peak``: Mt = max |T|.
-
+    - ``sensitivity_peak``: Ms = max |S|; ``complementary_peak``: Mt = max |T|;
     - ``following``: bandwidth and peak of the response to small motions of the
       reference; None if only L is known.
 

@@ -1,4 +1,4 @@
-"""Margins of a loop on the measured points of the frequency response of its plant."""
+"""Margins of a loop from the measured frequency response of its plant."""
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -7,22 +7,22 @@ from pydantic import BaseModel
 from .conserved import LinearLoop
 
 FOLDED = 0.999
-"""Share of half the rate up to which measured lines count."""
+"""Frequency up to which measured lines count, as a share of half the rate."""
 
 Lines = Float[np.ndarray, " lines"]
 Response = Complex[np.ndarray, " lines"]
 
 
 class MeasuredMargins(BaseModel):
-    """Margins of a loop whose plant is known at ``lines`` measured frequencies alone.
+    """Margins of a loop whose plant is known at ``lines`` measured frequencies only.
 
     ``stable`` is True if 1 + L encircles 0 as often as with the model, with which the
     loop is stable. ``sensitivity_peak`` is the largest |S| at a line, at
-    ``sensitivity_peak_Hz``. Crossings are interpolated between two lines;
-    ``gain_margin_dB`` is the smallest gain above 1, ``phase_margin_deg`` the smallest
-    phase, lag or lead, ``delay_margin_samples`` the smallest delay. A margin without a
-    crossing within the lines is None. The lines extend from ``lowest_Hz`` to
-    ``highest_Hz``; nothing is known outside this band.
+    ``sensitivity_peak_Hz``. ``gain_margin_dB`` is the smallest gain above 1 that makes
+    the loop unstable, ``phase_margin_deg`` the smallest such phase, lag or lead, and
+    ``delay_margin_samples`` the smallest such delay. Crossings are interpolated between
+    two lines; a margin without such a crossing is None. The lines extend from
+    ``lowest_Hz`` to ``highest_Hz``; nothing is known outside this band.
     """
 
     lines: int

@@ -44,10 +44,11 @@ def worst_delay_margin(
     """Return the smallest delay (samples) at which the loop can be unstable, by line.
 
     ``bound`` is the relative error of the plant, ``angle`` the frequency in rad/sample.
-    A delay of tau samples makes ``1 + L (1 + D) exp(-j w tau) = 0`` for an error ``|D|
-    <= l`` if ``rho exp(j (phi + w tau))`` lies within l of 1, where ``rho exp(j phi) =
-    -1/L``: if ``cos(phi + w tau) >= (rho^2 + 1 - l^2) / (2 rho)``. The value is 0 where
-    no delay is needed, and ``UNLIMITED_DELAY`` where none suffices. Differentiable.
+    Let ``rho exp(j phi) = -1/L``. A delay of tau samples makes ``1 + L (1 + D) exp(-j w
+    tau) = 0`` for an error ``|D| <= l`` if ``rho exp(j (phi + w tau))`` lies within l
+    of 1, which means ``cos(phi + w tau) >= (rho^2 + 1 - l^2) / (2 rho)``. The value is
+    0 where the loop can be unstable without delay, and ``UNLIMITED_DELAY`` where no
+    delay suffices. Differentiable.
     """
     complementary = 1.0 - sensitivity
     known = (jnp.abs(sensitivity) > _SMALLEST) & (jnp.abs(complementary) > _SMALLEST)
