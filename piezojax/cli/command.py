@@ -26,14 +26,15 @@ RESULTS = Path("results")
 
 
 def common(function: Callable) -> Callable:
-    """Add the options that every command takes."""
+    """Add the options ``--out``, ``--seed`` and ``--quiet``."""
     for option in (
-        click.option("--quiet", is_flag=True, help="Print nothing but errors."),
+        click.option("--quiet", is_flag=True, help="Print only alarms and errors."),
         click.option(
             "--seed",
             type=click.IntRange(min=0),
             default=None,
-            help="Seed of all noise and sampling (default: the study's).",
+            help="Seed of random numbers, where the command uses it (default: that of "
+            "the study, or 0).",
         ),
         click.option(
             "--out",
@@ -63,10 +64,10 @@ def results_folder(
 ) -> Iterator[Path]:
     """Yield an empty folder for results: ``out``, or a numbered one named ``name``.
 
-    A folder ``out`` that holds the file ``going_on`` is taken as it is. No other
-    command takes the folder while this one runs. The folder is removed if the work
-    fails while it is empty. Raises ValueError if ``out`` is in use or cannot be
-    written.
+    A folder ``out`` that holds the file ``going_on`` is yielded with its content, to be
+    continued. No other command takes the folder while this one runs. The folder is
+    removed if the work fails while it is empty. Raises ValueError if ``out`` holds
+    other results, is in use or cannot be written.
     """
     with ExitStack() as stack:
         if out is not None and going_on and (out / going_on).is_file():
@@ -106,7 +107,7 @@ def run(quiet: bool, body: Callable[[Console], Any]) -> None:
 
 
 def print_loading(console: Console) -> None:
-    """Print the first sign of life, because importing JAX takes seconds."""
+    """Print that the command has started, because importing JAX takes seconds."""
     console.print("loading", style="dim")
 
 
@@ -125,7 +126,7 @@ def print_page(page: "Page", console: Console) -> None:
 
 
 def print_results(page: "Page", folder: Path, console: Console) -> None:
-    """Print ``page``, and where it and its results lie: in ``folder``."""
+    """Print ``page``, and its path and that of the results in ``folder``."""
     from ..report.page import PAGE
 
     print_page(page, console)

@@ -12,7 +12,7 @@ from .command import Command, run
 @click.option(
     "--plant",
     type=click.Path(path_type=Path),
-    help="Saved model that takes the place of the plant of the study.",
+    help="Saved model to emulate instead of the plant of the study.",
 )
 @click.option(
     "--gain", type=float, default=1.0, help="Factor on the displacement (default: 1)."
@@ -21,7 +21,7 @@ from .command import Command, run
     "--delay",
     type=click.FloatRange(0.0, 5.0),
     default=0.0,
-    help="Further delay of the stage, samples (default: 0).",
+    help="Additional delay of the stage, samples (default: 0).",
 )
 @click.option(
     "--slew",
@@ -44,19 +44,20 @@ from .command import Command, run
     "--speed",
     type=click.FloatRange(min=0.0),
     default=1.0,
-    help="Duration of a run relative to real time; 0: as fast as possible (default: "
-    "1).",
+    help="Duration of a run relative to real time: 2 takes twice as long, 0 runs as "
+    "fast as possible (default: 1).",
 )
 @click.option(
     "--seed", type=click.IntRange(min=0), default=0, help="Seed of noise and drift."
 )
 @click.option("--quiet", is_flag=True, help="Print only the address.")
 def main(study, plant, gain, delay, slew, largest_error, port, speed, seed, quiet):
-    """Emulate the stage of a STUDY in this process, for a trial without hardware.
+    """Emulate the stage of a STUDY, to try gains without hardware.
 
-    The stage has the plant, the controller, the limits and the noise of the STUDY; with
-    --plant, --gain and --delay it is not what the model says. It answers at the printed
-    address until Ctrl-C, and becomes safe if a connection breaks.
+    The stage has the plant, the controller, the limits and the noise of the STUDY;
+    --plant, --gain and --delay make it differ from the model. It answers other commands
+    at the printed address until Ctrl-C. If a connection breaks, it sets its safe gains
+    and moves to its safe voltage.
     """
 
     def body(console):

@@ -5,7 +5,7 @@ import click
 from .command import Command, common, print_results, results_folder, run
 
 RECORD = "record.csv"
-"""Name of the file of a whole record."""
+"""File name of the voltages of all parts, one after another."""
 
 
 @click.command(cls=Command)
@@ -21,7 +21,9 @@ RECORD = "record.csv"
     help="Frequency of the cycles over the whole range, Hz.",
 )
 @click.option(
-    "--highest", type=float, help="Highest frequency, Hz (default: 0.4 of the rate)."
+    "--highest",
+    type=float,
+    help="Highest frequency of the multisine, Hz (default: 0.4 of the rate).",
 )
 @click.option(
     "--hold",
@@ -38,12 +40,13 @@ RECORD = "record.csv"
 )
 @common
 def main(points, out, seed, quiet, **limits):
-    """Write voltages to record for a model of hysteresis, creep and dynamics.
+    """Write voltages that excite the hysteresis, creep and dynamics of a stage.
 
-    The record begins with a rest and contains all parts twice: identify fits the first
-    half and validates on the second. --points writes each part to its own file, at a
-    lower rate if the part is too long; an NV200 has 1024 points at a --rate of 20000.
-    Record each part, and give all records to identify together.
+    Apply them to the stage, and record voltage and displacement. The file record.csv
+    begins with a rest and contains all parts twice: identify fits the first half of the
+    record and validates on the second. --points writes each part once, to its own file,
+    at a lower rate or with a shorter multisine if needed; an NV200 has 1024 points at a
+    --rate of 20000. Record each part, and give all records to identify together.
     """
 
     def body(console):

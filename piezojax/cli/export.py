@@ -117,8 +117,9 @@ def export_file(
 ) -> None:
     """Export the System in the file or folder ``source`` and print the result.
 
-    ``runs`` are those of the study in which a controller in C is judged, by default
-    read from its file. The other arguments are the options of the command.
+    ``runs`` are the runs of the study, which judge a controller in C; by default they
+    are computed from the file of the study. The other arguments are the options of the
+    command.
     """
     from ..core.files import read_model
     from ..core.serial import load, read_about
@@ -137,7 +138,7 @@ def export_file(
     system = load(path, accept_unsafe=True)
     folder = out or numbered_folder(RESULTS / f"{path.stem}_{to}")
     if to != "c":
-        runs = None  # only C code is run in them
+        runs = None  # they judge only C code
     elif about.study is not None and runs is None:
         try:
             runs = _runs(study, path, about, system)
@@ -186,7 +187,7 @@ def _runs(
 
     ``named`` defaults to the study.toml beside the ``file`` of the controller. Raises
     ValueError if study and controller have different sampling rates, and for a
-    study.toml that is not that of the controller.
+    study.toml with another SHA-256 than the study of the controller.
     """
     from .. import study as studies
     from ..tuning.exported_runs import holdout_of, make_runs

@@ -57,7 +57,8 @@ class _Gain(click.ParamType):
     "--response",
     is_flag=True,
     help="Fit modes, lag and delay to the frequency response in RECORD, for a "
-    "controller of --rate; with --method, to that of a record over time.",
+    "controller at --rate. With --method, RECORD is a record over time, from which the "
+    "response is measured first.",
 )
 @click.option(
     "--held/--not-held",
@@ -65,7 +66,7 @@ class _Gain(click.ParamType):
     help="With --response: converters held the input between samples, at the rate of "
     "the record or --rate (default: held in a record over time).",
 )
-@click.option("--unit", help="With --response: unit of a file of a response  [um/V]")
+@click.option("--unit", help="With --response: unit of the response in a file  [um/V]")
 @click.option(
     "--amplitude",
     "amplitudes",
@@ -77,22 +78,24 @@ class _Gain(click.ParamType):
     "--realisations",
     type=click.IntRange(min=1),
     default=1,
-    help="With --response: realisations of a multisine, one after another in a RECORD.",
+    help="With --response: number of realisations of the multisine, one after another "
+    "in a RECORD.",
 )
 @click.option(
     "--skip",
     type=click.IntRange(min=0),
-    help="With --response: periods at the start that the method robust discards  [1]",
+    help="With --response: number of periods that the method robust discards at the "
+    "start  [1]",
 )
 @click.option(
     "--segment",
     type=click.IntRange(min=1),
-    help="With --response: samples in a segment of the method welch.",
+    help="With --response: number of samples in a segment of the method welch.",
 )
 @click.option(
     "--dynamics",
     type=click.Path(path_type=Path),
-    help="Hold the linear dynamics of this saved model; fit hysteresis and creep.",
+    help="Keep the linear dynamics of this saved model; fit only hysteresis and creep.",
 )
 @click.option(
     "--closed-loop",
@@ -103,18 +106,19 @@ class _Gain(click.ParamType):
 @click.option(
     "--loop-controller",
     metavar="FILE|NAME",
-    help="With --closed-loop indirect: gains.toml or the catalogued controller that "
-    "closed the loop.",
+    help="With --closed-loop indirect: controller that closed the loop, as the path of "
+    "a gains.toml or its name in the catalogue.",
 )
 @click.option(
     "--among",
-    help="With 'all': compare only these hysteresis models (A,B) and linear models.",
+    help="With --model all: compare only these hysteresis models, separated by commas, "
+    "and the linear models.",
 )
 @record_columns
 @click.option(
     "--method",
-    help="Method of the fit (default: the first that can fit the model), or, with "
-    "--response, of measuring: welch, local_polynomial or robust.",
+    help="Method of the fit (default: the first that can fit the model). With "
+    "--response: method that measures the response: welch, local_polynomial or robust.",
 )
 @click.option(
     "--order",
@@ -128,14 +132,14 @@ class _Gain(click.ParamType):
     type=click.IntRange(min=1),
     default=20,
     show_default=True,
-    help="p of the Hankel-Toeplitz regression, samples.",
+    help="Number p of past and future samples in the Hankel-Toeplitz regression.",
 )
 @click.option(
     "--oversample",
     type=click.IntRange(min=1),
     default=8,
     show_default=True,
-    help="Steps of bouc_wen per sample.",
+    help="Simulated steps of bouc_wen per sample.",
 )
 @click.option(
     "--steps",
@@ -151,7 +155,9 @@ class _Gain(click.ParamType):
     "--validate", type=SampleRange(), help="Samples to validate on (default: rest)."
 )
 @click.option(
-    "--test", type=SampleRange(), help="With 'all': samples for a hold-out error."
+    "--test",
+    type=SampleRange(),
+    help="With --model all: samples for a hold-out error.",
 )
 @common
 def main(
@@ -185,11 +191,11 @@ def main(
 ):
     """Fit a plant model to measured RECORDs of one stage.
 
-    With --controller, measure how a device scales its gains: the input is its error,
-    the output its voltage. With --response, fit a frequency response.
+    With --controller, measure how a device scales its gains: the input column is its
+    error, the output column its voltage. With --response, fit a frequency response.
 
-    Text (.csv, .txt, .dat), .npz, .mat and .h5 files; .tdms, .lvm and .xlsx with
-    piezojax[lab].
+    A RECORD is a text file (.csv, .txt, .dat) or a .npz, .mat or .h5 file; with
+    piezojax[lab] also a .tdms, .lvm or .xlsx file.
     """
     del seed  # the random starts of a fit have fixed seeds
 

@@ -50,7 +50,7 @@ class ResponseOptions(NamedTuple):
     segment: int | None
 
     def given(self) -> list[str]:
-        """Return the options that only ``--response`` takes, as they were typed."""
+        """Return the names of the given options that only ``--response`` takes."""
         named = {
             "--held": self.held is not None,
             "--unit": self.unit is not None,

@@ -12,7 +12,9 @@ from .terminal import Bar
 @click.command(cls=Command)
 @click.argument("results", type=click.Path(path_type=Path))
 @stage_option
-@click.option("--reference", help="Reference to learn; the first of the study if none.")
+@click.option(
+    "--reference", help="Reference of the study to repeat (default: the first)."
+)
 @click.option(
     "--runs",
     type=click.IntRange(min=2),
@@ -23,23 +25,24 @@ from .terminal import Bar
 @click.option(
     "--points",
     type=click.IntRange(min=2),
-    help="Write the result also as a table of at most so many points, for a waveform "
-    "generator that holds each.",
+    help="Also write the learned reference as a table of at most this many points, for "
+    "a waveform generator that holds each point.",
 )
 @click.option(
     "--study",
     "named",
     type=click.Path(path_type=Path),
-    help="Study of RESULTS, if it names files that lie beside it.",
+    help="File of the tuned study, if the files that it names have moved (default: the "
+    "study.toml in RESULTS).",
 )
 @common
 def main(results, name, reference, runs, points, named, out, seed, quiet):
-    """Learn the reference that leads a stage along a repeated motion.
+    """Learn the reference with which a stage follows a repeated motion.
 
     The stage repeats a reference of the study with the gains in the folder RESULTS of
     tune; after each run the reference is corrected by the inverse of the closed loop,
-    as far as its plant is known. The stage then has the gains from before; after a
-    fault, Ctrl-C or a lost connection the safe ones.
+    as far as its plant is known. At the end the gains from before are set again; after
+    a fault, Ctrl-C or a lost connection the stage has its safe gains.
     """
     del seed  # nothing is random
 

@@ -17,7 +17,7 @@ stage_option: Callable = click.option(
     "name",
     required=True,
     metavar="NAME",
-    help="Stage: host:port, as printed by python -m piezojax.emulate, nv200:host, or "
+    help="Stage: host:port (as printed by python -m piezojax.emulate), nv200:host, or "
     "module:function of your own stage.",
 )
 
@@ -27,8 +27,8 @@ def tuned_gains(
 ) -> "tuple[Result, dict[str, float], Sequence[Motion]]":
     """Return result, gains and motions of a folder of ``tune``.
 
-    The paths of the gains begin in the controller. Raises ValueError for gains with an
-    alarm, and for a folder without them.
+    The paths of the gains are relative to the controller. Raises ValueError for gains
+    with an alarm, and for a folder without gains.
     """
     from ..core.serial import load
     from ..stages.of_study import motions_of
@@ -72,8 +72,9 @@ def learning_law(results: Path, named: Path | None) -> "LearningFilter":
 
 @contextmanager
 def connected(name: str) -> "Iterator[Stage]":
-    """Yield the stage ``name``; say goodbye to it if nothing fails.
+    """Yield the stage ``name``; close its connection at the end.
 
+    After an error, the connection is abandoned instead, which makes the stage safe.
     Raises ValueError, one line, for a StageError.
     """
     from ..stages import ConnectedStage, StageError, stage_of

@@ -33,8 +33,8 @@ NAMES = (
 @click.option(
     "--calibrate",
     is_flag=True,
-    help="Fit the stage to half of the cells and predict the others, then swap "
-    "(half an hour or more).",
+    help="Fit the stage to half of the table cells and predict the other half, then "
+    "swap the halves (half an hour or more).",
 )
 @common
 def main(tables, calibrate, out, seed, quiet):

@@ -35,9 +35,9 @@ def main(study, name, runs, out, seed, quiet):
 
     The plant of STUDY is fitted to the runs again and again, and the gains are tuned on
     it, near the best ones so far. A small motion comes before the references. Gains
-    with an alarm are not tried; those that are not better are taken back. After a
-    fault, Ctrl-C or a lost connection the stage has its safe gains. To go on after an
-    interruption, give the same folder as --out.
+    with an alarm are not tried. After gains that are not better, the best ones are set
+    again. After a fault, Ctrl-C or a lost connection the stage has its safe gains. To
+    go on after an interruption, give the same folder as --out.
     """
 
     def body(console):

@@ -43,14 +43,18 @@ QUESTIONS = {
     "noise": Question("rms noise of the sensor [um]"),
     "frequency": Question("frequency of the slowest reference [Hz]"),
     "track": Question(
-        "references to track, with their frequencies in Hz", str, ", as SIN10,PWSW40"
+        "references to track, with their frequencies in Hz",
+        str,
+        ", such as SIN10,PWSW40",
     ),
     "amplitude": Question("amplitude of the references, half of their range [um]"),
     "offset": Question("lowest value of the references [um]"),
     "slew": Question(
         "fastest slew that the controller follows; jumps become ramps [um/s]"
     ),
-    "controller": Question("controller to tune", str, ", as inversion_pid or nv200"),
+    "controller": Question(
+        "controller to tune", str, ", such as inversion_pid or nv200"
+    ),
     "scale": Question("scale of the gains of the device, 0 if unknown [V/um]"),
     "lowest": Question("lowest position of the device's range [um]"),
     "highest": Question("highest position of the device's range [um]"),
@@ -58,7 +62,7 @@ QUESTIONS = {
 """The questions by the name of their option; ``planned`` gives the defaults."""
 
 OF_DEVICES = ("scale", "lowest", "highest")
-"""Questions that only the design of a device needs."""
+"""Questions that only a controller of a vendor needs."""
 
 
 def questions(function: Callable) -> Callable:
@@ -88,9 +92,9 @@ def main(record, model, check, yes, sliders, out, seed, quiet, **given):
     """Tune a controller from a RECORD of your stage, and export its gains.
 
     The command asks for limits, sensor noise and references; the defaults come from
-    the record, and each answer is also an option. It writes a study to the new folder,
-    which piezojax.tune can tune again. It does not export gains with an alarm. To go on
-    after an interruption, give the same folder as --out.
+    the record, and each answer is also an option. It writes a study, which
+    piezojax.tune can tune again, into the new folder. It does not export gains with an
+    alarm. To go on after an interruption, give the same folder as --out.
 
     Exit status 3 means that the gains have an alarm, as for piezojax.tune.
     """
@@ -147,7 +151,7 @@ def _write_study(
     seed: int | None,
     console: Console,
 ) -> None:
-    """Ask the ``QUESTIONS`` and write the first ``study`` of the ``record``."""
+    """Write the first ``study`` of ``record``; ask the ``QUESTIONS`` unless ``yes``."""
     from ..core.files import fresh_folder
     from ..identification import DEFAULT
     from ..identification.records.recognise import recognised
@@ -216,7 +220,10 @@ def _concerns(name: str, plan: "Plan") -> bool:
 
 
 def _check_same(study: Path, record: Path, given: dict[str, Any]) -> None:
-    """Raise ValueError if ``study`` has another record, or ``given`` has an option."""
+    """Raise ValueError if ``study`` has another record, or an option is ``given``.
+
+    A study that exists is tuned as it is and follows no options.
+    """
     from ..core.files import seen_from
     from ..study import load
 
@@ -260,7 +267,7 @@ def _export(
 ) -> None:
     """Export the gains in ``tuned``, unless they are exported already.
 
-    Those of a device become its own file, all others C code.
+    Gains of a device are written in its file format, all others as C code.
     """
     from ..study import load
     from ..study.first_study import DEVICES

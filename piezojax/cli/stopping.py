@@ -55,7 +55,8 @@ def remember(number: int) -> None:
     """Remember ``number``, the signal that interrupts the command."""
     _first.append(number)
     if number == signal.SIGTERM:
-        # A Python handler waits for XLA's compiler to return; the default does not.
+        # A second SIGTERM ends the process at once, even inside XLA's compiler: a
+        # Python handler would wait for it to return, the default one does not.
         signal.signal(number, signal.SIG_DFL)
 
 

@@ -40,13 +40,15 @@ def _shard(context: click.Context, option: click.Parameter, text: str) -> tuple:
     "--samples",
     type=click.IntRange(min=1),
     default=None,
-    help="Number of random points; without [sweep] from the box of [parameters].",
+    help="Number of random points; without a [sweep] they are drawn from the bounds of "
+    "[parameters].",
 )
 @click.option(
     "--dask",
     metavar="WHERE",
     default=None,
-    help="Simulate on Dask workers: address of a scheduler, or number to start here.",
+    help="Simulate on Dask workers: address of a scheduler, or number of workers to "
+    "start on this machine.",
 )
 @common
 def main(
@@ -58,7 +60,7 @@ def main(
     seed: int | None,
     quiet: bool,
 ) -> None:
-    """Simulate every point of the [sweep] of STUDY into one labelled data set.
+    """Simulate every point of the [sweep] of STUDY, and write one labelled data set.
 
     STUDY is a TOML file or the name of a study that comes with piezojax; without it,
     two gains of the P-753's controller are mapped. A sweep that was interrupted

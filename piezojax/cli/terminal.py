@@ -19,7 +19,7 @@ from rich.progress import (
 from .stopping import SIGNALS, handled, remember
 
 NOTE_EVERY = 30.0
-"""Least time between two notes without a terminal, s."""
+"""Shortest time between two printed notes without a terminal, s."""
 
 _STOPPING = "stopping; Ctrl-C again stops at once"
 
@@ -31,8 +31,9 @@ class Bar:
     """Progress bar on a terminal; plain lines without one.
 
     While it runs, the first Ctrl-C or SIGTERM waits for the next report of progress,
-    because an exception inside JAX's compiler can be lost or crash it; the second acts
-    at once. With ``at_once`` the first does too: a stage that moves must not wait.
+    because an exception inside JAX's compiler can be lost or can crash the compiler.
+    The second acts at once. With ``at_once`` the first also acts at once: a stage that
+    moves must not wait.
     """
 
     def __init__(self, console: Console, at_once: bool = False):
@@ -76,9 +77,9 @@ class Bar:
             self._progress.update(self._task, note=_STOPPING)
 
     def finish(self) -> None:
-        """Ignore the first Ctrl-C or SIGTERM from here on, while results are written.
+        """Ignore the first Ctrl-C or SIGTERM, even a pending one, from here on.
 
-        A pending one is ignored too, because the work is complete.
+        The work is complete, and its results are written next.
         """
         self._finishing = True
 

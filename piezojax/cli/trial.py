@@ -16,10 +16,10 @@ from .terminal import Bar
 def main(results, name, out, seed, quiet):
     """Try the gains in the folder RESULTS of tune on a stage.
 
-    A small motion comes first, then every reference of the study. The gains are kept if
-    each error is at most twice the promised one; otherwise those that the stage had
-    before are set again. After a fault, Ctrl-C or a lost connection the stage has its
-    safe gains.
+    The stage follows 10 % and 30 % of the first reference of the study, then every
+    reference. The gains are kept if each error is at most twice the promised one;
+    otherwise the gains from before are set again. After a fault, Ctrl-C or a lost
+    connection the stage has its safe gains.
     """
     del seed  # nothing is random
 

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 sliders_option = click.option(
     "--sliders/--no-sliders",
     default=True,
-    help="Let the page show what gains near the tuned ones would give (seconds).",
+    help="Add sliders to the page that show the results of gains near the tuned ones "
+    "(takes seconds).",
 )
 
 
@@ -44,7 +45,8 @@ sliders_option = click.option(
 @click.option(
     "--baselines",
     is_flag=True,
-    help="Also tune by Ziegler-Nichols, a relay, CMA-ES and Nelder-Mead (minutes).",
+    help="Also tune by Ziegler-Nichols, a relay, CMA-ES and Nelder-Mead (takes "
+    "minutes).",
 )
 @sliders_option
 @click.option(
@@ -66,8 +68,8 @@ def main(
 
     STUDY is a TOML file or the name of a study that comes with piezojax; without it, a
     PI with a learned inverse is tuned on the P-753 stage. Several studies, or a
-    comparison (controllers and rates in one file, as comparison/p753), are tuned one
-    after another, each into its own folder. One table and one picture compare them.
+    comparison (controllers and rates in one file, such as comparison/p753), are tuned
+    one after another, each into its own folder. One table and one picture compare them.
 
     Exit status 3 means that the run finished with an alarm: the loop violates a limit,
     diverges or stays at a voltage limit, or the model is not validated. The alarms are
@@ -97,7 +99,7 @@ def main(
 
 
 def finish(result: "Result") -> None:
-    """End the command if the search of ``result`` was interrupted or has alarms."""
+    """End the command if ``result`` was interrupted or has alarms."""
     if result.status == "interrupted":
         exit_interrupted()
     exit_unsafe(result.alarms)
@@ -128,14 +130,14 @@ def tune_study(
     from ..tuning.gain_surrogate import gain_surrogate
     from ..tuning.tuner import tune
 
-    # Gains near the tuned ones are simulated beside drawing.
+    # Gains near the tuned ones are simulated in a thread while the pictures are drawn.
     with Bar(console) as bar, ThreadPoolExecutor(1) as pool:
         bar.stage(f"reading {path.name}")
         description = studies.load(path)
         with results_folder(out, path.stem) as folder:
             case = studies.build(description, path, seed=seed, progress=bar)
             if case.fit is not None:
-                # At once: the search of gains that will have them takes minutes.
+                # Printed before the search, which takes minutes.
                 print_alarms(console, case.fit.report.alarms)
             outcome = tune(case, baselines=baselines, progress=bar)
             bar.finish()
@@ -162,7 +164,7 @@ def tune_study(
 def _surrogate(
     found: "Future[GainSurrogate | str]", progress: "Progress"
 ) -> "GainSurrogate | str":
-    """Wait for the surrogate; ``Ctrl-C`` ends the wait."""
+    """Return the surrogate when it is ready, or why there is none."""
     progress.stage("simulating gains near the tuned ones")
     try:
         return found.result()

@@ -39,8 +39,8 @@ def main(results, name, baseline, runs, false_alarms, reference, out, seed, quie
     """Watch whether a stage still moves as it did, with the gains in RESULTS of tune.
 
     The first time, several runs of a reference become the baseline. Later, --baseline
-    compares new runs with it: a change of gain, lag, error or noise beyond that of the
-    baseline is an alarm.
+    compares new runs with it: a change of gain, lag, error or noise beyond the scatter
+    of the baseline is an alarm.
     """
     del seed  # nothing is random
 

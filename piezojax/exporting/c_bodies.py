@@ -67,7 +67,7 @@ def init_body(
         graph, outputs = trace(init, dynamic, interface.start)
         names = [*expressions(fields.parameters, "parameters->"), *names]
     except NotScalarError:
-        # Equations are solved here, once, for the exported parameters.
+        # ``init`` solves equations: they are solved here for the exported parameters.
         graph, outputs = trace(system.init, interface.start)
     for slot in rounding:
         outputs.append(np.full(slot.size, graph.constant(0.0, "real")))
@@ -190,7 +190,7 @@ def _prepared(
 def _copied(
     graph: Graph, outputs: Sequence[Any], fields: Fields, names: Sequence[str]
 ) -> list[Any]:
-    """Return the outputs; a long array that changes its field is copied by element."""
+    """Return the outputs; a long array from another field is copied by element."""
     own = [f"state->{slot.name}[0]" for slot in fields.states]
     own += [""] * len(fields.outputs)
     return [

@@ -59,10 +59,10 @@ def write_c(
 
 
 def rounding_error(code: CProject, inputs: Any, outputs: Any) -> float:
-    """Return the relative change of ``outputs`` if each parameter changes by one bit.
+    """Return the change of ``outputs`` if the last bit of each parameter changes.
 
-    The bit is the last one, up or down at random. The change is a share of the largest
-    value of its output. It shows how far two correct programs may differ.
+    Each parameter goes up or down at random. The result is the largest change, as a
+    share of the largest value of its output: two correct programs may differ by it.
     """
     draw = np.random.default_rng(0)
 
@@ -85,7 +85,7 @@ def rounding_error(code: CProject, inputs: Any, outputs: Any) -> float:
 def vectors(code: CProject, inputs: Any, outputs: Any) -> str:
     """Return a simulation as CSV: start, column names, and a row for each sample.
 
-    The origin stands before them in lines that begin with ``#``.
+    The lines before them begin with ``#`` and state the origin.
     """
     columns = [
         np.asarray(leaf).reshape(len(leaf))

@@ -24,9 +24,9 @@ TURNS = 5
 
 
 class RunTrace(NamedTuple):
-    """Tracking error of ``axis`` under the reference ``name``, in the slice ``runs``.
+    """Runs and axis that show the tracking error under the reference ``name``.
 
-    ``unit`` is the unit of the axis, um or urad.
+    ``runs`` is a slice of the runs, and ``unit`` the unit of the axis, um or urad.
     """
 
     name: str

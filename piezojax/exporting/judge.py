@@ -30,9 +30,9 @@ class ReferenceCost(BaseModel):
     """Tracking errors under a reference by precision, in ``unit`` (nm or nrad).
 
     ``rms`` is the RMS error of the worst run. ``cost`` is its increase over that in
-    double, and ``percent`` that increase in percent of it. ``difference`` is the RMS
-    difference from the displacements in double; in an unstable loop it is large in any
-    precision.
+    double, and ``percent`` this increase in percent of the error in double.
+    ``difference`` is the RMS difference from the displacements in double, in the worst
+    run; in an unstable loop it is large in any precision.
     """
 
     unit: str
@@ -134,6 +134,6 @@ def _counted(signals: np.ndarray, runs: Runs, trace: RunTrace) -> np.ndarray:
 def _rms(errors: Any) -> float:
     """Return the RMS of ``errors`` [runs, samples] (um or urad) in nm or nrad.
 
-    As in the result of tuning it is that of the worst run.
+    It is that of the worst run, as in the result of tuning.
     """
     return 1e3 * float(np.sqrt(np.mean(np.square(errors), axis=1).max()))

@@ -1,4 +1,4 @@
-"""Stages that can be asked to run: an emulated one, and others over a socket."""
+"""Stages with a controller: emulated, remote, or an NV200; trial and watch of gains."""
 
 from .changes import Baseline as Baseline
 from .changes import Judgement as Judgement

@@ -1,4 +1,4 @@
-"""Watch: whether a stage still moves as it did when its gains were set."""
+"""Detection of a change of a stage by comparing its runs with earlier ones."""
 
 import contextlib
 import math
@@ -28,12 +28,13 @@ Samples = Float[np.ndarray, "runs samples"]
 
 
 class RunFeatures(BaseModel):
-    """Features of a run, relative to the means of the baseline.
+    """Features of a run that are compared with those of the baseline.
 
-    ``gain_percent`` and ``lag_us`` are the changes of the gain and of the lag of the
-    stage (us): those of its reading less those of its voltage. ``log_error`` and
-    ``log_rest`` are the decimal logarithms of the rms tracking error (um) and of the
-    rms voltage (V) that a change of scale, lag and zero and a drift do not explain.
+    ``gain_percent`` and ``lag_us`` (us) are the changes of the gain and of the lag of
+    the stage, from voltage to reading, relative to the means of the baseline.
+    ``log_error`` is the decimal logarithm of the rms tracking error (um). ``log_rest``
+    is that of the rms residual of the voltage (V): the part that a change of scale, lag
+    and offset and a linear drift do not explain.
     """
 
     gain_percent: float
@@ -47,7 +48,7 @@ class Judgement(BaseModel):
 
     ``distance`` is Hotelling's T^2 of the features. It exceeds ``threshold`` in the
     stated share of the runs of an unchanged stage. ``stopped`` is the reason why the
-    guard stopped the run, which has no features then.
+    guard stopped the run; such a run has no features.
     """
 
     file: str = ""
@@ -58,7 +59,7 @@ class Judgement(BaseModel):
 
     @property
     def moved(self) -> bool:
-        """Whether the stage has changed."""
+        """Whether the stage has changed; a run that was stopped counts as a change."""
         if self.distance is None or self.threshold is None:
             return True
         return self.distance > self.threshold
@@ -108,10 +109,11 @@ class Baseline:
         """Compare ``record`` with the baseline.
 
         The likelihood ratio test of the mean of normal features with unknown covariance
-        is Hotelling's: for n runs and p features, T^2 n / (n + 1) follows
-        p (n - 1) / (n - p) F(p, n - p) (Anderson, An Introduction to Multivariate
-        Statistical Analysis, 3rd ed., 5.3). Raises ValueError for a record of another
-        reference.
+        is Hotelling's. For n runs with p features, their sample covariance S, and the
+        difference d of a further run from their mean, T^2 = n / (n + 1) d' S^-1 d
+        follows p (n - 1) / (n - p) F(p, n - p) (Anderson, An Introduction to
+        Multivariate Statistical Analysis, 3rd ed., 5.3). Raises ValueError for a record
+        of another reference.
         """
         from scipy import stats  # slow to import
 
@@ -136,10 +138,11 @@ class Baseline:
             raise ValueError("a run can only be compared with runs of its reference")
 
     def _features(self, record: Record, others: Samples) -> RunFeatures:
-        """Return the features of ``record``; its rest is relative to ``others``.
+        """Return the features of ``record``.
 
-        The rest of a run of the baseline is relative to the mean of the other runs,
-        because that of a later run contains the noise of the mean too.
+        The residual of its voltage is relative to the mean of the voltages ``others``.
+        For a run of the baseline, these are the other runs, so that its residual
+        contains the noise of their mean, as that of a later run does.
         """
         voltage, reading = record.input[self._start :], record.output[self._start :]
         assert record.reference is not None
@@ -164,7 +167,7 @@ def _explained(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the changes of scale and advance (s) of ``signal`` from ``mean``.
 
-    The second result is the rest, without zero and constant drift.
+    The second result is the residual after these, an offset and a linear drift.
     """
     columns = [
         mean - mean.mean(),
@@ -179,7 +182,7 @@ def _explained(
 
 
 def read_runs(folder: Path, dt: float) -> list[Record]:
-    """Return the runs that ``watch`` left in ``folder``; ``dt`` in s.
+    """Return the runs that ``watch`` wrote into ``folder``; ``dt`` in s.
 
     Raises ValueError if there are none.
     """
@@ -208,11 +211,11 @@ def watch(
 ) -> WatchReport:
     """Run ``motion`` on ``stage`` and judge whether the stage has changed.
 
-    The runs are compared with those in the folder ``baseline``; without one, ``runs``
-    of them are recorded into ``folder``, after one that does not count. ``folder``
-    receives the samples of every run and the report. The stage keeps ``gains``; it is
-    made safe after a fault. Raises ValueError for a ``baseline`` of another reference
-    or with too few runs.
+    ``runs`` runs are compared with those in the folder ``baseline``. Without one, they
+    become a baseline themselves, after a run that does not count. ``folder`` receives
+    the samples of every run that counts, and the report. The stage keeps ``gains``; it
+    is made safe after a failure. Raises ValueError for a ``baseline`` of another
+    reference or with too few runs.
     """
     known = None
     if baseline is not None:
@@ -255,7 +258,7 @@ def _runs(
     false_alarms: float,
     progress: Progress | None,
 ) -> tuple[list[Record], list[Judgement]]:
-    """Run ``motion``, and judge each run by ``known``; end at a run that is stopped."""
+    """Run ``motion`` and compare each run with ``known``; end at a stopped run."""
     progress = progress or Silent()
     progress.stage("running the reference on the stage", runs)
     records, judged = [], []
@@ -279,7 +282,7 @@ def _runs(
 
 
 def _alarm(judged: Judgement) -> str:
-    """Return the sentence on a run of a stage that has changed, or ""."""
+    """Return the alarm about a run, "" if the stage has not changed."""
     if judged.stopped:
         return f"{judged.file}: the run was stopped: {judged.stopped}"
     if not judged.moved or judged.features is None:

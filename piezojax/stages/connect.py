@@ -7,7 +7,7 @@ from .protocol import Stage
 from .remote import RemoteStage
 
 DEVICES = {"nv200": nv200_stage}
-"""Functions that connect to a device, by the word before its address."""
+"""Functions that connect to a device, by the prefix of its address."""
 
 
 def stage_of(name: str) -> Stage:
@@ -15,7 +15,7 @@ def stage_of(name: str) -> Stage:
 
     It is "host:port", "nv200:host" of a device in ``DEVICES``, or "module:function".
     The function has no argument and returns a Stage. Raises ValueError for another
-    name, a module or function that is missing, or one that does not return a stage.
+    name, a missing module or function, and a function that does not return a stage.
     """
     device, _, address = name.partition(":")
     if device in DEVICES:
@@ -23,8 +23,8 @@ def stage_of(name: str) -> Stage:
     place, _, what = name.rpartition(":")
     if not (place and what):
         raise ValueError(
-            f"--stage is {name!r}; give host:port, as 127.0.0.1:5025, nv200:host, or "
-            "module:function of your own stage"
+            f"--stage is {name!r}; give host:port (such as 127.0.0.1:5025), "
+            "nv200:host, or module:function of your own stage"
         )
     if what.isdigit():
         return RemoteStage(name)

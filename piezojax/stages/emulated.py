@@ -23,25 +23,25 @@ from .faults import FailingSensor, Fault, sensor_faults
 from .protocol import Gains, StoppedError
 
 BLOCK = 200
-"""Samples between two looks at the guard and at requests to stop."""
+"""Number of samples between two checks of the guard and of requests to stop."""
 
 APPROACH = 0.1
-"""Duration of the move to the beginning of a reference, s; it rests as long there."""
+"""Duration of the move to the beginning of a reference, and of the rest there, s."""
 
 LONGEST_HOLD = 0.5
-"""Longest time between two runs that is simulated, s."""
+"""Longest simulated time between two runs, s."""
 
 ASKED = "it was asked to stop"
 
 RETREATING = len(REASONS)
-"""Reason of a guard that retreats without a fault of its own."""
+"""Number of the reason of a guard that retreats without a fault."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits that the guard of a stage holds; the fields are those of a Guard.
+    """Limits of the guard of a stage; the fields are those of a Guard.
 
-    ``retreat`` is the voltage of a stage that was stopped, V.
+    ``retreat`` is the safe voltage, V, to which the stage moves after a stop.
     """
 
     lower: float
@@ -55,13 +55,14 @@ class Limits:
 
 @dataclass
 class EmulatedStage:
-    """Stage in the computer: ``controller``, ``plant``, ``actuator`` and ``sensor``.
+    """Simulated stage of ``controller``, ``plant``, ``actuator`` and ``sensor``.
 
-    The ``plant`` is the truth; it need not be the model that anybody has of the stage.
-    ``safe_gains`` are those after a stop and at the beginning. ``drift`` is the rms
-    value of a random walk of the position after 1 s, um. ``faults`` occur in the next
-    run. Time goes on between runs, at most ``LONGEST_HOLD``, by the ``clock`` (s).
-    ``speed`` is the duration of a run relative to real time, 0 as fast as possible.
+    The ``plant`` may differ from the model on which gains are tuned. ``safe_gains`` are
+    set at the beginning and after a stop. ``drift`` is the rms value of a random walk
+    of the position after 1 s, um. ``faults`` occur in the next run. Between runs, the
+    stage is simulated for the time that passes on the ``clock`` (s), at most
+    ``LONGEST_HOLD``. ``speed`` is the duration of a run relative to real time: 2 takes
+    twice as long, 0 runs as fast as possible.
     """
 
     controller: System
@@ -103,7 +104,7 @@ class EmulatedStage:
             faults, self.faults = tuple(self.faults), ()
             here = float(self._state.controller.measured)
             self._follow(_approach(here, reference[0], self.dt), ())
-            # At sample k the loop is told the reference at k + 1.
+            # At sample k the loop receives the reference of sample k + 1.
             found = self._follow(np.append(reference[1:], reference[-1]), faults)
         return Record(
             found.voltage,
@@ -182,7 +183,7 @@ class EmulatedStage:
     def _follow(
         self, reference: Float[np.ndarray, " samples"], faults: tuple[Fault, ...]
     ) -> LoopSample:
-        """Follow ``reference``; raise StoppedError if the guard gives up."""
+        """Follow ``reference``; raise StoppedError at a fault or a request to stop."""
         samples = len(reference)
         padded = np.concatenate([reference, np.full(-samples % BLOCK, reference[-1])])
         codes, blocks = sensor_faults(faults, len(padded)), []
@@ -231,7 +232,7 @@ class EmulatedStage:
         return _joined(blocks, samples)
 
     def _retreat(self) -> None:
-        """Set the safe gains, and move to the safe voltage behind a stopped guard."""
+        """Set the safe gains; let the guard move the stage to the safe voltage."""
         self._set(replace(self.controller, _arrays(self.safe_gains)))
         reason = jnp.asarray(RETREATING, jnp.int32)
         stopped = self._state.controller._replace(reason=reason)

@@ -10,14 +10,15 @@ from ..core.arrays import Scalar, State, as_array
 from ..core.system import System
 
 SENSOR_FAULTS = ("dropout", "stuck")
-"""Faults of the sensor: no number, or the last reading again."""
+"""Faults of the sensor: a reading that is not a number, or the last reading again."""
 
 
 class Fault(NamedTuple):
-    """Event of a run: it begins at sample ``begin`` and lasts ``samples``.
+    """Fault in a run.
 
-    "dropout" and "stuck" are faults of the sensor. "plant" replaces the plant by
-    ``plant``, which has the same structure, from the next block of samples on.
+    "dropout" and "stuck" are faults of the sensor from sample ``begin`` on, for
+    ``samples``. "plant" replaces the plant for good by ``plant``, which has the same
+    structure, at the start of the block of samples that contains ``begin``.
     """
 
     kind: Literal["dropout", "stuck", "plant"]
@@ -27,11 +28,11 @@ class Fault(NamedTuple):
 
 
 class FailingSensor(System):
-    """A ``sensor`` that fails where its noise says so.
+    """A ``sensor`` with the faults that its input prescribes.
 
-    The input is ``(displacement, (draw, fault))``, where ``fault`` is 0 without a
-    fault, 1 for a reading that is not a number, and 2 for the last reading again. A
-    plain draw has no fault.
+    The input is ``(displacement, (draw, fault))``, with the noise ``draw`` of unit
+    variance. ``fault`` is 0 without a fault, 1 for a reading that is not a number, and
+    2 for the last reading again. The input ``(displacement, draw)`` has no fault.
     """
 
     sensor: System
@@ -56,7 +57,7 @@ def _split(input: Any) -> tuple[Any, tuple[Any, Any]]:
 
 
 def sensor_faults(faults: tuple[Fault, ...], samples: int) -> Float[np.ndarray, " n"]:
-    """Return the fault of the sensor at each of ``samples``, as in FailingSensor."""
+    """Return the number of the fault at each of ``samples``, as in FailingSensor."""
     found = np.zeros(samples)
     for fault in faults:
         if fault.kind in SENSOR_FAULTS:

@@ -1,4 +1,4 @@
-"""Iterative learning on a stage: the reference of a repeated motion is corrected."""
+"""Iterative learning control on a stage: the reference of a motion is corrected."""
 
 import math
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from .try_gains import Motion, TriedRun, safe_after_failure, tried
 LEARN_FILE, LEARNED_FILE, TABLE_FILE = "learn.json", "learned.csv", "table.csv"
 
 ASSUMED = 0.3
-"""Relative error of a plant without a bound from its record."""
+"""Assumed relative error of a plant without an error bound from its record."""
 
 TRUSTED = 0.5
 """Relative error of the closed loop at which half of an error is corrected."""
@@ -38,7 +38,8 @@ REACH = 0.1
 """Largest correction, as a share of the range of the motion."""
 
 ABOVE = 3.0
-"""Power of a line over that of noise alone which noise exceeds in 5 % of the lines."""
+"""Ratio of the power of a line to the mean power of noise, above which the noise alone
+lies in 5 % of the lines."""
 
 RISE = 0.02
 """Share of the motion at the beginning over which a correction rises from 0."""
@@ -51,11 +52,11 @@ GAINED = 0.98
 
 
 class LearnReport(BaseModel):
-    """Report of a learning, the content of ``learn.json``.
+    """Report on the learning of a reference, the content of ``learn.json``.
 
     ``gains`` are those during the runs, ``before`` all gains of the stage before, which
     are set again at the end. Run 1 follows the ``reference`` itself. ``best`` is the
-    place of the run with the smallest error, None if none was completed. ``verdict`` is
+    index of the run with the smallest error, None if none was completed. ``verdict`` is
     "done", "stopped" (a run was stopped, or the user ended it: the safe gains are set)
     or "lost" (no connection); "running" until then.
     """
@@ -81,7 +82,10 @@ class LearnReport(BaseModel):
 
 @dataclass(frozen=True)
 class LearningFilter:
-    """Correction of a reference per error, at ``frequency`` (Hz)."""
+    """Filter from the error of a run to the correction of its reference.
+
+    ``gain`` is its complex response at ``frequency`` (Hz).
+    """
 
     frequency: Float[np.ndarray, " lines"]
     gain: Complex[np.ndarray, " lines"]
@@ -91,9 +95,8 @@ class LearningFilter:
     ) -> Float[np.ndarray, " samples"]:
         """Return the correction (um) for the ``error`` (um) of a run.
 
-        Outside the run the error counts as 0. Lines whose power is not above ABOVE
-        times that of white ``noise`` (um rms) are not corrected, stronger ones by what
-        is above it.
+        Outside the run the error counts as 0. Each line is multiplied by 1 - ABOVE n/p,
+        but at least 0, where p is its power and n that of white ``noise`` (um rms).
         """
         samples = len(error)
         padded = 1 << (2 * samples - 1).bit_length()
@@ -114,12 +117,12 @@ def learning_filter(
 ) -> LearningFilter:
     """Return the filter of ``loop``, an inverse as far as its plant is known.
 
-    The reference passes the closed loop T (displacement over reference, small motions
-    below ``highest`` (um), mean of both branches of the hysteresis), so that an error e
-    asks for the correction e / T. If the plant has the relative error d, that of T is
-    |S| d, and what is left of e after a run |S| d e: the correction is multiplied by
-    1 / (1 + (|S| d / TRUSTED)^2), and is at most LARGEST times the error. d is
-    ``bound``, or ASSUMED without one. One axis.
+    T is the response of the displacement to the reference, for small motions at the
+    reference ``highest`` (um), averaged over both branches of the hysteresis. An error
+    e is corrected by e / T. If the plant has the relative error d, that of T is |S| d,
+    and |S| d e remains of e after a run. The correction is therefore multiplied by
+    1 / (1 + (|S| d / TRUSTED)^2), and limited to LARGEST times the error. d is
+    ``bound``, or ASSUMED without one. For one axis.
     """
     point = OperatingPoint(np.asarray(highest), dt=dt)
     followed = np.mean(np.asarray(references_followed(loop, point)), axis=0)
@@ -144,14 +147,14 @@ def learn_reference(
     name: str = "stage",
     progress: Progress | None = None,
 ) -> LearnReport:
-    """Repeat ``motion`` on ``stage`` with ``gains``, and correct it after each run.
+    """Repeat ``motion`` on ``stage``, and correct its reference after each run.
 
-    The corrected reference moves the stage along ``motion``. Learning ends after
-    ``runs`` runs, or when the error does not fall any more; then the gains from before
-    are set, after a run that was stopped or a fault the safe ones. ``folder`` receives
-    the samples of every run (its reference is the motion), the best reference in
-    ``learned.csv``, as a table of at most ``points`` points in ``table.csv``, and after
-    each run the report.
+    The stage runs with ``gains``. Learning ends after ``runs`` runs, or when the error
+    does not fall any more. Then the gains from before are set, but the safe ones after
+    a run that was stopped or a failure. ``folder`` receives the samples of every run
+    (with the motion as its reference), the best reference in ``learned.csv``, the same
+    as a table of at most ``points`` points in ``table.csv``, and the report after each
+    run.
 
     Raises as ``Stage.run`` does for gains that the stage does not have.
     """
@@ -222,7 +225,7 @@ def _write_learned(
     command: np.ndarray,
     points: int | None,
 ) -> None:
-    """Write the motion and the reference that leads to it, and that in ``points``.
+    """Write the motion with the learned reference, and the latter in ``points``.
 
     A waveform generator holds each point; all times are multiples of ``dt``.
     """

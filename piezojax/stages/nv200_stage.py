@@ -35,8 +35,8 @@ REST = 0.2
 """Rest at the beginning of a reference, s."""
 
 POLL, MARGIN = 0.02, 5.0
-"""Time between two looks at the status during a run, and the longest wait after it,
-s."""
+"""Time between two readings of the status during a run, and the time that a run may
+take beyond its duration, s."""
 
 PATIENCE = 20
 """Number of samples at a limit of the voltage, or in a row with too large an error,
@@ -61,22 +61,23 @@ FAULTS = {
     12: "the device reports an error",
     13: "the device reports an error of its bus",
 }
-"""Reasons by bit of the status."""
+"""Reasons to stop a run, by bit of the status."""
 
 
 class NV200Stage:
-    """Loop of an NV200 at ``host``, closed with the gains that it has.
+    """NV200 at ``host``, whose loop is closed already.
 
     The gains are the values of its commands, with the names and units of
     ``piezojax.control.NV200``; a value that the device does not keep is an error. A
     reference of at most 307 ms is written into the waveform generator as at most 1024
-    points; position and voltage are recorded at 20 kHz. Writing the points takes some
-    10 ms each, but only for a reference that is new.
+    points; position and voltage are recorded at 20 kHz. Writing takes about 10 ms a
+    point, and is left out for a reference that the generator holds already.
 
-    The safe gains and the safe position are those at the beginning. The device watches
-    its voltage limits alone: its status is read during a run, and what the record
-    shows is judged after it. Without a connection it keeps the gains that it has.
-    ``largest_error`` (um) is by default a tenth of the range.
+    The safe gains and the safe position are those at the beginning. The device itself
+    enforces only its voltage limits. Its status is read during a run; voltage and
+    error are judged afterwards, from the record. After a lost connection the device
+    keeps the gains that are set. ``largest_error`` (um) is by default a tenth of the
+    range.
 
     Needs the library ``nv200`` (Python 3.12 or 3.13). Raises ValueError without it,
     and for a loop that is open or a position that is not in um; StageError for a
@@ -107,8 +108,9 @@ class NV200Stage:
     def run(self, reference: Float[np.ndarray, " samples"], gains: Gains) -> Record:
         """Follow ``reference`` (um) with ``gains``, as ``Stage.run`` describes.
 
-        Its points are held for as many samples as 1024 of them need. Raises ValueError
-        for more than 6144 samples and for a reference outside the range.
+        Each point is held for the fewest samples with which 1024 points suffice. Raises
+        ValueError for fewer than 2 or more than 6144 samples, and for a reference
+        outside the range.
         """
         reference = np.asarray(reference, dtype=float)
         if reference.ndim != 1 or not np.all(np.isfinite(reference)):
@@ -132,7 +134,7 @@ class NV200Stage:
         self._do(self._set(_texts(gains)))
 
     def gains(self) -> dict[str, float]:
-        """Return the values of the commands."""
+        """Return the gains that are set."""
         return _numbers(self._do(self._values()))
 
     def safe(self) -> None:
@@ -157,7 +159,7 @@ class NV200Stage:
         self.close()
 
     def _do(self, work: Coroutine) -> Any:
-        """Return the result of ``work`` in the thread of the connection."""
+        """Run ``work`` in the thread of the connection, and return its result."""
         if not self._loop.is_running():
             work.close()
             raise LostError(f"{self._name}: the connection is closed")
@@ -165,7 +167,7 @@ class NV200Stage:
         try:
             return waiting.result()
         except (OSError, EOFError, AttributeError) as error:
-            # The library has no reader, an attribute error, after a lost connection.
+            # AttributeError: after a lost connection the library has no reader.
             why = str(error) or type(error).__name__
             raise LostError(f"{self._name}: no connection: {why}") from error
         except _library("shared_types").DeviceError as error:
@@ -205,7 +207,7 @@ class NV200Stage:
             if not math.isclose(now[name], float(text), rel_tol=1e-6, abs_tol=1e-12)
         }
         feedforward = [changed.pop(name, "") for name in FEEDFORWARD]
-        # The notch may be at most twice as wide as its frequency.
+        # The device limits the width of the notch to twice its frequency.
         wider = "notchb" in changed and float(changed["notchb"]) > now["notchb"]
         first, last = ("notchf", "notchb") if wider else ("notchb", "notchf")
         for name in (first, last, *changed):
@@ -225,7 +227,7 @@ class NV200Stage:
                 )
 
     async def _move(self, position: float) -> None:
-        # The setpoint acts from modsrc on: the other order would move twice.
+        # The setpoint takes effect with modsrc: the other order would move twice.
         await self._device.write(f"set,{position:.4f}")
         await self._device.write("modsrc,0")
 

@@ -7,7 +7,7 @@ SHARE = 0.05
 """Range of the motion, as a share of the range of the reference."""
 
 SINES = 60
-"""Number of sines, evenly spaced on a logarithmic scale as far as the lines allow."""
+"""Largest number of sines; their logarithmic spacing is rounded to whole periods."""
 
 HIGHEST = 0.2
 """Highest frequency, as a share of the sampling rate."""

@@ -36,7 +36,7 @@ class StoppedError(StageError):
 
 
 class LostError(StageError):
-    """The connection to a stage is lost; its own guard makes it safe."""
+    """The connection to a stage is lost; the stage has to make itself safe."""
 
 
 @runtime_checkable
@@ -51,7 +51,7 @@ class Stage(Protocol):
     dt: float
 
     def run(self, reference: Float[np.ndarray, " samples"], gains: Gains) -> Record:
-        """Apply ``gains``, move to the first sample of ``reference`` (um), follow it.
+        """Apply ``gains``, move to the start of ``reference`` (um), and follow it.
 
         The record holds the voltage, the reading and the reference. Raises
         StoppedError if the run is stopped, LostError without a connection, and

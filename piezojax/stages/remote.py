@@ -13,15 +13,15 @@ from ..identification import Record
 from .protocol import Gains, LostError, StageError, StoppedError
 
 TIMEOUT = 60.0
-"""Longest time without an answer, s, beside the duration of a run."""
+"""Longest wait for an answer, s; four times the duration of a run is added to it."""
 
 
 class RemoteStage:
     """Stage behind the socket of a StageServer at ``address``, "host:port".
 
     A request and its answer are one line of JSON each. The server makes the stage safe
-    if the connection breaks; ``close`` ends it without that. Raises ValueError for a
-    wrong address and LostError if nobody answers there.
+    if the connection breaks, but not after ``close``. Raises ValueError for a wrong
+    address and LostError if no server answers there.
     """
 
     def __init__(self, address: str, timeout: float = TIMEOUT):

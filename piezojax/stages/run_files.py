@@ -10,7 +10,7 @@ from ..core.files import atomic_replacement
 Samples = Float[np.ndarray, " samples"]
 
 COLUMNS = "reference_um", "measured_um", "voltage_V"
-"""Arrays in the file of a run."""
+"""Names of the arrays in the file of a run."""
 
 
 def run_file(folder: Path, number: int) -> Path:

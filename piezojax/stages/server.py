@@ -1,4 +1,4 @@
-"""Server of a stage: answers a RemoteStage, and makes the stage safe without one."""
+"""Server that answers a RemoteStage; a broken connection makes the stage safe."""
 
 import contextlib
 import json
@@ -15,15 +15,15 @@ LONGEST_LINE = 1 << 26
 """Longest request, bytes: about three million samples."""
 
 SILENCE = 10
-"""Time after which a connection is asked whether it is still there, s."""
+"""Time without data after which a connection is probed, and between two probes, s."""
 
 
 class StageServer(socketserver.ThreadingTCPServer):
     """Server of ``stage`` at a ``port`` of this machine, 0 for any free one.
 
-    Whenever a connection ends without a goodbye, the stage is made safe: if the other
-    process is killed, or the network fails. ``serve_forever`` answers until
-    ``shutdown``. The socket is reachable from this machine only.
+    Whenever a connection ends without a goodbye, for example because the client was
+    killed, the stage is made safe. ``serve_forever`` answers until ``shutdown``. The
+    socket is reachable from this machine only.
     """
 
     allow_reuse_address = True
@@ -41,7 +41,11 @@ class StageServer(socketserver.ThreadingTCPServer):
 
 
 class _Connection(socketserver.StreamRequestHandler):
-    """Connection to one client; a run is computed beside, so that its end is seen."""
+    """Connection to one client.
+
+    Requests are answered in other threads, so that the end of the connection is noticed
+    during a run.
+    """
 
     @property
     def _stage(self) -> Stage:
@@ -83,7 +87,7 @@ class _Connection(socketserver.StreamRequestHandler):
         self._send(answer)
 
     def _send(self, answer: dict[str, Any]) -> None:
-        # The end of the connection is seen by ``handle``.
+        # ``handle`` notices the end of the connection.
         with contextlib.suppress(OSError):
             self.wfile.write(json.dumps(answer).encode() + b"\n")
 
@@ -97,7 +101,7 @@ def _parsed(line: bytes) -> dict[str, Any]:
 
 
 def _done(stage: Stage, request: dict[str, Any]) -> dict[str, Any]:
-    """Do what ``request`` asks ``stage`` for; return the answer."""
+    """Carry out ``request`` on ``stage``; return the answer."""
     match request:
         case {"do": "hello"}:
             return {"dt": stage.dt}

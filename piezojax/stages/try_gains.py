@@ -1,4 +1,4 @@
-"""Trial of tuned gains on a stage: a small motion first, then the references."""
+"""Trial of tuned gains on a stage: small motions first, then the references."""
 
 import contextlib
 import math
@@ -35,7 +35,7 @@ class Motion:
 
     Samples before ``start`` do not count. ``noise`` is the rms noise of the sensor, um:
     it is part of the measured error, but not of the promised one. ``promised`` is None
-    if nothing is.
+    if no error is.
     """
 
     name: str
@@ -48,10 +48,11 @@ class Motion:
 class TriedRun(BaseModel):
     """Run of a trial with a ``share`` of a reference.
 
-    ``measured_um`` is the rms of reference minus reading, ``error_um`` the same without
-    as much noise as the sensor may have in so many samples (three standard deviations),
-    and ``peak_um`` the largest; None if the run was stopped, for the reason
-    ``stopped``. ``file`` holds the samples.
+    ``measured_um`` is the rms of reference minus reading, and ``peak_um`` its largest
+    absolute value. ``error_um`` is the rms without the noise of the sensor: the noise
+    power subtracted is its mean plus three standard deviations over so many samples.
+    All three are None if the run was stopped, for the reason ``stopped``. ``file``
+    holds the samples.
     """
 
     reference: str
@@ -66,8 +67,7 @@ class TriedRun(BaseModel):
 
     @property
     def ratio(self) -> float:
-        """Error relative to the promised one; infinite for a run that was stopped, and
-        without a promise."""
+        """Error relative to the promised one; infinite if one of them is not known."""
         if self.error_um is None or self.promised_um is None:
             return math.inf
         return self.error_um / self.promised_um
@@ -100,13 +100,13 @@ def trial(
     name: str = "stage",
     progress: Progress | None = None,
 ) -> TrialReport:
-    """Try ``gains`` on ``stage``, and keep them if they keep what was promised.
+    """Try ``gains`` on ``stage``; keep them if no error is much larger than promised.
 
-    The gains of the stage are saved first. The first of ``motions`` begins with small
-    shares of its reference. The trial ends at the first run that is stopped, or whose
-    error exceeds FAR times the promised one; then the gains from before, or the safe
-    ones of the stage, are set. ``folder`` receives the samples of every run, and after
-    each step the report.
+    The gains of the stage are saved first. The stage then follows the shares ``SMALL``
+    of the first of ``motions``, and all ``motions``. The trial ends at a run that is
+    stopped, after which the stage has its safe gains, or at a run whose error exceeds
+    FAR times the promised one, after which the gains from before are set. ``folder``
+    receives the samples of every run, and the report after each step.
 
     Raises ValueError if there is no motion or the stage lacks one of the gains.
     """
@@ -141,10 +141,10 @@ def trial(
 
 @contextlib.contextmanager
 def safe_after_failure(stage: Stage, report: Any, file: Path) -> Iterator[None]:
-    """Do some work on ``stage`` and write ``report`` to ``file`` at its end.
+    """Write ``report`` to ``file`` at the end of this context of work on ``stage``.
 
-    If it fails, the stage is made safe and ``report`` has the alarm. An error of the
-    stage ends here, others are raised again.
+    If the work fails, the stage is made safe, and ``report`` receives the verdict and
+    an alarm. A StageError ends here; other errors are raised again.
     """
     try:
         yield
@@ -231,7 +231,7 @@ def _judge(stage: Stage, report: TrialReport) -> None:
 def abandoned(
     stage: Stage, error: BaseException
 ) -> tuple[Literal["stopped", "lost"], str]:
-    """Make ``stage`` safe after ``error``, if it can be reached; return the alarm."""
+    """Make ``stage`` safe after ``error`` if possible; return verdict and alarm."""
     with contextlib.suppress(LostError):
         if not isinstance(error, LostError):
             stage.safe()
